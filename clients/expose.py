@@ -17,10 +17,13 @@ __all__ = ["Forecast", "Measured", "Transmission", "expose", "exposure_of"]
 
 @dataclass(frozen=True)
 class Measured:
-    """The same figures of a scan that was made; see `Forecast`."""
+    """The same figures of a scan that was made; see `Forecast`.
+
+    `saturated` is None where the panel's largest count is not known.
+    """
 
     transmission: Transmission
-    saturated: float
+    saturated: float | None
     starved: float
     images: int
 
@@ -32,15 +35,13 @@ def exposure_of(data: DataSet | str | PathLike[str]) -> Measured:
         data: a data set or its folder.
     """
     scan = data if isinstance(data, DataSet) else load_dataset(data)
-    bits = 16 if scan.machine is None else scan.machine.detector.bits
-    top = (1 << bits) - 1
     wanted = np.unique(np.linspace(0, len(scan) - 1, VIEWS).astype(int))
     counts = np.stack([scan.counts(int(i)) for i in wanted])
     alive = scan.flat > scan.dark
     signal = (counts - scan.dark)[:, alive]
     return Measured(
         Transmission.of(signal / (scan.flat - scan.dark)[alive]),
-        float((counts >= top).mean()),
+        None if scan.full_scale is None else float((counts >= scan.full_scale).mean()),
         float((signal < FEW_COUNTS).mean()),
         len(scan),
     )

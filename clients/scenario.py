@@ -11,6 +11,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cached_property
 from importlib.metadata import version
@@ -276,10 +277,11 @@ class ScenarioImages:
             flat = np.full(counts.shape[1:], round(self.brightest), np.uint16)
         if flat is not None:
             flat = np.rint(np.maximum(flat, 0.0))
-        return DataSet.from_arrays(
+        made = DataSet.from_arrays(
             counts, scan.geometry.cone_vec, dark=dark, flat=flat, name=self.path.stem,
             warnings=scan.notes, truth=self,
         )  # fmt: skip
+        return replace(made, full_scale=2**scan.grey.bits - 1)
 
     def write(self, folder: str | os.PathLike[str]) -> Path:
         """Write all images as TIFF, and CTSimU's metadata, into a new folder.

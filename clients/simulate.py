@@ -78,6 +78,11 @@ class Truth:
     def __repr__(self) -> str:
         return f"<Truth: {self.sample.name!r}, {len(self.geometry)} views>"
 
+    def of_views(self, chosen: npt.NDArray[np.intp]) -> Truth:
+        """That of some of the views."""
+        scatter = None if self.scatter is None else self.scatter.of_views(chosen)
+        return replace(self, geometry=self.geometry[chosen], scatter=scatter)
+
     @property
     def assumed(self) -> tuple[str, ...]:
         """What is not known about the materials."""
@@ -217,9 +222,10 @@ def simulate(
         assert image.expected is not None
         counts[i] = read(2 + i, image.expected)
     warnings = (*truth.assumed, *_flat_doubts(flat, panel, cone))
-    return DataSet.from_arrays(
+    made = DataSet.from_arrays(
         counts, cone, dark=dark, flat=flat, name=phantom.name, warnings=warnings, truth=truth
     )
+    return replace(made, full_scale=panel.full_scale)
 
 
 def _within_pixels(rows: FloatArray, rays: int) -> FloatArray:
@@ -305,9 +311,11 @@ def _flat_doubts(flat: Counts, panel: Panel, cone: ConeVec) -> Iterator[str]:
 
 
 def _different(cone: ConeVec) -> npt.NDArray[np.float64]:
-    """Views whose distances or foot points differ, (k, 12)."""
+    """Views whose distances or foot points differ, the extremes among them, (k, 12)."""
     ray = cone.source - cone.detector
     feet = [np.einsum("ij,ij->i", ray, edge) for edge in (cone.u, cone.v)]
     keys = np.column_stack([cone.source_detector_distance, *feet]).round(6)
     _, index = np.unique(keys, axis=0, return_index=True)
-    return cone.rows[np.sort(index)][:100]
+    some = index[np.linspace(0, len(index) - 1, 100).astype(int)]
+    ends = keys.argmin(axis=0), keys.argmax(axis=0)
+    return np.asarray(cone.rows[np.unique(np.concatenate([some, *ends]))])

@@ -184,31 +184,34 @@ def expose(
     scanner = machine if isinstance(machine, Machine) else builtin_machine(machine)
     spec = scanner.detector
     low, high = max(scanner.tube.min_kV, voltages()[0]), min(scanner.tube.max_kV, voltages()[1])
-    tried = [kV] if isinstance(kV, int | float) else list(kV or [scanner.tube.kV])
+    tried = np.atleast_1d(scanner.tube.kV if kV is None else kV).astype(float).tolist()
+    power = scanner.tube.power_W if power_W is None else power_W
+    time_ms = spec.exposure_ms if exposure_ms is None else exposure_ms
     for what, values, least, most in (
         ("kV", tried, low, high),
-        ("power_W", [power_W or scanner.tube.power_W], 1e-9, scanner.tube.max_W),
-        ("exposure_ms", [exposure_ms or spec.exposure_ms], spec.min_exposure_ms,
+        ("power_W", [power], 1e-9, scanner.tube.max_W),
+        ("exposure_ms", [time_ms], spec.min_exposure_ms,
          spec.max_exposure_ms),
         ("averages", [averages], 1, 10**6), ("images", [images], 1, 10**7),
     ):  # fmt: skip
         for value in values:
-            if not least <= value <= most:
+            counted = what in ("averages", "images")
+            if not least <= value <= most or (counted and value != int(value)):
+                whole = "whole numbers from " if counted else ""
                 raise LimitError(
-                    f"{what} is {value:g}; allowed with {scanner.name}: {least:g} to {most:g}",
+                    f"{what} is {value:g}; allowed with {scanner.name}: {whole}{least:g} to "
+                    f"{most:g}",
                     {"asked": value, "allowed": [least, most]},
                 )
     missing, size = _layer("detail", detail)
     wanted = (None if missing == VOID else material_of(missing).substance, size)
     phantom = as_phantom(sample, material=material, voxel_mm=voxel_mm)
     parts = channels(phantom)
-    camera = replace(spec.camera, exposure_ms=exposure_ms or spec.exposure_ms, averages=averages)
+    camera = replace(spec.camera, exposure_ms=time_ms, averages=averages)
     cone = ConeVec.circular(
         sod=sod, sdd=sdd, angles=VIEWS, shape=camera.shape, pixel=camera.pixel_mm(spec.sensor)
     )
-    lit = ExposureSettings(
-        float(tried[0]), power_W or scanner.tube.power_W, camera.exposure_ms, averages
-    )
+    lit = ExposureSettings(tried[0], power, camera.exposure_ms, averages)
     panel, tube = panel_of(spec), tube_of(scanner.tube)
 
     def chain(layer: str) -> Chain:

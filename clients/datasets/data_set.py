@@ -78,6 +78,7 @@ class DataSet:
         complete: whether the scan says it finished and no file is missing.
         reason: why it is not complete.
         warnings: what is doubtful.
+        full_scale: largest count of the panel; None where it is not known.
         truth: of a simulated data set, what lies behind it.
 
     Example:
@@ -107,6 +108,7 @@ class DataSet:
     complete: bool = True
     reason: str = ""
     warnings: tuple[str, ...] = ()
+    full_scale: int | None = None
     truth: Any = None
 
     @classmethod
@@ -197,6 +199,7 @@ class DataSet:
             nominal=None if self.nominal is None else self.nominal[chosen],
             positions={name: values[chosen] for name, values in self.positions.items()},
             arrays=None if arrays is None else replace(arrays, counts=arrays.counts[chosen]),
+            truth=self.truth.of_views(chosen) if hasattr(self.truth, "of_views") else None,
         )
 
     def __iter__(self) -> Iterator[Float32Array]:
@@ -445,7 +448,8 @@ class DataSet:
         """Write a folder that `flexdt.open` reads: di000000.tif, io000000.tif, scan_000000.tif ...
         (uint16) and the geometry.
 
-        geometry.json holds the geometry with the correction in force. A data set with flexdt.json
+        geometry.json holds the geometry with the correction in force, warnings and the largest
+        count of the panel. A data set with flexdt.json
         keeps that instead, as long as it has all of its projections; texts are copied. A data set
         in memory gets the scanner's two texts, `scan settings.txt` and `data settings XRE.txt`,
         where they can say its geometry: a circle in the plane z = 0 with equal steps and an upright

@@ -10,6 +10,7 @@ from __future__ import annotations
 import fnmatch
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Final
@@ -46,6 +47,7 @@ from flexdt.twin.machine.description import (
 
 AGREE_MM: Final = 1e-6
 """How far the cone_vec of a file may lie from what its motor positions give [mm]."""
+NO_DARK: Final = "no dark image"
 
 
 def load_dataset(
@@ -90,12 +92,13 @@ def read_tiffs(
     """Anybody's frames: TIFF images in a folder, and a geometry for them.
 
     Images are counts (uint16), or floats: counts too if there is a flat image, else line integrals.
-    Floats are kept in memory as counts of an open beam of 60000.
+    Floats are kept in memory as counts of an open beam of 60000, or down to 20000 where pixels are
+    brighter than it; a warning says how many are beyond what that holds.
 
     Args:
         folder: where the images are.
-        geometry: one view for each projection, in the order of the numbers in their names; or a
-            file that `ConeVec.load` reads.
+        geometry: one view for each projection, in the order of their names, where 10 comes after
+            9; or a file that `ConeVec.load` reads.
         frames, dark, flat: patterns of the names of projections, dark and flat images. What is
             dark or flat is no projection.
 
@@ -118,13 +121,19 @@ def read_tiffs(
     darks, flats = (fnmatch.filter(names, pattern) for pattern in (dark, flat))
     others = {*darks, *flats}
     chosen = [n for n in fnmatch.filter(names, frames) if n not in others]
-    first = read_values(content.path / chosen[0]) if chosen else None
+    if not chosen:
+        taken = f": dark={dark!r} and flat={flat!r} took {', '.join(sorted(others)[:3])}"
+        raise DatasetMissingError(
+            f"{content.path}: no projections match {frames!r}{taken if others else ''}",
+            {"path": str(content.path), "missing": [frames]},
+        )
+    first = read_values(content.path / chosen[0])
     if isinstance(geometry, str | PathLike):
-        geometry = ConeVec.load(geometry, shape=None if first is None else first.shape)
+        geometry = ConeVec.load(geometry, shape=first.shape)
     cone = geometry if isinstance(geometry, ConeVec) else ConeVec(np.asarray(geometry))
-    if first is not None and first.dtype != np.uint16:
+    if first.dtype != np.uint16:
         return _of_floats(content.path, cone, chosen, darks, flats)
-    return listed(content, cone, chosen or [frames], darks, flats)
+    return listed(content, cone, chosen, darks, flats)
 
 
 OPEN_COUNTS: Final = 60_000.0
@@ -151,10 +160,19 @@ def _of_floats(
     else:
         images = np.exp(-images)
     top = np.iinfo(np.uint16).max
-    counts = np.rint(np.clip(OPEN_COUNTS * images, 0, top)).astype(np.uint16)
-    flat = np.full(counts.shape[1:], OPEN_COUNTS)
+    # Brighter pixels than the open beam, as noise makes them, need room above it.
+    opened = float(np.clip(np.floor(top / max(images.max(), 1e-9)), OPEN_COUNTS / 3, OPEN_COUNTS))
+    images *= opened
+    lost = float(((images < 1.0) | (images > top)).mean())
+    held = f"{np.log(opened / top):.3g} to {np.log(opened):.3g}"
+    told = f"{100 * lost:.3g} % of the pixels have line integrals outside {held}: they are cut"
+    counts = np.rint(np.clip(images, 0, top)).astype(np.uint16)
+    flat = np.full(counts.shape[1:], opened)
     dark = np.zeros(counts.shape[1:])
-    return DataSet.from_arrays(counts, geometry, dark=dark, flat=flat, name=folder.name)
+    return DataSet.from_arrays(
+        counts, geometry, dark=dark, flat=flat, name=folder.name,
+        warnings=[told] if lost else [],
+    )  # fmt: skip
 
 
 def _by_numbers(name: str) -> list[tuple[int, str]]:
@@ -202,6 +220,7 @@ def _from_document(content: Folder, machine: Machine | None, profile: Profile | 
         profile=profile,
         settings=settings,
         document=doc,
+        full_scale=(1 << machine.detector.bits) - 1,
         complete=doc.complete and not lost,
         reason="; ".join(filter(None, (unfinished, lost))),
         warnings=tuple(warnings + _doubts(doc.files("dark"))),
@@ -213,8 +232,10 @@ def _from_geometry(content: Folder) -> DataSet:
     path = content.path / GEOMETRY
     geometry = read_geometry_text(read_text(path), str(path))
     names = geometry.files or [content.projection_name(i) for i in range(len(geometry))]
-    return listed(content, geometry.cone_vec.with_shape(geometry.shape), names,
-                  content.darks, content.flats, geometry.name)  # fmt: skip
+    found = listed(content, geometry.cone_vec.with_shape(geometry.shape), names,
+                   content.darks, content.flats, geometry.name)  # fmt: skip
+    notes = [note for note in geometry.notes if not note.startswith(NO_DARK)]
+    return replace(found, warnings=(*found.warnings, *notes), full_scale=geometry.full_scale)
 
 
 def listed(
@@ -305,6 +326,7 @@ def _from_texts(content: Folder, machine: Machine | None, profile: Profile | Non
         machine=rebuilt.machine,
         profile=rebuilt.profile,
         settings=settings,
+        full_scale=None if rebuilt.machine is None else (1 << rebuilt.machine.detector.bits) - 1,
         complete=not reasons,
         reason="; ".join(reasons),
         warnings=(*warnings, *rebuilt.notes, *_doubts(content.darks)),
@@ -357,7 +379,7 @@ def _require_one_circle(content: Folder) -> None:
 
 
 def _doubts(darks: Sequence[str]) -> list[str]:
-    return [] if darks else ["no dark image (di000000.tif): zero is taken"]
+    return [] if darks else [f"{NO_DARK} (di000000.tif): zero is taken"]
 
 
 def _lost(content: Folder, names: Sequence[str]) -> str:

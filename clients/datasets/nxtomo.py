@@ -111,7 +111,10 @@ def _geometry(data: DataSet) -> tuple[str, bytes]:
         data.nominal.cone_vec().rows, data.cone_vec.rows, rtol=0.0, atol=1e-6
     )
     if document is None or moved or document.files("projection") != files:
-        geometry = ScanGeometry(data.geometry, data.shape, name=data.name, files=files)
+        geometry = ScanGeometry(
+            data.geometry, data.shape, name=data.name, files=files, notes=data.warnings,
+            full_scale=data.full_scale,
+        )  # fmt: skip
         return GEOMETRY, geometry_text(geometry).encode()
     c = data.correction
     entry = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,40 @@ def test_saturated_and_starved_pixels_are_foreseen() -> None:
     assert dark.starved == pytest.approx(share * 0.93, rel=0.1)  # 60 of 64 mm in the picture
 
 
+@pytest.mark.parametrize("bits", [10, 14])
+def test_saturation_is_known_of_a_saved_scan_and_else_unknown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], bits: int
+) -> None:
+    geometry = fx.ConeVec.circular(sod=600, sdd=700, angles=3, shape=(20, 30), pixel=1.0)
+    scan = fx.simulate(
+        rod(2.0), geometry, tube=fx.Tube(power_W=100), detector=fx.Detector(bits=bits)
+    )
+    share = float((scan.counts() == 2**bits - 1).mean())
+    assert share > 0.5
+    scan.save(tmp_path / "whole")
+    back = fx.open(tmp_path / "whole")
+    assert exposure_of(scan).saturated == exposure_of(back).saturated == pytest.approx(share)
+    assert scan.warnings
+    assert set(back.warnings) == set(scan.warnings)
+    plain = fx.DataSet.from_arrays(scan.counts(), geometry, dark=scan.dark, flat=scan.flat)
+    assert exposure_of(plain).saturated is None
+    plain.save(tmp_path / "plain")
+    assert run(["expose", str(tmp_path / "plain")]) == 0
+    assert "saturated unknown" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "words", [{"images": 10.5}, {"averages": 2.5}, {"power_W": 0}, {"exposure_ms": 0}]
+)
+def test_numbers_that_no_scan_has_are_refused(words: dict[str, float]) -> None:
+    with pytest.raises(fx.TwinError, match=f"{next(iter(words))} is .* allowed"):
+        fx.expose(rod(5.0), **words)
+
+
+def test_a_voltage_may_be_numpys() -> None:
+    assert fx.expose(rod(5.0), kV=np.int64(60), power_W=np.float32(20)).asked.kV == 60.0
+
+
 def test_proposed_settings_take_the_time_asked_for_the_best_first(forecast: Any) -> None:
     cnr = [one.cnr for one in forecast.best]
     assert cnr == sorted(cnr, reverse=True)
@@ -100,6 +135,8 @@ def test_kerma_falls_with_the_square_of_the_distance_and_grows_with_the_charge()
         (["--kV", "500"], "allowed with flexray: 20 to 90"),
         (["--kV", "nan"], "allowed with flexray"),
         (["--power", "-1"], "power_W is -1"),
+        (["--power", "0"], "power_W is 0"),
+        (["--exposure", "0"], "exposure_ms is 0"),
         (["--exposure", "1e9"], "exposure_ms is 1e+09"),
         (["--frames", "0"], "images is 0"),
         (["--detail", "void:500"], "a void of at most that"),

@@ -139,6 +139,16 @@ def test_one_energy_attenuates_as_the_material_says(metal: str, keV: float) -> N
     assert material(metal).mu_at(keV) * 0.1 == pytest.approx(wanted, rel=2e-3)
 
 
+@pytest.mark.parametrize("views", [2, 300])
+def test_the_flat_images_doubt_looks_at_all_views(views: int) -> None:
+    far = np.linspace(1000.0, 1200.0, views)
+    cone = ConeVec.from_vectors([0, -500, 0], np.c_[0 * far, far - 500, 0 * far], [1, 0, 0],
+                                [0, 0, -1])  # fmt: skip
+    scan = simulate(SCENE, cone, tube=Tube(power_W=1), detector=SHARP, shape=(2, 2))
+    differs = 100 * (1 - (1000 / 1200) ** 2)
+    assert any(f"up to {differs:.2g} %" in one for one in scan.warnings), scan.warnings
+
+
 def test_a_spectrum_is_the_sum_over_its_energies_and_the_counts_are_absolute() -> None:
     cone = ConeVec.from_vectors([0, -300, 0], [0, 200, 0], [PIXEL, 0, 0], [0, 0, -PIXEL])
     tube = Tube(kV=80, power_W=40, filters=[("Al@2.70", 0.5), ("Cu@8.96", 0.1)], spot_mm=0.0)

@@ -116,6 +116,43 @@ def test_frames_of_others_follow_the_numbers_in_their_names(tmp_path: Path) -> N
         fx.read_tiffs(tmp_path, scan.with_shape((9, 9)), dark="dark*", flat="white*")
 
 
+def test_what_the_patterns_took_is_said(tmp_path: Path) -> None:
+    for name in ("diamond_0.tif", "iodine_0.tif"):
+        tifffile.imwrite(tmp_path / name, np.full((2, 3), 7, np.uint16))
+    scan = fx.ConeVec.circular(sod=60, sdd=100, angles=2, pixel=1.0)
+    with pytest.raises(DatasetMissingError, match=r"dark='di\*' and flat='io\*' took diamond_0"):
+        fx.read_tiffs(tmp_path, scan)
+    assert len(fx.read_tiffs(tmp_path, scan, dark="", flat="")) == 2
+
+
+def test_float_images_keep_the_mean_of_air_and_say_what_is_cut(tmp_path: Path) -> None:
+    """Air of N(0, 0.1) is neither raised nor cut; what 16 bits do not hold is told."""
+    scan = fx.ConeVec.circular(sod=60, sdd=100, angles=1, pixel=1.0)
+    air = np.random.default_rng(4).normal(0.0, 0.1, (80, 90)).astype(np.float32)
+    air[3, 4], air[5, 6] = -0.5, 8.0
+    tifffile.imwrite(tmp_path / "a.tif", air)
+    read = fx.read_tiffs(tmp_path, scan)
+    assert read.warnings == ()
+    assert_allclose(read.line_integrals(0)[air < 4], air[air < 4], atol=1e-4)
+    assert read.line_integrals(0)[5, 6] == pytest.approx(8.0, abs=0.05)
+    air[:8, 0] = 14.0
+    tifffile.imwrite(tmp_path / "a.tif", air)
+    (said,) = fx.read_tiffs(tmp_path, scan).warnings
+    assert said.startswith(f"{100 * 8 / air.size:.3g} % of the pixels")
+
+
+def test_the_truth_of_some_views_is_theirs() -> None:
+    scan = fx.ConeVec.circular(sod=200, sdd=400, angles=6, shape=(7, 9), pixel=1.6)
+    ball = {"kind": "sphere", "center": [2, 0, 0], "radius": 3, "material": "pmma"}
+    data = fx.simulate(ball, scan, scatter="first")
+    for chosen in (slice(4, 6), [5, 1]):
+        part = data[chosen]
+        assert_array_equal(part.truth.line_integrals(), data.truth.line_integrals()[chosen])
+        assert_array_equal(part.truth.geometry.rows, part.cone_vec.rows)
+        views = np.arange(6)[chosen]
+        assert_array_equal(part.truth.scatter[1].signal, data.truth.scatter[views[1]].signal)
+
+
 @pytest.mark.parametrize(
     ("counts", "more", "said"),
     [

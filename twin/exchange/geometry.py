@@ -39,6 +39,7 @@ class ScanGeometry:
         name: of the scan, "" if unknown.
         files: the images' names, () if unknown.
         notes: remarks for the reader.
+        full_scale: largest count of the images; None if unknown.
     """
 
     cone_vec: ConeVec
@@ -47,6 +48,7 @@ class ScanGeometry:
     name: str = ""
     files: tuple[str, ...] = ()
     notes: tuple[str, ...] = field(default=(), compare=False)
+    full_scale: int | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         for what, count in (("real rows", self.real), ("files", self.files or None)):

@@ -29,6 +29,7 @@ def geometry_text(geometry: ScanGeometry) -> str:
         "detector": {"rows": rows, "columns": cols},
         "notes": list(geometry.notes),
         "files": list(geometry.files),
+        **({} if geometry.full_scale is None else {"full_scale": geometry.full_scale}),
     }
     parts = [f" {json.dumps(k)}: {json.dumps(v, ensure_ascii=False)}" for k, v in head.items()]
     parts.append(_rows("cone_vec", geometry.cone_vec))
@@ -62,6 +63,9 @@ def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
         if not all(type(size) is int and size > 0 for size in sizes):
             raise ExchangeError(f"{file}: detector: rows and columns must be whole numbers above 0")
         shape = (int(sizes[0]), int(sizes[1]))  # type: ignore[arg-type]
+    full_scale = document.get("full_scale")
+    if full_scale is not None and type(full_scale) is not int:
+        raise ExchangeError(f"{file}: full_scale must be a whole number")
     real = document.get("real_cone_vec")
     return ScanGeometry(
         _cone_vec(document.get("cone_vec"), "cone_vec", file),
@@ -70,6 +74,7 @@ def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
         str(document.get("name") or ""),
         _texts(document.get("files"), "files", file),
         _texts(document.get("notes"), "notes", file),
+        full_scale,
     )
 
 

@@ -11,7 +11,7 @@ simulations; the views in between are interpolated linearly along the way of sou
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from hashlib import blake2b
 from typing import Final, Literal
@@ -365,14 +365,16 @@ class ScanScatter:
     Attributes:
         settings: how it was simulated.
         images: of the simulated views.
-        simulated: (k,) their indices, growing.
+        simulated: (k,) their indices in the whole scan, growing.
         way: (n,) how far source and panel have come at each view [rad].
+        known: (k,) the same at the simulated ones.
     """
 
     settings: ScatterSettings
     images: tuple[ScatterImage, ...]
     simulated: tuple[int, ...]
     way: FloatArray
+    known: FloatArray
 
     def __len__(self) -> int:
         return len(self.way)
@@ -380,6 +382,10 @@ class ScanScatter:
     def __getitem__(self, index: int) -> Scattered:
         """Scatter of a view at every pixel; never negative, though splines may overshoot."""
         return Scattered(self.signal(index), self._spread_out(index, "spread"))
+
+    def of_views(self, chosen: npt.NDArray[np.intp]) -> ScanScatter:
+        """Scatter of some of the views."""
+        return replace(self, way=self.way[chosen])
 
     def signal(self, index: int) -> Float32Array:
         """`Scattered.signal` of a view alone."""
@@ -410,7 +416,7 @@ class ScanScatter:
     def _at(self, index: int, values: FloatArray, power: int = 1) -> FloatArray:
         if not -len(self) <= index < len(self):
             raise IndexError(f"view {index} of {len(self)}")
-        place, known = self.way[index], self.way[list(self.simulated)]
+        place, known = self.way[index], self.known
         after = min(int(np.searchsorted(known, place)), len(known) - 1)
         before = max(after - 1, 0)
         span = known[after] - known[before]
@@ -471,7 +477,7 @@ def scan_scatter(
     way = _way(rows)
     simulated = _simulated(way, np.radians(wanted.step_deg))
     images = tuple(scatter_image(thing, rows[i], shape, beam, wanted, i) for i in simulated)
-    return ScanScatter(wanted, images, tuple(simulated), way)
+    return ScanScatter(wanted, images, tuple(simulated), way, way[list(simulated)])
 
 
 def _way(rows: FloatArray) -> FloatArray:

@@ -65,10 +65,8 @@ def _seen(found: Forecast | Measured) -> None:
     seen: Transmission = found.transmission
     say(f"transmission: least {seen.least:.3g}, 1 % below {seen.p1:.3g}, 5 % below {seen.p5:.3g}, "
         f"half below {seen.median:.3g}")  # fmt: skip
-    say(
-        f"saturated {100 * found.saturated:.3g} % of the pixels, "
-        f"starved {100 * found.starved:.3g} %"
-    )
+    full = "unknown" if found.saturated is None else f"{100 * found.saturated:.3g} % of the pixels"
+    say(f"saturated {full}, starved {100 * found.starved:.3g} %")
 
 
 def _told(forecast: Forecast) -> None:
