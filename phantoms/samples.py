@@ -15,7 +15,12 @@ import numpy as np
 
 from flexdt.phantoms.catalog import is_shipped, load_phantom, phantom_names
 from flexdt.phantoms.files.mesh_files import FORMATS, filled_mesh, mesh_phantom, voxel_phantom
-from flexdt.phantoms.files.phantom_files import phantom_of, read_phantom_file, solids_of
+from flexdt.phantoms.files.phantom_files import (
+    phantom_of,
+    read_phantom_file,
+    require_replaced,
+    solids_of,
+)
 from flexdt.phantoms.materials import material as material_of
 from flexdt.phantoms.phantom import Phantom, assemble
 from flexdt.phantoms.pieces import PhantomError, size_about_origin
@@ -24,6 +29,8 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection import Volume
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Vector
 
+FILLED: Final = 1e-3
+"""How far the filled part of a voxel may lie outside 0 to 1."""
 TEXTS: Final = (".toml", ".json")
 FORMS: Final = (
     "a phantom or its name, the path of a file (TOML, JSON, " + ", ".join(FORMATS).upper() + "), a "
@@ -61,7 +68,9 @@ def as_phantom(
         ...            ).size_mm
         (10.0, 10.0, 10.0)
     """
-    return _one(sample, material, voxel_mm, keep=False, priority=priority)
+    made = _one(sample, material, voxel_mm, keep=False, priority=priority)
+    require_replaced(made, sample)
+    return made
 
 
 def _one(
@@ -144,6 +153,14 @@ def _array(
         )
     data = values.astype(np.float32)
     if material is not None:
+        low, high = float(data.min()), float(data.max())
+        if low < -FILLED or high > 1.0 + FILLED:
+            raise PhantomError(
+                f"with material={material!r} an array holds the part of each voxel that it fills, "
+                f"0 to 1, and this one goes from {low:g} to {high:g}; for an array of labels give "
+                "material={1: ...}",
+                {"asked": [low, high], "allowed": [0, 1]},
+            )
         data *= np.float32(material_of(material).mu_per_mm)
     return voxel_phantom(data, voxel_mm, material=material)
 

@@ -32,6 +32,10 @@ from flexdt.twin.projection import TriangleMesh
 from flexdt.twin.projection.analytic_solids import Scene, Solid
 
 MAX_TEXT_BYTES: Final = 256 << 20
+CHECKED_ALONG: Final = 96
+"""Voxels along the longest side in which `require_replaced` looks."""
+ABSENT: Final = 0.25
+"""Part of a voxel that may be replaced without being there."""
 BEAD_KEYS: Final = ("schema", "name", "description", "body", "bead", "spiral")
 SCENE_KEYS: Final = ("schema", "name", "description", "solid", "mesh")
 
@@ -100,7 +104,32 @@ def _scene_file(document: Mapping[str, object], folder: Path | None) -> Phantom:
 
     meshes = reading.each(document.get("mesh", []), "phantom.mesh", read)
     ranks = [0.0] * len(parts) + [rank for _, rank in meshes]
-    return assemble(name, parts + [mesh for mesh, _ in meshes], told, ranks)
+    whole = assemble(name, parts + [mesh for mesh, _ in meshes], told, ranks)
+    require_replaced(whole, document.get("solid", []))
+    return whole
+
+
+def require_replaced(phantom: Phantom, solids: object) -> None:
+    """Check that what solids of a scene file, one or a list of anything, replace is there, once.
+
+    Raises:
+        PhantomError: names the material.
+    """
+    from flexdt.phantoms.voxelise import voxelise
+
+    listed = solids if isinstance(solids, list | tuple) else [solids]
+    told = [one["replaces"] for one in listed if isinstance(one, Mapping) and "replaces" in one]
+    for name in dict.fromkeys(told):
+        there = tuple(one for one in phantom.scene.solids if one.material == name)
+        meshes = [one for one in phantom.surfaces if one.material == name]
+        edge = max(phantom.size_mm) / CHECKED_ALONG
+        least = float(voxelise(Scene(there), meshes, phantom.size_mm, edge, 2).data.min())
+        if least < -ABSENT * material_of(name).mu_per_mm:
+            raise PhantomError(
+                f"{name} is replaced where there is none of it, or twice; allowed: inside solids "
+                f"of {name} that are not replaced already",
+                {"asked": name, "allowed": "inside it"},
+            )
 
 
 def solids_of(value: object, where: str) -> tuple[Solid, ...]:

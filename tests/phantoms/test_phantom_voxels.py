@@ -18,6 +18,7 @@ from flexdt.phantoms import (
     voxel_phantom,
 )
 from flexdt.phantoms.channels import channels, line_integrals
+from flexdt.phantoms.files.phantom_files import load_phantom_file
 from flexdt.phantoms.pieces import Surface
 from flexdt.phantoms.samples import as_phantom
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -226,3 +227,39 @@ def test_labels_are_one_grid_for_each_material(seed: int) -> None:
             as_phantom(bad, material=names, voxel_mm=edges)
     with pytest.raises(PhantomError, match="allowed are 0 for nothing"):
         as_phantom(labels, material={**names, 0: "water"}, voxel_mm=edges)
+
+
+@pytest.mark.parametrize("worst", [255.0, 2.0, -1.0, 1.01])
+def test_parts_of_voxels_are_from_0_to_1(worst: float) -> None:
+    part = np.zeros((3, 4, 5))
+    part[1, 1, 1] = worst
+    with pytest.raises(PhantomError, match="0 to 1"):
+        as_phantom(part, material="pmma", voxel_mm=1.0)
+    part[1, 1, 1] = 1.0
+    as_phantom(part, material="pmma", voxel_mm=1.0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_replaced_must_be_there_once(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    body = {"kind": "box", "center": [0, 0, 0], "size": rng.uniform(8, 12, 3).tolist(),
+            "material": "steel"}  # fmt: skip
+
+    def ball(x: float, y: float, z: float) -> dict[str, object]:
+        return {"kind": "sphere", "center": [x, y, z], "radius": 1.9, "material": "pmma",
+                "replaces": "steel"}  # fmt: skip
+
+    place = rng.uniform(-2, 2, 3)
+    as_phantom([body, ball(*place)])
+    as_phantom([body, ball(-2, 0, 0), ball(2, 0, 0)])
+    for wrong in (
+        [ball(*place)], [body, ball(0, 0, body["size"][2] / 2)],
+        [body, ball(*place), ball(*(place + 0.5))], ball(*place),
+    ):  # fmt: skip
+        with pytest.raises(PhantomError, match="steel is replaced where"):
+            as_phantom(wrong)
+    hole = Scene((Solid(Sphere((0.0, 0.0, 0.0), 1.0), "hole", -0.01),))
+    as_phantom([body, hole])  # a scene by itself says what it is
+    text = json.dumps({"schema": 1, "solid": [ball(*place)]})
+    with pytest.raises(PhantomError, match="steel is replaced where"):
+        load_phantom_file(text)
