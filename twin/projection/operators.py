@@ -7,6 +7,7 @@ focal spot to the pixel centre, no further.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -243,6 +244,15 @@ def check_projections(projections: npt.ArrayLike, n: int) -> Any:
             {"asked": list(values.shape), "allowed": [n, "rows", "cols"]},
         )
     return values
+
+
+def require_finite(values: Any) -> None:
+    """Raise GeometryError for projections in memory that are not finite."""
+    if not gpu.is_there(values) and not math.isfinite(float(values.sum())):
+        raise GeometryError(
+            "projections hold values that are not finite; allowed: finite line integrals",
+            {"asked": "NaN or infinity", "allowed": "finite"},
+        )
 
 
 def voxel_rays(cone_vec: ConeVec, layout: Layout, shape: Shape2) -> FloatArray:

@@ -28,7 +28,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Grid, Volume, as_volume, gpu
 from flexdt.twin.projection.cpu import threads
-from flexdt.twin.projection.operators import as_cone_vec, check_projections
+from flexdt.twin.projection.operators import as_cone_vec, check_projections, require_finite
 from flexdt.twin.reconstruction.helix import Sharing
 from flexdt.twin.reconstruction.rectify import (
     is_upright,
@@ -256,7 +256,9 @@ def fdk(
 
     def parts() -> Iterable[Float32Array]:
         for start in range(0, len(values), CHUNK):
-            yield np.asarray(values[start : start + CHUNK], dtype=np.float32)
+            part = np.asarray(values[start : start + CHUNK], dtype=np.float32)
+            require_finite(part)
+            yield part
 
     shape = (values.shape[1], values.shape[2])
     truncation = None

@@ -21,7 +21,7 @@ from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import Grid, Volume, as_volume, back, forward, room_like
-from flexdt.twin.projection.operators import as_cone_vec, check_projections
+from flexdt.twin.projection.operators import as_cone_vec, check_projections, require_finite
 
 SMALLEST = 1e-6
 """Sums of weights below this part of the largest are not divided by."""
@@ -74,6 +74,7 @@ class Problem:
             )
         geometry = as_cone_vec(cone_vec)
         values = check_projections(projections, len(geometry))
+        require_finite(values)
         geometry.of_shape((values.shape[1], values.shape[2]))
         return cls(values, geometry, as_volume(like))
 
@@ -86,9 +87,11 @@ class Problem:
         """Values to begin with: a copy of the first guess, or zeros."""
         if start is None:
             return np.zeros(self.like.shape, np.float32)
-        if start.shape != self.like.shape:
+        if start.shape != self.like.shape or not np.allclose(
+            [start.voxel_xyz, start.center_mm], [self.like.voxel_xyz, self.like.center_mm]
+        ):
             raise GeometryError(
-                f"the first guess has shape {start.shape}; allowed: the grid's {self.like.shape}",
+                f"the first guess is {start!r}; allowed: on the grid of {self.like!r}",
                 {"asked": list(start.shape), "allowed": list(self.like.shape)},
             )
         return np.array(start.data, dtype=np.float32)

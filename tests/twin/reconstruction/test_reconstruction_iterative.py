@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.projection import Volume, forward
-from flexdt.twin.reconstruction import Grid, cgls, em, sart, sirt
+from flexdt.twin.reconstruction import Grid, cgls, em, fdk, sart, sirt, tv
 from tests.twin.reconstruction.scans import MU, ball, circle, measure
 
 SCAN = circle(45, pixel=1.4)
@@ -96,3 +98,17 @@ def test_what_they_refuse():
         cgls(DATA[:3], SCAN, LIKE)
     with pytest.raises(GeometryError, match="first guess"):
         sirt(DATA, SCAN, LIKE, start=Grid((2, 2, 2), 1.0).blank())
+    for other in (
+        replace(LIKE, voxel_mm=2.0 * LIKE.voxel_xyz[0]), replace(LIKE, center_mm=(0.0, 0.0, 3.0)),
+    ):  # fmt: skip
+        with pytest.raises(GeometryError, match="first guess"):
+            cgls(DATA, SCAN, LIKE, start=other)
+
+
+@pytest.mark.parametrize("method", [sirt, sart, cgls, em, tv, fdk])
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_images_that_are_not_finite_are_refused(method, bad):
+    images = np.array(DATA)
+    images[1, 2, 3] = bad
+    with pytest.raises(GeometryError, match="not finite"):
+        method(images, SCAN, LIKE)
