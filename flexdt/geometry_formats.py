@@ -14,6 +14,7 @@ import numpy as np
 
 from flexdt.clients.datasets.exchange import (
     ENDINGS,
+    FORMATS,
     Given,
     import_geometry,
     load_geometry,
@@ -30,7 +31,7 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.outward import File
 
 BY_ENDING: Final = {
-    ending: format for format, endings in ENDINGS.items() for ending in endings if ending != ".json"
+    ending: format for format in FORMATS for ending in ENDINGS[format] if ending != ".json"
 }
 
 
@@ -54,6 +55,10 @@ def from_astra(geometry: Any, shape: Shape2 | None) -> ConeVec:
         raise GeometryError(
             f"ASTRA's geometry lacks {error}", {"asked": sorted(map(str, geometry))}
         ) from None
+    except (TypeError, ValueError) as error:
+        if isinstance(error, GeometryError):
+            raise
+        raise GeometryError(f"ASTRA's geometry: {error}", {"asked": repr(error)}) from None
     own = ConeVec(rows, counted)
     own.of_shape(shape)
     return own
@@ -119,20 +124,21 @@ def load(
 ) -> ConeVec:
     """See `ConeVec.load`."""
     path = Path(file)
-    if format is None and path.suffix.lower() == ".json":
-        return _value(_json(path, shape))
     pitch = None if pixel is None else _pair(pixel)
+    if format is None and path.suffix.lower() == ".json":
+        return _value(_json(path, Given(shape, pitch)))
     return _value(import_geometry(path, format or _format(path), Given(shape, pitch)))
 
 
-def _json(path: Path, shape: Shape2 | None) -> ScanGeometry:
+def _json(path: Path, given: Given) -> ScanGeometry:
     """Our own document, or a CTSimU scenario: the document says which."""
     if "file" in read_json(text_of(path), str(path)):
-        return import_geometry(path, "ctsimu", Given(shape))
+        return import_geometry(path, "ctsimu", given)
     own = load_geometry(path)
-    if shape is not None:
-        own.cone_vec.with_shape(own.shape).of_shape(shape)
-    return own if own.shape is not None else ScanGeometry(own.cone_vec, shape)
+    if given.shape is not None:
+        own.cone_vec.with_shape(own.shape).of_shape(given.shape)
+    given.check_pitch(own, path)
+    return own if own.shape is not None else ScanGeometry(own.cone_vec, given.shape)
 
 
 def save(cone_vec: ConeVec, file: File, format: str | None) -> None:

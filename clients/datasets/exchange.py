@@ -60,6 +60,16 @@ class Given:
         pitch = ScanGeometry(dataset.cone_vec).pitch_mm
         return cls(dataset.shape, pitch, len(dataset))
 
+    def check_pitch(self, geometry: ScanGeometry, path: Path) -> None:
+        """Raise ExchangeError if a file says another pitch."""
+        pitch = geometry.pitch_mm
+        if self.pitch_mm is not None and not np.allclose(pitch, self.pitch_mm, rtol=1e-3):
+            raise ExchangeError(
+                f"{path} says pixels of {pitch[0]:g} x {pitch[1]:g} mm, not "
+                f"{self.pitch_mm[0]:g} x {self.pitch_mm[1]:g}",
+                {"asked": list(self.pitch_mm), "allowed": list(pitch)},
+            )
+
 
 def geometry_of(dataset: DataSet, parameters: Offsets | None = None) -> ScanGeometry:
     """A data set's geometry.
@@ -192,6 +202,8 @@ def _content(
     if format == "tomosipo":
         np.savez(buffer, **tomosipo_arrays(geometry))  # type: ignore[arg-type]
         return buffer.getvalue()
+    if format != "astra":
+        raise _unknown(format)
     if out.suffix.lower() != ".npy":
         return vectors_text(geometry)
     np.save(buffer, geometry.cone_vec.rows, allow_pickle=False)
@@ -229,13 +241,7 @@ def import_geometry(
             f"{path} says {geometry.shape} rows and columns, not {known.shape}",
             {"asked": list(known.shape), "allowed": geometry.shape},
         )
-    pitch = geometry.pitch_mm
-    if known.pitch_mm is not None and not np.allclose(pitch, known.pitch_mm, rtol=1e-3):
-        raise ExchangeError(
-            f"{path} says pixels of {pitch[0]:g} x {pitch[1]:g} mm, not "
-            f"{known.pitch_mm[0]:g} x {known.pitch_mm[1]:g}",
-            {"asked": list(known.pitch_mm), "allowed": list(pitch)},
-        )
+    known.check_pitch(geometry, path)
     if known.views is not None and len(geometry) != known.views:
         raise ExchangeError(
             f"{path} holds {len(geometry)} views, not {known.views}",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from numpy.testing import assert_allclose
 from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.geometry.rigid import Rigid
-from flexdt.twin.projection import Volume, forward, project_scene
+from flexdt.twin.projection import Grid, Volume, forward, project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 
 SCAN = {"sod": 600.0, "sdd": 1059.0, "shape": (76, 96), "pixel": 1.496}
@@ -262,12 +263,19 @@ def test_files_give_the_geometry_back(name: str, tmp_path: Path) -> None:
     if name in ("g.json", "g.npz", "g.csv"):
         with pytest.raises(TwinError, match="76"):
             ConeVec.load(file, shape=(1, 1))
+        with pytest.raises(TwinError, match=r"1\.496 mm, not 9 x 9"):
+            ConeVec.load(file, pixel=9.0)
 
 
 def test_files_that_do_not_hold_are_typed_errors(tmp_path: Path) -> None:
     scan = ConeVec.circular(angles=5, **SCAN)
-    with pytest.raises(TwinError, match=r"\.json, \.xml"):
-        scan.save(tmp_path / "g.png")
+    for name in ("g.png", "g.nxs", "g.nx", "g.h5", "g.hdf5"):
+        (tmp_path / name).write_bytes(b"what was there")
+        with pytest.raises(TwinError, match=r"\.json, \.xml"):
+            scan.save(tmp_path / name)
+        with pytest.raises(TwinError, match="nxtomo"):
+            scan.save(tmp_path / name, format="nxtomo")
+        assert (tmp_path / name).read_bytes() == b"what was there"
     (tmp_path / "g.xml").write_text("{}")
     with pytest.raises(TwinError, match="not valid XML"):
         ConeVec.from_rtk(tmp_path / "g.xml", pixel=1.0)
@@ -277,6 +285,37 @@ def test_files_that_do_not_hold_are_typed_errors(tmp_path: Path) -> None:
         ConeVec.from_astra({"type": "parallel3d", "DetectorRowCount": 1, "DetectorColCount": 1})
     with pytest.raises(GeometryError, match="lacks 'Vectors'"):
         ConeVec.from_astra({"type": "cone_vec", "DetectorRowCount": 1, "DetectorColCount": 1})
+    numbers = dict.fromkeys(("DistanceOriginSource", "DistanceOriginDetector"), 5.0)
+    with pytest.raises(GeometryError, match="'x'"):
+        ConeVec.from_astra({"type": "cone", "DetectorRowCount": 1, "DetectorColCount": 1,
+                            "ProjectionAngles": [0.0], "DetectorSpacingX": "x",
+                            "DetectorSpacingY": 1.0, **numbers})  # fmt: skip
+
+
+@pytest.mark.parametrize("document", [{}, {"rows": "x"}, {"rows": [1, 2]}, [], None])
+def test_documents_that_hold_no_geometry(document: Any) -> None:
+    with pytest.raises(GeometryError):
+        ConeVec.from_dict(document)
+
+
+@pytest.mark.parametrize("factor", [0, -1, 1.5, 77, "x"])
+def test_binning_leaves_pixels(factor: Any) -> None:
+    with pytest.raises(GeometryError, match="1 to 76"):
+        ConeVec.circular(angles=5, **SCAN).binned(factor)
+
+
+def test_nothing_cannot_be_stacked() -> None:
+    with pytest.raises(GeometryError, match="at least one"):
+        ConeVec.concatenate([])
+
+
+@pytest.mark.parametrize(
+    ("shape", "edge"),
+    [((1.5, 1, 1), 1.0), ((1, 1), 1.0), ((2, 2, 2), (1, 1, 2.0)), ((2, 2, 2), np.nan), (3, 1.0)],
+)
+def test_grids_have_three_whole_numbers_and_one_edge(shape: Any, edge: Any) -> None:
+    with pytest.raises(GeometryError, match="whole numbers"):
+        Grid(shape, edge)
 
 
 class TomosipoCone:

@@ -330,6 +330,8 @@ class ConeVec:
             >>> ConeVec.concatenate([scan[:1], scan[2:]]).shape
             (3, 76, 96)
         """
+        if not parts:
+            raise GeometryError("no geometries to stack; allowed: at least one", {"asked": 0})
         shapes = {p.detector_shape for p in parts}
         rows = np.concatenate([p.rows for p in parts], axis=0)
         return cls(rows, shapes.pop() if len(shapes) == 1 else None)
@@ -410,8 +412,14 @@ class ConeVec:
             >>> ConeVec.from_dict(scan.to_dict()) == scan
             True
         """
-        shape = document.get("detector_shape")
-        return cls(np.asarray(document["rows"], dtype=np.float64), shape)
+        try:
+            rows = np.asarray(document["rows"], dtype=np.float64)
+        except (KeyError, TypeError, ValueError) as error:
+            raise GeometryError(
+                f"a geometry's document has rows of twelve numbers: {error!r}",
+                {"asked": repr(document)[:100], "allowed": "rows"},
+            ) from None
+        return cls(rows, document.get("detector_shape"))
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -622,12 +630,20 @@ class ConeVec:
             factor: pixels per coarse pixel along each side.
             shape: (rows, cols) of the fine image.
 
+        Raises:
+            GeometryError: a factor that leaves no pixel, or is no whole number.
+
         Example:
             >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
             >>> scan.binned(2).shape, round(float(np.linalg.norm(scan.binned(2).u[0])), 6)
             ((4, 38, 48), 0.3)
         """
         rows, cols = self.of_shape(shape)
+        if factor not in range(1, min(rows, cols) + 1):
+            raise GeometryError(
+                f"binning by {factor!r}; allowed: a whole number from 1 to {min(rows, cols)}",
+                {"asked": repr(factor), "allowed": [1, min(rows, cols)]},
+            )
         shift_u = (cols // factor * factor - cols) / 2
         shift_v = (rows // factor * factor - rows) / 2
         centre = self.detector + shift_u * self.u + shift_v * self.v

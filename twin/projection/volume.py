@@ -8,6 +8,7 @@ use, and kept.
 from __future__ import annotations
 
 import math
+import operator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -423,10 +424,15 @@ class Grid:
     center_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if min(self.shape) < 1 or not (math.isfinite(self.voxel_mm) and self.voxel_mm > 0):
+        try:
+            counts, edge = [operator.index(n) for n in self.shape], float(self.voxel_mm)
+        except TypeError:
+            counts, edge = [0], 0.0
+        if len(counts) != 3 or min(counts) < 1 or not (math.isfinite(edge) and edge > 0):
             raise GeometryError(
-                f"grid of {self.shape} voxels of {self.voxel_mm:g} mm; allowed: positive numbers",
-                {"asked": [*self.shape, self.voxel_mm]},
+                f"grid of {self.shape} voxels of {self.voxel_mm} mm; allowed: three whole numbers "
+                "above 0, and one edge above 0",
+                {"asked": repr((self.shape, self.voxel_mm)), "allowed": "> 0"},
             )
 
     @property
