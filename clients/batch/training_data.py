@@ -42,10 +42,13 @@ class Augment:
     shift_px: float = 0.0
 
     def __post_init__(self) -> None:
-        low, high = self.photons or (1.0, 1.0)
+        try:
+            low, high = (1.0, 1.0) if self.photons is None else map(float, self.photons)
+        except (TypeError, ValueError):
+            low = high = 0.0
         if not (0.0 < low <= high < np.inf and 0.0 <= self.shift_px < np.inf):
             raise LimitError(
-                f"photons {self.photons}, shift_px {self.shift_px:g}; allowed: two positive "
+                f"photons {self.photons!r}, shift_px {self.shift_px:g}; allowed: two positive "
                 "numbers, the lower first, and a shift that is not negative",
                 {"asked": [self.photons, self.shift_px]},
             )
@@ -79,7 +82,7 @@ class TrainingData:
         epoch: part of what is drawn; raise it after each pass.
 
     Raises:
-        CommandError: the folder holds no finished batch, or `augment` meets counts.
+        CommandError: the folder holds no finished batch, or `augment` meets counts or noise.
         TwinError: zarr is not installed.
 
     Example:
@@ -97,6 +100,11 @@ class TrainingData:
         plan = manifest["plan"]
         if augment is not None and plan["images"]["values"] != "line_integrals":
             raise CommandError(f"{self.folder}: holds counts; augment needs line integrals")
+        if augment is not None and augment.photons and plan["images"]["noise"]:
+            raise CommandError(
+                f"{self.folder}: its images have noise; photons would add to it. Make the batch "
+                "with noise = false, or give Augment(photons=None)"
+            )
         self.names = tuple(manifest["arrays"])
         self.shard = int(plan["batch"]["shard"])
         done = [i["status"] == "done" for i in manifest["items"]]

@@ -7,8 +7,12 @@ take, never wall-clock time.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
+
+import numpy as np
+import numpy.typing as npt
 
 from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.collision.convex_solids import box
@@ -26,17 +30,42 @@ BINNING: Final = 32
 """Detector pixels per coarse pixel of small images."""
 
 
-def require_positive(**values: float) -> None:
-    """Check an environment's settings.
+COUNTS: Final = ("frames", "attempts")
+
+
+def require_positive(*, or_zero: bool = False, **values: float) -> None:
+    """Check an environment's settings; `COUNTS` are whole numbers.
 
     Raises:
         LimitError: names the argument.
     """
     for name, value in values.items():
-        if not 0.0 < value < math.inf:
+        counted = name in COUNTS
+        above = value >= 0.0 if or_zero else value > 0.0
+        if not (above and value < math.inf) or (counted and value != int(value)):
+            least = "0 or more" if or_zero else "more than 0"
+            allowed = f"{least}, a whole number" if counted else least
             raise LimitError(
-                f"{name} {value:g}; allowed: more than 0", {"asked": value, "allowed": "> 0"}
+                f"{name} {value:g}; allowed: {allowed}", {"asked": value, "allowed": allowed}
             )
+
+
+def choices(action: npt.ArrayLike, sizes: Sequence[int]) -> list[int]:
+    """An action of whole numbers, one for each size and below it.
+
+    Raises:
+        LimitError: says what is allowed.
+    """
+    values = np.atleast_1d(action).tolist()
+    if len(values) != len(sizes) or any(
+        v not in range(n) for v, n in zip(values, sizes, strict=True)
+    ):
+        allowed = ", ".join(f"0 to {n - 1}" for n in sizes)
+        raise LimitError(
+            f"action {values}; allowed: {len(sizes)} whole numbers, {allowed}",
+            {"asked": values, "allowed": list(sizes)},
+        )
+    return [int(value) for value in values]
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,9 @@ from typing import Any, Final
 import gymnasium
 import numpy as np
 import numpy.typing as npt
+from gymnasium.error import ResetNeeded
 
-from flexdt.clients.learning.moved_scanner import Lab, require_positive
+from flexdt.clients.learning.moved_scanner import Lab, choices, require_positive
 from flexdt.clients.learning.rewards import GRID, SIDE_MM, blank, noisy, quality, random_object
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import NOMINAL
@@ -56,6 +57,7 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
         self, attempts: int = 5, work_weight: float = 0.5, render_mode: str | None = None
     ) -> None:
         require_positive(attempts=attempts)
+        require_positive(or_zero=True, work_weight=work_weight)
         self.attempts, self.work_weight, self.render_mode = attempts, work_weight, render_mode
         self.action_space = gymnasium.spaces.MultiDiscrete([len(ALGORITHMS), len(WINDOWS), 2])
         self.observation_space = gymnasium.spaces.Box(0.0, 1.0, (13,), np.float32)
@@ -90,15 +92,21 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
         return self._observe(), {"quality": 0.0, "best": 0.0, "work": 0.0}
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One attempt."""
-        algorithm, strength, nonnegative = (int(a) for a in action)
+        """One attempt.
+
+        Raises:
+            LimitError: no action of this environment.
+            ResetNeeded: the episode has not begun, or is over.
+        """
+        algorithm, strength, nonnegative = choices(action, [len(ALGORITHMS), len(WINDOWS), 2])
+        if self._cone is None or self._left <= 0:
+            raise ResetNeeded("there is no episode to go on with: call reset() first")
         volume, work = self._run(algorithm, strength, bool(nonnegative))
         self._volume = volume
         reached = quality(volume, self._truth)
         gain = max(0.0, reached - self._best)
         self._best = max(self._best, reached)
         self._left -= 1
-        assert self._cone is not None
         rest = self._images - forward(volume, self._cone, self._lab.small_shape)
         scale = float(np.mean(self._images**2))
         kind = np.zeros(3, np.float32)

@@ -14,10 +14,11 @@ from typing import Any, Final, Literal
 import gymnasium
 import numpy as np
 import numpy.typing as npt
+from gymnasium.error import ResetNeeded
 
-from flexdt.clients.learning.moved_scanner import Lab, require_positive
+from flexdt.clients.learning.moved_scanner import Lab, choices, require_positive
 from flexdt.clients.learning.rewards import TASKS, Task
-from flexdt.twin.errors import UnknownNameError
+from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.geometry.poses import Poses
 
 Action = npt.NDArray[np.float32] | np.int64
@@ -76,6 +77,10 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
             if value not in allowed:
                 raise UnknownNameError.among(f"no {what} {value!r}; there are", value, allowed)
         require_positive(frames=frames, exposure_s=exposure_s)
+        require_positive(
+            or_zero=True, time_weight=time_weight, dose_weight=dose_weight,
+            collision_penalty=collision_penalty,
+        )  # fmt: skip
         self.kind: Kind = action
         self.frames = frames
         self.time_weight, self.dose_weight = time_weight, dose_weight
@@ -88,7 +93,7 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         self.lab = self.new_lab()
         self._last: Poses | None = None
         self._sectors = np.zeros(SECTORS, np.float32)
-        self._taken = 0
+        self._taken, self._over = 0, True
         self.action_space = (
             gymnasium.spaces.Discrete(SECTORS)
             if action == "discrete"
@@ -109,14 +114,22 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         self.task.reset(self.lab, self.np_random)
         self._last = None
         self._sectors = np.zeros(SECTORS, np.float32)
-        self._taken = 0
+        self._taken, self._over = 0, False
         return self._observe(), self._info(0.0, 0.0)
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Move, take a frame, and say what it was worth."""
+        """Move, take a frame, and say what it was worth.
+
+        Raises:
+            LimitError: no action of this environment.
+            ResetNeeded: the episode has not begun, or is over.
+        """
+        if self._over:
+            raise ResetNeeded("there is no episode to go on with: call reset() first")
         taken = self.lab.take(self.targets(action))
         cost = self.time_weight * taken.seconds + self.dose_weight * taken.dose
         if taken.collided:
+            self._over = True
             return self._observe(), -self.collision_penalty - cost, True, False, {
                 **self._info(0.0, taken.seconds), "collision": True
             }  # fmt: skip
@@ -125,7 +138,7 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         self._last = poses
         self._sectors[round(self.lab.position("rot_obj") / 10.0) % SECTORS] = 1.0
         self._taken += 1
-        done = self._taken >= self.frames
+        self._over = done = self._taken >= self.frames
         return (
             self._observe(),
             self._gain * worth - cost,
@@ -148,8 +161,14 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
     def targets(self, action: Action) -> dict[str, float]:
         """Motor targets of an action [deg, mm]."""
         if self.kind == "discrete":
-            return {"rot_obj": 360.0 * int(action) / SECTORS}
-        values = np.clip(np.asarray(action, dtype=np.float64).ravel(), -1.0, 1.0)
+            return {"rot_obj": 360.0 * choices(action, [SECTORS])[0] / SECTORS}
+        values = np.asarray(action, dtype=np.float64).ravel()
+        if values.shape != self.action_space.shape or not np.isfinite(values).all():
+            raise LimitError(
+                f"action {values.tolist()}; allowed: {self.action_space}",
+                {"asked": values.tolist(), "allowed": str(self.action_space)},
+            )
+        values = np.clip(values, -1.0, 1.0)
         out = {"rot_obj": 180.0 * float(values[0])}
         for axis, value in zip(POSE_AXES, values[1:], strict=False):
             lower, upper = self.lab.range_of(axis)

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from flexdt.clients.learning.moved_scanner import Lab, Taken
+from flexdt.clients.learning.moved_scanner import Lab, Taken, choices
 from flexdt.clients.learning.rewards import (
     ITERATIONS,
     PHOTONS,
@@ -286,10 +286,12 @@ class ScanVectorEnv(SyncVectorEnv):
 
         Raises:
             ValueError: another shape.
+            LimitError: no such angle.
         """
         chosen = np.asarray(actions)
         if chosen.shape != (self.num_envs,):
             raise ValueError(f"actions have shape {chosen.shape}; allowed: ({self.num_envs},)")
+        choices(chosen, [SECTORS] * self.num_envs)
         same_step = self.autoreset_mode == AutoresetMode.SAME_STEP
         steps = [
             env.measure(action)

@@ -169,13 +169,20 @@ def test_a_shift_moves_image_and_true_geometry_together(folder: Path) -> None:
 def test_what_cannot_be_is_refused(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(CommandError, match="no finished batch"):
         TrainingData(tmp_path)
-    for photons, shift in (((5.0, 1.0), 0.0), ((0.0, 1.0), 0.0), (None, -1.0), (None, np.nan)):
+    for photons, shift in (
+        ((5.0, 1.0), 0.0), ((0.0, 1.0), 0.0), (None, -1.0), (None, np.nan), (0, 0.0),
+        ((1e3,), 0.0), (1e3, 0.0), (("a", "b"), 0.0),
+    ):  # fmt: skip
         with pytest.raises(LimitError, match="allowed"):
             Augment(photons, shift)
     run_batch(plan_of(2, 1, values="counts"), tmp_path / "counts", here())
     assert TrainingData(tmp_path / "counts")[0]["projections"].dtype == np.uint16
     with pytest.raises(CommandError, match="line integrals"):
         TrainingData(tmp_path / "counts", Augment())
+    run_batch(plan_of(2, 1, noise=True), tmp_path / "noisy", here())
+    TrainingData(tmp_path / "noisy", Augment(shift_px=0.3))
+    with pytest.raises(CommandError, match="have noise"):
+        TrainingData(tmp_path / "noisy", Augment(photons=(1e3, 1e4)))
 
 
 def test_without_pytorch_one_line_says_what_to_install(

@@ -7,10 +7,12 @@ import math
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
 from flexdt.clients.learning import ENVIRONMENTS
@@ -57,12 +59,49 @@ def test_same_seed_same_episode_and_another_differs(name: str) -> None:
         ("flexdt/NextPose-v0", {"frames": -3}),
         ("flexdt/NextAngle-v0", {"exposure_s": -1.0}),
         ("flexdt/NextAngle-v0", {"exposure_s": math.nan}),
+        ("flexdt/NextAngle-v0", {"frames": 2.5}),
         ("flexdt/Reconstruction-v0", {"attempts": 0}),
     ],
 )
 def test_numbers_that_make_no_sense_are_refused(name: str, words: dict[str, float]) -> None:
     with pytest.raises(LimitError, match="allowed: more than 0"):
         gymnasium.make(name, **words)
+
+
+@pytest.mark.parametrize("weight", ["time_weight", "dose_weight", "collision_penalty"])
+@pytest.mark.parametrize("value", [-1.0, math.nan, math.inf])
+def test_costs_are_not_negative(weight: str, value: float) -> None:
+    with pytest.raises(LimitError, match=f"{weight} .* allowed: 0 or more"):
+        gymnasium.make("flexdt/NextAngle-v0", **{weight: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "good", "bad"),
+    [
+        ("flexdt/NextAngleDiscrete-v0", 3, (36, -1, 1.7, [1, 2], math.nan)),
+        ("flexdt/NextPose-v0", np.zeros(4), (np.zeros(2), np.full(4, np.nan))),
+        ("flexdt/Reconstruction-v0", [0, 0, 0], ([3, 0, 0], [0, -1, 0], [0, 0], [0, 0.5, 0])),
+    ],
+)
+def test_what_is_no_action_changes_nothing(name: str, good: Any, bad: tuple[Any, ...]) -> None:
+    env = gymnasium.make(name).unwrapped
+    with pytest.raises(ResetNeeded):
+        env.step(good)
+    env.reset(seed=3)
+    for action in bad:
+        with pytest.raises(LimitError, match="allowed"):
+            env.step(action)
+    found = env.step(good)
+    env.reset(seed=3)
+    again = env.step(good)
+    np.testing.assert_array_equal(found[0], again[0])
+    assert found[1:] == again[1:]
+    over = found[2] or found[3]
+    while not over:
+        *_, terminated, truncated, _ = env.step(good)
+        over = terminated or truncated
+    with pytest.raises(ResetNeeded):
+        env.step(good)
 
 
 def test_time_is_the_motors_trapezoid_and_dose_the_inverse_square() -> None:
