@@ -470,7 +470,7 @@ def _source(dataset: DataSet, request: VolumeRequest) -> tuple[float, TubeModel,
     if kV is None:
         raise LimitError(
             f"{dataset.where} does not say its tube voltage, which corrections of beam hardening "
-            "and scatter need",
+            "and scatter need; give kV= or tube=",
             {"missing": "kV"},
         )
     return kV, _tube(dataset), None
