@@ -165,6 +165,16 @@ class ImageFlags(Result):
     truncated: list[Literal["left", "right", "top", "bottom"]] = Field(
         description="edges of the image at which the sample is cut off"
     )
+    good_counts: Pair | None = Field(
+        default=None,
+        description="a pixel with fewer counts than the first is starved, from the second on "
+        "saturated",
+    )
+    good_lines: Pair | None = Field(
+        default=None,
+        description="the same of line integrals: saturated below the first, starved above the "
+        "second",
+    )
 
 
 class State(Result):

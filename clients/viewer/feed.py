@@ -46,6 +46,7 @@ class ShownImage:
         cone_vec: its geometry, twelve numbers.
         time: of the pose [s of the twin's clock].
         seq: the event's number.
+        flags: what the twin says of it; None of a recorded one.
     """
 
     pixels: npt.NDArray[np.generic]
@@ -53,6 +54,7 @@ class ShownImage:
     cone_vec: tuple[float, ...]
     time: float
     seq: int
+    flags: object = None
 
 
 def window_of(image: ShownImage) -> tuple[float, float]:
@@ -125,6 +127,7 @@ def packed(
         "time": image.time,
         "cone_vec": list(image.cone_vec),
         "seq": image.seq,
+        "flags": image.flags,
         "window": list(window_of(image)),
         "beads": [[round(float(c), 3), round(float(r), 3)] for c, r in beads],
         **facts,
@@ -261,4 +264,5 @@ def radiograph(params: Mapping[str, object]) -> ShownImage:
         cone,
         float(time if stamp is None else stamp),  # type: ignore[arg-type]
         int(seq),  # type: ignore[call-overload]
+        data.get("flags"),
     )

@@ -6,6 +6,8 @@ warned before a scan.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
@@ -60,7 +62,7 @@ def flags_of(
     exposure: ExposureSettings,
     time: float | None = None,
 ) -> ImageFlags:
-    """Saturated and starved parts of an image, and the edges at which the sample is cut off.
+    """Saturated and starved parts of an image, where they begin, and edges that cut the sample off.
 
     Args:
         radiography: how images are made.
@@ -71,10 +73,14 @@ def flags_of(
     lines = radiograph.shown
     signal = radiography.signal(radiograph, camera, exposure)[::EVERY, ::EVERY]
     top = radiography.full_scale - radiography.offset
+    # The signal of an open beam, as a logarithm. Two digits: with more, poly would tell distances.
+    beam = float(np.median(lines[::EVERY, ::EVERY] + np.log(np.maximum(signal, 1e-30))))
     edges = {"left": lines[:, 0], "right": lines[:, -1], "top": lines[0], "bottom": lines[-1]}
     return ImageFlags(
         time=time,
         saturated=float(np.mean(signal >= top)),
         starved=float(np.mean(signal < FEW_COUNTS)),
         truncated=[name for name, edge in edges.items() if float(edge.max()) > SHADOW],  # type: ignore[misc]
+        good_counts=(radiography.offset + FEW_COUNTS, radiography.full_scale),
+        good_lines=(round(beam - math.log(top), 2), round(beam - math.log(FEW_COUNTS), 2)),
     )

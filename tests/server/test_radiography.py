@@ -377,6 +377,17 @@ def test_marks_are_what_the_saved_counts_say(tmp_path: Path, physics: str) -> No
     assert ((marks & STARVED) > 0)[few < FEW_COUNTS - 6].all()
     assert not (marks & STARVED)[few > FEW_COUNTS + 6].any()
     assert (marks & STARVED).any()
+    # The limits that are told part pixels as the saved counts do, off by what a rounding is.
+    for ms, sample in ((1000.0, "lego"), (0.5, "lego"), (100.0, "compact")):
+        image, exposure, counts, _ = look(ms, sample)
+        flags = flags_of(way, image, MIDDLE, exposure)
+        assert flags.good_counts == (way.offset + 10.0, 2**M.detector.bits - 1)
+        assert flags.good_lines is not None
+        least, most = flags.good_lines
+        lines, above = image.shown, counts - way.offset
+        assert np.mean((lines < least) == (counts == way.full_scale)) > 0.97
+        assert (above[lines < most] >= 10 - 6).all()
+        assert (above[lines > most] <= 10 + 6).all()
     image, exposure, _, marks = look(100.0, "tall")
     cut = (marks & CUT_OFF) > 0
     np.testing.assert_array_equal(cut[0], image.shown[0] > 0.05)

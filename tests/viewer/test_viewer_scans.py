@@ -471,14 +471,14 @@ def test_starved_and_saturated_pixels_are_marked(page: Any, twin: TwinClient, wa
     wait(lambda: abs(twin.state().axes["rot_obj"].position) < 1e-6)
     block = trimesh.creation.box((14.0, 14.0, 14.0)).export(file_type="stl")
     page.evaluate("flexdt.call('session.control', {action: 'release'})")
-    twin.upload_mesh(block, "block", format="stl", material="steel")
+    twin.upload_mesh(block, "block", format="stl", material="tungsten-carbide")
     page.evaluate("flexdt.call('sample.set', {name: 'block'})")
     page.check("#show-flags")
     seen(page, twin)
     orange = lambda: (np.abs(film(page) - [255, 176, 48, 255]).max(axis=2) < 3).sum()  # noqa: E731
     red = lambda: (np.abs(film(page) - [255, 64, 48, 255]).max(axis=2) < 3).sum()  # noqa: E731
     try:
-        wait(lambda: orange() > 100, "starved behind 14 mm of steel")
+        wait(lambda: orange() > 100, "starved behind 14 mm of tungsten carbide")
         page.select_option("#kind", "counts")
         page.evaluate("flexdt.call('camera.set', {exposure_ms: 5000})")
         page.evaluate("flexdt.call('tube.set', {on: true})")

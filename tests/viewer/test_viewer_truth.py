@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -10,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from flexdt.clients.client.client import TwinClient
 from tests.viewer.looking import seen
@@ -20,6 +23,7 @@ SHOWN_S = 2.0
 """What hangs is seen so soon [s]."""
 TOLD_S = 4.0
 """And a stop that nobody confirms is told so soon [s]."""
+ORANGE, RED = (255, 176, 48), (255, 64, 48)
 TRIES = 6
 """Of which a busy machine may spoil all but one."""
 
@@ -164,6 +168,59 @@ def test_the_histogram_counts_what_the_image_holds(page: Any, twin: TwinClient, 
     assert flags is not None
     seen(page, twin)
     assert page.inner_text("#starved").startswith(f"starved {100 * flags.starved:.0f}")
+
+
+DRAWN_WITH_FLAGS = """
+image => {
+  const store = flexdt.store, before = [store.image, store.state];
+  const box = document.querySelector('#show-flags'), was = box.checked;
+  store.state = { ...store.state, tube: { ...store.state.tube, on: true, ready: true } };
+  store.image = { ...image, pixels: Uint16Array.from(image.pixels) };
+  box.checked = true;
+  const drawn = flexdt.picture();
+  [store.image, store.state] = before; box.checked = was;
+  return drawn;
+}
+"""
+
+
+@pytest.mark.parametrize("bits", [14, 16])
+@pytest.mark.parametrize("code", ["deflate", "jpeg"])
+@pytest.mark.parametrize("kind", ["counts", "line_integral"])
+def test_flags_are_drawn_by_the_cameras_limits(page: Any, bits: int, code: str, kind: str) -> None:
+    """As the page gets images at rest and in motion, of cameras of any depth."""
+    rng, full = np.random.default_rng([bits, len(code), len(kind)]), 2.0**bits - 1.0
+    for most in (0.7, 0.99, 1.0, 1.0):
+        if kind == "counts":
+            good, values = (110.0, full), rng.uniform(0.0, most * full, (24, 31))
+            values[0, :9], values[-1, :5] = most * full, (0, 50, 99, 100, 105)
+            low_flag, high_flag = ORANGE, RED
+        else:
+            good, values = (0.2, 6.0), rng.uniform(0.0, 8.0 * most, (24, 31))
+            low_flag, high_flag = RED, ORANGE
+        low, scale = 0.0, 1.0
+        if code == "jpeg" or kind == "line_integral":
+            low, scale = values.min(), np.ptp(values) / 65535.0
+        pixels = np.rint((values - low) / scale)
+        if code == "jpeg":
+            pixels = 257.0 * np.rint(pixels / 257.0)
+        image = {
+            "kind": kind, "code": code, "shape": [24, 31], "full": [24, 31], "low": low,
+            "scale": scale, "window": [0.0, 1.0], "beads": [], "pixels": pixels.ravel().tolist(),
+            "cone_vec": [0.0] * 12, "seq": 1,
+            "flags": {"good_counts": good, "good_lines": good, "saturated": 0, "starved": 0},
+        }  # fmt: skip
+        url = page.evaluate(DRAWN_WITH_FLAGS, image)
+        raw = base64.b64decode(url.partition(",")[2])
+        drawn = np.asarray(Image.open(io.BytesIO(raw)).convert("RGB"), dtype=int)
+        step = 0.51 * scale * (257.0 if code == "jpeg" else 1.0)
+        for flag, wanted, edge in (
+            (low_flag, values < good[0], good[0]),
+            (high_flag, values >= good[1], good[1]),
+        ):
+            clear = (np.abs(values - edge) > 2 * step) | (values == full)
+            found = np.abs(drawn - flag).max(axis=2) < 3
+            np.testing.assert_array_equal(found[clear], wanted[clear])
 
 
 def test_a_move_that_halts_early_is_not_called_standing(

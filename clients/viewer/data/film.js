@@ -9,7 +9,7 @@ const buffer = document.createElement("canvas"), pixels2d = buffer.getContext("2
 // Zoom is relative to the whole image fitted in; x, y is the middle in pixels of the image.
 const view = { zoom: 1, x: 0, y: 0 };
 const SLIMMEST = 0.75, FLATTEST = 3; // of the film; a narrower image gets black edges
-const SATURATED = 16383, STARVED_T = 0.02, STARVED_COUNTS = 200;
+const SATURATED = 0xff3040ff, STARVED = 0xff30b0ff; // drawn in red and orange
 let range = [0, 1], windowed = [0, 1], due = false, stamps = [], quiet = 0, pointer = null;
 export const shown = { count: 0, at: 0 };
 
@@ -36,9 +36,12 @@ export function value(column, row) {
   return c < 0 || r < 0 || c >= i.shape[1] || r >= i.shape[0] ? NaN : i.low + i.scale * i.pixels[r * i.shape[1] + c];
 }
 
+// Values between which a pixel is neither starved nor saturated: the twin says so with each image. Counts of a
+// recorded one are judged by the same camera, its line integrals by nothing that is known.
+function good(i) { const f = i.flags ?? store.state?.image; return (i.kind === "counts" ? f?.good_counts : i.flags?.good_lines) ?? [NaN, NaN]; }
 function limits(i) {
   if (i.signed) return i.window;
-  if (i.kind === "counts") return [0, SATURATED];
+  if (i.kind === "counts") return [0, Math.max(good(i)[1] || 0, i.window[1])];
   return [Math.min(0, i.low), Math.max(i.low + i.scale * 65535, 0.1)];
 }
 
@@ -58,15 +61,13 @@ function develop(i) {
   let [low, high] = windowed;
   if (high <= low) high = low + 1e-6;
   const a = (255 * i.scale) / (high - low), b = (255 * (i.low - low)) / (high - low), flip = $("#invert").checked;
-  const flags = $("#show-flags").checked && !i.signed;
-  const starved = i.kind === "counts" ? (STARVED_COUNTS - i.low) / i.scale : (-Math.log(STARVED_T) - i.low) / i.scale;
-  const saturated = i.kind === "counts" ? SATURATED : Infinity;
-  const p = i.pixels;
+  const counts = i.kind === "counts", flags = $("#show-flags").checked && !i.signed && !(counts && unlit(i)), p = i.pixels;
+  const [least, most] = good(i).map((v) => (v - i.low) / i.scale), top = most - (i.code === "jpeg" ? 128.5 : 0.5); // half a step of the code
   for (let k = 0; k < data.length; k++) {
     let g = a * p[k] + b; g = g < 0 ? 0 : g > 255 ? 255 : g | 0;
     if (flip) g = 255 - g;
     data[k] = i.signed ? signed(g) : 0xff000000 | (g << 16) | (g << 8) | g;
-    if (flags) { if (i.kind === "counts" ? p[k] <= starved : p[k] >= starved) data[k] = 0xff30b0ff; else if (p[k] >= saturated) data[k] = 0xff3040ff; }
+    if (flags) { if (p[k] < least) data[k] = counts ? STARVED : SATURATED; else if (p[k] >= top) data[k] = counts ? SATURATED : STARVED; }
   }
   pixels2d.putImageData(out, 0, 0);
 }
@@ -74,8 +75,9 @@ function develop(i) {
 // Less than the reference is blue, as much is black, more is orange.
 function signed(g) { const d = 2 * Math.abs(g - 127.5) | 0; return g < 127.5 ? 0xff000000 | (d << 16) | ((d >> 1) << 8) : 0xff000000 | ((d >> 1) << 8) | d; }
 // An image taken with the beam off says so: it is dark, or drawn as though the beam were on.
+function unlit(i) { const tube = store.state?.tube; return i && !i.recorded && tube && !(tube.on && tube.ready); }
 function beam(i) {
-  const tube = store.state?.tube, off = i && !i.recorded && tube && !(tube.on && tube.ready);
+  const tube = store.state?.tube, off = unlit(i);
   $("#film-beam").hidden = !off;
   if (off) setText($("#film-beam"), tube.on ? "X-rays warming up" : i.kind === "counts" ? "X-rays off: dark image" : "X-rays off: drawn as though on");
 }
@@ -164,6 +166,7 @@ chart.addEventListener("pointermove", (e) => { if (pulled) pull(e); });
 for (const end of ["pointerup", "pointercancel"]) chart.addEventListener(end, () => { pulled?.dispatchEvent(new Event("change")); pulled = null; });
 on("state", (s) => {
   for (const what of ["saturated", "starved"]) setText($(`#${what}`), `${what} ${s.image && !store.recorded ? (100 * s.image[what]).toFixed(s.image[what] && s.image[what] < 0.1 ? 1 : 0) : "–"} %`);
+  if ($("#film-beam").hidden === Boolean(unlit(store.image))) ask(); // a dark image has no flags
   beam(store.image);
 });
 
