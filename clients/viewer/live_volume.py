@@ -104,12 +104,13 @@ def grow(folder: Path, side: int, tell: Tell, alive: Callable[[], bool] = lambda
 def slices(target: OnProcessor) -> dict[str, Any]:
     """The three middle slices of what has been added up, and the values that are black and white.
 
-    Rows and columns: y and x from above; then z, from the top, and x; then z and y.
+    As they are seen from above (+x to the right, +y up), from the source (+x to the right, +z up)
+    and from +x, as the view from the side (+y to the right, +z up).
     """
     grown = target.volume()  # (y, x, z)
     ny, nx, nz = grown.shape
     middle = {
-        "top": grown[:, :, nz // 2],
+        "top": grown[::-1, :, nz // 2],
         "front": grown[ny // 2].T[::-1],
         "side": grown[:, nx // 2].T[::-1],
     }

@@ -27,6 +27,7 @@ VIEWS, SIDE, MU, RADIUS = 61, 48, 0.03, 9.0
 MACHINE = builtin_machine()
 PROFILE = builtin_profile(MACHINE.default_profile)
 Array = npt.NDArray[np.float64]
+Place = tuple[float, float, float]
 
 
 def through(radius: float, source: Array, pixels: Array) -> Array:
@@ -53,6 +54,10 @@ def begun(root: Path, kind: str, frames: int) -> Path:
 @pytest.fixture
 def scan(tmp_path: Path) -> tuple[Path, list[Path]]:
     """A ball about the origin on a circle: its folder, and the projections, which lie elsewhere."""
+    return scan_of(tmp_path, (0.0, 0.0, 0.0), RADIUS)
+
+
+def scan_of(tmp_path: Path, at: Place, radius: float) -> tuple[Path, list[Path]]:
     home = begun(tmp_path, "fly", VIEWS)
     document = parse_document((home / "flexdt.json").read_text())
     waiting: list[Path] = []
@@ -63,7 +68,7 @@ def scan(tmp_path: Path) -> tuple[Path, list[Path]]:
         places = row[3:6] + c[None, :, None] * row[6:9] + r[:, None, None] * row[9:12]
         beam = {"dark": 0.0, "flat": 1.0}.get(frame.kind)
         if beam is None:
-            beam = np.exp(-MU * through(RADIUS, row[:3], places))
+            beam = np.exp(-MU * through(radius, row[:3] - at, places - at))
         counts = np.rint(np.broadcast_to(100.0 + 12_000.0 * beam, (rows, cols))).astype(np.uint16)
         file = (home if frame.kind != "projection" else tmp_path) / frame.file
         tifffile.imwrite(file, counts)
@@ -72,11 +77,15 @@ def scan(tmp_path: Path) -> tuple[Path, list[Path]]:
     return home, waiting
 
 
+def grey_of(document: dict[str, Any], name: str) -> npt.NDArray[np.uint8]:
+    part = document["slices"][name]
+    return np.frombuffer(base64.b64decode(part["data"]), np.uint8).reshape(part["shape"])
+
+
 def middle(document: dict[str, Any], name: str) -> float:
     """The value in the middle of a slice [1/mm]."""
-    part = document["slices"][name]
-    rows, cols = part["shape"]
-    grey = np.frombuffer(base64.b64decode(part["data"]), np.uint8).reshape(rows, cols)
+    grey = grey_of(document, name)
+    rows, cols = grey.shape
     span = document["high"] - document["low"]
     around = grey[rows // 2 - 1 : rows // 2 + 2, cols // 2 - 1 : cols // 2 + 2].mean()
     return float(document["low"] + around / 255.0 * span)
@@ -112,6 +121,24 @@ def test_it_grows_with_every_image_to_the_true_values(
     rows, cols = told[-1]["slices"]["top"]["shape"]
     assert rows == cols
     assert abs(cols - SIDE) <= 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_slice_is_a_mirror_image(tmp_path: Path, seed: int) -> None:
+    """A ball off all three planes lies in each picture where one who looks that way has it."""
+    rng = np.random.default_rng(seed)
+    x, y, z = (float(v) for v in rng.choice([-1.0, 1.0], 3) * rng.uniform(2.5, 4.0, 3))
+    home, files = scan_of(tmp_path, (x, y, z), 5.5)
+    for file in files:
+        file.rename(home / file.name)
+    told: list[dict[str, Any]] = []
+    grow(home, SIDE, told.append)
+    for name, (right, up) in {"top": (x, y), "front": (x, z), "side": (y, z)}.items():
+        grey = grey_of(told[-1], name)
+        rows, cols = np.nonzero(grey > 160)
+        from_middle = cols.mean() - (grey.shape[1] - 1) / 2, (grey.shape[0] - 1) / 2 - rows.mean()
+        at_mm = np.array(from_middle) * told[-1]["voxel_mm"]
+        np.testing.assert_allclose(at_mm, (right, up), atol=0.7 * told[-1]["voxel_mm"])
 
 
 def test_nobody_waits_for_a_scan_that_nobody_looks_at(scan: tuple[Path, list[Path]]) -> None:
