@@ -93,6 +93,7 @@ def grow(folder: Path, side: int, tell: Tell, alive: Callable[[], bool] = lambda
                 "views": views,
                 "of": len(indices),
                 "name": folder.name,
+                "side": side,
                 "voxel_mm": voxel_mm,
                 **slices(target),
             }
@@ -174,6 +175,7 @@ class Grower:
             async for line in process.stdout:
                 self.newest = line.decode()
                 self._tell(self.newest)
+            await process.wait()  # to kill what has just ended would take its code from the loop
         finally:
             if process.returncode is None:
                 process.kill()

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import threading
 import time
+from collections.abc import AsyncIterator
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ import numpy.typing as npt
 import pytest
 import tifffile
 
-from flexdt.clients.viewer.live_volume import grow
+from flexdt.clients.viewer.live_volume import Grower, grow
 from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.twin.dataset.flexdt_json import parse_document
 from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
@@ -144,6 +146,42 @@ def test_no_slice_is_a_mirror_image(tmp_path: Path, seed: int) -> None:
 def test_nobody_waits_for_a_scan_that_nobody_looks_at(scan: tuple[Path, list[Path]]) -> None:
     with pytest.raises(SystemExit):
         grow(scan[0], SIDE, lambda document: None, alive=lambda: False)
+
+
+class Ended:
+    """A process that has said a line and ended; the loop has not heard of its end yet."""
+
+    returncode: int | None = None
+    killed = False
+
+    async def _lines(self) -> AsyncIterator[bytes]:
+        yield b"{}\n"
+
+    stdout = property(_lines)
+
+    def kill(self) -> None:
+        self.killed = True
+
+    async def wait(self) -> None:
+        self.returncode = 0
+
+
+def test_a_process_that_has_ended_is_not_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python would take its exit code from the loop, which then logs an unknown child."""
+    process, told = Ended(), []
+
+    async def start(*words: str, **options: object) -> Ended:
+        return process
+
+    async def body() -> None:
+        monkeypatch.setattr("asyncio.create_subprocess_exec", start)
+        Grower(told.append).grow(Path("none"), 128)
+        while process.returncode is None:
+            await asyncio.sleep(0)
+
+    asyncio.run(body())
+    assert told == ["{}\n"]
+    assert not process.killed
 
 
 def test_what_is_no_circle_is_told(tmp_path: Path) -> None:

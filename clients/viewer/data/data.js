@@ -71,7 +71,12 @@ let typing = null, drawn = "";
 search.addEventListener("input", () => { clearTimeout(typing); typing = setTimeout(list, SEARCH_MS); });
 on("tab", (tab) => { if (tab === "data" && store.session) list(); });
 on("session", () => { if (!$("#tab-data").hidden) list(); });
-on("job", () => { if (!$("#tab-data").hidden) { clearTimeout(typing); typing = setTimeout(list, SEARCH_MS); } });
+export const folder = (job) => (job?.dataset ?? "").split(/[\\/]/).pop() || "?";
+on("job", (job) => {
+  if (!$("#tab-data").hidden) { clearTimeout(typing); typing = setTimeout(list, SEARCH_MS); }
+  // Open while it was scanned: now it has more images, or all.
+  if (told?.info.state === "running" && folder(job) === told.info.name && !["queued", "running", "paused"].includes(job.state)) open(told.info.name, index);
+});
 
 // Opens a data set at an image, or closes the one that is open (null).
 export async function open(name, at = null, step = false) {

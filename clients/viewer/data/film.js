@@ -122,7 +122,8 @@ export function draw() {
   clearTimeout(quiet); quiet = setTimeout(() => setText($("#film-rate"), ""), 2000);
   tell();
   const [low, high] = windowed.map((v) => fixed(v, i.kind === "counts" ? 0 : 2)), zoom = view.zoom !== 1 ? `  ·  ${view.zoom.toFixed(1)}×` : "";
-  setText($("#film-note"), `${i.full[1]} × ${i.full[0]}  ·  window ${low} – ${high}${zoom}`);
+  const alone = reference && $("#difference").checked && !i.signed ? "  ·  no difference: the reference is of another kind or size" : "";
+  setText($("#film-note"), `${i.full[1]} × ${i.full[0]}  ·  window ${low} – ${high}${zoom}${alone}`);
 }
 
 // How often each value occurs, drawn as the logarithm, so that a thin sample shows beside much air; what the

@@ -2,7 +2,7 @@
 import { $, bytes, el, fixed, pressed, seconds } from "./dom.js";
 import { call, command, emit, on, store } from "./link.js";
 import { rememberedScript, rememberScript } from "./address.js";
-import { open as openData } from "./data.js";
+import { folder, open as openData } from "./data.js";
 import { draw as drawTimeline } from "./timeline.js";
 
 const FINAL = ["done", "failed", "aborted", "incomplete"];
@@ -182,7 +182,17 @@ export function show(r) {
     box.append(el("div", { class: "problem" }, link(p.line), el("span", { class: p.severity === "error" ? "error" : "" }, p.message)));
   }
   if (r.steps.length) box.append(el("div", { class: "steps mono" }, ...r.steps.slice(0, 500).map(stepRow)));
+  checked = store.state && stands(store.state);
 }
+// A report holds for what the machine was when it came: any client may change that.
+let checked = null;
+const stands = (s) => JSON.stringify([s.sample, s.correction, Object.entries(s.axes).map(([name, { position }]) => [name, position.toFixed(2)])]);
+on("state", (s) => {
+  const box = $("#report"), stale = Boolean($(".verdict", box)) && checked !== stands(s);
+  box.classList.toggle("stale", stale);
+  if (stale && !$("#stale")) box.prepend(el("div", { id: "stale" }, "The machine has changed since: check again"));
+  else if (!stale) $("#stale")?.remove();
+});
 function stepRow(s) {
   const go = () => { goTo(s.line); if (plan) scrub(s.start_s + s.duration_s); };
   return el("div", pressed(go),
@@ -208,7 +218,6 @@ async function showPlan() {
 on("open", () => { lost = plan !== null; });
 on("layers", () => { if (lost) { lost = false; makePlan(planned, at); } });
 
-export const folder = (job) => (job?.dataset ?? "").split(/[\\/]/).pop() || "?";
 on("recorded", (name) => { if (name !== null) forget(); });
 // A scan that was run, as it was planned: its script lies with its data set.
 async function recall() {
@@ -271,6 +280,7 @@ let toldAt = -Infinity;
 on("connection", () => { if (!store.twin) toldAt = -Infinity; }); // a twin that starts again counts from 0
 function showJob(job) {
   const fresh = store.job?.job !== job.job;
+  if (fresh && job.state === "queued" && store.job && !FINAL.includes(store.job.state)) return; // its turn comes
   if (!fresh && (job.time < toldAt || (job.time === toldAt && FINAL.includes(store.job.state)))) return;
   toldAt = job.time ?? -Infinity;
   store.job = job;

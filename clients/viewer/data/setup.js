@@ -166,12 +166,19 @@ const PHYSICS = {
   poly: "Photons of all energies below, through the filters: voltage changes contrast, brightness and noise.",
 };
 async function predict() {
+  const of = predictable(store.state);
+  predicted = null;
   $("#predict").disabled = true; $("#predicted").textContent = "a few seconds …";
   const p = await command("exposure.predict", {}, "No prediction");
   $("#predict").disabled = false;
   const setting = (s) => `${fixed(s.kV, 0)} kV${s.filter ? ` ${s.filter}` : ""}: ${fixed(s.cnr, 1)}`;
   $("#predicted").textContent = p ? `contrast to noise of ${p.detail}: ${setting(p.asked)}${p.best.length ? ` · best ${setting(p.best[0])}` : ""} · darkest ${fixed(100 * p.transmission.p1, 1)} % through` : "";
+  if (p) predicted = of;
 }
+// What a prediction was made for; it goes with that.
+let predicted = null;
+const predictable = ({ sample, tube, camera, geometry: g }) =>
+  JSON.stringify([sample, tube.kV, tube.power_W, camera, g.SOD_mm.toFixed(2), g.SDD_mm.toFixed(2)]);
 let spectrumOf = null;
 async function spectrum(kV) {
   if (spectrumOf === kV || $("#tab-setup").hidden) return;
@@ -197,6 +204,7 @@ let listed;
 on("session", list);
 on("state", show);
 function show(state) {
+  if (predicted !== null && predicted !== predictable(state)) { predicted = null; $("#predicted").textContent = "sample, beam, camera or distances have changed: predict again"; }
   spectrum(state.tube.kV);
   put("kV", state.tube.kV, 2); put("power", state.tube.power_W, 2);
   const xrays = $("#beam");

@@ -11,6 +11,7 @@ async function offer(method, params, title) {
   emit("note", "good", a.name, bytes(a.bytes));
 }
 function shot() {
+  if (current === "none") { emit("note", "error", "No picture", "open a view first"); return; }
   const [width, height] = $("#shot-size").value.split("x").map(Number);
   offer("viewer.screenshot", { view: current === "four" ? "iso" : current, width, height }, "No picture");
 }

@@ -1,5 +1,5 @@
 // Bar, readouts, warnings and notes: who holds control, how near things are, what went wrong.
-import { $, el, fixed, setText } from "./dom.js";
+import { $, $$, el, fixed, setText } from "./dom.js";
 import { call, command, emit, OLD_S, on, store } from "./link.js";
 
 const ROWS = [
@@ -76,7 +76,7 @@ on("state", (s) => {
   const factor = s.clock.real_time_factor;
   setText($("#clock"), `t = ${fixed(s.clock.time_s, 1)} s · ${factor ? `${factor >= 10 ? fixed(factor, 0) : fixed(factor, 2)}×` : s.clock.speed_up === "max" ? "max" : `${s.clock.speed_up}×`}`);
   const estop = $("#estop"), down = s.safety.estop || s.safety.state !== "ok";
-  if (s.safety.estop) pressed = null;
+  if (s.safety.estop) { pressed = null; for (const n of $$("#notes .note")) if (n.dataset.key.startsWith(UNCONFIRMED)) n.remove(); }
   else if (pressed !== null && store.fresh !== null && performance.now() - Math.max(pressed, store.fresh) > 2000 * OLD_S) {
     pressed = null;
     note("error", "The emergency stop did not take effect", "press it again");
@@ -107,11 +107,12 @@ $("#take").addEventListener("click", () => {
   const who = store.state?.controller ?? null, action = who === null ? "acquire" : who === store.session ? "release" : "force";
   command("session.control", { action }, "Control");
 });
+const UNCONFIRMED = "E-stop not confirmed";
 // Who clicks twice in a hurry means to stop, not to reset. Pressed, and not confirmed by a state yet [ms].
 let pressed = null;
 export async function estop() {
   const mine = pressed = performance.now();
-  const answer = await command("safety.estop", {}, "E-stop not confirmed");
+  const answer = await command("safety.estop", {}, UNCONFIRMED);
   if (answer?.safety.estop && pressed === mine) pressed = null;
 }
 $("#estop").addEventListener("click", (e) => {
@@ -139,7 +140,7 @@ function connection() {
   pill.title = store.problem ?? "";
   $("#veil").hidden = up && !unconfirmed;
   document.body.dataset.old = String(!up);
-  setText($("#veil-title"), unconfirmed ? `E-stop not confirmed${title && `. ${title}`}` : title);
+  setText($("#veil-title"), unconfirmed ? `${UNCONFIRMED}${title && `. ${title}`}` : title);
   setText($("#veil-text"), unconfirmed || !up ? [why, BUTTON].filter(Boolean).join("; ") : "");
 }
 on("age", () => {

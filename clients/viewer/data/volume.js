@@ -1,7 +1,7 @@
 // The volume that grows while a scan runs: its three middle slices, from the images so far.
 import { $, el, fixed, setText } from "./dom.js";
 import { call, on, store } from "./link.js";
-import { folder } from "./scan.js";
+import { folder } from "./data.js";
 
 const KEY = "flexdt-volume", PLANES = { top: "from above", front: "from the source", side: "from the side" };
 const size = el("select", { id: "volume-side", "aria-label": "Slices while a scan runs", onchange: choose },
@@ -13,17 +13,18 @@ size.value = localStorage.getItem(KEY) ?? "";
 
 let asked = null;
 function ask() {
-  const name = store.job?.dataset ? folder(store.job) : null, wish = size.value && name ? `${name} ${size.value}` : "";
+  const name = store.job?.dataset && store.job.state !== "queued" ? folder(store.job) : null, wish = size.value && name ? `${name} ${size.value}` : "";
   if (wish === (asked ?? "")) return;
   const before = asked;
   asked = wish;
   // The folder comes a moment after the job: what is refused is asked again.
   if (wish || before) call("viewer.live", wish ? { name, side: Number(size.value) } : {}).catch(({ message }) => {
+    if (asked !== wish) return;
     setText(note, message);
     setTimeout(() => { if (asked === wish) { asked = null; ask(); } }, 1000);
   });
   $(".slices").hidden = true;
-  setText(note, wish ? "waiting for dark, flat and the first image" : "");
+  setText(note, wish ? "starting; dark, flat and a first image are needed" : "");
 }
 function choose() { try { localStorage.setItem(KEY, size.value); } catch { /* it has no room */ } ask(); }
 on("job", () => { $("#volume-card").hidden = false; ask(); });
@@ -34,7 +35,8 @@ on("volume", (m) => {
   if (!asked?.startsWith(`${m.name} `)) return;
   if (m.problem) { setText(note, m.problem); return; }
   $(".slices").hidden = false;
-  setText(note, `${m.views} of ${m.of} views · voxels of ${fixed(1000 * m.voxel_mm, 0)} µm · ${fixed(m.low, 4)} to ${fixed(m.high, 4)} per mm`);
+  const other = m.side === Number(size.value) ? "" : `${m.side} voxels a side, as another page chose · `;
+  setText(note, `${other}${m.views} of ${m.of} views · voxels of ${fixed(1000 * m.voxel_mm, 0)} µm · ${fixed(m.low, 4)} to ${fixed(m.high, 4)} per mm`);
   for (const [name, { shape: [rows, cols], data }] of Object.entries(m.slices)) {
     const canvas = $(`#slice-${name}`), x = canvas.getContext("2d"), raw = atob(data);
     canvas.width = cols; canvas.height = rows;
