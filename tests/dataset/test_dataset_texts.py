@@ -205,6 +205,22 @@ def test_both_texts_of_a_scan_agree(record: Callable[..., ScanRecord]) -> None:
     assert {n: m.value for n, m in a.motors.items()} == {n: m.value for n, m in b.motors.items()}
 
 
+def test_the_xre_has_voxels_in_mm_and_the_turntable_s_rates(
+    record: Callable[..., ScanRecord],
+) -> None:
+    """In the other text they are in um."""
+    um = parse_scan_settings(format_scan_settings(record())).voxel_um
+    assert um
+    for rates in (20.0, 0.0):
+        rated = dict.fromkeys(record().positions, rates)
+        xre = parse_xre(format_xre(record(speeds=rated, accelerations=rated)))
+        assert float(xre.sections["CT-parameters IN"]["Voxel size"]) * 1e3 == pytest.approx(
+            um, 1e-3
+        )
+        last = xre.sections["Acquisition settings"]
+        assert [float(last[f"rotation {key}"]) for key in ("speed", "acc")] == [rates] * 2
+
+
 def test_dates_with_a_zone_are_written_in_universal_time(record: Callable[..., ScanRecord]) -> None:
     zone = timezone(timedelta(hours=2))
     xre = parse_xre(format_xre(record(started=datetime(2026, 3, 14, 1, 5, 9, 250, zone))))
@@ -332,6 +348,7 @@ def test_places_of_sample_and_turntable_are_written(record: Callable[..., ScanRe
     points = parse_xre(text).sections["POIs"]
     assert "radius[15.000000]height[2000.000000]track[TRUE]" in points["bricks$ample"]
     assert points["TMV"].endswith("safe range?[FALSE]minimal[-Inf;-Inf;-Inf]maximal[Inf;Inf;Inf]")
+    assert "height[0.000000]" in points["TMV"]
     assert points["TMV"].split("dirX")[0] == points["COT"].split("dirX")[0]
     settings = parse_xre(text).sections["Acquisition settings"]
     assert (settings["mag_tube"], settings["tra_tube"]) == ("0.000000", "1.250000")

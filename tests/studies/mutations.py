@@ -37,7 +37,7 @@ T, S = "tests/twin", "tests/twin/script"
 SCRIPT_TESTS = (
     f"{S}/test_script_reading.py", f"{S}/test_script_planning.py", f"{S}/test_script_fly.py",
     f"{S}/test_script_checking.py", f"{T}/test_values.py", f"{T}/test_script_compose.py",
-    f"{S}/test_script_examples.py", f"{S}/test_executed_log.py",
+    f"{S}/test_script_examples.py", f"{S}/test_executed_log.py", f"{S}/test_timing_ranges.py",
 )  # fmt: skip
 TESTS: dict[str, tuple[str, ...]] = {
     "protocol/acquila.py": ("tests/protocol/test_acquila.py",),

@@ -250,6 +250,8 @@ def test_against_says_line_real_predicted_error_worst_first(
     assert run(words) == 0
     text = capsys.readouterr().out
     assert text.startswith("line  real [s]  predicted [s]")
+    inside = sum(row["p5_s"] - 1e-9 <= row["real_s"] <= row["p95_s"] + 1e-9 for row in rows)
+    assert f"in their 90 % range:  {inside} of 57 lines" in text
     assert "where an axis stood before its first move, a log does not say" in text
     assert run(["check", str(LOG), "--against", str(LOG), "--machine", "unitom_xl"]) == 0
 

@@ -22,7 +22,7 @@ from flexdt.twin.script import (
     html_report,
 )
 from flexdt.twin.script.planning.dry_run_report import summary
-from tests.twin.script.conftest import blob, tabbed
+from tests.twin.script.conftest import Planner, blob, tabbed
 
 LINES = [
     "tube set kV 80 ACK",
@@ -321,3 +321,16 @@ def test_the_unitom_script_on_the_flexray_is_a_roi_error_and_planned_all_the_sam
     assert [p.code for p in made.errors] == ["roi"]
     assert made.plan.frames == 1440
     assert len(made.plan.steps) == 20
+
+
+@pytest.mark.parametrize(("last", "said"), [(1, 1), (3, 0)])
+def test_a_region_without_a_binned_pixel_is_said_once(
+    planned: Planner, last: int, said: int
+) -> None:
+    """Each single line holds: only the images that are saved are of nothing."""
+    region = f"camera set ROI 0 0 {last} {last} ACK"
+    images = ["camera take image ACK", "camera save image a%d ACK"] * 3
+    plan = planned(region, "camera set mode HW4SW1High ACK", *images)
+    found = [p for p in plan.problems if p.severity == "error"]
+    assert [(p.code, p.line) for p in found] == [("roi", 4)] * said
+    assert all("holds no pixel" in p.message for p in found)

@@ -20,7 +20,13 @@ from flexdt.twin.machine.description import (
     parse_machine,
     profile_of,
 )
-from flexdt.twin.script import ScanPlan, StartState, parse_script, plan_poses, plan_script
+from flexdt.twin.script import (
+    ScanPlan,
+    StartState,
+    parse_script,
+    plan_poses,
+    plan_script,
+)
 from tests.twin.script.conftest import Planner
 
 # FleX-ray, linear axes: 50 mm/s, 50 mm/s2; so a move of d >= 50 mm takes d / 50 + 1 s, a shorter
@@ -385,6 +391,11 @@ def test_streamed_poses(flexray: Machine, profile: Profile) -> None:
     with pytest.raises(UnknownNameError, match="rot_obj"):
         plan_poses([{"rotation": 1.0}], flexray, profile)
     assert codes(plan_poses([{"mag_obj": 2000.0}], flexray, profile))[0][1] == "limit_clamped"
+
+
+def test_a_script_without_projections_has_no_poses(planned: Planner) -> None:
+    plan = planned("tra_obj move absolute 10 ACK")
+    assert plan.frames == len(plan.poses.angle) == 0
 
 
 def test_the_sample_out_of_the_beam_and_in_the_flat(planned: Planner) -> None:

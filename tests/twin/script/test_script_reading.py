@@ -7,8 +7,10 @@ from pathlib import Path
 import pytest
 
 from flexdt.twin.machine.camera import Roi
-from flexdt.twin.script import ScriptError, Wait, parse_script, read_script
+from flexdt.twin.machine.description import builtin_machine, profile_of
+from flexdt.twin.script import ScriptError, Wait, parse_script, plan_script, read_script
 from flexdt.twin.script import commands as c
+from flexdt.twin.script.grammar import shorten
 from tests.twin.script.conftest import blob, tabbed
 
 LISTING_1 = Path(__file__).parents[3] / "examples/scripts/listing1.txt"
@@ -231,6 +233,53 @@ def test_custom_components_are_allowed_with_a_warning() -> None:
         assert isinstance(script.commands[0], c.Custom)
     # The scanner's naming makes it a motor, whatever machine has it.
     assert isinstance(one("rot_grid move absolute 3 ACK"), c.MoveAbsolute)
+
+
+@pytest.mark.parametrize(
+    ("tail", "known"), [("ACK", True), ("no wait", True), ("no wait 5", True), ("ACK 5 7.5", True),
+                        ("ACK 5 7 // x", True), ("no wait x", False), ("no wait 5 x", False),
+                        ("no wait 1 2 3", False), ("", False)]
+)  # fmt: skip
+def test_a_wait_is_followed_by_two_numbers_at_most(tail: str, known: bool) -> None:
+    """Only a line with a wait can be of a custom component."""
+    script, problems = read_script(f"my_thing wiggle {tail}")
+    assert [p.code for p in problems] == ["custom_component" if known else "unknown_component"]
+    assert len(script.commands) == known
+
+
+@pytest.mark.parametrize("tail", ["ACK // go", "ACK\t5 // x", "ACK // a\tb\tc", "ACK\t// 5"])
+def test_a_comment_may_stand_from_the_column_of_the_wait_on(tail: str) -> None:
+    script, problems = read_script(f"tra_obj\tmove absolute\t10\t\t{tail}")
+    assert problems == ()
+    assert [(x.wait, x.timeout_ms) for x in script.commands] == [
+        (Wait.ACK, 5.0 if "5 //" in tail else None)
+    ]
+
+
+def test_an_error_s_message_counts_errors_and_its_data_has_all() -> None:
+    text = "tra_obj move absolute 5\ntra_obj move absolute much ACK\ntra_obj move absolute 6\n"
+    with pytest.raises(ScriptError) as caught:
+        parse_script(text)
+    first, *lines = str(caught.value).splitlines()
+    assert first == "the script has 1 error:"
+    assert [line.split(",")[0] for line in lines] == ["line 2"]
+    assert [p.severity for p in caught.value.problems] == ["warning", "error", "warning"]
+
+
+@pytest.mark.parametrize("length", [1, 59, 60, 61, 62, 500])
+def test_text_in_messages_is_shortened_to_60_characters(length: int) -> None:
+    text = "abcdefghij" * 50
+    found = shorten(text[:length])
+    assert len(found) == min(length, 60)
+    assert found == text[:length] or (length > 60 and found == text[:57] + "...")
+
+
+def test_commands_of_an_axis_that_the_twin_does_not_know_are_said() -> None:
+    machine = builtin_machine("xyzr_cabinet")
+    script, _ = read_script("X wiggle 3 ACK\ngrid_motor wiggle 3 ACK\n")
+    found = plan_script(script, machine, profile_of(machine)).problems
+    assert [p.line for p in found if p.message.startswith("X: the twin does not know")] == [1]
+    assert not [p for p in found if "grid_motor: the twin" in p.message]
 
 
 def test_missing_wait_is_assumed_and_said() -> None:

@@ -51,3 +51,5 @@ def test_what_a_total_is_uncertain_by(n: int, count: int, squares: float) -> Non
     low, high = total_range(rows, 2.0 * count + 50.0, timing) or (0.0, 0.0)
     assert 2.0 * count + 50.0 - low == pytest.approx(1.0 * math.sqrt(squares) + 0.2 * count)
     assert high - 2.0 * count - 50.0 == pytest.approx(4.0 * math.sqrt(squares) + 0.2 * count)
+    low, _ = total_range(rows, 0.1, timing) or (1.0, 1.0)
+    assert low == 0.0  # no scan takes less than no time
