@@ -35,11 +35,13 @@ def machine(word: str | PathLike[str] | None = None) -> Machine:
     return builtin_machine(name)
 
 
-def profile(word: str | None, of: Machine, file: str | None = None) -> Profile:
+def profile(
+    word: Profile | str | PathLike[str] | None, of: Machine, file: str | None = None
+) -> Profile:
     """A calibration profile by shipped name or by file; None is the machine's default.
 
     Args:
-        word: what was asked for.
+        word: what was asked for, or the profile itself.
         of: the machine.
         file: what was asked for as the machine, for the error.
 
@@ -48,10 +50,17 @@ def profile(word: str | None, of: Machine, file: str | None = None) -> Profile:
         UnknownNameError: neither a file nor a shipped name.
     """
     from flexdt.twin.errors import MachineFileError
-    from flexdt.twin.machine.description import builtin_profile, default_profile, parse_profile
+    from flexdt.twin.machine.description import (
+        Profile,
+        builtin_profile,
+        default_profile,
+        parse_profile,
+    )
 
-    name = of.default_profile if word is None else word
-    if is_file(name):
+    name = of.default_profile if word is None else str(word)
+    if isinstance(word, Profile):
+        found = word
+    elif is_file(name):
         found = parse_profile(Path(name).read_text(encoding="utf-8"), name)
     elif word is None:
         found = default_profile(of, file or DEFAULT_MACHINE)

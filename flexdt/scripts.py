@@ -9,7 +9,7 @@ from flexdt.clients.cli.commands.scanner.script_commands import collisions
 from flexdt.machines import machine as find_machine
 from flexdt.machines import profile as find_profile
 from flexdt.phantoms.samples import as_phantom
-from flexdt.twin.machine.description import Machine
+from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.outward import File
 from flexdt.twin.script import (
     CheckReport,
@@ -26,7 +26,7 @@ def plan(
     script: Script | str | bytes | PathLike[str],
     machine: Machine | str | PathLike[str] | None = None,
     *,
-    profile: str | None = None,
+    profile: Profile | str | PathLike[str] | None = None,
     sample: object = None,
 ) -> ScanPlan:
     """Plan a scan script on a clock that starts at 0, without a server.
@@ -35,7 +35,7 @@ def plan(
         script: from `parse_script`, its text or bytes, or its path. A text of one line that names
             a file is a path.
         machine: a machine, its shipped name or its file; the FleX-ray if None.
-        profile: zero offsets, by shipped name or file; the machine's default if None.
+        profile: zero offsets, their shipped name or file; the machine's default if None.
         sample: what stands on the stage, for truncation: anything that `flexdt.simulate` takes.
 
     Returns:

@@ -239,6 +239,30 @@ def test_script_new_refuses_the_impossible(
 
 
 @pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--kind", "helical", "--rise", "-5"], "rise_mm is -5; allowed: 0.001 to"),
+        (["--kind", "helical", "--rise", "0"], "rise_mm is 0; allowed"),
+        (["--kind", "helical", "--rise", "nan"], "rise_mm is nan; allowed"),
+        (["--kind", "fly", "--height", "nan"], "height_mm is nan; allowed"),
+        (["--kind", "fly", "--height", "inf"], "height_mm is inf; allowed"),
+        (["--kind", "fly", "--sdd", "nan"], "sdd_mm is nan; allowed"),
+        (["--kind", "fly", "--roi", "10 10 0 0"], "ROI 10 10 0 0 holds no pixel at binning"),
+        (["--kind", "fly", "--mode", "HW9"], "HW9"),
+        (["--kind", "fly", "--kv", "1e6"], "tube voltage 1e+06 kV is outside [0, 90] kV"),
+    ],
+)
+def test_script_new_names_what_was_asked(
+    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["script", "new", *words]) != 0
+    told = capsys.readouterr().err
+    assert said in told
+    assert "assumed" not in told
+    assert "depend on each other" not in told
+
+
+@pytest.mark.parametrize(
     ("option", "value", "of"),
     [("position", "500", "calibration"), ("tiles", "0", "tiled"), ("turns", "0", "helical"),
      ("rise", "0", "helical")],

@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 
 import flexdt as fx
 from flexdt.clients.cli import main
+from flexdt.twin.machine.description import builtin_profile
 from flexdt.twin.script import ScanPlan, ScriptError, check_script, parse_script
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "scripts"
@@ -23,6 +24,10 @@ def test_text_path_and_script_give_equal_plans() -> None:
     plan = fx.plan(text)
     assert plan == fx.plan(FLY) == fx.plan(str(FLY)) == fx.plan(parse_script(text))
     assert plan == fx.plan(FLY, machine=fx.machine("flexray")) == fx.plan(FLY, machine="flexray")
+    flexray = fx.machine("flexray")
+    assert plan == fx.plan(FLY, profile=builtin_profile(flexray.default_profile))
+    thesis = builtin_profile("thesis")
+    assert fx.plan(FLY, profile=thesis) == fx.plan(FLY, profile="thesis") != plan
     assert plan != fx.plan("rot_obj move absolute 90 ACK")
     assert ScanPlan.from_dict(json.loads(json.dumps(plan.to_dict()))) == plan
     with pytest.raises(FileNotFoundError):

@@ -82,6 +82,24 @@ def test_everything_comes_out_centred(
     np.testing.assert_allclose(np.linalg.norm(cone_vec.source[:, :2], axis=1), sod, atol=1e-5)
 
 
+@settings(max_examples=30, deadline=None)
+@given(
+    st.integers(0, 750).map(lambda k: 2 * k), st.integers(150, 249).map(lambda k: 2 * k + 1),
+    st.integers(0, 850).map(lambda k: 2 * k), st.integers(50, 149).map(lambda k: 2 * k + 1),
+)  # fmt: skip
+def test_the_sample_goes_to_a_region_of_a_panel_that_stands_still(left, wide, top, high) -> None:
+    cabinet = builtin_machine("xyzr_cabinet")
+    wish = ScanRequest(frames=41, exposure_ms=500, sod_mm=300, sdd_mm=1000,
+                       roi=Roi(left, top, left + wide, top + high))  # fmt: skip
+    rows = [line.split("\t") for line in compose_script(
+        wish, cabinet, profile_of(cabinet)).splitlines()]  # fmt: skip
+    at = {row[0]: float(row[2]) for row in rows if row[1] == "move absolute" and row[0] in "XYZ"}
+    # By hand: the middle of 2000 pixels of 0.2 mm is 999.5, a magnification of 1000 / 300.
+    assert 999.5 + at["X"] * (1000 / 300) / 0.2 == pytest.approx(left + wide / 2, abs=1e-3)
+    assert 999.5 - at["Y"] * (1000 / 300) / 0.2 == pytest.approx(top + high / 2, abs=1e-3)
+    assert at["Z"] == 300.0
+
+
 def test_fly_images_follow_the_smooth_scan_rule() -> None:
     plan = planned(ScanRequest(frames=37, exposure_ms=200))
     angles = [e.positions["rot_obj"] for e in plan.exposures if e.kind == "projection"]

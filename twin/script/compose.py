@@ -28,7 +28,7 @@ from flexdt.twin.geometry.conventions import (
     FloatArray,
     turn_detector,
 )
-from flexdt.twin.machine.camera import CameraSettings, Roi
+from flexdt.twin.machine.camera import CameraSettings, Roi, check_roi
 from flexdt.twin.machine.description import Axis, Machine, Profile, check_target
 from flexdt.twin.script.planning.smooth_scan import MARGIN_IMAGES, run_up
 
@@ -106,6 +106,10 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
         LimitError: a count, distance or speed that the machine does not allow, or a motion for
             which it has no motor; says which.
     """
+    if request.roi is not None:
+        camera = machine.detector.camera
+        binning = replace(camera, mode=request.mode or camera.mode).binning
+        check_roi(request.roi, machine.detector.sensor, binning)
     attempts = list(_usual(request, _Places(machine, profile)))
     for sod, sdd, height in attempts:
         placed = (ScanPosition(sod),) if request.placements is None else request.placements
@@ -492,6 +496,10 @@ class _Writer(_Places):
         }
         if not self.has("source_z"):
             wanted["object_z"] = height + lift  # the sample's middle into the beam
+        # Where no motor brings the region into the beam's middle, the sample goes to the region.
+        for across, k in (("x", 0), ("z", 2)):
+            if not self.has(f"detector_{across}") and f"object_{across}" in self.drivers:
+                wanted[f"object_{across}"] += self.region[k] * sod / w.sdd_mm
         found = self.solved(wanted)
         rows, cols = self.camera.shape
         pixel, row_pixel = self.camera.pixels_mm(self.machine.detector.sensor)
@@ -610,7 +618,11 @@ def _check_counts(request: _Request) -> None:
         ("placements", len(request.placements), 1, 100),
         ("exposure_ms", request.exposure_ms, 1e-3, 1e7),
         ("turns", request.turns, 1e-3, 40.0),
+        ("rise_mm", request.rise_mm, 1e-3, 1e6),
+        ("height_mm", request.height_mm, -1e6, 1e6),
+        ("sdd_mm", request.sdd_mm, 1e-3, 1e6),
         ("sod_mm", request.sod_mm, 1e-3, request.sdd_mm),
+        *(("placements", x, -1e6, 1e6) for p in request.placements for x in vars(p).values()),
     )
     for name, value, least, most in rules:
         if not (math.isfinite(value) and least <= value <= most):

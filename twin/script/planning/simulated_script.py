@@ -164,13 +164,13 @@ class Simulation:
 
     def _voltage(self, command: c.SetVoltage) -> Span:
         spec = self.machine.tube
-        if self._range("tube voltage", command.kV, spec.min_kV, spec.max_kV, "kV"):
-            self.tube.set(self.now, kV=command.kV)
+        fits = self._range("tube voltage", command.kV, spec.min_kV, spec.max_kV, "kV")
+        self.tube.set(self.now, kV=command.kV if fits else self.tube.kV)
         return self.timed("set_tube")
 
     def _power(self, command: c.SetPower) -> Span:
-        if self._range("tube power", command.power_W, 0.0, self.machine.tube.max_W, "W"):
-            self.tube.set(self.now, power_W=command.power_W)
+        fits = self._range("tube power", command.power_W, 0.0, self.machine.tube.max_W, "W")
+        self.tube.set(self.now, power_W=command.power_W if fits else self.tube.power_W)
         return self.timed("set_tube")
 
     def _range(self, what: str, value: float, low: float, high: float, unit: str) -> bool:
@@ -198,7 +198,7 @@ class Simulation:
             binning_of(command.mode, self.machine.detector.modes)
         except LimitError as error:
             self.note("error", "mode", error.message)
-            return self._set_camera()
+            return self._stated("mode", self.camera.settings.mode)
         return self._stated("mode", command.mode)
 
     def _exposure(self, command: c.SetExposure) -> Span:
