@@ -214,7 +214,7 @@ def test_iterative_corrections_and_what_is_refused(
 def made_by(dataset: DataSet, **figures: float) -> DataSet:
     """The same images, said to be made so."""
     assert dataset.document is not None
-    noise = dataset.document.noise.model_copy(update={"model": figures})
+    noise = dataclasses.replace(dataset.document.noise, model=figures)
     document = dataset.document.model_copy(update={"noise": noise})
     return dataclasses.replace(dataset, document=document)
 
