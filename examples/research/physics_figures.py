@@ -37,8 +37,8 @@ def transmission(chain: Chain, *lengths: float) -> float:
 def slabs() -> float:
     """Largest relative error of Beer-Lambert's law, one energy, plastic and steel."""
     two = tuple(material(n).substance for n in ("abs", "steel"))
-    chain = Chain(Panel(), substances=two, thickest_mm=(50.0, 5.0), mono_keV=50.0)
-    mu = [s.attenuation()[90] for s in two]  # the bin from 50.0 to 50.5 keV
+    chain = Chain(Panel(), substances=two, thickest_mm=(50.0, 5.0), mono_keV=50.25)
+    mu = [s.attenuation()[90] for s in two]  # the bin about 50.25 keV
     grid = [(a, b) for a in (0.0, 1.0, 20.0, 50.0) for b in (0.0, 1.0, 4.0)]
     return max(abs(transmission(chain, a, b) / np.exp(-a * mu[0] - b * mu[1]) - 1) for a, b in grid)
 
