@@ -70,7 +70,7 @@ class SubsetWork:
     def problem(self, measured: bool = True) -> Problem:
         """Its geometry and grid, and its frames if they are needed."""
         same_version(self.made_by)
-        images = np.empty((len(self.views), *self.shape), np.float32)
+        images = np.zeros((len(self.views), *self.shape), np.float32)
         if measured:
             for k, view in enumerate(self.views):
                 images[k] = self.image(view)
