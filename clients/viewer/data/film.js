@@ -87,7 +87,8 @@ function transmission(i) {
   const through = [];
   for (let k = 0; k < i.pixels.length; k += EVERY) through.push(Math.exp(-(i.low + i.scale * i.pixels[k])));
   through.sort((a, b) => a - b);
-  return `transmission ${(100 * through[Math.floor(0.01 * through.length)]).toFixed(1)} % (darkest) · ${((100 * through.reduce((a, v) => a + v, 0)) / through.length).toFixed(1)} % (mean)`;
+  const dark = through[Math.floor(0.01 * through.length)], mean = through.reduce((a, v) => a + v, 0) / through.length;
+  return `transmission ${(100 * dark).toFixed(1)} % or less in 1 % of the pixels · ${(100 * mean).toFixed(1)} % in the mean`;
 }
 
 export function draw() {

@@ -172,7 +172,9 @@ async function predict() {
   const p = await command("exposure.predict", {}, "No prediction");
   $("#predict").disabled = false;
   const setting = (s) => `${fixed(s.kV, 0)} kV${s.filter ? ` ${s.filter}` : ""}: ${fixed(s.cnr, 1)}`;
-  $("#predicted").textContent = p ? `contrast to noise of ${p.detail}: ${setting(p.asked)}${p.best.length ? ` · best ${setting(p.best[0])}` : ""} · darkest ${fixed(100 * p.transmission.p1, 1)} % through` : "";
+  const told = () => [`contrast to noise of ${p.detail}: ${setting(p.asked)}`, ...p.best.slice(0, 1).map((s) => `best ${setting(s)}`),
+    `1 % of the pixels see ${fixed(100 * p.transmission.p1, 1)} % or less`];
+  $("#predicted").textContent = p ? told().join(" · ") : "";
   if (p) predicted = of;
 }
 // What a prediction was made for; it goes with that.
