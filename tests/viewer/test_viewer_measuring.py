@@ -127,7 +127,7 @@ def test_the_windows_end_is_pulled_on_the_histogram(page: Any, wait: Wait) -> No
     wait(lambda: abs(float(page.input_value("#high")) - 1000 * high) < 3, "auto again")
 
 
-def test_the_transmission_of_the_darkest_pixels_and_of_all(page: Any, twin: TwinClient, wait: Wait) -> None:
+def test_the_transmission_of_dark_pixels_and_all(page: Any, twin: TwinClient, wait: Wait) -> None:
     through = np.exp(-np.asarray(twin.projection().image, dtype=float))
     wanted = [100 * np.percentile(through, 1), 1.0, 100 * through.mean()]
     told = lambda: numbers(page.inner_text("#transmission"))  # noqa: E731
