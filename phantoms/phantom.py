@@ -215,10 +215,11 @@ def assemble(
             "together with other parts",
             {"asked": grids, "allowed": "solids and meshes"},
         )
-    ranks = priority or [0.0] * len(parts)
-    scene, surfaces = cut(
-        [(p.scene, p.surfaces, rank) for p, rank in zip(parts, ranks, strict=True)]
-    )
+    scene = Scene(tuple(solid for p in parts for solid in p.scene.solids))
+    surfaces = tuple(surface for p in parts for surface in p.surfaces)
+    if len(set(priority)) > 1:
+        ranked = zip(parts, priority, strict=True)
+        scene, surfaces = cut([(p.scene, p.surfaces, rank) for p, rank in ranked])
     x, y, z = np.max([p.size_mm for p in parts], axis=0).tolist()
     return Phantom(
         name,
