@@ -107,14 +107,13 @@ class ScenarioImages:
         pixels = row[3:6] - row[0:3] + u * row[6:9] + v * row[9:12]
         return np.asarray(np.linalg.norm(pixels, axis=2), dtype=np.float32)
 
-    def _paths(self, frame: int, shift: tuple[float, float], samples: bool) -> Float32Array:
+    def _paths(self, frame: int, ray: int, samples: bool) -> Float32Array:
         shape, order = self.scan.shape, {one: i for i, one in enumerate(self._thickest)}
         air = self.scan.environment is not None
         out = np.zeros((len(order) + air, *shape), np.float32)
         for sample, mesh in zip(self.scan.samples, self._meshes, strict=True) if samples else ():
-            row = sample.views[frame].copy()
-            row[3:6] += shift[0] * row[6:9] + shift[1] * row[9:12]
-            out[order[sample.substance]] += project_mesh(mesh, ConeVec(row[None]), shape)[0]
+            rows = within_pixels(sample.views[frame : frame + 1], self._rays)[ray : ray + 1]
+            out[order[sample.substance]] += project_mesh(mesh, ConeVec(rows), shape)[0]
         if air:
             out[-1] = np.maximum(self._distance(frame) - out[:-1].sum(axis=0), 0.0)
         return out
@@ -125,9 +124,8 @@ class ScenarioImages:
         beam = self._beams[scan.spectrum_of[frame]]
         mean, spread = (np.zeros(scan.shape, np.float32) for _ in range(2))
         for k in range(n * n):
-            shift = ((k % n + 0.5) / n - 0.5, (k // n + 0.5) / n - 0.5)
             for total, one in zip(
-                (mean, spread), beam.transmit(self._paths(frame, shift, samples)), strict=True
+                (mean, spread), beam.transmit(self._paths(frame, k, samples)), strict=True
             ):
                 total += one / np.float32(n * n)
         view = scan.views[frame]
@@ -374,3 +372,13 @@ class ScenarioImages:
 def _made_of(substance: Substance) -> Material:
     """For the scatter's grid, which asks nothing but the substance."""
     return Material(substance.name, "", substance.density_g_cm3, 0.0, (), "", substance.fractions)
+
+
+def within_pixels(rows: FloatArray, rays: int) -> FloatArray:
+    """Views whose pixels' centres are the middles of rays x rays parts of the pixels of each view,
+    (n * rays^2, 12)."""
+    steps = (np.arange(rays) + 0.5) / rays - 0.5
+    down, across = (one.ravel()[:, None] for one in np.meshgrid(steps, steps, indexing="ij"))
+    out = np.repeat(rows[:, None], rays**2, axis=1)
+    out[:, :, 3:6] += across * rows[:, None, 6:9] + down * rows[:, None, 9:12]
+    return out.reshape(-1, 12)

@@ -16,14 +16,14 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.clients.datasets.data_set import DataSet
-from flexdt.clients.scenario import MOST_RAYS, ScenarioImages
+from flexdt.clients.scenario import MOST_RAYS, ScenarioImages, within_pixels
 from flexdt.machines import machine as machine_of
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import Channel, chain_through, channels, scatter_object
 from flexdt.phantoms.samples import as_phantom
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.physics.apparatus import Detector, Tube
@@ -109,7 +109,7 @@ class Truth:
             exposures = [self.exposure] * (views.stop - views.start)
             known = self.scatter
             added = [] if known is None else [known[i] for i in range(views.start, views.stop)]
-            cone = _within_pixels(self.geometry.rows[views], self.rays)
+            cone = within_pixels(self.geometry.rows[views], self.rays)
             yield from radiographs(
                 self.chain, self._paths(ConeVec(cone)), cone, exposures, moments, added
             )
@@ -226,16 +226,6 @@ def simulate(
         counts, cone, dark=dark, flat=flat, name=phantom.name, warnings=warnings, truth=truth
     )
     return replace(made, full_scale=panel.full_scale)
-
-
-def _within_pixels(rows: FloatArray, rays: int) -> FloatArray:
-    """Views whose pixels' centres are the middles of rays x rays parts of the pixels of each view,
-    (n * rays^2, 12)."""
-    steps = (np.arange(rays) + 0.5) / rays - 0.5
-    down, across = (one.ravel()[:, None] for one in np.meshgrid(steps, steps, indexing="ij"))
-    out = np.repeat(rows[:, None], rays**2, axis=1)
-    out[:, :, 3:6] += across * rows[:, None, 6:9] + down * rows[:, None, 9:12]
-    return out.reshape(-1, 12)
 
 
 def _pitch(cone: ConeVec) -> tuple[float, float]:
