@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 
 import pytest
 from hypothesis import given, settings
@@ -96,6 +97,34 @@ def test_a_tick_count_of_no_use_is_0(tick: object) -> None:
     event = parse_event(json.dumps({**json.loads(LIVE), "tick count": tick}))
     assert abs(event.tick_count) < 2**64
     assert json.loads(format_event(event))["tick count"] == event.tick_count
+
+
+@pytest.mark.parametrize("tick", [2**64 - 1, 1 - 2**64, 0, 12, 7.9, -7.9])
+def test_a_tick_count_is_a_whole_number_of_64_bits(tick: float) -> None:
+    event = parse_event(json.dumps({**json.loads(LIVE), "tick count": tick}))
+    assert event.tick_count == math.trunc(tick)
+    for beyond in (2**64, -(2**64)):
+        event = parse_event(json.dumps({**json.loads(LIVE), "tick count": beyond}))
+        assert event.tick_count == 0
+
+
+@pytest.mark.parametrize(
+    ("field", "most"),
+    [("component", 100), ("comp_phys", 1000), ("command", 1000), ("arg2", 4096), ("reply", 65536),
+     ("comp_type", 100), ("UUID", 200)],
+)  # fmt: skip
+def test_the_longest_text_of_each_field(field: str, most: int) -> None:
+    event = format_event(parse_event(json.dumps({**json.loads(LIVE), field: "x" * most})))
+    assert json.loads(event)[field] == "x" * most
+    with pytest.raises(AcquilaError, match=f"{field} of {most + 1} char.*allowed: {most}$"):
+        parse_event(json.dumps({**json.loads(LIVE), field: "x" * (most + 1)}))
+
+
+def test_an_event_of_1_mib_is_read_and_one_byte_more_is_not() -> None:
+    data = LIVE + " " * (2**20 - len(LIVE))
+    assert parse_event(data) == parse_event(LIVE)
+    with pytest.raises(AcquilaError, match="1048577 bytes; allowed: 1048576"):
+        parse_event(data + " ")
 
 
 def test_an_argument_may_be_binary() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import random
 import time
 from typing import Any
 
@@ -320,3 +321,103 @@ def test_a_name_that_comes_twice_is_found_in_one_pass() -> None:
 
     others = max(seconds('"other":0') for _ in range(3))
     assert seconds('"4e1f":0') < 20 * others + 0.1
+
+
+PIECE = 1 << 16
+
+
+class Queue:
+    """What a connection should do, said with lists: whole messages, and bytes without an end."""
+
+    def __init__(self, codec: Codec) -> None:
+        self.json, self.whole, self.judged = codec is Codec.JSON, list[bytes](), 0
+        self.rest, self.large = b"", False
+
+    def end(self) -> int:
+        """Bytes of the message that `rest` begins with, framing included; 0: not all have come."""
+        if self.json:
+            return self.rest.find(b"\n") + 1
+        size = 4 + int.from_bytes(self.rest[:4], "big")
+        return size if 4 <= size <= len(self.rest) and len(self.rest) >= 4 else 0
+
+    def feed(self, data: bytes) -> None:
+        self.rest += data
+        while not self.large and (size := self.end()):
+            self.whole.append(self.rest[:size])
+            self.rest = self.rest[size:]
+        self.large = self.large or len(self.rest) > PIECE
+
+    def body(self, message: bytes) -> bytes:
+        return message[:-1] if self.json else message[4:]
+
+    def next(self) -> bytes | None:
+        while self.whole:
+            body = self.body(self.whole.pop(0))
+            self.judged = max(0, self.judged - 1)
+            if body.strip() or not self.json:
+                return body
+        if not (self.large and self.end()):
+            return None
+        body = self.body(self.rest[: self.end()])
+        self.rest, self.large = self.rest[self.end() :], False
+        self.feed(b"")
+        return body
+
+    def overtake(self, most: int, shown: list[bytes]) -> list[bytes]:
+        out, seen = [], 0
+        if not any(b"stop" in m for m in self.whole[self.judged :]):
+            self.judged = len(self.whole)
+        while self.judged < len(self.whole) and seen < most:
+            message = self.whole[self.judged]
+            seen += b"stop" in message
+            if b"stop" in message:
+                shown.append(self.body(message))
+            if b"stop now" in message:
+                out.append(self.body(self.whole.pop(self.judged)))
+            else:
+                self.judged += 1
+        return out
+
+
+@pytest.mark.parametrize("codec", Codec)
+@pytest.mark.parametrize("seed", range(40))
+def test_messages_come_out_whole_once_and_urgent_ones_first(codec: Codec, seed: int) -> None:
+    rng = random.Random(seed)
+    wire, queue, stream = Connection(codec), Queue(codec), b""
+    for _ in range(rng.randrange(2, 30)):
+        body = rng.choice([b"stop", b"stop now", b"go", b"x", b"", b" \r"]) * rng.choice([1, 1, 3])
+        if rng.random() < 0.15:
+            body += b"." * (PIECE - rng.randrange(-3, 12))
+        stream += body + b"\n" if queue.json else len(body).to_bytes(4, "big") + body
+    while stream or queue.whole or queue.large:
+        if rng.random() < 0.5:
+            size = rng.choice(
+                [rng.randrange(1, 9), rng.randrange(1, 90), PIECE - 2, PIECE, 200_000]
+            )
+            piece, stream = stream[:size], stream[size:]
+            wire.feed(piece)
+            queue.feed(piece)
+        elif rng.random() < 0.5:
+            raw = wire.next_raw()
+            assert not isinstance(raw, Malformed)
+            assert (b"".join(raw) if isinstance(raw, tuple) else raw) == queue.next()
+        else:
+            shown: list[list[bytes]] = [[], []]
+
+            def wanted(body: bytes, shown: list[bytes] = shown[0]) -> bool:
+                shown.append(body)
+                return b"stop now" in body
+
+            most = rng.choice([1, 2, 32])
+            got = wire.overtake([b"stop"], wanted, most)
+            assert got == queue.overtake(most, shown[1])
+            assert shown[0] == shown[1]
+        ended = queue.large and queue.end() > 0
+        assert wire.whole is (len(queue.whole) > 0 or ended)
+        assert wire.waiting == len(queue.whole) + ended
+        assert wire.unjudged is (queue.judged < len(queue.whole))
+        assert wire.holds(b"stop") is any(b"stop" in m for m in queue.whole[queue.judged :])
+        assert wire.mid_message is (not ended if queue.large else len(queue.rest) > 0)
+        if not queue.large:
+            assert wire.pending == sum(map(len, queue.whole)) + len(queue.rest)
+    assert wire.next_raw() is None

@@ -191,8 +191,12 @@ def test_a_server_answers_each_request_once_and_takes_no_answers() -> None:
     ping, note = Request("a", "session.ping"), Notification("axes.stop")
     assert calls.receive(Batch((ping, ping, note))) == [ping, ping, note]
     assert calls.open == 2
+    assert calls.owes("a")
+    assert not calls.owes("b")
     calls.answer(Response("a", 1))
+    assert calls.owes("a")
     calls.answer(Failure("a", BUSY))
+    assert not calls.owes("a")
     with pytest.raises(LookupError, match="'a'"):
         calls.answer(Response("a", 1))
     calls.answer(Failure(None, BUSY))  # about the connection

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 from typing import Any
 
 import numpy as np
@@ -277,3 +278,128 @@ def test_a_projection_has_places_within_10_km_and_pixels() -> None:
     for detector in ((0, 1), (1, 0), (-1, 5), (1,), (1, 1, 1), (1.5, 1), (2**31, 1)):
         with pytest.raises(RpcError, match="detector"):
             asked(0.0, *detector)
+
+
+NC = {"client": "nc"}
+UPLOAD = {"name": "a", "format": "stl", "total": 3, "data": b"ABC"}
+ROW = [0.0, -600.0, 0.0, 0.0, 500.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, -1.0]
+VIEWS = {"volume": "v", "detector": [2, 3]}
+GRID = {"shape": [1, 2, 3], "voxel_mm": [1.0, 1.0, 1.0]}
+STACK = np.zeros((2, 3, 4), np.float32)
+MESH = {"vertices": 4, "triangles": 4}
+
+
+def stack(array: np.ndarray[Any, Any]) -> dict[str, Any]:
+    return {"cone_vec": [ROW] * 2, "grid": GRID, "projections": image.encode(array)}
+
+
+@pytest.mark.parametrize(
+    ("method", "good", "bad", "says"),
+    [
+        ("session.hello", {**NC, "protocol": "x" * 40}, {**NC, "protocol": "x" * 41}, "40"),
+        ("session.hello", {**NC, "protocol": 999}, {**NC, "protocol": 1000}, "protocol"),
+        ("session.hello", {**NC, "protocol": -999.5}, {**NC, "protocol": -1e3}, "protocol"),
+        ("axes.move", {"targets": {f"a{i}": 1.0 for i in range(64)}},
+         {"targets": {f"a{i}": 1.0 for i in range(65)}}, "65 members; at most 64"),
+        ("sample.upload", {**UPLOAD, "name": "é" * 16 + "abcd"},
+         {**UPLOAD, "name": "é" * 16 + "abcde"}, "101 bytes percent-encoded"),
+        ("sample.upload", {**UPLOAD, "name": "." * 33 + "a"}, {**UPLOAD, "name": "." * 34},
+         "102 bytes percent-encoded"),
+        ("project", {**VIEWS, "cone_vec": [ROW]}, {**VIEWS, "cone_vec": []}, "cone_vec"),
+        ("project", {**VIEWS, "cone_vec": np.full((100_000, 12), 1.0)},
+         {**VIEWS, "cone_vec": np.full((100_001, 12), 1.0)}, "100001 rows.*1 to 100000"),
+        ("project", {**VIEWS, "cone_vec": [ROW] * 2}, {**VIEWS, "cone_vec": [ROW[:11]] * 2},
+         r"shape \[2, 11\]"),
+        ("project", {**VIEWS, "cone_vec": [ROW]}, {**VIEWS, "cone_vec": ROW}, r"shape \[12\]"),
+        ("project", {**VIEWS, "cone_vec": [ROW]}, {**VIEWS, "cone_vec": [[*ROW[:11], True]]},
+         "truth value"),
+        ("project", {**VIEWS, "cone_vec": [ROW]}, {**VIEWS, "cone_vec": [["a"] * 12]}, "cone_vec"),
+        ("backproject", stack(STACK), stack(STACK.astype(np.float64)), "float32"),
+        ("backproject", stack(STACK), stack(STACK[0]), "float32 of shape"),
+        ("backproject", stack(STACK), stack(STACK[:, :0]), "float32 of shape"),
+        ("volume.put", {"name": "v", "grid": GRID, "data": b"abcd"}, {"name": "v", "grid": GRID},
+         "data goes with"),
+        ("volume.put", {"name": "v", "scene": {}}, {"name": "v", "scene": {}, "data": b"a"},
+         "data goes with"),
+        ("volume.put", {"name": "v", "mesh": MESH, "data": b"a"},
+         {"name": "v", "mesh": MESH, "grid": GRID, "data": b"a"}, "one of scene, grid, mesh"),
+        ("volume.put", {"name": "v", "mesh": MESH, "data": b"a"}, {"name": "v", "data": b"a"},
+         "one of scene, grid, mesh"),
+        *(("volume.put", {"name": "v", "mesh": {**MESH, key: good}, "data": b"a"},
+           {"name": "v", "mesh": {**MESH, key: bad}, "data": b"a"}, key)
+          for key in MESH for good, bad in ((4, 3), (2**27, 2**27 + 1))),
+        ("volume.put", {"name": "v" * 300, "scene": {}}, {"name": "v" * 301, "scene": {}}, "name"),
+        ("project", {**VIEWS, "cone_vec": [ROW], "key": "k" * 300},
+         {**VIEWS, "cone_vec": [ROW], "key": "k" * 301}, "key"),
+        ("cancel", {"request": 2**64 - 1}, {"request": 2**64}, "request"),
+        ("cancel", {"request": "x" * 1000}, {"request": "x" * 1001}, "request"),
+        ("cancel", {"request": ""}, {"request": -1}, "request"),
+        ("state.get", {}, {str(i): 1 for i in range(51)}, "51 members; allowed: none"),
+    ],
+)  # fmt: skip
+def test_the_last_that_fits_and_the_first_that_does_not(
+    method: str, good: Any, bad: Any, says: str
+) -> None:
+    def encoded(params: dict[str, Any]) -> dict[str, Any]:
+        return {k: image.encode(v) if isinstance(v, np.ndarray) else v for k, v in params.items()}
+
+    table = METHODS if method in METHODS else PROJECTOR_METHODS
+    assert parse_params(table[method], encoded(good))
+    with pytest.raises(RpcError) as caught:
+        parse_params(table[method], encoded(bad))
+    assert caught.value.code == -32602
+    assert re.search(says, f"{caught.value.message} {caught.value.data}")
+
+
+def test_with_50_members_too_many_the_first_of_them_is_named() -> None:
+    with pytest.raises(RpcError, match="0") as caught:
+        parse_params(METHODS["state.get"], {str(i): 1 for i in range(50)})
+    assert "members;" not in caught.value.message
+
+
+def test_the_bytes_of_voxels_and_of_a_mesh_and_what_is_left_out() -> None:
+    """Voxels are float32; corners three float64 and triangles three int32."""
+    put = PROJECTOR_METHODS["volume.put"]
+    grid = {"shape": [3, 5, 7], "voxel_mm": [0.1, 0.2, 0.3]}
+    voxels: Any = parse_params(put, {"name": "v", "grid": grid, "data": b"abcd"})
+    assert voxels.grid.nbytes == np.zeros((3, 5, 7), np.float32).nbytes
+    assert voxels.grid.center_mm == (0.0, 0.0, 0.0)
+    assert (voxels.start, bytes(voxels.data), voxels.mesh) == (0, b"abcd", None)
+    mesh: Any = parse_params(
+        put, {"name": "m", "mesh": {"vertices": 5, "triangles": 6}, "data": b""}
+    )
+    assert mesh.mesh.nbytes == np.zeros((5, 3)).nbytes + np.zeros((6, 3), np.int32).nbytes
+
+
+@pytest.mark.parametrize("limit", [4, 5, 40, 200])
+def test_a_clipped_text_is_the_text_as_far_as_it_goes(limit: int) -> None:
+    for length in range(limit - 2, limit + 3):
+        text = "abcdefghij" * 30
+        cut = text[:limit] + "..." if length > limit else text[:length]
+        assert clip(text[:length], limit) == cut
+        assert clip(["x"] * length, limit).startswith("['x'"[:limit])
+    some = limit // 2
+    for count in (some - 1, some, some + 1):
+        whole = "[" + ", ".join(["1"] * min(count, some)) + (", ...]" if count > some else "]")
+        assert clip([1] * count, limit) == (whole if len(whole) <= limit else whole[:limit] + "...")
+        pairs = ", ".join(f"{i}: 1" for i in range(min(count, some)))
+        whole = "{" + pairs + (", ...}" if count > some else "}")
+        shown = clip(dict.fromkeys(range(count), 1), limit)
+        assert shown == (whole if len(whole) <= limit else whole[:limit] + "...")
+    assert clip(2**4095) == str(2**4095)[:200] + "..."
+    assert clip(2**4096) == "a whole number of 4097 bits"
+
+
+def test_codes_and_what_may_be_called_when_are_what_they_were() -> None:
+    """The wire's own: peers of other versions know them by number."""
+    codes = {c.name: int(c) for c in Code}
+    assert codes == {
+        "PARSE": -32700, "INVALID_REQUEST": -32600, "METHOD_NOT_FOUND": -32601,
+        "INVALID_PARAMS": -32602, "INTERNAL": -32603, "LIMIT": -32001, "COLLISION": -32002,
+        "BUSY": -32003, "NOT_AUTHORISED": -32004, "SCRIPT_INVALID": -32005,
+        "PROJECTOR_UNAVAILABLE": -32006, "NOT_IDENTIFIABLE": -32007, "TOO_LARGE": -32008,
+        "SUPERSEDED": -32009, "CANCELLED": -32010,
+    }  # fmt: skip
+    unsafe = {name for name, m in PROJECTOR_METHODS.items() if not m.safe}
+    assert unsafe == {"backproject"}
+    assert not any(m.control or m.urgent or m.limits for m in PROJECTOR_METHODS.values())
