@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 
@@ -10,11 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import nnls
+from scipy.spatial import ConvexHull
 from swept import sweep
 
 from flexdt.twin.collision.collision_scene import Scene, build_scene, scene_of
 from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid, box, hull
-from flexdt.twin.collision.guard import SceneGuard
+from flexdt.twin.collision.guard import SceneGuard, _Overlap
 from flexdt.twin.collision.nearest import separation_of
 from flexdt.twin.collision.paths import path_of
 from flexdt.twin.collision.relative import RelativeMotion
@@ -433,3 +435,107 @@ def test_an_overlap_is_measured_where_that_is_asked(depth: float, gap: float, de
     }
     assert touching({"x": 40.0 - gap}, deep=deep) == {pair: pytest.approx(gap, abs=1e-3)}
     assert touching({"x": 38.0}, deep=deep) == {}
+
+
+def drawn_motion(rng: np.random.Generator, reach: float) -> Trajectory:
+    """To and fro within `reach`, faster or slower, retargeted on the way."""
+    legs = [motion.at_rest(float(rng.uniform(-reach, reach)), 0.0)]
+    for now in np.cumsum(rng.uniform(0.2, 2.0, 4)).tolist():
+        last = legs[-1]
+        target, speed = float(rng.uniform(-reach, reach)), float(rng.uniform(5.0, reach))
+        at = last.position(now), last.velocity(now)
+        legs.append(motion.move(*at, target, speed, float(rng.uniform(20.0, 90.0)), now))
+    return motion.joined(legs)
+
+
+@pytest.mark.parametrize("seed", range(16))
+def test_drawn_motions_against_distances_at_many_times(seed: int) -> None:
+    """Where they touch first, and how near they come: least squares at 1200 times say the same."""
+    rng = np.random.default_rng(seed)
+    moving = box(rng.uniform(2, 12, 3), rng.uniform(-4, 4, 3))
+    ways = {name: drawn_motion(rng, 40.0) for name in AXES}
+
+    def apart(time: float, walls: Sequence[Polytope]) -> float:
+        x, y, turn = (ways[n].position(time) for n in AXES)
+        c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
+        points = moving.vertices @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        return min(true_distance(points + (x, y, 0.0), w.vertices) for w in walls)
+
+    walls: list[Polytope] = []
+    while len(walls) < 2:
+        wall = box(rng.uniform(4, 20, 3), rng.normal(size=3) * (25.0, 25.0, 3.0))
+        walls += [wall] if apart(0.0, [wall]) > 2 * MARGIN else []
+    times = np.linspace(0.0, max(t.end for t in ways.values()), 1200)
+    gaps = np.array([apart(time, walls) for time in times])
+    fastest = 60.0 + math.radians(40.0) * 12.0  # two motors at 40 mm/s, and corners 12 mm out
+    exact = Limits(MARGIN, TOLERANCE, (1e-3, 0.0))
+    scene = dataclasses.replace(one_against(moving, walls), limits=exact)
+    found = sweep(scene, ways, 0.0, times[-1])
+    if found.contact is None:
+        low = gaps.min() - fastest * (times[1] - times[0]) / 2
+        assert gaps.min() >= MARGIN
+        assert low - 1e-3 <= found.min_clearance_mm <= gaps.min() + 2e-3
+    else:
+        assert gaps[times <= found.contact.time].min() > MARGIN - 1e-3
+        assert MARGIN - 1e-3 <= apart(found.contact.time, walls) <= MARGIN + TOLERANCE + 1e-3
+        assert found.contact.last_free_time <= found.contact.time
+        assert apart(found.contact.last_free_time, walls) >= MARGIN + TOLERANCE
+        assert MARGIN <= found.min_clearance_mm <= MARGIN + TOLERANCE
+
+
+def test_the_error_allowed_in_a_clearance_is_absolute_or_a_share_of_it() -> None:
+    limits = Limits(MARGIN, TOLERANCE, (0.1, 0.02))
+    assert [limits.slack(mm) for mm in (0.0, 2.0, 5.0, 50.0)] == [0.1, 0.1, 0.1, 1.0]
+
+
+def centred_solid(rng: np.random.Generator) -> Solid:
+    kind = rng.integers(3)
+    if kind == 0:
+        return box(rng.uniform(2, 40, 3))
+    if kind == 1:
+        corners = rng.normal(size=(rng.integers(5, 12), 3)) * rng.uniform(4, 20, 3)
+        return hull(corners - corners.mean(axis=0))
+    return Cylinder((0.0, 0.0, 0.0), rng.uniform(2, 20), rng.uniform(2, 30))
+
+
+def signed_distance(a: FloatArray, b: FloatArray) -> float:
+    """Distance of two hulls of points, or minus the least shift that parts them: how far the
+    origin lies inside the hull of all differences."""
+    differences = (a[:, None] - b[None, :]).reshape(-1, 3)
+    inside = float(ConvexHull(differences).equations[:, 3].max())
+    return inside if inside < 0.0 else true_distance(a, b)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_depth_of_an_overlap_and_what_is_left_of_it_on_the_way_out(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scene = one_against(centred_solid(rng), [centred_solid(rng)])
+    [pair] = scene.all.pairs
+    a, b = (scene.bodies[i] for i in pair)
+    polygon = 0.0023 * sum(s.solid.radius for s in (a, b) if isinstance(s.solid, Cylinder))
+
+    def truth(q: FloatArray) -> float:
+        points = [solid_points(x.solid) @ x.rotation(float(q @ x.turns)).T + q @ x.slides
+                  for x in (a, b)]  # fmt: skip
+        return signed_distance(*points)
+
+    begin = np.array([*rng.uniform(-3, 3, 2), rng.uniform(-400, 400)])
+    assert truth(begin) < 0.0
+    at = dict(zip(AXES, begin.tolist(), strict=True))
+    [(names, depth)] = SceneGuard(scene).touching(at, deep=True).items()
+    assert set(names) == {"thing", "wall 0"}
+    assert depth <= truth(begin) + 1e-6
+    assert depth >= truth(begin) - polygon - (0.02 if polygon else 1e-6)
+    overlap = _Overlap.at(a, b, begin)
+    for turn in (0.0, 25.0, -170.0):
+        for share in np.linspace(-6.0, 6.0, 5):
+            q = begin + (share, -0.7 * share, turn)
+            assert overlap.separation(q) <= truth(q) + 1e-6
+            if turn == 0.0 and truth(q) < 0.0:
+                assert overlap.separation(q) >= truth(q) - polygon - (1.0 if polygon else 1e-6)
+
+
+@pytest.mark.parametrize("corners", [np.zeros(3), np.zeros((4, 2)), np.full((4, 3), np.nan)])
+def test_corners_that_are_none_are_refused(corners: FloatArray) -> None:
+    with pytest.raises(ValueError, match=r"allowed: \(k, 3\), finite"):
+        Polytope(corners, np.zeros((1, 3), dtype=np.intp))

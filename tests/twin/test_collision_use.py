@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 
@@ -291,6 +292,31 @@ def test_the_stated_size_stands_in_for_a_mesh() -> None:
     assert {c.pair for c in wide.collisions} >= {("detector", "sample")}
     unknown_height = check(plan, M, P, SampleSize(420.0))
     assert unknown_height.collisions
+
+
+def test_a_size_of_nothing_is_no_sample() -> None:
+    text = script("mag_det 780")
+    plan = plan_script(parse_script(text), M, P)
+    check = collision_check()
+    empty = check(plan, M, P, None)
+    for height in (0.0, 30.0):
+        assert check(plan, M, P, SampleSize(0.0, height)) == empty
+
+
+def test_the_trace_of_a_script_that_does_not_move_is_its_beginning_and_end() -> None:
+    still = "scanner\tpause\t5000.0\t\tACK\t\t\r\n"
+    plan = plan_script(parse_script(still), M, P)
+    found = collision_check([LEGO])(plan, M, P, None)
+    assert [t for t, _ in found.trace] == [0.0, plan.duration_s]
+    assert found.trace[0][1] == found.trace[1][1] > 1.0
+    moved = plan_script(parse_script(still + script("mag_det 900", "tra_obj 30")), M, P)
+    times = [t for t, _ in collision_check([LEGO])(moved, M, P, None).trace]
+    assert (times[0], times[-1]) == (0.0, moved.duration_s)
+    assert 110 <= len(times) <= 120
+    moving = [s for s in moved.steps if s.command.line in (3, 4)]
+    along = [t for t in times for s in moving if s.start_s <= t <= s.start_s + s.duration_s]
+    shares = [s.duration_s / moved.duration_s for s in moving]
+    assert len(along) >= 60 + 55 * sum(shares)  # half of them follow the way, half the time
 
 
 def test_a_machine_without_components_has_nothing_to_touch() -> None:

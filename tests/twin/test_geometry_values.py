@@ -147,6 +147,8 @@ def test_a_helix_rises_with_the_angle() -> None:
         ({"angles": True}, "number of views"),
         ({"angles": [0.0, math.inf]}, "finite"),
         ({"pixel": -1.0}, "pixel"),
+        ({"pixel": 0.0}, "pixel"),
+        ({"pixel": (0.1, 0.0)}, "pixel"),
         ({"pixel": "wide"}, "pixel is 'wide'"),
         ({"offset": 3.0}, "offset"),
         ({"tilts": (1, 2)}, "tilts"),

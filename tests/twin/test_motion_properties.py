@@ -259,3 +259,76 @@ def test_hand_computed_profile() -> None:
     assert t.time_at(50.0) == 11.5
     assert t.moving(12.999)
     assert not t.moving(13.0)
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_speeds_and_laws_are_those_of_many_moments(seed: int) -> None:
+    """What a motion says of itself, against differences of its positions."""
+    rng = np.random.default_rng(seed)
+    legs = [motion.at_rest(0.0, 1.0)]
+    for now in (1.0 + np.cumsum(rng.uniform(0.3, 3.0, 4))).tolist():
+        x, v = legs[-1].position(now), legs[-1].velocity(now)
+        a = float(rng.uniform(5.0, 60.0))
+        legs.append(
+            [
+                lambda x=x, v=v, a=a, now=now: motion.move(
+                    x, v, rng.uniform(-80, 80), rng.uniform(4, 40), a, now
+                ),
+                lambda x=x, v=v, a=a, now=now: motion.jog(x, v, rng.uniform(-30, 30), 1.0, a, now),
+                lambda x=x, v=v, a=a, now=now: motion.stop(x, v, a, now),
+            ][rng.integers(3)]()
+        )
+    t = motion.joined(legs)
+    step = 1e-4
+    times = np.arange(t.start - 0.5, t.end + 0.5, 1e-2)
+    # The knots, found from the positions alone: where second differences of them change.
+    x = t.positions(times[:, None] + step * np.arange(-1, 2))
+    speed = (x[:, 2] - x[:, 0]) / (2 * step)
+    change = (x[:, 2] - 2 * x[:, 1] + x[:, 0]) / step**2
+    smooth = ~np.isin(np.arange(len(times)), [
+        i for k in (*t.knots, t.end) for i in np.flatnonzero(np.abs(times - k) < 2 * step)
+    ])  # fmt: skip
+    assert t.top_speed == pytest.approx(np.abs(speed).max(), abs=0.7)
+    assert t.top_speed >= np.abs(speed[smooth]).max() - 1e-6
+    for i in rng.choice(np.flatnonzero(smooth), 40):
+        now = float(times[i])
+        later = np.abs(change[i:][smooth[i:]]).max()
+        assert t.acceleration(now) >= later - 1e-3
+        ends = [p.start for p in t.pieces[1:]] + [t.end]
+        long = [abs(p.acceleration) for p, end in zip(t.pieces, ends, strict=True)
+                if end > now and end - max(p.start, now) > 0.03]  # fmt: skip
+        short = [abs(p.acceleration) for p, end in zip(t.pieces, ends, strict=True) if end > now]
+        assert max(long, default=0.0) - 1e-3 <= t.acceleration(now) <= max(short, default=0.0)
+        v, a, until = t.law(now)
+        assert v == pytest.approx(speed[i], abs=1e-5)
+        assert a == pytest.approx(change[i], abs=1e-3)
+        assert until > now
+        inside = (times >= now) & (times <= until - 2 * step) & smooth
+        assert_allclose(change[inside], a, atol=1e-3)
+        assert_allclose(speed[inside], v + a * (times[inside] - now), atol=1e-5)
+        assert (speed[inside] * v >= -1e-5).all() or v == 0.0
+        if math.isfinite(until):  # there it turns round, or another piece begins
+            assert abs(v + a * (until - now)) < 1e-6 or until in (*t.knots, t.end)
+        assert t.moving(now) is (t.start <= now < t.end)
+
+
+def test_the_time_of_a_position_is_the_first_that_many_moments_show() -> None:
+    """Of 200 drawn motions: passed in a ramp, in a cruise, where it turns round, never."""
+    rng = np.random.default_rng(3)
+    for _ in range(200):
+        x, v = rng.uniform(-20, 20, 2)
+        way = motion.move(x, v, rng.uniform(-40, 40), rng.uniform(2, 30), rng.uniform(3, 40), 5.0)
+        times = np.linspace(way.start, way.end, 2001)
+        at = way.positions(times)
+        low, high = at.min(), at.max()
+        for place in (*rng.uniform(low, high, 3), low - 0.1, high + 0.1, way.target):
+            found = way.time_at(float(place))
+            sides = np.sign(at - place)
+            passed = np.flatnonzero(sides[1:] * sides[:-1] <= 0)
+            if found is None:
+                assert len(passed) == 0 or abs(at - place).min() < 1e-9
+                continue
+            assert way.position(found) == pytest.approx(place, abs=1e-6)
+            if len(passed):
+                assert found <= times[passed[0] + 1] + 1e-9
+        assert way.time_at(low - 0.1) is way.time_at(high + 0.1) is None

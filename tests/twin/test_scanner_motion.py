@@ -17,6 +17,7 @@ from flexdt.twin.machine.description import (
     parse_machine,
     profile_of,
 )
+from flexdt.twin.motion.braking import braked_apart
 from flexdt.twin.motion.drives import home, plan_move
 from flexdt.twin.motion.profiles import at_rest
 from flexdt.twin.scanner.scanner import ScannerTwin
@@ -250,6 +251,36 @@ def test_coupled_motors_of_different_gears_run_in_step(tube: float, panel: float
         for name, way in ways.items():
             assert abs(way.velocity(t)) <= drives[name].speed + 1e-9
     assert gone["ver_det"] == pytest.approx(20.0 * panel)
+
+
+@pytest.mark.parametrize("when", [0.3, 1.5])
+@pytest.mark.parametrize(("tube", "panel"), [(-2.0, -0.5), (-0.25, 1.0), (-1.0, 3.0)])
+def test_coupled_motors_of_different_gears_stop_in_step(
+    tube: float, panel: float, when: float
+) -> None:
+    geared = parse_machine(
+        f'base = "flexray"\n[virtual_axes.ver_obj]\nfactor = {1 / tube}\n'
+        f"moves = {{ ver_tube = {tube}, ver_det = {panel} }}\n"
+    )
+    drives = {n: replace(d, trajectories=(at_rest(150.0),)) for n, d in home(geared, 0.0).items()}
+    drives["ver_tube"] = replace(drives["ver_tube"], acceleration=5.0)
+    ways = plan_move(geared, drives, {"ver_obj": 30.0}, 0.0, relative=True)
+    going = {n: drives[n].following(ways[n]) if n in ways else drives[n] for n in drives}
+    most = {n: 100.0 if n == "ver_det" else 5.0 for n in drives}
+    stop = braked_apart(geared, going, when, most)
+    end = max(t.end for t in stop.values())
+    for t in np.linspace(when, end, 30).tolist():
+        gone = {n: stop[n].position(t) - 150.0 for n in ways}
+        assert gone["ver_tube"] / tube == pytest.approx(gone["ver_det"] / panel, abs=1e-6)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_jog_faster_than_the_motor_is_refused_either_way(sign: float) -> None:
+    s = scanner()
+    fastest = M.axes["mag_obj"].max_speed
+    s.jog("mag_obj", sign * fastest, 0.1, 0.0)
+    with pytest.raises(LimitError, match=f"mag_obj allows {fastest:g}"):
+        s.jog("mag_obj", sign * fastest * 1.001, 0.1, 1.0)
 
 
 def test_coupled_jog_halts_both_at_the_first_limit() -> None:

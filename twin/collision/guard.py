@@ -55,12 +55,7 @@ def leaving(scene: Scene, path: Path) -> Contact | None:
         scene: what may touch what.
         path: the motion.
     """
-    start = path.q[0]
-    limit = scene.limits.margin + scene.limits.tolerance
-    stack = scene.candidates(path.q.min(axis=0), path.q.max(axis=0))
-    near = np.flatnonzero(stack.clearances(start, start) <= limit).tolist()
-    pairs = [stack.pairs[k] for k in near]
-    stuck = [p for p in pairs if separation_at(scene, p, start) <= GRAZING_MM]
+    stuck = [pair for pair, gap in bodies_touching(scene, path.q[0]) if gap <= GRAZING_MM]
     others = first_contact(_without(scene, stuck), path)
     found = [c for pair in stuck if (c := _of_pair(scene, path, pair)) is not None]
     contacts = [*found, *([] if others is None else [others])]
@@ -122,8 +117,6 @@ class _Overlap:
         outward = np.unique(ConvexHull(between).equations[:, :3].round(9), axis=0)
         outward /= np.linalg.norm(outward, axis=1)[:, None]
         overlap = cls((a, b), (turn_a, turn_b), -outward)
-        if not any(isinstance(body.solid, Cylinder) or _many(body.solid) for body in (a, b)):
-            return overlap
         return replace(overlap, directions=np.vstack([overlap.directions, overlap._refined(q)]))
 
     @cached_property

@@ -341,7 +341,6 @@ class _Builder:
             return
         self.pieces.append(Piece(self.time, self.position, self.velocity, acceleration))
         self.position += dt * (self.velocity + 0.5 * acceleration * dt)
-        self.velocity += acceleration * dt
         self.time += dt
 
     def ramp(self, velocity: float, acceleration: float) -> None:

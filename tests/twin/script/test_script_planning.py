@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import random
 
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from flexdt.twin.errors import UnknownNameError
+from flexdt.twin.geometry.conventions import rotation_about
 from flexdt.twin.machine.description import (
     Machine,
     Profile,
@@ -20,6 +22,7 @@ from flexdt.twin.machine.description import (
     parse_machine,
     profile_of,
 )
+from flexdt.twin.scanner.state import Placement
 from flexdt.twin.script import (
     ScanPlan,
     StartState,
@@ -27,6 +30,7 @@ from flexdt.twin.script import (
     plan_poses,
     plan_script,
 )
+from flexdt.twin.script.planning.plan import SampleSize
 from tests.twin.script.conftest import Planner
 
 # FleX-ray, linear axes: 50 mm/s, 50 mm/s2; so a move of d >= 50 mm takes d / 50 + 1 s, a shorter
@@ -418,3 +422,64 @@ def test_another_scanner_is_another_file(profile: Profile) -> None:
     unitom = builtin_machine("unitom_xl")
     plan = plan_script(parse_script("tra_tube move absolute 1 ACK"), unitom, profile)
     assert codes(plan) == [("error", "unknown_component", 1)]
+
+
+@pytest.mark.parametrize(("tube", "panel"), [(-2.0, -0.5), (-0.25, 1.0), (-1.0, 3.0)])
+def test_a_geared_virtual_axis_moves_at_the_pace_of_its_slowest_motor(
+    tube: float, panel: float
+) -> None:
+    """By hand: the axis goes as fast, and speeds up as fast, as each motor's gear lets it."""
+    geared = parse_machine(
+        f'base = "flexray"\n[virtual_axes.ver_obj]\nfactor = {1 / tube}\n'
+        f"moves = {{ ver_tube = {tube}, ver_det = {panel} }}\n"
+    )
+    text = (
+        "ver_tube move absolute 150 no wait\nver_det move absolute 150 ACK\n"
+        "ver_tube set speed 7 ACK\nver_tube set acceleration 5 ACK\nver_obj move absolute {} ACK"
+    )
+    there = 379.998  # any reading; the way is what counts
+    plan = plan_script(parse_script(text.format(there)), geared, profile_of(geared))
+    last = plan.steps[-1]
+    begin, end = (plan.positions(t) for t in (last.start_s, plan.duration_s))
+    way = (end["ver_tube"] - begin["ver_tube"]) / tube
+    start = plan.start
+    pace = min(7.0 / abs(tube), start.speeds["ver_det"] / abs(panel))
+    rate = min(5.0 / abs(tube), start.accelerations["ver_det"] / abs(panel))
+    d = abs(way)
+    expected = d / pace + pace / rate if d > pace**2 / rate else 2 * math.sqrt(d / rate)
+    assert d > 1.0
+    assert last.duration_s == pytest.approx(expected)
+    for t in np.linspace(last.start_s, plan.duration_s, 30).tolist():
+        now = plan.positions(t)
+        gone = [(now[n] - begin[n]) / f for n, f in (("ver_tube", tube), ("ver_det", panel))]
+        assert gone[0] == pytest.approx(gone[1], abs=1e-9)
+
+
+@pytest.mark.parametrize("at", [(0.0, 0.0, 0.0), (3.0, -4.0, 0.0), (-6.0, 2.5, 7.0)])
+@pytest.mark.parametrize("tilted", [False, True])
+def test_the_cylinder_about_a_box_holds_its_corners_at_every_angle(
+    at: tuple[float, float, float], tilted: bool
+) -> None:
+    """Corners of the box, turned about its own middle, shifted, and turned with the stage."""
+    size = np.array([8.0, 5.0, 12.0])
+    tilts = (40.0, 25.0) if tilted else (0.0, 0.0)
+    placed = Placement(*at, rx=tilts[0], ry=tilts[1])
+    found = SampleSize.around(size.tolist(), "mesh", placed)
+    corners = np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * size
+    widest = highest = 0.0
+    for rz in np.radians(np.arange(0.0, 360.0, 0.5)):
+        turned = corners
+        for axis, angle in ((0, math.radians(tilts[0])), (1, math.radians(tilts[1])), (2, rz)):
+            turned = turned @ rotation_about(np.eye(3)[axis], float(angle)).T
+        turned = turned + at
+        widest = max(widest, float(np.hypot(turned[:, 0], turned[:, 1]).max()))
+        highest = max(highest, float(np.abs(turned[:, 2]).max()))
+    assert found.source == "mesh"
+    assert found.diameter_mm >= 2 * widest - 1e-9
+    assert found.height_mm >= 2 * highest - 1e-9
+    if tilted:  # then it holds the ball about the box
+        assert found.diameter_mm == pytest.approx(np.linalg.norm(size) + 2 * math.hypot(*at[:2]))
+        assert found.height_mm == pytest.approx(np.linalg.norm(size) + 2 * abs(at[2]))
+    else:
+        assert found.diameter_mm == pytest.approx(2 * widest, rel=1e-4)
+        assert found.height_mm == pytest.approx(2 * highest)

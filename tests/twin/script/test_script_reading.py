@@ -300,3 +300,19 @@ def test_a_long_line_is_read_in_linear_time_and_its_message_is_short() -> None:
     for filler in ("x" * 2_000_000, " " * 2_000_000, "ACK " * 400_000, "\t" * 500_000):
         for _, problem in enumerate(read_script("tube nonsense " + filler + " end")[1]):
             assert len(problem.message) < 500
+
+
+@pytest.mark.parametrize(
+    "fields", [f for f, *_ in EVERY_COMMAND if "path" not in f[1] and "save" not in f[1]]
+)
+def test_one_argument_more_than_a_command_takes_is_said(fields: tuple[str, ...]) -> None:
+    takes = 2 if fields[1] == "move absolute" else len(fields) - 2
+    if takes == 2:
+        return
+    most = [*fields[2:], "7", "8"][: takes + 1]
+    columns = [*most, "", ""][:2] if takes else ["7", ""]
+    (problem,) = read_script(tabbed(*fields[:2], *columns, "ACK"))[1]
+    said = f"takes {takes or 'no'} argument"
+    assert (problem.code, said in problem.message) == ("syntax", True), problem
+    (problem,) = read_script(" ".join([*fields, "7", "ACK"]))[1]
+    assert problem.code in ("syntax", "value", "roi"), problem
