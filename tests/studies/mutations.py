@@ -1,255 +1,348 @@
 """Small changes to the core that a test must notice: `python tests/studies/mutations.py`.
 
-A mutant is one change of one operator, comparison, condition, constant or sign in one module. Each
-runs in a temporary copy of the code against the tests named for its module in `TESTS`; it is killed
-when a test fails or the run takes too long, and it survives otherwise. Survivors are printed with
-their place, as are those that `mutants_equivalent.toml` explains as equivalent. The draw follows
-from the seed and the code. Exit code 1 when fewer than 95 % of the others are killed.
-Options: --count N, --seed N, --jobs N, --under PATH..., --list, --timeout S.
+Each mutant (see `mutants.py`) runs in a copy of the code against the tests that execute its line,
+in a process forked from this one, which holds the third-party libraries but nothing of flexdt. It
+is killed when a test fails or takes far too long, and it survives otherwise; so do those whose line
+no test executes. Survivors are printed, as are those that `mutants_equivalent.toml` explains as
+equivalent. Exit code 1 when fewer than 95 % of the others are killed.
+
+Which tests execute which lines is found once, with coverage.py, and again for test files that have
+changed; of a source file that has changed, the tests that execute any line of it are taken. Tests
+that fail without any change in the copy, and `slow` ones, do not count. Compiled kernels cannot be
+traced, so files with kernels are not drawn from. Lines and fates are kept in the folder --work: an
+interrupted campaign goes on where it ended, and the draw is the same wherever the code is.
+Options: --count N, --seed N, --jobs N, --under PATH..., --seconds S, --list, --again, --work DIR.
 """
 
 from __future__ import annotations
 
 import argparse
-import ast
-import copy
-import itertools
+import hashlib
+import importlib
+import json
 import os
-import random
+import resource
 import shutil
-import subprocess
+import signal
 import sys
-import tempfile
 import time
 import tomllib
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
-from queue import SimpleQueue
+from typing import Any
+
+import coverage
+import pytest
+from mutants import Mutant, draw, mutants_of, mutated
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("protocol", "twin", "phantoms", "server", "clients", "flexdt")
+PACKAGES = ("protocol", "twin", "phantoms", "server", "clients")
 EQUIVALENT = Path(__file__).with_name("mutants_equivalent.toml")
-WANTED = 0.95
-
-T, S = "tests/twin", "tests/twin/script"
-SCRIPT_TESTS = (
-    f"{S}/test_script_reading.py", f"{S}/test_script_planning.py", f"{S}/test_script_fly.py",
-    f"{S}/test_script_checking.py", f"{T}/test_values.py", f"{T}/test_script_compose.py",
-    f"{S}/test_script_examples.py", f"{S}/test_executed_log.py", f"{S}/test_timing_ranges.py",
+UNDER = ("protocol", "twin/geometry", "twin/machine", "twin/motion", "twin/script", "twin/dataset",
+         "twin/collision")  # fmt: skip
+TESTS = (
+    "protocol/test_*.py", "dataset/test_*.py", "twin/script/test_*.py", "twin/test_[!ceps]*.py",
+    "twin/test_collision_*.py", "twin/test_scanner_*.py", "twin/test_script_*.py",
+    "twin/exchange/test_exchange_r*.py", "twin/calibration/test_calibration_model.py",
+    "twin/projection/test_projection_hard.py",
 )  # fmt: skip
-TESTS: dict[str, tuple[str, ...]] = {
-    "protocol/acquila.py": ("tests/protocol/test_acquila.py",),
-    "protocol": ("tests/protocol",),
-    "twin/geometry": (
-        f"{T}/test_frames.py", f"{T}/test_frames_off_centre.py", f"{T}/test_frames_astra.py",
-        f"{T}/test_geometry_values.py", f"{T}/test_values.py", f"{T}/test_machine.py",
-        f"{T}/exchange/test_exchange_refusals.py", f"{T}/calibration/test_calibration_model.py",
-        f"{T}/projection/test_projection_hard.py",
-    ),
-    "twin/machine": (
-        f"{T}/test_machine.py", f"{T}/test_frames.py", f"{T}/test_frames_off_centre.py",
-        f"{S}/test_script_checking.py", f"{T}/test_scanner_motion.py",
-    ),
-    "twin/motion": (
-        f"{T}/test_braking.py", f"{T}/test_scanner_motion.py", f"{T}/test_motion_properties.py",
-        f"{T}/test_joining.py", f"{T}/test_scanner_safety.py", f"{T}/test_motion_oracle.py",
-    ),
-    "twin/script/compose.py": (f"{T}/test_script_compose.py", f"{S}/test_script_examples.py"),
-    "twin/script": SCRIPT_TESTS,
-    "twin/dataset": (
-        "tests/dataset/test_dataset_texts.py", "tests/dataset/test_dataset_reader.py",
-        "tests/dataset/test_dataset_writer.py", "tests/dataset/test_dataset_independent.py",
-        f"{T}/test_values.py",
-    ),
-    "twin/collision": (
-        f"{T}/test_collision_sweep.py", f"{T}/test_collision_scene.py",
-        f"{T}/test_collision_machine.py", f"{T}/test_collision_use.py",
-        f"{S}/test_script_checking.py", f"{T}/test_scanner_safety.py",
-    ),
-}  # fmt: skip
-"""Module or folder -> the tests that cover it, the quickest first; the longest match counts."""
+"""In `tests/`: what covers the code under mutation and takes seconds, not minutes."""
+LIBRARIES = (
+    "cv2", "fcl", "hypothesis.extra.numpy", "matplotlib", "msgpack", "numba", "pydantic",
+    "pytest_timeout", "rich", "scipy.ndimage", "scipy.optimize", "scipy.spatial", "ssl", "tifffile",
+    "trimesh", "typer", "xdist", "xml.etree.ElementTree", "zarr",
+)  # fmt: skip
+"""What most tests import and no mutant changes: a child begins with it."""
+WANTED = 0.95
+FILE_S = 30.0
+"""Of one test file while its lines are found; tests that come later do not count."""
 
-SWAPS: dict[type[ast.AST], type[ast.AST]] = {
-    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult,
-    ast.FloorDiv: ast.Mult, ast.Mod: ast.Mult, ast.Pow: ast.Mult,
-    ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt,
-    ast.Eq: ast.NotEq, ast.NotEq: ast.Eq, ast.Is: ast.IsNot, ast.IsNot: ast.Is,
-    ast.In: ast.NotIn, ast.NotIn: ast.In, ast.And: ast.Or, ast.Or: ast.And,
-    ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd,
-}  # fmt: skip
-REVERSED = {ast.Lt: ast.GtE, ast.LtE: ast.Gt, ast.Gt: ast.LtE, ast.GtE: ast.Lt}
-NAMES = {"min": "max", "max": "min", "any": "all", "all": "any", "sin": "cos", "cos": "sin"}
-SKIPPED = (ast.JoinedStr, ast.Assert, ast.Import, ast.ImportFrom)
-"""Texts for people and what only the type checker needs."""
+MEMORY = 12 << 30
+"""Address space of a child [bytes]."""
+
+Lines = dict[str, Any]
+"""Of one test file: the seconds of its tests; the tests of each line as bits of a number, where the
+last bit stands for what the whole file does; the files of flexdt that it imports, with digests."""
 
 
-@dataclass(frozen=True)
-class Mutant:
-    """One change: the `choice`-th one of the `node`-th node of a file."""
-
-    file: str
-    node: int
-    choice: int
-    line: int
-    function: str
-    before: str
-    after: str
-
-    def __str__(self) -> str:
-        return f"{self.file}:{self.line} ({self.function}): {self.before}  ->  {self.after}"
-
-
-def variants(node: ast.AST) -> list[ast.AST]:
-    """What a node may become."""
-    out: list[ast.AST] = []
-
-    def changed(**values: object) -> None:
-        other = copy.copy(node)
-        for name, value in values.items():
-            setattr(other, name, value)
-        out.append(other)
-
-    match node:
-        case ast.BinOp(op=op) | ast.BoolOp(op=op) | ast.AugAssign(op=op) if type(op) in SWAPS:
-            changed(op=SWAPS[type(op)]())
-        case ast.Compare(ops=[op]):
-            for table in (SWAPS, REVERSED):
-                if type(op) in table:
-                    changed(ops=[table[type(op)]()])
-        case ast.UnaryOp(op=ast.USub() | ast.Not(), operand=operand):
-            out.append(operand)
-        case ast.Constant(value=bool(value)):
-            changed(value=not value)
-        case ast.Constant(value=int(value)):
-            changed(value=value + 1)
-        case ast.Constant(value=float(value)):
-            changed(value=1.0 if value == 0.0 else value * 1.25)
-        case ast.If(test=test) | ast.While(test=test) | ast.IfExp(test=test):
-            changed(test=ast.UnaryOp(ast.Not(), test))
-        case ast.Call(func=ast.Name(id="abs"), args=[operand]):
-            out.append(operand)
-        case ast.Call(func=ast.Name(id=name)) if name in NAMES:
-            changed(func=ast.Name(NAMES[name], ast.Load()))
-        case ast.Call(func=ast.Attribute(value=owner, attr=name)) if name in NAMES:
-            changed(func=ast.Attribute(owner, NAMES[name], ast.Load()))
-    return out
-
-
-def places(tree: ast.AST, function: str = "module") -> Iterator[tuple[ast.AST, str, ast.AST, str]]:
-    """Every expression and statement that runs: (parent, field, node, function), in order."""
-    for field, value in ast.iter_fields(tree):
-        if field in ("annotation", "returns", "decorator_list", "type_comment"):
-            continue
-        for node in value if isinstance(value, list) else [value]:
-            if not isinstance(node, ast.AST) or isinstance(node, SKIPPED):
-                continue
-            inner = function
-            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-                inner = node.name if function == "module" else f"{function}.{node.name}"
-            if isinstance(tree, ast.Assign | ast.AnnAssign) and _is_type(tree):
-                continue
-            yield tree, field, node, inner
-            yield from places(node, inner)
-
-
-def _is_type(statement: ast.Assign | ast.AnnAssign) -> bool:
-    """Whether a statement names a type, as in `A = B | None`."""
-    value = statement.value
-    return isinstance(value, ast.BinOp | ast.Subscript) and all(
-        isinstance(n, ast.Name | ast.Attribute | ast.Subscript | ast.BinOp | ast.BitOr | ast.Load
-                   | ast.Tuple | ast.Constant)
-        and not (isinstance(n, ast.Name) and not (n.id[:1].isupper() or n.id in ("type", "str",
-                 "int", "float", "bool", "tuple", "list", "dict", "slice", "npt", "np", "bytes")))
-        for n in ast.walk(value)
-    )  # fmt: skip
-
-
-def mutants_of(file: str) -> list[Mutant]:
-    """All mutants of a file, in order."""
-    found = []
-    for index, (_, _, node, function) in enumerate(places(ast.parse((ROOT / file).read_text()))):
-        for choice, other in enumerate(variants(node)):
-            before, after = (_short(n) for n in (node, other))
-            line = getattr(node, "lineno", 0)
-            found.append(Mutant(file, index, choice, line, function, before, after))
-    return found
-
-
-def _short(node: ast.AST) -> str:
-    shown = node.test if isinstance(node, ast.If | ast.While) else node
-    return " ".join(ast.unparse(shown).split())
-
-
-def mutated(mutant: Mutant, text: bytes) -> str:
-    """The text of the mutant's file, made from the original one."""
-    tree = ast.parse(text)
-    parent, field, node, _ = next(itertools.islice(places(tree), mutant.node, None))
-    other = variants(node)[mutant.choice]
-    value = getattr(parent, field)
-    if isinstance(value, list):
-        value[next(i for i, n in enumerate(value) if n is node)] = other
-    else:
-        setattr(parent, field, other)
-    return ast.unparse(ast.fix_missing_locations(tree))
-
-
-def tests_of(file: str) -> tuple[str, ...]:
-    """The tests that cover a file."""
-    best = max((p for p in TESTS if file == p or file.startswith(f"{p}/")), key=len)
-    return TESTS[best]
+def digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
 class Copy:
-    """A copy of the code in which one mutant at a time runs."""
+    """A copy of the code, in which one child at a time works."""
 
     def __init__(self, folder: Path) -> None:
+        """Make the copy, or bring it up to date; what was compiled is kept."""
         self.folder = folder
-        for name in (*PACKAGES, "tests", "examples"):
-            shutil.copytree(ROOT / name, folder / name)
-        shutil.copy2(ROOT / "pyproject.toml", folder)
-        for name in PACKAGES[
-            :-1
-        ]:  # one package, as the wheel has it; it comes before the installed
-            (folder / "flexdt" / name).symlink_to(folder / name)
-        self.environment = {
-            **os.environ,
-            "PYTHONPATH": str(folder),
-            "PYTHONDONTWRITEBYTECODE": "1",
+        wanted = {"pyproject.toml": ROOT / "pyproject.toml"} | {
+            str(path.relative_to(ROOT)): path
+            for name in (*PACKAGES, "flexdt", "tests", "examples")
+            for path in (ROOT / name).rglob("*")
+            if path.is_file() and "__pycache__" not in path.parts
         }
-        used = subprocess.run(
-            [sys.executable, "-c", "import flexdt.twin; print(flexdt.twin.__file__)"],
-            cwd=folder, env=self.environment, capture_output=True, text=True, check=True,
-        ).stdout  # fmt: skip
-        if not used.startswith(str(folder)):
-            raise RuntimeError(f"the tests would import {used.strip()}, not the copy")
+        for path in folder.rglob("*"):
+            name = str(path.relative_to(folder))
+            if path.is_file() and "__pycache__" not in path.parts and name not in wanted:
+                path.unlink()
+        for name, path in wanted.items():
+            there = folder / name
+            if not there.exists() or there.stat().st_mtime_ns != path.stat().st_mtime_ns:
+                there.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(path, there)
+        for name in PACKAGES:  # one package, as the wheel has it
+            link = folder / "flexdt" / name
+            link.unlink(missing_ok=True)
+            link.symlink_to(folder / name)
 
-    def run(self, tests: Sequence[str], timeout: float) -> str:
-        """ "killed", "timeout" or "survived"."""
-        command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider",
-                   "-k", "not linear_time", *tests]  # fmt: skip
-        try:
-            done = subprocess.run(
-                command, cwd=self.folder, env=self.environment, timeout=timeout,
-                stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False,
-            )  # fmt: skip
-        except subprocess.TimeoutExpired:
-            return "timeout"
-        return "killed" if done.returncode else "survived"
-
-    def judge(self, mutant: Mutant, timeout: float) -> str:
-        """What becomes of a mutant."""
+    def put(self, mutant: Mutant) -> None:
+        """Put a mutant in place. Its time differs from all earlier ones, for what is compiled."""
         path = self.folder / mutant.file
-        original, times = path.read_bytes(), path.stat()
-        for compiled in (path.parent / "__pycache__").glob(f"{path.stem}.*.pyc"):
-            compiled.unlink()
-        path.write_text(mutated(mutant, original))
+        self.original = path.read_bytes(), path.stat().st_mtime_ns
+        path.write_text(mutated(mutant, self.original[0].decode()))
+        os.utime(path, ns=(time.time_ns(), time.time_ns() + 10**12))
+
+    def take_back(self, mutant: Mutant) -> None:
+        """Put the original back."""
+        (self.folder / mutant.file).write_bytes(self.original[0])
+        os.utime(self.folder / mutant.file, ns=(self.original[1],) * 2)
+
+
+def in_children(
+    jobs: Iterable[tuple[Any, float]],
+    copies: Iterable[Copy],
+    work: Callable[[Any, Copy], int],
+    before: Callable[[Any, Copy], None] = lambda job, copy: None,
+) -> Iterator[tuple[Any, Copy, int]]:
+    """Do each job, which should take some seconds, in a child; yields what `waitpid` says."""
+    free, live, left = list(copies), dict[int, tuple[Any, Copy, float]](), iter(jobs)
+    try:
+        while True:
+            while free and (job := next(left, None)) is not None:
+                copy = free.pop()
+                before(job[0], copy)
+                pid = os.fork()
+                if pid == 0:
+                    _child(copy, partial(work, job[0], copy))
+                live[pid] = job[0], copy, time.monotonic() + 10 * job[1]
+            if not live:
+                return
+            pid, status = os.waitpid(-1, os.WNOHANG)
+            if pid:
+                job, copy, _ = live.pop(pid)
+                free.append(copy)
+                yield job, copy, status
+                continue
+            for pid, (_, _, end) in live.items():
+                if time.monotonic() > end:
+                    os.killpg(pid, signal.SIGKILL)
+            time.sleep(0.01)
+    finally:
+        for pid in live:
+            os.killpg(pid, signal.SIGKILL)
+
+
+def _child(copy: Copy, work: Callable[[], int]) -> None:
+    """Become a process that works in a copy and ends."""
+    code = 3
+    try:
+        os.setsid()
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        os.chdir(copy.folder)
+        log = os.open("log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(log, 1), os.dup2(log, 2)
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+        os.environ["PYTHONPATH"] = sys.path[0] = str(copy.folder)
+        code = work()
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        os._exit(code)
+
+
+def tests_in(file: str, plugin: object, *options: str) -> int:
+    """Run tests of one file of the copy in this process; pytest's exit code."""
+    return int(pytest.main(
+        ["-q", "-p", "no:cacheprovider", "-W", "ignore::pytest.PytestAssertRewriteWarning",
+         "-m", "not slow and not browser", "-k", "not linear_time", *options, file],
+        plugins=[plugin],
+    ))  # fmt: skip
+
+
+class Chosen:
+    """A plugin: only some tests, the quickest first."""
+
+    def __init__(self, seconds: dict[str, float]) -> None:
+        self.seconds = seconds
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        items[:] = sorted((i for i in items if i.nodeid in self.seconds),
+                          key=lambda i: self.seconds[i.nodeid])  # fmt: skip
+
+
+class Traced:
+    """A plugin: which test executes which lines of the files under mutation."""
+
+    def __init__(self, file: str, folder: Path) -> None:
+        self.file, self.folder = file, folder
+        self.coverage = coverage.Coverage(
+            data_file=None,
+            config_file=False,
+            include=[str(folder / name / "*") for name in ("protocol", "twin")],
+        )
+        self.seconds: dict[str, float] = {}
+        self.failed: set[str] = set()
+        self.test = file
+        self.coverage.start()
+        self.coverage.switch_context(file)
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
+        for module in list(sys.modules.values()):  # what an earlier test left must run again
+            if str(getattr(module, "__file__", "")).startswith(str(self.folder)):
+                for value in list(vars(module).values()):
+                    if hasattr(value, "cache_clear"):
+                        value.cache_clear()
+        self.test = item.nodeid
+        self.coverage.switch_context(self.test)
+        if time.process_time() > FILE_S:
+            item.session.shouldstop = "enough"
         try:
-            return self.run(tests_of(mutant.file), timeout)
+            return (yield)
         finally:
-            path.write_bytes(original)
-            os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
+            self.coverage.switch_context(self.file)
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_fixture_setup(self, fixturedef: Any) -> Any:
+        """What tests share counts for all of the file."""
+        if fixturedef.scope != "function":
+            self.coverage.switch_context(self.file)
+        try:
+            return (yield)
+        finally:
+            self.coverage.switch_context(self.test)
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        self.seconds[report.nodeid] = self.seconds.get(report.nodeid, 0.0) + report.duration
+        if not report.passed:
+            self.failed.add(report.nodeid)
+
+    def result(self) -> Lines:
+        self.coverage.stop()
+        tests = [name for name in self.seconds if name not in self.failed]
+        bit = {name: 1 << i for i, name in enumerate(tests)} | {self.file: 1 << len(tests)}
+        data = self.coverage.get_data()
+        own = {m.__file__ for m in list(sys.modules.values()) if getattr(m, "__file__", None)}
+        used = [Path(os.path.realpath(f)).relative_to(self.folder)
+                for f in own if os.path.realpath(f).startswith(f"{self.folder}/")]  # fmt: skip
+        return {
+            "digests": {str(f): digest(self.folder / f) for f in used if f.suffix == ".py"},
+            "seconds": {name: round(self.seconds[name], 3) for name in tests},
+            "lines": {
+                str(Path(path).relative_to(self.folder)): {
+                    line: hex(sum(bit.get(name, 0) for name in set(names)))
+                    for line, names in data.contexts_by_lineno(path).items()
+                }
+                for path in data.measured_files()
+            },
+        }
+
+
+class Tests:
+    """Which tests execute which lines of the code as it is."""
+
+    def __init__(self, known: Path, copies: list[Copy], digests: dict[str, str]) -> None:
+        self.digests = digests
+        entries: dict[str, Lines] = json.loads(known.read_text()) if known.exists() else {}
+        files = sorted({str(p.relative_to(ROOT)) for t in TESTS for p in (ROOT / "tests").glob(t)})
+        self.entries = {
+            file: entry for file, entry in entries.items()
+            if file in files and entry["digests"].get(file) == digest(ROOT / file)
+        }  # fmt: skip
+        new = [(f, 2 * FILE_S) for f in files if f not in self.entries]
+        for count, (file, copy, status) in enumerate(in_children(new, copies, _trace)):
+            found = copy.folder / "lines.json"
+            if status == 0 and found.exists():
+                self.entries[file] = json.loads(found.read_text())
+            else:
+                print(f"no lines of {file}: {(copy.folder / 'log').read_text()[-2000:]}")
+            tests = len(self.entries.get(file, {"seconds": ()})["seconds"])
+            print(f"lines of {count + 1}/{len(new)} {file}: {tests} tests", flush=True)
+            known.write_text(json.dumps(self.entries))
+        for copy in copies:  # what was compiled in one copy need not be compiled in the next
+            for other in copies:
+                for path in copy.folder.rglob("__pycache__/*.nb?"):
+                    there = other.folder / path.relative_to(copy.folder)
+                    there.parent.mkdir(exist_ok=True)
+                    if not there.exists() or there.stat().st_size < path.stat().st_size:
+                        shutil.copy2(path, there)
+        self.weight = {file: _weight(entry) for file, entry in self.entries.items()}
+
+    def of(self, mutant: Mutant, most_s: float) -> list[tuple[str, dict[str, float]]]:
+        """The tests of a mutant by file, with their seconds, those likely to kill it soon first."""
+        found = []
+        for file, entry in self.entries.items():
+            if mutant.file not in entry["lines"]:
+                continue
+            lines, all_of_file = entry["lines"][mutant.file], 1 << len(entry["seconds"])
+            bits = 0 if mutant.inside else all_of_file
+            same = entry["digests"].get(mutant.file) == self.digests[mutant.file]
+            for line in map(str, mutant.lines) if same else lines:
+                bits |= int(lines.get(line, "0"), 16)
+            chosen = {t: s for i, (t, s) in enumerate(entry["seconds"].items())
+                      if bits & (all_of_file | 1 << i)}  # fmt: skip
+            if chosen:
+                folder = os.path.dirname(mutant.file)
+                weight = self.weight[file].get(folder, 0.0)
+                weight *= 1.0 if bits & (all_of_file - 1) else 0.1
+                found.append((file, chosen, (0.3 + sum(chosen.values())) / (0.01 + weight)))
+        out, left = [], most_s
+        for file, chosen, _ in sorted(found, key=lambda f: f[2]):
+            kept = {}
+            for test, seconds in sorted(chosen.items(), key=lambda t: t[1]):
+                left -= seconds
+                if left > 0:
+                    kept[test] = seconds
+            if kept:
+                out.append((file, kept))
+        return out
+
+
+def _weight(entry: Lines) -> dict[str, float]:
+    """How much of what the tests of a file execute lies in which folder."""
+    shared = 1 << len(entry["seconds"])
+    counts: dict[str, int] = {}
+    for file, lines in entry["lines"].items():
+        called = sum(int(bits, 16) != shared for bits in lines.values())
+        counts[os.path.dirname(file)] = counts.get(os.path.dirname(file), 0) + called
+    return {folder: n / max(1, sum(counts.values())) for folder, n in counts.items()}
+
+
+def _trace(file: str, copy: Copy) -> int:
+    """Find the lines of a test file; twice where kernels had to be compiled first."""
+    sys.dont_write_bytecode = False
+    found = copy.folder / "lines.json"
+    found.unlink(missing_ok=True)
+    traced = Traced(file, copy.folder)
+    tests_in(file, traced)
+    found.write_text(json.dumps(traced.result()))
+    return 0
+
+
+def judge(job: tuple[Mutant, list[tuple[str, dict[str, float]]]], copy: Copy) -> int:
+    """1 as soon as a test fails; a file that takes far too long ends the process."""
+    sys.dont_write_bytecode = True
+    os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
+    for file, seconds in job[1]:
+        signal.setitimer(signal.ITIMER_PROF, 10.0 + 3 * sum(seconds.values()))
+        if tests_in(file, Chosen(seconds), "-x") not in (0, 5):
+            return 1
+    return 0
 
 
 def equivalents() -> dict[tuple[str, str, str, str], str]:
@@ -258,63 +351,96 @@ def equivalents() -> dict[tuple[str, str, str, str], str]:
     return {(m["file"], m["function"], m["before"], m["after"]): m["why"] for m in table}
 
 
+def fate_of(mutant: Mutant, status: int, known: dict[tuple[str, str, str, str], str]) -> str:
+    """What the end of a child means."""
+    if os.WIFSIGNALED(status):
+        late = os.WTERMSIG(status) in (signal.SIGPROF, signal.SIGKILL)
+        return "timeout" if late else "killed"
+    if status:
+        return "killed"
+    return "equivalent" if mutant.name[:4] in known else "survived"
+
+
+def share(fates: Iterable[str]) -> float:
+    """Of the mutants that differ, how many are killed."""
+    counts = Counter(fates)
+    differ = counts.total() - counts["equivalent"]
+    return (counts["killed"] + counts["timeout"]) / max(1, differ)
+
+
+def table(fates: dict[Mutant, str]) -> str:
+    """Fates by folder."""
+    folders = {m: m.file.rsplit("/", 1)[0] for m in fates}
+    rows = []
+    for name in (*sorted(set(folders.values())), ""):
+        its = Counter(fate for m, fate in fates.items() if folders[m].startswith(name))
+        words = ", ".join(f"{its[f]} {f}" for f in ("killed", "timeout", "survived", "equivalent"))
+        rows.append(f"{name or 'all':24} {words}: {100 * share(its.elements()):.1f} %")
+    return "\n".join(rows)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=14)
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--timeout", type=float, default=300.0, help="of one mutant [s]")
-    parser.add_argument("--under", nargs="*", default=[p for p in TESTS if "." not in p])
-    parser.add_argument("--trust", action="store_true", help="skip the run without any change")
+    parser.add_argument("--under", nargs="*", default=UNDER)
+    parser.add_argument("--seconds", type=float, default=40.0, help="of tests for one mutant")
     parser.add_argument("--list", action="store_true", help="print the draw, run nothing")
+    parser.add_argument("--again", action="store_true", help="judge known survivors once more")
+    parser.add_argument("--work", type=Path, default=ROOT / "build" / "mutations")
     options = parser.parse_args()
     files = sorted(
-        {
-            str(path.relative_to(ROOT))
-            for under in options.under
-            for path in ([ROOT / under] if under.endswith(".py") else (ROOT / under).rglob("*.py"))
-        }
-    )
-    everything = [m for file in files for m in mutants_of(file)]
-    count = min(options.count, len(everything))
-    drawn = random.Random(options.seed).sample(everything, count)
-    print(f"{count} of {len(everything)} mutants in {len(files)} files, seed {options.seed}")
+        str(path.relative_to(ROOT)) for under in options.under
+        for path in ([ROOT / under] if under.endswith(".py") else (ROOT / under).rglob("*.py"))
+        if "numba" not in path.read_text()
+    )  # fmt: skip
+    everything = [m for file in files for m in mutants_of(file, (ROOT / file).read_text())]
+    digests = {file: digest(ROOT / file) for file in files}
+    drawn = draw(everything, options.count, options.seed)
+    print(f"{len(drawn)} of {len(everything)} mutants in {len(files)} files, seed {options.seed}")
     if options.list:
         print("\n".join(str(m) for m in drawn))
         return 0
-    known = equivalents()
+    for threads in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ[threads] = "1"
+    for library in LIBRARIES:
+        importlib.import_module(library)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # children end with this process
+    begun, known = time.monotonic(), equivalents()
+    copies = [Copy(options.work / f"copy-{i}") for i in range(options.jobs)]
+    tests = Tests(options.work / "lines.json", copies, digests)
+    book = options.work / "fates.jsonl"
+    earlier = {}
+    for line in book.read_text().splitlines() if book.exists() else ():
+        name, code, fate = json.loads(line)
+        earlier[(*name, code)] = fate
     fates: dict[Mutant, str] = {}
-    begun = time.monotonic()
-    with tempfile.TemporaryDirectory(prefix="flexdt-mutants-") as folder:
-        copies: SimpleQueue[Copy] = SimpleQueue()
-        for i in range(options.jobs):
-            copies.put(Copy(Path(folder) / str(i)))
-        first = copies.get()
-        for tests in [] if options.trust else sorted({tests_of(m.file) for m in drawn}):
-            if first.run(tests, 10 * options.timeout) != "survived":
-                print(f"the tests fail without any change: {' '.join(tests)}")
-                return 1
-        copies.put(first)
-
-        def judge(mutant: Mutant) -> None:
-            place = copies.get()
-            try:
-                fates[mutant] = place.judge(mutant, options.timeout)
-            finally:
-                copies.put(place)
-            if fates[mutant] == "survived":
-                why = known.get((mutant.file, mutant.function, mutant.before, mutant.after))
-                fates[mutant] = "survived" if why is None else "equivalent"
-                print(f"{fates[mutant]}: {mutant}", f"({why})" if why else "", flush=True)
-
-        with ThreadPoolExecutor(options.jobs) as pool:
-            list(pool.map(judge, drawn))
-    totals = {f: sum(v == f for v in fates.values())
-              for f in ("killed", "timeout", "equivalent", "survived")}  # fmt: skip
-    share = (totals["killed"] + totals["timeout"]) / max(1, count - totals["equivalent"])
-    print(", ".join(f"{n} {fate}" for fate, n in totals.items()), end="; ")
-    print(f"{100 * share:.1f} % of those that differ killed in {time.monotonic() - begun:.0f} s")
-    return 0 if share >= WANTED else 1
+    for mutant in drawn:
+        fate = earlier.get((*mutant.name, digests[mutant.file]))
+        if fate is not None and not (options.again and fate == "survived"):
+            fates[mutant] = fate_of(mutant, 0, known) if fate == "survived" else fate
+    print(f"{len(fates)} are known, after {time.monotonic() - begun:.0f} s", flush=True)
+    chosen = [(m, tests.of(m, options.seconds)) for m in drawn if m not in fates]
+    jobs = [((m, t), 60.0 + 10 * sum(sum(f.values()) for _, f in t)) for m, t in chosen]
+    ran = in_children(jobs, copies, judge, lambda job, copy: copy.put(job[0]))
+    with book.open("a") as written:
+        for count, ((mutant, _), copy, status) in enumerate(ran, 1):
+            copy.take_back(mutant)
+            fate = fates[mutant] = fate_of(mutant, status, known)
+            shown = "survived" if fate == "equivalent" else fate
+            written.write(json.dumps([mutant.name, digests[mutant.file], shown]) + "\n")
+            written.flush()
+            if fate in ("survived", "equivalent"):
+                print(f"{fate}: {mutant} {known.get(mutant.name[:4], '')}", flush=True)
+            if count % 50 == 0:
+                print(f"{len(fates)} of {len(drawn)}: {100 * share(fates.values()):.1f} % killed "
+                      f"after {time.monotonic() - begun:.0f} s", flush=True)  # fmt: skip
+    for mutant, fate in fates.items():
+        if fate == "survived" and not any(m == mutant for m, _ in chosen):
+            print(f"survived: {mutant}")
+    print(table(fates), f"after {time.monotonic() - begun:.0f} s")
+    return 0 if share(fates.values()) >= WANTED else 1
 
 
 if __name__ == "__main__":
