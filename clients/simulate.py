@@ -155,7 +155,7 @@ def simulate(
         voxel_mm: edge of an array's voxels [mm].
         rays: along each side of a pixel, 1 to 16; their signals are averaged, as a pixel does.
             With one, the default but for scenarios (3), edges along rows or columns come out in
-            steps, which `align` takes for a roll of the panel.
+            steps, of which `align` has wider sigmas.
 
     Returns:
         The data set in memory; its `truth` is what lies behind it.

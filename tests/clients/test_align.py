@@ -160,6 +160,58 @@ def test_a_ramp_of_the_flat_field_and_missing_frames_do_not_mislead(
         assert np.abs(pulls(lost, scanner)).max() < 4  # the stage missed a step
 
 
+@pytest.mark.parametrize("rays", [1, 3])
+def test_flat_ends_along_the_rows_in_images_of_few_rays_a_pixel_do_not_mislead(
+    rays: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(globals(), "SHAPE", (64, 80))
+    monkeypatch.setitem(globals(), "PITCH", 0.7)
+    off = []
+    for seed in (*range(3, 6), *range(8, 14)):
+        rng = np.random.default_rng([181, seed])
+        scanner = Scanner.drawn(rng)
+        scanner.pitch, scanner.yaw = 0.0, 0.0  # leave the ends along the rows
+        scanner.roll = math.radians(rng.normal(0, 0.4))
+        size = rng.uniform((14, 9, 9), (20, 16, 13))
+        middle = np.array([*rng.uniform(-2, 2, 2), rng.uniform(-0.4, 0.4) - size[2] / 2])
+        lines = box_lines(scanner, middle - size / 2, middle + size / 2, rays)
+        found = data_set(lines, DEGREES, 1.5e4, rng).align()
+        if found.identifiable:
+            off.append(pulls(found, scanner))
+    assert len(off) >= 6
+    assert np.abs(off).max() < 4
+    assert (np.sqrt(np.mean(np.square(off), axis=0)) < 1.7).all()
+
+
+def box_lines(scanner: Scanner, low: np.ndarray, high: np.ndarray, rays: int) -> np.ndarray:
+    """Line integrals of a box of 0.02 1/mm; the mean over rays x rays a pixel, (n, rows, cols)."""
+    centre, u, v = scanner.panel()
+    fine = [(np.arange(n * rays) + 0.5) / rays - n / 2 for n in SHAPE[::-1]]
+    c, r = np.meshgrid(*fine)
+    ray = centre + c[..., None] * u + r[..., None] * v
+    out = []
+    for angle in np.radians(DEGREES):
+        turn = np.array([[math.cos(angle), -math.sin(angle), 0],
+                         [math.sin(angle), math.cos(angle), 0], [0, 0, 1]])  # fmt: skip
+        start, way = turn @ -np.array([scanner.axis_x, SOD, 0]), ray @ turn.T
+        ends = np.stack([(low - start) / way, (high - start) / way])
+        inside = ends.max(axis=0).min(axis=-1) - ends.min(axis=0).max(axis=-1)
+        chord = np.maximum(inside, 0) * np.linalg.norm(ray, axis=-1)
+        out.append(0.02 * chord.reshape(SHAPE[0], rays, SHAPE[1], rays).mean(axis=(1, 3)))
+    return np.array(out)
+
+
+def test_a_round_body_that_turns_back_is_no_repeated_frame(
+    scans: list[tuple[Scanner, np.ndarray]],
+) -> None:
+    scanner, degrees = scans[0][0], np.arange(120) * 3.0
+    rod = np.array([[9.0, 4.0, 0, 11, 11, 21, 0.02]])
+    lines = scanner.lines(rod, np.radians(degrees))
+    found = data_set(lines, degrees, 1.5e4, np.random.default_rng(3)).align()
+    assert not found.warnings
+    assert np.abs(pulls(found, scanner)).max() < 4
+
+
 def test_an_exact_copy_of_a_frame_is_left_out_by_name(
     scans: list[tuple[Scanner, np.ndarray]],
 ) -> None:

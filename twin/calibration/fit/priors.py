@@ -41,7 +41,7 @@ def prior_widths(
     It is the profile's where that states one, else the machine's, else the assumed one.
 
     >>> prior_widths()["dD_z"]
-    2.0
+    1.0
     """
     out = dict(ASSUMED)
     for stated in (machine, profile):

@@ -8,7 +8,9 @@ The map is a homography of the panel.
 The estimate is the root of Z' W r: r is the mean minus its mirror image, Z the slopes of a smoother
 copy, freed of what a flat field that is wrong by a polynomial of third degree would add. Noise in Z
 is also in r, which would shorten the steps and the sigma: what white noise of the variance seen
-in the mean (photons and flat field) contributes to Z' W r is subtracted.
+in the mean (photons and flat field) contributes to Z' W r is subtracted. Edges that lie along rows
+or columns, and are so sharp that sampling puts them into steps, count less, and their steps are in
+the sigma: a flat end of an object, seen without blur, would be taken for an axis that is upright.
 """
 
 from __future__ import annotations
@@ -31,6 +33,10 @@ LEVELS: Final = (64, 128, 256)
 """Columns over the smoothing's sigma, coarse to fine."""
 BLOCKS: Final = 16
 """Blocks of rows, and of columns, whose scatter is compared with what the noise makes of it."""
+NEAR_PX: Final = 2.0
+"""Edges along rows and columns are looked for in neighbourhoods of this width [px]."""
+SEEN: Final = 3.0
+"""And are some from so many standard deviations of the noise on."""
 ROUNDS: Final = 15
 REACH: Final = 0.12
 """The axis is looked for so far from its nominal column, as a share of the columns."""
@@ -149,6 +155,9 @@ class _Level:
         change = np.diff(np.pad(turn.mean, ((0, 0), (1, 1)), mode="reflect"), 2, axis=1)
         self.pixel = np.square(change) / 6
         self.white = gaussian_filter(self.pixel, 2.0 * sigma, mode="nearest")
+        noise = gaussian_filter(self.pixel, NEAR_PX, mode="nearest")
+        steps = (_steps(turn.mean, noise), _steps(turn.mean.T, noise.T).T)
+        self.steps = [gaussian_filter(i, sigma, mode="nearest") for i in steps]
         self.margin = 2.0 * sigma
         stride = max(1, round(sigma / 2))
         c, r = (
@@ -214,9 +223,12 @@ class _Pairs:
         self.level, self.here, self.at = level, here, at
         image = self.image = level._mirrored(here, at)
         variance = sum(map_coordinates(level.relative, p[::-1], order=1) for p in (at, image))
-        w = self.w = 1.0 / np.asarray(variance)
         self.own = [_read(soft, at) for soft in level.soft]
         self.white = [map_coordinates(level.white, p[::-1], order=1) for p in (at, image)]
+        self.steps = [map_coordinates(i, at[::-1], order=1) for i in level.steps]
+        noise = sum(self.white) / (4.0 * math.pi * level.sigma**2)
+        doubt = 1.0 + np.square(self.steps).sum(axis=0) / np.maximum(noise, 1e-30)
+        w = self.w = 1.0 / np.asarray(variance * doubt)
         self.odd = self._polynomials(at) - self._polynomials(image)
         self.to_odd = np.linalg.pinv((self.odd.T * w) @ self.odd) @ (self.odd.T * w)
         self.ends = []
@@ -279,7 +291,8 @@ class _Pairs:
             self.slopes / np.linalg.norm(self.slopes * np.sqrt(self.w)[:, None], axis=0)
         ).sum(axis=1)  # fmt: skip
         covariance = inverse @ noise @ inverse.T
-        for place in (self.at[1], self.at[0]):
+        stepped = np.zeros(len(noise))
+        for place, steps in zip((self.at[1], self.at[0]), self.steps, strict=True):
             order = np.argsort(place, kind="stable")
             share = np.cumsum(weight[order]) / weight.sum()
             block = np.minimum(share * BLOCKS, BLOCKS - 1).astype(np.intp)
@@ -288,7 +301,11 @@ class _Pairs:
             free = BLOCKS - 1 - len(noise)
             scatter = inverse @ (sums.T @ sums) @ inverse.T * (BLOCKS / free)
             wider = np.maximum(wider, np.diag(scatter) / np.diag(covariance))
-        covariance = covariance * np.sqrt(np.outer(wider, wider))
+            # An edge may be off in the same way all along: what it does adds up.
+            off = np.abs(inverse @ z.T) * steps
+            edge = (place / (6.0 * math.hypot(self.level.sigma, NEAR_PX))).astype(np.intp)
+            stepped += [np.square(np.bincount(edge, o)).sum() for o in off]
+        covariance = covariance * np.sqrt(np.outer(wider, wider)) + np.diag(stepped)
         for i in range(1, len(self.own)):
             shift = inverse @ (z.T @ self._residual(self.here, i))
             shift /= 2.0 if i == 1 else 1.0  # lack of views: half of what half of them lack
@@ -313,6 +330,25 @@ class _Pairs:
         return np.asarray(
             gaussian_filter(out.reshape(rows, cols), self.level.sigma, mode="nearest")
         )
+
+
+def _steps(mean: FloatArray, noise: FloatArray) -> FloatArray:
+    """Standard deviation of what sampling does to edges along the rows, (rows, cols).
+
+    Pixels that are points know an edge between two of them to half a row; blur and a pixel's size
+    spread it over several. An edge without blur has all frequencies alike, so what is left of
+    them at half the sampling's, relative to a quarter, tells what is left at the sampling's own.
+    """
+    change = np.diff(mean, axis=0, append=mean[-1:])
+
+    def at(turn: float) -> FloatArray:
+        wave = np.exp(1j * turn * np.arange(len(mean)))[:, None]
+        return np.asarray(np.abs(gaussian_filter(change * wave, NEAR_PX, mode="nearest")))
+
+    half, quarter = at(np.pi), at(np.pi / 2)
+    seen = np.square(quarter) > SEEN**2 * noise / (2.0 * math.pi * NEAR_PX**2)
+    left = min(1.0, half[seen].sum() / max(quarter[seen].sum(), 1e-30))
+    return np.asarray(np.where(seen, quarter, 0.0) * left**2 / math.sqrt(6.0))
 
 
 def _read(coefficients: FloatArray, at: FloatArray) -> FloatArray:
