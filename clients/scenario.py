@@ -122,12 +122,12 @@ class ScenarioImages:
         """Energy in each pixel of one frame [keV], and its variance, before the detector blurs."""
         scan, n = self.scan, self._rays if samples else 1
         beam = self._beams[scan.spectrum_of[frame]]
-        mean, spread = (np.zeros(scan.shape, np.float32) for _ in range(2))
+        # In double precision: rays that meet nothing then average to the open beam's very value.
+        sums: list[Any] = [np.zeros(scan.shape) for _ in range(2)]
         for k in range(n * n):
-            for total, one in zip(
-                (mean, spread), beam.transmit(self._paths(frame, k, samples)), strict=True
-            ):
-                total += one / np.float32(n * n)
+            for total, one in zip(sums, beam.transmit(self._paths(frame, k, samples)), strict=True):
+                total += one
+        mean, spread = ((total / n**2).astype(np.float32) for total in sums)
         view = scan.views[frame]
         u, v = (float(np.linalg.norm(view[i : i + 3])) for i in (6, 9))
         spot = [spot_blur_px(view, one * FWHM) for one in scan.spot_mm]
@@ -375,10 +375,11 @@ def _made_of(substance: Substance) -> Material:
 
 
 def within_pixels(rows: FloatArray, rays: int) -> FloatArray:
-    """Views whose pixels' centres are the middles of rays x rays parts of the pixels of each view,
-    (n * rays^2, 12)."""
-    steps = (np.arange(rays) + 0.5) / rays - 0.5
-    down, across = (one.ravel()[:, None] for one in np.meshgrid(steps, steps, indexing="ij"))
+    """Views through a point in each of rays x rays parts of the pixels of each view, (n * rays^2,
+    12): no two in one row or column, so that edges along them come out in rays^2 steps."""
+    j, i = np.divmod(np.arange(rays**2)[:, None], rays)
+    across = (i + (j + 0.5) / rays) / rays - 0.5
+    down = (j + (rays - i - 0.5) / rays) / rays - 0.5
     out = np.repeat(rows[:, None], rays**2, axis=1)
     out[:, :, 3:6] += across * rows[:, None, 6:9] + down * rows[:, None, 9:12]
     return out.reshape(-1, 12)

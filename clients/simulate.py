@@ -27,7 +27,15 @@ from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.physics.apparatus import Detector, Tube
-from flexdt.twin.physics.chain import Chain, Expected, expected_signal, flux_of, read_out
+from flexdt.twin.physics.chain import (
+    Chain,
+    Expected,
+    expected_signal,
+    flux_of,
+    read_out,
+    spot_blur_px,
+    spot_views,
+)
 from flexdt.twin.physics.exposure import Counts, ExposureSettings, frame_rng
 from flexdt.twin.physics.panel import Panel, panel_of
 from flexdt.twin.physics.radiograph import Radiograph, radiographs
@@ -45,6 +53,9 @@ from flexdt.twin.projection.operators import as_cone_vec
 
 BATCH_BYTES: Final = 64 << 20
 """Path lengths in memory at a time."""
+MOST_POINTS: Final = 1024
+DOUBTED_PX: Final = 0.25
+"""Difference of the spot's blur over a sample from which it is worth a warning [pixels]."""
 SAME_PITCH: Final = 1e-6
 """Relative difference of pitches that count as equal."""
 
@@ -63,6 +74,7 @@ class Truth:
         parts: the materials and where they are.
         scatter: of each view, in units of the open beam; None where none was simulated.
         rays: along each side of a pixel.
+        spot_points: of the focal spot; 1 for one blur of the whole image.
     """
 
     sample: Phantom
@@ -74,6 +86,7 @@ class Truth:
     parts: tuple[Channel, ...]
     scatter: ScanScatter | None = None
     rays: int = 1
+    spot_points: int = 1
 
     def __repr__(self) -> str:
         return f"<Truth: {self.sample.name!r}, {len(self.geometry)} views>"
@@ -102,16 +115,23 @@ class Truth:
     def radiographs(self) -> Iterator[Radiograph]:
         """What the X-rays of each view do to the panel, without noise."""
         rows, cols = self.camera.shape
-        moments = self.rays**2
+        chain, moments = self.chain, self.rays**2 * self.spot_points
+        spot_mm = chain.tube.focal_spot_mm(self.exposure.power_W)
+        if self.spot_points > 1:
+            sharp = replace(chain.tube, spot_mm_per_W=0.0, smallest_spot_mm=0.0)
+            chain = replace(chain, tube=sharp)
         each = max(1, BATCH_BYTES // (4 * rows * cols * moments * max(1, len(self.parts))))
         for start in range(0, len(self.geometry), each):
             views = slice(start, min(start + each, len(self.geometry)))
             exposures = [self.exposure] * (views.stop - views.start)
             known = self.scatter
             added = [] if known is None else [known[i] for i in range(views.start, views.stop)]
-            cone = within_pixels(self.geometry.rows[views], self.rays)
+            cone = self.geometry.rows[views]
+            if self.spot_points > 1:
+                cone = spot_views(cone, spot_mm, self.spot_points)
+            cone = within_pixels(cone, self.rays)
             yield from radiographs(
-                self.chain, self._paths(ConeVec(cone)), cone, exposures, moments, added
+                chain, self._paths(ConeVec(cone)), cone, exposures, moments, added
             )
 
     def line_integrals(self) -> Float32Array:
@@ -132,6 +152,7 @@ def simulate(
     material: str | Mapping[int, str] | None = None,
     voxel_mm: float | Vector | None = None,
     rays: int | None = None,
+    spot_points: int = 1,
 ) -> DataSet:
     """Simulate a scan: counts, dark and flat images of a sample.
 
@@ -156,6 +177,10 @@ def simulate(
         rays: along each side of a pixel, 1 to 16; their signals are averaged, as a pixel does.
             With one, the default but for scenarios (3), edges along rows or columns come out in
             steps, of which `align` has wider sigmas.
+        spot_points: of the focal spot from which rays start, 3 to 1024; their signals are averaged,
+            and each depth of the sample is blurred as it is. With 1 all are blurred as the rotation
+            axis is, and the data set warns where that matters. Ghosts of edges stay where the blur
+            [pixels] is more than about a quarter of the points.
 
     Returns:
         The data set in memory; its `truth` is what lies behind it.
@@ -172,7 +197,8 @@ def simulate(
     """
     if geometry is None:
         given = (tube, detector, machine, shape, material, voxel_mm)
-        if not isinstance(sample, str | os.PathLike) or scatter != "off" or given != (None,) * 6:
+        other = scatter != "off" or spot_points != 1 or given != (None,) * 6
+        if not isinstance(sample, str | os.PathLike) or other:
             raise GeometryError(
                 "no geometry; allowed without one: the path of a CTSimU scenario, and noise",
                 {"asked": None},
@@ -189,6 +215,11 @@ def simulate(
     if rays not in range(1, MOST_RAYS + 1):
         raise LimitError(
             f"rays is {rays}; allowed: 1 to {MOST_RAYS}", {"asked": rays, "allowed": [1, MOST_RAYS]}
+        )
+    if spot_points != 1 and spot_points not in range(3, MOST_POINTS + 1):
+        raise LimitError(
+            f"spot_points is {spot_points}; allowed: 1, or 3 to {MOST_POINTS}",
+            {"asked": spot_points, "allowed": [1, 3, MOST_POINTS]},
         )
     cone = as_cone_vec(geometry)
     size = cone.of_shape(shape)
@@ -207,7 +238,9 @@ def simulate(
             how = ScatterSettings(kind=how, seed=noise or 0)
         grid = scatter_object(parts, phantom.size_mm, how.voxels)
         scattered = scan_scatter(grid, cone.rows, size, Beam.of(chain, exposure.kV), how)
-    truth = Truth(phantom, cone, chain, exposure, camera, noise, parts, scattered, rays)
+    truth = Truth(
+        phantom, cone, chain, exposure, camera, noise, parts, scattered, rays, spot_points
+    )
 
     def read(number: int, expected: Expected, lit: ExposureSettings = exposure) -> Counts:
         rng = None if noise is None else frame_rng(noise, number)
@@ -221,7 +254,7 @@ def simulate(
     for i, image in enumerate(truth.radiographs()):
         assert image.expected is not None
         counts[i] = read(2 + i, image.expected)
-    warnings = (*truth.assumed, *_flat_doubts(flat, panel, cone))
+    warnings = (*truth.assumed, *_flat_doubts(flat, panel, cone), *_spot_doubt(truth))
     made = DataSet.from_arrays(
         counts, cone, dark=dark, flat=flat, name=phantom.name, warnings=warnings, truth=truth
     )
@@ -297,6 +330,20 @@ def _flat_doubts(flat: Counts, panel: Panel, cone: ConeVec) -> Iterator[str]:
         yield (
             "the flat image is that of the first view; the open beam of other views differs by up "
             f"to {100.0 * worst:.2g} %"
+        )
+
+
+def _spot_doubt(truth: Truth) -> Iterator[str]:
+    """One blur holds for a sample of little depth."""
+    spot_mm = truth.chain.tube.focal_spot_mm(truth.exposure.power_W)
+    half = 0.5 * float(np.hypot(*truth.sample.size_mm[:2]))
+    view = truth.geometry.rows[0]
+    far, axis, near = (spot_blur_px(view, spot_mm, at) for at in (-half, 0.0, half))
+    if truth.spot_points == 1 and near - far > DOUBTED_PX:
+        yield (
+            f"the focal spot blurs the whole sample by {axis:.2g} pixels (standard deviation), "
+            f"really by {far:.2g} to {near:.2g}, from its far side to its near one: spot_points="
+            f"{max(16, 4 * int(np.ceil(min(near, 200.0))))} has each depth as it is"
         )
 
 

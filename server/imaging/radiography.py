@@ -113,7 +113,12 @@ class Radiography:
     @property
     def remembers(self) -> bool:
         """Whether a frame depends on earlier frames."""
-        return self.physics != "ideal" and self.panel.lag_fraction > 0.0
+        return self.physics != "ideal" and (self.panel.lag_fraction > 0.0 or self.traps)
+
+    @property
+    def traps(self) -> bool:
+        """Whether it depends on all of them."""
+        return self.physics != "ideal" and self.panel.long_lag_fraction > 0.0
 
     def record(self) -> Mapping[str, float]:
         """The figures of detector and tube by name, for data sets."""
@@ -126,6 +131,8 @@ class Radiography:
         figures: dict[str, float] = {f"physics_{self.physics}": 1.0}
         for name in self.panel.__dataclass_fields__:
             value = getattr(self.panel, name)
+            if name.startswith("long_lag") and not self.traps:
+                continue  # as before there was any, so that older scans go on
             if isinstance(value, tuple):
                 high, low = value
                 figures |= {f"{name}_high": float(high), f"{name}_low": float(low)}
@@ -231,6 +238,7 @@ class Radiography:
         exposure: ExposureSettings,
         rng: np.random.Generator | None,
         before: Before = (),
+        trapped: Float32Array | None = None,
     ) -> Counts:
         """What the camera saves of a radiograph, uint16 (rows, cols)."""
         expected = radiograph.expected
@@ -244,4 +252,4 @@ class Radiography:
             for earlier, gap in before
             if earlier.expected is not None
         ]
-        return read_out(self.panel, expected, camera, exposure, rng, left)
+        return read_out(self.panel, expected, camera, exposure, rng, left, trapped)

@@ -24,7 +24,9 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.server.imaging.radiography import FORGOTTEN_S, Before, Radiography
+from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.kinematics import motor_poses
+from flexdt.twin.physics.chain import trapped_after
 from flexdt.twin.physics.exposure import ExposureSettings, frame_rng
 from flexdt.twin.physics.radiograph import Radiograph
 from flexdt.twin.scanner.state import Sample
@@ -65,6 +67,9 @@ class Acquisition:
     shown: Shown | None = None
     _recent: dict[int, Radiograph] = field(default_factory=dict, init=False)
     """Images by index that later frames may ask for."""
+    _trapped: dict[int, Float32Array] = field(default_factory=dict, init=False)
+    """By index of a frame, the charge in the panel's traps when it starts."""
+    _trapping: asyncio.Lock = field(default_factory=asyncio.Lock, init=False)
 
     async def produce(self, batch: Sequence[Exposure]) -> None:
         """Make and store frames that share camera settings.
@@ -78,7 +83,8 @@ class Acquisition:
         else:
             images = [self.radiography.dark(batch[0].camera)] * len(batch)
         before = [await self._before(frame) for frame in batch]
-        await asyncio.to_thread(self._store, batch, images, before)
+        trapped = [await self._traps(frame) for frame in batch]
+        await asyncio.to_thread(self._store, batch, images, before, trapped)
         if self.shown is not None and batch[-1].xrays_on:
             self.shown(batch[-1], images[-1])
 
@@ -105,11 +111,36 @@ class Acquisition:
             earlier = self.plan.exposures[index]
             gap = frame.start_s - earlier.start_s - earlier.duration_s
             if earlier.xrays_on and earlier.camera == frame.camera and gap < FORGOTTEN_S:
-                image = self._recent.get(index)
-                if image is None:
-                    image = (await self._take([earlier]))[0]
-                found.append((image, gap))
+                found.append((await self._image(earlier), gap))
         return found
+
+    async def _image(self, frame: Exposure) -> Radiograph:
+        """Of a frame with X-rays on; made anew if it is not at hand."""
+        image = self._recent.get(frame.index)
+        return (await self._take([frame]))[0] if image is None else image
+
+    async def _traps(self, frame: Exposure) -> Float32Array | None:
+        """Charge in the panel's traps when a frame starts, from the first frame on, so that it is
+        the same wherever a scan was cut. Empty after a change of the camera's settings.
+        """
+        if not self.radiography.traps:
+            return None
+        async with self._trapping:
+            at = max((i for i in self._trapped if i <= frame.index), default=0)
+            charge = self._trapped.get(at, np.zeros(self.plan.exposures[at].camera.shape, "f4"))
+            for index in range(at, frame.index):
+                now, later = self.plan.exposures[index : index + 2]
+                if now.camera != later.camera:
+                    charge = np.zeros(later.camera.shape, np.float32)
+                else:
+                    lit = (await self._image(now)).expected if now.xrays_on else None
+                    gap = later.start_s - now.start_s - now.duration_s
+                    charge = trapped_after(
+                        self.radiography.panel, charge, lit, settings_of(now), max(gap, 0.0)
+                    )
+                self._trapped[index + 1] = charge
+                self._trapped.pop(index + 1 - RECENT, None)
+            return charge
 
     async def _project(self, batch: Sequence[Exposure]) -> list[Radiograph]:
         """One view a frame, or several of one frame that is taken in motion."""
@@ -138,12 +169,17 @@ class Acquisition:
         return self.plan.subframe_positions(self.moments)
 
     def _store(
-        self, batch: Sequence[Exposure], images: Sequence[Radiograph], before: Sequence[Before]
+        self,
+        batch: Sequence[Exposure],
+        images: Sequence[Radiograph],
+        before: Sequence[Before],
+        trapped: Sequence[Float32Array | None],
     ) -> None:
-        for frame, image, earlier in zip(batch, images, before, strict=True):
+        for frame, image, earlier, traps in zip(batch, images, before, trapped, strict=True):
             assert frame.file is not None
             rng = None if self.seed is None else frame_rng(self.seed, self._numbers[frame.file])
-            counts = self.radiography.counts(image, frame.camera, settings_of(frame), rng, earlier)
+            settings = settings_of(frame)
+            counts = self.radiography.counts(image, frame.camera, settings, rng, earlier, traps)
             self.put(frame.file, counts)
 
 

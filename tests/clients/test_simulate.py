@@ -114,10 +114,10 @@ def test_a_pixel_averages_the_signals_of_its_rays() -> None:
     mu = Substance.of("Al", "Al", 2.70).attenuation()[np.searchsorted(tables().energy_keV, 60.2)]
     for image, row in zip(transmission(scan), cone.rows, strict=True):
         expected = np.zeros(SHAPE)
-        for down in (-1, 0, 1):
-            for across in (-1, 0, 1):
+        for j in (-1, 0, 1):
+            for i in (-1, 0, 1):
                 moved = row.copy()
-                moved[3:6] += across / 3 * row[6:9] + down / 3 * row[9:12]
+                moved[3:6] += (3 * i + j) / 9 * row[6:9] + (3 * j - i) / 9 * row[9:12]
                 expected += np.exp(-mu * chord(moved, centre, radius)) / 9
         np.testing.assert_allclose(image, expected, atol=2e-4)
     one = simulate(ball, cone, tube=Tube(kV=90, mono_keV=60.25, spot_mm=0.0), detector=SHARP,
@@ -209,6 +209,44 @@ def test_noise_has_the_variance_of_a_compound_poisson_process() -> None:
                      shape=SHAPE)  # fmt: skip
     # No view depends on the others.
     np.testing.assert_array_equal(again.counts(), scan.counts()[:3])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_points_of_the_spot_blur_each_depth_as_it_is(seed: int) -> None:
+    """Two knives at two depths: the width of each edge's shadow by similar triangles."""
+    rng = np.random.default_rng(seed)
+    sod, sdd, pixel, spot = rng.uniform(40, 60), rng.uniform(300, 400), 0.1, rng.uniform(0.08, 0.12)
+    depths = rng.uniform(8, 15), -rng.uniform(8, 15)  # upper knife, towards the source, and lower
+    knives = [
+        {"kind": "box", "center": [-15.0, -at, side * 9.52], "size": [30.0, 0.02, 19.0],
+         "material": "W@19.25"}
+        for at, side in zip(depths, (1, -1), strict=True)
+    ]  # fmt: skip
+    cone = ConeVec.from_vectors([0, -sod, 0], [0, sdd - sod, 0], [pixel, 0, 0], [0, 0, -pixel])
+    ideal = Detector.ideal(bits=16)
+    tube = Tube(kV=60, power_W=20, spot_mm=spot)
+
+    def widths(points: int, rays: int = 1) -> list[float]:
+        scan = simulate(
+            knives, cone, tube=tube, detector=ideal, shape=(61, 121), spot_points=points, rays=rays
+        )
+        assert ("spot_points" in " ".join(scan.warnings)) == (points == 1)
+        found = []
+        for row in (5, 55):
+            spread = np.diff(np.exp(-scan.truth.line_integrals()[0, row, 36:85].astype(float)))
+            x = np.arange(len(spread)) - (spread * np.arange(len(spread))).sum() / spread.sum()
+            found.append(float((spread * x**2).sum() / spread.sum()))
+        return found
+
+    sigma = spot / 2.3548
+    real = [(sdd / (sod - at) - 1) * sigma / pixel for at in depths]
+    axis = (sdd / sod - 1) * sigma / pixel
+    # The differences of pixels that are 9 rays wide add 1/12 and that of nine points, 20/243.
+    found = [np.sqrt(one - 1 / 12 - 20 / 243) for one in widths(64, 3)]
+    assert found == pytest.approx(real, rel=0.02)
+    blurred = [np.sqrt(one - 1 / 12) for one in widths(1)]
+    assert blurred == pytest.approx([axis, axis], rel=0.02)
+    assert real[0] > 1.2 * axis > 1.4 * real[1]
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -308,6 +308,53 @@ def test_lag_comes_from_the_poses_before(tmp_path: Path) -> None:
     assert all(np.array_equal(first[n], plain[n]) for n in first)  # only a dark came before
 
 
+def test_traps_give_back_what_they_took(tmp_path: Path) -> None:
+    """Long lag against a sum over all earlier frames, whatever of the scan is made first."""
+    figures = {
+        "long_lag_fraction": 0.1, "long_lag_s": 3.0, "lag_fraction": 0.0,
+        "offset_sigma_counts": 0.0, "gain_sigma": 0.0, "dead_fraction": 0.0, "blur_mm": 0.0,
+    }  # fmt: skip
+    plan = plan_script(parse_script(FLY), M, P)
+
+    def made(groups: list[list[int]], **panel: float) -> list[npt.NDArray[np.float64]]:
+        way = radiography(tmp_path, "poly", **{**figures, **panel})
+        found: dict[str, npt.NDArray[np.uint16]] = {}
+        acquisition = Acquisition(plan, way, Sample("lego"), None, found.__setitem__)
+        for group in groups:
+            asyncio.run(acquisition.produce([plan.exposures[i] for i in group]))
+        return [found[name].astype(float) for name in sorted(found)]
+
+    together = made([[0], [1, 2, 3, 4, 5, 6, 7]])
+    backwards = made([[7], [6, 5], [0], [4, 3, 2, 1]])
+    assert all(np.array_equal(a, b) for a, b in zip(together, backwards, strict=True))
+    prompt = made([[0], [1, 2, 3, 4, 5, 6, 7]], long_lag_fraction=0.0)
+    dark = prompt[0].mean()
+    for k, frame in enumerate(plan.exposures):
+        wanted = prompt[k].copy()
+        for earlier, image in zip(plan.exposures[:k], prompt, strict=False):
+            if earlier.xrays_on:
+                gap = frame.start_s - earlier.start_s - earlier.duration_s
+                given = np.exp(-gap / 3.0) - np.exp(-(gap + frame.duration_s) / 3.0)
+                wanted += 0.1 * (image - dark) * given
+        if frame.xrays_on:
+            wanted -= 0.1 * (prompt[k] - dark)
+        np.testing.assert_allclose(together[k], wanted, atol=1.5)
+    assert abs(together[7] - prompt[7]).max() > 300.0
+    assert "long_lag_s" not in radiography(tmp_path, "poly").record()
+    assert radiography(tmp_path, "poly", **figures).record()["long_lag_s"] == 3.0
+
+
+def test_the_machine_file_states_the_traps(tmp_path: Path) -> None:
+    detector = M.detector.model_copy(update={"long_lag_fraction": 0.004, "long_lag_s": 3.0})
+    own = M.model_copy(update={"detector": detector})
+    way = radiography(tmp_path, "poly")
+    made = Radiography.of(way.imaging, way.model, own, "poly")
+    assert (made.panel.long_lag_fraction, made.panel.long_lag_s) == (0.004, 3.0)
+    assert made.traps
+    assert not replace(made, physics="ideal").traps
+    assert not way.traps
+
+
 def test_a_resumed_scan_keeps_its_physics() -> None:
     from flexdt.twin.script import StartState
 

@@ -161,6 +161,10 @@ class DetectorSpec(_Frozen):
     exposure_ms: Positive = 100.0
     min_exposure_ms: float = Field(1.0, ge=1e-6)
     max_exposure_ms: float = Field(60_000.0, gt=0, le=1e7)
+    long_lag_fraction: float = Field(0.0, ge=0, lt=1)
+    """Part of the charge that traps keep for later images."""
+    long_lag_s: Positive = 10.0
+    """Time constant with which they give it back."""
 
     @property
     def sensor(self) -> Sensor:

@@ -4,9 +4,10 @@ There are two steps, so that the second can depend on earlier frames: `expected_
 noise and depends on geometry, tube and sample; `read_out` adds lag, noise, blur, fixed pattern and
 conversion. Random numbers are an argument. Scattered radiation is `flexdt.twin.physics.scatter`'s.
 
-The blur has exactly the requested variance, however narrow it is: its kernel is the discrete
-Gaussian exp(-t) I_n(t). Blurring twice is blurring once with the summed variances, and a standard
-deviation of a tenth of a pixel is still exact.
+The blur has the requested variance, however narrow it is. From 0.7 pixels on its kernel is a
+Gaussian at the pixels' centres, whose modulation is a Gaussian's up to the Nyquist frequency.
+Samples of a narrower one would lose variance: there it is the discrete Gaussian exp(-t) I_n(t),
+whose modulation is exp(-2 t sin^2(pi f)) and so more than a Gaussian's at high frequencies.
 """
 
 from __future__ import annotations
@@ -29,17 +30,20 @@ from flexdt.twin.physics.spectrum import TubeModel, monochromatic, tube_spectrum
 
 FWHM = 2.3548200450309493
 """Full width at half maximum of a Gaussian of standard deviation 1."""
+SAMPLED = 0.7
+"""Standard deviation from which samples of a Gaussian have its variance [pixels]."""
 NARROWEST = 0.02
 """Standard deviation below which nothing is done [pixels]."""
 
 
 def kernel(sigma_px: float) -> Float32Array:
-    """Weights of the discrete Gaussian, (2 r + 1,), adding up to 1."""
+    """Weights of the blur, (2 r + 1,), adding up to 1."""
     from scipy.special import ive
 
     t = sigma_px * sigma_px
     reach = max(1, int(np.ceil(4.0 * sigma_px + 1.0)))
-    weights = ive(np.abs(np.arange(-reach, reach + 1)), t)
+    n = np.arange(-reach, reach + 1)
+    weights = np.exp(n * n / (-2.0 * t)) if sigma_px >= SAMPLED else ive(np.abs(n), t)
     return np.asarray(weights / weights.sum(), dtype=np.float32)
 
 
@@ -169,6 +173,7 @@ def read_out(
     exposure: ExposureSettings,
     rng: np.random.Generator | None = None,
     before: Sequence[tuple[Float32Array, float]] = (),
+    trapped: Float32Array | None = None,
 ) -> Counts:
     """The image that is saved.
 
@@ -180,6 +185,8 @@ def read_out(
         rng: generator of this frame's noise; None for the expectation.
         before: noise-free electrons of earlier frames, each with the time [s] from its end to
             this frame's start: what they leave behind is added.
+        trapped: electrons in traps at the frame's start, from `trapped_after`; None without long
+            lag. What they give back meanwhile is added, what they take is lost.
 
     Returns:
         uint16 (rows, cols).
@@ -200,6 +207,10 @@ def read_out(
         left = panel.lag_fraction * np.exp(-max(gap_s, 0.0) / panel.lag_s)
         charge += np.float32(left) * earlier
     averages = exposure.averages
+    if trapped is not None:
+        given = -np.expm1(-exposure.duration_s / panel.long_lag_s) / averages
+        charge += np.float32(given) * trapped
+        charge -= np.float32(panel.long_lag_fraction) * expected.mean_e
     if rng is not None:
         charge = _with_quantum_noise(charge, variance, averages, rng)
     charge = blurred(charge, *panel.blur_px(camera))
@@ -216,6 +227,29 @@ def read_out(
     np.clip(counts, 0.0, panel.full_scale, out=counts)
     counts[fixed.dead] = 0.0
     return counts.astype(np.uint16)
+
+
+def trapped_after(
+    panel: Panel,
+    trapped: Float32Array,
+    expected: Expected | None,
+    exposure: ExposureSettings,
+    gap_s: float,
+) -> Float32Array:
+    """Electrons in traps when the next frame starts, (rows, cols).
+
+    Args:
+        panel: the detector.
+        trapped: at the frame's start, (rows, cols).
+        expected: what falls on the panel in the frame; None in the dark.
+        exposure: of the frame.
+        gap_s: from its end to the next frame's start.
+    """
+    left = trapped * np.float32(np.exp(-(exposure.duration_s + gap_s) / panel.long_lag_s))
+    if expected is not None:
+        taken = panel.long_lag_fraction * exposure.averages * np.exp(-gap_s / panel.long_lag_s)
+        left += np.float32(taken) * expected.mean_e
+    return left
 
 
 def _with_quantum_noise(
@@ -236,16 +270,38 @@ def _with_quantum_noise(
     return np.asarray(out)
 
 
-def spot_blur_px(view: FloatArray, spot_mm: float) -> float:
-    """Standard deviation of the focal spot's image at the rotation axis's magnification [pixels].
-
-    The blur really grows towards the source; one value for the whole sample is a simplification.
-    """
+def spot_blur_px(view: FloatArray, spot_mm: float, towards_mm: float = 0.0) -> float:
+    """Standard deviation of the focal spot's image at the magnification of what stands on the
+    rotation axis, or `towards_mm` nearer to the source [pixels]."""
     source, centre, u, v = view[0:3], view[3:6], view[6:9], view[9:12]
     normal = np.cross(u, v)
     to_axis, to_panel = float(-source @ normal), float((centre - source) @ normal)
-    magnification = to_panel / to_axis
+    magnification = to_panel / max(
+        to_axis - towards_mm * float(np.linalg.norm(normal)), 1e-3 * to_axis
+    )
     return max(0.0, magnification - 1.0) * spot_mm / FWHM / float(np.linalg.norm(u))
+
+
+def spot_views(rows: FloatArray, spot_mm: float, points: int) -> FloatArray:
+    """Views (n, 12) from so many points of a Gaussian focal spot, (n * points, 12): their mean has
+    the spot's blur at every depth. A spiral, so that no two points lie behind one another.
+
+    Args:
+        rows: cone_vec rows.
+        spot_mm: full width at half maximum.
+        points: from each view, at least 3.
+    """
+    k = (np.arange(points) + points // 2) % points  # the innermost in the middle
+    turn = np.pi * (3.0 - np.sqrt(5.0)) * k
+    radius = np.sqrt(-2.0 * np.log1p(-(k + 0.5) / points))
+    places = radius * np.array([np.cos(turn), np.sin(turn)])
+    places -= places.mean(axis=1, keepdims=True)
+    places = np.linalg.solve(np.linalg.cholesky(np.cov(places, bias=True)), places)
+    edges = rows[:, 6:].reshape(-1, 2, 3)
+    edges = edges / np.linalg.norm(edges, axis=2, keepdims=True) * (spot_mm / FWHM)
+    out = np.repeat(rows[:, None], points, axis=1)
+    out[:, :, :3] += np.einsum("ak,nax->nkx", places, edges)
+    return out.reshape(-1, 12)
 
 
 def flux_of(view: npt.ArrayLike, shape: tuple[int, int]) -> Float32Array:

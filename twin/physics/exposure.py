@@ -65,6 +65,11 @@ class ExposureSettings:
     averages: int = 1
     xrays_on: bool = True
 
+    @property
+    def duration_s(self) -> float:
+        """Of all read-outs together."""
+        return self.exposure_ms * self.averages / 1000.0
+
 
 def detector_model(machine: Machine) -> DetectorModel:
     """The model for the detector of `machine`; an open beam fills about 3/4 of its depth."""

@@ -42,6 +42,8 @@ class Panel:
         gain_sigma, offset_sigma_counts: fixed pattern, each unbinned pixel.
         dead_fraction: unbinned pixels that give nothing.
         lag_fraction, lag_s: part of the charge left for later frames, and how fast it fades.
+        long_lag_fraction, long_lag_s: part of the charge that traps take from its own frame, and
+            the time constant with which they give it back.
         serial: seed of the fixed pattern: another panel has another one.
     """
 
@@ -64,6 +66,8 @@ class Panel:
     dead_fraction: float = 1e-5
     lag_fraction: float = 0.002
     lag_s: float = 0.5
+    long_lag_fraction: float = 0.0
+    long_lag_s: float = 10.0
     serial: int = 1512
     row_pitch_mm: float | None = None
 
@@ -128,6 +132,8 @@ LABELS: Final[Mapping[str, str]] = {
     "dead_fraction": "assumed",
     "lag_fraction": "assumed",
     "lag_s": "assumed",
+    "long_lag_fraction": "assumed: none on CMOS; 0.001 to 0.004 of amorphous silicon (literature)",
+    "long_lag_s": "assumed: between the 3 and 20 s of amorphous silicon (literature)",
     "serial": "assumed",
     "row_pitch_mm": "literature: as pitch_mm",
 }
@@ -138,7 +144,8 @@ def panel_of(spec: DetectorSpec) -> Panel:
     """The panel of a machine: its own size, pitch and depth, all else as for the default."""
     return Panel(
         columns=spec.columns, rows=spec.rows, pitch_mm=spec.pitch_mm, bits=spec.bits,
-        row_pitch_mm=spec.row_pitch_mm,
+        row_pitch_mm=spec.row_pitch_mm, long_lag_fraction=spec.long_lag_fraction,
+        long_lag_s=spec.long_lag_s,
     )  # fmt: skip
 
 
