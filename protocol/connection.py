@@ -180,11 +180,10 @@ class Connection:
         if self._large is not None:
             self._feed_large(bytes(data))
             return
+        new, most = len(self._buffer), A_PIECE
         self._buffer += data
-        most = A_PIECE
         if self.codec is Codec.JSON:
             most = min(A_PIECE, self.max_message)
-            new = max(self._edge, len(self._buffer) - len(data))
             self.waiting += self._buffer.count(b"\n", new)
             end = self._buffer.rfind(b"\n", new)
             self._edge = end + 1 if end >= 0 else self._edge

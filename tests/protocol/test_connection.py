@@ -409,7 +409,7 @@ def test_messages_come_out_whole_once_and_urgent_ones_first(codec: Codec, seed: 
                 return b"stop now" in body
 
             most = rng.choice([1, 2, 32])
-            got = wire.overtake([b"stop"], wanted, most)
+            got = wire.overtake([b"halt", b"stop"], wanted, most)
             assert got == queue.overtake(most, shown[1])
             assert shown[0] == shown[1]
         ended = queue.large and queue.end() > 0

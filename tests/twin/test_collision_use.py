@@ -17,7 +17,7 @@ from flexdt.twin.collision.convex_solids import box
 from flexdt.twin.collision.guard import scene_guard
 from flexdt.twin.collision.obstacle_path import _Planner, direct_contact, free_moves
 from flexdt.twin.collision.plan_report import collision_check
-from flexdt.twin.collision.sample_hull import Mesh, convex_pieces
+from flexdt.twin.collision.sample_hull import Mesh, _clip, convex_pieces
 from flexdt.twin.collision.scene_search import clearance, touching
 from flexdt.twin.errors import CollisionError, GeometryError, SafetyError
 from flexdt.twin.geometry.conventions import FloatArray, rotation_x, rotation_z
@@ -100,6 +100,23 @@ def test_a_concave_sample_is_cut_where_that_pays_and_a_convex_one_is_not() -> No
     cavity = convex_pieces(angle_bracket())
     scene = build_scene(M, P, cavity)
     assert {scene.bodies[i].name for pair in scene.pairs for i in pair} >= {"sample"}
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_plane_cuts_a_convex_solid_into_two_that_fill_it(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    corners = rng.normal(size=(9, 3)) * (20.0, 9.0, 14.0) + rng.uniform(-30, 30, 3)
+    whole = trimesh.convex.convex_hull(corners)
+    for axis in range(3):
+        low, high = corners[:, axis].min(), corners[:, axis].max()
+        at = float(rng.uniform(low + 0.2 * (high - low), high - 0.2 * (high - low)))
+        volume = 0.0
+        for side in (-1.0, 1.0):
+            half = _clip(np.asarray(whole.triangles), axis, at, side)
+            assert (side * (half[:, :, axis] - at) >= -1e-9).all()
+            points = half.reshape(-1, 3)
+            volume += ConvexHull(points).volume
+        assert volume == pytest.approx(float(whole.volume), rel=1e-9)
 
 
 def test_a_sample_is_turned_first_and_then_shifted() -> None:

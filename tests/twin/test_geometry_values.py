@@ -16,6 +16,8 @@ from numpy.testing import assert_allclose
 from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.geometry.rigid import Rigid
+from flexdt.twin.machine.description import builtin_machine, profile_of
+from flexdt.twin.machine.kinematics import poses
 from flexdt.twin.projection import Grid, Volume, forward, project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 
@@ -354,3 +356,36 @@ def test_a_plot_shows_sources_and_panels() -> None:
     axes = ConeVec.circular(angles=4, **SCAN).plot()
     assert axes.name == "3d"
     assert len(axes.lines) == 1 + 2 * 4 + 2
+
+
+def test_binning_by_one_is_no_binning_and_by_all_rows_leaves_one() -> None:
+    scan = ConeVec.circular(angles=3, **{**SCAN, "shape": (7, 9)})  # type: ignore[arg-type]
+    assert_allclose(scan.binned(1).rows, scan.rows, rtol=1e-15)
+    assert scan.binned(1).shape == scan.shape
+    coarse = scan.binned(7)  # nine columns: two on the right are cut off
+    assert coarse.shape == (3, 1, 1)
+    assert_allclose(coarse.u, 7 * scan.u)
+    assert_allclose(coarse.detector, scan.detector - scan.u)
+    with pytest.raises(GeometryError, match="1 to 7"):
+        scan.binned(8)
+
+
+def test_a_stage_on_the_turntable_moves_a_point_by_hand() -> None:
+    """Raised 2 mm and shifted (3, -4) on a table turned by 90 degrees, with the wobble tau."""
+    machine = builtin_machine("micro_ct")
+    profile = profile_of(machine)
+    camera = machine.detector.camera
+    names = {q: next(iter(machine.geometry[q])) for q in ("mount_x", "mount_y", "angle")}
+    away = {names["mount_x"]: 3.0, names["mount_y"]: -4.0}
+    for angle in (0.0, 90.0, -35.0):
+        at = {a: np.array([axis.home]) for a, axis in machine.axes.items()}
+        at[names["angle"]] = np.array([angle])
+        here = poses(machine, profile, camera, at).cone_vec()
+        moved = {a: at[a] + away.get(a, 0.0) for a in at}
+        there = poses(machine, profile, camera, moved).cone_vec()
+        gone = [sum(machine.geometry[q].values()) * v for q, v in
+                (("mount_x", 3.0), ("mount_y", -4.0))]  # fmt: skip
+        # The sample's frame goes along: source and panel are seen the other way in it.
+        assert_allclose(there.source - here.source, [[-gone[0], -gone[1], 0.0]], atol=1e-9)
+        assert_allclose(there.detector - here.detector, [[-gone[0], -gone[1], 0.0]], atol=1e-9)
+        assert_allclose(there.u, here.u)

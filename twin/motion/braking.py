@@ -283,11 +283,9 @@ def _along(drive: Drive, cells: list[_Cell], now: float) -> Trajectory:
             middle = x + half * (v + 0.5 * first * half)
             pieces.append(Piece(cell.start + half, middle, v + first * half, second))
         end, target = cell.start + cell.length, reached
-    if not pieces or end == now:
-        return motion.at_rest(target, now)
     while pieces and pieces[-1].velocity == 0.0 and pieces[-1].acceleration == 0.0:
         pieces.pop()
-    if not pieces:
+    if not pieces or end == now:
         return motion.at_rest(target, now)
     final = drive.at(now).target
     return Trajectory(tuple(pieces), end, final if abs(target - final) < SAME_PLACE else target)

@@ -74,7 +74,7 @@ class Trajectory:
         """The piece in force, or None when at rest (before the start or after the end)."""
         if time >= self.end or time < self.start:
             return None
-        return self.pieces[bisect_right(self.knots, time, 0, len(self.pieces)) - 1]
+        return self.pieces[bisect_right(self.knots, time, hi=len(self.pieces)) - 1]
 
     def position(self, time: float) -> float:
         """Position at `time` [s]."""
@@ -115,7 +115,7 @@ class Trajectory:
             return 0.0, 0.0, math.inf
         if time < self.start:
             return 0.0, 0.0, self.start
-        index = bisect_right(self.knots, time, 0, len(self.pieces)) - 1
+        index = bisect_right(self.knots, time, hi=len(self.pieces)) - 1
         piece = self.pieces[index]
         until = self.knots[index + 1] if index + 1 < len(self.knots) else self.end
         velocity, a = piece.velocity + piece.acceleration * (time - piece.start), piece.acceleration
