@@ -148,9 +148,11 @@ def further(line: Callable[..., None], cases: dict[str, dict[int, Document]]) ->
     (nz, ny, nx), voxel = SIZES[name]
     like = Volume(np.zeros((nz, ny, nx), np.float32), voxel)
     scan, block = circle(COUNTS[-1], PANEL), gpu_fdk_kernels.BLOCK
-    columns = cuda.device_array((len(scan), PANEL[1], PANEL[0]), np.float32)
+    columns = cuda.device_array(len(scan) * PANEL[1] * PANEL[0], np.float32)
     arrays = (
         columns,
+        PANEL[1],
+        PANEL[0],
         *(cuda.to_device(a) for a in (view_table(scan, PANEL), *np.full((2, 3), voxel))),
     )
     grid = (-(-nz // (block[0] * gpu_fdk_kernels.RUN)), -(-nx // block[1]), ny)

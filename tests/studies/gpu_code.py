@@ -30,8 +30,6 @@ LOADS = 12
 """Least loads in the forward kernel's unrolled body."""
 A_SLAB = 40
 """Most instructions for a slab in that body."""
-REPORTED = frozenset({"backproject"})
-"""Not held to a budget yet: still in double precision, with 72 registers."""
 UNROLLED = 4
 LOAD, BRANCH = 0x181, 0x147
 DOUBLE = {0x028: "DMUL", 0x029: "DADD", 0x02A: "DSETP", 0x02B: "DFMA"}
@@ -115,11 +113,14 @@ def innermost_loops(words: list[tuple[int, int]]) -> list[list[int]]:
 
 def all_kernels() -> dict[str, tuple[Any, tuple[Any, ...]]]:
     """Every kernel with the types of its arguments."""
-    from numba import float32, float64, int64
+    from numba import boolean, float32, float64, int64, types
 
+    arrays = load_kernels("projection/kernels/gpu_array_kernels.py")
     project = load_kernels("projection/kernels/gpu_kernels.py")
     fdk = load_kernels("reconstruction/gpu_fdk_kernels.py")
-    table = float64[:, ::1]
+    tv = load_kernels("reconstruction/gpu_tv_kernels.py")
+    table, images, flat2 = float64[:, ::1], float32[:, :, ::1], float32[:, ::1]
+    flat, counts, edges = float32[::1], types.UniTuple(int64, 3), types.UniTuple(float32, 3)
 
     def walk(voxel: Any) -> tuple[Any, ...]:
         return (
@@ -136,10 +137,23 @@ def all_kernels() -> dict[str, tuple[Any, tuple[Any, ...]]]:
         "spread_rays, deterministic": (project.spread_rays, walk(int64)),
         "clear": (project.clear, (float32[::1],)),
         "unscale": (project.unscale, (int64[::1], float64, float32[::1])),
+        "weigh": (fdk.weigh, (images, int64, flat2, flat2, flat2, images)),
+        "convolve": (fdk.convolve, (images, float32[::1], int64, images)),
         "backproject": (
             fdk.backproject,
-            (float32[:, :, ::1], table, float64[::1], float64[::1], float32[:, :, ::1]),
+            (float32[::1], int64, int64, table, float64[::1], float64[::1], images),
         ),
+        "combine": (
+            arrays.combine,
+            (int64, float32[::1], float32[::1], float32, boolean, float32[::1]),
+        ),
+        "lengths": (tv.lengths, (flat, counts, int64, edges, flat)),
+        "primal_step": (
+            tv.primal_step,
+            (flat, flat, float32, counts, int64, edges, float32, flat, flat),
+        ),
+        "dual_step": (tv.dual_step, (flat, flat, flat, float32, float32, counts, int64, edges)),
+        "fold": (arrays.fold, (int64, float32[::1], float32[::1], float64[::1])),
     }
 
 
@@ -182,7 +196,7 @@ def main() -> int:
             f"precision in inner loops{': ' if wrong else ''}{'; '.join(wrong)}",
             flush=True,
         )
-        status = max(status, int(bool(wrong) and name not in REPORTED))
+        status = max(status, int(bool(wrong)))
     return status
 
 

@@ -14,7 +14,8 @@ import ctypes
 import logging
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -34,6 +35,8 @@ CHUNK_BYTES = 256 * 2**20
 """Images on the device at a time."""
 SPARE_BYTES = 256 * 2**20
 """What must stay free on a device: for the driver, and for whoever else uses it."""
+VIEWS_A_DEVICE = 8
+"""So many views are worth another device."""
 VIEWS_A_THREAD = 7 / 16
 """A volume of the host is worth its way to the device and back from so many views on, for each
 thread of the processor (measured: about 7 views beside 16 threads)."""
@@ -46,8 +49,8 @@ LINEAR = 256
 LOGGER = logging.getLogger("flexdt")
 
 
-class DeviceError(Exception):
-    """The device failed at something that is to be begun anew on the processor."""
+class DeviceError(TwinError):
+    """The device failed; what it was to do may be begun anew on the processor."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,7 @@ def _project_one_ray() -> None:
     box = Box(np.array([1, 3], np.float32), None, 0, 1, 2, 2, 1, 1, 0.5, 0.5, 0.5)
     views = np.array([[-1.0, 0.5, 0.5, 4.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0]])
     image = np.zeros((1, 1, 1), np.float32)
-    project(box, upload(box.flat), views, image)
+    project(box, [upload(box.flat)], views, image)
     if not np.isclose(image[0, 0, 0], 2.0, rtol=1e-5):
         raise ArithmeticError(f"found {image[0, 0, 0]} instead of 2.0")
 
@@ -139,11 +142,19 @@ def attempt(work: Callable[[], object]) -> bool:
     return True
 
 
-def upload(flat: Float32Array) -> Any:
-    """Copy voxels to the device, where they stay as long as the result is referenced."""
+def upload(flat: Float32Array, device: int = 0) -> Any:
+    """Copy voxels to a device, where they stay as long as the result is referenced."""
     from numba import cuda
 
-    return cuda.to_device(flat)
+    with cuda.gpus[device]:
+        return cuda.to_device(flat)
+
+
+def devices_for(views: int) -> int:
+    """How many devices are worth it."""
+    from numba import cuda
+
+    return max(1, min(len(cuda.gpus), views // VIEWS_A_DEVICE))
 
 
 def free_bytes() -> int | None:
@@ -215,18 +226,18 @@ def taken(x: Any) -> Any:
 
 
 def demand(work: Callable[[], Any]) -> Any:
-    """What some work on the device returns, for values that are there and nowhere else.
+    """What some work on the device returns, for values that are there.
 
     Raises:
-        TwinError: the device failed; the log says so, too.
+        DeviceError: the device failed; the log says so, too.
     """
     found: list[Any] = []
     if not attempt(lambda: found.append(work())):
-        raise TwinError("the CUDA device failed at arrays that are on it; the log says of what")
+        raise DeviceError("the CUDA device failed at arrays that are on it; the log says of what")
     return found[0]
 
 
-def project_there(box: Box, voxels: Any, views: FloatArray, shape: tuple[int, int]) -> Any:
+def project_there(box: Box, voxels: Any, views: FloatArray, shape: tuple[int, ...]) -> Any:
     """Images (n, rows, cols) of a volume on the device, which stay there."""
     from numba import cuda
 
@@ -235,18 +246,31 @@ def project_there(box: Box, voxels: Any, views: FloatArray, shape: tuple[int, in
     return images.reshape(len(views), *shape)
 
 
-def project(box: Box, voxels: Any, views: FloatArray, out: Float32Array) -> None:
+def project(box: Box, voxels: Sequence[Any], views: FloatArray, out: Float32Array) -> None:
     """Fill out (n, rows, cols) with line integrals.
+
+    Portions are dealt to the devices in turn, and fetched as late as that leaves one for each.
 
     Args:
         box: the volume; its flat array is not touched.
-        voxels: the same array as `upload` returned it.
+        voxels: the same array as `upload` returned it, on each device that takes part.
         views: (n, 12) source, first pixel minus source, u, v in voxel units.
         out: C-ordered float32.
     """
-    for part in _chunks(out):
-        images = project_there(box, voxels, views[part], (out.shape[1], out.shape[2]))
-        images.copy_to_host(out[part])
+    from numba import cuda
+
+    under_way: deque[tuple[int, Any, slice]] = deque()
+    portions = _chunks(out, len(voxels))
+    for turn in range(len(portions) + len(voxels)):
+        if turn >= len(voxels) and under_way:
+            device, images, part = under_way.popleft()
+            with cuda.gpus[device]:
+                images.copy_to_host(out[part])
+        if turn < len(portions):
+            device, part = turn % len(voxels), portions[turn]
+            with cuda.gpus[device]:
+                images = project_there(box, voxels[device], views[part], out.shape[1:])
+            under_way.append((device, images, part))
 
 
 def spread_there(
@@ -386,7 +410,8 @@ def launcher(
     return launch
 
 
-def _chunks(images: Float32Array) -> list[slice]:
-    """Views in portions that fit the device."""
+def _chunks(images: Float32Array, devices: int = 1) -> list[slice]:
+    """Views in portions that fit a device, and at least one for each."""
     count = max(1, CHUNK_BYTES // max(1, images[:1].nbytes))
+    count = min(count, max(1, -(-len(images) // devices)))
     return [slice(i, i + count) for i in range(0, len(images), count)]

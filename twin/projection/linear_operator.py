@@ -9,8 +9,9 @@ it, and by nothing else.
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, singledispatch
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import gpu
 from flexdt.twin.projection.arrays import on_host
+from flexdt.twin.projection.device_arrays import DeviceArray
 from flexdt.twin.projection.geometry_gradient import geometry_change, geometry_gradient
 from flexdt.twin.projection.operators import Shape2, as_cone_vec, back, forward
 from flexdt.twin.projection.volume import DeviceVolume, Grid, Volume, as_volume, room_like
@@ -146,17 +148,7 @@ class Operator:
                 f"tolerance {tolerance:g}; allowed: {SMALLEST_TOLERANCE:g} to 1",
                 {"asked": tolerance, "allowed": [SMALLEST_TOLERANCE, 1.0]},
             )
-        x = np.ones(self.voxel_shape, np.float32)
-        while True:
-            x /= np.float32(np.sqrt(_dot(x, x)))
-            image = self._back(self._forward(x))
-            square = _dot(x, image)
-            if square == 0.0:  # no ray meets the grid
-                return 0.0
-            rest = image - np.float32(square) * x
-            if _dot(rest, rest) <= (2 * tolerance * square) ** 2:
-                return float(np.sqrt(square))
-            x = image
+        return norm_of(self._forward, self._back, np.ones(self.voxel_shape, np.float32), tolerance)
 
     def gradient(self, x: Volume | npt.ArrayLike, weights: npt.ArrayLike) -> FloatArray:
         """Derivative of sum(weights * (A @ x)) with respect to the geometry, (n, 12) [1/mm].
@@ -306,5 +298,27 @@ def _same_grid(a: Volume | DeviceVolume, b: Volume) -> bool:
     )
 
 
-def _dot(a: Float32Array, b: Float32Array) -> float:
+@singledispatch
+def dot(a: Any, b: Any) -> float:
+    """Inner product of two stacks or volumes, summed in double precision."""
     return float(np.einsum("ijk,ijk->", a, b, dtype=np.float64))
+
+
+dot.register(DeviceArray, DeviceArray.dot)
+
+
+def norm_of(
+    project: Callable[[Any], Any], spread: Callable[[Any], Any], ones: Any, tolerance: float
+) -> float:
+    """`Operator.norm` of a map and its transpose, from an array of ones, of numpy or a device."""
+    x = ones
+    while True:
+        x = x * np.float32(1.0 / np.sqrt(dot(x, x)))
+        image = spread(project(x))
+        square = dot(x, image)
+        if square == 0.0:  # no ray meets the grid
+            return 0.0
+        rest = image - np.float32(square) * x
+        if dot(rest, rest) <= (2 * tolerance * square) ** 2:
+            return float(np.sqrt(square))
+        x = image

@@ -97,7 +97,7 @@ def _on_device(volume: Volume, geometry: ConeVec, shape: Shape2, out: Float32Arr
     views, box = voxel_rays(geometry, layout, shape), box_of(layout)
     to_move = 0 if layout.resident else layout.flat.nbytes
     return gpu.usable(to_move, out, cpu.threads()) and gpu.attempt(
-        lambda: gpu.project(box, layout.on_device, views, out)
+        lambda: gpu.project(box, layout.on_devices(gpu.devices_for(len(views))), views, out)
     )
 
 

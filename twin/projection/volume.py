@@ -69,6 +69,18 @@ class Layout:
 
         return gpu.upload(self.flat)
 
+    def on_devices(self, count: int) -> list[Any]:
+        """The storage on each of the first devices; uploaded once and cached with the layout."""
+        from flexdt.twin.projection import gpu
+
+        for device in range(1 + len(self._elsewhere), count):
+            self._elsewhere.append(gpu.upload(self.flat, device))
+        return [self.on_device, *self._elsewhere[: count - 1]]
+
+    @cached_property
+    def _elsewhere(self) -> list[Any]:
+        return []
+
 
 def room_like(volume: Volume) -> Float32Array:
     """Zeros (nz, ny, nx) with z contiguous in memory: what `back` can write into.

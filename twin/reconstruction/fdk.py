@@ -4,9 +4,9 @@ The panel may be moved to any side and turned about the vertical: distances and 
 each row of the geometry. Tilted panels are resampled upright first. Views may come in parts, so
 neither all images nor, slab by slab, the whole volume need fit into memory.
 
-Backprojection runs on a CUDA device if it has room, else on the processor. Both take views in parts
-and hand out the volume at the end; the volume stays where it is computed until then. They give the
-same numbers (to 1e-5 of the maximum). Views come weighted and filtered.
+Weights, filter and backprojection run on a CUDA device if it has room for the volume, else on the
+processor. Both take views in parts and hand out the volume at the end; the volume stays where it is
+computed until then. They give the same numbers (to 1e-5 of the maximum).
 
 Detector rows are filtered by the ramp filter as sampled in space, with the usual windows, and
 padded to twice their length, so that the convolution does not wrap.
@@ -17,7 +17,8 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, Final, Protocol
 
 import numpy as np
@@ -49,24 +50,62 @@ from flexdt.twin.reconstruction.truncation import Truncation, truncation_of
 
 MOST_COLUMNS = 65_535
 """Voxel columns along y that a device's grid can hold."""
+CHUNK = 32
+"""Views worked on at a time."""
+STACKS: Final = 6
+"""Stacks of so many images that a device holds: twice what came, and made wider, of three steps."""
 MOST_ASIDE: Final = 0.1
 """By how much of its width the panel may go sideways between the views: jitter, not tiles."""
 
 
-class Backprojector(Protocol):
-    """Adds filtered views to a volume."""
+@dataclass(frozen=True, eq=False)
+class Weighing:
+    """What views are multiplied by before the filter: factors / length of the ray to the pixel.
 
-    def add(self, columns: Float32Array, shares: Float32Array, table: FloatArray) -> None:
-        """Add views: columns (n, cols, rows), and the kernel's other arguments."""
+    Attributes:
+        factors: float64 (n, cols).
+        across, up: squares of the ray's horizontal and vertical parts, (n, cols) and (n, rows)
+            [mm^2].
+    """
+
+    factors: FloatArray
+    across: FloatArray
+    up: FloatArray
+
+
+class Backprojector(Protocol):
+    """Weighs and filters views, and adds them to a volume."""
+
+    def add(
+        self,
+        images: Float32Array,
+        top: int,
+        weighing: Weighing,
+        response: Float32Array,
+        kept: slice,
+        shares: Float32Array,
+        table: FloatArray,
+    ) -> None:
+        """Add views.
+
+        Args:
+            images: (n, rows of the panel, cols).
+            top: their first row that is needed.
+            weighing: of the rows that are needed, and all columns.
+            response: of the filter.
+            kept: columns whose filtered values are needed.
+            shares, table: of `fdk_kernels.backproject`.
+        """
 
     def volume(self) -> Float32Array:
         """What has been added up, (ny, nx, nz)."""
 
 
-def device_takes(like: Volume) -> bool:
-    """Whether there is a device that has room for the grid of `like`."""
+def device_takes(like: Volume, shape: tuple[int, int]) -> bool:
+    """Whether there is a device that has room for the grid of `like` and images of (rows, cols)."""
     nz, ny, nx = like.shape
-    return gpu.availability().present and ny <= MOST_COLUMNS and gpu.has_room(4 * nz * ny * nx)
+    need = 4 * (nz * ny * nx + STACKS * CHUNK * shape[0] * shape[1])
+    return gpu.availability().present and ny <= MOST_COLUMNS and gpu.has_room(need)
 
 
 class OnProcessor:
@@ -77,10 +116,31 @@ class OnProcessor:
         self._first, self._size = _grid(like)
         self._data = np.zeros((ny, nx, nz), np.float32)
 
-    def add(self, columns: Float32Array, shares: Float32Array, table: FloatArray) -> None:
+    def add(
+        self,
+        images: Float32Array,
+        top: int,
+        weighing: Weighing,
+        response: Float32Array,
+        kept: slice,
+        shares: Float32Array,
+        table: FloatArray,
+    ) -> None:
         """See `Backprojector`."""
         from flexdt.twin.reconstruction import fdk_kernels
 
+        n, wide, rows = *weighing.factors.shape, weighing.up.shape[1]
+        ready = np.empty((n, rows, wide), np.float32)
+        fdk_kernels.weigh(
+            np.ascontiguousarray(images),
+            top,
+            weighing.factors,
+            weighing.across,
+            weighing.up,
+            ready,
+        )
+        columns = np.empty((n, kept.stop - kept.start, rows), np.float32)
+        fdk_kernels.stand_up(filtered(ready, response), kept.start, columns)
         fdk_kernels.backproject(
             columns, shares, table, *self._first, *self._size, self._data, threads()
         )
@@ -91,58 +151,117 @@ class OnProcessor:
 
 
 class OnDevice:
-    """On a CUDA device, circles only.
+    """On a CUDA device, circles only: images go there, and the volume comes back.
+
+    Images are copied into one of two page-locked buffers while the device works on the other. The
+    filter is a plain convolution with the taps of its response: for 1000 columns a few hundredths
+    of a second for 360 views, without a library for Fourier transforms there.
 
     Raises:
         gpu.DeviceError: from each method; the device failed, and what was added is lost.
     """
 
     def __init__(self, like: Volume) -> None:
+        from numba import cuda
+
         nz, ny, nx = like.shape
-        self._data: Any = None
+        self._shape, self._turn = (ny, nx, nz), 0
+        self._buffers: dict[int, tuple[Any, Any]] = {}
 
         def prepare() -> None:
-            from numba import cuda
+            self._grid = [cuda.to_device(np.array(numbers)) for numbers in _grid(like)]
+            self._data = gpu.zeros(ny * nx * nz)
+            self._stream = cuda.stream()
 
-            first, size = _grid(like)
-            self._first, self._size = (
-                cuda.to_device(np.array(first)),
-                cuda.to_device(np.array(size)),
-            )
-            self._data = cuda.to_device(np.zeros((ny, nx, nz), np.float32))
+        gpu.demand(prepare)
 
-        _try(prepare)
-
-    def add(self, columns: Float32Array, shares: Float32Array, table: FloatArray) -> None:
+    def add(
+        self,
+        images: Float32Array,
+        top: int,
+        weighing: Weighing,
+        response: Float32Array,
+        kept: slice,
+        shares: Float32Array,
+        table: FloatArray,
+    ) -> None:
         """See `Backprojector`."""
+        gpu.demand(lambda: self._add(images, top, weighing, response, kept, table))
 
-        def launch() -> None:
-            from numba import cuda
+    def _add(
+        self,
+        images: Float32Array,
+        top: int,
+        weighing: Weighing,
+        response: Float32Array,
+        kept: slice,
+        table: FloatArray,
+    ) -> None:
+        from numba import cuda
 
-            from flexdt.twin.reconstruction.gpu_fdk_kernels import BLOCK, RUN, backproject
+        from flexdt.twin.reconstruction import gpu_fdk_kernels as kernels
 
-            ny, nx, nz = self._data.shape
-            grid = (-(-nz // (BLOCK[0] * RUN)), -(-nx // BLOCK[1]), ny)
-            backproject[grid, (*BLOCK, 1)](
-                cuda.to_device(columns),
-                cuda.to_device(np.ascontiguousarray(table)),
-                self._first,
-                self._size,
-                self._data,
-            )
+        n, wide, rows = *weighing.factors.shape, weighing.up.shape[1]
+        cols, (ny, nx, nz), stream = kept.stop - kept.start, self._shape, self._stream
+        there = self._upload(images)
 
-        _try(launch)
+        def small(values: FloatArray, kind: type = np.float32) -> Any:
+            return cuda.to_device(np.ascontiguousarray(values, dtype=kind), stream)
+
+        def plane(columns: int) -> tuple[int, int, int]:
+            return -(-rows // kernels.PLANE[0]), -(-columns // kernels.PLANE[1]), n
+
+        weighted = cuda.device_array((n, wide, rows), np.float32, stream=stream)
+        kernels.weigh[plane(wide), (*kernels.PLANE, 1), stream](
+            there, top, small(weighing.factors), small(weighing.across), small(weighing.up),
+            weighted,
+        )  # fmt: skip
+        ready = cuda.device_array((n, cols, rows), np.float32, stream=stream)
+        kernels.convolve[plane(-(-cols // kernels.RUN)), (*kernels.PLANE, 1), stream](
+            weighted, small(_taps(response, wide, kernels.RUN)), kept.start, ready
+        )
+        blocks = (-(-nz // (kernels.BLOCK[0] * kernels.RUN)), -(-nx // kernels.BLOCK[1]), ny)
+        kernels.backproject[blocks, (*kernels.BLOCK, 1), stream](
+            ready.reshape(ready.size), cols, rows, small(table, np.float64), *self._grid,
+            self._data.reshape(self._shape),
+        )  # fmt: skip
+
+    def _upload(self, images: Float32Array) -> Any:
+        """Images on the device, by way of page-locked memory, which the copy does not wait for."""
+        from numba import cuda
+
+        self._turn = 1 - self._turn
+        buffer, copied = self._buffers.get(self._turn, (None, None))
+        if copied is not None:
+            copied.synchronize()
+        if buffer is None or len(buffer) < len(images):
+            buffer, copied = cuda.pinned_array(images.shape, np.float32), cuda.event()
+            self._buffers[self._turn] = buffer, copied
+        part = buffer[: len(images)]
+        np.copyto(part, images)
+        there = cuda.to_device(part, self._stream)
+        copied.record(self._stream)
+        return there
 
     def volume(self) -> Float32Array:
         """See `Backprojector`."""
-        out = np.empty(self._data.shape, np.float32)
-        _try(lambda: self._data.copy_to_host(out))
+        out = np.empty(self._shape, np.float32)
+
+        def fetch() -> None:
+            self._stream.synchronize()
+            self._data.copy_to_host(out.reshape(-1))
+
+        gpu.demand(fetch)
         return out
 
 
-def _try(work: Callable[[], object]) -> None:
-    if not gpu.attempt(work):
-        raise gpu.DeviceError
+def _taps(response: Float32Array, wide: int, more: int) -> FloatArray:
+    """The filter as it is in space: of the distance in columns, (wide + more,)."""
+    from scipy import fft
+
+    length = fft.next_fast_len(2 * wide, real=True)
+    taps = np.fft.irfft(response.astype(np.float64), length)[:wide]
+    return np.pad(taps, (0, more))
 
 
 def _grid(like: Volume) -> tuple[list[float], list[float]]:
@@ -201,9 +320,6 @@ def filtered(rows: Float32Array, response: Float32Array) -> Float32Array:
 
 Progress = Callable[[float], None]
 """Called with the fraction done, from 0 to 1."""
-
-CHUNK = 32
-"""Views worked on at a time."""
 
 
 def fdk(
@@ -283,7 +399,8 @@ def fdk_parts(
 
     Args:
         parts: gives float32 (k, rows, cols) arrays of line integrals, together one image a view;
-            called once more where a device fails on the way.
+            called once more where a device fails on the way, and for each slab of a volume that it
+            has no room for.
         cone_vec: of all views.
         shape: detector (rows, cols).
         like: the grid, or a volume on it.
@@ -294,13 +411,46 @@ def fdk_parts(
     """
     like = as_volume(like)
 
-    def onto(target: Backprojector) -> Volume:
-        return _fdk(parts(), cone_vec, shape, target, like, window, progress, truncation)
+    def onto(target: Backprojector, part: Volume, tell: Progress | None) -> Volume:
+        return _fdk(parts(), cone_vec, shape, target, part, window, tell, truncation)
 
-    if target is None and device_takes(like) and not circle_of(cone_vec).rise:
+    if target is None and not circle_of(cone_vec).rise:
+        slabs = _slabs(like, shape)
         with suppress(gpu.DeviceError):
-            return onto(OnDevice(like))
-    return onto(target or OnProcessor(like))
+            if len(slabs) == 1:
+                return onto(OnDevice(like), like, progress)
+            if slabs:
+                nz, ny, nx = like.shape
+                data = np.empty((ny, nx, nz), np.float32).transpose(2, 0, 1)
+                for k, (first, last) in enumerate(slabs):
+                    slab, tell = _layers(like, first, last), _share(progress, k, len(slabs))
+                    data[first:last] = onto(OnDevice(slab), slab, tell).data
+                return replace(like, data=data)
+    return onto(target or OnProcessor(like), like, progress)
+
+
+def _slabs(like: Volume, shape: tuple[int, int]) -> list[tuple[int, int]]:
+    """Layers (first, last) of the slabs that a device has room for one by one; none without one."""
+    count, layers = 1, like.shape[0]
+    while not device_takes(_layers(like, 0, -(-layers // count)), shape):
+        if count >= layers or not gpu.availability().present:
+            return []
+        count = min(2 * count, layers)
+    edges = [round(i * layers / count) for i in range(count + 1)]
+    return list(pairwise(edges))
+
+
+def _layers(like: Volume, first: int, last: int) -> Volume:
+    """The grid of layers first <= z < last."""
+    x, y, z = like.center_mm
+    middle = z + ((first + last) / 2 - like.shape[0] / 2) * like.voxel_xyz[2]
+    data = np.broadcast_to(np.zeros((), np.float32), (last - first, *like.shape[1:]))
+    return replace(like, data=data, center_mm=(x, y, middle))
+
+
+def _share(progress: Progress | None, k: int, count: int) -> Progress | None:
+    """What to tell of the k-th of several equal parts."""
+    return None if progress is None else lambda part: progress((k + part) / count)
 
 
 def _check_steady(circle: Circle, level: ConeVec, shape: tuple[int, int]) -> None:
@@ -331,8 +481,6 @@ def _fdk(
     truncation: Truncation | None,
 ) -> Volume:
     shape = cone_vec.of_shape(shape)
-    from flexdt.twin.reconstruction import fdk_kernels
-
     circle = circle_of(cone_vec)
     if on_its_side(cone_vec):
         parts = (part.transpose(0, 2, 1) for part in parts)
@@ -377,14 +525,11 @@ def _fdk(
         if pitch not in responses:
             responses[pitch] = ramp(wide, pitch, window)
         shape_needed = last - first, wide
-        ready = _weighted(images, top, shape_needed, level[views], circle, views, weights[views])
-        ready = filtered(ready, responses[pitch])
-        columns = np.empty((len(part), kept.stop - kept.start, last - first), np.float32)
-        fdk_kernels.stand_up(ready, kept.start, columns)
+        weighing = _weighing(shape_needed, level[views], circle, views, weights[views])
         shares = np.zeros((len(part), 0, 0), np.float32)
         if sharing is not None:
             shares = sharing.table(views, (first, last))
-        target.add(columns, shares, table[views])
+        target.add(images, top, weighing, responses[pitch], kept, shares, table[views])
         done = views.stop
         if progress is not None:
             progress(done / len(cone_vec))
@@ -396,38 +541,26 @@ def _fdk(
     return replace(like, data=target.volume().transpose(2, 0, 1))
 
 
-def _weighted(
-    images: Float32Array,
-    first: int,
-    shape: tuple[int, int],
-    cone_vec: ConeVec,
-    circle: Circle,
-    views: slice,
-    weights: FloatArray,
-) -> Float32Array:
-    """Images, from row `first` on, times the weights that FDK applies before the filter.
+def _weighing(
+    shape: tuple[int, int], cone_vec: ConeVec, circle: Circle, views: slice, weights: FloatArray
+) -> Weighing:
+    """The weights that FDK applies before the filter.
 
     The cosine is that of the ray with the line from source to axis. Exact fan-beam inversion for a
     panel at any angle to that line then needs the distance along the panel's normal only.
     """
-    from flexdt.twin.reconstruction import fdk_kernels
-
     rows, cols = shape
     source, u, v = cone_vec.source, cone_vec.u, cone_vec.v
     panel = cone_vec.detector - source
     inward = circle.centre - source[:, :2]
     radius = np.linalg.norm(inward, axis=1)
-    normal = cone_vec.normal
-    depth = np.abs((panel * normal).sum(axis=1))
+    depth = np.abs((panel * cone_vec.normal).sum(axis=1))
     c, r = np.arange(cols) - (cols - 1) / 2, np.arange(rows) - (rows - 1) / 2
     x = panel[:, None, :2] + c[:, None] * u[:, None, :2]
     z = panel[:, 2, None] + r * v[:, 2, None]
     along = (x * (inward / radius[:, None])[:, None]).sum(axis=2)
     factors = weights * along * (circle.step[views] * depth * radius)[:, None]
-    out = np.empty((len(images), rows, cols), np.float32)
-    ready = np.ascontiguousarray(images)
-    fdk_kernels.weigh(ready, first, factors, (x * x).sum(axis=2), z * z, out)
-    return out
+    return Weighing(factors, (x * x).sum(axis=2), z * z)
 
 
 def view_table(cone_vec: ConeVec, shape: tuple[int, int]) -> FloatArray:

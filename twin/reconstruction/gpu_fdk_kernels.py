@@ -1,9 +1,8 @@
-"""CUDA kernel: voxel-driven backprojection with FDK's weights, as the processor does it.
+"""CUDA kernels of FDK: weights, filter, and backprojection, as the processor does them.
 
-Neighbouring threads take voxels above one another, which are neighbours in memory and read
-neighbouring rows of one detector column; what is common to a voxel column is computed once for RUN
-voxels, in double precision. Imported only where a CUDA device (or numba's simulator of one) has
-been found. Arguments are not checked.
+Neighbouring threads take neighbouring rows of one detector column (weights and filter), or voxels
+above one another, which read such rows. Imported only where a CUDA device (or numba's simulator of
+one) has been found. Arguments are not checked.
 """
 
 from __future__ import annotations
@@ -11,68 +10,166 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import cuda
+from numba import config, cuda
 
 BLOCK = (32, 4)
-"""Threads a block: along z, and voxel columns along x."""
+"""Threads a block: along z, and voxel columns along x; each is one warp."""
 RUN = 8
-"""Voxels a thread, BLOCK[0] apart along z."""
+"""Voxels a thread, BLOCK[0] apart along z; columns a thread of the filter."""
+PLANE = (32, 8)
+"""Threads a block of `weigh` and `convolve`: rows, and columns, of which eight are one sector of
+memory in an image whose columns are neighbours."""
+BITS = 32
+"""Of a row's number, behind the point."""
+FIXED = float(2**BITS)
+UNIT = np.float32(1.0 / FIXED)
+STEEP = float(2**30)
+"""Rows from voxel to voxel, at most; where there are more, one voxel at most is on the panel."""
+
+if config.ENABLE_CUDASIM:
+
+    def narrow(i):  # noqa: D103
+        return int(i)
+
+    def place(i):  # noqa: D103
+        return int(i) % 2**32
+
+else:
+    narrow, place = np.int32, np.uint32
 
 
 @cuda.jit
-def backproject(images, views, first, size, volume):
+def weigh(images, top, factors, across, up, out):
+    """out[n, c, r] = images[n, top + r, c] * factors[n, c] / sqrt(across[n, c] + up[n, r]).
+
+    All are float32; images (n, rows of the panel, cols), out (n, cols, rows); see
+    `fdk_kernels.weigh`.
+    """
+    r = cuda.blockIdx.x * PLANE[0] + cuda.threadIdx.x
+    c = cuda.blockIdx.y * PLANE[1] + cuda.threadIdx.y
+    view = cuda.blockIdx.z
+    if c < out.shape[1] and r < out.shape[2]:
+        weight = factors[view, c] / math.sqrt(across[view, c] + up[view, r])
+        out[view, c, r] = images[view, top + r, c] * weight
+
+
+@cuda.jit
+def convolve(weighted, taps, start, out):
+    """out[n, c, r] = sum over j of weighted[n, j, r] * taps[|start + c - j|].
+
+    A thread finds RUN neighbouring columns: from one j to the next the taps move on by one place,
+    so that two numbers are read for RUN products.
+
+    weighted: float32 (n, wide, rows), rows contiguous; out: (n, cols, rows).
+    taps: float32 (wide + RUN,) at least.
+    """
+    r = cuda.blockIdx.x * PLANE[0] + cuda.threadIdx.x
+    c = (cuda.blockIdx.y * PLANE[1] + cuda.threadIdx.y) * RUN
+    view = cuda.blockIdx.z
+    cols, rows = out.shape[1], out.shape[2]
+    if c >= cols or r >= rows:
+        return
+    acc = cuda.local.array(8, np.float32)
+    near = cuda.local.array(8, np.float32)
+    for m in range(RUN):
+        acc[m] = 0.0
+        near[m] = taps[abs(start + c + m + 1)]  # those of j = -1
+    for j in range(weighted.shape[1]):
+        x = weighted[view, j, r]
+        for m in range(RUN - 1, 0, -1):
+            near[m] = near[m - 1]
+        near[0] = taps[abs(start + c - j)]
+        for m in range(RUN):
+            acc[m] += x * near[m]
+    for m in range(RUN):
+        if c + m < cols:
+            out[view, c + m, r] = acc[m]
+
+
+@cuda.jit
+def backproject(images, cols, rows, views, first, size, volume):
     """Add views to a volume.
 
-    images: float32 (n, cols, rows), rows contiguous.
+    The line of rows that a voxel column meets is the same for all its voxels. The threads of a
+    warp, which have one voxel column in common, find it in double precision for as many views at a
+    time, one each; then every thread goes through these views with rows in fixed point.
+
+    images: float32 (n * cols * rows,), rows of a column beside each other; fewer than 2^32.
     views: float64 (n, 11), as `fdk.view_table` makes them.
     first, size: centre of the first voxel and steps, (3,) x, y, z [mm].
     volume: float32 (ny, nx, nz), added to; a value counts with 1 / depth^2.
     """
-    lane = cuda.threadIdx.x
-    ix = cuda.blockIdx.y * BLOCK[1] + cuda.threadIdx.y
+    lane, warp = cuda.threadIdx.x, cuda.threadIdx.y
+    ix = cuda.blockIdx.y * BLOCK[1] + warp
     iy = cuda.blockIdx.z
-    ny, nx, nz = volume.shape
-    if ix >= nx or iy >= ny:
-        return
-    n, cols, rows = images.shape
+    _, nx, nz = volume.shape
+    n, rows = len(views), narrow(rows)
+    columns = cuda.shared.array((4, 32), np.int32)
+    parts = cuda.shared.array((4, 32), np.float32)
+    weights = cuda.shared.array((4, 32), np.float32)
+    lowest = cuda.shared.array((4, 32), np.int32)
+    highest = cuda.shared.array((4, 32), np.int32)
+    starts = cuda.shared.array((4, 32), np.int64)
+    steps = cuda.shared.array((4, 32), np.int64)
     begin = cuda.blockIdx.x * (BLOCK[0] * RUN) + lane
     acc = cuda.local.array(8, np.float32)
     for m in range(RUN):
         acc[m] = 0.0
-    for view in range(n):
-        # Depth, column and the row's line over k: common to the voxels of this column.
-        x = first[0] + ix * size[0] - views[view, 0]
-        y = first[1] + iy * size[1] - views[view, 1]
-        depth = x * views[view, 3] + y * views[view, 4]
-        if depth <= 0.0:
-            continue
-        inverse = 1.0 / depth
-        c = views[view, 8] + (x * views[view, 5] + y * views[view, 6]) * inverse * views[view, 7]
-        if c < 0.0 or c > cols - 1:
-            continue
-        i = max(min(int(c), cols - 2), 0)
-        across = np.float32(c - i)
-        step = -size[2] * views[view, 9] * inverse
-        start = views[view, 10] - (first[2] - views[view, 2]) * views[view, 9] * inverse
-        # Rows fall with z. The margin at the edges is that of the processor's kernel.
-        every = 1.0 / step
-        lowest = max(0, int(math.ceil((rows - 1 - start) * every + 1e-3)))  # noqa: RUF046
-        highest = min(nz - 1, int(math.floor(-start * every - 1e-3)))  # noqa: RUF046
-        weight = np.float32(inverse * inverse)
+    for base in range(0, n, BLOCK[0]):
+        view = base + lane
+        cuda.syncthreads()
+        highest[warp, lane] = -1
+        lowest[warp, lane] = 0
+        if view < n and ix < nx:
+            x = first[0] + ix * size[0] - views[view, 0]
+            y = first[1] + iy * size[1] - views[view, 1]
+            depth = x * views[view, 3] + y * views[view, 4]
+            if depth > 0.0:
+                inverse = 1.0 / depth
+                c = views[view, 8] + (x * views[view, 5] + y * views[view, 6]) * (
+                    inverse * views[view, 7]
+                )
+                if 0.0 <= c <= cols - 1:
+                    i = max(min(int(c), cols - 2), 0)
+                    step = -size[2] * views[view, 9] * inverse
+                    start = views[view, 10] - (first[2] - views[view, 2]) * views[view, 9] * inverse
+                    # Rows fall with z. The margin at the edges is that of the processor's kernel.
+                    every = 1.0 / step
+                    low = max(0, int(math.ceil((rows - 1 - start) * every + 1e-3)))  # noqa: RUF046
+                    high = min(nz - 1, int(math.floor(-start * every - 1e-3)))  # noqa: RUF046
+                    lowest[warp, lane] = low
+                    highest[warp, lane] = high
+                    columns[warp, lane] = i
+                    parts[warp, lane] = c - i
+                    weights[warp, lane] = inverse * inverse
+                    starts[warp, lane] = int((start + low * step) * FIXED)
+                    steps[warp, lane] = int(max(step, -STEEP) * FIXED)
+        cuda.syncthreads()
+        for v in range(min(BLOCK[0], n - base)):
+            low = lowest[warp, v]
+            high = highest[warp, v]
+            if begin > high or begin + (RUN - 1) * BLOCK[0] < low:
+                continue
+            left = place((base + v) * cols + columns[warp, v]) * place(rows)
+            right = left + place(rows)
+            across = parts[warp, v]
+            weight = weights[warp, v]
+            at = starts[warp, v] + (begin - low) * steps[warp, v]
+            rate = BLOCK[0] * steps[warp, v]
+            for m in range(RUN):
+                k = begin + m * BLOCK[0]
+                if low <= k <= high:
+                    j = min(max(narrow(at >> BITS), 0), rows - 1)
+                    after = place(min(j + 1, rows - 1))
+                    down = np.float32(place(at)) * UNIT
+                    up = images[left + place(j)]
+                    up += across * (images[right + place(j)] - up)
+                    under = images[left + after]
+                    under += across * (images[right + after] - under)
+                    acc[m] += weight * (up + down * (under - up))
+                at += rate
+    if ix < nx:
         for m in range(RUN):
             k = begin + m * BLOCK[0]
-            if k < lowest or k > highest:
-                continue
-            at = start + k * step
-            j = min(max(int(at), 0), rows - 1)
-            down = np.float32(at - j)
-            after = min(j + 1, rows - 1)
-            low = images[view, i, j]
-            low += across * (images[view, i + 1, j] - low)
-            high = images[view, i, after]
-            high += across * (images[view, i + 1, after] - high)
-            acc[m] += weight * (low + down * (high - low))
-    for m in range(RUN):
-        k = begin + m * BLOCK[0]
-        if k < nz:
-            volume[iy, ix, k] += acc[m]
+            if k < nz:
+                volume[iy, ix, k] += acc[m]

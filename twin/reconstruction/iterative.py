@@ -5,14 +5,17 @@ one function; all see geometry through `forward` and `back` only. Everything is 
 caller chooses the number of iterations; there is no stopping rule.
 
 A `Problem` is what every method has in hand: data, geometry and grid, and the matched pair of
-operators on plain arrays.
+operators on plain arrays. Where a CUDA device has room for all that a method holds, the same method
+runs on a `DeviceProblem`, whose arrays are there from the first iteration to the last.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, singledispatch
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -20,11 +23,19 @@ import numpy.typing as npt
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.projection import Grid, Volume, as_volume, back, forward, room_like
+from flexdt.twin.projection import Grid, Volume, as_volume, back, forward, gpu, room_like
+from flexdt.twin.projection.device_arrays import DeviceArray
+from flexdt.twin.projection.linear_operator import dot as dot
 from flexdt.twin.projection.operators import as_cone_vec, check_projections, require_finite
+from flexdt.twin.projection.volume import DeviceVolume
 
 SMALLEST = 1e-6
 """Sums of weights below this part of the largest are not divided by."""
+STACKS, VOLUMES = 4, 5
+"""How many stacks of images, and volumes, a method holds at a time, at most."""
+
+
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True)
@@ -113,9 +124,17 @@ class Problem:
 
     def inverse_sums(self, geometry: ConeVec) -> tuple[Float32Array, Float32Array]:
         """Inverse sums of the projector's rows and columns, zero where (nearly) nothing is."""
-        rows = self.project(np.ones(self.like.shape, np.float32), geometry)
-        columns = self.spread(np.ones_like(rows), geometry)
+        rows = self.project(ones(self.first(None)), geometry)
+        columns = self.spread(ones(rows), geometry)
         return inverse(rows), inverse(columns)
+
+    def part(self, views: slice | npt.NDArray[np.intp]) -> Float32Array:
+        """The measured line integrals of some views."""
+        return self.measured[views]
+
+    def volume(self, x: Float32Array) -> Volume:
+        """The voxels that were found, on their grid."""
+        return replace(self.like, data=x)
 
     def tell(self, watch: Watch | None, i: int, of: int, rest: Float32Array) -> None:
         """Report iteration i (from 0) with the residual `rest`."""
@@ -123,16 +142,81 @@ class Problem:
             watch(Step(i + 1, of, float(np.sqrt(dot(rest, rest) / rest.size))))
 
 
+@dataclass(frozen=True, eq=False)
+class DeviceProblem(Problem):
+    """The same on a CUDA device: every array is a `DeviceArray`.
+
+    Attributes:
+        returns: whether the volume goes back to the host, where the images came from.
+    """
+
+    returns: bool = True
+
+    @classmethod
+    def of_host(cls, problem: Problem) -> DeviceProblem:
+        """With the line integrals moved there, unless they are there."""
+        there: Any = DeviceArray.of_images(problem.measured)
+        return cls(there, problem.geometry, problem.like, not gpu.is_there(problem.measured))
+
+    def first(self, start: Volume | None) -> Any:
+        """See `Problem`."""
+        if start is None:
+            return DeviceArray.of_volume(DeviceVolume.blank(self.like))
+        return DeviceArray.of_voxels(replace(self.like, data=super().first(start)))
+
+    def project(self, x: Any, geometry: ConeVec | None = None) -> Any:
+        """See `Problem`."""
+        geometry = self.geometry if geometry is None else geometry
+        return DeviceArray.of_images(forward(x.volume, geometry, self.shape))
+
+    def spread(self, y: Any, geometry: ConeVec | None = None) -> Any:
+        """See `Problem`; in memory of its own."""
+        geometry = self.geometry if geometry is None else geometry
+        found: Any = back(y.images, geometry, self.like)
+        return DeviceArray.of_volume(found)
+
+    def part(self, views: slice | npt.NDArray[np.intp]) -> Any:
+        """See `Problem`."""
+        all_of_them: Any = self.measured
+        return all_of_them if isinstance(views, slice) else all_of_them.images_of(views)
+
+    def volume(self, x: Any) -> Any:
+        """See `Problem`; a `DeviceVolume` where the images were on the device."""
+        return x.volume.to("cpu") if self.returns else x.volume
+
+
+def solved(problem: Problem, method: Callable[[Problem], Found]) -> Found:
+    """By a method on the device, if images are there or it has room, or else on the processor."""
+    if gpu.is_there(problem.measured):
+        return method(DeviceProblem.of_host(problem))
+    voxels = 4 * int(np.prod(problem.like.shape))
+    need = STACKS * problem.measured.nbytes + VOLUMES * voxels
+    if gpu.availability().present and gpu.has_room(need):
+        with suppress(gpu.DeviceError):
+            return method(DeviceProblem.of_host(problem))
+    return method(problem)
+
+
+def ones(like: Any) -> Any:
+    """Ones of the form of an array, which may be on a device."""
+    return like * np.float32(0) + np.float32(1)
+
+
 def inverse(values: Float32Array) -> Float32Array:
     """One over sums of weights, zero where (nearly) nothing is."""
-    out = np.zeros_like(values)
-    np.divide(1.0, values, out=out, where=values > SMALLEST * float(values.max()))
-    return out
+    found: Float32Array = ratio(ones(values), values)
+    return found
 
 
-def dot(a: Float32Array, b: Float32Array) -> float:
-    """Inner product of two stacks or volumes, summed in double precision."""
-    return float(np.einsum("ijk,ijk->", a, b, dtype=np.float64))
+@singledispatch
+def ratio(a: Any, b: Any) -> Any:
+    """a / b, zero where (nearly) nothing is in b."""
+    return np.divide(a, b, out=np.zeros_like(b), where=b > SMALLEST * float(b.max()))
+
+
+@ratio.register
+def _(a: DeviceArray, b: DeviceArray) -> DeviceArray:
+    return a.over(b, SMALLEST * b.max())
 
 
 def far_apart(count: int) -> list[int]:
@@ -181,7 +265,10 @@ def sirt(
         True
     """
     problem = Problem.of(projections, cone_vec, like, iterations)
-    return _subset_steps(problem, [slice(None)], 1.0, iterations, start, nonnegative, watch)
+    return solved(
+        problem,
+        lambda p: _subset_steps(p, [slice(None)], 1.0, iterations, start, nonnegative, watch),
+    )
 
 
 def sart(
@@ -221,7 +308,10 @@ def sart(
             {"asked": [subsets, relaxation]},
         )
     parts = [np.arange(k, len(problem.geometry), count) for k in far_apart(count)]
-    return _subset_steps(problem, parts, relaxation, iterations, start, nonnegative, watch)
+    return solved(
+        problem,
+        lambda p: _subset_steps(p, parts, relaxation, iterations, start, nonnegative, watch),
+    )
 
 
 def _subset_steps(
@@ -240,7 +330,7 @@ def _subset_steps(
         squares = 0.0
         for part, (rows, columns) in zip(parts, sums, strict=True):
             geometry = problem.geometry[part]
-            rest = problem.measured[part] - problem.project(x, geometry)
+            rest = problem.part(part) - problem.project(x, geometry)
             squares += dot(rest, rest)
             rest *= rows
             x = x + np.float32(relaxation) * columns * problem.spread(rest, geometry)
@@ -248,7 +338,7 @@ def _subset_steps(
                 np.maximum(x, 0.0, out=x)
         if watch is not None:
             watch(Step(i + 1, iterations, float(np.sqrt(squares / problem.measured.size))))
-    return replace(problem.like, data=x)
+    return problem.volume(x)
 
 
 def cgls(
@@ -276,6 +366,10 @@ def cgls(
         True
     """
     problem = Problem.of(projections, cone_vec, like, iterations)
+    return solved(problem, lambda p: _cgls(p, iterations, start, watch))
+
+
+def _cgls(problem: Problem, iterations: int, start: Volume | None, watch: Watch | None) -> Volume:
     x = problem.first(start)
     rest = problem.measured - problem.project(x)
     gradient = problem.spread(rest)
@@ -293,7 +387,7 @@ def cgls(
         new = dot(gradient, gradient)
         direction = gradient + np.float32(new / norm) * direction
         norm = new
-    return replace(problem.like, data=x)
+    return problem.volume(x)
 
 
 def em(
@@ -320,19 +414,18 @@ def em(
         True
     """
     problem = Problem.of(projections, cone_vec, like, iterations)
-    measured = np.maximum(problem.measured, 0.0)
-    whole = problem.spread(np.ones_like(measured)).copy(order="K")
-    seen = whole > SMALLEST * whole.max()
+    return solved(problem, lambda p: _em(p, iterations, start, watch))
+
+
+def _em(problem: Problem, iterations: int, start: Volume | None, watch: Watch | None) -> Volume:
+    measured = np.maximum(problem.measured, np.float32(0))
+    whole = problem.spread(ones(measured)).copy(order="K")
     x = problem.first(start)
     if start is None:
-        reach = problem.project(np.ones_like(x))
-        x = np.where(seen, np.float32(measured.sum() / max(float(reach.sum()), 1e-30)), 0.0)
-        x = x.astype(np.float32)
+        reach = float(problem.project(ones(x)).sum())
+        x = ratio(whole, whole) * np.float32(measured.sum() / max(reach, 1e-30))
     for i in range(iterations):
         image = problem.project(x)
         problem.tell(watch, i, iterations, problem.measured - image)
-        floor = SMALLEST * float(image.max())
-        ratio = np.divide(measured, image, out=np.zeros_like(image), where=image > floor)
-        gain = problem.spread(ratio)
-        x = x * np.divide(gain, whole, out=np.zeros_like(gain), where=seen)
-    return replace(problem.like, data=x)
+        x = x * ratio(problem.spread(ratio(measured, image)), whole)
+    return problem.volume(x)

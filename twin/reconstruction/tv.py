@@ -14,7 +14,8 @@ end is the minimum whatever the subsets were.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,8 +23,18 @@ import numpy.typing as npt
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.projection import Grid, Operator, Volume
-from flexdt.twin.reconstruction.iterative import Problem, Watch, dot, far_apart
+from flexdt.twin.projection import Grid, Volume, gpu
+from flexdt.twin.projection.device_arrays import DeviceArray
+from flexdt.twin.projection.linear_operator import norm_of
+from flexdt.twin.reconstruction.iterative import (
+    DeviceProblem,
+    Problem,
+    Watch,
+    dot,
+    far_apart,
+    ones,
+    solved,
+)
 
 WEIGHT = 1e-2
 """Default strength as a part of max(A' b); see docs/operator.md for how it was chosen."""
@@ -154,14 +165,34 @@ def minimise_tv(
             raise LimitError(
                 f"{name} {value:g}; allowed: {least:g} or more", {"asked": value, "allowed": least}
             )
+    regular = Regular.of(problem.like, nonnegative, mask)
+
+    def minimised(problem: Problem) -> Minimised:
+        there = isinstance(problem, DeviceProblem)
+        kept = DeviceRegular.of_host(regular, problem.like) if there else regular
+        return _minimised(problem, kept, iterations, weight, tolerance, subsets, start, watch)
+
+    return solved(problem, minimised)
+
+
+def _minimised(
+    problem: Problem,
+    regular: Regular | DeviceRegular,
+    iterations: int,
+    weight: float,
+    tolerance: float,
+    subsets: int,
+    start: Volume | None,
+    watch: Watch | None,
+) -> Minimised:
     scale = problem.spread(problem.measured)
     strength = weight * max(float(scale.max()), 0.0)
-    objective = _Objective(problem, strength, Regular.of(problem.like, nonnegative, mask))
+    objective = _Objective(problem, strength, regular)
     at = objective.at(objective.regular.allow(problem.first(start)))
     costs = [at.cost]
-    norm = Operator(problem.geometry, problem.like, problem.shape).norm(NORM)
+    norm = norm_of(problem.project, problem.spread, ones(problem.first(None)), NORM)
     if norm == 0.0:
-        return Minimised(replace(problem.like, data=at.x), tuple(costs), True, strength)
+        return Minimised(problem.volume(at.x), tuple(costs), True, strength)
     step = 1.0 / (1.02 * norm) ** 2  # the estimate of the norm is from below
     little = 0
 
@@ -194,7 +225,7 @@ def minimise_tv(
         done = tell(at)
         t, further = momentum(t)
         ahead = at.beyond(last, further)
-    return Minimised(replace(problem.like, data=at.x), tuple(costs), done, strength)
+    return Minimised(problem.volume(at.x), tuple(costs), done, strength)
 
 
 def momentum(t: float) -> tuple[float, float]:
@@ -227,7 +258,7 @@ class _Objective:
 
     problem: Problem
     strength: float
-    regular: Regular
+    regular: Regular | DeviceRegular
 
     def at(self, x: Float32Array) -> _At:
         rest = self.problem.project(x) - self.problem.measured
@@ -246,7 +277,7 @@ class _Objective:
         for k in far_apart(count):
             part = np.arange(k, n, count)
             geometry = self.problem.geometry[part]
-            rest = self.problem.project(x, geometry) - self.problem.measured[part]
+            rest = self.problem.project(x, geometry) - self.problem.part(part)
             x -= np.float32(step * n / len(part)) * self.problem.spread(rest, geometry)
         return self.regular.proximal(x, count * step * self.strength)
 
@@ -301,9 +332,7 @@ class Regular:
         z = np.ascontiguousarray(z)
         x = np.empty_like(z)
         ahead = self.dual.copy()
-        small = np.float32(theta)
-        # The squared norm of the differences is at most 4 sum(scale^2).
-        rate = np.float32(1.0 / (4.0 * theta * float((self.scale**2).sum())))
+        small, rate = np.float32(theta), _rate(self.scale, theta)
         t = 1.0
         for _ in range(INNER):
             tv_kernels.primal_step(z, ahead, small, self.scale, self.lowest, self.allowed, x)
@@ -311,3 +340,63 @@ class Regular:
             tv_kernels.dual_step(x, ahead, self.dual, rate, np.float32(further), self.scale)
         tv_kernels.primal_step(z, self.dual, small, self.scale, self.lowest, self.allowed, x)
         return x
+
+
+def _rate(scale: Float32Array, theta: float) -> np.float32:
+    """Of the dual steps: the squared norm of the differences is at most 4 sum(scale^2)."""
+    return np.float32(1.0 / (4.0 * theta * float((scale**2).sum())))
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceRegular:
+    """`Regular` on a CUDA device: volumes are `DeviceArray`."""
+
+    scale: Float32Array
+    lowest: np.float32
+    allowed: DeviceArray
+    dual: Any = field(repr=False)
+
+    @classmethod
+    def of_host(cls, regular: Regular, like: Volume) -> DeviceRegular:
+        """The same there, with all dual variables zero."""
+        allowed = DeviceArray.of_voxels(like.like(regular.allowed.astype(np.float32)))
+        dual = gpu.demand(lambda: gpu.zeros(3 * allowed.flat.size))
+        return cls(regular.scale, regular.lowest, allowed, dual)
+
+    def allow(self, x: Any) -> Any:
+        """See `Regular`."""
+        return np.maximum(x, self.lowest) * self.allowed
+
+    def variation(self, x: Any) -> float:
+        """See `Regular`."""
+        found = x.copy()
+        self._run("lengths", x.flat, *self._form(), found.flat)
+        return float(found.sum())
+
+    def proximal(self, z: Any, theta: float) -> Any:
+        """See `Regular`."""
+        if theta == 0.0:
+            return self.allow(z)
+        x, ahead = z.copy(), DeviceArray.of_images(self.dual.reshape(1, 1, self.dual.size)).copy()
+        small, rate, form = np.float32(theta), _rate(self.scale, theta), self._form()
+        last = (*form, self.lowest, self.allowed.flat, x.flat)
+        t = 1.0
+        for _ in range(INNER):
+            self._run("primal_step", z.flat, ahead.flat, small, *last)
+            t, further = momentum(t)
+            self._run("dual_step", x.flat, ahead.flat, self.dual, rate, np.float32(further), *form)
+        self._run("primal_step", z.flat, self.dual, small, *last)
+        return x
+
+    def _form(self) -> tuple[Any, ...]:
+        stride = self.allowed.volume.layout.stride_x
+        return self.allowed.shape, stride, tuple(self.scale)
+
+    def _run(self, name: str, *arguments: Any) -> None:
+        def launch() -> None:
+            from flexdt.twin.reconstruction import gpu_tv_kernels
+
+            blocks = -(-self.allowed.flat.size // gpu.LINEAR)
+            getattr(gpu_tv_kernels, name)[blocks, gpu.LINEAR](*arguments)
+
+        gpu.demand(launch)

@@ -72,6 +72,81 @@ print("simulated")
 """
 
 
+TWO_DEVICES = """
+import numpy as np
+from numba import cuda
+from flexdt.twin.projection import Volume, forward, gpu, level_axis
+from flexdt.twin.projection.kernels import gpu_kernels
+from tests.twin.projection.conftest import _circle
+
+assert gpu.availability().present
+gpu_kernels.BLOCK, gpu.VIEWS_A_THREAD = (4, 2), 0.0
+level_axis.level_axes = lambda rays, *_: np.zeros(len(rays), int)
+inside, seen = [], []
+
+class Device:
+    def __init__(self, number):
+        self.number = number
+    def __enter__(self):
+        inside.append(self.number)
+    def __exit__(self, *_):
+        inside.pop()
+    def get_memory_info(self):
+        raise AssertionError
+
+cuda.gpus.lst = (Device(0), Device(1))
+there, upload = gpu.project_there, cuda.to_device
+
+class Tagged:  # an array of one device: nothing may touch it from the other
+    def __init__(self, array):
+        self.array, self.device = array, inside[-1]
+    def copy_to_host(self, out):
+        assert inside[-1] == self.device
+        self.array.copy_to_host(out)
+
+def project_there(box, voxels, views, shape):
+    assert voxels.device == inside[-1]
+    seen.append((inside[-1], len(views)))
+    return Tagged(there(box, voxels.array, views, shape))
+
+gpu.project_there = project_there
+uploads = []
+def to_device(array, *rest):
+    made = upload(array, *rest)
+    if array.ndim == 1 and array.dtype == np.float32:
+        uploads.append(inside[-1])
+        return Tagged(made)
+    return made
+cuda.to_device = to_device
+
+data = np.random.default_rng(1).random((4, 5, 3), dtype=np.float32)
+volume = Volume(data, 0.5)
+for count, chunk, portions in ((19, 10**9, [(0, 10), (1, 9)]), (7, 10**9, [(0, 7)]),
+                               (17, 4 * 20 * 4, [(0, 4), (1, 4), (0, 4), (1, 4), (0, 1)])):
+    gpu.CHUNK_BYTES = chunk
+    scan = _circle(count, 60.0, 100.0, 1.2, start=0.2, height=1.0)
+    seen.clear()
+    images = forward(volume, scan, (4, 5))
+    assert seen == portions, seen
+    with gpu.switched_off():
+        exact = forward(volume, scan, (4, 5))
+    assert np.abs(images - exact).max() < 3e-6 * exact.max() and exact.max() > 0
+assert sorted(uploads) == [0, 1], uploads  # the volume goes to each device once
+print("simulated")
+"""
+
+
+def test_views_are_dealt_to_two_devices_that_share_nothing() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", TWO_DEVICES],
+        env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.stdout.strip() == "simulated", done.stderr
+
+
 def test_host_logic_and_kernels_in_the_simulator() -> None:
     done = subprocess.run(
         [sys.executable, "-c", SIMULATED],

@@ -1,0 +1,174 @@
+"""Images and voxels on a CUDA device with numpy's arithmetic, for methods written in it.
+
+`+`, `-`, `*` and `numpy.maximum`, in place, too, run where the numbers are; nothing is moved but
+the numbers that `dot`, `sum` and `max` return.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numpy.lib.mixins import NDArrayOperatorsMixin
+
+from flexdt.twin.errors import GeometryError
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.projection import gpu
+from flexdt.twin.projection.operators import layout_data
+from flexdt.twin.projection.volume import DeviceVolume, Volume, blank_layout
+
+UFUNCS = {np.add: "ADD", np.subtract: "SUBTRACT", np.multiply: "MULTIPLY", np.maximum: "MAXIMUM"}
+"""What there is of numpy's functions, and what the kernel calls it."""
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceArray(NDArrayOperatorsMixin):
+    """Numbers of single precision on the device.
+
+    Every method raises `gpu.DeviceError` where the device fails.
+
+    Attributes:
+        flat: numba's one-dimensional array.
+        shape: (n, rows, cols) of images, (nz, ny, nx) of voxels.
+        grid: of voxels, where each lies in `flat`; what its layout holds is not used.
+    """
+
+    flat: Any
+    shape: tuple[int, int, int]
+    grid: DeviceVolume | None = None
+
+    @classmethod
+    def of_images(cls, images: Any) -> DeviceArray:
+        """(n, rows, cols), of the host, or on the device, whose memory is shared."""
+        there = images if gpu.is_there(images) else gpu.demand(lambda: gpu.upload(images))
+        return cls(there.reshape(images.size), images.shape)
+
+    @classmethod
+    def of_volume(cls, volume: DeviceVolume) -> DeviceArray:
+        """The voxels of a volume that has room for all of its grid; their memory is shared."""
+        return cls(volume.layout.flat, volume.shape, volume)
+
+    @classmethod
+    def of_voxels(cls, volume: Volume) -> DeviceArray:
+        """The voxels of a volume of the host, copied there."""
+        layout = blank_layout(volume)
+        layout_data(layout)[...] = volume.data
+        layout = replace(layout, flat=gpu.demand(lambda: gpu.upload(layout.flat)))
+        return cls.of_volume(DeviceVolume(layout, volume.shape, volume.voxel_xyz, volume.center_mm))
+
+    @property
+    def images(self) -> Any:
+        """Numba's array of its shape, the memory shared."""
+        return self.flat.reshape(self.shape)
+
+    @property
+    def volume(self) -> DeviceVolume:
+        """The voxels as a volume, the memory shared."""
+        assert self.grid is not None
+        return replace(self.grid, layout=replace(self.grid.layout, flat=self.flat))
+
+    def images_of(self, views: npt.NDArray[np.intp]) -> DeviceArray:
+        """A copy of the images of some views."""
+
+        def gather() -> DeviceArray:
+            from numba import cuda
+
+            there, each = self.images, self.size // max(1, self.shape[0])
+            some = cuda.device_array(len(views) * each, np.float32)
+            for k, view in enumerate(views):
+                some[k * each : (k + 1) * each].copy_to_device(there[int(view)].reshape(each))
+            return DeviceArray(some, (len(views), *self.shape[1:]))
+
+        found: DeviceArray = gpu.demand(gather)
+        return found
+
+    @property
+    def size(self) -> int:
+        """How many numbers."""
+        return int(np.prod(self.shape))
+
+    def __array_ufunc__(
+        self, ufunc: np.ufunc, method: str, *inputs: Any, out: Any = None, **options: Any
+    ) -> Any:
+        a, b = inputs if len(inputs) == 2 else (self, None)
+        if not isinstance(a, DeviceArray) and ufunc is not np.subtract:
+            a, b = b, a  # the other three are the same either way round
+        if (
+            ufunc not in UFUNCS
+            or method != "__call__"
+            or options
+            or not isinstance(a, DeviceArray)
+            or not isinstance(b, DeviceArray | float | int | np.number)
+        ):
+            return NotImplemented
+        other = b if isinstance(b, DeviceArray) else float(b)
+        return _combined(UFUNCS[ufunc], a, other, None if out is None else out[0])
+
+    def over(self, other: DeviceArray, least: float) -> DeviceArray:
+        """self / other, and 0 where other is at most `least`."""
+        return _combined("RATIO", self, other, least=least)
+
+    def copy(self, order: str = "K") -> DeviceArray:
+        """The same numbers in memory of their own."""
+        return _combined("ADD", self, 0.0)
+
+    def dot(self, other: DeviceArray) -> float:
+        """Sum of the products."""
+        return float(_folded("DOT", self, other).sum())
+
+    def sum(self) -> float:
+        """Of all numbers."""
+        return float(_folded("SUM", self, self).sum())
+
+    def max(self) -> float:
+        """The largest number."""
+        return float(_folded("LARGEST", self, self).max())
+
+
+def _combined(
+    name: str,
+    a: DeviceArray,
+    b: DeviceArray | float,
+    out: DeviceArray | None = None,
+    least: float = 0.0,
+) -> DeviceArray:
+    if isinstance(b, DeviceArray) and b.shape != a.shape:
+        raise GeometryError(
+            f"arrays of {a.shape} and {b.shape} on the device; allowed: of one shape",
+            {"asked": list(b.shape), "allowed": list(a.shape)},
+        )
+
+    def launch() -> DeviceArray:
+        from numba import cuda
+
+        from flexdt.twin.projection.kernels import gpu_array_kernels as kernels
+
+        made = out
+        if made is None:
+            made = replace(a, flat=cuda.device_array(a.flat.size, np.float32))
+        if isinstance(b, DeviceArray):
+            second = (b.flat, np.float32(least), False)
+        else:
+            second = (a.flat, np.float32(b), True)
+        blocks = -(-a.flat.size // gpu.LINEAR)
+        kernels.combine[blocks, gpu.LINEAR](getattr(kernels, name), a.flat, *second, made.flat)
+        return made
+
+    found: DeviceArray = gpu.demand(launch)
+    return found
+
+
+def _folded(name: str, a: DeviceArray, b: DeviceArray) -> FloatArray:
+    def launch() -> FloatArray:
+        from numba import cuda
+
+        from flexdt.twin.projection.kernels import gpu_array_kernels as kernels
+
+        parts = cuda.device_array(kernels.FOLDING[0] * kernels.FOLDING[1], np.float64)
+        kernels.fold[kernels.FOLDING](getattr(kernels, name), a.flat, b.flat, parts)
+        return np.asarray(parts.copy_to_host())
+
+    found: FloatArray = gpu.demand(launch)
+    return found
