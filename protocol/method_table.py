@@ -191,7 +191,7 @@ def parse_result(model: type[_R], given: object) -> _R:
 
 def _explain(method: str, error: ValidationError, allowed: list[str]) -> RpcError:
     problems: list[dict[str, object]] = []
-    for e in error.errors(include_url=False)[:50]:
+    for e in error.errors()[:50]:
         problem: dict[str, object] = {
             "path": ".".join(clip(str(part), 80) for part in e["loc"]) or "params",
             "message": e["msg"].removeprefix("Value error, "),

@@ -31,7 +31,7 @@ from flexdt.protocol.method_table import compatible
 from flexdt.protocol.params import SampleUpload
 from flexdt.protocol.projector import PROJECTOR_METHODS
 from flexdt.protocol.results import MoveResult
-from flexdt.protocol.rpc_errors import Code, clip, invalid_params
+from flexdt.protocol.rpc_errors import Code, clip, internal, invalid_params
 
 BAD: list[tuple[str, object, str]] = [
     ("state.get", {"x": 1}, "x"),
@@ -386,6 +386,11 @@ def test_a_clipped_text_is_the_text_as_far_as_it_goes(limit: int) -> None:
         whole = "{" + pairs + (", ...}" if count > some else "}")
         shown = clip(dict.fromkeys(range(count), 1), limit)
         assert shown == (whole if len(whole) <= limit else whole[:limit] + "...")
+    for count in (24, 25, 26):  # inside another value, of a quarter of the length
+        more = ", ..." if count > 25 else ""
+        ones, pairs = ["1"] * min(count, 25), [f"{i}: 1" for i in range(min(count, 25))]
+        assert clip([[1] * count]) == f"[[{', '.join(ones)}{more}]]"
+        assert clip([dict.fromkeys(range(count), 1)]) == f"[{{{', '.join(pairs)}{more}}}]"
     assert clip(2**4095) == str(2**4095)[:200] + "..."
     assert clip(2**4096) == "a whole number of 4097 bits"
 
@@ -403,3 +408,28 @@ def test_codes_and_what_may_be_called_when_are_what_they_were() -> None:
     unsafe = {name for name, m in PROJECTOR_METHODS.items() if not m.safe}
     assert unsafe == {"backproject"}
     assert not any(m.control or m.urgent or m.limits for m in PROJECTOR_METHODS.values())
+
+
+def test_an_internal_error_names_its_trace_where_there_is_one() -> None:
+    assert internal("job-1/3").data == {"trace": "job-1/3"}
+    assert internal().data is None
+    assert {internal("a").code, internal().code} == {-32603}
+
+
+@pytest.mark.parametrize("method", ["calibration.fit", "calibration.apply"])
+@pytest.mark.parametrize("value", [float("inf"), float("nan"), -float("inf")])
+def test_no_number_of_a_request_is_infinite(method: str, value: float) -> None:
+    key = {"calibration.fit": "priors", "calibration.apply": "parameters"}[method]
+    with pytest.raises(RpcError) as caught:
+        parse_params(METHODS[method], {key: {"dO_x": value}})
+    problems = caught.value.data["problems"]  # type: ignore[index]
+    assert f"{key}.dO_x" in {p["path"] for p in problems}
+
+
+def test_images_have_up_to_four_sizes() -> None:
+    for sizes in ((), (2,), (2, 1, 3), (1, 2, 1, 3)):
+        array = np.arange(np.prod(sizes, dtype=int), dtype=np.float32).reshape(sizes)
+        assert_array_equal(image.decode(image.encode(array)), array)
+    five = {**image.encode(np.zeros((1, 2, 1, 3), np.float32)), "shape": [1, 2, 1, 3, 1]}
+    with pytest.raises(RpcError, match="up to four sizes"):
+        image.decode(five)

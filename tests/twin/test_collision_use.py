@@ -315,7 +315,7 @@ def test_a_size_of_nothing_is_no_sample() -> None:
     plan = plan_script(parse_script(text), M, P)
     check = collision_check()
     empty = check(plan, M, P, None)
-    for height in (0.0, 30.0):
+    for height in (0.0, 30.0, 5000.0):
         assert check(plan, M, P, SampleSize(0.0, height)) == empty
 
 

@@ -15,6 +15,9 @@ from numpy.testing import assert_allclose
 
 from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.geometry import ConeVec
+from flexdt.twin.geometry.cone_vec import check_cone_vec
+from flexdt.twin.geometry.motion import Motion
+from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.geometry.rigid import Rigid
 from flexdt.twin.machine.description import builtin_machine, profile_of
 from flexdt.twin.machine.kinematics import poses
@@ -143,9 +146,13 @@ def test_a_helix_rises_with_the_angle() -> None:
     [
         ({"sod": 0.0}, "sod"),
         ({"sdd": 500.0}, "0 < sod <= sdd"),
-        ({"sod": math.nan}, "sod is nan"),
+        ({"sod": math.nan}, "sod is nan.*one finite number"),
+        ({"sod": [1.0, 2.0]}, "one finite number"),
+        ({"offset": (1.0, math.nan)}, "2 finite numbers"),
+        ({"tilts": (math.inf, 1.0, 2.0)}, "3 finite numbers"),
         ({"angles": 0}, "number of views"),
         ({"angles": 30.0}, "number of views"),
+        ({"angles": np.zeros((2, 2))}, r"array of shape \(2, 2\)"),
         ({"angles": True}, "number of views"),
         ({"angles": [0.0, math.inf]}, "finite"),
         ({"pixel": -1.0}, "pixel"),
@@ -389,3 +396,87 @@ def test_a_stage_on_the_turntable_moves_a_point_by_hand() -> None:
         assert_allclose(there.source - here.source, [[-gone[0], -gone[1], 0.0]], atol=1e-9)
         assert_allclose(there.detector - here.detector, [[-gone[0], -gone[1], 0.0]], atol=1e-9)
         assert_allclose(there.u, here.u)
+
+
+def test_motion_of_a_scan_goes_to_its_document_and_back() -> None:
+    """In degrees and mm, by hand; nan says that a parameter was found not to move."""
+    angles = np.radians([0.0, 0.5, -0.25])
+    values = np.stack([[1.0, -2.0, 0.5], angles], axis=1)
+    sigma = np.stack([[0.1, 0.2, 0.3], np.full(3, np.nan)], axis=1)
+    motion = Motion(("dO_x", "alpha"), values, sigma, (9.0, -1.5))
+    document = motion.to_dict()
+    assert document["dO_x"] == {"unit": "mm", "values": [1.0, -2.0, 0.5], "sigmas": [0.1, 0.2, 0.3],
+                                "evidence": 9.0, "moves": True}  # fmt: skip
+    assert document["alpha"]["values"] == pytest.approx([0.0, 0.5, -0.25])
+    assert document["alpha"]["sigmas"] == [None, None, None]
+    back = Motion.from_dict(json.loads(json.dumps(document)))
+    assert (back.names, back.evidence) == (motion.names, motion.evidence)
+    assert_allclose(back.values, values, rtol=1e-14)
+    assert_allclose(back.sigma, sigma, rtol=1e-14)
+    assert repr(motion) == "<Motion: 3 frames, dO_x 3 mm, alpha 0.75 deg>"
+    still = Motion(("dO_x",), np.zeros((2, 1)), np.zeros((2, 1)), (0.0,))
+    assert still.to_dict()["dO_x"]["moves"] is False
+
+
+def test_estimates_of_a_motion_are_near_within_a_hundredth_of_a_sigma() -> None:
+    values, sigma = np.array([[1.0, 5.0], [-1.0, 5.0]]), np.array([[0.1, np.nan], [0.2, np.nan]])
+    motion = Motion(("dO_x", "dO_y"), values, sigma, (1.0, 1.0))
+    for i, step, near in ((0, 0.0009, True), (0, 0.0011, False), (1, -0.0019, True),
+                          (1, -0.0021, False)):  # fmt: skip
+        other = values.copy()
+        other[i, 0] += step
+        assert motion.near(Motion(motion.names, other, sigma, (1.0, 1.0))) is near
+    other = values + (0.0, 1e-9)  # what does not move has no sigma
+    assert not motion.near(Motion(motion.names, other, sigma, (1.0, 1.0)))
+
+
+GOOD = {"values": [1.0, 2.0], "sigmas": [0.1, 0.1], "evidence": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("document", "said"),
+    [
+        ({"src_ort": GOOD}, "'src_ort' cannot differ from frame to frame; allowed: dO_x"),
+        ({"dO_x": {**GOOD, "values": [[1.0], [2.0]], "sigmas": [[1.0], [2.0]]}}, "number a frame"),
+        ({"dO_x": {**GOOD, "values": [1.0]}}, "motion of dO_x: values and sigmas"),
+        ({"dO_x": {**GOOD, "values": [1.0, math.nan]}}, "motion of dO_x: values and sigmas"),
+        ({"dO_x": {**GOOD, "evidence": "much"}}, "motion of dO_x: could not convert"),
+        ({"dO_x": {"values": [1.0]}}, "motion of dO_x: 'sigmas'"),
+        ({"dO_x": GOOD, "dO_y": {**GOOD, "values": [1.0], "sigmas": [1.0]}}, "different numbers"),
+        ({}, "different numbers of frames, or there is none"),
+    ],
+)
+def test_documents_that_hold_no_motion(document: Any, said: str) -> None:
+    with pytest.raises(TwinError, match=said):
+        Motion.from_dict(document)
+
+
+@pytest.mark.parametrize("views", [1, 2, 3])
+def test_up_to_two_poses_print_as_python_and_more_in_a_line(views: int) -> None:
+    machine = builtin_machine()
+    at = {a: np.full(views, axis.home) for a, axis in machine.axes.items()}
+    at["rot_obj"] = np.arange(views) * 30.0
+    found = poses(machine, profile_of(machine), machine.detector.camera, at)
+    if views > 2:
+        assert repr(found) == "<Poses: 3 views, 0 to 60 deg>"
+    else:
+        names = {"Poses": Poses, "array": np.array}
+        assert eval(repr(found), names) == found
+
+
+@pytest.mark.parametrize("pixel", [0.03, 4.0])
+def test_pixels_are_checked_to_a_millionth_and_axes_to_their_right_angle(pixel: float) -> None:
+    scan = ConeVec.circular(sod=300.0, sdd=900.0, angles=3, pixel=pixel)
+    check_cone_vec(scan, pixel)
+    check_cone_vec(scan, (pixel * (1 + 0.9e-6), pixel * (1 - 0.9e-6)))
+    for pitches, name in (((pixel * (1 + 1.1e-6), pixel), "u"), ((pixel, pixel * 1.1), "v")):
+        with pytest.raises(GeometryError, match=rf"row 0: \|{name}\| is {pixel:g}"):
+            check_cone_vec(scan, pitches)
+    for skew, sound in ((0.9e-6, True), (1.1e-6, False)):
+        rows = scan.rows.copy()
+        rows[1, 9:] += skew * rows[1, 6:9]
+        if sound:
+            check_cone_vec(ConeVec(rows), pixel)
+        else:
+            with pytest.raises(GeometryError, match="row 1: u and v are not orthogonal"):
+                check_cone_vec(ConeVec(rows), pixel)
