@@ -285,32 +285,25 @@ class Tests:
 
     def of(self, mutant: Mutant, most_s: float) -> list[tuple[str, dict[str, float]]]:
         """The tests of a mutant by file, with their seconds, those likely to kill it soon first."""
-        found = []
+        ranked = []
         for file, entry in self.entries.items():
-            if mutant.file not in entry["lines"]:
-                continue
-            lines, all_of_file = entry["lines"][mutant.file], 1 << len(entry["seconds"])
-            bits = 0 if mutant.inside else all_of_file
+            lines, shared = entry["lines"].get(mutant.file, {}), 1 << len(entry["seconds"])
+            bits = shared if lines and not mutant.inside else 0
             same = entry["digests"].get(mutant.file) == self.digests[mutant.file]
             for line in map(str, mutant.lines) if same else lines:
                 bits |= int(lines.get(line, "0"), 16)
-            chosen = {t: s for i, (t, s) in enumerate(entry["seconds"].items())
-                      if bits & (all_of_file | 1 << i)}  # fmt: skip
-            if chosen:
-                folder = os.path.dirname(mutant.file)
-                weight = self.weight[file].get(folder, 0.0)
-                weight *= 1.0 if bits & (all_of_file - 1) else 0.1
-                found.append((file, chosen, (0.3 + sum(chosen.values())) / (0.01 + weight)))
-        out, left = [], most_s
-        for file, chosen, _ in sorted(found, key=lambda f: f[2]):
-            kept = {}
-            for test, seconds in sorted(chosen.items(), key=lambda t: t[1]):
-                left -= seconds
-                if left > 0:
-                    kept[test] = seconds
-            if kept:
-                out.append((file, kept))
-        return out
+            weight = 0.01 + self.weight[file].get(os.path.dirname(mutant.file), 0.0)
+            for i, (test, seconds) in enumerate(entry["seconds"].items()):
+                own = bool(bits & 1 << i)
+                if own or bits & shared:
+                    ranked.append((not own, (0.02 + seconds) / weight, file, test, seconds))
+        chosen: dict[str, dict[str, float]] = {}
+        for _, _, file, test, seconds in sorted(ranked):
+            most_s -= seconds
+            if most_s < 0.0:
+                break
+            chosen.setdefault(file, {})[test] = seconds
+        return list(chosen.items())
 
 
 def _weight(entry: Lines) -> dict[str, float]:
