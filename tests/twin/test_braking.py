@@ -153,3 +153,52 @@ def test_a_motor_that_pauses_during_a_stop_stands_until_it_goes_on(hair: float) 
             end = one.position + dt * (one.velocity + 0.5 * one.acceleration * dt)
             assert end == pytest.approx(following.position, abs=1e-6)
         assert any(p.velocity == 0.0 == p.acceleration for p in way.pieces)
+
+
+def drawn_programme(rng: np.random.Generator) -> Drive:
+    legs = rng.integers(1, 4)
+    return programme([
+        (float(rng.uniform(-200, 200)), float(rng.uniform(5, 50)), float(rng.uniform(5, 100)),
+         float(rng.uniform(0, 4)), bool(rng.integers(2))) for _ in range(legs)
+    ])  # fmt: skip
+
+
+def soonest(drives: Mapping[str, Drive], now: float, most: Mapping[str, float] | None) -> float:
+    """When all rest, by small steps: programme time slows as fast as some motor can brake."""
+    s, rate, time, step = now, 1.0, now, 5e-4
+    while rate > 0.0:
+        slowing = 1e9
+        for name, drive in drives.items():
+            leg = drive.at(s)
+            v = leg.velocity(s)
+            if abs(v) < 1e-6:
+                continue
+            along = (leg.velocity(s + 1e-7) - v) / 1e-7 * np.sign(v)
+            may = max(leg.acceleration(s), most[name] if most else 0.0)
+            slowing = min(slowing, max(0.0, may + along * rate * rate) / abs(v))
+        if slowing == 1e9:
+            return time
+        s, rate, time = s + rate * step, rate - slowing * step, time + step
+    return time
+
+
+@pytest.mark.parametrize("hard", [False, True])
+@pytest.mark.parametrize("seed", range(15))
+def test_a_stop_is_as_short_as_the_weakest_motor_allows(seed: int, hard: bool) -> None:
+    rng = np.random.default_rng(seed)
+    drives = {name: drawn_programme(rng) for name in MOTORS[: 2 + seed % 2]}
+    now = float(rng.uniform(0.0, 0.9)) * max(d.end for d in drives.values())
+    most = dict.fromkeys(drives, 120.0) if hard else None
+    stop = braked_along(drives, now, most)
+    end = max(way.end for way in stop.values())
+    least = soonest(drives, now, most) - now
+    assert 0.99 * least - 0.005 <= end - now <= 1.08 * least + 0.01  # in cells of even slowing
+    for name, way in stop.items():
+        times = np.linspace(now, end, 400)
+        at, step = way.positions(times), times[1] - times[0]
+        fastest = max(t.top_speed for t in drives[name].trajectories) + 1e-3
+        assert np.abs(np.diff(at)).max() <= fastest * step + 1e-6
+        assert way.position(now) == pytest.approx(drives[name].at(now).position(now), abs=1e-7)
+        assert way.position(end) == way.target
+        low, high = (f([t.target for t in drives[name].trajectories] + [0.0]) for f in (min, max))
+        assert low - 1e-6 <= at.min() <= at.max() <= high + 1e-6

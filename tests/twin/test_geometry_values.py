@@ -373,8 +373,9 @@ def test_binning_by_one_is_no_binning_and_by_all_rows_leaves_one() -> None:
     assert coarse.shape == (3, 1, 1)
     assert_allclose(coarse.u, 7 * scan.u)
     assert_allclose(coarse.detector, scan.detector - scan.u)
-    with pytest.raises(GeometryError, match="1 to 7"):
+    with pytest.raises(GeometryError, match="1 to 7") as caught:
         scan.binned(8)
+    assert caught.value.data == {"asked": "8", "allowed": [1, 7]}
 
 
 def test_a_stage_on_the_turntable_moves_a_point_by_hand() -> None:
