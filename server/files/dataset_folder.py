@@ -210,9 +210,17 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
                 f"{path} claims {shape[1]} x {shape[0]} pixels; allowed: {MAX_IMAGE_BYTES} bytes",
                 {"path": str(path), "asked": size, "allowed": MAX_IMAGE_BYTES},
             )
-        if page.compression != tifffile.COMPRESSION.NONE:
-            _check_inflation(path, page, size)
         wanted = np.uint16 if kind.kind == "u" else np.float32
+        packing = tifffile.COMPRESSION
+        if page.compression in (packing.ADOBE_DEFLATE, packing.DEFLATE):
+            _check_inflation(path, page, size)
+        elif page.compression != packing.NONE:  # LZW and others, which tifffile leaves to a codec
+            import cv2
+
+            image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            if image is None or image.shape != shape or image.dtype != kind.newbyteorder("="):
+                raise ValueError(f"its compression ({page.compression!r}) cannot be undone")
+            return np.asarray(image, dtype=wanted)
         return np.asarray(series.asarray(), dtype=wanted)
 
 

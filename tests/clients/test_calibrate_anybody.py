@@ -10,6 +10,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import tifffile
@@ -110,6 +111,43 @@ def test_annotated_beads_of_a_known_phantom(tmp_path: Path) -> None:
         fx.calibrate(None, "normal-4", geometry=scan, markers=tmp_path / "seen.npy")
     with pytest.raises(TwinError, match="no data: allowed with geometry and markers"):
         fx.calibrate(None, "lego", geometry=scan)
+
+
+@pytest.mark.parametrize("ending", ["json", "npy", "txt", "npz", "csv", "xml", "toml"])
+def test_any_program_s_geometry_goes_with_marked_beads(
+    ending: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    angles = 36.0 * np.arange(10)
+    truth = {"dO_x": 1.5, "dO_y": 0.7, "alpha": 20.0}
+    tracks = pixels(load_phantom("lego").beads, angles, SOD, truth)
+    np.save(tmp_path / "seen.npy", tracks + 0.05 * np.random.default_rng(2).normal(size=(10, 5, 2)))
+    study.geometry(angles).save(tmp_path / f"scan.{ending}")
+    words = ["calibrate", "--markers", str(tmp_path / "seen.npy"), "--phantom", "lego", "--json",
+             "--geometry", str(tmp_path / f"scan.{ending}")]  # fmt: skip
+    unsaid = {"npy": "shape=", "txt": "shape=", "xml": "pixel="}
+    if ending in unsaid:
+        assert run(words) != 0
+        assert unsaid[ending] in capsys.readouterr().err
+    assert run([*words, "--shape", "760,956", "--pixel", "0.1496"]) == 0
+    p = json.loads(capsys.readouterr().out)["parameters"]
+    for name, true in truth.items():
+        assert abs(p[name]["value"] - true) < 4 * p[name]["sigma"]
+
+
+def test_compressed_images_of_another_writer_are_read(tmp_path: Path) -> None:
+    images = np.random.default_rng(4).integers(900, 1000, (3, 40, 50)).astype(np.uint16)
+    lzw, packbits = 5, 32773
+    for i, (image, how) in enumerate(zip(images, (lzw, packbits, lzw), strict=True)):
+        packed = [cv2.IMWRITE_TIFF_COMPRESSION, how]
+        assert cv2.imwrite(str(tmp_path / f"p{i}.tif"), image, packed)
+    for name in ("di0.tif", "io0.tif"):
+        cv2.imwrite(str(tmp_path / name), np.full((40, 50), 1000 * (name[0] == "i"), np.uint16))
+    scan = fx.ConeVec.circular(sod=100, sdd=200, angles=3, pixel=1)
+    np.testing.assert_array_equal(fx.read_tiffs(tmp_path, scan).counts(), images)
+    short = (tmp_path / "p1.tif").read_bytes()[:600]
+    (tmp_path / "p1.tif").write_bytes(short)
+    with pytest.raises(TwinError, match=r"p1\.tif"):
+        fx.read_tiffs(tmp_path, scan).counts()
 
 
 @pytest.mark.slow

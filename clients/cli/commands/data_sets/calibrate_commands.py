@@ -15,6 +15,7 @@ import typer
 
 from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
+from flexdt.clients.cli.commands.data_sets.exchange_commands import said
 from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import emit, note, say, table, warn
 from flexdt.clients.cli.options import argument, option
@@ -24,6 +25,7 @@ from flexdt.clients.whole_files import write_whole
 if TYPE_CHECKING:
     from flexdt.clients.client.client import TwinClient
     from flexdt.clients.datasets.data_set import DataSet
+    from flexdt.clients.datasets.exchange import Given
     from flexdt.twin.scanner.state import Correction
 
 ReadingName = Literal["axis", "mount"]
@@ -53,6 +55,10 @@ def calibrate(
     ),
     bound: float | None = option(None, "Largest sigma (mm, deg); default 5.", metavar="MM"),
     frames: Path | None = option(None, "Anybody's TIFFs, with --geometry.", metavar="DIR"),
+    shape: str | None = option(
+        None, "Of their detector, if FILE does not say.", metavar="ROWS,COLS"
+    ),
+    pixel: str | None = option(None, "Their pitch, the same (RTK).", metavar="MM or U,V"),
     markers: Path | None = option(
         None, "Where markers were seen: CSV or npy, in pixels.", metavar="FILE"
     ),
@@ -101,8 +107,9 @@ def calibrate(
     if report is not None and report.suffix.lower() != ".json":
         require_plots()
     outcome = calibrate_datasets(
-        _given(datasets or [], frames, markers, geometry or []), target, request, markers=markers,
-        scale=None if scale is None else Scale.of(scale), radius_px=radius,
+        _given(datasets or [], frames, markers, geometry or [], said(None, shape, pixel)), target,
+        request, markers=markers, scale=None if scale is None else Scale.of(scale),
+        radius_px=radius,
     )  # fmt: skip
     document: dict[str, Any] = outcome.document
     if report is not None:
@@ -142,8 +149,9 @@ def _named(phantom: str | None) -> str:
 
 
 def _given(
-    folders: list[Path], frames: Path | None, markers: Path | None, geometries: list[Path]
-) -> list[DataSet]:
+    folders: list[Path], frames: Path | None, markers: Path | None, geometries: list[Path],
+    known: Given,
+) -> list[DataSet]:  # fmt: skip
     """The data sets, anybody's frames, or the geometry of markers without images."""
     if folders:
         if frames is not None:
@@ -152,15 +160,17 @@ def _given(
     if len(geometries) != 1 or (frames is None and markers is None):
         raise typer.BadParameter("no data set; allowed: --frames DIR or --markers FILE, and one "
                                  "--geometry FILE")  # fmt: skip
+    from flexdt.twin.geometry.cone_vec import ConeVec
+
+    cone = ConeVec.load(geometries[0], shape=known.shape, pixel=known.pitch_mm)
     if frames is not None:
         from flexdt.clients.datasets.dataset import read_tiffs
 
-        return [read_tiffs(frames, geometries[0])]
+        return [read_tiffs(frames, cone)]
     from flexdt.clients.calibration.markers import markers_alone
-    from flexdt.twin.geometry.cone_vec import ConeVec
 
     assert markers is not None
-    return [markers_alone(ConeVec.load(geometries[0]), markers.stem)]
+    return [markers_alone(cone, markers.stem)]
 
 
 def _opened(folders: list[Path], geometries: list[Path] | None) -> list[DataSet]:

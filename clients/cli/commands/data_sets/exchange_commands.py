@@ -107,7 +107,7 @@ def import_(
 
     `flexdt reconstruct` and `calibrate` take it with --geometry, Python with `load_geometry`.
     """
-    given = _given(like, shape, pixel, views)
+    given = said(like, shape, pixel, views)
     from dataclasses import replace
 
     from flexdt.clients.datasets.exchange import import_geometry, save_geometry
@@ -132,7 +132,10 @@ def import_(
     say(f"{out}: {len(geometry)} views of {size}, pixel {u:.6g} x {v:.6g} mm")
 
 
-def _given(like: Path | None, shape: str | None, pixel: str | None, views: int | None) -> Given:
+def said(
+    like: Path | None, shape: str | None, pixel: str | None, views: int | None = None
+) -> Given:
+    """What the options say that a geometry's file does not."""
     size = None if shape is None else _numbers(shape, "the shape", 2)
     if size is not None and not all(s >= 1 and s.is_integer() for s in size):
         raise typer.BadParameter(f"shape {shape!r} is not ROWS,COLS, e.g. 760,956")
