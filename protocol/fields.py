@@ -168,6 +168,8 @@ Shift = Annotated[float, Ge(-1e4), Le(1e4)]
 """Of a sample from where it stands by itself [mm]."""
 Turn = Annotated[float, Ge(-3600), Le(3600)]
 """[deg]"""
+Distance = Annotated[float, Ge(1e-3), Le(1e5)]
+"""Of source, object and detector [mm]."""
 Pitch = Annotated[float, Ge(1e-6), Le(1e3)]
 """Of voxels [mm]."""
 Side = Annotated[int, Ge(1), Le(32_768)]
@@ -187,6 +189,9 @@ Roi = Annotated[tuple[int, int, int, int], Field(strict=False)]
 Pixel = Annotated[int, Ge(0), Le(65_535)]
 RoiAsked = Annotated[tuple[Pixel, Pixel, Pixel, Pixel], Field(strict=False)]
 """A `Roi` in a request."""
+Place = Annotated[float, Ge(-1), Le(65_535)]
+PixelAsked = Annotated[tuple[Place, Place], Field(strict=False)]
+"""(column, row) of an image in a request."""
 VoxelPitch = Annotated[tuple[Pitch, Pitch, Pitch], Field(strict=False)]
 """(x, y, z) [mm]."""
 VoxelShape = Annotated[tuple[Side, Side, Side], Field(strict=False)]

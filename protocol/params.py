@@ -16,6 +16,7 @@ from flexdt.protocol.fields import (
     AxisName,
     Comment,
     Deviation,
+    Distance,
     Exposure,
     Material,
     Name,
@@ -23,6 +24,7 @@ from flexdt.protocol.fields import (
     Pace,
     Params,
     Payload,
+    PixelAsked,
     Power,
     RoiAsked,
     ShortText,
@@ -230,7 +232,10 @@ class SampleUpload(Params):
 
 
 class ProjectionGet(Params):
-    """What kind of image, at the current pose."""
+    """What kind of image, at the current pose, or as though it stood and were set otherwise.
+
+    Such an image is predicted: from the geometry of `geometry.get`, without noise.
+    """
 
     kind: Literal["line_integral", "counts"] = "line_integral"
     binning: Annotated[int, Ge(1), Le(32)] = Field(
@@ -239,6 +244,17 @@ class ProjectionGet(Params):
     marks: bool = Field(
         default=False, description="say which pixels are saturated, starved or cut off as well"
     )
+    positions: Targets | None = Field(
+        default=None, description="motor -> [mm, deg] there; others stand as they do"
+    )
+    tube: TubeSet | None = Field(default=None, description="as though set so")
+    camera: CameraSet | None = Field(default=None, description="as though set so")
+
+
+class RayGet(Params):
+    """A pixel of the image of this moment."""
+
+    pixel: PixelAsked = Field(description="(column, row); (0, 0) is the centre of the top left one")
 
 
 LayerText = Annotated[ShortText, MaxLen(100)]
@@ -254,6 +270,8 @@ class ExposurePredict(Params):
     exposure_ms: Exposure | None = None
     averages: Averages | None = None
     frames: Frames = Field(default=361, description="of the scan")
+    sod_mm: Distance | None = Field(default=None, description="default: as it stands")
+    sdd_mm: Distance | None = Field(default=None, description="default: as it stands")
     detail: LayerText = Field(
         default="void:0.5", description="MATERIAL:MM or void:MM on the darkest ray, to be seen"
     )
@@ -376,6 +394,9 @@ class CalibrationFit(Params):
         default=0, description="covariances after so many parts of the frames are told"
     )
     residuals: bool = Field(default=False, description="tell those of every bead in every frame")
+    tracks: bool = Field(
+        default=False, description="tell where beads are, and were put before and after"
+    )
 
 
 class CalibrationAlign(Params):

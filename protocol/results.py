@@ -180,6 +180,12 @@ class JobListResult(Result):
 ImageKind = Literal["dark", "flat", "projection"]
 
 
+class RayResult(Result):
+    """What the ray of a pixel goes through, in the geometry of geometry.get."""
+
+    paths_mm: dict[str, float] = Field(description="material -> path through it")
+
+
 class DatasetInfo(Result):
     """A data set in a few words; what is not known of it is null."""
 
@@ -226,7 +232,9 @@ class DatasetResult(Result):
     kinds: list[ImageKind]
     present: list[bool]
     times_s: list[float] | None = Field(description="on the scan's clock")
-    positions: dict[str, list[float]] = Field(description="motor -> [mm, deg], script's sign")
+    positions: dict[str, list[float | None]] = Field(
+        description="motor -> [mm, deg], script's sign; null where it is not known"
+    )
     same_machine: bool = Field(description="whether this twin has the same axes, parts and zeros")
     counts: list[float | None] | None = Field(
         default=None, description="mean of each image; null where it cannot be read"
@@ -250,6 +258,8 @@ class DatasetFrameResult(ImageValue):
     exposure_ms: float | None = None
     positions: dict[str, float] | None = None
     cone_vec: list[float] | None = Field(default=None, description="nominal, without a correction")
+    tube: dict[str, JsonValue] | None = Field(default=None, description="for projection.get")
+    camera: dict[str, JsonValue] | None = Field(default=None, description="for projection.get")
 
 
 class TransmissionShares(Result):
@@ -338,6 +348,9 @@ class CalibrationFitResult(Result):
         default=None, description="of each frame and bead: measured minus predicted column and row"
     )
     steps: list[CalibrationStep] = Field(default_factory=list)
+    tracks: dict[str, JsonValue] | None = Field(
+        default=None, description="as `flexdt calibrate --tracks` writes them"
+    )
     problems: list[CalibrationProblem]
 
 

@@ -76,6 +76,7 @@ class SharedMethods:
     upload_scene = Method(m.upload_scene)
     upload_voxels = Method(m.upload_voxels)
     projection = Method(m.projection)
+    ray = Method(m.ray)
     geometry = Method(m.geometry)
     predict_exposure = Method(m.predict_exposure)
     check_script = Method(m.check_script)

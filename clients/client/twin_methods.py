@@ -376,23 +376,58 @@ def _upload(
 
 
 def projection(
-    kind: Kind = "line_integral", binning: int = 1, *, marks: bool = False
+    kind: Kind = "line_integral",
+    binning: int = 1,
+    *,
+    marks: bool = False,
+    positions: Mapping[str, float] | None = None,
+    tube: Mapping[str, object] | None = None,
+    camera: Mapping[str, object] | None = None,
 ) -> Flow[Projection]:
-    """An X-ray image at the current pose.
+    """An X-ray image at the current pose, or as it would be at another.
+
+    Where `positions`, `tube` or `camera` is given nothing moves: the image is predicted, from the
+    geometry of `geometry`, without noise.
 
     Args:
         kind: line_integral (float32) or counts (uint16).
         binning: average so many pixels along each side, for a quick look.
         marks: also mark pixels that are saturated, starved or where the sample is cut off.
+        positions: motor -> [mm, deg] there; others stand as they do.
+        tube: as though set so: kV, power_W, on.
+        camera: as though set so: exposure_ms, mode, roi, averages.
 
     Example:
         >>> projection = twin.projection("line_integral", binning=8)
         >>> projection.image.shape, projection.kind
         ((95, 119), 'line_integral')
     """
-    params = {"kind": kind, "binning": binning, "marks": marks or None}
+    params = {
+        "kind": kind, "binning": binning, "marks": marks or None, "positions": positions,
+        "tube": tube, "camera": camera,
+    }  # fmt: skip
     answer = yield from ask("projection.get", params, WireProjection)
     return Projection.from_wire(answer)
+
+
+def ray(column: float, row: float) -> Flow[dict[str, float]]:
+    """Path lengths through materials on the way to a pixel, in the geometry of `geometry`.
+
+    Args:
+        column, row: of the image of this moment.
+
+    Returns:
+        Material -> [mm].
+
+    Raises:
+        RpcError: -32001, the image has no such pixel.
+
+    Example:
+        >>> all(mm >= 0.0 for mm in twin.ray(477.5, 379.5).values())
+        True
+    """
+    told = yield from ask("projection.ray", {"pixel": [column, row]}, r.RayResult)
+    return dict(told.paths_mm)
 
 
 def geometry() -> Flow[s.GeometryResult]:
@@ -417,15 +452,18 @@ def predict_exposure(
     exposure_ms: float | None = None,
     averages: int | None = None,
     frames: int = 361,
+    sod_mm: float | None = None,
+    sdd_mm: float | None = None,
     detail: str = "void:0.5",
 ) -> Flow[r.ExposurePrediction]:
-    """Transmission, contrast to noise and dose of a circular scan at the present distances.
+    """Transmission, contrast to noise and dose of a circular scan.
 
     Args:
         sample: a shipped phantom or an upload; default: the one on the stage.
         kV, power_W, exposure_ms, averages: default: as they are set.
         filter: MATERIAL:MM beside the machine's own.
         frames: of the scan.
+        sod_mm, sdd_mm: distances; default: the present ones.
         detail: MATERIAL:MM or void:MM on the darkest ray, whose contrast is told.
 
     Raises:
@@ -439,6 +477,7 @@ def predict_exposure(
     params = {
         "sample": sample, "kV": kV, "power_W": power_W, "filter": filter,
         "exposure_ms": exposure_ms, "averages": averages, "frames": frames, "detail": detail,
+        "sod_mm": sod_mm, "sdd_mm": sdd_mm,
     }  # fmt: skip
     return ask("exposure.predict", params, r.ExposurePrediction)
 
@@ -797,6 +836,7 @@ def fit_calibration(
     per_frame: Sequence[str] = (),
     steps: int = 0,
     residuals: bool = False,
+    tracks: bool = False,
 ) -> Flow[r.CalibrationFitResult]:
     """Calibrate from data sets of the twin's data directory; nothing is applied.
 
@@ -810,6 +850,7 @@ def fit_calibration(
         per_frame: parameters that may also move.
         steps: tell the covariance after so many parts of the frames.
         residuals: tell those of every bead in every frame.
+        tracks: tell where beads were seen, and were put before and after.
 
     Raises:
         RpcError: -32602, there is no such data set or phantom; -32008, it takes too long.
@@ -823,7 +864,7 @@ def fit_calibration(
     params = {
         "datasets": list(datasets), "phantom": phantom, "free": free and list(free),
         "priors": dict(priors or {}), "per_frame": list(per_frame), "steps": steps,
-        "residuals": residuals,
+        "residuals": residuals, "tracks": tracks,
     }  # fmt: skip
     return ask("calibration.fit", params, r.CalibrationFitResult, patience_s=None)
 

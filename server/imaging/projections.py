@@ -82,8 +82,13 @@ class Imaging:
         camera: CameraSettings,
         *,
         times: npt.ArrayLike | None = None,
+        truth: TrueGeometry | None = None,
     ) -> Float32Array:
         """Images of `sample` at n nominal poses, `times` (n,) [s] after the scan's start.
+
+        Args:
+            sample, poses, camera, times: as `Radiography.take` has them.
+            truth: instead of the hidden one.
 
         Returns:
             float32 (n, rows, cols), dimensionless; zeros for an empty stage.
@@ -96,7 +101,7 @@ class Imaging:
             return np.zeros((len(poses), *camera.shape), dtype=np.float32)
         _, bodies, names = await self._sent(sample, "part")
         factors = [factor for _, factor in bodies]
-        cone = self.truth.cone_vec(poses, sample.offset, times)
+        cone = (truth or self.truth).cone_vec(poses, sample.offset, times)
         check_cone_vec(cone, camera.pixels_mm(self.sensor))
         if factors == [1.0]:
             return await self.projector.project(names[0], cone, camera.shape)
@@ -112,8 +117,9 @@ class Imaging:
         camera: CameraSettings,
         *,
         times: npt.ArrayLike | None = None,
+        truth: TrueGeometry | None = None,
     ) -> tuple[tuple[Channel, ...], Float32Array, FloatArray]:
-        """Paths through each material of `sample` at n nominal poses.
+        """Paths through each material of `sample` at n nominal poses; arguments as above.
 
         Returns:
             The materials (m), float32 (m, n, rows, cols) [mm], and the true geometry (n, 12), which
@@ -122,7 +128,7 @@ class Imaging:
         Raises:
             As `line_integrals`.
         """
-        cone = self.truth.cone_vec(poses, sample.offset, times)
+        cone = (truth or self.truth).cone_vec(poses, sample.offset, times)
         check_cone_vec(cone, camera.pixels_mm(self.sensor))
         channels: tuple[Channel, ...] = ()
         names: list[str] = []
@@ -132,6 +138,17 @@ class Imaging:
         for i, name in enumerate(names):
             out[i] = await self.projector.project(name, cone, camera.shape)
         return channels, out, cone.rows
+
+    async def ray(self, sample: Sample, cone: ConeVec) -> dict[str, float]:
+        """Material -> path [mm] to the one pixel of `cone`, n = 1, in the object's frame."""
+        if not sample.name:
+            return {}
+        _, channels, names = await self._sent(sample, "material")
+        view = sample.offset.to_sample(cone)
+        return {
+            channel.material.name: float((await self.projector.project(name, view, (1, 1))).sum())
+            for channel, name in zip(channels, names, strict=True)
+        }
 
     async def scatterer(self, sample: Sample, voxels: int) -> Object:
         """The materials of `sample` on a grid of about so many voxels, made once."""

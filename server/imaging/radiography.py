@@ -18,6 +18,7 @@ import numpy.typing as npt
 from flexdt.phantoms.channels import chain_through
 from flexdt.phantoms.materials import stated_keV
 from flexdt.server.imaging.projections import Imaging
+from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.poses import Poses
@@ -152,6 +153,7 @@ class Radiography:
         exposures: Sequence[ExposureSettings],
         *,
         times: npt.ArrayLike | None = None,
+        truth: TrueGeometry | None = None,
     ) -> list[Radiograph]:
         """Images of `sample`, one for each of `exposures`.
 
@@ -161,6 +163,7 @@ class Radiography:
             camera: of all of them.
             exposures: tube and time of each image; taken as if X-rays were on.
             times: of the poses since the scan's start, (n,) [s]; None is the start.
+            truth: instead of the hidden one.
 
         Raises:
             ProjectorUnavailable: the projector does not answer.
@@ -169,11 +172,15 @@ class Radiography:
         """
         count = len(exposures)
         if self.physics == "ideal":
-            lines = await self.imaging.line_integrals(sample, poses, camera, times=times)
+            lines = await self.imaging.line_integrals(
+                sample, poses, camera, times=times, truth=truth
+            )
             if len(lines) == count:
                 return [Radiograph(one) for one in lines]
             return [Radiograph(part) for part in lines.reshape(count, -1, *lines.shape[1:])]
-        channels, paths, views = await self.imaging.path_lengths(sample, poses, camera, times=times)
+        channels, paths, views = await self.imaging.path_lengths(
+            sample, poses, camera, times=times, truth=truth
+        )
         mono_keV = stated_keV() if self.physics == "mono" else None
         chain = chain_through(channels, self.panel, self.tube, mono_keV)
         moments = len(poses) // count

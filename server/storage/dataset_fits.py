@@ -52,6 +52,8 @@ def fit(root: Path, asked: p.CalibrationFit, *_: object) -> r.CalibrationFitResu
             {"frames": n, "covariance": None if matrix is None else matrix.tolist()}
             for n, matrix in covariance_by_step(fitted, asked.steps)
         ]
+    if asked.tracks:
+        told["tracks"] = import_module("flexdt.clients.calibration.tracks").tracks_document(found)
     return r.CalibrationFitResult.model_validate(told)
 
 

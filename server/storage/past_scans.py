@@ -14,6 +14,7 @@ import stat
 import time
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
@@ -157,17 +158,46 @@ _DOCUMENTS, _NORMALS = _Kept(4), _Kept(4)
 
 @dataclass(frozen=True)
 class _Bare:
-    """An image of which only its file is known."""
+    """An image of which its file is known, and perhaps what the scanner's texts say."""
 
     file: str
     kind: FrameKind
     time_s: None = None
-    exposure_ms: None = None
-    cone_vec: None = None
+    exposure_ms: float | None = None
+    averages: int | None = None
+    mode: str | None = None
+    roi: tuple[int, int, int, int] | None = None
+    xrays_on: bool = True
+    cone_vec: list[float] | None = None
     positions: Mapping[str, float] = field(default_factory=dict)
 
 
 _Images = tuple[FrameEntry | _Bare, ...]
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """A data set's folder as it was read.
+
+    Attributes:
+        folder: its files.
+        images: of all kinds, in the order taken.
+        document: flexdt.json; None where there is none, or none of use.
+        texts: where there is none, the data set that the scanner's texts tell (a `DataSet`).
+        problem: why there is no document.
+    """
+
+    folder: Folder
+    images: _Images = ()
+    document: DatasetDocument | None = None
+    texts: Any = None
+    problem: str = ""
+
+    @property
+    def beam(self) -> tuple[float | None, float | None]:
+        """kV and W of the projections."""
+        said = self.document.tube if self.document else self.texts and self.texts.settings
+        return (said.kV, said.power_W) if said else (None, None)
 
 
 def _place(root: Path, name: str) -> tuple[Path, tuple[object, ...]]:
@@ -194,38 +224,72 @@ def _document(folder: Folder, most: int) -> DatasetDocument:
     return parse_document(read_text(path, most), DOCUMENT)
 
 
-def _images(folder: Folder, document: DatasetDocument | None) -> _Images:
-    if document is not None:
-        return tuple(document.frames)
-    bare = [_Bare(f, "dark") for f in folder.darks] + [_Bare(f, "flat") for f in folder.flats]
-    return (*bare, *(_Bare(f, "projection") for f in folder.projections.values()))
+def _scan(folder: Folder, most: int) -> _Scan:
+    try:
+        document = _document(folder, most)
+        return _Scan(folder, tuple(document.frames), document)
+    except DatasetError as error:
+        if not folder.projections:
+            raise
+        texts, problem = _texts(folder), error.message
+    bare = [_Bare(f, "dark", xrays_on=False) for f in folder.darks]
+    bare += [_Bare(f, "flat") for f in folder.flats]
+    if texts is None:
+        bare += [_Bare(f, "projection") for f in folder.projections.values()]
+        return _Scan(folder, tuple(bare), problem=problem)
+    s = texts.settings
+    shown = {} if s is None else {"exposure_ms": s.exposure_ms, "mode": s.mode}
+    if s is not None and s.averages:
+        shown["averages"] = round(s.averages)
+    if s is not None and s.roi is not None:
+        shown["roi"] = s.roi.edges
+    bare += [
+        _Bare(
+            frame.file, "projection", **shown, cone_vec=row,
+            positions={name: float(at[frame.index]) for name, at in texts.positions.items()},
+        )
+        for frame, row in zip(texts.frames, texts.cone_vec.rows.tolist(), strict=True)
+    ]  # fmt: skip
+    return _Scan(folder, tuple(bare), None, texts, f"there is no {DOCUMENT}: its texts are read")
 
 
-def _opened(root: Path, name: str) -> tuple[Folder, DatasetDocument | None, str]:
-    """Folder, document, and why there is none; kept."""
+def _texts(folder: Folder) -> Any:
+    """What the scanner's own texts say of a folder without a document; None for nothing."""
+    if folder.document or list_folder(folder.path).names != folder.names:  # links are not followed
+        return None
+    try:
+        return import_module("flexdt.clients.datasets.dataset").load_dataset(folder.path)
+    except TwinError:
+        return None
+
+
+def _opened(root: Path, name: str) -> _Scan:
+    """A data set; kept."""
     path, key = _place(root, name)
-
-    def read() -> tuple[Folder, DatasetDocument | None, str]:
-        folder = list_folder(path, links=False)
-        try:
-            return folder, _document(folder, MAX_DOCUMENT), ""
-        except DatasetError as error:
-            if not folder.projections:
-                raise
-            return folder, None, error.message
-
-    found: tuple[Folder, DatasetDocument | None, str] = _DOCUMENTS.get(key, read)
+    found: _Scan = _DOCUMENTS.get(key, lambda: _scan(list_folder(path, links=False), MAX_DOCUMENT))
     return found
 
 
-def _info(
-    path: Path, modified: float, folder: Folder, document: DatasetDocument | None, problem: str
-) -> r.DatasetInfo:
+def _info(path: Path, modified: float, scan: _Scan) -> r.DatasetInfo:
+    folder, document = scan.folder, scan.document
+    kV, power_W = scan.beam
     if document is None:
-        there = len(folder.projections)
-        return r.DatasetInfo(
-            name=path.name, modified=modified, projections=there, present=there, problem=problem
-        )
+        there, texts = len(folder.projections), scan.texts
+        told = {}
+        if texts is not None and (said := texts.settings) is not None:
+            told = {
+                "state": "complete" if texts.complete else "incomplete", "reason": texts.reason,
+                "started": said.started and said.started.isoformat(),
+                "sample": said.sample_name or "", "operator": said.operator or "",
+                "machine": said.scanner_name, "mode": said.mode, "shape": texts.shape,
+                "exposure_ms": said.exposure_ms, "projections": len(texts), "kV": kV,
+                "power_W": power_W,
+            }  # fmt: skip
+        info = r.DatasetInfo(
+            name=path.name, modified=modified, projections=there, present=there,
+            problem=scan.problem[:500],
+        )  # fmt: skip
+        return info.model_copy(update=told)
     lost = [f.file for f in document.frames if f.file not in folder.names]
     files = document.files("projection")
     reason = document.reason
@@ -244,8 +308,8 @@ def _info(
         machine=str(named)[:100],
         sample=document.sample.name,
         operator=document.operator,
-        kV=document.tube.kV,
-        power_W=document.tube.power_W,
+        kV=kV,
+        power_W=power_W,
         exposure_ms=detector.exposure_ms,
         mode=detector.mode,
         shape=(detector.rows, detector.cols),
@@ -303,10 +367,10 @@ def _listed(path: Path, modified: float) -> r.DatasetInfo | str:
     if folder.document is None and not folder.projections:
         return ""
     try:
-        document, problem = _document(folder, LISTED_DOCUMENT), ""
+        scan = _scan(folder, LISTED_DOCUMENT)
     except (TwinError, MemoryError) as error:
-        document, problem = None, str(error) or "it takes too much memory"
-    return _info(path, modified, folder, document, problem[:500])
+        scan = _Scan(folder, problem=str(error) or "it takes too much memory")
+    return _info(path, modified, scan)
 
 
 def _with_thumbnail(root: Path, info: r.DatasetInfo, side: int, until: float) -> r.DatasetInfo:
@@ -340,19 +404,15 @@ def _with_thumbnail(root: Path, info: r.DatasetInfo, side: int, until: float) ->
 
 
 def _get(root: Path, asked: p.DatasetGet, around: Around, codec: Codec) -> r.DatasetResult:
-    folder, document, problem = _opened(root, asked.name)
-    images = _images(folder, document)
-    info = _info(folder.path, folder.path.stat().st_mtime, folder, document, problem)
+    scan = _opened(root, asked.name)
+    folder, document, images = scan.folder, scan.document, scan.images
+    info = _info(folder.path, folder.path.stat().st_mtime, scan)
     if asked.name == around.running:
         info = info.model_copy(update={"state": "running", "reason": ""})
     last = len(images) - 1
     at = np.unique(np.linspace(0, last, min(asked.points, last + 1)).round().astype(int)).tolist()
     chosen = [images[i] for i in at]
-    motors = [
-        name
-        for name in (chosen[0].positions if chosen else ())
-        if all(name in frame.positions for frame in chosen)
-    ]
+    motors = list(chosen[-1].positions if chosen else ())
     times = [frame.time_s for frame in chosen if frame.time_s is not None]
     told: dict[str, Any] = {}
     if asked.measure:
@@ -368,17 +428,22 @@ def _get(root: Path, asked: p.DatasetGet, around: Around, codec: Codec) -> r.Dat
         kinds=[frame.kind for frame in chosen],
         present=[frame.file in folder.names for frame in chosen],
         times_s=times if chosen and len(times) == len(chosen) else None,
-        positions={name: [frame.positions[name] for frame in chosen] for name in motors},
-        same_machine=document is not None and _same(document, around),
+        positions={name: [frame.positions.get(name) for frame in chosen] for name in motors},
+        same_machine=_same(scan, around),
         script=_script(folder) if asked.script else None,
         **told,
     )
 
 
-def _same(document: DatasetDocument, around: Around) -> bool:
+def _same(scan: _Scan, around: Around) -> bool:
+    said, texts = scan.document, scan.texts
+    machine, profile = (said.machine, said.profile) if said else ({}, None)
+    if texts is not None and texts.profile is not None and texts.positions:
+        machine = texts.machine.model_dump(mode="json", by_alias=True)
+        profile = texts.profile.model_dump(mode="json")
     parts = ("axes", "geometry", "fixed", "components", "detector")
-    own, theirs = around.machine, document.machine
-    return document.profile == around.profile and all(own.get(k) == theirs.get(k) for k in parts)
+    own = around.machine
+    return profile == around.profile and all(own.get(k) == machine.get(k) for k in parts)
 
 
 def _script(folder: Folder) -> str:
@@ -437,8 +502,8 @@ def _clearances(
 
 
 def _frame(root: Path, asked: p.DatasetFrame, around: Around, codec: Codec) -> r.DatasetFrameResult:
-    folder, document, _ = _opened(root, asked.name)
-    images = _images(folder, document)
+    scan = _opened(root, asked.name)
+    folder, document, images = scan.folder, scan.document, scan.images
     if asked.index >= len(images):
         raise LimitError(
             f"{asked.name} has {len(images)} images; there is no image {asked.index}",
@@ -456,6 +521,7 @@ def _frame(root: Path, asked: p.DatasetFrame, around: Around, codec: Codec) -> r
         pixels = _normal(root, asked.name, folder, images, counts.shape)(counts)
     small = binned_mean(pixels.astype(np.float32), asked.binning)
     small = np.rint(small).astype(np.uint16) if asked.kind == "counts" else small
+    kV, power_W = scan.beam
     size = small.nbytes if codec is Codec.MSGPACK else small.nbytes * 4 // 3
     if size > (most := MAX_ANSWER[codec] - (1 << 16)):  # beside the pixels
         raise too_large("an image (ask for a binned one)", size, most)
@@ -470,7 +536,12 @@ def _frame(root: Path, asked: p.DatasetFrame, around: Around, codec: Codec) -> r
         exposure_ms=frame.exposure_ms,
         positions=dict(frame.positions) or None,
         cone_vec=frame.cone_vec,
-    )
+        tube={"kV": kV, "power_W": power_W, "on": frame.xrays_on},
+        camera={
+            "exposure_ms": frame.exposure_ms, "mode": frame.mode, "averages": frame.averages,
+            "roi": list(frame.roi) if frame.roi else None,
+        },
+    )  # fmt: skip
 
 
 def _there(folder: Folder, file: str) -> str:

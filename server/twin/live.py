@@ -20,12 +20,14 @@ from flexdt.protocol import results as r
 from flexdt.protocol.state_model import ImageFlags
 from flexdt.server.imaging.exposure_flags import flags_of
 from flexdt.server.imaging.radiography import Radiography
+from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.runtime.log import log
 from flexdt.server.scans.twin_clock import TwinClock
 from flexdt.server.twin.hub import Hub, View
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.physics.exposure import ExposureSettings
 from flexdt.twin.physics.radiograph import Radiograph
@@ -170,13 +172,18 @@ class LiveView:
                     break
                 await asyncio.sleep(max(0.0, begun + FRAME_INTERVAL_S - loop.time()))
 
-    async def shoot(self, shot: Shot) -> tuple[Radiograph, ConeVec]:
-        """The image of a shot, and its public geometry."""
+    async def shoot(self, shot: Shot, *, predicted: bool = False) -> tuple[Radiograph, ConeVec]:
+        """The image of a shot, and its public geometry; `predicted`: of that geometry alone."""
         scanner = self.scanner
         poses = scanner.poses_at(dict(shot.positions), shot.camera)
         cone = scanner.corrected(poses, shot.camera, shot.correction)
-        images = await self.radiography.take(shot.sample, poses, shot.camera, [shot.exposure])
-        self._seen = (images[0], shot)
+        known = NOMINAL if shot.correction is None else shot.correction.parameters
+        images = await self.radiography.take(
+            shot.sample, poses, shot.camera, [shot.exposure],
+            truth=TrueGeometry(known) if predicted else None,
+        )  # fmt: skip
+        if not predicted:
+            self._seen = (images[0], shot)
         return images[0], cone
 
     def judge(self, radiograph: Radiograph, shot: Shot) -> None:

@@ -52,8 +52,9 @@ def called(root: Path, method: str, **params: object) -> Any:
 
 def test_a_fit_over_the_wire_is_that_of_the_package(data: Path, own: Any) -> None:
     told = called(
-        data, "calibration.fit", datasets=["lego"], phantom="lego", steps=4, residuals=True
-    )
+        data, "calibration.fit", datasets=["lego"], phantom="lego", steps=4, residuals=True,
+        tracks=True,
+    )  # fmt: skip
     fit = own.calibration.fit
     assert told["identifiable"]
     assert list(told["parameters"]) == list(fit.values)
@@ -67,6 +68,11 @@ def test_a_fit_over_the_wire_is_that_of_the_package(data: Path, own: Any) -> Non
         off = np.array([frame[k] for frame in told["residuals_px"] if frame[k] is not None])
         assert np.sqrt(np.mean(off**2)) == pytest.approx(stated, abs=1e-4)
     assert [s["frames"] for s in told["steps"]] == [7, 13, 19, 25]
+    [tracked] = told["tracks"]["datasets"]
+    for frame, off in zip(tracked["frames"], told["residuals_px"], strict=True):
+        for seen, after, residual in zip(frame["measured"], frame["after"], off, strict=True):
+            if residual is not None:
+                assert np.subtract(seen, after) == pytest.approx(residual, abs=2e-3)
     assert {q["code"] for q in told["problems"]} == {f.code for f in own.calibration.findings}
 
 

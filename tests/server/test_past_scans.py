@@ -112,6 +112,39 @@ def test_a_scan_is_told_as_its_folder_says(server: Process, data: Path) -> None:
         assert np.abs(np.asarray(halved, dtype=float) - mean).max() <= 0.5
 
 
+def test_a_scanner_s_own_texts_tell_the_poses(server: Process, data: Path) -> None:
+    """Against flexdt.json of the same scan, which is taken away. The texts have fewer digits."""
+    whole = json.loads((data / "first scan" / "flexdt.json").read_text("utf-8"))
+    shots = [f for f in whole["frames"] if f["kind"] == "projection"]
+    shutil.copytree(data / "first scan", data / "texts")
+    (data / "texts" / "flexdt.json").unlink()
+    try:
+        told = asked(data, p.DatasetGet(name="texts"))
+        assert told["same_machine"]
+        assert told["times_s"] is None
+        assert (told["info"]["kV"], told["info"]["state"]) == (whole["tube"]["kV"], "complete")
+        assert told["kinds"].count("projection") == FRAMES
+        first = told["kinds"].index("projection")
+        for motor, values in told["positions"].items():
+            assert values[:first] == [None] * first
+            stated = [f["positions"][motor] for f in shots]
+            assert values[first:] == pytest.approx(stated, abs=2e-3)
+        for index, shot in enumerate(shots):
+            frame = asked(data, p.DatasetFrame(name="texts", index=first + index))
+            assert frame["cone_vec"] == pytest.approx(shot["cone_vec"], abs=2e-2)
+            assert frame["tube"] == {**whole["tube"], "on": True}
+            there = {n: shot[n] for n in ("exposure_ms", "mode", "averages", "roi")}
+            assert frame["camera"] == there
+            there = asked(data, p.DatasetFrame(name="first scan", index=first + index))
+            assert frame["camera"] == there["camera"]
+        (data / "texts" / "io000000.tif").unlink()  # a link among the files: texts are not read
+        (data / "texts" / "io000000.tif").symlink_to(data / "first scan" / "io000000.tif")
+        told = asked(data, p.DatasetGet(name="texts"))
+        assert (told["positions"], told["same_machine"]) == ({}, False)
+    finally:
+        shutil.rmtree(data / "texts")
+
+
 def test_the_nearest_parts_are_those_the_check_finds(server: Process, data: Path) -> None:
     """The dry run's least clearance is of the whole motion, so no image is nearer than it; and of
     the sample's own shape, which the cylinder contains, so images of the scan may say less."""

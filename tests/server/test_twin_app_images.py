@@ -6,6 +6,7 @@ import asyncio
 import json
 import threading
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.twin import live, wire_values
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.machine.camera import Roi
 
 
 def test_projections_flow_while_an_axis_moves_and_the_last_is_the_final_pose(
@@ -96,6 +98,91 @@ def test_truth_reaches_images_and_nothing_else(tmp_path: Path) -> None:
         assert len(texts) >= 4
 
     run(tmp_path, body, truth=TrueGeometry(Offsets(dD_x=secret)))
+
+
+def test_an_image_of_another_pose_is_predicted_from_what_is_known(tmp_path: Path) -> None:
+    """Where the point lies follows from the machine's pose and the correction; the hidden truth,
+    and what stands now, have no part in it. Poses are drawn, settings too."""
+    known = {"dD_x": 0.8, "dO_z": -0.4}
+
+    async def body(lab: Lab) -> None:
+        c = lab.client()
+        await c.call("calibration.apply", parameters=known)
+        stands = (await c.call("state.get"))["axes"]
+        rng = np.random.default_rng(21)
+        for _ in range(5):
+            there = {"rot_obj": rng.uniform(-360, 360), "ver_det": 20 + rng.uniform(-2, 2)}
+            camera = {"roi": ROI, "mode": "HW2SW1High", "exposure_ms": 50.0, "averages": 2}
+            told = await c.call("projection.get", positions=there, camera=camera)
+            image = wire_image.decode(told)
+            poses = lab.twin.scanner.poses_at(
+                {n: there.get(n, a["position"]) for n, a in stands.items() if n in M.axes},
+                replace(lab.twin.scanner.camera, mode="HW2SW1High", roi=Roi(*ROI)),
+            )
+            cone = poses.cone_vec(Offsets.from_edge(known))
+            assert told["cone_vec"] == pytest.approx(cone.rows[0].tolist())
+            column, row = cone.project_points(PointProjector.POINT, (48, 64))[0, 0]
+            spot = np.unravel_index(image.argmax(), image.shape)
+            assert spot == (int(np.clip(row, 0, 47)), int(np.clip(column, 0, 63)))
+        kV = {"kV": 80.0, "power_W": 10.0, "on": True}
+        half, full = [
+            wire_image.decode(
+                await c.call("projection.get", kind="counts", tube=kV,
+                             camera={"roi": ROI, "exposure_ms": ms})
+            ).astype(float)
+            for ms in (25.0, 50.0)
+        ]  # fmt: skip
+        dark = wire_image.decode(
+            await c.call("projection.get", kind="counts", tube={"on": False},
+                         camera={"roi": ROI, "exposure_ms": 50.0})
+        ).astype(float)  # fmt: skip
+        assert np.abs((full - dark) - 2 * (half - dark)).max() <= 2  # no noise: rounded alone
+        assert full.mean() > half.mean() > dark.mean()
+        for axis, now in (await c.call("state.get"))["axes"].items():
+            assert now["position"] == stands[axis]["position"]
+        assert (await c.error("projection.get", positions={"up": 1.0})).code == -32602
+        assert (await c.error("projection.get", tube={"kV": 9e3})).code == -32001
+        assert (await c.error("projection.get", camera={"mode": "none"})).code in (-32001, -32602)
+
+    run(tmp_path, body, truth=TrueGeometry(Offsets(dD_x=1.5, dO_z=0.7)))
+
+
+def test_the_ray_of_a_pixel_ends_in_it(tmp_path: Path) -> None:
+    """The point of the fake projector stands in the pixel that sees it, and in no other; so the
+    sum over its ray says which pixel was asked for."""
+
+    async def body(lab: Lab) -> None:
+        c = lab.client()
+        await c.call("camera.set", roi=ROI)
+        await c.call("calibration.apply", parameters={"dD_x": 0.8})
+        await c.call("sample.set", name="lego", offset={"x": 1.0, "rz": 20.0})
+        seen: list[Any] = []
+
+        async def project(name: str, cone: ConeVec, shape: tuple[int, int]) -> Any:
+            seen.append((name, cone, shape))
+            return np.full((1, *shape), float(len(seen)), np.float32)
+
+        lab.projector.project = project  # type: ignore[method-assign]
+        told = (await c.call("projection.ray", pixel=[7.25, 40.5]))["paths_mm"]
+        nominal = ConeVec((await c.call("geometry.get"))["cone_vec"])
+        assert list(told.values()) == [float(k + 1) for k in range(len(seen))]
+        assert set(told) >= {"abs"}
+        for _, cone, shape in seen:
+            assert shape == (1, 1)
+            # From the sample's own frame back to the object's; then the whole image sees the pixel.
+            turn = np.radians(20.0)
+            back = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0],
+                             [0.0, 0.0, 1.0]])  # fmt: skip
+            place = back @ cone.detector[0] + [1.0, 0.0, 0.0]
+            spot = nominal.project_points(place[None] * (1 - 1e-9), (48, 64))[0, 0]
+            assert spot == pytest.approx([7.25, 40.5], abs=1e-5)
+            assert back @ cone.source[0] + [1.0, 0.0, 0.0] == pytest.approx(nominal.source[0])
+        for outside in ([64.0, 3.0], [3.0, 47.6]):
+            assert (await c.error("projection.ray", pixel=outside)).code == -32001
+        await c.call("sample.set", name="empty")
+        assert (await c.call("projection.ray", pixel=[1.0, 1.0]))["paths_mm"] == {}
+
+    run(tmp_path, body, truth=TrueGeometry(Offsets(dD_x=1.5)))
 
 
 def test_a_correction_shows_in_geometry_get_and_stands_beside_the_data_set(

@@ -37,6 +37,7 @@ HANDLERS: Mapping[str, Handler] = {
     "sample.mesh": samples.mesh,
     "sample.upload": samples.upload,
     "projection.get": images.get_projection,
+    "projection.ray": images.ray,
     "geometry.get": images.get_geometry,
     "exposure.predict": images.predict,
     "script.check": jobs.check_script,

@@ -1,13 +1,15 @@
-"""projection.get, geometry.get and exposure.predict."""
+"""projection.get and .ray, geometry.get and exposure.predict."""
 
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 
 import numpy as np
 
 from flexdt.protocol import Codec, image
 from flexdt.protocol import params as p
+from flexdt.protocol import results as r
 from flexdt.protocol import state_model as w
 from flexdt.protocol.connection import MAX_ANSWER, encoded
 from flexdt.protocol.fields import Empty, ImageValue
@@ -18,18 +20,25 @@ from flexdt.server.imaging.exposure_prediction import predicted
 from flexdt.server.storage.stored_samples import EMPTY
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client
+from flexdt.server.twin.handlers.setting_methods import camera_change
 from flexdt.server.twin.hub import View
 from flexdt.server.twin.live import Shot, image_of
 from flexdt.twin.errors import LimitError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.scanner.settings import changed_camera, changed_tube, switched
 
 
 async def get_projection(twin: TwinServer, client: Client, params: p.ProjectionGet) -> Encoded:
-    """An image at the pose of this moment.
+    """An image at the pose of this moment, or predicted for another pose or other settings.
 
     Raises:
         RpcError: -32008, it would be larger than an answer may be.
+        TwinError: a motor or a setting that the machine does not have.
     """
     shot = Shot.of(twin.scanner, twin.clock.now())
+    elsewhere = any(x is not None for x in (params.positions, params.tube, params.camera))
+    if elsewhere:
+        shot = _as_though(twin, shot, params)
     if params.binning > min(shot.camera.shape):
         raise invalid_params(
             f"binning {params.binning} leaves nothing of {shot.camera.shape} pixels",
@@ -38,12 +47,13 @@ async def get_projection(twin: TwinServer, client: Client, params: p.ProjectionG
         )
     codec = client.peer.codec
     _require_room(shot.camera.shape, params, codec)
-    radiograph, cone = await twin.live.shoot(shot)
+    radiograph, cone = await twin.live.shoot(shot, predicted=elsewhere)
 
     def work() -> Encoded:
         """Apart: an image is some megabytes."""
         view, way = View(params.kind, params.binning), twin.radiography
-        made = image_of(radiograph, cone, shot, view, way, np.random.default_rng())
+        rng = None if elsewhere else np.random.default_rng()
+        made = image_of(radiograph, cone, shot, view, way, rng)
         if params.marks:
             marks = marks_of(way, radiograph, shot.camera, shot.exposure, params.binning)
             made = made.model_copy(update={"marks": ImageValue(**image.encode(marks))})  # type: ignore[arg-type]
@@ -53,6 +63,16 @@ async def get_projection(twin: TwinServer, client: Client, params: p.ProjectionG
         return await asyncio.to_thread(work)
 
 
+def _as_though(twin: TwinServer, shot: Shot, params: p.ProjectionGet) -> Shot:
+    machine, asked = twin.machine, params.tube or p.TubeSet()
+    tube = changed_tube(machine.tube, shot.tube, asked.kV, asked.power_W)
+    tube = switched(machine, tube, tube.on if asked.on is None else asked.on, None, warm=True)
+    change = camera_change(params.camera or p.CameraSet())
+    camera = changed_camera(machine.detector, shot.camera, change)
+    there = dict(shot.positions) | (params.positions or {})
+    return replace(shot, positions=tuple(sorted(there.items())), tube=tube, camera=camera)
+
+
 def _require_room(shape: tuple[int, int], params: p.ProjectionGet, codec: Codec) -> None:
     rows, cols = (n // params.binning for n in shape)
     size = rows * cols * ((2 if params.kind == "counts" else 4) + params.marks)
@@ -60,6 +80,23 @@ def _require_room(shape: tuple[int, int], params: p.ProjectionGet, codec: Codec)
     most = MAX_ANSWER[codec] - 4096  # beside the pixels
     if size > most:
         raise too_large("an image", size, most)
+
+
+async def ray(twin: TwinServer, client: Client, params: p.RayGet) -> r.RayResult:
+    """Path lengths on the ray of a pixel, in the public geometry.
+
+    Raises:
+        LimitError: the image has no such pixel.
+    """
+    scanner, (column, row) = twin.scanner, params.pixel
+    rows, cols = scanner.camera.shape
+    if not (-0.5 <= column < cols - 0.5 and -0.5 <= row < rows - 0.5):
+        asked = {"asked": [column, row], "allowed": [[0, cols - 1], [0, rows - 1]]}
+        raise LimitError(f"no pixel ({column:g}, {row:g}) in {cols} columns, {rows} rows", asked)
+    whole = scanner.cone_vec(twin.clock.now())
+    off = (column - (cols - 1) / 2) * whole.u + (row - (rows - 1) / 2) * whole.v
+    pixel = ConeVec(np.hstack([whole.source, whole.detector + off, whole.u, whole.v]))
+    return r.RayResult(paths_mm=await twin.imaging.ray(scanner.sample, pixel))
 
 
 def get_geometry(twin: TwinServer, client: Client, params: Empty) -> w.GeometryResult:
@@ -91,7 +128,7 @@ async def predict(twin: TwinServer, client: Client, params: p.ExposurePredict) -
         "exposure_ms": params.exposure_ms or camera.exposure_ms,
         "averages": params.averages or camera.averages,
         "filter": params.filter, "images": params.frames, "detail": params.detail,
-        "sod": at.SOD_mm, "sdd": at.SDD_mm,
+        "sod": params.sod_mm or at.SOD_mm, "sdd": params.sdd_mm or at.SDD_mm,
     }  # fmt: skip
     async with twin.samples.turn:
         phantom = await asyncio.to_thread(twin.samples.load, name, material)

@@ -12,6 +12,7 @@ from flexdt.server.twin.handlers.handler import Client, free
 from flexdt.twin.errors import SafetyError
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.scanner.settings import CameraChange
 
 
 def set_clock(twin: TwinServer, client: Client, params: p.ClockSet) -> w.ClockState:
@@ -47,11 +48,17 @@ async def set_camera(twin: TwinServer, client: Client, params: p.CameraSet) -> w
     """Change the camera; omitted settings stay."""
 
     def change(scanner: ScannerTwin) -> None:
-        roi = None if params.roi is None else Roi(*params.roi)
-        scanner.set_camera(**params.model_dump() | {"roi": roi})
+        scanner.set_camera(**camera_change(params))
 
     await change_settings(twin, change, free(twin, client, "camera.set", "camera.set"))
     return views.camera_view(twin.scanner.camera, twin.machine)
+
+
+def camera_change(params: p.CameraSet) -> CameraChange:
+    """What to change, as the twin has it."""
+    roi = None if params.roi is None else Roi(*params.roi)
+    change: CameraChange = {**params.model_dump(), "roi": roi}  # type: ignore[typeddict-item]
+    return change
 
 
 async def set_axis(twin: TwinServer, client: Client, params: p.AxisSet) -> r.AxisSetResult:
