@@ -17,7 +17,7 @@ import logging
 import struct
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -47,6 +47,7 @@ class ShownImage:
         time: of the pose [s of the twin's clock].
         seq: the event's number.
         flags: what the twin says of it; None of a recorded one.
+        virtual: to compare it with, of the same shape and kind; None for none.
     """
 
     pixels: npt.NDArray[np.generic]
@@ -55,6 +56,7 @@ class ShownImage:
     time: float
     seq: int
     flags: object = None
+    virtual: npt.NDArray[np.generic] | None = None
 
 
 def window_of(image: ShownImage) -> tuple[float, float]:
@@ -103,7 +105,7 @@ def packed(
 
     Pixels are uint16 with a scale. Exact ones are the differences from column to column (mod 2^16),
     first the low bytes of all, then the high ones, deflated (zlib). Coarse ones are a grey JPEG of
-    their high bytes.
+    their high bytes. The rows of a virtual image follow those of an exact one.
 
     Args:
         image: what to send.
@@ -111,6 +113,9 @@ def packed(
         beads: predicted bead centres (column, row) in pixels of the full image.
         facts: more entries of the header.
     """
+    full, pair = image.pixels.shape, image.virtual is not None
+    if image.virtual is not None:
+        image = replace(image, pixels=np.concatenate([image.pixels, image.virtual]))
     values = np.asarray(halved(image.pixels) if coarse else image.pixels, dtype=np.float32)
     low, scale = 0.0, 1.0
     if image.kind == "line_integral" or coarse:
@@ -120,8 +125,9 @@ def packed(
     header = {
         "kind": image.kind,
         "code": "jpeg" if coarse else "deflate",
-        "shape": list(raw.shape),
-        "full": list(image.pixels.shape),
+        "shape": [raw.shape[0] // (1 + pair), raw.shape[1]],
+        "pair": pair,
+        "full": list(full),
         "low": low,
         "scale": scale,
         "time": image.time,

@@ -106,8 +106,6 @@ class Page:
         """The focal spot's path over the plan, for the scenes of this page that open later."""
         self.recorded: str | None = None
         """The data set whose images this page shows instead of live ones."""
-        self.tracks: Mapping[str, Any] | None = None
-        """Beads of the last fit asked for here."""
         self._connection, self._local = connection, local
         self.link = KeptConnection(address, "flexdt viewer", on_change=self._link_changed)
         self._notes: deque[str] = deque()

@@ -6,6 +6,7 @@ The free view belongs to its user; only the page's preset button moves its camer
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,9 +15,13 @@ import numpy as np
 import viser
 
 from flexdt.clients.viewer.front import SCENE_PATH
+from flexdt.clients.viewer.scenes.sample import MM
 from flexdt.clients.viewer.scenes.standpoints import FIXED, Camera
 from flexdt.clients.viewer.viser_gate import Scenes
+from flexdt.twin.geometry.conventions import FloatArray
 
+FILLS = 1.3
+"""Of the distance at which a ball that is looked at fills the picture."""
 WIDE = 1.35
 """Aspect (width over height) for which the fixed cameras are made."""
 
@@ -75,6 +80,17 @@ class SceneClients:
         for client in self.of(page, view):
             if camera is not None:
                 aim(client, roomy(camera, client.camera.aspect))
+
+    def look(self, page: str, view: str, at: FloatArray, radius_mm: float) -> None:
+        """Have a page's view look at a ball, (3,) [mm], from where it looks."""
+        preset = self.cameras[view]
+        for client in self.of(page, view):
+            aspect = client.camera.aspect
+            far = FILLS * radius_mm * MM / math.sin(preset.fov / 2) / min(1.0, max(aspect, 0.3))
+            way = np.subtract(preset.position, preset.look_at)
+            middle = at * MM
+            x, y, z = (middle + far * way / np.linalg.norm(way)).tolist()
+            aim(client, replace(preset, position=(x, y, z), look_at=tuple(middle.tolist())))
 
     def theme(self, page: str, dark: bool) -> None:
         """Light or dark, for all frames of a page."""

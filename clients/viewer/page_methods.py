@@ -19,18 +19,20 @@ from typing import Any, Final
 
 import numpy as np
 
-from flexdt.clients.viewer import fitting
+from flexdt.clients.client.async_client import AsyncTwinClient
+from flexdt.clients.client.flows import Ask
 from flexdt.clients.viewer import page_params as p
 from flexdt.clients.viewer import scrubbed_plan as plans
 from flexdt.clients.viewer.export import picture, replay_file, scene_file
 from flexdt.clients.viewer.feed import ShownImage, packed
 from flexdt.clients.viewer.front import Download
-from flexdt.clients.viewer.page import Page
+from flexdt.clients.viewer.page import Page, without_bytes
 from flexdt.clients.viewer.scenes.world import motors
 from flexdt.clients.viewer.viewer import PageMethod, ShownMachine, Viewer
 from flexdt.protocol import Code, Method, RpcError, parse_params
 from flexdt.protocol import image as wire_image
 from flexdt.protocol.fields import Nothing, Params
+from flexdt.protocol.params import CalibrationAlign, CalibrationFit
 from flexdt.protocol.rpc_errors import busy
 from flexdt.protocol.state_model import State
 from flexdt.server.wire_errors import explain
@@ -70,8 +72,11 @@ async def theme(viewer: Viewer, page: Page, params: p.Theme) -> object:
 
 
 async def camera(viewer: Viewer, page: Page, params: p.Camera) -> object:
-    """Put a view of this page back to its preset."""
-    viewer.clients.reset(page.id, params.view)
+    """Put a view of this page back to its preset, or have it look at the sample."""
+    if params.sample and viewer.world is not None:
+        viewer.clients.look(page.id, params.view, viewer.world.sample.shift, viewer.look.radius_mm)
+    else:
+        viewer.clients.reset(page.id, params.view)
     return {}
 
 
@@ -90,9 +95,24 @@ async def window(viewer: Viewer, page: Page, params: p.Window) -> object:
     return {}
 
 
+async def ray(viewer: Viewer, page: Page, params: p.Ray) -> object:
+    """Show this page the ray of a pixel; what it goes through."""
+    lab, world = _lab(viewer), viewer.world
+    clients = viewer.clients.of(page.id)
+    if params.pixel is None or world is None:
+        lab.scene.plan.ray(clients, None)
+        return {}
+    told: Any = await page.link.request("projection.ray", {"pixel": list(params.pixel)})
+    ends = np.array([world.source, world.pixel(*params.pixel)])
+    lab.scene.plan.ray(clients, ends)
+    return {**told, "length_mm": float(np.linalg.norm(ends[1] - ends[0]))}
+
+
 async def spectrum(viewer: Viewer, page: Page, params: p.Spectrum) -> object:
-    """Photons by energy at a voltage, behind the filters of the machine's tube."""
-    tube = tube_of(_lab(viewer).machine.tube)
+    """Photons by energy at a voltage, behind the filters of the machine's tube; what tube and
+    camera allow."""
+    machine = _lab(viewer).machine
+    tube, lit, panel = tube_of(machine.tube), machine.tube, machine.detector
     behind = tube_spectrum(params.kV, tube)
     layers = [{"material": f.substance.name, "thickness_mm": f.thickness_mm} for f in tube.filters]
     return {
@@ -100,6 +120,11 @@ async def spectrum(viewer: Viewer, page: Page, params: p.Spectrum) -> object:
         "photons": behind.fluence.tolist(),
         "mean_keV": behind.mean_keV,
         "filters": layers,
+        "limits": {
+            "kV": [lit.min_kV, lit.max_kV],
+            "power_W": [0.0, lit.max_W],
+            "exposure_ms": [panel.min_exposure_ms, panel.max_exposure_ms],
+        },
     }
 
 
@@ -138,7 +163,7 @@ async def recorded(viewer: Viewer, page: Page, params: p.Recorded) -> object:
     elif told["same_machine"] and viewer.state is not None:
         page.plan = plans.Recorded.of(told)
         taken = np.array(told["kinds"], dtype=str) == "projection"
-        at = {n: np.array(v)[taken] for n, v in told["positions"].items()}
+        at = {n: np.array(v, dtype=float)[taken] for n, v in told["positions"].items()}
         page.orbit = plans.source_path(at, lab.machine, lab.profile, viewer.state)
     lab.scene.plan.orbit(clients, page.orbit)
     return told or {}
@@ -149,13 +174,25 @@ async def recorded_image(viewer: Viewer, page: Page, params: p.RecordedImage) ->
     lab, name = _lab(viewer), page.recorded
     if name is None:
         raise RpcError(Code.INVALID_PARAMS, "open a data set first: there is nothing to show")
-    told: Any = await page.link.request("dataset.frame", {"name": name, **params.model_dump()})
+    asked = {"name": name, "index": params.index, "kind": params.kind}
+    told: Any = await page.link.request("dataset.frame", asked)
+    about = {k: told[k] for k in ("name", "index", "file", "image", "time_s", "positions")}
+    about["problem"] = ""
+    pixels, virtual = wire_image.decode(told), None
+    if params.virtual and told["image"] == "projection" and told["positions"]:
+        try:
+            virtual = await _virtual(page, told)
+        except RpcError as error:
+            about["problem"] = error.message
     if page.recorded != name:
         raise RpcError(Code.SUPERSEDED, "another data set was opened meanwhile")
-    pixels = wire_image.decode(told)
+    if virtual is not None and virtual.shape != pixels.shape:
+        about["problem"] = f"the virtual image has {virtual.shape} pixels, not {pixels.shape}"
+        virtual = None
     cone = tuple(told["cone_vec"] or ())
-    shot = ShownImage(pixels, told["kind"], cone, told["time_s"] or 0.0, params.index)
-    about = {k: told[k] for k in ("name", "index", "file", "image", "time_s", "positions")}
+    shot = ShownImage(
+        pixels, told["kind"], cone, told["time_s"] or 0.0, params.index, virtual=virtual
+    )
     content = await asyncio.to_thread(
         packed, shot, coarse=False, beads=(), facts={"at": time.time(), "recorded": about}
     )
@@ -165,6 +202,14 @@ async def recorded_image(viewer: Viewer, page: Page, params: p.RecordedImage) ->
     if page.plan is not None and about["positions"]:
         lab.scene.plan.ghost(clients, about["positions"])
     return about
+
+
+async def _virtual(page: Page, told: Mapping[str, Any]) -> Any:
+    """The image that the twin predicts where one of a data set was taken, as it was exposed."""
+    asked = {name: told[name] for name in ("kind", "positions")}
+    for what in ("tube", "camera"):  # what is not known of it is as it is now
+        asked[what] = {k: v for k, v in told[what].items() if v is not None}
+    return wire_image.decode(await page.link.request("projection.get", asked))  # type: ignore[arg-type]
 
 
 async def live(viewer: Viewer, page: Page, params: p.Live) -> object:
@@ -186,14 +231,18 @@ async def compose(viewer: Viewer, page: Page, params: p.Compose) -> object:
     lab, state = _lab(viewer), viewer.state
     request = ScanRequest(kind=params.kind, frames=params.frames, exposure_ms=params.exposure_ms)
     if state is not None:
+        at = state.geometry
+        sod = at.SOD_mm
+        if params.voxel_um is not None:
+            sod = params.voxel_um / 1000.0 / state.camera.pixel_mm * at.SDD_mm
         request = replace(
             request,
-            sod_mm=round(state.geometry.SOD_mm, 4),
-            sdd_mm=round(state.geometry.SDD_mm, 4),
+            sod_mm=round(sod, 4),
+            sdd_mm=round(at.SDD_mm, 4),
             mode=state.camera.mode,
             roi=Roi(*state.camera.roi),
-            kV=state.tube.kV,
-            power_W=state.tube.power_W,
+            kV=state.tube.kV if params.kV is None else params.kV,
+            power_W=state.tube.power_W if params.power_W is None else params.power_W,
         )
     text = compose_script(request, lab.machine, lab.profile)
     if state is None:
@@ -220,35 +269,32 @@ def _moved(text: str, lab: ShownMachine, state: State) -> dict[str, tuple[float,
 
 
 async def datasets(viewer: Viewer, page: Page, params: p.Datasets) -> object:
-    """Data sets, newest first, with thumbnails; and whether this viewer can calibrate from them."""
+    """Data sets, newest first, with thumbnails."""
     asked = {"search": params.search, "start": params.start, "thumbnail": 96}
     told: Any = await page.link.request("dataset.list", asked)
     for info in told["datasets"]:
         if (small := info["thumbnail"]) is not None:
             small["data"] = base64.b64encode(small["data"]).decode("ascii")
-    return {**told, "available": viewer.data is not None}
+    return told
 
 
-async def calibrate(viewer: Viewer, page: Page, params: p.Calibrate) -> object:
-    """Fit the geometry from data sets; nothing is applied. One at a time, for all pages."""
-    folder = _data(viewer)
-    document, tracks = await viewer.fitter.calibrate(folder, params.datasets, params.phantom)
-    page.tracks = tracks
-    return {**document, "comparison": fitting.summary(tracks)}
+async def estimate(viewer: Viewer, page: Page, params: CalibrationFit | CalibrationAlign) -> object:
+    """Fit a geometry to data sets; nothing is applied.
+
+    Over a connection of its own: other requests of the page do not wait for this one.
+    """
+    at = viewer.twin_address
+    name = "fit" if isinstance(params, CalibrationFit) else "align"
+    asked = Ask(f"calibration.{name}", params.model_dump(exclude_none=True), None)
+    async with AsyncTwinClient(
+        at.host, at.port, at.token, name=f"flexdt viewer ({name})", ssl=at.ssl
+    ) as client:
+        return without_bytes(await client.core.call(asked))
 
 
 async def correct(viewer: Viewer, page: Page, params: p.Correct) -> object:
     """A correction for the twin."""
     return await page.link.request("calibration.apply", params.model_dump(exclude_none=True))
-
-
-async def compared(viewer: Viewer, page: Page, params: p.Compared) -> object:
-    """A radiograph of this page's last fit, with its beads before and after."""
-    if page.tracks is None:
-        raise RpcError(Code.INVALID_PARAMS, "calibrate first: there is nothing to compare")
-    return await asyncio.to_thread(
-        fitting.view, _data(viewer), page.tracks, params.dataset, params.frame
-    )
 
 
 async def scrub(viewer: Viewer, page: Page, params: p.Scrub) -> object:
@@ -330,11 +376,14 @@ Answer = Callable[["Viewer", Page, Any], Awaitable[object]]
 
 METHODS: Mapping[str, tuple[type[Params], Answer]] = {
     "calibration.apply": (p.Correct, correct),
+    "calibration.fit": (CalibrationFit, estimate),
+    "calibration.align": (CalibrationAlign, estimate),
     "viewer.layers": (p.Layers, layers),
     "viewer.theme": (p.Theme, theme),
     "viewer.camera": (p.Camera, camera),
     "viewer.feed": (p.Feed, feed),
     "viewer.window": (p.Window, window),
+    "viewer.ray": (p.Ray, ray),
     "viewer.spectrum": (p.Spectrum, spectrum),
     "viewer.plan": (p.Plan, plan),
     "viewer.recorded": (p.Recorded, recorded),
@@ -342,8 +391,6 @@ METHODS: Mapping[str, tuple[type[Params], Answer]] = {
     "viewer.live": (p.Live, live),
     "viewer.compose": (p.Compose, compose),
     "viewer.datasets": (p.Datasets, datasets),
-    "viewer.calibrate": (p.Calibrate, calibrate),
-    "viewer.compared": (p.Compared, compared),
     "viewer.scrub": (p.Scrub, scrub),
     "viewer.screenshot": (p.Screenshot, screenshot),
     "viewer.export": (p.Export, export),

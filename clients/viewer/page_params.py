@@ -10,7 +10,17 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Le, Len
 from pydantic import Field, model_validator
 
-from flexdt.protocol.fields import AxisName, Deviation, Exposure, Params, ShortText, few
+from flexdt.protocol.fields import (
+    AxisName,
+    Deviation,
+    Exposure,
+    Params,
+    PixelAsked,
+    Power,
+    ShortText,
+    Voltage,
+    few,
+)
 from flexdt.protocol.params import CalibrationApply, ScriptText
 from flexdt.twin.script.compose import Kind as KindOfScan
 
@@ -37,6 +47,7 @@ class Layers(Params):
     machine: bool | None = None
     orbit: bool | None = None
     gizmos: bool | None = None
+    labels: bool | None = None
     opacity: Annotated[float, Ge(0.05), Le(1)] | None = None
 
 
@@ -47,9 +58,16 @@ class Theme(Params):
 
 
 class Camera(Params):
-    """A view of the page."""
+    """A view of the page, and whether to look at the sample from there."""
 
     view: View = "free"
+    sample: bool = False
+
+
+class Ray(Params):
+    """A pixel of the live image to see the ray of; none: show it no longer."""
+
+    pixel: PixelAsked | None = None
 
 
 class Spectrum(Params):
@@ -92,10 +110,11 @@ class Recorded(Params):
 
 
 class RecordedImage(Params):
-    """An image of the data set that is looked at."""
+    """An image of the data set that is looked at, and with it the virtual one of its pose."""
 
     index: Annotated[int, Ge(0), Le(10**7)]
     kind: Kind = "counts"
+    virtual: bool = False
 
 
 class Live(Params):
@@ -111,6 +130,10 @@ class Compose(Params):
     kind: KindOfScan = "fly"
     frames: Annotated[int, Ge(1), Le(1_000_000)] = 73
     exposure_ms: Exposure = 100.0
+    kV: Voltage | None = None
+    power_W: Power | None = None
+    voxel_um: Annotated[float, Ge(0.01), Le(1e6)] | None = None
+    """Of the finest details at the axis; none: the distances stay."""
     keep: Annotated[list[AxisName], Len(0, 64)] = Field(default_factory=list)
 
 
@@ -121,24 +144,10 @@ class Datasets(Params):
     start: Index = 0
 
 
-class Calibrate(Params):
-    """Data sets to fit the geometry to, and the phantom in them."""
-
-    datasets: Annotated[list[FileName], Len(1, 100)]
-    phantom: Annotated[ShortText, Len(1, 120)]
-
-
 class Correct(CalibrationApply):
     """A correction; on the wire an empty one is a nominal one, on a page it is a slip."""
 
     parameters: Annotated[dict[AxisName, Deviation], few(64), Len(1, 64)]
-
-
-class Compared(Params):
-    """A frame of the last fit."""
-
-    dataset: Index = 0
-    frame: Index = 0
 
 
 class Scrub(Params):

@@ -62,12 +62,15 @@ class Recorded:
 
     @classmethod
     def of(cls, told: Mapping[str, Any]) -> Recorded | None:
-        """Of what `dataset.get` tells; None where poses or times are not known."""
-        if not told["times_s"] or not told["positions"]:
+        """Of what `dataset.get` tells; None where poses are not known. Images without times are a
+        second apart."""
+        motors = {n: np.array(values, dtype=float) for n, values in told["positions"].items()}
+        if not motors:
             return None
-        order = np.argsort(told["times_s"], kind="stable")
-        motors = {name: np.array(values)[order] for name, values in told["positions"].items()}
-        return cls(np.array(told["times_s"])[order], motors)
+        times = np.array(told["times_s"] or told["indices"], dtype=float)
+        order = np.argsort(times, kind="stable")
+        order = order[np.isfinite(next(iter(motors.values()))[order])]
+        return cls(times[order], {name: values[order] for name, values in motors.items()})
 
     @property
     def duration_s(self) -> float:

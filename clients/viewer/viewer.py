@@ -24,7 +24,6 @@ from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress
 from flexdt.clients.client.transport import ConnectionLost
 from flexdt.clients.viewer import scrubbed_plan as plans
 from flexdt.clients.viewer.feed import ImageFeed, ShownImage, grey, packed, window_of
-from flexdt.clients.viewer.fitting import Fitter
 from flexdt.clients.viewer.front import Download, Front
 from flexdt.clients.viewer.live_volume import Grower
 from flexdt.clients.viewer.page import TRY_AGAIN, Page, watched, without_bytes
@@ -77,7 +76,7 @@ class Viewer:
         answers: the viewer's own methods by name.
         machine, profile: instead of the ones the twin names (for files).
         token: browsers must show; None for none.
-        data: the twin's data directory where it can be read, for calibrations.
+        data: the twin's data directory where it can be read, for slices of running scans.
         limits: what all pages together may cost.
 
     Attributes:
@@ -98,7 +97,6 @@ class Viewer:
         self._machine, self._profile = machine, profile
         self.data, self.limits = data, limits or ViewerLimits()
         self.failed = asyncio.Event()
-        self.fitter = Fitter()
         self.grower = Grower(self._grown)
         self.opened = self.drawn = self.sharing = 0
         self.pages: dict[str, Page] = {}

@@ -27,7 +27,6 @@ def viewer_pages(viewer: Viewer) -> Pages:
                     0 if front is None else front.doorkeeper.dropped),
             gauge("flexdt_scenes", "Views open.", 0 if front is None else front.scenes),
             counter("flexdt_states_drawn_total", "States drawn.", viewer.drawn),
-            gauge("flexdt_fits", "Calibrations under way.", float(viewer.fitter.busy)),
             gauge("flexdt_twin_connected", "Whether there is one.", float(viewer.link.connected)),
             counter("flexdt_wrong_tokens_total", "Wrong tokens shown.",
                     0 if front is None else front.wrong_tokens),

@@ -61,7 +61,7 @@ COSTLY = {
     "sample.mesh": 10, "rpc.discover": 40, "scene.save": 4, "calibration.list": 10,
     "calibration.apply": 10, "calibration.revert": 4, "job.list": 10, "job.resume": 60,
     "job.step": 60, "job.pause": 20, "job.abort": 20, "axes.move": 2, "axes.jog": 2,
-    "viewer.export": 200, "viewer.plan": 40, "viewer.calibrate": 40, "sample.list": 4,
+    "viewer.export": 200, "viewer.plan": 40, "sample.list": 4,
     "dataset.list": 40, "dataset.get": 40, "dataset.frame": 20, "exposure.predict": 400,
     "calibration.fit": 400, "calibration.align": 400,
 }  # fmt: skip
@@ -870,7 +870,6 @@ def page_maker(document: dict[str, Any], scene: dict[str, Any], rng: random.Rand
              "phantom": lambda: "lego", "time_s": lambda: 1.0}  # fmt: skip
     valid: dict[str, list[Callable[[], dict[str, Any]]]] = {
         **base._valid,
-        "viewer.compared": [lambda: {"dataset": 0, "frame": 0}],
         "viewer.scrub": [lambda: {"time_s": 1.0}],
         "viewer.window": [lambda: {"low": 0.0, "high": 1.0}],
         "viewer.plan": [lambda: {"text": SCRIPT}, lambda: {"text": fly_script(3)}],

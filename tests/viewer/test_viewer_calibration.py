@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from flexdt.clients.client.client import TwinClient
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.twin.geometry.offsets import Offsets
-from tests.viewer.looking import begun
+from tests.viewer.looking import begun, film
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]
 WRONG = {"dO_x": 0.6, "dO_z": -0.8}
 
 
-def pixels(page: Any) -> np.ndarray:
-    raw = page.locator("#compare-canvas").screenshot()
-    return np.asarray(Image.open(io.BytesIO(raw)).convert("RGB"), dtype=float)
+def residue(page: Any) -> float:
+    """Rms of what the page got: recorded less virtual line integrals."""
+    told = page.evaluate(
+        "(({scale, pixels, virtual}) => ({scale, pixels: [...pixels], virtual: [...virtual]}))"
+        "(flexdt.store.image)"
+    )
+    return float(told["scale"] * np.subtract(told["pixels"], told["virtual"]).std())
 
 
 def number(page: Any, id: str) -> float:
@@ -32,7 +34,7 @@ def number(page: Any, id: str) -> float:
 
 def coloured(picture: np.ndarray, colour: tuple[int, int, int]) -> int:
     """Pixels that are near `colour`."""
-    return int((np.abs(picture - np.array(colour)).max(axis=2) < 40).sum())
+    return int((np.abs(picture[..., :3] - np.array(colour)).max(axis=2) < 40).sum())
 
 
 def on_top(page: Any, selector: str) -> bool:
@@ -81,41 +83,43 @@ def test_from_scan_to_correction_and_back(page: Any, twin: TwinClient, wait: Wai
     sigmas = {each: float(sigma.removeprefix("± ")) for each, _, sigma, _ in cells if sigma.strip()}
 
     page.click("#fit-compare")
-    page.locator("#compare-file", has_text="scan_000000.tif").wait_for()
+    page.locator("#film-recorded", has_text="scan_000000.tif").wait_for()
     assert number(page, "compare-all-before") > 1.0
     assert number(page, "compare-all-after") < 0.2
     assert number(page, "compare-frame-before") > 10 * number(page, "compare-frame-after")
     assert page.locator("#estop").is_visible()
-    both = pixels(page)
+    both = film(page)
     assert coloured(both, AMBER) > 50
     assert coloured(both, GREEN) > 50
     page.uncheck("#compare-before")
-    assert coloured(pixels(page), AMBER) == 0
+    assert coloured(film(page), AMBER) == 0
     page.uncheck("#compare-after")
-    assert coloured(pixels(page), GREEN) == 0
+    assert coloured(film(page), GREEN) == 0
     page.check("#compare-before")
     page.check("#compare-after")
-    page.locator("#compare-frame").fill("7")
-    page.locator("#compare-file", has_text="scan_000007.tif").wait_for()
     page.select_option("#compare-times", "10")
-    # What is wrong with the machine is seen over it, and what is told leaves its button free.
+    assert coloured(film(page), AMBER) > coloured(both, AMBER)  # longer lines to the circles
+    # What is wrong with the machine is seen over it.
     page.evaluate("flexdt.call('safety.estop')")
     page.locator("#warnings .bad", has_text="Emergency stop").wait_for()
-    page.locator(".note", has_text="E-stop").wait_for()
     assert on_top(page, "#warnings .bad")
-    assert on_top(page, "#compare-close")
+    assert on_top(page, "#record-close")
     page.evaluate("flexdt.call('safety.reset')")
-    page.keyboard.press("Escape")
-    assert not page.locator("#compare").is_visible()
-    page.click("#fit-compare")
-    page.locator("#compare").wait_for()
-    page.click("#compare-close")
-    assert not page.locator("#compare").is_visible()
+    for way in ("measured", "before", "after"):
+        page.uncheck(f"#compare-{way}")
 
+    # The virtual image is that of the wrong correction, which the recorded one was not taken with.
+    page.select_option("#compare-mode", "difference")
+    page.wait_for_function("flexdt.store.image?.virtual")
+    apart = residue(page)
     page.click("#fit-apply")
     wait(lambda: twin.state().correction is not None and twin.state().correction.name != "wrong")
     applied = twin.state().correction
     assert applied is not None
+    wait(lambda: residue(page) < 0.2 * apart, "the virtual image goes with the correction")
+    page.select_option("#compare-mode", "recorded")
+    page.keyboard.press("Escape")
+    assert not page.locator("#record").is_visible()
     for parameter in WRONG:
         assert abs(applied.parameters[parameter]) < 4 * sigmas[parameter], applied.parameters
     # dO_z is told no better than the panel's height is known; what the images see of it is.

@@ -28,13 +28,15 @@ def scans(lab: Any) -> Iterator[Any]:
         twin.submit_script(fly_script(frames=FRAMES), "whole scan", "max")
         assert twin.wait_job().state == "done"
         twin.control("release")
-    for name in ("cut scan", "bare"):
+    for name in ("cut scan", "bare", "own texts"):
         shutil.copytree(lab.data / "whole scan", lab.data / name)
     (lab.data / "cut scan" / "scan_000004.tif").write_bytes(b"II*\0")
     (lab.data / "cut scan" / "scan_000008.tif").unlink()
-    (lab.data / "bare" / "flexdt.json").unlink()
+    (lab.data / "own texts" / "flexdt.json").unlink()
+    for file in ("flexdt.json", "scan settings.txt", "data settings XRE.txt"):
+        (lab.data / "bare" / file).unlink()
     yield lab.data
-    for name in ("whole scan", "cut scan", "bare"):
+    for name in ("whole scan", "cut scan", "bare", "own texts"):
         shutil.rmtree(lab.data / name)
 
 
@@ -128,6 +130,80 @@ def test_an_image_that_cannot_be_read_leaves_none_in_its_place(page: Any, scans:
     page.evaluate("flexdt.data.open('bare')")
     page.locator("#record-note", has_text="poses and times are not known").wait_for()
     assert page.locator("#record-replay").is_disabled()
+    assert page.locator("#compare-mode").is_disabled()
+
+
+def part(page: Any, what: str) -> Any:
+    """The recorded or the virtual image as the page got it, (rows, cols)."""
+    told = page.evaluate(
+        "what => (({low, scale, shape, [what]: p}) => ({low, scale, shape, p: [...p]}))"
+        "(flexdt.store.image)",
+        what,
+    )
+    return (told["low"] + told["scale"] * np.array(told["p"])).reshape(told["shape"])
+
+
+def compares(page: Any, how: str) -> None:
+    page.select_option("#compare-mode", how)
+    page.wait_for_function("flexdt.store.image?.virtual && flexdt.store.image.recorded")
+    page.locator("#film-recorded", has_text="virtual").wait_for()
+
+
+def test_a_recorded_image_beside_the_virtual_one(
+    page: Any, scans: Any, twin: TwinClient, tmp_path: Any
+) -> None:
+    """The scanner's own texts alone tell the pose. What the panel shows left and right of the
+    curtain, and as difference, is what the two images say there."""
+    frames = json.loads((scans / "whole scan" / "flexdt.json").read_text("utf-8"))["frames"]
+    page.select_option("#kind", "counts")
+    page.evaluate("flexdt.data.open('own texts')")
+    shows(page, 2)
+    compares(page, "virtual")
+    for index in (2, 6):
+        page.locator("#record-frame").evaluate(
+            "(e, v) => { e.value = v; e.dispatchEvent(new Event('input')); }", index
+        )
+        shows(page, index)
+        page.wait_for_function("flexdt.store.image.virtual")
+        shot = frames[index]
+        camera = {k: shot[k] for k in ("mode", "roi", "exposure_ms", "averages")}
+        tube = {"kV": 90.0, "power_W": 20.0, "on": True}
+        there = twin.projection("counts", positions=shot["positions"], tube=tube, camera=camera)
+        assert np.array_equal(part(page, "pixels"), tifffile.imread(scans / "bare" / shot["file"]))
+        assert np.abs(part(page, "virtual") - there.image).max() <= 2  # the texts round the angle
+    recorded, virtual = part(page, "pixels"), part(page, "virtual")
+    noise = (recorded - virtual)[8:-8, 8:-8]
+    assert abs(noise.mean()) < 0.01 * recorded.mean()  # the same exposure
+
+    page.uncheck("#show-beads")
+    compares(page, "curtain")
+    page.locator("#curtain").evaluate(
+        "e => { e.value = 250; e.dispatchEvent(new Event('input')); }"
+    )
+    page.wait_for_function("flexdt.value(0, 0) === flexdt.store.image.pixels[0]")
+    cols = recorded.shape[1]
+    seen = np.array(
+        page.evaluate("([r, n]) => [...Array(n).keys()].map((c) => flexdt.value(c, r))", [20, cols])
+    )
+    cut = round(cols / 4)
+    assert np.array_equal(seen[:cut], recorded[20, :cut])
+    assert np.array_equal(seen[cut:], virtual[20, cut:])
+    box = page.locator("#film-canvas").bounding_box()  # dragged in the picture, too
+    page.mouse.move(box["x"] + box["width"] / 4, box["y"] + box["height"] / 2)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] * 0.75, box["y"] + box["height"] / 2, steps=4)
+    page.mouse.up()
+    assert float(page.input_value("#curtain")) == pytest.approx(750, abs=20)
+
+    compares(page, "difference")
+    page.wait_for_function("flexdt.value(3, 3) < flexdt.store.image.pixels[0] / 2")
+    seen = np.array(
+        page.evaluate("([r, n]) => [...Array(n).keys()].map((c) => flexdt.value(c, r))", [20, cols])
+    )
+    assert seen == pytest.approx((recorded - virtual)[20], abs=1.0)
+    page.check("#show-beads")
+    page.select_option("#compare-mode", "recorded")
+    page.select_option("#kind", "line_integral")
 
 
 def test_playing_ends_with_the_last_image(page: Any, scans: Any) -> None:

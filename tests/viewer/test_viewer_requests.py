@@ -21,7 +21,6 @@ from websockets.exceptions import ConnectionClosed
 
 from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress
 from flexdt.clients.launch import up
-from flexdt.clients.viewer import fitting
 from flexdt.clients.viewer import main as viewer_main
 from flexdt.clients.viewer import page as tasks
 from flexdt.clients.viewer import viewer as app
@@ -29,7 +28,7 @@ from flexdt.clients.viewer.feed import ImageFeed, ShownImage
 from flexdt.clients.viewer.page import MAX_NOTES, Page
 from flexdt.clients.viewer.page_methods import METHODS
 from flexdt.process_settings import Address, UpSettings, ViewerSettings, parse
-from flexdt.protocol import Connection, Notification, Request, Response, RpcError
+from flexdt.protocol import Connection, Notification, Request, Response
 
 PATIENCE_S = 60.0
 NOWHERE = TwinAddress("127.0.0.1", 1)
@@ -95,9 +94,10 @@ WRONG = [
     ("viewer.compose", {"frames": 0}),
     ("viewer.compose", {"exposure_ms": None}),
     ("viewer.datasets", {"all": True}),
-    ("viewer.calibrate", {"datasets": "x", "phantom": "lego"}),
-    ("viewer.calibrate", {"datasets": ["x"], "phantom": None}),
-    ("viewer.compared", {"dataset": "0"}),
+    ("calibration.fit", {"datasets": "x", "phantom": "lego"}),
+    ("calibration.fit", {"datasets": ["x"], "phantom": None}),
+    ("calibration.align", {"name": ["a"]}),
+    ("viewer.recorded_image", {"index": 0, "virtual": 1}),
     ("viewer.scrub", {"time_s": "soon"}),
     ("viewer.scrub", {"time_s": 2**70}),
     ("viewer.scrub", {"time_s": 1e300}),
@@ -111,9 +111,9 @@ WRONG = [
     ("viewer.live", {"name": "a", "side": 129}),
     ("viewer.compose", {"frames": 2**70}),
     ("viewer.compose", {"exposure_ms": 1e-300}),
-    ("viewer.calibrate", {"datasets": ["\udfff"], "phantom": "lego"}),
-    ("viewer.calibrate", {"datasets": ["a"], "phantom": "\ud800"}),
-    ("viewer.compared", {"frame": 2**70}),
+    ("calibration.fit", {"datasets": ["\udfff"], "phantom": "lego"}),
+    ("calibration.fit", {"datasets": ["a"], "phantom": "\ud800"}),
+    ("viewer.ray", {"pixel": [1.0, 2**70]}),
     ("viewer.screenshot", {"height": 2**70}),
     ("calibration.apply", {"parameters": {"alpha\ud800": 0.2}}),
     ("calibration.apply", {"parameters": {"alpha": 2**70}}),
@@ -285,64 +285,6 @@ def test_a_plan_that_takes_too_much_is_refused_and_the_pages_go_on(lab: Any) -> 
         assert got["error"]["code"] == -32005, got
 
     on_page(lab.viewer.port, work)
-
-
-def test_names_of_phantoms_do_not_leave_the_data_directory(tmp_path: Path) -> None:
-    data = tmp_path / "data"
-    data.mkdir()
-    (tmp_path / "outside.json").write_text("{}")
-    (data / "mine.toml").write_text("")
-    (data / "link.toml").symlink_to(tmp_path / "outside.json")
-    (data / "notes.txt").write_text("")
-    assert fitting.phantom_word(data, "lego") == "lego"
-    assert fitting.phantom_word(data, "normal-7") == "normal-7"
-    assert fitting.phantom_word(data, "mine.toml") == str(data / "mine.toml")
-    outside = str(tmp_path / "outside.json")
-    for wrong in (outside, "../outside.json", "/etc/shadow", "link.toml", "notes.txt", "none.toml",
-                  "", "--json", "normal-0", "nobody-5", "mine.toml/", "lego\n"):  # fmt: skip
-        with pytest.raises(RpcError, match="no phantom"):
-            fitting.phantom_word(data, wrong)
-
-
-def _data_set(folder: Path) -> None:
-    (folder / "one").mkdir(parents=True)
-    (folder / "one" / "scan_000000.tif").write_bytes(b"")
-
-
-def test_one_fit_at_a_time_and_one_that_is_given_up_is_ended(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Who closes the page ends the command, and the next one may."""
-    _data_set(tmp_path)
-    begun: list[asyncio.subprocess.Process] = []
-    spawn = asyncio.create_subprocess_exec
-
-    async def sleeper(*_: object, **options: Any) -> asyncio.subprocess.Process:
-        script = "import time; time.sleep(600)"
-        begun.append(await spawn(sys.executable, "-c", script, **options))
-        return begun[-1]
-
-    monkeypatch.setattr(asyncio, "create_subprocess_exec", sleeper)
-
-    async def run() -> None:
-        fitter = fitting.Fitter()
-        first = asyncio.create_task(fitter.calibrate(tmp_path, ["one"], "lego"))
-        async with asyncio.timeout(PATIENCE_S):
-            while not begun:
-                await asyncio.sleep(0.01)
-        with pytest.raises(RpcError, match="under way"):
-            await fitter.calibrate(tmp_path, ["one"], "lego")
-        first.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await first
-        assert begun[0].returncode is not None
-        assert not fitter.busy
-        monkeypatch.setattr(fitting, "LIMIT_S", 0.05)
-        with pytest.raises(RpcError, match="no result within"):
-            await fitter.calibrate(tmp_path, ["one"], "lego")
-        assert begun[1].returncode is not None
-
-    asyncio.run(run())
 
 
 def test_an_image_that_cannot_be_shown_is_not_the_last() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -563,3 +564,70 @@ def test_servers_killed_and_restarted_while_the_page_is_open(
     assert page.locator("#timeline-card").is_visible()
     page.fill("#script", "")
     wait(lambda: page.evaluate(ask) is None, "the plan has gone")
+
+
+def pull(page: Any, bar: str, share: float) -> float:
+    """Moves a bar of the designer; the value that it then says."""
+    page.locator(f"#design-{bar}").evaluate(
+        "(e, v) => { e.value = 1000 * v; e.dispatchEvent(new Event('input'));"
+        " e.dispatchEvent(new Event('change')); }",
+        share,
+    )
+    return float(page.inner_text(f"#design-{bar}-is").split()[0])
+
+
+def written(page: Any, device: str, command: str) -> list[float]:
+    """Values of a command in the script, in their order."""
+    rows = [line.split("\t") for line in page.input_value("#script").splitlines()]
+    return [float(row[2]) for row in rows if row[:2] == [device, command]]
+
+
+def test_a_bar_of_the_designer_rewrites_the_script(page: Any, twin: TwinClient, wait: Wait) -> None:
+    """What it says is counted here: bytes by images, time by exposures, kerma by both."""
+    page.evaluate("flexdt.call('sample.set', {name: 'lego'})")
+    page.evaluate("flexdt.call('camera.set', {roi: [32, 8, 1943, 1527], mode: 'HW2SW1High'})")
+    seen(page, twin)
+    page.click("#tabs [data-tab=scan]")
+    page.select_option("#wish-kind", "fly")
+    page.fill("#script", "")
+    page.click("#designer summary")
+    page.locator("#design-quality .verdict").wait_for()
+    told = []
+    for share in (0.55, 0.7):
+        frames = pull(page, "frames", share)
+        wait(lambda n=frames: f"\t{n:.0f}\t" in page.input_value("#script"), "the script")
+        size = f"{frames * 956 * 760 * 2 / 1e6:.1f} MB"
+        page.locator("#design-time", has_text=size).wait_for()
+        told.append(
+            float(re.findall(r"([0-9.]+) mGy", page.inner_text("#design-time"))[0]) / frames
+        )
+    assert told[0] == pytest.approx(told[1], rel=0.02)
+    kV = pull(page, "kV", 0.6)
+    wait(lambda: set(written(page, "tube", "set kV")) == {kV}, "the voltage")
+    g, first = twin.state().geometry, written(page, "mag_obj", "move absolute")[0]
+    voxel = pull(page, "voxel_um", 0.62)
+    there = first - g.SOD_mm + voxel / 1000 / 0.1496 * g.SDD_mm
+    at = lambda: written(page, "mag_obj", "move absolute")[0]  # noqa: E731
+    wait(lambda: abs(at() - there) < 2.0, "the magnification")
+    # The proposed exposure reaches what was wished for.
+    page.locator("#design-reach").wait_for()
+    words = page.inner_text("#design-reach")
+    page.click("#design-reach")
+    page.locator("#design-quality .verdict.ok").wait_for()
+    wish, ms = (float(v) for v in re.findall(r"[0-9.]+", words))
+    assert float(page.inner_text("#design-quality .verdict")) >= 0.98 * wish
+    wait(lambda: abs(written(page, "camera", "set exposure")[0] - ms) <= 0.02 * ms, "the exposure")
+    # Somebody's own script stays.
+    page.fill("#script", "camera\tset exposure\t123\t\tACK\t\t\n")
+    pull(page, "kV", 0.5)
+    page.locator("#design-facts", has_text="predicting").wait_for()
+    page.locator("#design-quality").wait_for()
+    assert written(page, "camera", "set exposure") == [123.0]
+    # What cannot be is said.
+    page.fill("#design-detail", "no such thing")
+    page.press("#design-detail", "Tab")
+    page.locator("#design-facts", has_text="no such thing").wait_for()
+    page.fill("#design-detail", "void:0.5")
+    page.click("#designer summary")
+    page.fill("#script", "")
+    page.evaluate("roi => flexdt.call('camera.set', {roi, exposure_ms: 100})", ROI)

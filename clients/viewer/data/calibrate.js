@@ -1,12 +1,13 @@
 // The Calibrate tab: corrections there are, the one in force, applying and undoing, running a fit.
 import { $, el, fixed } from "./dom.js";
 import { call, command, emit, on, store } from "./link.js";
-import { compare } from "./compare.js";
+import { know } from "./compare.js";
+import { open } from "./data.js";
 
 $("#tab-calibrate").append(
   el("div", { class: "card" }, el("h2", {}, "In force"), el("div", { id: "in-force" }),
     el("div", { class: "row", style: "margin-top:7px" }, el("button", { id: "revert", class: "small", onclick: revert }, "Undo"))),
-  el("div", { class: "card", id: "fit-card", hidden: true }, el("h2", {}, "Calibrate from data sets"),
+  el("div", { class: "card", id: "fit-card" }, el("h2", {}, "Calibrate from data sets"),
     el("div", { class: "list", id: "datasets" }),
     el("div", { class: "form", style: "margin-top:7px" },
       el("label", { class: "muted" }, "phantom"), el("input", { type: "text", id: "fit-phantom", value: "lego", "aria-label": "Phantom" }),
@@ -17,7 +18,6 @@ $("#tab-calibrate").append(
     el("div", { class: "row", style: "margin-top:7px" }, el("input", { type: "file", id: "correction-file", accept: ".json", "aria-label": "A calibration's report" }))),
   el("div", { class: "card" }, el("h2", {}, "History"), el("div", { class: "list", id: "corrections" })));
 
-let fitted = null;
 const values = (parameters) => Object.fromEntries(Object.entries(parameters).map(([k, v]) => [k, typeof v === "number" ? v : v?.value]));
 // The parameters of a report, or of a plain list of them: all of them numbers, or none is taken.
 export function parametersOf(report) {
@@ -32,12 +32,12 @@ export function parametersOf(report) {
 const unit = (name) => (name === "angle_scale" ? "" : /^(alpha|det_|axis_tilt_)/.test(name) ? "°" : "mm");
 // Decimals that leave `digits` significant ones.
 const decimals = (v, digits) => Math.min(9, Math.max(0, digits - 1 - Math.floor(Math.log10(Math.abs(v) || 1))));
-function table(parameters, sigmas = {}) {
+function table(parameters, sigmas = {}, units = {}) {
   const shown = Object.entries(parameters).filter(([k, v]) => (k === "angle_scale" ? v !== 1 : v !== 0));
   return el("table", { class: "plain mono" }, ...shown.map(([k, v]) => {
     const sigma = sigmas[k], d = sigma > 0 ? decimals(sigma, 2) : decimals(k === "angle_scale" ? v - 1 : v, 3);
     return el("tr", {}, el("td", {}, k), el("td", { class: "n" }, fixed(v, d)),
-      el("td", { class: "n muted" }, sigma > 0 ? `± ${fixed(sigma, d)}` : ""), el("td", { class: "muted" }, unit(k)));
+      el("td", { class: "n muted" }, sigma > 0 ? `± ${fixed(sigma, d)}` : ""), el("td", { class: "muted" }, units[k] ?? unit(k)));
   }));
 }
 export async function apply(parameters, source, comment = "") {
@@ -78,7 +78,6 @@ $("#correction-file").addEventListener("change", async (e) => {
 async function datasets() {
   let answer;
   try { answer = await call("viewer.datasets"); } catch { return; }
-  $("#fit-card").hidden = !answer.available;
   const box = $("#datasets"), chosen = new Set(ticked());
   box.textContent = "";
   if (!answer.datasets.some((each) => each.present)) box.append(el("div", { class: "muted" }, "no data sets yet: run a scan"));
@@ -88,29 +87,38 @@ async function datasets() {
   }
 }
 const ticked = () => [...$("#datasets").querySelectorAll("input:checked")].map((i) => i.value);
-async function fit() {
+function fit() {
   const names = ticked();
   if (!names.length) { emit("note", "warning-note", "Calibrate", "choose a data set"); return; }
-  $("#fit").disabled = true; $("#fit-note").textContent = "running…"; $("#fit-report").textContent = "";
-  const r = await command("viewer.calibrate", { datasets: names, phantom: $("#fit-phantom").value }, "No calibration");
+  estimate("calibration.fit", { datasets: names, phantom: $("#fit-phantom").value, tracks: true }, names, "No calibration");
+}
+async function estimate(method, params, names, title) {
+  $("#fit").disabled = true; $("#fit-note").textContent = `${names.join(", ")}: running…`; $("#fit-report").textContent = "";
+  const r = await command(method, params, title);
   $("#fit").disabled = false; $("#fit-note").textContent = "";
   if (!r) return;
-  fitted = values(r.parameters);
-  const sigmas = Object.fromEntries(Object.entries(r.parameters).map(([k, v]) => [k, v.sigma]));
-  const box = $("#fit-report");
-  box.textContent = "";
-  const figures = `  rms ${fixed(r.rms_px, 3)} px · ${r.frames} frames · cost −${fixed(r.cost_reduction_pct, 1)} %`;
-  const applied = { id: "fit-apply", class: "small primary", disabled: !r.identifiable, onclick: () => apply(fitted, names.join(", ")) };
-  const compared = { id: "fit-compare", class: "small", disabled: !r.comparison?.length, onclick: () => compare(r.comparison) };
+  const scan = know(r.tracks?.datasets ?? []), found = values(r.parameters), of = (what) => Object.fromEntries(Object.entries(r.parameters).map(([k, v]) => [k, v[what]]));
+  const figures = r.tracks ? `  rms ${fixed(r.rms_px, 3)} px · ${r.frames} frames · cost −${fixed(r.cost_reduction_pct, 1)} %` : `  ${names[0]}, without a phantom`;
+  const applied = { id: "fit-apply", class: "small primary", disabled: !r.identifiable || !r.correction, onclick: () => apply(r.correction, names.join(", ")) };
+  const compared = { id: "fit-compare", class: "small", disabled: !scan, onclick: () => open(scan, null, true) };
   compared.title = "Where the beads were predicted before and after, over the radiographs";
-  box.append(
+  $("#fit-report").append(
     el("div", {},
       el("span", { class: `verdict ${r.identifiable ? "ok" : "bad"}` }, r.identifiable ? "Identifiable" : "Not identifiable"),
       el("span", { class: "muted" }, figures)),
-    table(fitted, sigmas), ...(r.weak ?? []).map((w) => el("div", { class: "error" }, w)),
+    table(found, of("sigma"), of("unit")), ...(r.weak ?? []).map((w) => el("div", { class: "error" }, w)),
+    ...Object.entries(r.refused ?? {}).map(([name, why]) => el("div", { class: "muted" }, `${name}: ${why}`)), ...(r.warnings ?? []).map((w) => el("div", { class: "error" }, w)),
     el("div", { class: "row", style: "margin-top:7px" },
-      el("button", applied, "Apply"), el("button", compared, "Compare over a radiograph")));
+      el("button", applied, "Apply"), r.tracks ? el("button", compared, "Compare over a radiograph") : null));
 }
+on("calibrate", async (dataset, sample) => {
+  emit("show-tab", "calibrate");
+  await datasets();
+  for (const tick of $("#datasets").querySelectorAll("input")) tick.checked = tick.value === dataset;
+  if (sample) $("#fit-phantom").value = sample;
+  estimate("calibration.fit", { datasets: [dataset], phantom: $("#fit-phantom").value, tracks: true }, [dataset], "No calibration");
+});
+on("align", (dataset) => { emit("show-tab", "calibrate"); estimate("calibration.align", { name: dataset }, [dataset], "Not aligned"); });
 let name;
 on("state", (state) => {
   const c = state.correction;

@@ -3,6 +3,7 @@ import { $, el, fixed, seconds, setText } from "./dom.js";
 import { call, command, emit, on, store } from "./link.js";
 import { asked, remember } from "./address.js";
 import { draw as drawTimeline } from "./timeline.js";
+import * as compare from "./compare.js";
 
 const SEARCH_MS = 250, AGAIN_MS = 500, PLAYED = 300, LEAST_MS = 60;
 const WORDS = { complete: "complete", incomplete: "incomplete", running: "running", unknown: "cannot be read in full" };
@@ -18,11 +19,13 @@ const canvas = el("canvas", { id: "record-line", role: "img", "aria-label": "Mot
 const button = (id, text, title, f) => el("button", { id, class: "small", title, onclick: f }, text);
 const panel = el("div", { id: "record", hidden: true },
   el("div", { class: "row head" }, el("b", { id: "record-name", class: "cut" }), el("span", { id: "record-state", class: "muted cut" }), el("span", { class: "spacer" }),
+    button("record-fit", "Calibrate", "Calibrate from this data set: its sample is the phantom", () => emit("calibrate", told.info.name, told.info.sample)),
+    button("record-align", "Align", "Find the axis of this scan without a phantom", () => emit("align", told.info.name)),
     button("record-script", "Script", "Bring its script into the Scan tab", script), button("record-replay", "Replay file", "This scan as one HTML file that plays it", replay),
     button("record-close", "Close", "Back to what is live (Escape)", () => open(null, null, true))),
   el("div", { class: "row head" }, button("record-play", "▶", "Play", () => play(!playing)), button("record-back", "‹", "The image before", () => show(index - 1)),
     slider, button("record-next", "›", "The next image", () => show(index + 1)), el("span", { id: "record-at", class: "mono small-text cut" })),
-  el("div", { class: "lanes" }, canvas), el("div", { id: "record-note", class: "muted small-text cut" }));
+  compare.row, el("div", { class: "lanes" }, canvas), el("div", { id: "record-note", class: "muted small-text cut" }));
 $("#stage").append(panel);
 
 // Thumbnails come as 8-bit grey.
@@ -97,6 +100,7 @@ export async function open(name, at = null, step = false) {
   setText($("#record-name"), i.name);
   setText($("#record-state"), `${WORDS[i.state]}${i.problem || i.reason ? `: ${i.problem || i.reason}` : ""} · ${settings(i)}${i.duration_s ? ` · ${seconds(i.duration_s)}` : ""}`);
   $("#record-state").title = $("#record-state").textContent;
+  compare.allow(told.same_machine ? "" : "not this twin’s machine and zeros, or poses that are not known");
   $("#record-replay").disabled = bare || !told.same_machine;
   slider.max = Math.max(0, told.images - 1);
   setText($("#record-note"), note());
@@ -111,8 +115,13 @@ export async function open(name, at = null, step = false) {
 let opening = 0;
 function note() {
   const parts = [];
-  if (!told.times_s) parts.push("poses and times are not known: only images are shown");
+  if (!Object.keys(told.positions).length) parts.push("poses and times are not known: only images are shown");
   else if (!told.same_machine) parts.push("another machine or other zeros than this twin's: its pose is not drawn in the scene");
+  if (compare.how() !== "recorded") {
+    const { sample, correction } = store.state ?? {};
+    const other = sample?.name === told.info.sample ? "" : ` (the scan says ${told.info.sample || "nothing of its sample"})`;
+    parts.push(`virtual: ${sample?.name || "empty stage"}${other}, ${correction ? `correction ${correction.name}` : "nominal geometry"}`);
+  }
   if (told.clearance_of) parts.push(`clearance: ${told.clearance_of}`);
   parts.push(told.counts === null ? "measuring counts and clearances …" : told.counts.some((c) => c === null) ? "gaps: images that cannot be read" : "");
   return parts.filter(Boolean).join(" · ");
@@ -120,7 +129,7 @@ function note() {
 function lanes() {
   const times = told.times_s ?? told.indices, curves = {}, units = {};
   for (const [name, values] of Object.entries(told.positions)) {
-    const moves = values.some((v) => Math.abs(v - values[0]) > 1e-6);
+    const known = values.filter((v) => v !== null), moves = known.some((v) => Math.abs(v - known[0]) > 1e-6);
     if (moves) { curves[name] = values; units[name] = store.state?.axes[name]?.unit === "deg" ? "°" : "mm"; }
   }
   if (told.clearance_mm) { curves.clearance = told.clearance_mm; units.clearance = "mm"; }
@@ -150,7 +159,7 @@ async function show(wanted) {
     // Dark and flat images have no line integrals; of an image between those told the answer says what it is.
     const kind = k >= 0 && kinds.kinds[k] !== "projection" ? "counts" : $("#kind").value;
     let about = null, why = "";
-    try { about = await call("viewer.recorded_image", { index: at, kind }); }
+    try { about = await call("viewer.recorded_image", { index: at, kind, virtual: compare.how() !== "recorded" }); }
     catch (error) {
       why = error.message;
       if (kind !== "counts") about = await call("viewer.recorded_image", { index: at, kind: "counts" }).catch(() => null);
@@ -160,7 +169,8 @@ async function show(wanted) {
     store.hidden = !about;
     if (!about) { store.image = null; emit("image"); }
     panel.dataset.index = at; panel.dataset.shown = String(Boolean(about));
-    const facts = about && [about.file, about.time_s === null ? "" : `${fixed(about.time_s, 2)} s`, about.image === "projection" ? "" : about.image, why && `counts: ${why}`];
+    const facts = about && [about.file, about.time_s === null ? "" : `${fixed(about.time_s, 2)} s`, about.image === "projection" ? "" : about.image,
+      why && `counts: ${why}`, about.problem && `no virtual image: ${about.problem}`];
     setText($("#record-at"), [`${at + 1} of ${told.images}`, ...(facts ?? [why])].filter(Boolean).join(" · "));
     $("#record-at").title = $("#record-at").textContent;
     redraw();
@@ -191,6 +201,15 @@ async function replay() {
   const a = await command("viewer.export", { format: "html", replay: true }, "No replay");
   if (a) { const link = el("a", { href: a.url, download: a.name }); document.body.append(link); link.click(); link.remove(); }
 }
+// The virtual image goes with what the twin has in force.
+let force = "";
+const anew = () => { if (told) { setText($("#record-note"), note()); show(index); } };
+on("compare", anew);
+on("state", ({ sample, correction }) => {
+  const now = JSON.stringify([sample, correction?.name]);
+  if (now !== force && told && compare.how() !== "recorded") anew();
+  force = now;
+});
 const seek = (e) => {
   if (!plan) return;
   const b = canvas.getBoundingClientRect(), t = Math.min(1, Math.max(0, (e.clientX - b.left) / b.width)) * plan.duration_s;

@@ -3,6 +3,7 @@
 import { $, fixed, setText } from "./dom.js";
 import { call, emit, on, store } from "./link.js";
 import * as measure from "./measure.js";
+import * as compare from "./compare.js";
 
 const canvas = $("#film-canvas"), context = canvas.getContext("2d"), film = $("#film");
 const buffer = document.createElement("canvas"), pixels2d = buffer.getContext("2d");
@@ -14,11 +15,14 @@ let range = [0, 1], windowed = [0, 1], due = false, stamps = [], quiet = 0, poin
 export const shown = { count: 0, at: 0 };
 
 let reference = null;
-// What is shown: the newest image, or by how much it differs from the reference, as an image of its own.
+// What is shown: the newest image, its virtual one, or by how much it differs from that or from the reference, as
+// an image of its own.
 function frame() {
-  const i = store.image, r = reference;
-  if (!$("#difference").checked || !i || !r || r.kind !== i.kind || r.full.join() !== i.full.join()) return i;
-  if (apart?.of === i && apart.from === r) return apart;
+  const i = store.image, way = i?.virtual ? compare.how() : "";
+  if (way === "virtual" || way === "curtain") return compare.beside(i);
+  const r = way === "difference" ? { ...i, pixels: i.virtual } : $("#difference").checked ? reference : null;
+  if (!i || !r || r.kind !== i.kind || r.full.join() !== i.full.join()) return i;
+  if (apart?.of === i && apart.from === r.pixels) return apart;
   const [rows, cols] = i.shape, f = r.shape[1] / cols, values = new Float32Array(rows * cols);
   for (let k = 0; k < values.length; k++) {
     const row = Math.min(r.shape[0] - 1, Math.floor((Math.floor(k / cols) + 0.5) * f)), col = Math.min(r.shape[1] - 1, Math.floor(((k % cols) + 0.5) * f));
@@ -26,7 +30,7 @@ function frame() {
   }
   const sizes = values.filter((v, k) => k % EVERY === 0).map(Math.abs).sort(), span = Math.max(1e-6, 1.2 * sizes[Math.floor(0.995 * sizes.length)]);
   const scale = Math.max(span, values.reduce((a, v) => Math.max(a, Math.abs(v)), 0)) / 32767;
-  return (apart = { ...i, of: i, from: r, signed: true, low: -32768 * scale, scale, pixels: Uint16Array.from(values, (v) => Math.round(v / scale) + 32768), window: [-span, span] });
+  return (apart = { ...i, of: i, from: r.pixels, signed: true, low: -32768 * scale, scale, pixels: Uint16Array.from(values, (v) => Math.round(v / scale) + 32768), window: [-span, span] });
 }
 let apart = null;
 export function value(column, row) {
@@ -83,7 +87,7 @@ function beam(i) {
 }
 // The part of the beam that comes through: from the thickest place (all but one in a hundred let more through) on.
 function transmission(i) {
-  if (!i || i.kind !== "line_integral" || i.signed) return i?.signed ? "difference from the reference" : "transmission: choose line integral";
+  if (!i || i.kind !== "line_integral" || i.signed) return i?.signed ? "a difference, no transmission" : "transmission: choose line integral";
   const through = [];
   for (let k = 0; k < i.pixels.length; k += EVERY) through.push(Math.exp(-(i.low + i.scale * i.pixels[k])));
   through.sort((a, b) => a - b);
@@ -97,7 +101,7 @@ export function draw() {
   beam(i);
   $("#difference").disabled = !reference;
   $("#film-recorded").hidden = !store.recorded;
-  if (store.recorded) setText($("#film-recorded"), `recorded · ${i?.recorded ? i.recorded.file : "no image to be shown"}`);
+  if (store.recorded) setText($("#film-recorded"), compare.words(i));
   if (!i) { canvas.width = canvas.height = 1; setText($("#film-note"), ""); tell(); measure.tell(null, value); return; }
   chooseWindow(i); develop(i);
   film.style.aspectRatio = Math.min(FLATTEST, Math.max(SLIMMEST, i.full[1] / i.full[0]));
@@ -178,6 +182,7 @@ function overlay(i, s, dpr) {
     context.strokeStyle = "#36e28f";
     for (const [c, r] of i.beads) { context.beginPath(); context.arc(c + 0.5, r + 0.5, (9 * dpr) / s, 0, 7); context.stroke(); }
   }
+  compare.draw(context, i, dpr / s);
   const g = store.state?.geometry;
   if (g && !i.recorded) {
     const [c, r] = g.piercing_point_px, d = (7 * dpr) / s;
@@ -206,7 +211,7 @@ function tell() {
   if (!i || !pointer) { setText($("#pixel"), "point at the image"); return; }
   const [c, r] = at(pointer).map(Math.floor), v = value(c, r);
   const plain = i.kind === "counts" ? `${fixed(v, 0)} counts` : `${fixed(v, 3)}  ·  T ${(100 * Math.exp(-v)).toFixed(1)} %`;
-  const words = i.signed ? `${fixed(v, i.kind === "counts" ? 0 : 4)} more than the reference` : plain;
+  const words = i.signed ? `${fixed(v, i.kind === "counts" ? 0 : 4)} more than ${i.virtual ? "the virtual image" : "the reference"}` : plain;
   setText($("#pixel"), Number.isFinite(v) ? `(${c}, ${r})  ${words}` : "–");
 }
 // The newest image as windowed, every pixel of it and nothing drawn over it (flags, if they are on): a PNG.
@@ -233,13 +238,13 @@ let drag = null;
 const place = (e) => { const { full } = store.image; return at([e.clientX, e.clientY]).map((v, k) => Math.min(full[1 - k] - 1, Math.max(0, Math.floor(v)))); };
 canvas.addEventListener("pointerdown", (e) => {
   canvas.setPointerCapture(e.pointerId);
-  if (store.image && measure.press(place(e))) ask();
+  if (store.image && (measure.press(place(e)) || compare.press(at([e.clientX, e.clientY]), 1 / scale()))) ask();
   else drag = [e.clientX, e.clientY, view.x, view.y];
 });
-for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, () => { drag = null; measure.release(); });
+for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, () => { drag = null; measure.release(); compare.release(); });
 canvas.addEventListener("pointermove", (e) => {
   pointer = [e.clientX, e.clientY];
-  if ((store.image && measure.drag(place(e))) || measure.follows()) ask();
+  if ((store.image && (measure.drag(place(e)) || compare.drag(place(e)))) || measure.follows()) ask();
   if (drag) { view.x = drag[2] - (e.clientX - drag[0]) / scale(); view.y = drag[3] - (e.clientY - drag[1]) / scale(); clampView(); ask(); }
   tell();
 });

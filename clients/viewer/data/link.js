@@ -132,9 +132,9 @@ const decoders = {
     return pixels;
   },
   // Differences from column to column, low bytes before high ones.
-  async deflate(body, [rows, cols]) {
+  async deflate(body, [, cols]) {
     const planes = new Uint8Array(await new Response(new Blob([body]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer());
-    const pixels = new Uint16Array(rows * cols);
+    const pixels = new Uint16Array(planes.length / 2);
     for (let k = 0; k < pixels.length; k++) {
       const step = planes[k] | (planes[pixels.length + k] << 8);
       pixels[k] = k % cols ? pixels[k - 1] + step : step;
@@ -148,6 +148,7 @@ async function image(whole) {
   const head = JSON.parse(new TextDecoder().decode(whole.subarray(8, 8 + size)));
   head.at_ms = performance.now();
   head.pixels = await decoders[head.code](whole.subarray(8 + size), head.shape);
+  if (head.pair) { const n = head.pixels.length / 2; head.virtual = head.pixels.subarray(n); head.pixels = head.pixels.subarray(0, n); }
   if (number < unpacked) return; // a newer one was quicker
   unpacked = number;
   // Neither a live image while a data set is open, nor the other way round.

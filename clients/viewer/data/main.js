@@ -3,7 +3,7 @@ import { $, $$ } from "./dom.js";
 import { call, connect, emit, on, store } from "./link.js";
 import "./status.js";
 import "./axes.js";
-import { picture, shown as film } from "./film.js";
+import { picture, shown as film, value } from "./film.js";
 import "./setup.js";
 import * as scan from "./scan.js";
 import * as data from "./data.js";
@@ -48,4 +48,4 @@ listen(window);
 connect();
 // The scenes' frames say which page they belong to, so the page has been registered before.
 on("connection", () => { if (store.cameras && !$("#views").childElementCount) layout(asked("view") ?? localStorage.getItem("flexdt-layout") ?? "iso"); });
-window.flexdt = { store, call, scan, data, film, picture };
+window.flexdt = { store, call, scan, data, film, picture, value };

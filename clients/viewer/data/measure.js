@@ -1,18 +1,21 @@
-// Measuring in the radiograph: a loupe, the profile along a line, the statistics of a region. Places are
+// Measuring in the radiograph: a loupe, the profile along a line, the statistics of a region, the ray of a pixel. Places are
 // (column, row) of the full image; what was marked stays and is measured anew in every image.
 import { $, field, fixed, parsed, setText } from "./dom.js";
+import { call } from "./link.js";
 
 const LOUPE = { radius: 72, times: 4 }, SAMPLES = 512;
-const HINTS = { pan: "", loupe: "", profile: "drag a line, or type its ends: column row column row", region: "drag a box, or type its corners: column row column row" };
-const shapes = { profile: null, region: null };
+const HINTS = { pan: "", loupe: "", profile: "drag a line, or type its ends: column row column row", region: "drag a box, or type its corners: column row column row",
+  ray: "click a pixel, or type it: column row" };
+const shapes = { profile: null, region: null, ray: null };
+const many = () => (tool === "ray" ? 2 : 4);
 let tool = "pan", drawing = false, redraw = () => {};
 
-const typed = field({ id: "measure-at", "aria-label": "Ends of the line or corners of the box: column row column row" }, apply, () => { typed.classList.remove("typed"); redraw(); });
+const typed = field({ id: "measure-at", "aria-label": "Ends of the line, corners of the box, or the pixel: column row, column row" }, apply, () => { typed.classList.remove("typed"); redraw(); });
 $("#measure-row").prepend(typed);
 function apply() {
-  const four = typed.value.trim().split(/[\s;]+|,\s+/).map(parsed);
-  if (four.length === 4 && four.every(Number.isFinite)) { shapes[tool] = four.map(Math.round); typed.classList.remove("typed"); redraw(); }
-  else setText($("#measured"), "four numbers: column row column row");
+  const found = typed.value.trim().split(/[\s;]+|,\s+/).map(parsed);
+  if (found.length === many() && found.every(Number.isFinite)) { shapes[tool] = found.map(Math.round); typed.classList.remove("typed"); redraw(); }
+  else setText($("#measured"), `${many() === 2 ? "two" : "four"} numbers: ${HINTS[tool].split(": ")[1]}`);
 }
 
 export function start(again) {
@@ -22,11 +25,11 @@ export function start(again) {
 // Whether a press or a move of the pointer is the tool's, and not the picture's.
 export function press(place) {
   drawing = tool in shapes;
-  if (drawing) shapes[tool] = [...place, ...place];
+  if (drawing) shapes[tool] = [...place, ...place].slice(0, many());
   return drawing;
 }
-export function drag(place) { if (drawing) shapes[tool].splice(2, 2, ...place); return drawing; }
-export function release() { drawing = false; }
+export function drag(place) { if (drawing) shapes[tool].splice(many() - 2, 2, ...place); return drawing; }
+export function release() { if (drawing) { drawing = false; redraw(); } }
 export const follows = () => tool === "loupe";
 
 // The pixels of a box whose corners are both within it: how many, mean, deviation, least and greatest.
@@ -48,11 +51,11 @@ export function profile(value, [c0, r0, c1, r1]) {
 
 // Over the picture, in its coordinates; `unit` is a CSS pixel.
 export function draw(x, unit) {
-  for (const [name, colour] of [["profile", "#ffd54a"], ["region", "#7cf0ff"]]) {
+  for (const [name, colour] of [["profile", "#ffd54a"], ["region", "#7cf0ff"], ["ray", "#ff3ca0"]]) {
     const s = shapes[name];
     if (!s || tool !== name) continue;
     x.strokeStyle = colour; x.lineWidth = 1.5 * unit; x.beginPath();
-    if (name === "profile") { x.moveTo(s[0] + 0.5, s[1] + 0.5); x.lineTo(s[2] + 0.5, s[3] + 0.5); } else {
+    if (name === "ray") { x.arc(s[0] + 0.5, s[1] + 0.5, 6 * unit, 0, 7); } else if (name === "profile") { x.moveTo(s[0] + 0.5, s[1] + 0.5); x.lineTo(s[2] + 0.5, s[3] + 0.5); } else {
       const [left, right] = [s[0], s[2]].sort((a, b) => a - b), [top, bottom] = [s[1], s[3]].sort((a, b) => a - b);
       x.rect(left, top, right - left + 1, bottom - top + 1);
     }
@@ -68,14 +71,29 @@ export function loupe(x, buffer, i, [c, r], unit) {
   x.strokeStyle = "#cfe3ff"; x.lineWidth = 1.5 * unit; x.beginPath(); x.arc(c, r, radius, 0, 7); x.stroke();
 }
 
+// The ray of a pixel of the live image at rest: a line in the scenes, and what it goes through.
+let rayed = "", through = "";
+function ray(i) {
+  const s = tool === "ray" && i && !i.recorded && !drawing && i.code === "deflate" ? shapes.ray : null, key = s ? `${s} ${i.seq}` : "";
+  if (key === rayed) return;
+  if (rayed && !s) call("viewer.ray").catch(() => {});
+  rayed = key; through = s ? "…" : "";
+  if (s) call("viewer.ray", { pixel: s }).then(({ paths_mm, length_mm }) => {
+    const parts = Object.entries(paths_mm).filter(([, mm]) => mm > 1e-4).map(([name, mm]) => `${name} ${fixed(mm, 3)} mm`);
+    return `${parts.join(" · ") || "nothing in its way"} · ${fixed(length_mm, 1)} mm from the focal spot`;
+  }, (error) => error.message).then((words) => { if (rayed === key) { through = words; redraw(); } });
+}
+
 const plot = $("#profile"), plot2d = plot.getContext("2d");
 // What was marked, measured in this image.
 export function tell(i, value) {
   const s = shapes[tool], marks = tool in shapes;
+  ray(i);
   $("#measure-row").hidden = !marks; plot.hidden = tool !== "profile" || !s || !i;
   if (!marks) return;
   if (!typed.classList.contains("typed") && document.activeElement !== typed) typed.value = s ? s.join(" ") : "";
   if (!s || !i) { setText($("#measured"), HINTS[tool]); return; }
+  if (tool === "ray") { setText($("#measured"), i.recorded ? "of live images only" : through || "at rest only"); return; }
   const number = (v) => fixed(v, i.kind === "counts" ? 1 : 4);
   if (tool === "region") {
     const m = region(i, s), ratio = m.deviation > 0 ? ` · signal to noise ${fixed(m.mean / m.deviation, 1)}` : "";

@@ -4,6 +4,7 @@ import { call, command, emit, on, store } from "./link.js";
 import { rememberedScript, rememberScript } from "./address.js";
 import { folder, open as openData } from "./data.js";
 import { draw as drawTimeline } from "./timeline.js";
+import * as designer from "./designer.js";
 
 const FINAL = ["done", "failed", "aborted", "incomplete"];
 const MAX_THUMBS = 40;
@@ -48,6 +49,7 @@ $("#tab-scan").append(
       el("span", { id: "scrub-at", class: "cut" }),
       el("button", { class: "small", id: "unscrub", onclick: () => scrub(null) }, "Hide ghost"))),
   el("div", { class: "card", id: "thumb-card", hidden: true }, el("h2", {}, "Frames"), el("div", { class: "thumbs", id: "thumbs" })));
+designer.place($("#tab-scan .card"));
 $("#job").append(
   el("div", { class: "row between" }, el("b", { id: "job-name" }), el("span", { id: "job-state", class: "muted" })),
   el("div", { class: "progress", id: "job-bar" }, el("i")),
@@ -129,13 +131,16 @@ async function compose(keep = []) {
   const none = "No script was composed";
   if (!Number.isInteger(frames) || frames < 1) { emit("note", "error", none, "frames: a whole number above 0"); return; }
   if (!(exposure_ms > 0)) { emit("note", "error", none, "ms: a number above 0"); return; }
-  const answer = await command("viewer.compose", { kind: $("#wish-kind").value, frames, exposure_ms, keep }, none);
+  const answer = await command("viewer.compose", { kind: $("#wish-kind").value, ...designer.wish(), frames, exposure_ms, keep }, none);
   if (!answer) return;
   setScript(answer.text);
-  const mine = text.value;
+  const mine = made = text.value;
   await check();
   if (text.value === mine) offer(answer.moved, keep);
 }
+// The designer rewrites what was written here; a script of somebody's own stays until Write is pressed.
+let made = "";
+on("design", () => { if (!text.value || text.value === made) compose(); });
 // What stands elsewhere than a scan's script would put it may be meant so.
 function offer(moved, kept) {
   const axes = Object.keys(moved), unit = (axis) => (store.state?.axes[axis]?.unit === "deg" ? "°" : " mm");

@@ -8,7 +8,7 @@ const FORMATS = ["stl", "obj", "ply", "glb", "off"];
 const LAYERS = {
   beam: "X-ray cone", panel: "image on the panel", axis: "axis, piercing point", ranges: "travel ranges",
   bodies: "collision bodies", margin: "safety margin", sample: "sample", machine: "machine",
-  orbit: "planned trajectory", gizmos: "handles to drag",
+  orbit: "planned trajectory", gizmos: "handles to drag", labels: "names, axes, scale",
 };
 const ROI = ["l", "t", "r", "b"], SIX = ["x", "y", "z", "rx", "ry", "rz"];
 // What is set here and not yet applied bears the class "typed"; everything else shows the state.

@@ -44,7 +44,8 @@ function frame(view) {
     return { box, iframe, crop, tag, src };
   }
   const home = el("button", { class: "home", title: "Back to this view's preset", onclick: () => call("viewer.camera", { view }) }, "⌂");
-  box.append(iframe, tag, home);
+  const look = el("button", { class: "look", title: "Look at the sample", onclick: () => call("viewer.camera", { view, sample: true }) }, "◎");
+  box.append(iframe, tag, home, look);
   return { box, iframe, tag, src };
 }
 

@@ -42,6 +42,7 @@ STAND = "/object/stand"
 GAP_MM = 0.6
 """Distance of the image from the panel's face, in front of which it floats."""
 AXIS_REACH_MM = 120.0
+SCALE_MM, AXES_MM = 500.0, 150.0
 
 
 class LabScene:
@@ -76,10 +77,12 @@ class LabScene:
         self.shown: dict[str, bool] = {
             "beam": True, "axis": True, "panel": True, "ranges": False, "bodies": False,
             "margin": False, "sample": True, "machine": True, "orbit": True, "gizmos": False,
+            "labels": False,
         }  # fmt: skip
         with server.atomic():
             self._build()
             self._build_bodies()
+            self._build_labels()
             self._gizmos = Gizmos(server, machine, drag)
         self._layers: Mapping[str, Sequence[Any]] = {
             "beam": [self._beam],
@@ -90,6 +93,7 @@ class LabScene:
             "machine": [*self._looks, self._stand_frame],
             "orbit": [self._paths],
             "gizmos": self._gizmos.controls,
+            "labels": self._labels,
         }
         """Layer -> nodes to show or hide; those of bodies and margin depend on what is near."""
 
@@ -165,6 +169,30 @@ class LabScene:
             if margin > 0.0:
                 shell = bodies.grown(hull, margin)
                 self._margins[name] = self._hull(f"/machine/{name}/margin", shell, AMBER, 0.25)
+
+    def _build_labels(self) -> None:
+        """Names of parts, the world's axes, and a scale on the floor; hidden at first."""
+        scene = self._server.scene
+        (x, y, z), name = _scale_mm(self._machine), f"{SCALE_MM:g} mm"
+        ends = np.array([[[x, y, z], [x, y + SCALE_MM, z]]]) * MM
+        bar = scene.add_line_segments("/scale", ends, RANGE, thickness=5.0, **SCREEN, visible=False)
+        axes = scene.add_frame(
+            "/axes", axes_length=AXES_MM * MM, axes_radius=4 * MM, visible=False,
+            position=tuple((np.array([x, y - 2 * AXES_MM, z]) * MM).tolist()),
+        )  # fmt: skip
+        self._labels = [bar, axes, scene.add_label("/scale/label", name, position=ends[0].mean(0))]
+        for k, words in enumerate(("x traversal", "y source to detector", "z up")):
+            place = np.eye(3)[k] * 1.15 * AXES_MM * MM
+            self._labels.append(scene.add_label(f"/axes/{words[0]}", words, position=place))
+        for part in self._machine.components:
+            if part.axis is None and not part.role:
+                continue
+            (x, _, z), words = part.size_mm, part.name.replace("_", " ")
+            corner = (np.array(part.center_mm) + [x / 2, 0.0, z / 2]) * MM
+            name = f"/machine/{part.name}/label"
+            self._labels.append(scene.add_label(name, words, position=corner))
+        for node in self._labels:
+            node.visible = False
 
     def _hull(self, node: str, mesh: Any, color: tuple[int, int, int], opacity: float) -> Any:
         vertices, faces = solids.plain(mesh)
@@ -327,6 +355,13 @@ class LabScene:
         if lines:
             self._ranges.points = (np.array(lines) * MM).astype(np.float32)
             self._ranges.colors = np.full((len(lines), 2, 3), RANGE, dtype=np.uint8)
+
+
+def _scale_mm(machine: Machine) -> FloatArray:
+    """Where the scale begins: beside the machine's largest part, on its top."""
+    ground = max(machine.components, key=lambda part: part.size_mm[0] * part.size_mm[1])
+    (x, y, z), middle = ground.size_mm, np.array(ground.center_mm)
+    return np.asarray(middle + [0.45 * x, -0.4 * y, z / 2 + 2.0])
 
 
 def _panel_rotation(world: World) -> FloatArray:

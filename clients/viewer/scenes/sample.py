@@ -224,6 +224,12 @@ class Look:
     beads: FloatArray
     exact: bool = True
 
+    @property
+    def radius_mm(self) -> float:
+        """Of the ball about the sample's origin that holds it; of a hand for an empty stage."""
+        far = [float(np.linalg.norm(skin.vertices, axis=1).max()) for skin in self.skins]
+        return max(far) / MM if far else 50.0
+
 
 DEFAULT_MATERIAL = "abs"
 Key = tuple[str | None, str | None, str | None]

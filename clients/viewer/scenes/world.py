@@ -107,6 +107,12 @@ class World:
         """The piercing point in pixels (column, row), (2,)."""
         return self.view.piercing_points().reshape(2)
 
+    def pixel(self, column: float, row: float) -> FloatArray:
+        """Centre of a pixel (3,) [mm]."""
+        rows, cols = self.shape
+        across, down = column - (cols - 1) / 2, row - (rows - 1) / 2
+        return np.asarray(self.detector + across * self.u + down * self.v)
+
     @property
     def corners(self) -> FloatArray:
         """Outer corners of the image: top left, top right, bottom right, bottom left (4, 3)."""
@@ -215,6 +221,7 @@ PATH = (90, 120, 255)
 HOME = "/object/plan"
 """The node that holds the paths in all scenes: one switch for all of them."""
 ORBIT = f"{HOME}/orbit"
+RAY, RAY_COLOR = "/ray", (255, 60, 160)
 
 
 class PlanDrawing:
@@ -271,6 +278,17 @@ class PlanDrawing:
             client.scene.add_line_segments(
                 ORBIT, segments, PATH, thickness=1.5, thickness_units="screen"
             )
+
+    def ray(self, clients: Sequence[viser.ClientHandle], ends: FloatArray | None) -> None:
+        """Show some clients a ray, (2, 3) [mm, world]; None: no longer."""
+        _remove(clients, RAY)
+        if ends is None:
+            return
+        for client in clients:
+            client.scene.add_line_segments(
+                RAY, (ends[None] * MM).astype(np.float32), RAY_COLOR,
+                thickness=3.0, thickness_units="screen",
+            )  # fmt: skip
 
 
 def _remove(clients: Iterable[viser.ClientHandle], name: str) -> None:
