@@ -59,13 +59,9 @@ class ScenarioImages:
     def __init__(
         self, path: str | os.PathLike[str], seed: int | None = None, rays: int = 3
     ) -> None:
-        for name, value, high in (("seed", seed or 0, 2**63), ("rays", rays - 1, MOST_RAYS - 1)):
-            if not 0 <= value <= high:
-                raise LimitError(
-                    f"{name} is {seed if name == 'seed' else rays}; allowed: seeds from 0, "
-                    f"1 to {MOST_RAYS} rays along each side of a pixel",
-                    {"asked": value},
-                )
+        if not 0 <= (seed or 0) <= 2**63:
+            raise LimitError(f"seed is {seed}; allowed: 0 to 2^63", {"asked": seed})
+        check_rays(rays)
         self.path, self._seed, self._rays = Path(path), seed, rays
         self.scan = read_scenario(text_of(self.path), str(self.path), self._beside)
         self._meshes = [self._mesh(sample) for sample in self.scan.samples]
@@ -182,7 +178,9 @@ class ScenarioImages:
         grey, view = self.scan.grey, self.scan.views[0]
         u, v = (float(np.linalg.norm(view[i : i + 3])) for i in (6, 9))
         if grey.mtf is None:
-            return blurred(image, grey.blur_mm / u, grey.blur_mm / v)
+            # The resolution of a detector is that with its pixels.
+            rest = (np.sqrt(max((grey.blur_mm / one) ** 2 - 1 / 12, 0.0)) for one in (u, v))
+            return blurred(image, *map(float, rest))
         wide = max(image.shape) // 2
         padded = np.pad(image, wide, mode="edge")
         frequency = np.hypot(
@@ -372,6 +370,19 @@ class ScenarioImages:
 def _made_of(substance: Substance) -> Material:
     """For the scatter's grid, which asks nothing but the substance."""
     return Material(substance.name, "", substance.density_g_cm3, 0.0, (), "", substance.fractions)
+
+
+def check_rays(rays: int) -> None:
+    """Refuse a number of rays along each side of a pixel that there cannot be.
+
+    Raises:
+        LimitError: says what is allowed.
+    """
+    if rays not in range(1, MOST_RAYS + 1):
+        raise LimitError(
+            f"rays is {rays}; allowed: 1 to {MOST_RAYS} along each side of a pixel",
+            {"asked": rays, "allowed": [1, MOST_RAYS]},
+        )
 
 
 def within_pixels(rows: FloatArray, rays: int) -> FloatArray:

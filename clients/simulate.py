@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.clients.datasets.data_set import DataSet
-from flexdt.clients.scenario import MOST_RAYS, ScenarioImages, within_pixels
+from flexdt.clients.scenario import ScenarioImages, check_rays, within_pixels
 from flexdt.machines import machine as machine_of
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import Channel, chain_through, channels, scatter_object
@@ -212,10 +212,7 @@ def simulate(
         )
     if noise is not None and (not isinstance(noise, int | np.integer) or noise < 0):
         raise LimitError(f"noise is {noise}; allowed: a seed >= 0, or None", {"asked": noise})
-    if rays not in range(1, MOST_RAYS + 1):
-        raise LimitError(
-            f"rays is {rays}; allowed: 1 to {MOST_RAYS}", {"asked": rays, "allowed": [1, MOST_RAYS]}
-        )
+    check_rays(rays)
     if spot_points != 1 and spot_points not in range(3, MOST_POINTS + 1):
         raise LimitError(
             f"spot_points is {spot_points}; allowed: 1, or 3 to {MOST_POINTS}",

@@ -173,9 +173,13 @@ def _labelled(sample: object, names: Mapping[int, str], voxel_mm: float | Vector
             f"materials by label are for an array or a Volume, not for {_shown(sample)}",
             {"asked": _shown(sample), "allowed": "array, Volume"},
         )
-    found, place = np.unique(labels, return_inverse=True)
     order = [0, *sorted(key for key in names if key != 0)]
-    unknown = sorted(set(found.tolist()) - set(order))
+    index, known = np.zeros(labels.shape, np.uint8), labels == 0
+    for i, key in enumerate(order[1:256], 1):
+        there = labels == key
+        index[there] = i
+        known |= there
+    unknown = np.unique(labels[~known]).tolist()
     if unknown or 0 in names or len(order) > 256:
         raise PhantomError(
             f"labels {unknown or list(names)}: allowed are 0 for nothing and the at most 255 that "
@@ -183,8 +187,6 @@ def _labelled(sample: object, names: Mapping[int, str], voxel_mm: float | Vector
             {"asked": unknown or list(names), "allowed": order},
         )
     mu = np.array([0.0, *(material_of(names[key]).mu_per_mm for key in order[1:])], np.float32)
-    index = np.array([order.index(one) for one in found.tolist()], np.uint8)[place]
-    index = index.reshape(labels.shape)
     if isinstance(sample, Volume):
         made = voxel_phantom(mu[index], sample.voxel_xyz, center_mm=sample.center_mm)
     else:

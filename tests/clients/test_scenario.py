@@ -296,7 +296,9 @@ def test_lag_blur_and_spot(tmp_path: Path) -> None:
     document["detector"]["unsharpness"] = {"mtf": {"value": "mtf.tsv"}}
     assert width() == pytest.approx(np.hypot(spot, 0.2), rel=0.03)
     document["detector"]["unsharpness"] = {"basic_spatial_resolution": mm(0.3)}
-    assert width() == pytest.approx(np.hypot(spot, 0.3 * 0.69), rel=0.03)
+    pixel = 0.1**2 / 12  # is in the resolution
+    wanted = np.sqrt(spot**2 + (0.3 * 0.69) ** 2 - pixel)
+    assert width() == pytest.approx(wanted, rel=0.01)
 
 
 @pytest.mark.slow
