@@ -56,6 +56,13 @@ def test_beads_that_are_lost_are_named() -> None:
     assert "bead 0, 3 of 'lego' has no spot in any frame" in told.text
 
 
+@pytest.mark.parametrize("first", [0.0, 37.0])
+def test_a_stage_that_turns_the_other_way_is_not_called_turned_images(first: float) -> None:
+    """Four of the five beads fit images turned by 180 deg, too, and more closely."""
+    detections = spots(first - ANGLES, [0, 1, 2, 3, 4])
+    assert codes(detections) == [("angle_reversed", "error")]
+
+
 def test_a_gap_in_the_numbers_is_not_another_phantom() -> None:
     for at in (15, 21):
         gap = ANGLES + np.where(np.arange(36) >= at, 20.0, 0.0)

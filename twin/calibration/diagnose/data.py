@@ -303,7 +303,7 @@ def _alternative(
             ("bead_displaced", f"without bead {j} the others fit: it is not where the phantom's "
              "model has it", others, poses, detections)
         )  # fmt: skip
-    best: tuple[float, str, str] | None = None
+    best: tuple[float, float, str, str] | None = None
     for code, text, beads, geometry, shadows in trials:
         other = attempt(shadows, beads, geometry, search=search)
         if other is None:
@@ -313,10 +313,13 @@ def _alternative(
             or other.rms_px < 0.3 * found.rms_px
             or (other.explained > found.explained + 0.2)
         )
-        if _convincing(other) and better and (best is None or other.rms_px < best[0]):
-            best = (other.rms_px, code, text)
+        # A mistake that explains all spots comes before one that fits most of them more closely:
+        # four of the LEGO phantom's five beads are a helix, which turns round into itself.
+        off = (round(1.0 - other.explained, 1), other.rms_px)
+        if _convincing(other) and better and (best is None or off < best[:2]):
+            best = (*off, code, text)
     if best is not None:
-        return best[1:]
+        return best[2:]
     if found is not None and _plausible(found) and found.typical_px > 0.3 * found.rms_px:
         return None  # The right beads in about the right places: the residuals will tell.
     return (
