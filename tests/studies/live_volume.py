@@ -1,0 +1,69 @@
+"""How long the slices of a running scan take: a scan at its own pace, and beside it the process
+that the viewer starts for "Slices so far", at each size.
+
+`python tests/studies/live_volume.py [FRAMES]` starts its own servers and prints, for each size, the
+views a second, the seconds from one picture to the next, and how far the volume was behind the
+scan's last image when that was saved.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import flexdt as fx
+from flexdt.server.runtime.workers import ENVIRONMENT
+from flexdt.twin.machine.description import builtin_machine, profile_of
+from flexdt.twin.script.compose import ScanRequest, compose_script
+
+
+def measured(twin: fx.TwinClient, data: Path, side: int, frames: int) -> str:
+    """One scan with its slices, in words."""
+    machine = builtin_machine("flexray")
+    script = compose_script(ScanRequest(frames=frames), machine, profile_of(machine, None))
+    name = f"slices-{side}"
+    job = twin.submit_script(script, name, 1.0).job
+    grower = subprocess.Popen(
+        [sys.executable, "-m", "flexdt.clients.viewer.live_volume", str(data / name), str(side)],
+        stdout=subprocess.PIPE, text=True, env={**os.environ, **ENVIRONMENT},
+    )  # fmt: skip
+    assert grower.stdout is not None
+    last = data / name / f"scan_{frames - 1:06d}.tif"
+    steps, views, behind, voxel_mm, ended = [], [], 0.0, 0.0, 0.0
+    for line in grower.stdout:
+        told, now = json.loads(line), time.monotonic()
+        assert "problem" not in told, told
+        steps.append(now)
+        views.append(told["views"])
+        voxel_mm, ended = told["voxel_mm"], time.time()
+    grower.wait()
+    assert twin.wait_job(job).state == "done"
+    behind = ended - last.stat().st_mtime
+    between = [b - a for a, b in itertools.pairwise(steps)]
+    rate = (views[-1] - views[0]) / (steps[-1] - steps[0])
+    return (
+        f"| {side} | {1000 * voxel_mm:.0f} um | {rate:.1f} | {statistics.median(between):.2f} s | "
+        f"{max(between):.2f} s | {behind:.1f} s |"
+    )
+
+
+def main(frames: int = 120) -> None:
+    """The table."""
+    print(f"load average before: {os.getloadavg()[0]:.1f}; {os.cpu_count()} processors")
+    print("| side | voxel | views/s | from picture to picture | at worst | behind the last image |")
+    print("|---|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory() as folder, fx.LocalTwin(data=folder) as twin:
+        twin.set_sample("lego")
+        for side in (128, 192, 256):
+            print(measured(twin, Path(folder), side, frames), flush=True)
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))
