@@ -32,7 +32,9 @@ from flexdt.twin.projection.cpu import threads
 from flexdt.twin.projection.operators import as_cone_vec, check_projections, require_finite
 from flexdt.twin.reconstruction.helix import Sharing
 from flexdt.twin.reconstruction.rectify import (
+    FINER,
     is_upright,
+    leans,
     on_its_side,
     rectified,
     rows_needed,
@@ -485,8 +487,10 @@ def _fdk(
     if on_its_side(cone_vec):
         parts = (part.transpose(0, 2, 1) for part in parts)
         cone_vec, shape = swapped(cone_vec), (shape[1], shape[0])
-    tilted = not is_upright(cone_vec)
-    level = panels = upright(cone_vec) if tilted else cone_vec
+    tilted, seen = not is_upright(cone_vec), shape
+    if leans(cone_vec):
+        shape = (shape[0], round(FINER * shape[1]))
+    level = panels = upright(cone_vec, shape[1] / seen[1]) if tilted else cone_vec
     _check_steady(circle, level, shape)
     weights = redundancy(circle, level, shape[1])
     # Columns off the panel whose filtered values are needed, and those that go into the filter.
@@ -508,13 +512,13 @@ def _fdk(
     done = 0
     for part in parts:
         views = slice(done, done + len(part))
-        if part.shape[1:] != shape or views.stop > len(cone_vec):
+        if part.shape[1:] != seen or views.stop > len(cone_vec):
             raise GeometryError(
                 f"projections of shape {part.shape} after {done} views; allowed: "
-                f"{len(cone_vec)} views of {shape}",
-                {"asked": list(part.shape), "allowed": [len(cone_vec), *shape]},
+                f"{len(cone_vec)} views of {seen}",
+                {"asked": list(part.shape), "allowed": [len(cone_vec), *seen]},
             )
-        images = rectified(part, cone_vec[views], panels[views]) if tilted else part
+        images = rectified(part, cone_vec[views], panels[views], shape[1]) if tilted else part
         top = first
         if before or after:
             images, top = np.pad(images[:, first:last], ((0, 0), (0, 0), (before, after))), 0

@@ -185,13 +185,14 @@ def warp(images, maps, weights, out):
     `weights` are those of `lanczos`: with three lobes what is sharp in a tilted image stays sharper
     than by cubic interpolation, which took contrast from the finest details.
     """
-    n, rows, cols = out.shape
+    n, rows, wide = out.shape
+    cols = images.shape[2]
     for job in prange(n * rows):
         view = job // rows
         r = job % rows
         h = maps[view]
         image = images[view]
-        for c in range(cols):
+        for c in range(wide):
             scale = 1.0 / (h[2, 0] * c + h[2, 1] * r + h[2, 2])
             x = (h[0, 0] * c + h[0, 1] * r + h[0, 2]) * scale
             y = (h[1, 0] * c + h[1, 1] * r + h[1, 2]) * scale

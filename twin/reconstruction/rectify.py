@@ -21,17 +21,23 @@ from flexdt.twin.projection import Grid, Volume
 
 UPRIGHT = 1e-7
 """Largest slope of rows and columns of a panel that counts as upright."""
+FINER = 1.3
+"""Columns of an upright panel for each of the tilted panel's, in FDK: resampled twice, before the
+filter and after it, edges would come out wider."""
 FLAT = 1e-3
 """Smallest horizontal part of a panel's normal that can be stood upright."""
 
 
-def is_upright(cone_vec: ConeVec) -> bool:
-    """Whether all rows are horizontal and all columns point down."""
+def leans(cone_vec: ConeVec) -> bool:
+    """Whether rows are not horizontal, or columns not vertical."""
     slope_u = np.abs(cone_vec.u[:, 2]) / np.linalg.norm(cone_vec.u, axis=1)
     slope_v = np.linalg.norm(cone_vec.v[:, :2], axis=1) / np.linalg.norm(cone_vec.v, axis=1)
-    return bool(
-        slope_u.max() <= UPRIGHT and slope_v.max() <= UPRIGHT and (cone_vec.v[:, 2] < 0).all()
-    )
+    return bool(max(slope_u.max(), slope_v.max()) > UPRIGHT)
+
+
+def is_upright(cone_vec: ConeVec) -> bool:
+    """Whether all rows are horizontal and all columns point down."""
+    return not leans(cone_vec) and bool((cone_vec.v[:, 2] < 0).all())
 
 
 def on_its_side(cone_vec: ConeVec) -> bool:
@@ -47,8 +53,12 @@ def swapped(cone_vec: ConeVec) -> ConeVec:
     return ConeVec.from_vectors(cone_vec.source, cone_vec.detector, cone_vec.v, cone_vec.u)
 
 
-def upright(cone_vec: ConeVec) -> ConeVec:
+def upright(cone_vec: ConeVec, finer: float = 1.0) -> ConeVec:
     """Upright panels with the same centres and pitches, their backs turned the same way.
+
+    Args:
+        cone_vec: (n).
+        finer: columns for each of the panel's own; their pitch is narrower by as much.
 
     Raises:
         GeometryError: a panel that lies flat has no upright one.
@@ -63,39 +73,44 @@ def upright(cone_vec: ConeVec) -> ConeVec:
         )
     # Down times the normal is to the right, whatever turn the panel had about its normal.
     u = np.column_stack([away[:, 1], -away[:, 0], np.zeros(len(away))])
-    u *= (np.linalg.norm(cone_vec.u, axis=1) / level)[:, None]
+    u *= (np.linalg.norm(cone_vec.u, axis=1) / level / finer)[:, None]
     v = np.zeros_like(u)
     v[:, 2] = -np.linalg.norm(cone_vec.v, axis=1)
     return ConeVec.from_vectors(cone_vec.source, cone_vec.detector, u, v)
 
 
-def rectified(images: Float32Array, cone_vec: ConeVec, target: ConeVec) -> Float32Array:
+def rectified(
+    images: Float32Array, cone_vec: ConeVec, target: ConeVec, cols: int | None = None
+) -> Float32Array:
     """Images resampled (Lanczos) onto the panels of `target`, which has the same sources.
 
     Args:
         images: (n, rows, cols).
         cone_vec, target: n rows each.
+        cols: of the target's panels; default: as many as there are.
     """
     from flexdt.twin.reconstruction import fdk_kernels
 
     shape = (images.shape[1], images.shape[2])
+    new_shape = (shape[0], shape[1] if cols is None else cols)
     pairs = zip(cone_vec.rows, target.rows, strict=True)
-    maps = np.array([homography(old, new, shape) for old, new in pairs])
-    out = np.empty(images.shape, np.float32)
+    maps = np.array([homography(old, new, shape, new_shape) for old, new in pairs])
+    out = np.empty((len(images), *new_shape), np.float32)
     weights = fdk_kernels.lanczos()
     fdk_kernels.warp(np.ascontiguousarray(images, dtype=np.float32), maps, weights, out)
     return out
 
 
-def homography(old: FloatArray, new: FloatArray, shape: tuple[int, int]) -> FloatArray:
+def homography(
+    old: FloatArray, new: FloatArray, shape: tuple[int, int], new_shape: tuple[int, int]
+) -> FloatArray:
     """(3, 3): homogeneous (column, row) on `new` to those on `old`, pixel centres integer."""
-    rows, cols = shape
 
-    def plane(row: FloatArray) -> FloatArray:
+    def plane(row: FloatArray, rows: int, cols: int) -> FloatArray:
         first = row[3:6] - row[0:3] - (cols - 1) / 2 * row[6:9] - (rows - 1) / 2 * row[9:12]
         return np.column_stack([row[6:9], row[9:12], first])
 
-    return np.asarray(np.linalg.solve(plane(old), plane(new)))
+    return np.asarray(np.linalg.solve(plane(old, *shape), plane(new, *new_shape)))
 
 
 def field_of_view(cone_vec: ConeVec, shape: tuple[int, int], voxel_mm: float | None = None) -> Grid:

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from llvmlite import binding
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
+from scipy.optimize import curve_fit
+from scipy.special import ndtr
 
 from flexdt.twin.errors import GeometryError, UnknownNameError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -419,12 +421,36 @@ def test_tilted_images_become_upright_ones():
     point = np.array([[4.0, -7.0, 9.0]])
     for i in range(4):
         new = level.project_points(point, SHAPE)[i, 0]
-        old = homography(tilted.rows[i], level.rows[i], SHAPE) @ [*new, 1.0]
+        old = homography(tilted.rows[i], level.rows[i], SHAPE, SHAPE) @ [*new, 1.0]
         np.testing.assert_allclose(old[:2] / old[2], tilted.project_points(point, SHAPE)[i, 0])
     got = rectified(ball(tilted, SHAPE), tilted, level)
     wanted = ball(level, SHAPE)
     inner = np.s_[:, 8:-8, 8:-8]
     assert np.abs(got[inner] - wanted[inner]).mean() < 2e-3 * wanted.max()
+
+
+def edge_width(volume: Volume) -> float:
+    """Standard deviation of the Gaussian that blurs the ball's surface [voxels]."""
+    z, y, x = np.meshgrid(*(volume.centers()[i] for i in (2, 1, 0)), indexing="ij")
+    away = np.sqrt((x - CENTRE[0]) ** 2 + (y - CENTRE[1]) ** 2 + (z - CENTRE[2]) ** 2) - RADIUS
+    near = np.abs(away) < 3 * volume.voxel_mm
+    found, _ = curve_fit(
+        lambda at, low, high, sigma: low + (high - low) * ndtr(-at / sigma),
+        away[near], volume.data[near], p0=(0.0, MU, 0.3),
+    )  # fmt: skip
+    return float(abs(found[2]) / volume.voxel_mm)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_edges_are_as_sharp_from_tilted_panels(seed):
+    rng = np.random.default_rng(seed)
+    tilt, yaw = rng.uniform(0.01, 0.3) * rng.choice([-1, 1]), rng.uniform(-0.3, 0.3)
+    like = Grid((44, 44, 44), 0.34, CENTRE).blank()
+    level, tilted = (
+        edge_width(fdk(ball(scan, SHAPE), scan, like))
+        for scan in (circle(120), circle(120, tilt=tilt, yaw=yaw))
+    )
+    assert tilted < 1.01 * level
 
 
 def test_field_of_view():
