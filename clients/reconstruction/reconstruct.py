@@ -43,6 +43,7 @@ from flexdt.twin.reconstruction import (
     fdk_parts,
     field_of_view,
     hardening,
+    kernel_scatter,
     ring_errors,
     sart,
     sirt,
@@ -87,6 +88,7 @@ PART: Final = 16
 """Frames read at a time."""
 PREVIEW_VIEWS: Final = 180
 PREVIEW_VOXELS: Final = 160
+SCATTER_METHODS: Final = ("simulation", "kernel")
 SCATTER_VIEWS, SCATTER_PIXELS = 180, 100
 """Frames, and about their pixels a side, from which it is found what scatters."""
 
@@ -112,8 +114,10 @@ class VolumeRequest:
             set.
         png: write the three middle slices beside the volume.
         weight: of the total variation (`tv`); None is its own default.
-        scatter_correction: materials of the object: simulate their scatter and subtract it; None
+        scatter_correction: materials of the object: find their scatter and subtract it; None
             for no correction.
+        scatter_method: one of `SCATTER_METHODS`: simulate the scatter of the whole scan in rounds,
+            or that of few views and fit kernels to it.
         tube: of the scan, in place of what the data set says and of `kV`.
     """
 
@@ -132,6 +136,7 @@ class VolumeRequest:
     weight: float | None = None
     scatter_correction: tuple[str, ...] | None = None
     tube: Tube | None = None
+    scatter_method: str = "simulation"
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +252,7 @@ def reconstruct_dataset(
         correction (edge units), seconds.
 
     Raises:
-        UnknownNameError: no such algorithm, window or material.
+        UnknownNameError: no such algorithm, window, material or scatter method.
         TwinError: beam hardening cannot be corrected, because the data set has none.
         LimitError: another ending, one of the data set's own files, or a volume too large for this
             machine.
@@ -382,6 +387,9 @@ def _task(
     if wanted.algorithm not in ALGORITHMS:
         what = f"unknown algorithm {wanted.algorithm!r}; allowed"
         raise UnknownNameError.among(what, wanted.algorithm, ALGORITHMS)
+    if wanted.scatter_method not in SCATTER_METHODS:
+        what = f"unknown scatter method {wanted.scatter_method!r}; allowed"
+        raise UnknownNameError.among(what, wanted.scatter_method, SCATTER_METHODS)
     views = views_of(dataset, parameters, binning=wanted.binning, every=wanted.every)
     return wanted, views, grid_of(views, wanted)
 
@@ -450,7 +458,11 @@ def _without_scatter(views: Views, names: tuple[str, ...], request: VolumeReques
     each = max(1, len(views.indices) // SCATTER_VIEWS)
     geometry = views.cone_vec[::each].binned(factor, views.shape)
     coarse = Views(views.dataset, views.indices[::each], geometry, views.binning * factor)
-    found = scatterer_of(np.concatenate(list(coarse.parts())), geometry, chain, kV)
+    stack = np.concatenate(list(coarse.parts()))
+    if request.scatter_method == "kernel":
+        kernels = kernel_scatter(stack, geometry, chain, kV, None, (views.cone_vec, views.shape))
+        return replace(views, scatter=kernels.scatter, doubts=kernels.doubts)
+    found = scatterer_of(stack, geometry, chain, kV)
     beam = Beam.of(chain, kV)
     scatter = scan_scatter(found.thing, views.cone_vec.rows, views.shape, beam)
     return replace(views, scatter=scatter, doubts=found.doubts)

@@ -205,7 +205,7 @@ def without_scatter(
     stack, cone = np.asarray(line_integrals, dtype=np.float32), as_cone_vec(cone_vec)
     found = scatterer_of(stack, cone, chain, kV, settings)
     beam = Beam.of(chain, kV)
-    scatter = scan_scatter(found.thing, cone.rows, _shape(stack), beam, settings)
+    scatter = scan_scatter(found.thing, cone.rows, shape_of(stack), beam, settings)
     return np.stack([subtracted(image, scatter.signal(i)) for i, image in enumerate(stack)])
 
 
@@ -244,19 +244,17 @@ def scatterer_of(
         As `without_scatter`.
     """
     wanted = ScatterSettings() if settings is None else settings
-    stack, shape = line_integrals, _shape(line_integrals)
-    whole = field_of_view(cone_vec, shape)
-    coarser = (math.prod(whole.shape) / (FINER * wanted.voxels)) ** (1.0 / 3.0)
-    grid = field_of_view(cone_vec, shape, whole.voxel_mm * max(1.0, coarser))
-    (mu, straighten), beam = _attenuation(chain, kV), Beam.of(chain, kV)
+    stack, shape = line_integrals, shape_of(line_integrals)
+    grid = coarse_grid(cone_vec, shape, wanted)
+    (mu, straighten), beam = attenuations(chain, kV), Beam.of(chain, kV)
     in_rounds = replace(
         wanted, step_deg=max(wanted.step_deg, ROUND_DEG), nodes=min(wanted.nodes, ROUND_NODES),
         error=max(wanted.error, ROUND_ERROR),
     )  # fmt: skip
     direct, before, changes = stack, np.zeros(()), list[float]()
     while True:
-        volume = _volume(straighten(direct), cone_vec, grid)
-        thing = _object(volume, chain, mu)
+        volume = volume_of(straighten(direct), cone_vec, grid)
+        thing = object_in(volume, chain, mu)
         scatter = scan_scatter(thing, cone_vec.rows, shape, beam, in_rounds)
         change = np.abs(scatter.nodes - before).mean() / max(scatter.nodes.mean(), 1e-300)
         changes.append(float(change))
@@ -266,20 +264,32 @@ def scatterer_of(
             break
         direct = np.stack([subtracted(*pair) for pair in zip(stack, images, strict=True)])
     dark = float(np.mean(np.asarray(images) * np.exp(stack) > MOST))
-    return Scatterer(thing, tuple(changes), tuple(_doubts(changes[-1], dark, volume, chain, mu)))
+    doubts = doubts_about(dark, volume, chain, mu)
+    if changes[-1] >= SETTLED:
+        doubts.append(f"scatter still changes by {100 * changes[-1]:.1f} % after {ROUNDS} rounds")
+    return Scatterer(thing, tuple(changes), tuple(doubts))
 
 
-def _volume(stack: Float32Array, cone_vec: ConeVec, grid: Grid) -> Volume:
-    shape = _shape(stack)
+def coarse_grid(cone_vec: ConeVec, shape: tuple[int, int], settings: ScatterSettings) -> Grid:
+    """The field of view by voxels that scatter is simulated in."""
+    whole = field_of_view(cone_vec, shape)
+    coarser = (math.prod(whole.shape) / (FINER * settings.voxels)) ** (1.0 / 3.0)
+    return field_of_view(cone_vec, shape, whole.voxel_mm * max(1.0, coarser))
+
+
+def volume_of(stack: Float32Array, cone_vec: ConeVec, grid: Grid) -> Volume:
+    """FDK of straightened line integrals, smoothed."""
+    shape = shape_of(stack)
     truncation = truncation_of(stack.__getitem__, cone_vec, shape)
     return fdk_parts(lambda: [stack], cone_vec, shape, grid, "hann", None, truncation)
 
 
-def _shape(stack: Float32Array) -> tuple[int, int]:
+def shape_of(stack: Float32Array) -> tuple[int, int]:
+    """(rows, cols) of a stack."""
     return int(stack.shape[1]), int(stack.shape[2])
 
 
-def _attenuation(
+def attenuations(
     chain: Chain, kV: float
 ) -> tuple[FloatArray, Callable[[Float32Array], Float32Array]]:
     """Attenuation of the materials at one energy, (m,) [1/mm], and what straightens line integrals
@@ -304,7 +314,7 @@ def _attenuation(
     return mu, hardening(chain.substances[0], kV, keV, chain.panel, chain.tube)
 
 
-def _object(volume: Volume, chain: Chain, mu: FloatArray) -> Object:
+def object_in(volume: Volume, chain: Chain, mu: FloatArray) -> Object:
     """The occupied box of a volume as amounts of the materials."""
     order = np.argsort(mu)
     knots = np.concatenate([[0.0], mu[order]])
@@ -323,10 +333,16 @@ def _object(volume: Volume, chain: Chain, mu: FloatArray) -> Object:
     return Object(amounts, volume.voxel_xyz, (x, y, z), chain.substances)
 
 
-def _doubts(change: float, dark: float, volume: Volume, chain: Chain, mu: FloatArray) -> list[str]:
+def doubts_about(dark: float, volume: Volume, chain: Chain, mu: FloatArray) -> list[str]:
+    """What is doubtful about a correction, in sentences.
+
+    Args:
+        dark: part of the pixels whose signal would be nearly all scatter.
+        volume: reconstructed without the scatter.
+        chain: with the materials named.
+        mu: (m,) their attenuation in the volume [1/mm].
+    """
     out = []
-    if change >= SETTLED:
-        out.append(f"scatter still changes by {100 * change:.1f} % after {ROUNDS} rounds")
     if dark > OFTEN:
         share = f"over {100 * MOST:g} % of the signal"
         out.append(f"scatter would be {share} in {100 * dark:.2g} % of the pixels")

@@ -474,13 +474,13 @@ def scan_scatter(
     rows = np.asarray(views, dtype=np.float64)
     if not len(rows):
         raise LimitError("no views to simulate scatter for", {"asked": 0, "allowed": "> 0"})
-    way = _way(rows)
+    way = way_of(rows)
     simulated = _simulated(way, np.radians(wanted.step_deg))
     images = tuple(scatter_image(thing, rows[i], shape, beam, wanted, i) for i in simulated)
     return ScanScatter(wanted, images, tuple(simulated), way, way[list(simulated)])
 
 
-def _way(rows: FloatArray) -> FloatArray:
+def way_of(rows: FloatArray) -> FloatArray:
     """How far source and panel have come at each view, relative to their distances, (n,) [rad]."""
     source, centre, frame = rows[:, 0:3], rows[:, 3:6], rows[:, 6:12]
     scales = (

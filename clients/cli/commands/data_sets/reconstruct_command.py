@@ -49,6 +49,7 @@ def reconstruct(
         "The object is of these, e.g. pmma,aluminium: subtract their scatter.",
         metavar="MATERIALS",
     ),
+    scatter_method: Literal["simulation", "kernel"] | None = option(None, "Default: simulation."),
     kv: float | None = option(None, "Of the tube; default: what the data set says."),
     png: bool = option(False, "Three slices beside it.", "--png"),
     preview: bool = option(
@@ -69,7 +70,8 @@ def reconstruct(
         "algorithm": None if algorithm == "fdk" else algorithm, "voxel": voxel, "shape": shape,
         "binning": binning, "every": every, "iterations": iterations, "window": window,
         "weight": weight, "center": center, "rings": rings or None, "material": material,
-        "scatter-correction": scatter_correction, "scheduler": scheduler, "slurm": slurm,
+        "scatter-correction": scatter_correction, "scatter-method": scatter_method,
+        "scheduler": scheduler, "slurm": slurm,
     }  # fmt: skip
     chosen = [name for name, value in own.items() if value is not None]
     algorithm = algorithm or "fdk"
@@ -82,6 +84,8 @@ def reconstruct(
          f"{out}: the ending must be one of {', '.join(SUFFIXES)}"),
         (kv is not None and material is None and scatter_correction is None, "kv",
          "it is for --material and --scatter-correction"),
+        (scatter_method is not None and scatter_correction is None, "scatter-method",
+         "it is for --scatter-correction"),
         (iterations is not None and algorithm == "fdk", "iterations", "fdk has none"),
         (weight is not None and algorithm != "tv", "weight", f"{algorithm} has none"),
         (window is not None and algorithm != "fdk", "window", f"{algorithm} has no filter"),
@@ -134,6 +138,7 @@ def reconstruct(
         algorithm, voxel, wanted_shape, binning or 1, every or 1, iterations, window or "ram-lak",
         wanted_center, rings, material, kv, png, weight,
         None if scatter_correction is None else option_values.names(scatter_correction),
+        scatter_method=scatter_method or "simulation",
     )  # fmt: skip
     workers = None if scheduler is None else dask_executor(scheduler)
     if slurm is not None:
