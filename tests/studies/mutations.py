@@ -64,8 +64,8 @@ MEMORY = 12 << 30
 """Address space of a child [bytes]."""
 
 Lines = dict[str, Any]
-"""Of one test file: the seconds of its tests; the tests of each line as bits of a number, where the
-last bit stands for what the whole file does; the files of flexdt that it imports, with digests."""
+"""Of one test file: the processor seconds of its tests; the tests of each line as bits of a number,
+where the last bit stands for what the whole file does; the files it imports, with digests."""
 
 
 def digest(path: Path) -> str:
@@ -208,13 +208,14 @@ class Traced:
                 for value in list(vars(module).values()):
                     if hasattr(value, "cache_clear"):
                         value.cache_clear()
-        self.test = item.nodeid
+        self.test, begun = item.nodeid, time.process_time()
         self.coverage.switch_context(self.test)
         if time.process_time() > FILE_S:
             item.session.shouldstop = "enough"
         try:
             return (yield)
         finally:
+            self.seconds[item.nodeid] = time.process_time() - begun
             self.coverage.switch_context(self.file)
 
     @pytest.hookimpl(wrapper=True)
@@ -228,7 +229,6 @@ class Traced:
             self.coverage.switch_context(self.test)
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        self.seconds[report.nodeid] = self.seconds.get(report.nodeid, 0.0) + report.duration
         if not report.passed:
             self.failed.add(report.nodeid)
 
@@ -317,7 +317,7 @@ def _weight(entry: Lines) -> dict[str, float]:
 
 
 def _trace(file: str, copy: Copy) -> int:
-    """Find the lines of a test file; twice where kernels had to be compiled first."""
+    """Find the lines of a test file."""
     sys.dont_write_bytecode = False
     found = copy.folder / "lines.json"
     found.unlink(missing_ok=True)
@@ -378,7 +378,9 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=14)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--under", nargs="*", default=UNDER)
-    parser.add_argument("--seconds", type=float, default=40.0, help="of tests for one mutant")
+    parser.add_argument(
+        "--seconds", type=float, default=40.0, help="of a processor, for the tests of one mutant"
+    )
     parser.add_argument("--list", action="store_true", help="print the draw, run nothing")
     parser.add_argument("--again", action="store_true", help="judge known survivors once more")
     parser.add_argument("--work", type=Path, default=ROOT / "build" / "mutations")
