@@ -52,11 +52,15 @@ STARTS = (1.1, 1.5, 2.2)
 """Radii that the fit starts from, relative to the field of view's."""
 TURNS = (0.0, 0.4, 0.8, 1.2)
 """Angles against the best ellipse that the fit of a rectangle starts from [rad]."""
+LONGER = ((0.0, 0.0), (0.2, 0.0), (0.0, 0.2))
+"""Logarithms of what half axes are multiplied by where the last fit starts."""
 DOUBTFUL = 0.03
 """Misfit above which an outline is unlike an ellipse or a rectangle."""
 ROUGH = 0.01
 """Deviations from an ellipse, relative to large line integrals, beyond which they are taken for
 other things in the object and count less and less."""
+FINE = 0.003
+"""The same in the last fit, which begins near: other things in the object then pull much less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -372,6 +376,7 @@ class _Band:
         outline: Callable[[FloatArray], Outline],
         start: npt.ArrayLike,
         steps: int,
+        rough: float = ROUGH,
         **more: Any,
     ) -> tuple[float, FloatArray]:
         """Cost and arguments of the `outline` that fits best; what deviates much counts less."""
@@ -379,7 +384,7 @@ class _Band:
 
         found = least_squares(
             lambda x: (outline(x).integrals(self.source, self.rays) - self.seen).ravel(),
-            start, loss="cauchy", f_scale=ROUGH * self.top, max_nfev=steps, **more,
+            start, loss="cauchy", f_scale=rough * self.top, max_nfev=steps, **more,
         )  # fmt: skip
         return float(found.cost), np.asarray(found.x)
 
@@ -407,15 +412,18 @@ class _Band:
             centre, axes = (x[0] * field, x[1] * field), (float(half[0]), float(half[1]))
             return Prism(round, centre, axes, float(x[4]), float(np.exp(x[5])))
 
-        def fit(round: bool, start: Sequence[float]) -> tuple[float, bool, FloatArray]:
+        def fit(
+            round: bool, start: npt.ArrayLike, rough: float = ROUGH
+        ) -> tuple[float, bool, FloatArray]:
             begin = np.clip(start, -limit, limit)
-            cost, x = self.fit(partial(prism, round), begin, 60, bounds=(-limit, limit))
+            cost, x = self.fit(partial(prism, round), begin, 60, rough, bounds=(-limit, limit))
             return cost, round, x
 
         if near is not None:
             half, place = np.log(np.array(near.half) / field), np.array(near.centre) / field
             start = [*place, *half, near.angle, np.log(near.attenuation)]
-            return prism(near.round, fit(near.round, start)[2])
+            _, round, best = fit(near.round, start)
+            return prism(round, fit(round, best, FINE)[2])
         found = [
             fit(True, [0, 0, np.log(r), np.log(r), 0.3, np.log(top / (2 * r * field))])
             for r in STARTS
@@ -424,6 +432,9 @@ class _Band:
         for turn in TURNS:
             start = [*best[:2], *(best[2:4] - 0.12), best[4] + turn, best[5]]
             found.append(fit(False, start))
+        _, round, best = min(found, key=lambda f: f[0])
+        # Things in an object may have shortened one of its axes and made up for it by density.
+        found = [fit(round, best + [0, 0, a, b, 0, -(a + b) / 2], FINE) for a, b in LONGER]
         _, round, best = min(found, key=lambda f: f[0])
         return prism(round, best)
 
