@@ -361,10 +361,11 @@ import sys, json
 from pathlib import Path
 from flexdt.server.bench import __main__ as command, device_page
 from flexdt.twin.projection import gpu
-from flexdt.twin.projection.kernels import gpu_kernels
+from flexdt.twin.projection.kernels import gpu_array_kernels, gpu_kernels
 from flexdt.twin.reconstruction import gpu_fdk_kernels
 
-gpu_kernels.BLOCK = gpu_fdk_kernels.BLOCK = (4, 2)
+gpu_kernels.BLOCK = gpu_fdk_kernels.BLOCK = gpu_fdk_kernels.PLANE = (4, 2)
+gpu_array_kernels.FOLDING = (1, 4)
 gpu.LINEAR, gpu.VIEWS_A_THREAD, device_page.ROUNDS = 64, 0.0, 1
 sizes = ((4, 3, 3), 12.0), ((3, 4, 3), 12.0), ((3, 3, 3), 9.0)
 device_page.SIZES = dict(zip(("C1", "512^3", "1024^3"), sizes))

@@ -89,10 +89,13 @@ def _improved(
         # The hull's point nearest to the origin: least squares with weights that add up to one.
         points = np.array(corners).T
         system = np.vstack([points, np.full(len(corners), 100.0)])
-        weights, _ = nnls(system, [0.0, 0.0, 0.0, 100.0])
+        try:
+            weights, _ = nnls(system, [0.0, 0.0, 0.0, 100.0])
+        except RuntimeError:  # not within its rounds: what was found so far is a certificate, too
+            break
         nearest = points @ weights / weights.sum()
         length = math.sqrt(nearest @ nearest)
-        if length - found[0] < DOUBT:
+        if length - max(found[0], 0.0) < DOUBT:
             break
         normal = nearest / length
     return found

@@ -331,7 +331,7 @@ def _subset_steps(
         for part, (rows, columns) in zip(parts, sums, strict=True):
             geometry = problem.geometry[part]
             rest = problem.part(part) - problem.project(x, geometry)
-            squares += dot(rest, rest)
+            squares += 0.0 if watch is None else dot(rest, rest)
             rest *= rows
             x = x + np.float32(relaxation) * columns * problem.spread(rest, geometry)
             if nonnegative:

@@ -95,6 +95,7 @@ def tv(
 
     Examples:
         >>> scan = ConeVec.circular(sod=600, sdd=1000, angles=12, shape=(8, 8), pixel=1)
+        >>> from flexdt.twin.projection import Operator
         >>> grid = Grid((4, 4, 4), 1.0)
         >>> images = Operator(scan, grid) @ np.full((4, 4, 4), 0.02)
         >>> found = tv(images, scan, grid, weight=1e-4)
