@@ -81,6 +81,8 @@ def answer(method: str, params: Params) -> dict[str, Any]:
             raise RpcError(-32001, "too fast", {"asked": 99, "allowed": [0, 50]})
         case "projection.get":
             return {**image.encode(PIXELS), "cone_vec": CONE, "kind": "line_integral"}
+        case "projection.ray":
+            return {"paths_mm": {"PMMA": 4.5}}
         case "sample.upload":
             assert isinstance(params, SampleUpload)
             end = params.start + len(params.data)
@@ -129,6 +131,7 @@ def test_results_are_typed_and_images_are_arrays(fake: tuple[Fake, TwinClient]) 
     assert state.axes["mag_obj"].limits == (0, 2)
     assert state.camera.roi == (32, 8, 1943, 1527)
     assert client.ping() == 2.0
+    assert client.ray(2, 1) == {"PMMA": 4.5}
     taken = client.projection()
     assert_array_equal(taken.image, PIXELS)
     assert taken.image.dtype == np.float32
@@ -210,6 +213,7 @@ def test_every_method_of_the_wire_has_a_client_method(fake: tuple[Fake, TwinClie
         client.sample_mesh,
         lambda: client.upload_mesh(b"x", "a", format="stl"),
         client.projection,
+        lambda: client.ray(1, 1),
         client.geometry,
         client.predict_exposure,
         lambda: client.check_script("x"),

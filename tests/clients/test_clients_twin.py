@@ -148,6 +148,7 @@ def test_both_clients_do_every_method_of_the_wire(shell: Shell, tmp_path: Path) 
     assert state.axes["mag_obj"].position == POSE["mag_obj"]
     assert state.time > start
 
+    assert all(mm >= 0.0 for mm in twin.ray(0, 0).values())
     taken = twin.projection("line_integral", binning=2)
     assert (taken.image.shape, taken.image.dtype) == ((80, 100), np.float32)
     assert taken.image.max() > 0.1

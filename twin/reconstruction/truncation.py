@@ -61,6 +61,8 @@ ROUGH = 0.01
 other things in the object and count less and less."""
 FINE = 0.003
 """The same in the last fit, which begins near: other things in the object then pull much less."""
+HUGE = 50.0
+"""Logarithm of an attenuation that no fit takes: what goes beyond counts as this."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -410,7 +412,7 @@ class _Band:
         def prism(round: bool, x: FloatArray) -> Prism:
             half = field * np.exp(x[2:4])
             centre, axes = (x[0] * field, x[1] * field), (float(half[0]), float(half[1]))
-            return Prism(round, centre, axes, float(x[4]), float(np.exp(x[5])))
+            return Prism(round, centre, axes, float(x[4]), float(np.exp(min(x[5], HUGE))))
 
         def fit(
             round: bool, start: npt.ArrayLike, rough: float = ROUGH
