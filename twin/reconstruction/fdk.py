@@ -61,43 +61,44 @@ MOST_ASIDE: Final = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Weighing:
-    """What views are multiplied by before the filter: factors / length of the ray to the pixel.
+class Views:
+    """Some views on their way to a volume.
+
+    They are multiplied by factors / length of the ray to the pixel, and filtered along rows.
 
     Attributes:
+        images: (n, rows of the panel, cols).
+        top: the first row that is needed.
         factors: float64 (n, cols).
-        across, up: squares of the ray's horizontal and vertical parts, (n, cols) and (n, rows)
-            [mm^2].
+        across, up: squares of the ray's horizontal and vertical parts, (n, cols) and (n, rows that
+            are needed) [mm^2].
+        response: of the filter.
+        kept: columns whose filtered values are needed.
+        shares, table: of `fdk_kernels.backproject`.
     """
 
+    images: Float32Array
+    top: int
     factors: FloatArray
     across: FloatArray
     up: FloatArray
+    response: Float32Array
+    kept: slice
+    shares: Float32Array
+    table: FloatArray
+
+    @property
+    def sizes(self) -> tuple[int, int, int, int]:
+        """Views, columns before and after the filter, rows."""
+        n, wide = self.factors.shape
+        return n, wide, self.kept.stop - self.kept.start, self.up.shape[1]
 
 
 class Backprojector(Protocol):
     """Weighs and filters views, and adds them to a volume."""
 
-    def add(
-        self,
-        images: Float32Array,
-        top: int,
-        weighing: Weighing,
-        response: Float32Array,
-        kept: slice,
-        shares: Float32Array,
-        table: FloatArray,
-    ) -> None:
-        """Add views.
-
-        Args:
-            images: (n, rows of the panel, cols).
-            top: their first row that is needed.
-            weighing: of the rows that are needed, and all columns.
-            response: of the filter.
-            kept: columns whose filtered values are needed.
-            shares, table: of `fdk_kernels.backproject`.
-        """
+    def add(self, views: Views) -> None:
+        """Add views."""
 
     def volume(self) -> Float32Array:
         """What has been added up, (ny, nx, nz)."""
@@ -118,33 +119,18 @@ class OnProcessor:
         self._first, self._size = _grid(like)
         self._data = np.zeros((ny, nx, nz), np.float32)
 
-    def add(
-        self,
-        images: Float32Array,
-        top: int,
-        weighing: Weighing,
-        response: Float32Array,
-        kept: slice,
-        shares: Float32Array,
-        table: FloatArray,
-    ) -> None:
+    def add(self, views: Views) -> None:
         """See `Backprojector`."""
         from flexdt.twin.reconstruction import fdk_kernels
 
-        n, wide, rows = *weighing.factors.shape, weighing.up.shape[1]
+        n, wide, cols, rows = views.sizes
         ready = np.empty((n, rows, wide), np.float32)
-        fdk_kernels.weigh(
-            np.ascontiguousarray(images),
-            top,
-            weighing.factors,
-            weighing.across,
-            weighing.up,
-            ready,
-        )
-        columns = np.empty((n, kept.stop - kept.start, rows), np.float32)
-        fdk_kernels.stand_up(filtered(ready, response), kept.start, columns)
+        images = np.ascontiguousarray(views.images)
+        fdk_kernels.weigh(images, views.top, views.factors, views.across, views.up, ready)
+        columns = np.empty((n, cols, rows), np.float32)
+        fdk_kernels.stand_up(filtered(ready, views.response), views.kept.start, columns)
         fdk_kernels.backproject(
-            columns, shares, table, *self._first, *self._size, self._data, threads()
+            columns, views.shares, views.table, *self._first, *self._size, self._data, threads()
         )
 
     def volume(self) -> Float32Array:
@@ -156,8 +142,8 @@ class OnDevice:
     """On a CUDA device, circles only: images go there, and the volume comes back.
 
     Images are copied into one of two page-locked buffers while the device works on the other. The
-    filter is a plain convolution with the taps of its response: for 1000 columns a few hundredths
-    of a second for 360 views, without a library for Fourier transforms there.
+    filter is a plain convolution with the taps of its response, a product for each pair of pixels
+    of a row, without a library for Fourier transforms there.
 
     Raises:
         gpu.DeviceError: from each method; the device failed, and what was added is lost.
@@ -177,35 +163,18 @@ class OnDevice:
 
         gpu.demand(prepare)
 
-    def add(
-        self,
-        images: Float32Array,
-        top: int,
-        weighing: Weighing,
-        response: Float32Array,
-        kept: slice,
-        shares: Float32Array,
-        table: FloatArray,
-    ) -> None:
+    def add(self, views: Views) -> None:
         """See `Backprojector`."""
-        gpu.demand(lambda: self._add(images, top, weighing, response, kept, table))
+        gpu.demand(lambda: self._add(views))
 
-    def _add(
-        self,
-        images: Float32Array,
-        top: int,
-        weighing: Weighing,
-        response: Float32Array,
-        kept: slice,
-        table: FloatArray,
-    ) -> None:
+    def _add(self, views: Views) -> None:
         from numba import cuda
 
         from flexdt.twin.reconstruction import gpu_fdk_kernels as kernels
 
-        n, wide, rows = *weighing.factors.shape, weighing.up.shape[1]
-        cols, (ny, nx, nz), stream = kept.stop - kept.start, self._shape, self._stream
-        there = self._upload(images)
+        n, wide, cols, rows = views.sizes
+        (ny, nx, nz), stream = self._shape, self._stream
+        there = self._upload(views.images)
 
         def small(values: FloatArray, kind: type = np.float32) -> Any:
             return cuda.to_device(np.ascontiguousarray(values, dtype=kind), stream)
@@ -215,16 +184,15 @@ class OnDevice:
 
         weighted = cuda.device_array((n, wide, rows), np.float32, stream=stream)
         kernels.weigh[plane(wide), (*kernels.PLANE, 1), stream](
-            there, top, small(weighing.factors), small(weighing.across), small(weighing.up),
-            weighted,
+            there, views.top, small(views.factors), small(views.across), small(views.up), weighted
         )  # fmt: skip
         ready = cuda.device_array((n, cols, rows), np.float32, stream=stream)
         kernels.convolve[plane(-(-cols // kernels.RUN)), (*kernels.PLANE, 1), stream](
-            weighted, small(_taps(response, wide, kernels.RUN)), kept.start, ready
+            weighted, small(_taps(views.response, wide, kernels.RUN)), views.kept.start, ready
         )
         blocks = (-(-nz // (kernels.BLOCK[0] * kernels.RUN)), -(-nx // kernels.BLOCK[1]), ny)
         kernels.backproject[blocks, (*kernels.BLOCK, 1), stream](
-            ready.reshape(ready.size), cols, rows, small(table, np.float64), *self._grid,
+            ready.reshape(ready.size), cols, rows, small(views.table, np.float64), *self._grid,
             self._data.reshape(self._shape),
         )  # fmt: skip
 
@@ -533,7 +501,7 @@ def _fdk(
         shares = np.zeros((len(part), 0, 0), np.float32)
         if sharing is not None:
             shares = sharing.table(views, (first, last))
-        target.add(images, top, weighing, responses[pitch], kept, shares, table[views])
+        target.add(Views(images, top, *weighing, responses[pitch], kept, shares, table[views]))
         done = views.stop
         if progress is not None:
             progress(done / len(cone_vec))
@@ -547,8 +515,8 @@ def _fdk(
 
 def _weighing(
     shape: tuple[int, int], cone_vec: ConeVec, circle: Circle, views: slice, weights: FloatArray
-) -> Weighing:
-    """The weights that FDK applies before the filter.
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The weights that FDK applies before the filter: factors, across and up of `Views`.
 
     The cosine is that of the ray with the line from source to axis. Exact fan-beam inversion for a
     panel at any angle to that line then needs the distance along the panel's normal only.
@@ -564,7 +532,7 @@ def _weighing(
     z = panel[:, 2, None] + r * v[:, 2, None]
     along = (x * (inward / radius[:, None])[:, None]).sum(axis=2)
     factors = weights * along * (circle.step[views] * depth * radius)[:, None]
-    return Weighing(factors, (x * x).sum(axis=2), z * z)
+    return factors, (x * x).sum(axis=2), z * z
 
 
 def view_table(cone_vec: ConeVec, shape: tuple[int, int]) -> FloatArray:
