@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -434,57 +433,6 @@ def show_bare(page: Any, view: str, layer: str) -> Any:
     box.locator(".home").click()  # the preset of a picture as wide as this one
     still(box)
     return box
-
-
-PINK = (255.0, 60.0, 160.0)
-
-
-def path(page: Any) -> float:
-    told = re.match(r"aluminium ([0-9.]+) mm", page.inner_text("#measured"))
-    return float(told[1]) if told else math.nan
-
-
-def test_the_ray_of_a_pixel_and_what_it_goes_through(
-    scene: Any, twin: TwinClient, wait: Wait
-) -> None:
-    """Of an aluminium block that is turned: where its faces cut the line is computed here. In the
-    beam's eye the ray is a point, in the pixel that was asked for."""
-    size, turn = np.array([20.0, 12.0, 30.0]), 25.0
-    scene.evaluate("flexdt.call('session.control', {action: 'release'})")
-    block = trimesh.creation.box(size)
-    twin.upload_mesh(block.export(file_type="stl"), "a-block", format="stl")
-    twin.set_sample(file="a-block", material="aluminium", offset={"x": 2.0, "rz": turn})
-    twin.control("release")
-    scene.wait_for_function("flexdt.store.state.sample.name === 'a-block'")
-    seen(scene, twin)
-    told = twin.geometry()
-    source, middle, u, v = np.array(told.cone_vec).reshape(4, 3)
-    rows, cols = told.detector_shape
-    back = trimesh.transformations.rotation_matrix(-np.radians(turn), [0, 0, 1])[:3, :3]
-    rng = np.random.default_rng(8)
-    box = show(scene, "iso")
-    settled(box, lambda now: near(now, PINK) == 0)
-    scene.select_option("#tool", "ray")
-    for _ in range(4):
-        column, row = (cols // 2 + rng.integers(-30, 30)), (rows // 2 + rng.integers(-30, 30))
-        scene.fill("#measure-at", f"{column} {row}")
-        scene.press("#measure-at", "Enter")
-        end = middle + (column - (cols - 1) / 2) * u + (row - (rows - 1) / 2) * v
-        a, b = (back @ (p - [2.0, 0.0, 0.0]) for p in (source, end))
-        faces = np.sort((np.array([-size / 2, size / 2]) - a) / (b - a), axis=0)
-        inside = max(0.0, faces[1].min() - faces[0].max()) * np.linalg.norm(b - a)
-        assert inside > 5.0
-        length = f"{np.linalg.norm(end - source):.1f} mm from the focal spot"
-        wait(lambda inside=inside: abs(path(scene) - inside) < 0.02, f"{inside} mm of aluminium")
-        assert length in scene.inner_text("#measured")
-    settled(box, lambda now: near(now, PINK) > PATH_PX)
-    scene.select_option("#tool", "pan")
-    settled(box, lambda now: near(now, PINK) == 0)
-    scene.evaluate("flexdt.call('sample.set', {name: 'lego'})")
-
-
-def near(view: Any, colour: tuple[float, ...]) -> int:
-    return int((np.abs(view[..., :3] - np.array(colour)).max(axis=2) < 40.0).sum())
 
 
 def test_names_axes_scale_and_a_look_at_the_sample(scene: Any) -> None:

@@ -87,7 +87,7 @@ function beam(i) {
 }
 // The part of the beam that comes through: from the thickest place (all but one in a hundred let more through) on.
 function transmission(i) {
-  if (!i || i.kind !== "line_integral" || i.signed) return i?.signed ? "a difference, no transmission" : "transmission: choose line integral";
+  if (!i || i.kind !== "line_integral" || i.signed) return i?.signed ? `difference from the ${i.from === reference?.pixels ? "reference" : "virtual image"}` : "transmission: choose line integral";
   const through = [];
   for (let k = 0; k < i.pixels.length; k += EVERY) through.push(Math.exp(-(i.low + i.scale * i.pixels[k])));
   through.sort((a, b) => a - b);
