@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -339,31 +340,39 @@ def test_four_views_at_once(scene: Any) -> None:
 
 BLOCK_MM = (120.0, 80.0, 30.0)
 HIDDEN = ("machine", "panel", "beam", "axis", "orbit")
+MIDDLE = {"tra_obj": 0.0, "tra_tube": 0.0, "tra_det": 24.1, "ver_tube": 50.0, "ver_det": 60.0,
+          "mag_obj": 500.0, "mag_det": 1000.0, "rot_obj": 25.0}  # fmt: skip
+PINK = (255.0, 60.0, 160.0)
 
 
 @pytest.fixture
 def block(scene: Any, twin: TwinClient, wait: Wait) -> Iterator[Any]:
-    """A block on the stage, turned, the stages in the middle, and nothing else drawn."""
+    """A block on the stage, turned, the stages in the middle, and nothing else drawn; afterwards
+    everything is where it was."""
+    stood = {n: a.position for n, a in twin.state().axes.items() if n in MIDDLE}
     scene.evaluate("flexdt.call('session.control', {action: 'release'})")
     mesh = trimesh.creation.box(BLOCK_MM)
     twin.upload_mesh(mesh.export(file_type="stl"), "a-block", format="stl")
     twin.set_sample(file="a-block", material="abs")
-    scene.evaluate("flexdt.call('session.control', {action: 'force'})")
-    targets = {"tra_obj": 0.0, "tra_tube": 0.0, "tra_det": 24.1, "ver_tube": 50.0, "ver_det": 60.0,
-               "mag_obj": 500.0, "mag_det": 1000.0, "rot_obj": 25.0}  # fmt: skip
-    scene.evaluate("t => flexdt.call('axes.move', {targets: t, plan: true})", targets)
-
-    def there() -> bool:
-        axes = twin.state().axes
-        return all(abs(axes[n].position - v) < 1e-6 for n, v in targets.items())
-
-    wait(there, "in the middle")
+    go(scene, twin, wait, MIDDLE)
     layers(scene, **dict.fromkeys(HIDDEN, False), opacity=1.0)
     scene.set_viewport_size({"width": 1340, "height": 800})
     yield scene
     scene.set_viewport_size({"width": SIZE[0], "height": SIZE[1]})
     layers(scene, **dict.fromkeys(HIDDEN, True), sample=True, opacity=0.6)
     scene.evaluate("flexdt.call('sample.set', {name: 'lego'})")
+    go(scene, twin, wait, stood)
+
+
+def go(scene: Any, twin: TwinClient, wait: Wait, targets: dict[str, float]) -> None:
+    scene.evaluate("flexdt.call('session.control', {action: 'force'})")
+    scene.evaluate("t => flexdt.call('axes.move', {targets: t, plan: true})", targets)
+
+    def there() -> bool:
+        axes = twin.state().axes
+        return all(abs(axes[n].position - v) < 1e-6 for n, v in targets.items())
+
+    wait(there, f"at {targets}")
 
 
 def off_outline(box: Any, layer: str, view: str, points: npt.NDArray[np.float64]) -> float:
@@ -433,6 +442,84 @@ def show_bare(page: Any, view: str, layer: str) -> Any:
     box.locator(".home").click()  # the preset of a picture as wide as this one
     still(box)
     return box
+
+
+def test_a_clicked_pixels_ray_is_drawn_and_says_what_it_goes_through(
+    block: Any, twin: TwinClient, wait: Wait
+) -> None:
+    """Where the ray cuts the block's faces, and where it lies on the screen, is computed here."""
+    box = show_bare(block, "iso", "machine")
+    layers(block, machine=False, sample=False)
+    settled(box, lambda now: pink(now).sum() == 0)
+    seen(block, twin)
+    told = twin.geometry()
+    source, middle, u, v = np.array(told.cone_vec).reshape(4, 3)
+    rows, cols = told.detector_shape
+    block.wait_for_function("flexdt.store.image.code === 'deflate'")
+    block.select_option("#tool", "ray")
+    rng = np.random.default_rng(8)
+    for k in range(3):
+        # In the object's frame the block stands as it was uploaded; the panel sees its upper part.
+        aim = rng.uniform([-0.4, -0.4, 0.3], [0.4, 0.4, 0.48]) * BLOCK_MM
+        across, down, _ = np.linalg.solve(np.stack([u, v, source - aim], axis=1), source - middle)
+        column, row = round(across + (cols - 1) / 2), round(down + (rows - 1) / 2)
+        if k == 0:
+            block.fill("#measure-at", f"{column} {row}")
+            block.press("#measure-at", "Enter")
+        else:
+            click_pixel(block, column, row, (rows, cols))
+        end = middle + (column - (cols - 1) / 2) * u + (row - (rows - 1) / 2) * v
+        faces = np.sort((np.array([-1, 1])[:, None] * BLOCK_MM / 2 - source) / (end - source), 0)
+        length = float(np.linalg.norm(end - source))
+        inside = max(0.0, faces[1].min() - faces[0].max()) * length
+        assert inside > 5.0
+        words = rf"abs {NUMBER} mm · {NUMBER} mm from the focal spot"
+
+        def said(wanted: tuple[float, float] = (inside, length), words: str = words) -> bool:
+            found = re.fullmatch(words, block.inner_text("#measured"))
+            return found is not None and np.allclose([*map(float, found.groups())], wanted, 0, 0.06)
+
+        wait(said, f"{inside} mm of abs at {column} {row}")
+    here, there = (
+        np.array(_on_screen({**box.bounding_box(), "x": 0.0, "y": 0.0}, "iso", point))
+        for point in (_handles(block, twin)["source"], place_of(twin, (column, row)))
+    )
+    shown = settled(box, lambda now: pink(now).sum() > PATH_PX)
+    y, x = np.nonzero(pink(shown))
+    length = float(np.linalg.norm(there - here))
+    along, at = (there - here) / length, np.stack([x, y], axis=1) + 0.5 - here
+    assert np.abs(at @ [-along[1], along[0]]).max() <= 4.0
+    assert (at @ along).min() == pytest.approx(0.0, abs=6.0)
+    assert (at @ along).max() == pytest.approx(length, abs=6.0)
+    block.select_option("#tool", "pan")
+    settled(box, lambda now: pink(now).sum() == 0)
+
+
+NUMBER = r"([0-9.]+)"
+
+
+def pink(view: Any) -> Any:
+    return np.abs(view[..., :3] - np.array(PINK)).max(axis=2) < 40.0
+
+
+def place_of(twin: TwinClient, pixel: tuple[int, int]) -> npt.NDArray[np.float64]:
+    """The centre of a pixel in the world [m], of a machine that stands in the middle."""
+    state = twin.state()
+    at, pitch = state.geometry.piercing_point_px, state.camera.pixel_mm * 0.001
+    height = (state.axes["ver_tube"].position - 6.29) * 0.001
+    return np.array([(pixel[0] - at[0]) * pitch, state.geometry.SDD_mm * 0.001,
+                     height - (pixel[1] - at[1]) * pitch])  # fmt: skip
+
+
+def click_pixel(page: Any, column: int, row: int, shape: tuple[int, int]) -> None:
+    """Clicks a pixel of the radiograph that is fitted into its film."""
+    canvas = page.locator("#film-canvas")
+    canvas.scroll_into_view_if_needed()
+    box = canvas.bounding_box()
+    scale = min(box["width"] / shape[1], box["height"] / shape[0])
+    x = box["x"] + box["width"] / 2 + (column + 0.5 - shape[1] / 2) * scale
+    y = box["y"] + box["height"] / 2 + (row + 0.5 - shape[0] / 2) * scale
+    page.mouse.click(x, y)
 
 
 def test_names_axes_scale_and_a_look_at_the_sample(scene: Any) -> None:
