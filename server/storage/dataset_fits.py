@@ -72,4 +72,4 @@ def _there(root: Path, name: str, what: str) -> Path:
 
 def _face() -> Any:
     """The package's own functions, which know all rooms; by name, as servers know no clients."""
-    return import_module("flexdt.analysis")
+    return import_module("flexdt")

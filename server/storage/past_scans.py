@@ -258,7 +258,7 @@ def _texts(folder: Folder) -> Any:
     if folder.document or list_folder(folder.path).names != folder.names:  # links are not followed
         return None
     try:
-        return import_module("flexdt.clients.datasets.dataset").load_dataset(folder.path)
+        return import_module("flexdt").open(folder.path)
     except TwinError:
         return None
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 import time
 import xml.etree.ElementTree as ET
@@ -29,6 +27,7 @@ from flexdt.server.bench.measure import errors, exact_images, interleaved, sorte
 from flexdt.server.bench.peers import Peer
 from flexdt.twin.projection import forward, gpu, project_mesh, project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
+from tests.support.device_simulator import run_simulated
 
 SHAPE = (30, 40)
 PAGE = load(Path(__file__).parents[2] / "docs" / "tools" / "bench_page.py")
@@ -382,14 +381,7 @@ command.main()
 
 
 def test_the_page_of_a_device_has_every_target(tmp_path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", DEVICE, str(tmp_path)],
-        env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr
+    run_simulated(DEVICE, str(tmp_path))
     document = json.loads((tmp_path / "device.json").read_text("utf-8"))
     lines = {line["target"]: line for line in document["targets"]}
     assert len(lines) == len(document["targets"]) == 3 * 8 + 4

@@ -92,66 +92,35 @@ def kernel_scatter(
         >>> float(kernel_scatter(air, scan, chain, 90.0).scatter.signal(0).max())
         0.0
     """
-    from scipy.optimize import nnls
-
     wanted = ScatterSettings() if settings is None else settings
-    stack, shape, views = line_integrals, correction.shape_of(line_integrals), cone_vec.rows
+    stack, shape = line_integrals, correction.shape_of(line_integrals)
     every, whole = (cone_vec, shape) if panels is None else panels
     known = np.arange(0, len(every), -(-len(every) // len(stack)))
     beam, (mu, straighten) = simulation.Beam.of(chain, kV), correction.attenuations(chain, kV)
     grid = correction.coarse_grid(cone_vec, shape, wanted)
 
-    def simulated(thing: Object, chosen: npt.NDArray[np.intp]) -> list[simulation.ScatterImage]:
-        return [simulation.scatter_image(thing, views[i], shape, beam, wanted, i) for i in chosen]
+    def reconstructed(integrals: Float32Array) -> tuple[Volume, Object]:
+        volume = correction.volume_of(straighten(integrals), cone_vec, grid)
+        return volume, correction.object_in(volume, chain, mu)
 
-    def spread(
-        i: int, transmission: FloatArray, amplitudes: FloatArray, panel: FloatArray, size: Shape
-    ) -> FloatArray:
-        """What each Gaussian brings to the nodes of a panel in view `i`, (m, widths, v, u)."""
-        pixels = _places(views[i], shape, shape, views[i])
-        at = _places(panel, size, nodes, views[i])
-        inside = np.clip(transmission, 1e-30, 1.0)
-        out = np.zeros((*amplitudes.shape, *nodes))
-        for m, gap in enumerate(gaps[:, i]):
-            known = gap[gap > 0.0] if gap.any() else np.ones(1)
-            ways = np.unique(np.linspace(known.min(), known.max(), PLANES))
-            between = max(float(np.ptp(ways)) / (PLANES - 1), 1e-9)
-            for way, k in product(ways, np.flatnonzero(amplitudes[m])):
-                share = parts[m, i] * np.maximum(1.0 - np.abs(gap - way) / between, 0.0)
-                sigma = WIDTHS[k] * way
-                down, across = (
-                    np.exp(-0.5 * ((to[:, None] - pixel) / sigma) ** 2) * np.ptp(pixel[:2]) / sigma
-                    for to, pixel in zip(at, pixels, strict=True)
-                )
-                out[m, k] -= down @ (share * inside * np.log(inside)) @ across.T
-        return np.asarray(out * amplitudes[..., None, None] / (2.0 * np.pi))
+    def simulated(thing: Object, chosen: npt.NDArray[np.intp]) -> list[simulation.ScatterImage]:
+        rows = cone_vec.rows
+        return [simulation.scatter_image(thing, rows[i], shape, beam, wanted, i) for i in chosen]
 
     fitted, checked = np.linspace(0, len(stack) - 1, SIMULATED).astype(int).reshape(-1, 2).T
-    volume = correction.volume_of(straighten(stack), cone_vec, grid)
-    thing = correction.object_in(volume, chain, mu)
+    _, thing = reconstructed(stack)
     images = simulated(thing, fitted)
-    nodes = images[0].mean.shape
-    paths, gaps = _paths(thing, cone_vec, shape)
-    weakened = mu[:, None, None, None] * paths
-    parts = weakened / np.maximum(weakened.sum(axis=0), 1e-12)
+    views = _Views.of(thing, mu, cone_vec, shape, images[0].mean.shape)
     if amplitudes is None:
-        # The object as FDK shows it transmits what it was reconstructed from.
-        ones = np.ones((len(mu), len(WIDTHS)))
-        columns = [spread(i, np.exp(-stack[i]), ones, views[i], shape) for i in fitted]
-        matrix = np.stack(columns, axis=-1).reshape(ones.size, -1).T
-        seen = np.stack([one.mean for one in images], axis=-1).ravel()
-        amplitudes = nnls(matrix, seen)[0].reshape(ones.shape)
-    direct = stack.copy()
-    for i, _ in product(range(len(stack)), range(REPEATS)):
-        scatter = spread(i, np.exp(-direct[i]), amplitudes, views[i], shape).sum(axis=(0, 1))
-        direct[i] = correction.subtracted(stack[i], simulation.spread_out(scatter, shape))
-    found = []
-    for i, k in enumerate(known):
-        m = spread(i, np.exp(-direct[i]), amplitudes, every.rows[k], whole).sum(axis=(0, 1))
-        found.append(replace(images[0], shape=whole, mean=m, error=0 * m, spread=0 * m))
+        amplitudes = views.fitted(stack, fitted, images)
+    direct = views.without_scatter(stack, amplitudes)
+    means = [
+        views.spread(i, direct[i], amplitudes, every.rows[k], whole).sum(axis=(0, 1))
+        for i, k in enumerate(known)
+    ]
+    found = [replace(images[0], shape=whole, mean=m, error=0 * m, spread=0 * m) for m in means]
 
-    volume = correction.volume_of(straighten(direct), cone_vec, grid)
-    thing = correction.object_in(volume, chain, mu)
+    volume, thing = reconstructed(direct)
     truth = np.stack([one.full() for one in simulated(thing, checked)])
     wrong = correction.subtracted(stack[checked], truth) - direct[checked]
     missed = math.sqrt((wrong**2).sum() / max((direct[checked] ** 2).sum(), 1e-9))
@@ -165,6 +134,85 @@ def kernel_scatter(
     way = simulation.way_of(every.rows)
     scan = ScanScatter(wanted, tuple(found), tuple(known.tolist()), way, way[known])
     return KernelScatter(scan, amplitudes, missed, tuple(doubts))
+
+
+@dataclass(frozen=True, eq=False)
+class _Views:
+    """What weakens the rays of each view, and how far from the panel.
+
+    Attributes:
+        rows: (n, 12) of `ConeVec`.
+        shape: rows and columns of their panels.
+        nodes: rows and columns of the places on a panel where scatter is evaluated.
+        parts: of the line integrals, by material, (m, n, rows, cols).
+        gaps: from the middle of each material to the panel's plane [mm], 0 where it is not,
+            (m, n, rows, cols).
+    """
+
+    rows: FloatArray
+    shape: Shape
+    nodes: Shape
+    parts: FloatArray
+    gaps: FloatArray
+
+    @classmethod
+    def of(
+        cls, thing: Object, mu: FloatArray, cone_vec: ConeVec, shape: Shape, nodes: Shape
+    ) -> _Views:
+        """Of an object whose materials attenuate by `mu` [1/mm]."""
+        paths, gaps = _paths(thing, cone_vec, shape)
+        weakened = mu[:, None, None, None] * paths
+        parts = weakened / np.maximum(weakened.sum(axis=0), 1e-12)
+        return cls(cone_vec.rows, shape, nodes, parts, gaps)
+
+    def spread(
+        self, i: int, direct: Float32Array, amplitudes: FloatArray, panel: FloatArray, size: Shape
+    ) -> FloatArray:
+        """What each Gaussian brings to the nodes of a panel (12,) of `size` in view `i`, whose line
+        integrals without scatter are `direct`, (m, widths, v, u)."""
+        pixels = _places(self.rows[i], self.shape, self.shape, self.rows[i])
+        at = _places(panel, size, self.nodes, self.rows[i])
+        inside = np.clip(np.exp(-direct), 1e-30, 1.0)
+        left = inside * np.log(inside)
+        out = np.zeros((*amplitudes.shape, *self.nodes))
+        for m, gap in enumerate(self.gaps[:, i]):
+            there = gap[gap > 0.0] if gap.any() else np.ones(1)
+            ways = np.unique(np.linspace(there.min(), there.max(), PLANES))
+            between = max(float(np.ptp(ways)) / (PLANES - 1), 1e-9)
+            for way, k in product(ways, np.flatnonzero(amplitudes[m])):
+                share = self.parts[m, i] * np.maximum(1.0 - np.abs(gap - way) / between, 0.0)
+                sigma = WIDTHS[k] * way
+                down, across = (
+                    np.exp(-0.5 * ((to[:, None] - pixel) / sigma) ** 2) * np.ptp(pixel[:2]) / sigma
+                    for to, pixel in zip(at, pixels, strict=True)
+                )
+                out[m, k] -= down @ (share * left) @ across.T
+        return np.asarray(out * amplitudes[..., None, None] / (2.0 * np.pi))
+
+    def fitted(
+        self,
+        stack: Float32Array,
+        chosen: npt.NDArray[np.intp],
+        images: list[simulation.ScatterImage],
+    ) -> FloatArray:
+        """Amplitudes (m, widths) with which the chosen views scatter as simulated: the object as
+        FDK shows it transmits what it was reconstructed from."""
+        from scipy.optimize import nnls
+
+        ones = np.ones((len(self.parts), len(WIDTHS)))
+        columns = [self.spread(i, stack[i], ones, self.rows[i], self.shape) for i in chosen]
+        matrix = np.stack(columns, axis=-1).reshape(ones.size, -1).T
+        seen = np.stack([one.mean for one in images], axis=-1).ravel()
+        return np.asarray(nnls(matrix, seen)[0].reshape(ones.shape))
+
+    def without_scatter(self, stack: Float32Array, amplitudes: FloatArray) -> Float32Array:
+        """Line integrals of what remains when the scatter that it causes is subtracted."""
+        direct = stack.copy()
+        for i, _ in product(range(len(stack)), range(REPEATS)):
+            scatter = self.spread(i, direct[i], amplitudes, self.rows[i], self.shape)
+            whole = simulation.spread_out(scatter.sum(axis=(0, 1)), self.shape)
+            direct[i] = correction.subtracted(stack[i], whole)
+        return direct
 
 
 def _paths(thing: Object, cone_vec: ConeVec, shape: Shape) -> tuple[FloatArray, FloatArray]:

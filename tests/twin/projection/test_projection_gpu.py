@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +15,7 @@ from flexdt.twin.projection import Volume, back, forward, gpu, gpu_astra
 from flexdt.twin.projection.cpu import project, spread
 from flexdt.twin.projection.operators import box_of, voxel_rays
 from flexdt.twin.projection.volume import blank_layout
+from tests.support.device_simulator import run_simulated
 
 FOUND = gpu.availability()
 needs_gpu = pytest.mark.skipif(not FOUND.present, reason=f"no CUDA device: {FOUND.reason}")
@@ -68,7 +68,6 @@ assert np.array_equal(back(y, geometry, volume).data, layout_data(layout))
 assert np.array_equal(back(y, geometry, volume, out).data, layout_data(layout))
 gpu.free_bytes = lambda: None
 assert np.array_equal(back(y, geometry, volume).data, fits)
-print("simulated")
 """
 
 
@@ -132,30 +131,15 @@ for count, chunk, portions in ((19, 10**9, [(0, 10), (1, 9)]), (7, 10**9, [(0, 7
         exact = forward(volume, scan, (4, 5))
     assert np.abs(images - exact).max() < 3e-6 * exact.max() and exact.max() > 0
 assert sorted(uploads) == [0, 1], uploads  # the volume goes to each device once
-print("simulated")
 """
 
 
 def test_views_are_dealt_to_two_devices_that_share_nothing() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", TWO_DEVICES],
-        env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.stdout.strip() == "simulated", done.stderr
+    run_simulated(TWO_DEVICES)
 
 
 def test_host_logic_and_kernels_in_the_simulator() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", SIMULATED],
-        env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"},
-        capture_output=True,
-        text=True,
-        timeout=200,
-    )
-    assert done.stdout.strip() == "simulated", done.stderr
+    run_simulated(SIMULATED)
 
 
 DRAWN = """
@@ -170,7 +154,7 @@ gpu_kernels.BLOCK = (4, 2)  # a thread of the simulator costs more than what it 
 gpu.VIEWS_A_THREAD = 0.0
 level_axis.level_axes = lambda rays, *_: np.zeros(len(rays), int)  # fans along z, as in scans
 rng = np.random.default_rng(20261122)
-walked, means = [], []
+walked = []
 
 def processor(function, *arguments):
     real, gpu.availability = gpu.availability, lambda: gpu.Availability(False, "switched off")
@@ -203,7 +187,6 @@ for roll, height in ((0.0, 0.0), (0.0, 12.0), (0.03, 4.0), (1.6, -6.0), (0.8, 0.
     images = forward(volume, geometry, shape)
     exact = _siddon(data, voxel, center, geometry, shape)
     error = np.abs(images - exact) / exact.max()
-    means.append(error.mean())
     assert (exact > 0).mean() > 0.2, (roll, height)
     assert error.mean() < 3e-7 and error.max() < 3e-6, (roll, height, error.mean(), error.max())
     y = rng.random(images.shape, dtype=np.float32)
@@ -250,7 +233,6 @@ for geometry, shape in cases:
         d = g[3:6] + c[..., None] * g[6:9] + r[..., None] * g[9:12]
         inside += int((np.abs(d / np.abs(d).max(axis=2, keepdims=True)) < 1e-11).any(axis=2).sum())
 assert inside > 30, inside
-print("exact", np.mean(means))
 """
 
 
@@ -266,14 +248,7 @@ def test_compiled_kernels_keep_their_budget() -> None:
 
 
 def test_kernels_are_exact_in_the_simulator() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", DRAWN],
-        env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"},
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
-    assert done.stdout.startswith("exact"), done.stderr
+    run_simulated(DRAWN)
 
 
 THERE = """
@@ -368,19 +343,11 @@ assert "mps" in refused(lambda: there.to("mps"), NotBuiltError)
 gpu_kernels.project_slabs = None
 assert "failed" in refused(lambda: forward(there, geometry, shape), TwinError)
 assert "failed" in refused(lambda: volume.to("cuda"), NotBuiltError)
-print("there")
 """
 
 
 def test_volumes_on_a_device_stay_there_and_copies_are_counted() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", THERE],
-        env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.stdout.strip() == "there", done.stderr
+    run_simulated(THERE)
 
 
 def test_there_is_no_volume_on_a_device_that_is_not_there() -> None:
@@ -495,19 +462,11 @@ full = RuntimeError("[2] Call to cuMemAlloc results in CUDA_ERROR_OUT_OF_MEMORY"
 put(failing(1, full))
 assert np.array_equal(forward(Volume(volume.data, 4.0), scan, shape), exact[0])
 assert "lacks memory" in said[0] and gpu.availability().present
-print("survived")
 """
 
 
 def test_a_device_that_fails_at_any_time_leaves_it_to_the_processor() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", FAILING],
-        env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"},
-        capture_output=True,
-        text=True,
-        timeout=200,
-    )
-    assert done.stdout.strip() == "survived", done.stderr
+    run_simulated(FAILING)
 
 
 def test_few_views_of_a_volume_of_the_host_stay_on_the_processor(monkeypatch) -> None:

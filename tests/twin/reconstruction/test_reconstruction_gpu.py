@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
 from flexdt.twin.projection import gpu
 from flexdt.twin.reconstruction import Grid, fdk
 from flexdt.twin.reconstruction.fdk import device_takes
+from tests.support.device_simulator import run_simulated
 from tests.twin.reconstruction.scans import ball, circle, measure
 
 FOUND = gpu.availability()
@@ -64,7 +61,6 @@ for case in range(4):
     assert ((here != 0) == (there != 0)).all(), case
     worst = np.abs(here - there).max() / np.abs(here).max()
     assert worst < 3e-6, (case, worst)
-print("simulated")
 """
 
 ITERATED = """
@@ -143,20 +139,12 @@ gpu_array_kernels.fold = Broken()
 assert np.array_equal(cgls(images, scan, volume, iterations=2).data,
                       cgls(images, scan, volume, iterations=2).data)
 assert not gpu.availability().present and "lost" in gpu.availability().reason
-print("simulated")
 """
 
 
 @pytest.mark.parametrize("program", [SIMULATED, ITERATED], ids=["fdk", "iterative"])
 def test_what_runs_in_the_simulator_gives_the_processors_numbers(program: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.stdout.strip() == "simulated", done.stderr
+    run_simulated(program)
 
 
 def test_a_volume_too_large_for_the_device_goes_to_the_processor(monkeypatch) -> None:
