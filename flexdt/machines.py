@@ -27,12 +27,29 @@ def machine(word: str | PathLike[str] | None = None) -> Machine:
         >>> flexray.detector.camera.shape, flexray.axes["rot_obj"].unit
         ((760, 956), 'deg')
     """
-    from flexdt.twin.machine.description import builtin_machine, parse_machine
+    from flexdt.twin.machine.description import builtin_machine
 
     name = DEFAULT_MACHINE if word is None else fspath(word)
     if is_file(name):
-        return parse_machine(Path(name).read_text(encoding="utf-8"), name)
+        return parsed(Path(name).read_text(encoding="utf-8"), name)
     return builtin_machine(name)
+
+
+def parsed(text: str, file: str) -> Machine:
+    """A machine from the text of its file, and from the meshes of its parts, which lie beside it.
+
+    Raises:
+        MachineFileError: the text or a mesh does not hold; file, part, what is allowed.
+    """
+    from flexdt.phantoms.files.mesh_files import read_part
+    from flexdt.twin.collision.outer_hull import outer_hull
+    from flexdt.twin.machine.description import Vector3, parse_machine
+
+    def corners(name: str) -> list[Vector3]:
+        around = outer_hull(read_part(Path(file).parent / name).vertices)
+        return [(x, y, z) for x, y, z in around.vertices.tolist()]
+
+    return parse_machine(text, file, corners)
 
 
 def profile(

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
 
+from flexdt import machines
 from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress
 from flexdt.clients.gateway.connected_twin import ConnectedTwin
 from flexdt.process_settings import GatewaySettings, parse
@@ -25,7 +26,7 @@ from flexdt.server.runtime.process import (
     run_process,
     stop_signal,
 )
-from flexdt.twin.machine.description import parse_machine, parse_profile
+from flexdt.twin.machine.description import parse_profile
 
 EVENTS_HZ = 20.0
 
@@ -46,7 +47,7 @@ async def run(options: GatewaySettings) -> int:
         lambda topic, params: heard[0].heard(topic, params),
         subscription={"topics": ["state", "job"], "max_rate_hz": EVENTS_HZ},
     )
-    machine = read_if_there(options.machine, parse_machine)
+    machine = read_if_there(options.machine, machines.parsed)
     profile = read_if_there(options.profile, parse_profile)
     twin = ConnectedTwin(link, options.data.absolute(), machine, profile)
     heard.append(twin)

@@ -7,6 +7,7 @@ is written here.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -54,11 +55,12 @@ def replay_file(
     state: State,
     look: Look,
     planned: Scrubbed,
+    looks: Mapping[str, bytes] | None,
     form: Form,
     dark: bool,
 ) -> bytes:
     """A plan, or a scan that was made, as a file that plays it."""
-    return _file(_replay(machine, profile, state, look, planned), form, dark)
+    return _file(_replay(machine, profile, state, look, planned, looks), form, dark)
 
 
 def _file(serializer: Any, form: Form, dark: bool) -> bytes:
@@ -67,13 +69,20 @@ def _file(serializer: Any, form: Form, dark: bool) -> bytes:
     return bytes(serializer.serialize())
 
 
-def _replay(machine: Machine, profile: Profile, state: State, look: Look, planned: Scrubbed) -> Any:
+def _replay(
+    machine: Machine,
+    profile: Profile,
+    state: State,
+    look: Look,
+    planned: Scrubbed,
+    looks: Mapping[str, bytes] | None,
+) -> Any:
     scenes = Scenes()
     server = scenes.server
     try:
         server.initial_camera.position = FREE.position
         server.initial_camera.look_at = FREE.look_at
-        scene = LabScene(server, machine, profile)
+        scene = LabScene(server, machine, profile, looks=looks)
         scene.wear(look)
         serializer = server.get_scene_serializer()
         for time_s in np.linspace(0.0, planned.duration_s, FRAMES):

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from contextlib import redirect_stdout
 from typing import TextIO
 
+from flexdt import machines
 from flexdt.clients.client.kept_connection import TwinAddress
 from flexdt.process_settings import Address, ViewerSettings, parse
 from flexdt.server.runtime.access import (
@@ -31,7 +32,7 @@ from flexdt.server.runtime.process import (
     run_process,
     stop_signal,
 )
-from flexdt.twin.machine.description import parse_machine, parse_profile
+from flexdt.twin.machine.description import parse_profile
 
 
 async def run(options: ViewerSettings, out: TextIO) -> int:
@@ -40,6 +41,7 @@ async def run(options: ViewerSettings, out: TextIO) -> int:
     The ready line goes to `out`; returns the exit code.
     """
     from flexdt.clients.viewer.page_methods import ANSWERS
+    from flexdt.clients.viewer.scenes.parts import own_looks
     from flexdt.clients.viewer.viewer import Viewer
     from flexdt.clients.viewer.viewer_health import viewer_pages
     from flexdt.server.runtime.http_pages import served_pages
@@ -49,9 +51,10 @@ async def run(options: ViewerSettings, out: TextIO) -> int:
     twin = options.twin
     twin_address = TwinAddress(twin.host, twin.port, token, ssl)
     limits = with_limits(options.limit, ViewerLimits())
-    machine = read_if_there(options.machine, parse_machine)
+    machine = read_if_there(options.machine, machines.parsed)
     profile = read_if_there(options.profile, parse_profile)
-    viewer = Viewer(twin_address, ANSWERS, machine, profile, token, options.data, limits)
+    looks = own_looks(machine, options.machine.parent) if machine and options.machine else None
+    viewer = Viewer(twin_address, ANSWERS, machine, profile, token, options.data, limits, looks)
     stop = stop_signal()
     context = server_tls(options.tls_cert, options.tls_key)
     try:

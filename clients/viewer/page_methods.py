@@ -330,7 +330,10 @@ async def export(viewer: Viewer, page: Page, params: p.Export) -> object:
     elif page.plan is None or viewer.state is None:
         raise RpcError(Code.INVALID_PARAMS, "plan a script first: there is nothing to replay")
     else:
-        make = partial(replay_file, lab.machine, lab.profile, viewer.state, viewer.look, page.plan)
+        make = partial(
+            replay_file, lab.machine, lab.profile, viewer.state, viewer.look, page.plan,
+            viewer.looks,
+        )  # fmt: skip
     with _room(viewer):
         content = await asyncio.to_thread(make, form, page.dark)
     what = "replay" if params.replay else "scene"

@@ -78,6 +78,7 @@ class Viewer:
         token: browsers must show; None for none.
         data: the twin's data directory where it can be read, for slices of running scans.
         limits: what all pages together may cost.
+        looks: part of `machine` -> its own mesh.
 
     Attributes:
         failed: set when an essential task has failed; the process then ends.
@@ -92,9 +93,10 @@ class Viewer:
         token: str | None = None,
         data: Path | None = None,
         limits: ViewerLimits | None = None,
+        looks: Mapping[str, bytes] | None = None,
     ) -> None:
         self.twin_address, self._token = address, token
-        self._machine, self._profile = machine, profile
+        self._machine, self._profile, self.looks = machine, profile, looks
         self.data, self.limits = data, limits or ViewerLimits()
         self.failed = asyncio.Event()
         self.grower = Grower(self._grown)
@@ -299,7 +301,9 @@ class Viewer:
         named = None if hello is None else hello.profile
         profile = self._profile or profile_of(machine, named)
         if self.lab is None or (self.lab.machine, self.lab.profile) != (machine, profile):
-            scene = await asyncio.to_thread(LabScene, self.viser, machine, profile, self._dragged)
+            scene = await asyncio.to_thread(
+                LabScene, self.viser, machine, profile, self._dragged, self.looks
+            )
             if self.lab is not None:  # what was shown stays shown
                 for what, visible in self.lab.scene.shown.items():
                     scene.show(what, visible)

@@ -38,6 +38,11 @@ DEFAULT_UNIT: Final[Mapping[str, str]] = {"glb": "m"}
 MAX_BYTES: Final = 256 << 20
 MAX_FACES: Final = 4_000_000
 MAX_EXTENT_MM: Final = 2000.0
+PART_FORMATS: Final = ("glb", "stl")
+MAX_PART_BYTES: Final = 32 << 20
+MAX_PART_FACES: Final = 300_000
+MAX_PART_MM: Final = 20_000.0
+"""Of a machine's part: browsers draw a dozen of them at once."""
 MAX_PLY_HEADER: Final = 1 << 16
 MAX_PLANES: Final = 128
 """A convex mesh with at most so many planes is projected as a solid, others as their triangles."""
@@ -153,6 +158,31 @@ def read_mesh(source: bytes | str | os.PathLike[str]) -> trimesh.Trimesh:
     """
     raw, kind, label = _read(source, None)
     return _closed(_parse(raw, kind), label)
+
+
+def read_part(path: str | os.PathLike[str]) -> trimesh.Trimesh:
+    """The triangles of a machine's part [mm], from a GLB (m) or STL file (mm); they may be open.
+
+    Raises:
+        PhantomError: no such file, its format, size or content; says what is allowed.
+    """
+    kind = Path(path).suffix.lstrip(".").lower()
+    if kind not in PART_FORMATS:
+        raise PhantomError(f"{path}: not the mesh of a part; allowed: {', '.join(PART_FORMATS)}")
+    raw, _, _ = _read(path, kind)
+    if len(raw) > MAX_PART_BYTES:
+        raise PhantomError(f"{path} has {len(raw)} bytes; allowed: {MAX_PART_BYTES}")
+    mesh = _parse(raw, kind)
+    if len(mesh.faces) > MAX_PART_FACES:
+        raise PhantomError(f"{path}: {len(mesh.faces)} triangles; allowed: {MAX_PART_FACES}")
+    mesh.vertices *= UNITS_MM[default_unit(kind)]
+    largest = float(mesh.extents.max())
+    if not 0.0 < largest <= MAX_PART_MM:
+        raise PhantomError(
+            f"{path} measures {largest:g} mm; allowed: more than 0, at most {MAX_PART_MM:g} mm. "
+            "An STL file is taken to be in mm, a GLB file in m"
+        )
+    return mesh
 
 
 def default_unit(file_type: str) -> str:

@@ -276,7 +276,7 @@ def _chain(
 def _solid(part: Component, profile: Profile, p: Offsets) -> Cylinder | Polytope:
     if part.shape == "cylinder":
         return Cylinder(part.center_mm, 0.5 * part.size_mm[0], part.size_mm[2])
-    solid = box(part.size_mm, part.center_mm)
+    solid = hull(part.points_mm) if part.points_mm else box(part.size_mm, part.center_mm)
     turned = profile.det_roll_deg or p.det_yaw or p.det_pitch or p.det_roll
     if part.role == "panel" and turned:
         return Polytope(solid.vertices @ _panel_turn(profile, p).T, solid.faces)

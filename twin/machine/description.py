@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from importlib import resources
 from typing import Annotated, Any, Final, Literal, TypeVar
@@ -26,7 +26,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from flexdt.twin.errors import LimitError, MachineFileError, UnknownNameError
+from flexdt.twin.errors import LimitError, MachineFileError, TwinError, UnknownNameError
 from flexdt.twin.geometry.offsets import NAMES
 from flexdt.twin.machine.camera import CameraSettings, Roi, Sensor, binning_of, check_roi
 from flexdt.twin.values import message_of
@@ -243,6 +243,16 @@ class TubeSpec(_Frozen):
         return self
 
 
+MAX_POINTS: Final = 256
+"""Most corners of a convex part."""
+
+
+def _box_around(points: Iterable[Vector3]) -> tuple[Vector3, Vector3]:
+    """Edges and centre of the upright box around points."""
+    (x, x_), (y, y_), (z, z_) = ((min(c), max(c)) for c in zip(*points, strict=True))
+    return (x_ - x, y_ - y, z_ - z), ((x + x_) / 2, (y + y_) / 2, (z + z_) / 2)
+
+
 class Component(_Frozen):
     """A convex part of the machine on its kinematic chain; upright in world axes, mm.
 
@@ -256,8 +266,14 @@ class Component(_Frozen):
     parent: str | None = None
     axis: str | None = None
     """The motor that moves this part relative to its parent (None: rigidly mounted)."""
-    shape: Literal["box", "cylinder"] = "box"
-    """`cylinder` stands upright: size x is its diameter (y the same), z its height."""
+    shape: Literal["box", "cylinder", "hull"] = "box"
+    """`cylinder` stands upright: size x is its diameter (y the same), z its height. `hull` is the
+    convex hull of `points_mm`, for parts with a mesh."""
+    mesh: str = ""
+    """A GLB or STL file beside the machine file: how the part looks. `points_mm` contain it."""
+    mesh_at_mm: Vector3 = (0.0, 0.0, 0.0)
+    """Where the mesh's origin stands, measured as `center_mm` is."""
+    points_mm: tuple[Vector3, ...] = Field((), max_length=MAX_POINTS)
     size_mm: tuple[Positive, Positive, Positive]
     center_mm: Vector3
     anchor: Literal["world", "source", "object", "detector"] = "world"
@@ -276,6 +292,10 @@ class Component(_Frozen):
     def _round(self) -> Component:
         if self.shape == "cylinder" and self.size_mm[0] != self.size_mm[1]:
             raise _refused("size_mm", self.size_mm, "as wide in x as in y, for a cylinder")
+        if (self.shape == "hull") != bool(self.points_mm):
+            raise _refused("points_mm", len(self.points_mm), "there for a hull, and for it alone")
+        if self.points_mm and _box_around(self.points_mm) != (self.size_mm, self.center_mm):
+            raise _refused("size_mm", self.size_mm, "those of the box around points_mm")
         return self
 
 
@@ -640,7 +660,12 @@ def check_target(machine: Machine, axis: str, value: float) -> float:
     return value
 
 
-def parse_machine(text: str, file: str = "<machine>") -> Machine:
+Corners = Callable[[str], Sequence[Vector3]]
+"""Reads a mesh file by the name that a machine file gives it: corners of a convex body around the
+mesh [mm, its own frame], at most `MAX_POINTS`."""
+
+
+def parse_machine(text: str, file: str = "<machine>", corners: Corners | None = None) -> Machine:
     """Read a machine description.
 
     `base = NAME` at the top of the text takes over all that it does not say from a machine that
@@ -651,11 +676,12 @@ def parse_machine(text: str, file: str = "<machine>") -> Machine:
     Args:
         text: TOML.
         file: name for error messages.
+        corners: reads the meshes that it names (`flexdt.machines.parsed` does, beside the file).
 
     Raises:
         MachineFileError: TOML or content does not hold; file, key path, value, allowed.
     """
-    machine = _parse(Machine, _inherited, text, file)
+    machine = _parse(Machine, lambda own: _inherited(_meshed(own, corners)), text, file)
     driving = {name for factors in machine.geometry.values() for name in factors}
     idle = [name for name in machine.axes if name not in driving]
     if idle or not machine.geometry.get("angle"):
@@ -755,6 +781,33 @@ def _data(kind: str, name: str) -> str:
 
 
 Raw = dict[str, Any]
+
+
+def _meshed(own: Raw, corners: Corners | None) -> Raw:
+    """Put the convex bodies of parts with meshes in place; what is wrong with a part is told by its
+    name."""
+    parts = own.get("components", [])
+    meshed = [p for p in parts if isinstance(p, dict) and "mesh" in p] if parts else []
+    for part in meshed:
+        where, name = f"components.{part.get('name')}", part["mesh"]
+        said = [key for key in ("shape", "size_mm", "center_mm", "points_mm") if key in part]
+        if said:
+            raise UnknownNameError(f"{where}.{said[0]}: must be left out: the mesh says it")
+        at = part.get("mesh_at_mm", (0.0, 0.0, 0.0))
+        number = lambda v: isinstance(v, (int, float)) and not isinstance(v, bool)  # noqa: E731
+        if not isinstance(at, Sequence) or len(at) != 3 or not all(map(number, at)):
+            raise UnknownNameError(f"{where}.mesh_at_mm: must be three numbers (value: {at!r})")
+        if not isinstance(name, str) or corners is None:
+            most = "a file's name" if corners else "left out: no files are read here"
+            raise UnknownNameError(f"{where}.mesh: must be {most} (value: {name!r})")
+        try:
+            found = corners(name)
+        except TwinError as error:
+            raise UnknownNameError(f"{where}.mesh: {error.message}") from None
+        points = [tuple(float(v + a) for v, a in zip(p, at, strict=True)) for p in found]
+        size, center = _box_around(points)  # type: ignore[arg-type]
+        part.update(shape="hull", points_mm=points, size_mm=size, center_mm=center)
+    return own
 
 
 def _inherited(own: Raw) -> Raw:

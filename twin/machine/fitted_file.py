@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 from pydantic import BaseModel
 
@@ -15,20 +15,26 @@ _HEADER = re.compile(r"\s*\[([^\[\]]+)\]\s*(?:#.*)?")
 _ANY_HEADER = re.compile(r"\s*\[")
 
 
-def fitted_text(text: str, machine: Machine, axes: Collection[str]) -> str:
+def fitted_text(
+    text: str,
+    machine: Machine,
+    axes: Collection[str],
+    parse: Callable[[str, str], Machine] = parse_machine,
+) -> str:
     """The machine file `text` with the timing and some axes of `machine`, comments kept.
 
     Args:
         text: TOML of the machine that was fitted.
         machine: the fitted one.
         axes: names of the axes that are replaced.
+        parse: reads a machine file's text, with its meshes if it has any.
 
     Raises:
         MachineFileError: the file does not write its axes and times as tables.
     """
     blocks = {f"axes.{name}": _axis_table(name, machine.axes[name]) for name in axes}
     made = _replaced(text, {**blocks, "timing": _timing_table(machine.timing)})
-    if parse_machine(made, "fitted machine") != machine:
+    if parse(made, "fitted machine") != machine:
         raise MachineFileError(
             "the base machine's file must write axes as tables [axes.NAME] and times as [timing]",
             {"allowed": ["[axes.NAME]", "[timing]"]},

@@ -52,6 +52,7 @@ class LabScene:
         server: to draw in.
         machine, profile: what to draw.
         drag: called when a stage is dragged.
+        looks: part -> its own mesh (`parts.own_looks`).
     """
 
     def __init__(
@@ -60,8 +61,9 @@ class LabScene:
         machine: Machine,
         profile: Profile,
         drag: Drag = lambda client, targets: None,
+        looks: Mapping[str, bytes] | None = None,
     ) -> None:
-        self._server, self._machine = server, machine
+        self._server, self._machine, self._own = server, machine, looks or {}
         self._collision = build_scene(machine, profile)
         self._bodies = {b.name: b for b in self._collision.bodies}
         self._frames: dict[str, viser.FrameHandle] = {}
@@ -120,12 +122,12 @@ class LabScene:
         for part in self._machine.components:
             frame = scene.add_frame(f"/machine/{part.name}", show_axes=False)
             self._frames[part.name] = frame
-            look = solids.glb(parts.pieces_of(part))
-            self._looks.append(
-                scene.add_glb(
-                    f"/machine/{part.name}/look", look, cast_shadow=False, receive_shadow=False
-                )
-            )
+            own = self._own.get(part.name)
+            self._looks.append(scene.add_glb(
+                f"/machine/{part.name}/look", own or solids.glb(parts.pieces_of(part)),
+                position=tuple(np.array(part.mesh_at_mm if own else (0.0, 0.0, 0.0)) * MM),
+                cast_shadow=False, receive_shadow=False,
+            ))  # fmt: skip
         self._frames["sample"] = scene.add_frame("/sample", show_axes=False)
         self._frames["object"] = scene.add_frame("/object", show_axes=False)
         self._stand_frame = scene.add_frame(STAND, show_axes=False)

@@ -2,8 +2,8 @@
 
 Each builder fills the component's box; what it adds outside (carriages, motors, a tube housing) is
 decoration that is fixed to its own stage and never checked for collisions. Components with unknown
-names become bevelled boxes, so another machine file still draws. Coordinates are those of the
-component's own frame [mm].
+names become bevelled boxes, so another machine file still draws; a part with a mesh of its own is
+drawn as that. Coordinates are those of the component's own frame [mm].
 """
 
 from __future__ import annotations
@@ -11,16 +11,42 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from itertools import product
+from pathlib import Path
+
+import numpy as np
+import trimesh
 
 from flexdt.clients.viewer.scenes import sample as s
 from flexdt.clients.viewer.scenes.sample import Piece
-from flexdt.twin.machine.description import Component
+from flexdt.phantoms.files.mesh_files import read_part
+from flexdt.twin.machine.description import Component, Machine
 
 Builder = Callable[[Component], list[Piece]]
 
 
+def own_looks(machine: Machine, folder: Path) -> dict[str, bytes]:
+    """Part -> its own mesh as a GLB file [m], for those that have one.
+
+    Args:
+        machine: whose parts.
+        folder: of its machine file, in which the meshes lie.
+
+    Raises:
+        PhantomError: a file cannot be read any more.
+    """
+    looks = {}
+    for part in machine.components:
+        if part.mesh:
+            mesh = read_part(file := folder / part.mesh)
+            own = file.suffix.lower() == ".glb"  # with its colours
+            looks[part.name] = file.read_bytes() if own else s.glb([Piece(mesh, s.ALUMINIUM)])
+    return looks
+
+
 def pieces_of(part: Component) -> list[Piece]:
     """The part's painted meshes, in its own frame [mm]."""
+    if part.points_mm:
+        return [Piece(trimesh.convex.convex_hull(np.array(part.points_mm)), s.ALUMINIUM)]
     builder = BUILDERS.get(part.name)
     if builder is None:
         builder = ROLES.get(part.role, _generic)

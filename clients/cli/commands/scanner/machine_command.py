@@ -163,18 +163,21 @@ def fit(
     names = ", ".join(log.name for log in logs).encode("utf-8", "replace").decode()
     source = f"measured: {names} ({sum(map(len, commands))} lines)"
     found = fit_machine(commands, machine, source)
-    for log, lines in zip(logs, commands, strict=True):
-        tell(unlike(lines, machine), str(log))
-    out.write_text(fitted_text(text, found.machine, found.axes), encoding="utf-8")
+    for log, told in zip(logs, commands, strict=True):
+        tell(unlike(told, machine), str(log))
+    made = fitted_text(
+        text, found.machine, found.axes, lambda text, _: machines.parsed(text, str(out))
+    )
+    out.write_text(made, encoding="utf-8")
     if json:
         emit(found.to_dict())
         return
     say(_axes({n: (found.machine.axes[n], found.machine.axes[n].source) for n in found.axes}))
     say("\n" + _times(found.machine))
-    made = found.lines
+    lines = found.lines
     say(
-        f"\n{len(made.rows)} lines, {made.total_real_s:.2f} s; absolute errors sum to "
-        f"{made.sum_abs_error_s:.2f} s, {found.cross_validated_s:.2f} s with each time predicted "
+        f"\n{len(lines.rows)} lines, {lines.total_real_s:.2f} s; absolute errors sum to "
+        f"{lines.sum_abs_error_s:.2f} s, {found.cross_validated_s:.2f} s with each time predicted "
         "from the others of its kind"
     )
     if len(logs) == 1:
@@ -202,7 +205,8 @@ def _places(machine: Machine) -> str:
 def _bodies(machine: Machine) -> str:
     rows = [
         (c.name, c.role, " + ".join(reversed(machine.chain(c))) or "nothing",
-         " x ".join(f"{side:g}" for side in c.size_mm), c.source or _COMMENTS)
+         " x ".join(f"{side:g}" for side in c.size_mm),
+         "; ".join(filter(None, (c.mesh and f"mesh {c.mesh}", c.source))) or _COMMENTS)
         for c in machine.components
     ]  # fmt: skip
     return table(rows, ("body", "role", "moved by", "size [mm]", "source"))
