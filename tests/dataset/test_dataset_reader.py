@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from collections.abc import Callable
 from contextlib import suppress
@@ -19,7 +20,7 @@ from hypothesis import strategies as st
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetFormatError, DatasetMissingError
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, parse_document
-from flexdt.twin.dataset.normalise import LineIntegrals
+from flexdt.twin.dataset.normalise import LineIntegrals, binned_mean
 from flexdt.twin.dataset.record import ScanRecord
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import builtin_profile, builtin_profiles
@@ -85,6 +86,18 @@ def test_dead_pixels_take_their_neighbours_value_and_nothing_is_infinite() -> No
     assert out[2, 2] == out[2, 3] == pytest.approx(np.log(2000.0))
     with pytest.raises(DatasetFormatError, match="was the tube off"):
         LineIntegrals.of(dark, dark)
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3])
+def test_binned_images_are_means_of_whole_squares(factor: int) -> None:
+    images = np.random.default_rng(1).integers(0, 999, (2, 7, 8))
+    found = binned_mean(images, factor)
+    assert found.shape == (2, 7 // factor, 8 // factor)
+    for at in np.ndindex(found.shape):
+        k, row, col = at
+        square = [images[k, row * factor + i, col * factor + j]
+                  for i in range(factor) for j in range(factor)]  # fmt: skip
+        assert found[at] == pytest.approx(sum(square) / factor**2)
 
 
 @pytest.mark.parametrize("gone", [("flexdt.json",), ("flexdt.json", "scan settings.txt"),
@@ -304,6 +317,9 @@ def test_blocks_with_different_regions_keep_their_own_geometry(
         ({"machine": {}}, "machine"),
         ({"duration_s": "long"}, "duration_s"),
         ({"frames": []}, "lists no projections"),
+        ({"duration_s": math.nan}, "duration_s"),
+        ({"sample": {"diameter_mm": math.inf}}, "sample.diameter_mm"),
+        ({"noise": {"model": {"i0_counts": math.nan}}}, "noise.model"),
     ],
 )
 def test_wrong_documents_name_file_key_and_value(

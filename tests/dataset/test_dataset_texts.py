@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 import string
 from collections.abc import Callable
 from contextlib import suppress
@@ -15,9 +17,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
-from flexdt.twin.dataset.rebuild import rebuild
+from flexdt.twin.dataset.rebuild import angles_deg, rebuild
 from flexdt.twin.dataset.record import SampleRecord, ScanRecord
-from flexdt.twin.dataset.scan_settings import MotorLine, ScanSettings
+from flexdt.twin.dataset.scan_settings import (
+    Figures,
+    MotorLine,
+    ScanSettings,
+    figures_of,
+    poses_of,
+    settings_of,
+)
 from flexdt.twin.dataset.scan_settings_text import format_scan_settings, parse_scan_settings
 from flexdt.twin.dataset.xre import format_sections, format_xre, parse_xre
 from flexdt.twin.machine.camera import Roi
@@ -27,6 +36,7 @@ from flexdt.twin.machine.description import (
     builtin_profile,
     builtin_profiles,
 )
+from flexdt.twin.script import plan_script
 
 
 def read(path: Path) -> str:
@@ -243,6 +253,207 @@ def test_sections_tell_scans_that_the_texts_cannot_describe(
     assert not parse_xre(format_xre(helical)).one_circle
 
 
+FIGURES = st.builds(
+    Figures, st.floats(50, 900), st.floats(900, 2000), st.floats(-100, 1100), st.floats(-100, 900),
+    st.floats(-100, 1100), st.floats(0.01, 1.0),
+)  # fmt: skip
+
+
+@given(FIGURES, st.floats(-50, 50), st.floats(-50, 50), st.floats(-50, 50), st.floats(-7, 7))
+def test_figures_are_edges_and_poses_have_them(
+    f: Figures, across: float, up: float, axis_up: float, angle: float
+) -> None:
+    """A pinhole by hand: columns to the right, rows down, from the edge of the first pixel."""
+    rows, cols = 760, 956
+    p = poses_of(f, (rows, cols), np.array([angle, 0.3]), source_x=across, source_z=up,
+                 axis_z=axis_up)  # fmt: skip
+    [sx, sy, sz], [ax, ay, az], [dx, dy, dz] = p.source[0], p.axis[0], p.detector[0]
+    assert (sx, sy, sz, az) == (across, 0.0, up, axis_up)
+    assert (ay, dy) == pytest.approx((f.sod_mm, f.sdd_mm))
+    assert (sx - dx) / f.pixel_mm + cols / 2 == pytest.approx(f.hc_px, abs=1e-6)
+    assert (dz - sz) / f.pixel_mm + rows / 2 == pytest.approx(f.vc_px, abs=1e-6)
+    shadow = sx + (ax - sx) * f.sdd_mm / f.sod_mm
+    assert (shadow - dx) / f.pixel_mm + cols / 2 == pytest.approx(f.cor_px, abs=1e-6)
+    assert vars(figures_of(p[:1], (rows, cols))) == pytest.approx(vars(f), abs=1e-6)
+    assert f.magnification == f.sdd_mm / f.sod_mm
+    assert f.voxel_um * f.magnification == pytest.approx(1000 * f.pixel_mm)
+
+
+@pytest.mark.parametrize(
+    ("field", "close"),
+    [("sod_mm", 0.01), ("sdd_mm", 0.01), ("hc_px", 0.05), ("vc_px", 0.05), ("cor_px", 0.05),
+     ("binned_pixel_mm", 1e-5)],
+)  # fmt: skip
+def test_a_profile_reproduces_every_printed_figure_or_is_not_taken(
+    data: Path, field: str, close: float
+) -> None:
+    s = parse_scan_settings(read(data / "flexray_scan_settings.txt"))
+    profiles = [builtin_profile(n) for n in builtin_profiles()]
+    for off, taken in ((0.9, True), (-0.9, True), (1.1, False), (-1.1, False)):
+        value = getattr(s, field) + off * close
+        near = replace(s, **{field: value})
+        profile = rebuild(near, 361, (760, 956), [builtin_machine()], profiles).profile
+        assert (profile is not None) == taken, off
+
+
+def test_machines_are_found_by_name_or_by_their_motors(data: Path) -> None:
+    s = parse_scan_settings(read(data / "flexray_scan_settings.txt"))
+    machines = [builtin_machine(n) for n in builtin_machines()]
+    assert rebuild(s, 361, (760, 956), [builtin_machine()], []).profile is None
+    nameless = replace(s, scanner_name=None, scanner_type="")
+    found = rebuild(nameless, 361, (760, 956), machines, []).machine
+    assert found is not None
+    assert found.name == "flexray"
+    twice = [builtin_machine(), builtin_machine().model_copy(update={"name": "other"})]
+    other = replace(s, scanner_name="Nix", scanner_type=None)
+    for known, said in ((nameless, "'(unnamed)' is not known"), (other, "'Nix' is not known")):
+        r = rebuild(known, 361, (760, 956), twice, [])
+        assert r.machine is None
+        assert said in r.notes[0]
+
+
+def test_without_a_profile_places_are_those_of_the_motors(data: Path) -> None:
+    s = parse_scan_settings(read(data / "flexray_scan_settings.txt"))
+    motors = {**s.motors, "tra_tube": MotorLine(1.25), "ver_tube": MotorLine(30.0)}
+    r = rebuild(replace(s, roi=None, motors=motors), 3, (760, 956), [builtin_machine()], [])
+    assert r.profile is None
+    assert r.poses.source[0] == pytest.approx([1.25, 0.0, 30.0])
+    assert r.poses.axis[:, 2] == pytest.approx([20.0] * 3)
+
+
+@pytest.mark.parametrize(
+    ("projections", "count", "angles"),
+    [(5, 3, [10, 100, 190]), (None, 3, [10, 190, 370]), (1, 2, [10, 10]), (2, 2, [10, 370])],
+)
+def test_angles_follow_the_rule_of_the_stated_number(
+    projections: int | None, count: int, angles: list[float]
+) -> None:
+    s = ScanSettings(projections=projections, start_angle_deg=10.0, last_angle_deg=370.0)
+    assert angles_deg(s, count, "a.txt") == pytest.approx(angles)
+    for gone in ("start_angle_deg", "last_angle_deg"):
+        with pytest.raises(DatasetFormatError, match="angles cannot be known"):
+            angles_deg(replace(s, **{gone: None}), count, "a.txt")
+
+
+def test_exposures_before_and_after_are_counted(record: Callable[..., ScanRecord]) -> None:
+    """Darks and flats of ten averages; three flats of four more at the end."""
+    r = record()
+    dark, flat, scan, _ = r.blocks
+    few = replace(flat.camera, averages=4)
+    after = replace(flat, camera=few, files=("a", "b", "c"), times_s=np.zeros(3),
+                    positions={n: np.repeat(v, 3) for n, v in flat.positions.items()})  # fmt: skip
+    s = settings_of(replace(r, blocks=(dark, dark, flat, scan, after)))
+    assert (s.pre_flats, s.post_flats, s.darks, s.projections) == (10, 12, 20, 5)
+    assert (s.start_angle_deg, s.last_angle_deg) == pytest.approx((0.0, 360.0))
+    assert (s.filament_status, s.target_current_uA) == ("OK", 500.0)
+    none = settings_of(replace(r, blocks=(dark, flat)))
+    assert (none.start_angle_deg, none.last_angle_deg, none.projections) == (0.0, 0.0, 0)
+    off = parse_xre(format_xre(replace(r, kV=0.0))).sections["Tube settings"]
+    assert (off["Current set value"], off["Target current actual value"]) == ("0.000000",) * 2
+    assert off["Filament status"] == "OK"
+
+
+@pytest.mark.parametrize(
+    ("turns", "projections"),
+    [([0, 90, 180, 270, 360], 5), ([360, 270, 180, 90, 0], 5), ([0, 45, 90], 9), ([7], 1),
+     ([7, 7], 2), ([-180, 0, 180], 3)],
+)  # fmt: skip
+def test_what_the_xre_says_of_turn_and_volume(
+    record: Callable[..., ScanRecord], turns: list[float], projections: int
+) -> None:
+    r = record(frames=len(turns))
+    dark, flat, scan, _ = r.blocks
+    moved = replace(scan, positions={**scan.positions, "rot_obj": np.array(turns, dtype=float)})
+    sections = parse_xre(format_xre(replace(r, blocks=(dark, flat, moved)))).sections
+    acquisition, ct = sections["Acquisition settings"], sections["CT-parameters IN"]
+    assert acquisition["projs_per_360"] == str(projections)
+    assert [float(acquisition[f"CT {end} angle"]) for end in ("start", "stop")] == [
+        turns[0], turns[-1],
+    ]  # fmt: skip
+    assert [float(ct[key]) for key in ("x_end", "y_end", "z_end", "zmax")] == [29, 29, 23, 23]
+
+
+def test_places_of_the_scan_by_hand(record: Callable[..., ScanRecord]) -> None:
+    """Zero offsets of 2023-08-21; a panel of 30 x 24 pixels of 0.1496 mm in its middle."""
+    points = parse_xre(format_xre(record())).sections["POIs"]
+    found = {
+        name: {key: [float(x) for x in values.split(";")]
+               for key, values in re.findall(r"(WC|dir[XYZ])\[([^\]]*)\]", entry)}
+        for name, entry in points.items()
+    }  # fmt: skip
+    source, axis = [1.25, 0.0, 26.5 - 6.2917], [2.5 - 0.5405, 514.9192, 20.0]
+    panel = [24.1215 - 24.0, 1040.0008, 21.0]
+    c, s = math.cos(math.radians(6.25)), -math.sin(math.radians(6.25))
+    beam = [axis[0], axis[1], source[2]]
+    stretch = panel[1] / axis[1]
+    pitch = 1 / 0.1496
+    expected = {
+        "COT": (beam, [c, -s, 0], [-s, -c, 0], [0, 0, 1]),
+        "HCVC": ([source[0], panel[1], source[2]], *[[0, 0, 0]] * 3),
+        "image": ([panel[0] - 15 * 0.1496, panel[1], panel[2] + 12 * 0.1496], [pitch, 0, 0],
+                  [0, 0, -pitch], [0, -1, 0]),
+        "object": (axis, [c, -s, 0], [s, c, 0], [0, 0, 1]),
+        "TMV": (beam, [1, 0, 0], [0, 1, 0], [0, 0, 1]),
+        "bricks$ample": (beam, [c, -s, 0], [s, c, 0], [0, 0, 1]),
+        "projCOT": ([1.25 + (axis[0] - 1.25) * stretch, panel[1], source[2]], *[[0, 0, 0]] * 3),
+        "world": ([0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]),
+    }  # fmt: skip
+    for name, values in expected.items():
+        for key, value in zip(("WC", "dirX", "dirY", "dirZ"), values, strict=True):
+            assert found[name][key] == pytest.approx(value, abs=6e-5), (name, key)
+    for name, entry in points.items():
+        height = {"TMV": 0.0, "bricks$ample": 2000.0}.get(name, -1.0)
+        assert f"height[{height:f}]track[{'TRUE' if 'ample' in name else 'FALSE'}]" in entry
+
+
+def test_the_axis_of_the_flat_field_is_the_linear_one_that_moved_most() -> None:
+    text = (
+        "tube xrayon ACK\nmag_obj move absolute 500 ACK\ntra_obj move absolute -150 ACK\n"
+        "rot_obj move absolute 300 ACK\ncamera take image ACK\ncamera save image io0.tif ACK\n"
+        "{}rot_obj move absolute 0 ACK\ncamera take image ACK\ncamera save image s0.tif ACK\n"
+    )
+    for moves, axis in (("tra_obj move absolute 0 ACK\n", "tra_obj"), ("", ""),
+                        ("tra_obj move absolute -150.9 ACK\n", ""),
+                        ("mag_obj move absolute 502 ACK\n", "mag_obj")):  # fmt: skip
+        plan = plan_script(text.format(moves))
+        r = ScanRecord.from_plan(plan, name="a", started=datetime(2026, 3, 14))
+        assert r.flat_axis == axis
+        assert (r.sample.diameter_mm, r.sample.height_mm) == (0.0, 0.0)
+        assert (r.count("flat"), r.count("projection"), r.smooth) == (1, 1, False)
+        first = plan.exposures[-1]
+        assert r.positions == pytest.approx(first.positions)
+
+
+def test_every_place_of_the_panel_is_a_section(record: Callable[..., ScanRecord]) -> None:
+    r = record()
+    block = r.blocks[2]
+    places = [{**block.positions, "ver_det": block.positions["ver_det"] + k} for k in range(4)]
+    for n in range(1, 5):
+        tiles = tuple(replace(block, positions=place) for place in places[:n])
+        assert replace(r, blocks=tiles).sections() == n
+    uneven = {**block.positions, "rot_obj": np.array([0.0, 90.0, 180.0, 271.0, 360.0])}
+    assert replace(r, blocks=(replace(block, positions=uneven),)).sections() == 2
+    tail = {**block.positions, "ver_tube": block.positions["ver_tube"] + [0, 0, 0, 0, 1.0]}
+    assert replace(r, blocks=(replace(block, positions=tail),)).sections() == 2
+
+
+@pytest.mark.parametrize(
+    "line", ["1abc : 5 ; speed : 3", "(x) : 5", "plain : 5", "tra_obj : about 5", "a_b : 5 mm"]
+)
+def test_lines_that_are_no_motors_are_left_out(line: str) -> None:
+    assert parse_scan_settings(f"SOD : 1\n{line}").motors == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "kind"),
+    [("scan type:\nsmooth scan", "smooth scan"), ("scan type:\n# projections: 12", None),
+     ("scan type: step scan", "step scan"), ("SOD : 1\nscan type:\n\n\nsmooth scan", "smooth scan"),
+     ("SOD : 1\nscan type:", "")],
+)  # fmt: skip
+def test_the_scan_s_type_stands_on_its_line_or_on_the_next(text: str, kind: str | None) -> None:
+    assert parse_scan_settings(text).scan_type == kind
+
+
 TEXT = st.text(
     alphabet=string.ascii_letters + string.digits + " -_:=.,()/\\\"'äé", max_size=20
 ).map(str.strip)
@@ -254,7 +465,7 @@ MOMENT = st.datetimes(datetime(1990, 1, 1), datetime(2090, 1, 1)).map(
 ROI = st.builds(Roi, *[st.integers(0, 9999)] * 4)
 MOTORS = st.dictionaries(
     st.from_regex(r"(mag|rot|tra|ver)_[a-z]{3,6}", fullmatch=True),
-    st.builds(MotorLine, NUMBER, NUMBER, NUMBER),
+    st.builds(MotorLine, NUMBER, NUMBER, NUMBER) | st.builds(MotorLine, NUMBER, st.none() | NUMBER),
     max_size=9,
 )
 

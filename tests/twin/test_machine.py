@@ -7,11 +7,22 @@ from importlib import resources
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import BaseModel, ValidationError
 
 from flexdt.twin.errors import LimitError, MachineFileError, UnknownNameError
-from flexdt.twin.machine.camera import CameraSettings, Roi, binning_of, check_roi
+from flexdt.twin.machine.camera import CameraSettings, Roi, Sensor, binning_of, check_roi
 from flexdt.twin.machine.description import (
+    Axis,
+    Component,
+    DetectorSpec,
+    EStop,
+    Profile,
+    Spread,
     Timing,
+    TubeSpec,
+    VirtualAxis,
     builtin_machine,
     builtin_machines,
     builtin_profile,
@@ -22,6 +33,187 @@ from flexdt.twin.machine.description import (
 )
 from flexdt.twin.machine.kinematics import poses, resolve_targets
 from flexdt.twin.machine.new_file import Answers, new_machine_text
+
+X = {"lower": -5.0, "upper": 5.0, "home": 0.0, "speed": 1.0, "max_speed": 2.0, "acceleration": 1.0,
+     "max_acceleration": 2.0}  # fmt: skip
+TUBE = {"max_kV": 100.0, "max_W": 20.0, "kV": 80.0, "power_W": 8.0}
+PANEL = {"model": "a", "columns": 100, "rows": 80, "pitch_mm": 0.2, "bits": 14,
+         "mode": "HW2SW1High", "roi": (0, 0, 99, 79)}  # fmt: skip
+VIRTUAL = {"constant": 1.0, "of": "a", "factor": -2.0, "moves": {"a": -0.5}}
+PART = {"name": "a", "size_mm": (1.0, 1.0, 1.0), "center_mm": (0.0, 0.0, 0.0)}
+
+
+@pytest.mark.parametrize(
+    ("model", "base", "change", "fine"),
+    [
+        (Axis, X, {"lower": -1e9}, True), (Axis, X, {"lower": -1.01e9}, False),
+        (Axis, X, {"upper": 1e9}, True), (Axis, X, {"upper": 1.01e9}, False),
+        (Axis, X, {"lower": 0.0, "upper": 0.0}, True), (Axis, X, {"lower": 5.1}, False),
+        (Axis, X, {"home": -5.0}, True), (Axis, X, {"home": 5.0}, True),
+        (Axis, X, {"home": -5.1}, False), (Axis, X, {"home": 5.1}, False),
+        (Axis, X, {"speed": 2.0}, True), (Axis, X, {"speed": 2.1}, False),
+        (Axis, X, {"acceleration": 2.0}, True), (Axis, X, {"acceleration": 2.1}, False),
+        (Axis, X, {"speed": 1e-6}, True), (Axis, X, {"speed": 0.9e-6}, False),
+        (Axis, X, {"max_speed": 1e6}, True), (Axis, X, {"max_speed": 1.1e6}, False),
+        (Axis, X, {"arrival_tolerance": 0.0}, True), (Axis, X, {"arrival_tolerance": 0.5}, True),
+        (Axis, X, {"arrival_tolerance": -0.1}, False),
+        (TubeSpec, TUBE, {"min_kV": 0.5}, True), (TubeSpec, TUBE, {"min_kV": -0.1}, False),
+        (TubeSpec, TUBE, {"min_kV": 80.0}, True), (TubeSpec, TUBE, {"min_kV": 80.1}, False),
+        (TubeSpec, TUBE, {"max_kV": 80.0}, True), (TubeSpec, TUBE, {"max_kV": 79.9}, False),
+        (TubeSpec, TUBE, {"max_kV": 1e4}, True), (TubeSpec, TUBE, {"max_kV": 1.1e4}, False),
+        (TubeSpec, TUBE, {"max_W": 1e6}, True), (TubeSpec, TUBE, {"max_W": 1.1e6}, False),
+        (TubeSpec, TUBE, {"power_W": 20.0}, True), (TubeSpec, TUBE, {"power_W": 20.1}, False),
+        (TubeSpec, TUBE, {"warm_up_s": 0.0, "cold_after_s": 0.0}, True),
+        (TubeSpec, TUBE, {"warm_up_s": -0.1}, False), (TubeSpec, TUBE, {"cold_after_s": -1}, False),
+        (TubeSpec, TUBE, {"spot_mm_per_W": 0.0, "smallest_spot_mm": 0.0}, True),
+        (TubeSpec, TUBE, {"spot_mm_per_W": 1.0, "smallest_spot_mm": 10.0}, True),
+        (TubeSpec, TUBE, {"spot_mm_per_W": 1.1}, False),
+        (TubeSpec, TUBE, {"smallest_spot_mm": 10.1}, False),
+        (DetectorSpec, PANEL, {"pitch_mm": 1e6}, True),
+        (DetectorSpec, PANEL, {"pitch_mm": 0.0}, False),
+        (DetectorSpec, PANEL, {"pitch_mm": 1.1e6}, False), (DetectorSpec, PANEL, {"bits": 8}, True),
+        (DetectorSpec, PANEL, {"bits": 7}, False), (DetectorSpec, PANEL, {"bits": 16}, True),
+        (DetectorSpec, PANEL, {"min_exposure_ms": 1e-6, "max_exposure_ms": 1e7}, True),
+        (DetectorSpec, PANEL, {"max_exposure_ms": 1.1e7}, False),
+        (DetectorSpec, PANEL, {"modes": {"a": 1, "b": 64}}, True),
+        (DetectorSpec, PANEL, {"modes": {"a": 65}}, False),
+        (DetectorSpec, PANEL, {"modes": {"a": 0}}, False),
+        (DetectorSpec, PANEL, {"long_lag_fraction": 0.99}, True),
+        (DetectorSpec, PANEL, {"long_lag_fraction": 1.0}, False),
+        (DetectorSpec, PANEL, {"roi": (1, 2, 2, 3)}, True),
+        (DetectorSpec, PANEL, {"roi": (1, 2, 1, 3)}, False),
+        (DetectorSpec, PANEL, {"roi": (1, 2, 2, 2)}, False),
+        (DetectorSpec, PANEL, {"roi": (0, 0, 100, 79)}, False),
+        (VirtualAxis, VIRTUAL, {"moves": {"a": -0.5, "b": 3.0}}, True),
+        (VirtualAxis, VIRTUAL, {"moves": {"a": -0.5, "b": 0.0}}, False),
+        (VirtualAxis, VIRTUAL, {"moves": {"b": -0.5}}, False),
+        (VirtualAxis, VIRTUAL, {"moves": {"a": -0.500002}}, False),
+        (VirtualAxis, VIRTUAL, {"factor": 0.0}, False),
+        (Spread, {"p5_s": 0.0, "p95_s": 1.0, "n": 1}, {}, True),
+        (Spread, {"p5_s": 0.0, "p95_s": 1.0, "n": 1}, {"n": 0}, False),
+        (Spread, {"p5_s": 0.0, "p95_s": 1.0, "n": 1}, {"p95_s": 1e6}, True),
+        (Spread, {"p5_s": 0.0, "p95_s": 1.0, "n": 1}, {"p95_s": 1.1e6}, False),
+        (Spread, {"p5_s": 0.5, "p95_s": 1.0, "n": 1}, {}, True),
+        (Spread, {"p5_s": -0.1, "p95_s": 1.0, "n": 1}, {}, False),
+        (EStop, {}, {"coasting": {"a": 1e6}}, True), (EStop, {}, {"coasting": {"a": 0.0}}, False),
+        (Component, PART, {"center_mm": (-1e6, 1e6, 0.0)}, True),
+        (Component, PART, {"center_mm": (-1.1e6, 0.0, 0.0)}, False),
+        (Component, PART, {"size_mm": (1.0, 1e6, 1.0)}, True),
+        (Component, PART, {"size_mm": (1.0, 2.0, 1.0), "shape": "cylinder"}, False),
+        (Component, PART, {"size_mm": (1.0, 1.0, 2.0), "shape": "cylinder"}, True),
+        (Component, PART, {"name": "a" * 100}, True), (Component, PART, {"name": "a" * 101}, False),
+        (Component, PART, {"name": ""}, False), (Component, PART, {"name": "a b"}, False),
+        (Profile, {"name": "a", "machine": "b", "source": "c"}, {"priors": {"dD_x": 0.0}}, True),
+        (Profile, {"name": "a", "machine": "b", "source": "c"}, {"priors": {"dD_x": 0.5}}, True),
+        (Profile, {"name": "a", "machine": "b", "source": "c"}, {"priors": {"dD_x": -0.1}}, False),
+        (Profile, {"name": "a", "machine": "b", "source": "c"}, {"priors": {"dQ": 0.1}}, False),
+    ],
+)  # fmt: skip
+def test_figures_have_bounds(
+    model: type[BaseModel], base: dict[str, object], change: dict[str, object], fine: bool
+) -> None:
+    if fine:
+        made = model.model_validate(base | change)
+        assert {key: getattr(made, key) for key in change} == change
+    else:
+        with pytest.raises(ValidationError):
+            model.model_validate(base | change)
+
+
+def test_what_a_file_leaves_out() -> None:
+    axis, tube, panel = Axis(**X), TubeSpec(**TUBE), DetectorSpec(**PANEL)  # type: ignore[arg-type]
+    assert (axis.kind, axis.settings_sign, axis.arrival_tolerance) == ("linear", 1, 0.0)
+    assert (tube.min_kV, tube.cold_after_s, tube.warm_up_s) == (0.0, 8 * 3600.0, 300.0)
+    assert (tube.spot_mm_per_W, tube.smallest_spot_mm) == (0.001, 0.007)
+    assert [(f.material, f.thickness_mm) for f in tube.filters] == [("Al@2.70", 0.5)]
+    assert (panel.exposure_ms, panel.min_exposure_ms, panel.max_exposure_ms) == (100.0, 1.0, 6e4)
+    assert (panel.long_lag_fraction, panel.long_lag_s) == (0.0, 10.0)
+    assert panel.area_mm == pytest.approx((20.0, 16.0))
+    oblong = DetectorSpec(**PANEL, row_pitch_mm=0.3)  # type: ignore[arg-type]
+    assert oblong.area_mm == pytest.approx((20.0, 24.0))
+    profile = Profile(name="a", machine="b", source="c")
+    assert (profile.det_tan, profile.src_ort, profile.axs_tan, profile.c_obj, profile.c_det,
+            profile.det_roll_deg) == (0.0,) * 6  # fmt: skip
+    bare = parse_machine('base = "xyzr_cabinet"\nname = "bare"')
+    assert (bare.max_blocked_attempts, bare.estop.category) == (3, 1)
+
+
+@pytest.mark.parametrize(
+    ("base", "text", "said"),
+    [
+        ("xyzr_cabinet", "[fixed]\nmount_x = 1.0", "fixed.mount_x: must be left out"),
+        ("micro_ct", "[fixed]\nmount_x = 1.0", ""),
+        ("xyzr_cabinet", "[estop]\ncategory = 0", "a deceleration for every motor, X, Y, Z, R too"),
+        ("xyzr_cabinet", "[estop]\ncategory = 0\ncoasting = { X = 1, Y = 1, Z = 1, R = 1 }", ""),
+        ("xyzr_cabinet", "components = [1]", "components must be tables"),
+        ("xyzr_cabinet", "[priors]\ndQ = 1.0", "must be a known offset: dO_x"),
+        # The source is 120 x 200 x 120 mm about (0, -100, 0); its front may be the focal spot.
+        ("micro_ct", "[[components]]\nname = 'source'\ncenter_mm = [0.0, -100.0, 60.0]", ""),
+        ("micro_ct", "[[components]]\nname = 'source'\ncenter_mm = [0.0, -100.0, 60.1]",
+         "components.source.center_mm: must be such that the box"),
+        ("micro_ct", "[[components]]\nname = 'source'\ncenter_mm = [60.1, -100.0, 0.0]",
+         "holds the focal spot"),
+        ("micro_ct", "[[components]]\nname = 'source'\ncenter_mm = [0.0, -100.1, 0.0]", "focal"),
+        # The pin is a cylinder of radius 10 mm: 6 and 8 mm beside the axis it still holds it.
+        ("micro_ct", "[[components]]\nname = 'pin'\ncenter_mm = [6.0, -8.0, 0.0]", ""),
+        ("micro_ct", "[[components]]\nname = 'pin'\ncenter_mm = [6.1, 8.0, 0.0]",
+         "components.pin.center_mm: must be such that the cylinder"),
+        ("micro_ct", "[[components]]\nname = 'pin'\nparent = 'turntable'",
+         "components.pin.axis: must be carried by every motor that .geometry. gives the object"),
+        ("micro_ct", "[[components]]\nname = 'mount'\nparent = 'floor'\nanchor = 'object'",
+         "components.mount.axis: must be carried by the turntable .R., as mount_x and mount_y"),
+        ("micro_ct", "[[components]]\nname = 'pin'\naxis = 'CX'", "has already|every motor"),
+        ("micro_ct", "[[components]]\nname = 'panel'\nanchor = 'source'", "for a panel"),
+        ("micro_ct", "[[components]]\nname = 'floor'\nrole = 'tube'", "one component with role"),
+        ("micro_ct", "[[components]]\nname = 'floor'\nrole = 'sample_mount'\nanchor = 'world'",
+         "components.floor.anchor: must be 'object', for a sample_mount"),
+    ],
+)  # fmt: skip
+def test_parts_stand_where_the_x_ray_geometry_has_them(base: str, text: str, said: str) -> None:
+    """What is fine says nothing."""
+    file = f'base = "{base}"\n{text}\n'
+    if said:
+        with pytest.raises(MachineFileError, match=said):
+            parse_machine(file)
+    else:
+        parse_machine(file)
+
+
+@pytest.mark.parametrize(("less", "fine"), [(0.99, True), (1.01, False)])
+@pytest.mark.parametrize("side", [0, 2])
+def test_the_panel_s_body_may_be_half_a_millimetre_smaller_on_each_side(
+    side: int, less: float, fine: bool
+) -> None:
+    size = [*builtin_machine("micro_ct").detector.area_mm, 40.0]
+    size[1], size[2] = size[2], size[1]
+    size[side] -= less
+    part = f"[[components]]\nname = 'panel'\nsize_mm = {size}\n"
+    text = f'base = "micro_ct"\nallowed_contacts = []\n{part}'
+    if fine:
+        parse_machine(text)
+    else:
+        with pytest.raises(MachineFileError, match="holds the active area"):
+            parse_machine(text)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.data(), st.sampled_from([1, 2, 3, 4]))
+def test_the_middle_of_a_region_is_that_of_its_binned_pixels(
+    data: st.DataObject, binning: int
+) -> None:
+    """What is left over at the right and at the bottom makes no pixel."""
+    sensor = Sensor(1944, 1536, 0.0748, 14, 0.08)
+    left, top = data.draw(st.integers(0, 1900)), data.draw(st.integers(0, 1500))
+    right = data.draw(st.integers(left + binning - 1, 1943))
+    bottom = data.draw(st.integers(top + binning - 1, 1535))
+    camera = CameraSettings(f"HW{binning}SW1High", Roi(left, top, right, bottom))
+    columns = [left + binning * i for i in range((right + 1 - left) // binning)]
+    rows = [top + binning * i for i in range((bottom + 1 - top) // binning)]
+    assert camera.shape == (len(rows), len(columns))
+    across = ((columns[0] + columns[-1] + binning) / 2 - 972) * 0.0748
+    down = ((rows[0] + rows[-1] + binning) / 2 - 768) * 0.08
+    assert camera.roi_shift_mm(sensor) == pytest.approx((across, down), abs=1e-9)
+
 
 FLEXRAY = (resources.files("flexdt.twin") / "data/machines/flexray.toml").read_text("utf-8")
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -49,6 +52,124 @@ def test_every_kind_plans_without_a_word(kind: Kind) -> None:
     assert files == [f"scan_{i:06d}.tif" for i in range(len(files))]
     assert not next(e for e in plan.exposures if e.kind == "dark").xrays_on
     assert all(e.xrays_on for e in plan.exposures if e.kind != "dark")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_a_request_leaves_out_is_what_its_description_says(kind: Kind) -> None:
+    stated = ScanRequest(
+        kind, 600.0, 1059.0, 361, 100.0, 1, 20.0, 3.0, 20.0, 2,
+        (ScanPosition(600.0), ScanPosition(800.0)), "HW2SW1High", Roi(32, 8, 1943, 1527), 90.0,
+        50.0, 10, 10,
+    )  # fmt: skip
+    text = compose_script(stated, MACHINE, PROFILE)
+    assert compose_script(ScanRequest(kind), MACHINE, PROFILE) == text
+    changed = replace(stated, exposure_ms=120.0, averages=3, mode="HW4SW1High", kV=70.0,
+                      power_W=30.0, roi=Roi(0, 400, 999, 1199), darks=7, flats=8)  # fmt: skip
+    at = compose_script(changed, MACHINE, PROFILE).splitlines()
+    said = [line.split("\t")[1:3] for line in at]
+    for words in (["set exposure", "120.000000"], ["set mode", "HW4SW1High"],
+                  ["set kV", "70.000000"], ["set power", "30.000000"],
+                  ["set ROI", str(changed.roi)]):  # fmt: skip
+        assert said.count(words) == 1
+    averages = [value for command, value in said if command == "set number of averages"]
+    assert averages == ["7", "8", *["3"] * (len(averages) - 2)]
+
+
+@pytest.mark.parametrize(
+    ("field", "least", "most"),
+    [
+        ("frames", 2, 100_000), ("averages", 1, 10_000), ("darks", 1, 10_000),
+        ("flats", 1, 10_000), ("tiles", 1, 100), ("exposure_ms", 1e-3, 1e7), ("turns", 1e-3, 40.0),
+        ("rise_mm", 1e-3, 1e6), ("height_mm", -1e6, 1e6), ("sdd_mm", 1e-3, 1e6),
+        ("sod_mm", 1e-3, 1000.0), ("placements", 1, 100), ("lateral", -1e6, 1e6),
+    ],
+)  # fmt: skip
+def test_figures_of_a_request_have_bounds(field: str, least: float, most: float) -> None:
+    """At a bound another limit may be met, but not this one."""
+    step = 1 if isinstance(least, int) else 0.01
+    for value, fine in (
+        (least, True), (most, True), (least - abs(step * least), False),
+        (most + abs(step * most), False), (most + 1, False), (math.inf, False), (math.nan, False),
+    ):  # fmt: skip
+        name, asked = field, value
+        if field == "placements" and math.isfinite(value):
+            asked = [ScanPosition(600.0)] * int(value)  # type: ignore[assignment]
+        elif field in ("placements", "lateral"):
+            name, asked = "placements", (ScanPosition(600.0, value),)  # type: ignore[assignment]
+        whole = dict.fromkeys((name,), asked) | ({} if field == "sdd_mm" else {"sdd_mm": 1000.0})
+        found: object = None
+        try:
+            compose_script(ScanRequest(**whole), MACHINE, PROFILE)  # type: ignore[arg-type]
+        except LimitError as error:
+            found = error.data.get("setting")
+        assert (found != name) == fine, value
+
+
+def test_moves_begin_together_and_are_waited_for_one_by_one() -> None:
+    rows = [
+        line.split("\t") for line in compose_script(ScanRequest(), MACHINE, PROFILE).splitlines()
+    ]
+    moves = [(row[0], row[2], row[4]) for row in rows if row[1] == "move absolute"]
+    names = {"mag_obj", "mag_det", "tra_obj", "tra_det", "tra_tube", "ver_tube", "ver_det"}
+    begun = [move[:2] for move in moves[:7]]
+    assert {name for name, _ in begun} == names
+    assert moves[:14] == [(*move, "no wait") for move in begun] + [(*move, "ACK") for move in begun]
+    # Then the sample alone goes into the beam, and the turntable turns.
+    assert [(name, wait) for name, _, wait in moves[14:]] == [
+        ("tra_obj", "ACK"), ("rot_obj", "ACK"), ("rot_obj", "POS"),
+    ]  # fmt: skip
+
+
+CABINET_AXIS = "[axes.{name}]\nlower = {lower}\nupper = {upper}\nhome = {home}\n"
+
+
+@pytest.mark.parametrize("factor", [-2.0, -1.0, -0.5, 0.5, 1.0, 2.0])
+@pytest.mark.parametrize("motor", ["X", "Y"])
+@pytest.mark.parametrize("room", [(-40.0, 600.0), (-600.0, 40.0), (-20.0, 30.0)])
+def test_the_sample_leaves_the_beam_by_the_freer_side(
+    factor: float, motor: str, room: tuple[float, float]
+) -> None:
+    """By hand: 300 of 1000 mm, 2000 pixels of 0.2 mm, and 60 mm more; or what room there is."""
+    gone = "" if motor == "X" else 'without = ["X"]\n'
+    quantity = "object_x" if motor == "X" else "object_z"
+    machine = parse_machine(
+        f'base = "xyzr_cabinet"\nname = "mine"\n{gone}[geometry]\n'
+        f"{quantity} = {{ {motor} = {factor} }}\n"
+        + CABINET_AXIS.format(name=motor, lower=room[0], upper=room[1], home=0.0)
+    )
+    request = ScanRequest(frames=41, exposure_ms=500, sod_mm=300, sdd_mm=1000, height_mm=0.0)
+    rows = [line.split("\t") for line in compose_script(
+        request, machine, profile_of(machine)).splitlines()]  # fmt: skip
+    first, *_, last = [
+        float(row[2]) for row in rows if row[:2] == [motor, "move absolute"] and row[4] == "ACK"
+    ]
+    away = (2000 * 0.2 * 300 / 1000 / 2 + 60) / abs(factor)
+    freer = room[0] if -room[0] > room[1] else room[1]
+    assert first == pytest.approx(math.copysign(min(away, abs(freer)), freer), abs=1e-5)
+    assert last == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("beside", [0.099, 0.101])
+@pytest.mark.parametrize(
+    ("quantity", "mm"),
+    [("source_x", 400.0), ("detector_x", 400.0), ("source_z", 400.0), ("object_x", 120.0)],
+)
+def test_what_no_motor_moves_may_stand_a_tenth_of_the_view_beside(
+    quantity: str, mm: float, beside: float
+) -> None:
+    """2000 pixels of 0.2 mm; at the sample, 300 of 1000 mm, less."""
+    gone = 'without = ["X"]\n' if quantity == "object_x" else ""
+    heights = f"\ndetector_z = {mm * beside}" if quantity == "source_z" else ""
+    machine = parse_machine(
+        f'base = "xyzr_cabinet"\nname = "mine"\n{gone}[fixed]\n'
+        f"{quantity} = {mm * beside}{heights}\n"
+    )
+    request = ScanRequest(frames=41, exposure_ms=500, sod_mm=300, sdd_mm=1000, height_mm=0.0)
+    if beside < 0.1:
+        assert compose_script(request, machine, profile_of(machine))
+    else:
+        with pytest.raises(LimitError, match="no motor for"):
+            compose_script(request, machine, profile_of(machine))
 
 
 def test_the_form_is_the_scanners_own() -> None:
@@ -286,6 +407,8 @@ BARE = (
     ("more", "text", "kind", "says"),
     [
         ("", "[geometry]\nangle = { R = 0.5 }", "fly", "turns the sample by"),
+        ("", f"[axes.T]\nkind = 'rotation'\n{AXIS}home = 0.0\n[geometry]\n"
+         "angle = { R = 1.0, T = 1.0 }", "fly", "turns the sample by"),
         ("", "[fixed]\nsource_z = 80.0", "fly", "no motor for the height of the detector"),
         (', "X"', "[fixed]\nobject_x = 50.0", "fly", "no motor for the sample sideways"),
         ("", "[fixed]\ndetector_x = 80.0", "fly", "no motor for the detector sideways"),
@@ -312,6 +435,40 @@ def test_what_cannot_be_centred_is_said(more: str, text: str, kind: Kind, says: 
         compose_script(
             ScanRequest(kind=kind, frames=61, exposure_ms=1000), machine, profile_of(machine)
         )
+
+
+def test_motors_that_nearly_do_the_same_are_said() -> None:
+    """All other quantities come out, and these two as badly as the digits of the sums are few."""
+    text = (
+        'base = "xyzr_cabinet"\nname = "twins"\nwithout = ["Z", "source", "panel", "turntable", '
+        '"mount", "lift", "x_carriage", "z_carriage", "floor"]\nallowed_contacts = []\n'
+        "[geometry]\nobject_y = { A = 1.0, B = 1.0 }\n"
+        "detector_y = { A = 1.0, B = 1.000000000001 }\n"
+    )
+    for motor in "AB":
+        wide = AXIS.replace("500.0", "1000000000.0")
+        text += f"[axes.{motor}]\n{wide}home = 0.0\n"
+    machine = parse_machine(text)
+    with pytest.raises(LimitError, match="depend on each other"):
+        compose_script(
+            ScanRequest(sod_mm=300.1, sdd_mm=300.101, frames=41, exposure_ms=500), machine,
+            profile_of(machine),
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize(("upper", "second"), [(700.0, False), (800.0, True)])
+def test_a_second_place_is_chosen_where_there_is_room(upper: float, second: bool) -> None:
+    """SOD 600 and 800; or 600 and as at home, which is the first here."""
+    machine = parse_machine(
+        'base = "xyzr_cabinet"\nname = "mine"\n[fixed]\ndetector_y = 1059.0\n'
+        f"[axes.X]\nupper = 0.0\nhome = 0.0\n[axes.Z]\nupper = {upper}\nhome = 600.0\n"
+    )
+    text = compose_script(
+        ScanRequest("calibration", frames=41, exposure_ms=500), machine, profile_of(machine)
+    )
+    rows = [line.split("\t") for line in text.splitlines()]
+    at = [float(row[2]) for row in rows if row[:2] == ["Z", "move absolute"] and row[4] == "ACK"]
+    assert at == [600.0, 600.0, *([800.0] if second else [])]
 
 
 def test_a_second_motor_of_a_distance_is_sent_home() -> None:

@@ -122,8 +122,6 @@ class DatasetDocument(_Model):
     """Motor -> position when the settings texts were written [mm, deg], script's sign."""
     frames: list[FrameEntry]
 
-    model_config = ConfigDict(populate_by_name=True)
-
     @classmethod
     def of(cls, record: ScanRecord) -> DatasetDocument:
         """The document of a scan."""

@@ -118,7 +118,7 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
         try:
             _check_counts(full)
             writer = _Writer(machine, profile, full)
-            writer.station(sod, 0.0, 0.0)
+            writer.station(sod)
         except LimitError:
             if (sod, sdd, height) == attempts[-1]:
                 raise
@@ -127,7 +127,7 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
     if request.placements is None and writer.request.sod_mm == 600.0:
         for second in (800.0, writer.at_home("object_y")):
             with suppress(LimitError):
-                writer.station(second, 0.0, 0.0)
+                writer.station(second)
                 both = dict.fromkeys((*writer.request.placements, ScanPosition(second)))
                 writer = replace(writer, request=replace(writer.request, placements=tuple(both)))
                 break
@@ -296,7 +296,7 @@ class _Writer(_Places):
         yield _row("scanner", "pause", "0.000000")
         yield _row("scanner", "set output path", w.folder)
         yield from self.settings()
-        yield from self.moves(self.station(w.sod_mm, 0.0, 0.0) | out)
+        yield from self.moves(self.station(w.sod_mm) | out)
         yield from self.references()
         yield from {
             "fly": self.fly,
@@ -381,7 +381,7 @@ class _Writer(_Places):
                 {"asked": "helical", "missing": ["source_z", "detector_z", "object_z"]},
             )
         yield from self.go(*self.aside)
-        station = self.station(w.sod_mm, 0.0, 0.0)
+        station = self.station(w.sod_mm)
         targets: dict[str, tuple[float, float, float]] = {}
         for quantity in moved:
             motor = self.drivers.get(quantity, "")
@@ -476,7 +476,7 @@ class _Writer(_Places):
         yield from self.moves({name: every[name] for name in names})
 
     def station(
-        self, sod: float, lateral: float, detector_shift: float, lift: float = 0.0
+        self, sod: float, lateral: float = 0.0, detector_shift: float = 0.0, lift: float = 0.0
     ) -> dict[str, float]:
         """Motor targets that put everything where it belongs, checked against travel limits.
 
@@ -541,7 +541,7 @@ class _Writer(_Places):
         [quantity] = self.aside
         name = self.drivers[quantity]
         axis, factor = self.machine.axis(name), self.machine.geometry[quantity][name]
-        centre = self.station(w.sod_mm, 0.0, 0.0)[name]
+        centre = self.station(w.sod_mm)[name]
         across = quantity == "object_x"
         size = camera.shape[1 if across else 0]
         pixel = camera.pixels_mm(self.machine.detector.sensor)[0 if across else 1]

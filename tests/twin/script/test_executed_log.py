@@ -7,11 +7,19 @@ project, file `script_executed.txt`); what it should give is written out here by
 from __future__ import annotations
 
 import json
+import math
 import random
 import struct
+from collections.abc import Callable
+from datetime import datetime, timedelta
 from pathlib import Path
+from statistics import fmean, median
 
+import numpy as np
 import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy import stats
 
 from flexdt.clients.cli.entry import run
 from flexdt.twin.machine.description import (
@@ -22,7 +30,8 @@ from flexdt.twin.machine.description import (
     parse_machine,
 )
 from flexdt.twin.script import check_script, parse_script, plan_script
-from flexdt.twin.script.executed_log import Executed, read_log
+from flexdt.twin.script import commands as c
+from flexdt.twin.script.executed_log import Executed, MotorReply, motor_reply, read_log
 from flexdt.twin.script.planning.log_fit import Comparison, Fit, first_difference, fit_machine
 from flexdt.twin.script.planning.plan import step_range, total_range
 
@@ -157,7 +166,7 @@ def motor(*, upper: float = 90.0, copy: float = 90.0, target: float = 10.0) -> b
         (line(moment="23:59:60.000"), 1, "error", "no time of day"),
         (line(reply=motor(upper=1.1e9, copy=1.1e9)), 1, "warning", "17 big-endian doubles"),
         (line(reply=motor(upper=float("inf"), copy=float("inf"))), 1, "warning", "17 big-endian"),
-        (b"tube\txrayoff\t09:00:00.000\r\n", 1, "error", "has ten"),
+        (b"tube\txrayoff\t09:00:00.000\r\n", 1, "error", "3 columns, or no wait"),
         (line(reply=motor())[:-20] + b"\t09:00:00.000\r\n", 1, "warning", ""),
         (line(reply=motor(copy=80.0)), 1, "warning", "limits twice"),
         (line(reply=motor(target=40.0)), 1, "warning", "position near the target"),
@@ -179,6 +188,176 @@ def test_a_sound_reply_is_decoded() -> None:
     assert problems == ()
     assert found.motor is not None
     assert (found.motor.lower, found.motor.upper, found.motor.max_speed) == (-90.0, 90.0, 50.0)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    reply=st.binary(max_size=200) | st.text("\t\r\n0:.", max_size=30).map(str.encode),
+    own=st.integers(0, 604_800_000),
+    after=st.timedeltas(timedelta(0), timedelta(days=1) - timedelta(milliseconds=1)),
+    bounds=st.sampled_from([(None, None), (2000.0, None), (None, 150.0), (7.0, 8.0)]),
+)
+def test_columns_come_back_whatever_bytes_the_reply_has(
+    reply: bytes, own: int, after: timedelta, bounds: tuple[float | None, float | None]
+) -> None:
+    assume(reply.count(b":") < 2)  # what might be a moment ends a line
+    moment = (datetime(2026, 1, 1) + after).time()
+    words = "\t".join("" if bound is None else f"{bound:g}" for bound in bounds)
+    data = line(str(own), reply, moment.isoformat("milliseconds"))
+    data = data.replace(b"ACK\t\t", f"ACK\t{words}".encode(), 1)
+    (found,), _ = read_log(data)
+    assert (found.reply, found.own_s) == (reply, own / 1000)
+    assert found.sent_s == pytest.approx(after.total_seconds(), abs=1e-3)
+    command = found.command
+    assert (command.line, command.timeout_ms, command.expected_ms) == (1, *bounds)
+
+
+RATE = st.floats(1e-3, 1e6)
+PLACE = st.floats(-1e9, 1e9)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(PLACE, min_size=17, max_size=17), st.tuples(RATE, RATE, RATE, RATE), st.data())
+def test_a_reply_is_decoded_from_its_own_bytes_or_not_at_all(
+    values: list[float], rates: tuple[float, ...], data: st.DataObject
+) -> None:
+    """0 position, 1 target, 2 speed, 4 acceleration, 5 upper, 6 lower, 8 and 10 the maxima."""
+    lower, upper = sorted(data.draw(st.tuples(PLACE, PLACE).filter(lambda x: x[0] != x[1])))
+    assume(upper - lower > 1e-6)
+    values[0] = data.draw(st.floats(lower - 1, upper + 1))
+    (speed, max_speed), (acceleration, most) = sorted(rates[:2]), sorted(rates[2:])
+    values[2], values[4], values[5], values[6] = speed, acceleration, upper, lower
+    values[8], values[10] = max_speed, most
+    wrong = data.draw(st.sampled_from([None, *FAULTS]))
+    copy = [upper, lower]
+    if wrong is not None:
+        FAULTS[wrong](values, copy)
+    raw = struct.pack(">17d", *values) + bytes(7) + struct.pack(">2d", *copy)
+    assume(max(raw) >= 0x80)
+    assume(all(abs(values[i]) <= 1e9 for i in (0, 1)) or wrong is not None)
+    expected = MotorReply(values[0], values[1], speed, acceleration, lower, upper, max_speed, most)
+    assert motor_reply(raw) == (expected if wrong is None else None), wrong
+    assert motor_reply(raw[:-1]) is None
+
+
+def _put(index: int, value: Callable[[list[float]], float]) -> Callable[..., None]:
+    def change(values: list[float], copy: list[float]) -> None:
+        values[index] = value(values)
+
+    return change
+
+
+FAULTS: dict[str, Callable[[list[float], list[float]], None]] = {
+    "copy of the upper limit": lambda v, copy: copy.__setitem__(0, copy[0] + 1000.0),
+    "copy of the lower limit": lambda v, copy: copy.__setitem__(1, copy[1] - 1000.0),
+    "far above": _put(0, lambda v: v[5] + 1.01 + 1e-6 * abs(v[5])),
+    "far below": _put(0, lambda v: v[6] - 1.01 - 1e-6 * abs(v[6])),
+    "target": _put(1, lambda v: 1.01e9),
+    "no speed": _put(2, lambda v: 0.0),
+    "too fast": _put(2, lambda v: 1.01 * v[8]),
+    "no acceleration": _put(4, lambda v: 0.0),
+    "too sharp": _put(4, lambda v: 1.01 * v[10]),
+    "absurd speed": _put(8, lambda v: 1.01e6),
+    "absurd acceleration": _put(10, lambda v: 1.01e6),
+}
+
+
+@pytest.mark.parametrize(("upper", "text"), [(512.0, False), (256.0, True)])
+def test_a_reply_that_was_saved_as_plain_text_is_none(upper: float, text: bool) -> None:
+    """512 has the byte 0x80, the other powers of two have smaller ones."""
+    values = [4.0, 4.0, 8.0, 0.0, 32.0, upper, 2.0, 0.0, 16.0, 0.0, 64.0, *[0.0] * 6]
+    raw = struct.pack(">17d", *values) + bytes(7) + struct.pack(">2d", upper, 2.0)
+    assert (motor_reply(raw) is None) == text
+
+
+@pytest.mark.parametrize(
+    ("asked", "target", "position", "near"),
+    [
+        (0.0, 0.001, 0.001, True),
+        (10.0, 10.0109, 10.0, True),
+        (10.0, 10.0112, 10.0, False),
+        (10.0, 10.0, 11.0109, True),
+        (10.0, 10.0, 8.9888, False),
+        (500.0, 90.0, 90.0, True),  # the limit stopped it
+        (-500.0, -90.0, -90.5, True),
+        (-500.0, 90.0, 90.0, False),
+    ],
+)
+def test_a_reply_is_about_its_own_move(
+    asked: float, target: float, position: float, near: bool
+) -> None:
+    """The target to a thousandth of itself and a micrometre, the position to a millimetre more."""
+    reply = motor(target=target).replace(struct.pack(">d", 10.0), struct.pack(">d", position), 1)
+    (found,), problems = read_log(line(reply=reply).replace(b"\t10\t", f"\t{asked:g}\t".encode()))
+    assert (found.motor is not None, [p.code for p in problems]) == (
+        near,
+        [] if near else ["reply"],
+    )
+
+
+def drawn_log(rng: np.random.Generator, slower: float) -> tuple[Executed, ...]:
+    """Commands that only take the time of their kind, in another order each time."""
+    words = [("tube\tset kV\t80", 0.2), ("camera\tset exposure\t100", 0.7)] * 6
+    words += [("scanner\tpause\t250", 0.05)] * 6 + [("scanner\twrite settings file\t", 1.0)]
+    data = b""
+    for i in rng.permutation(len(words)):
+        text, typical = words[i]
+        own = 250 * ("pause" in text) + 1000 * typical * slower * rng.lognormal(0.0, 0.2)
+        data += f"{text}\t\tACK\t\t\t{own:.0f}\t\t09:00:00.000\r\n".encode()
+    lines, problems = read_log(data)
+    assert problems == ()
+    return lines
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_times_and_their_ranges_follow_the_description(seed: int, blank: Machine) -> None:
+    """The sums of the module's description, with another library's t distribution."""
+    rng = np.random.default_rng(seed)
+    logs = [drawn_log(rng, slower) for slower in (1.0, 1.1, 1.3)]
+    fit = fit_machine(logs, blank, "drawn")
+    kinds = {"set_tube": c.SetVoltage, "set_camera": c.SetExposure, "command": c.Pause,
+             "write_settings": c.WriteSettingsFile}  # fmt: skip
+    times = {
+        kind: [x.own_s - 0.25 * (type_ is c.Pause) for log in logs for x in log
+               if isinstance(x.command, type_)]
+        for kind, type_ in kinds.items()
+    }  # fmt: skip
+    assert {k: list(v) for k, v in fit.samples.items()} == {
+        k: pytest.approx(v) for k, v in times.items()
+    }
+    errors = {}
+    for kind, found in times.items():
+        half = math.ceil(len(found) / 2)
+        middle = median(found[:half]) + 0.003
+        errors[kind] = [
+            math.log((x + 0.003) / middle) / math.sqrt(1 + 1 / half) for x in found[half:]
+        ]
+    shift = fmean(fmean(e) for e in errors.values())
+    going_on = {kind: [x + shift / 3 for x in e] for kind, e in errors.items()}
+    common = median(fmean(x**2 for x in e) for e in going_on.values())
+    timing = fit.machine.timing
+    assert timing.drift == pytest.approx(math.exp(abs(shift) * 4 / 3) - 1, abs=1e-4)
+    for kind, found in times.items():
+        middle, own = median(found), going_on[kind]
+        freedom = 4 + len(own)
+        square = (4 * common + sum(x**2 for x in own)) / freedom
+        reach = stats.t.ppf(0.95, freedom) * math.sqrt(square * (1 + 1 / len(found)))
+        low, high = np.quantile(found, (0.05, 0.95), method="weibull")
+        low = min(low, (middle + 0.003) * math.exp(-reach) - 0.003)
+        high = max(high, (middle + 0.003) * math.exp(reach) - 0.003)
+        spread = timing.spread[kind]
+        assert timing.seconds(kind) == pytest.approx(middle, abs=1e-4)
+        assert (spread.p5_s, spread.p95_s) == pytest.approx((max(low, 0.0), high), abs=2e-4)
+        assert spread.p5_s <= low + 1e-12
+        assert spread.p95_s >= high - 1e-12
+        assert spread.n == len(found)
+    expected = fit.lines.sum_abs_error_s
+    for kind, found in times.items():
+        for i, x in enumerate(found):
+            others = median(found[:i] + found[i + 1 :])
+            expected += abs(x - others) - abs(x - timing.seconds(kind))
+    assert fit.cross_validated_s == pytest.approx(expected)
+    assert fit.to_dict()["single"] == []
 
 
 def test_damaged_logs_never_raise_and_never_shift_a_limit_unsaid() -> None:

@@ -96,6 +96,7 @@ def test_any_script_plans_and_every_plan_keeps_its_promises(text: str) -> None:
         assert x.max() <= limits.upper + 1e-6
         step = times[1] - times[0]
         assert np.abs(np.diff(x)).max() <= limits.max_speed * step * (1 + 1e-9) + 1e-6
+    assert all(0.0 <= b.start_s < b.end_s <= end for b in plan.beam)
     assert len(plan.starts) == sum(len(g) for g in plan.groups)
     if len(plan.starts) < 5000:
         assert [e.index for e in plan.exposures] == list(range(len(plan.starts)))

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from html.parser import HTMLParser
 
+import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from smooth_rule import smooth_scan
 
 from flexdt.twin.machine.description import Machine, Profile, builtin_machine, builtin_profile
@@ -21,7 +25,7 @@ from flexdt.twin.script import (
     check_script,
     html_report,
 )
-from flexdt.twin.script.planning.dry_run_report import summary
+from flexdt.twin.script.planning.dry_run_report import clearance_plot, summary
 from tests.twin.script.conftest import Planner, blob, tabbed
 
 LINES = [
@@ -105,6 +109,78 @@ def test_truncation_over_the_full_rotation(flexray: Machine, profile: Profile) -
     assert cut["top"] == pytest.approx(cut["bottom"])  # at home the beam meets the middle
 
 
+PLACES = st.fixed_dictionaries({
+    "mag_obj": st.floats(100, 700), "mag_det": st.floats(800, 1050), "tra_obj": st.floats(-4, 4),
+    "tra_det": st.floats(-200, 200), "ver_tube": st.floats(0, 100), "ver_det": st.floats(4, 100),
+})  # fmt: skip
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(PLACES, min_size=1, max_size=3), st.floats(1, 60), st.none() | st.floats(0.2, 90))
+def test_the_sample_s_projection_is_that_of_its_cylinder(
+    places: list[dict[str, float]], radius: float, high: float | None
+) -> None:
+    """Points of a cylinder through a pinhole, with the zero offsets of the published profile."""
+    flexray = builtin_machine()
+    profile = builtin_profile("cwi-2023-08-21")
+    lines = ["camera take image ACK", "camera take image ACK", "camera save image di0.tif ACK"]
+    for i, place in enumerate(places):
+        lines += [f"{motor} move absolute {x:.6f} ACK" for motor, x in place.items()]
+        lines += ["camera take image ACK", f"camera save image s_{i}.tif ACK"]
+    sample = SampleSize(2 * radius, high or 0.0)
+    made = check_script("\n".join(lines), flexray, profile, sample=sample)
+    [optics] = made.optics
+    turns = np.linspace(0, 2 * np.pi, 20_001)
+    cut, fields, shown, axes, sides = [], [], [], [], []
+    for place in places:
+        sod, sdd = place["mag_obj"] + 14.9192, place["mag_det"] + 40.0008
+        beam, panel = place["ver_tube"] - 6.2917, place["ver_det"]
+        x = place["tra_obj"] - 0.5405 + radius * np.cos(turns)
+        t = sdd / (sod + radius * np.sin(turns))
+        columns = (x * t + place["tra_det"] - 24.1215 - 16 * 0.0748) / 0.1496 + 477.5
+        depth = sdd / (sod + radius * np.array([1.0, -1.0]))
+        above = 20.0 + np.array([[0.5], [-0.5]]) * (high or 0.0) - beam
+        rows = (panel - beam - above * depth) / 0.1496 + 379.5
+        if high is None:
+            rows = (panel - beam - above * sdd / sod) / 0.1496 + 379.5
+        left, right, top, bottom = columns.min(), columns.max(), rows.min(), rows.max()
+        cut.append([-0.5 - left, right - 955.5, -0.5 - top, bottom - 759.5])
+        shown.append(right > -0.5 and left < 955.5 and bottom > -0.5 and top < 759.5)
+        middle = (place["tra_obj"] - 0.5405) * sdd / sod + place["tra_det"] - 24.1215 - 16 * 0.0748
+        half = 956 / 2 * 0.1496 - abs(middle)
+        axes.append(middle / 0.1496 + 477.5)
+        sides.append(
+            "left of" if right < -0.5 else "right of" if left > 955.5 else "above or below"
+        )
+        fields.append(2 * sod * math.sin(math.atan(max(half, 0.0) / sdd)))
+    names = ("left", "right", "top", "bottom")[: 2 if high is None else 4]
+    worst = np.maximum(np.max(cut, axis=0), 0.0)
+    assert optics.truncation is not None
+    assert dict(optics.truncation) == {
+        name: pytest.approx(px, abs=0.3, rel=1e-3) for name, px in zip(names, worst, strict=False)
+    }
+    assert optics.turn_field_mm == pytest.approx(min(fields), abs=1e-5)
+    everywhere = np.min(cut, axis=0)[: len(names)]
+    if np.abs(np.abs(cut) - 956).min() < 2 or np.abs(cut).min() < 2:
+        return  # at an edge, where the two ways need not agree
+    said = {p.code: p for p in made.problems}
+    assert ("sample_out_of_beam" in said) == (not all(shown))
+    assert ("truncated" in said) == (any(shown) and bool((everywhere > 0.5).any()))
+    if "truncated" in said:
+        parts = [name for name, px in zip(names, everywhere, strict=True) if px > 0.5]
+        assert [name for name in names if f"{name} by" in said["truncated"].message] == parts
+    if not all(shown):
+        first, more = shown.index(False), shown.count(False) - 1
+        message = said["sample_out_of_beam"].message
+        assert f"column {axes[first]:.0f}, {sides[first]} the image's" in message
+        assert (f"(and at {more} more lines)" in message) == (more > 0)
+
+
+def test_a_source_within_the_sample_has_a_report_too(flexray: Machine, profile: Profile) -> None:
+    made = report(flexray, profile, sample=SampleSize(1200.0, 50.0))
+    json.dumps(made.to_dict(), allow_nan=False)
+
+
 def test_sample_size_is_taken_from_the_script(flexray: Machine, profile: Profile) -> None:
     text = tabbed("scanner", "set sample info", blob("x", 80.0), "", "ACK")
     text += "\r\n".join(LINES).encode()
@@ -164,6 +240,80 @@ def test_collisions_come_from_the_function_handed_in(flexray: Machine, profile: 
     page = html_report(made, "a<b>.txt")
     assert "<svg" in page
     assert "sample and source" in page
+
+
+@pytest.mark.parametrize("beyond", [-0.02, 0.02])
+@pytest.mark.parametrize(("across", "sense"), [(True, 1), (True, -1), (False, 1), (False, -1)])
+def test_an_axis_is_in_the_beam_as_far_as_the_edge_of_the_last_pixel(
+    flexray: Machine, profile: Profile, across: bool, sense: int, beyond: float
+) -> None:
+    """SOD 500 and SDD 1000: from a spot at height 0, the middle at 20 mm is seen at 40 mm."""
+    off = sense * ((956 if across else 160) / 2 + beyond) * 0.1496
+    panel = (25.3183 - off, 40.0) if across else (25.3183, 40.0 + off)
+    moves = zip(("tra_det", "ver_det", "ver_tube"), (*panel, 6.2917), strict=True)
+    lines = [
+        *LINES[:-5],
+        *(f"{name} move absolute {at:.6f} ACK" for name, at in moves),
+        *LINES[-5:],
+    ]
+    lines[4] = "camera set ROI 32 608 1943 927 ACK"
+    made = check_script("\n".join(lines), flexray, profile, start=StartState.of(flexray))
+    said = [p.message for p in made.problems if p.code == "sample_out_of_beam"]
+    assert len(said) == (beyond > 0)
+
+
+def points(trace: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    [found] = re.findall(r'points="([^"]*)"', clearance_plot(trace, [(2.5, "a<b")]))
+    return [(float(x), float(y)) for x, y in (pair.split(",") for pair in found.split())]
+
+
+def test_a_plot_of_clearance_is_to_scale() -> None:
+    """The frame's corner lies at (60, 206), its ends at (870, 206) and (60, 28)."""
+    trace = [(0.0, 40.0), (2.5, -3.0), (7.5, 10.0), (10.0, 0.0)]
+    assert points(trace) == [(60.0, 28.0), (262.5, 206.0), (667.5, 161.5), (870.0, 206.0)]
+    page = clearance_plot(trace, [(2.5, "a<b")])
+    assert 'd="M60.0,28.0 V206.0 H870.0"' in page
+    marks = re.findall(r'<line x1="([\d.]+)" x2="([\d.]+)" y1="([\d.]+)" y2="([\d.]+)"', page)
+    assert marks == [("262.5", "262.5", "28.0", "206.0")]
+    assert "a&lt;b" in page
+    ticks = re.findall(r'<text x="([\d.]+)" y="([\d.]+)" text-anchor="(\w+)">([\d.]+)<', page)
+    across = [(float(x), float(y), v) for x, y, anchor, v in ticks if anchor == "middle"]
+    up = [(float(x), float(y), v) for x, y, anchor, v in ticks if anchor == "end"]
+    assert across == [(60 + 81 * v, 222.0, f"{v:g}") for v in (0, 2.5, 5, 7.5, 10)]
+    assert up == [(54.0, 206 - 4.45 * v + 4, f"{v:g}") for v in (0, 10, 20, 30, 40)]
+    assert points([(0.0, 0.0)]) == [(60.0, 206.0)]
+
+
+@pytest.mark.parametrize(
+    ("end", "step"),
+    [(1.0, 0.25), (3.0, 1.0), (7.9, 2.0), (41.0, 20.0), (9000.0, 2500.0), (0.3, 0.1)],
+)
+def test_ticks_are_round_numbers(end: float, step: float) -> None:
+    page = clearance_plot([(0.0, 1.0), (end, 1.0)])
+    ticks = re.findall(r'text-anchor="middle">([\d.]+)<', page)
+    assert [float(t) for t in ticks] == pytest.approx(np.arange(0.0, end + 1e-9, step))
+
+
+def test_figures_of_the_report_in_words(flexray: Machine, profile: Profile) -> None:
+    pause = "scanner pause 3724000 ACK"
+    made = check_script("\n".join([*LINES, pause]), flexray, profile, sample=SampleSize(20.0))
+    facts = dict(summary(made))
+    seconds = round(made.plan.duration_s) - 3600
+    assert facts["duration"].startswith(f"1 h {seconds // 60} min {seconds % 60} s (")
+    assert facts["  truncation"] == "none"
+    assert facts["collisions"] == "not checked"
+    assert repr(made).startswith("<CheckReport: ok, 0 collisions, of <ScanPlan on flexray: ")
+    assert "<details>" in html_report(made)
+    wide = report(flexray, profile, sample=SampleSize(80.0))
+    assert dict(summary(wide))["  truncation"] == "left 58 px, right 58 px"
+    assert dict(summary(wide))["duration"].startswith("0 min ")
+    free = Clearance((), 12.5, ("sample", "source"), ((0.0, 12.5),))
+    hit = Clearance((Collision(10, 4.5, ("sample", "source"), {}),), 0.5, ("sample", "source"))
+    for found, text, ok in ((free, "none; smallest clearance 12.50 mm (sample and source)", True),
+                            (hit, "1", False)):  # fmt: skip
+        checked = report(flexray, profile, collision=lambda *_, found=found: found)
+        assert dict(summary(checked))["collisions"] == text
+        assert (checked.ok, repr(checked).split(",")[1]) == (ok, f" {1 - ok} collisions")
 
 
 class _Tags(HTMLParser):

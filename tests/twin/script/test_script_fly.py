@@ -126,6 +126,16 @@ def test_what_is_unsaid_is_inferred(
     assert scan.last == pytest.approx(360.0)
 
 
+@pytest.mark.parametrize(("longer", "frames"), [(0.9, 1441), (-0.9, 1441), (1.1, 1445)])
+def test_a_scan_within_a_degree_of_whole_turns_is_one_of_them(
+    planned: Planner, longer: float, frames: int
+) -> None:
+    rule = smooth_scan(1441, 0.1, 1, 22.5)
+    lines = [x for x in fly_lines(100, 1, 1441) if "frames" not in x]
+    plan = fly(planned, lines, rule.speed, rule.start, rule.end + longer)
+    assert [scan.frames for scan in plan.fly_scans] == [frames]
+
+
 def test_without_a_rule_to_infer_from_the_documented_default_is_taken(planned: Planner) -> None:
     lines = [x for x in fly_lines(100, 1, 1) if "number" not in x]
     plan = planned(*lines, "camera take and save image sequence scan_ 0 ACK")
@@ -137,12 +147,34 @@ def test_without_a_rule_to_infer_from_the_documented_default_is_taken(planned: P
     assert plan.frames == 1
 
 
-def test_frames_that_miss_a_turn_are_named(planned: Planner) -> None:
-    rule = smooth_scan(361, 0.1, 1, 22.5)
-    # 360.3 deg in 360 steps: less than half a step too much.
-    plan = fly(planned, fly_lines(100, 1, 361), rule.speed * 360.3 / 360, -10, 370)
-    assert [p.code for p in plan.problems] == ["frame_angles"]
+@pytest.mark.parametrize("frames", [181, 361, 1441])
+@pytest.mark.parametrize(
+    ("miss", "said"), [(0.045, 0), (0.055, 1), (-0.055, 1), (0.3, 1), (0.45, 1)]
+)
+def test_frames_that_miss_a_turn_are_named(
+    planned: Planner, frames: int, miss: float, said: int
+) -> None:
+    """By part of a step; less than half of one, so the images are meant to make a turn."""
+    rule = smooth_scan(frames, 0.1, 1, 22.5)
+    speed = rule.speed * (1 + miss / (frames - 1))
+    plan = fly(planned, fly_lines(100, 1, frames), speed, -60, 420)
+    assert [p.code for p in plan.problems] == ["frame_angles"] * said
     assert plan.exposures[-1].positions["rot_obj"] == pytest.approx(360.0)
+
+
+def test_averages_follow_from_the_frames_before_the_run_up(planned: Planner) -> None:
+    """A run-up of 10 degrees more says nothing about the averages."""
+    rule = smooth_scan(361, 0.1, 3, 22.5)
+    lines = [x for x in fly_lines(100, 3, 361) if "averages" not in x]
+    plan = fly(planned, lines, rule.speed, rule.start - 10.0, rule.end + 10.0)
+    assert [scan.averages for scan in plan.fly_scans] == [3]
+
+
+def test_averages_that_are_inferred_hold_for_previews_too(planned: Planner) -> None:
+    rule = smooth_scan(361, 0.1, 3, 22.5)
+    lines = [x for x in fly_lines(100, 3, 361) if "averages" not in x]
+    plan = fly(planned, [*lines, "camera take image ACK"], rule.speed, rule.start, rule.end)
+    assert [(g.kind, g.camera.averages) for g in plan.groups] == [("preview", 3), ("projection", 3)]
 
 
 def test_half_a_turn_lies_where_the_motor_is(planned: Planner) -> None:
@@ -164,18 +196,23 @@ def test_a_short_run_up_and_an_early_end_are_named(planned: Planner) -> None:
     assert early.exposures[-1].positions["rot_obj"] == 355.0
 
 
-def test_commands_between_trigger_and_sequence_delay_it(planned: Planner) -> None:
+@pytest.mark.parametrize(("pause", "late"), [("50", 1), ("0.0000011", 1), ("0.0000009", 0)])
+def test_commands_between_trigger_and_sequence_delay_it(
+    planned: Planner, pause: str, late: int
+) -> None:
+    """A delay below a nanosecond is none."""
     rule = smooth_scan(361, 0.1, 1, 22.5)
     plan = planned(
         *fly_lines(100, 1, 361),
         f"rot_obj move absolute {rule.start} ACK",
         f"rot_obj set speed {rule.speed} ACK",
         f"rot_obj move absolute {rule.end} 0 POS",
-        "scanner pause 50 ACK",
+        f"scanner pause {pause} ACK",
         "camera take and save image sequence scan_ 0 ACK",
     )
-    assert [p.code for p in plan.problems] == ["late_start"]
-    assert plan.exposures[0].positions["rot_obj"] == pytest.approx(0.05 * rule.speed)
+    assert [p.code for p in plan.problems] == ["late_start"] * late
+    expected = float(pause) / 1000 * rule.speed
+    assert plan.exposures[0].positions["rot_obj"] == pytest.approx(expected, abs=1e-8)
 
 
 def test_turning_backwards(planned: Planner) -> None:

@@ -17,6 +17,7 @@ from flexdt.twin.geometry.conventions import rotation_about
 from flexdt.twin.machine.description import (
     Machine,
     Profile,
+    Timing,
     builtin_machine,
     builtin_machine_text,
     parse_machine,
@@ -75,6 +76,26 @@ def test_an_axis_may_be_written_in_any_case(rng: random.Random, name: str) -> No
     assert plan.problems == ()
     assert plan.steps[1].duration_s == pytest.approx(50 / 25 + 25 / 50)
     assert plan.positions([99.0])[name] == 50.0
+
+
+def test_a_plan_without_motion_has_nothing_that_moves(planned: Planner) -> None:
+    plan = planned("scanner pause 100 ACK", "camera take image ACK")
+    assert [e.moving for e in plan.exposures] == [False]
+    assert plan.steps[1].start_s == pytest.approx(0.1)
+    assert plan.duration_s == pytest.approx(0.1 + plan.steps[1].duration_s)
+    assert planned("scanner pause 100 ACK").duration_s == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("line", "what"),
+    [
+        ("rot_obj move absolute 10 5 POS", "rot_obj to 10, goes on at 5"),
+        ("rot_obj move absolute 10 ACK", "rot_obj to 10"),
+        ("rot_obj move absolute 10 5 no wait", "rot_obj to 10, goes on at once"),
+    ],
+)
+def test_a_move_in_words(planned: Planner, line: str, what: str) -> None:
+    assert planned(line).steps[0].what == what
 
 
 def test_batches_without_wait_start_together_and_ack_waits_for_its_own_move(
@@ -224,6 +245,19 @@ def test_assumed_times_come_from_the_machine_and_not_from_the_bound_in_column_7(
     assert on.end_s == pytest.approx(plan.steps[4].start_s)
 
 
+def test_settings_of_a_tube_that_is_on_part_its_time(flexray: Machine, planned: Planner) -> None:
+    """Two settings at one moment make no interval between them."""
+    still = Timing(source="none", xrayon_s=2.0)
+    plan = plan_script(
+        parse_script("tube xrayon ACK\nscanner pause 1000 ACK\ntube set kV 80 ACK\n"
+                     "tube set power 40 ACK\nscanner pause 500 ACK\ntube xrayoff ACK"),
+        flexray.model_copy(update={"timing": still}),
+    )  # fmt: skip
+    assert [(b.start_s, b.end_s, b.kV, b.power_W) for b in plan.beam] == [
+        (2.0, 3.0, 90.0, 50.0), (3.0, 3.5, 80.0, 40.0),
+    ]  # fmt: skip
+
+
 def test_x_rays_are_ready_without_waiting_when_a_pause_has_passed(planned: Planner) -> None:
     plan = planned(
         "tube xrayon ACK",
@@ -273,6 +307,8 @@ def test_images_kinds_names_and_settings(planned: Planner) -> None:
         ("../../../etc/passwd", "passwd.tif"),
         ("E:\\a\\x:y*?.tif", "x_y__.tif"),
         ("C:\\con.tif", "_con.tif"),
+        ("C:\\A.TIF", "A.TIF"),
+        ("C:\\a.tifx", "a.tifx.tif"),
         ("E:\\.hidden.tif", "hidden.tif"),
         ("\\\\server\\share\\a.tiff", "a.tiff"),
     ],
@@ -322,7 +358,8 @@ def test_settings_left_unsaid_are_named(planned: Planner) -> None:
 
 
 def test_step_and_shoot_images_are_where_the_stage_stopped(planned: Planner) -> None:
-    lines = [*QUIET, "tube xrayon ACK"]
+    dark = ["camera take image ACK", "camera take image ACK", "camera save image di0.tif ACK"]
+    lines = [*QUIET, "rot_obj move absolute 7 ACK", *dark, "tube xrayon ACK"]
     for i in range(24):
         lines += [
             f"rot_obj move absolute {i * 15} ACK",
@@ -332,7 +369,13 @@ def test_step_and_shoot_images_are_where_the_stage_stopped(planned: Planner) -> 
     plan = planned(*lines)
     assert codes(plan) == []
     assert plan.frames == 24
-    assert [e.positions["rot_obj"] for e in plan.exposures] == [15.0 * i for i in range(24)]
+    assert [e.positions["rot_obj"] for e in plan.exposures] == [
+        7,
+        7,
+        *(15.0 * i for i in range(24)),
+    ]
+    assert np.degrees(plan.poses.angle) == pytest.approx(np.arange(24) * 15.0)
+    assert plan.geometry.shape == (24, 760, 956)
     assert not any(e.moving for e in plan.exposures)
     assert np.all(np.diff(plan.starts) > 0.1)
 

@@ -154,7 +154,7 @@ class CheckReport(WithProblems):
     @property
     def ok(self) -> bool:
         """No error and no collision; warnings do not count."""
-        return not self.errors and not (self.clearance and self.clearance.collisions)
+        return not self.errors  # a collision is one
 
     @property
     def start(self) -> str:
@@ -340,9 +340,8 @@ def _optics(view: View) -> Optics:
     rows, cols = shape = camera.shape
     pixel = float(np.linalg.norm(p.u[0]))
     m = p.sdd / p.sod
-    half = np.min(view.axis - (-0.5)), np.min(cols - 0.5 - view.axis)
-    offset = max(0.0, float(min(half))) * pixel
-    reach = float(np.min(p.sod * np.sin(np.arctan2(offset, p.sdd))))
+    half = np.minimum(view.axis + 0.5, cols - 0.5 - view.axis) * pixel
+    reach = float(np.min(p.sod * np.sin(np.arctan2(np.maximum(half, 0.0), p.sdd))))
     cut = {
         "left": float(np.max(view.cut_columns[:, 0])),
         "right": float(np.max(view.cut_columns[:, 1])),

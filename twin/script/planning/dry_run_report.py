@@ -292,4 +292,4 @@ def _ticks(end: float) -> list[float]:
     raw = end / 4
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(m * power for m in (1, 2, 2.5, 5, 10) if m * power >= raw)
-    return [round(k * step, 12) for k in range(int(end / step) + 1)]
+    return [round(k * step, 12) for k in range(int(end / step + 1e-9) + 1)]

@@ -56,7 +56,6 @@ class Imaging:
         self.names: set[str] = set()
         self.hint = averages
         self.inferred_averages: int | None = None
-        self.unsaid_used = False
         self._complained: set[str] = set()
         if averages is not None:
             camera.assume("averages", averages)
@@ -318,13 +317,11 @@ class Imaging:
         for name, what, value in defaults:
             if name not in self.camera.said:
                 self._default(name, what, value)
-        if "averages" not in self.camera.said and "averages" not in self._complained:
-            self.unsaid_used = True
-            if self.hint is None:
-                self._complained.add("averages")
-                self.note(
-                    "warning", "averages_unsaid", "the number of averages is not set; 1 is assumed"
-                )
+        if not {"averages"} & (self.camera.said | self._complained) and self.hint is None:
+            self._complained.add("averages")
+            self.note(
+                "warning", "averages_unsaid", "the number of averages is not set; 1 is assumed"
+            )
         if draft.xrays_on:
             if not self.tube.kV_said:
                 self._default("kV", "the tube voltage", f"{draft.kV:g} kV")

@@ -75,7 +75,7 @@ class Motor:
         else:
             x, v = self.home, 0.0
         made = motion.move(x, v, target, speed, acceleration, time)
-        if made.end > time or v != 0.0:
+        if made.end > time:
             self.moves.append((time, made))
         return made
 

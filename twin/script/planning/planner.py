@@ -164,7 +164,7 @@ def simulated(commands: tuple[c.Command, ...], machine: Machine, start: StartSta
     simulation = Simulation(machine, start)
     simulation.run(commands)
     inferred = simulation.imaging.inferred_averages
-    if inferred is not None and simulation.imaging.unsaid_used:
+    if inferred is not None:  # it holds for the images before the scan too
         simulation = Simulation(machine, start, inferred)
         simulation.run(commands)
     return simulation

@@ -117,11 +117,14 @@ def _aggregate(view: View, bad: BoolArray, code: str, text: str) -> Problem:
 
 def _outside_text(view: View) -> str:
     i = int(np.argmax(view.outside))
-    cols = view.camera.shape[1]
-    side = "left" if view.right[i] < 0 else "right"
+    rows, cols = view.camera.shape
+    side, sides = "above or below", f"rows 0 to {rows - 1}"
+    if view.right[i] < -0.5 or view.left[i] > cols - 0.5:
+        side, sides = "left" if view.right[i] < -0.5 else "right", f"columns 0 to {cols - 1}"
+        side += " of"
     return (
         f"the sample is out of the beam: the shadow of its axis lies at column {view.axis[i]:.0f}, "
-        f"{side} of the image's columns 0 to {cols - 1}; projections show no sample"
+        f"{side} the image's {sides}; projections show no sample"
     )
 
 

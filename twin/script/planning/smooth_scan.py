@@ -70,8 +70,6 @@ def infer(flight: Flight) -> Inference | None:
     step = flight.speed * flight.exposure_s * averages
     frames = flight.frames
     if frames is None:
-        if length <= 0.0:
-            return None
         steps = length / step
         if not 0.5 <= steps < MAX_STEPS:
             return None
