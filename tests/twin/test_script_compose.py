@@ -431,10 +431,12 @@ def test_what_cannot_be_centred_is_said(more: str, text: str, kind: Kind, says: 
     if text.startswith("sample_height_mm"):
         head, text = head + text + "\n", ""
     machine = parse_machine(head + text)
-    with pytest.raises(LimitError, match=says):
+    with pytest.raises(LimitError, match=says) as caught:
         compose_script(
             ScanRequest(kind=kind, frames=61, exposure_ms=1000), machine, profile_of(machine)
         )
+    if says == "turns the sample by":
+        assert caught.value.data["allowed"] == [1.0, -1.0]
 
 
 def test_motors_that_nearly_do_the_same_are_said() -> None:

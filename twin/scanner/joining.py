@@ -359,18 +359,18 @@ class Prepared:
     version: tuple[int, int]
     guard: Guard | None = field(repr=False)
 
-    def certified(self) -> Certificate:
+    def certified(self) -> CertifiedProgramme:
         """Sweep all of it; takes about 60 ms for 1440 steps."""
         ways = {name: motion.at_rest(x, 0.0) for name, x in self.start.items()}
         for name, trajectories in self.programme.items():
             if trajectories:
                 wait = [ways[name]] if trajectories[0].start > 0.0 else []
                 ways[name] = motion.joined([*wait, *trajectories])
-        return Certificate(self, None if self.guard is None else self.guard(ways, 0.0))
+        return CertifiedProgramme(self, None if self.guard is None else self.guard(ways, 0.0))
 
 
 @dataclass(frozen=True)
-class Certificate:
+class CertifiedProgramme:
     """What the sweep of a programme found; it holds for the version it was prepared for."""
 
     prepared: Prepared

@@ -30,7 +30,7 @@ from flexdt.twin.motion.drives import Drive
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.scanner.joining import (
     LEAST_STEP,
-    Certificate,
+    CertifiedProgramme,
     Jog,
     Joined,
     Lookahead,
@@ -355,16 +355,16 @@ class ScannerTwin:
         stand = {**self.final_positions(), **(start or {})}
         return Prepared(programme, stand, (self._stage, self._stops), self.guard)
 
-    def may_follow(self, certificate: Certificate, now: float) -> bool:
+    def may_follow(self, certificate: CertifiedProgramme, now: float) -> bool:
         """Whether all is as it was prepared for: the stage, no stop since, the motors at rest."""
         here = not self.moving(now) and self.positions(now) == certificate.prepared.start
         return here and self.holds(certificate)
 
-    def holds(self, certificate: Certificate) -> bool:
+    def holds(self, certificate: CertifiedProgramme) -> bool:
         """Whether stage and stops are those that a programme was prepared for."""
         return certificate.prepared.version == (self._stage, self._stops)
 
-    def follow(self, certificate: Certificate, now: float) -> None:
+    def follow(self, certificate: CertifiedProgramme, now: float) -> None:
         """Take over a programme that was swept.
 
         Raises:

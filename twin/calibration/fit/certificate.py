@@ -49,7 +49,7 @@ WEAK_CONDITION = 500.0
 
 
 @dataclass(frozen=True, eq=False)
-class Spectrum:
+class Conditioning:
     """Rank and conditioning of a Jacobian, edge units.
 
     Attributes:
@@ -83,7 +83,7 @@ def spectrum(
     noise: float = 1.0,
     reported: int | None = None,
     bound: float = BOUND,
-) -> Spectrum:
+) -> Conditioning:
     """Analyse whitened Jacobian rows (m, p) in internal units (prior rows included).
 
     Args:
@@ -141,7 +141,7 @@ def spectrum(
         advice = f"worse than {bound:g} mm or deg: add a placement at another SOD, frames or beads"
         null.append(Direction(((names[worst], 1.0),), float(sigma[worst]), advice))
         rank -= 1
-    return Spectrum(tuple(names), covariance, rank, condition, s, tuple(null), tuple(weak))
+    return Conditioning(tuple(names), covariance, rank, condition, s, tuple(null), tuple(weak))
 
 
 def _singular(j: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -219,7 +219,7 @@ class Certificate:
     estimates: dict[str, Estimate]
     covariance: FloatArray
     correlation: FloatArray
-    spectrum: Spectrum
+    spectrum: Conditioning
     dof: float
     noise: float
     rms_px: float
@@ -436,7 +436,7 @@ def certify(
     )
 
 
-def _of_what_was_asked(given: Spectrum, whole: Spectrum) -> Spectrum:
+def _of_what_was_asked(given: Conditioning, whole: Conditioning) -> Conditioning:
     """`given` with the covariance and the open directions of `whole`, which has more columns."""
     rank = min(given.rank, len(given.names) - len(whole.null))
     return replace(given, unit_covariance=whole.unit_covariance, rank=rank, null=whole.null)

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
-from flexdt.twin.calibration.fit.certificate import Spectrum, spectrum
+from flexdt.twin.calibration.fit.certificate import Conditioning, spectrum
 from flexdt.twin.calibration.fit.nominal import Shape, as_poses, frame_shapes
 from flexdt.twin.calibration.fit.priors import require_widths
 from flexdt.twin.calibration.fit.problem import SIX, Reading, build_problem, require_tolerance
@@ -131,7 +131,7 @@ def identifiability(
 
     def predict(
         beads: BeadModel, plan: Poses, marks: npt.NDArray[np.int64], sizes: FloatArray
-    ) -> tuple[Spectrum, dict[str, float], FloatArray, npt.NDArray[np.bool_]]:
+    ) -> tuple[Conditioning, dict[str, float], FloatArray, npt.NDArray[np.bool_]]:
         visible = visible_beads(beads, plan, sizes, at)
         pixels = plan.cone_vec(at).project_points(beads.beads, (1, 1))
         origin = (sizes[:, ::-1] - 1) / 2
