@@ -31,7 +31,13 @@ from flexdt.twin.machine.description import (
 )
 from flexdt.twin.script import check_script, parse_script, plan_script
 from flexdt.twin.script import commands as c
-from flexdt.twin.script.executed_log import Executed, MotorReply, motor_reply, read_log
+from flexdt.twin.script.executed_log import (
+    Executed,
+    MotorReply,
+    motor_cluster,
+    motor_reply,
+    read_log,
+)
 from flexdt.twin.script.planning.log_fit import Comparison, Fit, first_difference, fit_machine
 from flexdt.twin.script.planning.plan import step_range, total_range
 
@@ -260,6 +266,14 @@ FAULTS: dict[str, Callable[[list[float], list[float]], None]] = {
     "absurd speed": _put(8, lambda v: 1.01e6),
     "absurd acceleration": _put(10, lambda v: 1.01e6),
 }
+
+
+def test_what_nobody_knows_of_a_reply_is_zero() -> None:
+    made = motor_cluster(MotorReply(4.0, 5.0, 6.0, 7.0, -8.0, 9.0, 10.0, 11.0))
+    head = struct.unpack_from(">17d", made)
+    assert head == (4.0, 5.0, 6.0, 0, 7.0, 9.0, -8.0, 0, 10.0, 0, 11.0, *[0] * 6)
+    assert struct.unpack_from(">2d", made, 17 * 8 + 7) == (9.0, -8.0)
+    assert not any(made[17 * 8 : 17 * 8 + 7] + made[17 * 8 + 23 :])
 
 
 @pytest.mark.parametrize(("upper", "text"), [(512.0, False), (256.0, True)])

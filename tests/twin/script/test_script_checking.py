@@ -231,7 +231,9 @@ def test_collisions_come_from_the_function_handed_in(flexray: Machine, profile: 
     made = report(flexray, profile, collision=find, sample=SampleSize(20.0))
     assert seen == [made.plan, flexray, profile, SampleSize(20.0)]
     assert not made.ok
-    assert [(p.line, p.code, p.severity) for p in made.problems] == [(10, "collision", "error")]
+    assert [(p.line, p.column, p.code, p.severity) for p in made.problems] == [
+        (10, 1, "collision", "error")
+    ]
     document = made.to_dict()
     assert document["collisions"] == [
         {"line": 10, "time_s": 4.5, "pair": ["sample", "source"], "last_free": {"mag_obj": 80.0}}

@@ -170,6 +170,18 @@ def test_averages_follow_from_the_frames_before_the_run_up(planned: Planner) -> 
     assert [scan.averages for scan in plan.fly_scans] == [3]
 
 
+@pytest.mark.parametrize(
+    ("ratio", "averages"), [(3.05, 3), (2.95, 3), (3.07, 1), (2.93, 1), (0.99, 1), (0.4, 1)]
+)
+def test_averages_are_a_whole_number_within_two_percent_or_not_inferred(
+    planned: Planner, ratio: float, averages: int
+) -> None:
+    rule = smooth_scan(361, 0.1 * ratio, 1, 22.5)
+    lines = [x for x in fly_lines(100, 1, 361) if "number" not in x]
+    plan = fly(planned, lines, rule.speed, rule.start, rule.end)
+    assert [scan.averages for scan in plan.fly_scans] == [averages]
+
+
 def test_averages_that_are_inferred_hold_for_previews_too(planned: Planner) -> None:
     rule = smooth_scan(361, 0.1, 3, 22.5)
     lines = [x for x in fly_lines(100, 3, 361) if "averages" not in x]

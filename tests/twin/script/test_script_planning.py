@@ -498,6 +498,21 @@ def test_a_geared_virtual_axis_moves_at_the_pace_of_its_slowest_motor(
         assert gone[0] == pytest.approx(gone[1], abs=1e-9)
 
 
+def test_a_rate_of_a_geared_virtual_axis_is_shared_out() -> None:
+    """Speeds in mm of the axis; the tube goes twice as far, the panel half as far."""
+    geared = parse_machine(
+        'base = "flexray"\n[virtual_axes.ver_obj]\nfactor = -0.5\n'
+        "moves = { ver_tube = -2.0, ver_det = -0.5 }\n"
+    )
+    text = (
+        "ver_obj set speed 3 ACK\nver_obj set acceleration 4 ACK\nscanner write settings file ACK"
+    )
+    plan = plan_script(parse_script(text), geared, profile_of(geared))
+    assert plan.settings is not None
+    assert [plan.settings.speeds[n] for n in ("ver_tube", "ver_det")] == [6.0, 1.5]
+    assert [plan.settings.accelerations[n] for n in ("ver_tube", "ver_det")] == [8.0, 2.0]
+
+
 @pytest.mark.parametrize("at", [(0.0, 0.0, 0.0), (3.0, -4.0, 0.0), (-6.0, 2.5, 7.0)])
 @pytest.mark.parametrize("tilted", [False, True])
 def test_the_cylinder_about_a_box_holds_its_corners_at_every_angle(
