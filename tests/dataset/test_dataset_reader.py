@@ -21,7 +21,7 @@ from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetFormatError, DatasetMissingError
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, parse_document
 from flexdt.twin.dataset.normalise import LineIntegrals, binned_mean
-from flexdt.twin.dataset.record import ScanRecord
+from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import builtin_profile, builtin_profiles
 
@@ -356,6 +356,22 @@ def test_documents_come_back_equal(record: Make) -> None:
     assert parse_document(doc.to_json()) == doc
     assert doc.machine_of() == record().machine
     assert doc.profile_of() == record().profile
+
+
+def test_what_a_document_leaves_out_is_what_older_ones_meant(record: Make) -> None:
+    content = json.loads(DatasetDocument.of(record()).to_json())
+    for key in ("flexdt", "operator", "smooth", "complete", "reason", "sample", "noise",
+                "correction", "settings_positions"):  # fmt: skip
+        del content[key]
+    doc = parse_document(json.dumps(content))
+    assert (doc.flexdt, doc.operator, doc.reason) == ("", "", "")
+    assert (doc.smooth, doc.complete, doc.correction) == (True, False, None)
+    assert (doc.sample, doc.noise, doc.settings_positions) == (SampleRecord(), NoiseRecord(), {})
+    assert vars(SampleRecord()) == {
+        "name": "", "owner": "", "project": "", "comment": "", "diameter_mm": 0.0, "height_mm": 0.0,
+    }  # fmt: skip
+    assert doc.cone_vec(None).rows.shape == (8, 12)
+    assert doc.files("flat") == ("io000000.tif", "io000001.tif")
 
 
 JSON = st.recursive(
