@@ -204,7 +204,7 @@ def move(
     require_positive(acceleration, "acceleration")
     build = _Builder(time, position, velocity)
     stop_at = position + velocity * abs(velocity) / (2 * acceleration)
-    if velocity != 0.0 and (target - stop_at) * velocity < 0:
+    if (target - stop_at) * velocity < 0:
         build.ramp(0.0, acceleration)
     distance = target - build.position
     if distance != 0.0:
