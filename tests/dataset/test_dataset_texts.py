@@ -315,10 +315,11 @@ def test_machines_are_found_by_name_or_by_their_motors(data: Path) -> None:
 def test_without_a_profile_places_are_those_of_the_motors(data: Path) -> None:
     s = parse_scan_settings(read(data / "flexray_scan_settings.txt"))
     motors = {**s.motors, "tra_tube": MotorLine(1.25), "ver_tube": MotorLine(30.0)}
-    r = rebuild(replace(s, roi=None, motors=motors), 3, (760, 956), [builtin_machine()], [])
-    assert r.profile is None
-    assert r.poses.source[0] == pytest.approx([1.25, 0.0, 30.0])
-    assert r.poses.axis[:, 2] == pytest.approx([20.0] * 3)
+    for count in (1, 3):
+        r = rebuild(replace(s, roi=None, motors=motors), count, (760, 956), [builtin_machine()], [])
+        assert r.profile is None
+        assert r.poses.source[0] == pytest.approx([1.25, 0.0, 30.0])
+        assert r.poses.axis[:, 2] == pytest.approx([20.0] * count)
 
 
 @pytest.mark.parametrize(
@@ -345,6 +346,7 @@ def test_exposures_before_and_after_are_counted(record: Callable[..., ScanRecord
     s = settings_of(replace(r, blocks=(dark, dark, flat, scan, after)))
     assert (s.pre_flats, s.post_flats, s.darks, s.projections) == (10, 12, 20, 5)
     assert (s.start_angle_deg, s.last_angle_deg) == pytest.approx((0.0, 360.0))
+    assert (s.reference_every, s.preheating_minutes) == (0, 0)
     assert (s.filament_status, s.target_current_uA) == ("OK", 500.0)
     none = settings_of(replace(r, blocks=(dark, flat)))
     assert (none.start_angle_deg, none.last_angle_deg, none.projections) == (0.0, 0.0, 0)
@@ -355,7 +357,7 @@ def test_exposures_before_and_after_are_counted(record: Callable[..., ScanRecord
 
 @pytest.mark.parametrize(
     ("turns", "projections"),
-    [([0, 90, 180, 270, 360], 5), ([360, 270, 180, 90, 0], 5), ([0, 45, 90], 9), ([7], 1),
+    [([0, 90, 180, 270, 360], 5), ([360, 270, 180, 90, 0], 5), ([0, 45, 90], 9), ([90, 45, 0], 9), ([7], 1),
      ([7, 7], 2), ([-180, 0, 180], 3)],
 )  # fmt: skip
 def test_what_the_xre_says_of_turn_and_volume(
@@ -422,6 +424,18 @@ def test_the_axis_of_the_flat_field_is_the_linear_one_that_moved_most() -> None:
         assert (r.count("flat"), r.count("projection"), r.smooth) == (1, 1, False)
         first = plan.exposures[-1]
         assert r.positions == pytest.approx(first.positions)
+
+
+@pytest.mark.parametrize("moving", ["flat", "projection"])
+def test_a_scan_is_smooth_where_its_projections_are(moving: str) -> None:
+    go = {moving: "rot_obj move absolute {} no wait\n"}
+    shot = "camera take image\ncamera save image {}.tif\n"
+    text = go.get("flat", "").format(90) + shot.format("io0")
+    text += (
+        "rot_obj move absolute 90 ACK\n" + go.get("projection", "").format(180) + shot.format("s0")
+    )
+    r = ScanRecord.from_plan(plan_script(text), name="a", started=datetime(2026, 3, 14))
+    assert r.smooth == (moving == "projection")
 
 
 def test_every_place_of_the_panel_is_a_section(record: Callable[..., ScanRecord]) -> None:
