@@ -357,8 +357,8 @@ def test_exposures_before_and_after_are_counted(record: Callable[..., ScanRecord
 
 @pytest.mark.parametrize(
     ("turns", "projections"),
-    [([0, 90, 180, 270, 360], 5), ([360, 270, 180, 90, 0], 5), ([0, 45, 90], 9), ([90, 45, 0], 9), ([7], 1),
-     ([7, 7], 2), ([-180, 0, 180], 3)],
+    [([0, 90, 180, 270, 360], 5), ([360, 270, 180, 90, 0], 5), ([0, 45, 90], 9),
+     ([90, 45, 0], 9), ([7], 1), ([7, 7], 2), ([-180, 0, 180], 3)],
 )  # fmt: skip
 def test_what_the_xre_says_of_turn_and_volume(
     record: Callable[..., ScanRecord], turns: list[float], projections: int
