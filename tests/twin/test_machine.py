@@ -33,6 +33,7 @@ from flexdt.twin.machine.description import (
 )
 from flexdt.twin.machine.kinematics import poses, resolve_targets
 from flexdt.twin.machine.new_file import Answers, new_machine_text
+from flexdt.twin.machine.places import places
 
 X = {"lower": -5.0, "upper": 5.0, "home": 0.0, "speed": 1.0, "max_speed": 2.0, "acceleration": 1.0,
      "max_acceleration": 2.0}  # fmt: skip
@@ -154,6 +155,12 @@ def test_what_a_file_leaves_out() -> None:
         ("micro_ct", "[[components]]\nname = 'source'\ncenter_mm = [60.1, -100.0, 0.0]",
          "holds the focal spot"),
         ("micro_ct", "[[components]]\nname = 'source'\ncenter_mm = [0.0, -100.1, 0.0]", "focal"),
+        ("micro_ct", "[[components]]\nname = 'source'\nshape = 'cylinder'\n"
+         "size_mm = [200.0, 200.0, 120.0]\ncenter_mm = [60.0, -80.0, 60.0]", ""),
+        ("micro_ct", "[[components]]\nname = 'source'\nshape = 'cylinder'\n"
+         "size_mm = [200.0, 200.0, 120.0]\ncenter_mm = [60.0, -80.0, 60.1]", "the focal spot"),
+        ("micro_ct", "[[components]]\nname = 'source'\nshape = 'cylinder'\n"
+         "size_mm = [200.0, 200.0, 120.0]\ncenter_mm = [60.0, -80.1, 60.0]", "the focal spot"),
         # The pin is a cylinder of radius 10 mm: 6 and 8 mm beside the axis it still holds it.
         ("micro_ct", "[[components]]\nname = 'pin'\ncenter_mm = [6.0, -8.0, 0.0]", ""),
         ("micro_ct", "[[components]]\nname = 'pin'\ncenter_mm = [6.1, 8.0, 0.0]",
@@ -528,6 +535,46 @@ def test_times_that_nobody_measured_are_none() -> None:
             Timing.model_validate({"source": "a", name: -1e-9})
 
 
+@pytest.mark.parametrize("name", [*builtin_machines(), "drawn"])
+def test_what_a_distance_is_the_sum_of_adds_up(name: str) -> None:
+    """The words are read again as a sum: a number, motors, factors before them."""
+    if name == "drawn":
+        extra = "".join(
+            f"[axes.{m}]\nlower = -7.0\nupper = 50.0\nhome = 3.0\nspeed = 1.0\nmax_speed = 1.0\n"
+            "acceleration = 1.0\nmax_acceleration = 1.0\n" for m in "AB"
+        )  # fmt: skip
+        machine = parse_machine(
+            'base = "xyzr_cabinet"\nname = "mine"\nsample_height_mm = 12.0\nallowed_contacts = []\n'
+            'without = ["source", "panel", "turntable", "mount", "lift", "x_carriage", '
+            '"z_carriage", "floor"]\n[geometry]\nobject_y = { Z = -1.0, A = 0.5 }\n'
+            "detector_y = { A = 2.0, B = -0.25 }\nobject_z = { Y = 1.0 }\n"
+            f"[fixed]\nobject_z = 5.0\nobject_y = 900.0\nsource_x = 1.5\n{extra}"
+        )
+        words = {place.name: place.total for place in places(machine)}
+        assert words["SOD"] == "900 - Z + 0.5 A"
+        assert words["SDD"] == "1000 + 2 A - 0.25 B"
+        assert (words["sample up"], words["source to the right"]) == ("17 + Y", "1.5")
+    else:
+        machine = builtin_machine(name)
+    for place in places(machine):
+        least = most = home = 0.0
+        terms = re.findall(r"([+-]? ?)(?:(-?[\d.]+)(?: |$))?([A-Za-z]\w*)?", place.total)
+        for sign, number, motor in terms:
+            if not number and not motor:
+                continue
+            factor = (-1.0 if sign.strip() == "-" else 1.0) * float(number or 1.0)
+            axis = machine.axes[motor] if motor else None
+            ends = (1.0, 1.0, 1.0) if axis is None else (axis.lower, axis.upper, axis.home)
+            low, high = sorted(factor * end for end in ends[:2])
+            least, most, home = least + low, most + high, home + factor * ends[2]
+        assert (place.least, place.most, place.home) == pytest.approx((least, most, home), abs=1e-4)
+        assert place.least <= place.home <= place.most
+        assert not place.total.startswith("+")
+    names = {place.name for place in places(machine)}
+    assert {"SOD", "SDD", "turntable"} <= names
+    assert ("source to the right" in names) == (name in ("flexray", "drawn"))
+
+
 def test_a_short_file_from_a_few_answers() -> None:
     text = new_machine_text(
         Answers("lab", "xyzr_cabinet", columns=1536, rows=1944, pitch_mm=(0.0748, 0.0754), bits=14,
@@ -539,6 +586,7 @@ def test_a_short_file_from_a_few_answers() -> None:
     assert (made.axes["Z"].lower, made.axes["Z"].upper, made.axes["Z"].home) == (60, 500, 400)
     assert made.fixed["detector_y"] == 800.0
     assert (made.detector.columns, made.detector.rows) == (1536, 1944)
+    assert made.detector.roi == (0, 0, 1535, 1943)
     assert made.detector.camera.pixels_mm(made.detector.sensor) == pytest.approx((0.1496, 0.1508))
     assert made.tube.kV == 100.0
     assert "Y" not in made.axes

@@ -420,6 +420,12 @@ def test_fit_writes_a_file_that_is_accepted_and_keeps_the_rest(
     assert set(document["timing"]["set_camera"]) == {"median_s", "p5_s", "p95_s", "n"}
     assert document["sum_abs_error_s"] <= 8.5 < document["total_s"]
     made, shipped = parse_machine(out.read_text()), builtin_machine("unitom_xl")
+    times = out.read_text().split("[timing]")[1].split("[timing.spread]")[0].strip().splitlines()
+    for row in times:
+        kind = row.split(" = ")[0].removesuffix("_s")
+        told = "measured, log" if kind in (*document["timing"], "drift") else "assumed"
+        assert row.partition("  # ")[2] == ("" if kind == "source" else told)
+    assert len(times) > 8
     assert made.components == shipped.components
     assert made.axes == shipped.axes
     assert run(["check", str(SCRIPT), "--machine", str(out), "--json"]) == 0
