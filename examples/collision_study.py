@@ -31,7 +31,7 @@ from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid, box, 
 from flexdt.twin.collision.guard import scene_guard
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.collision.sample_hull import convex_pieces
-from flexdt.twin.collision.scene_search import Search, SweepResult
+from flexdt.twin.collision.scene_search import PathSearch, SweepResult
 from flexdt.twin.collision.stages import Body
 from flexdt.twin.collision.sweep import Limits
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
@@ -247,7 +247,7 @@ def sample_times(case: Case) -> np.ndarray:
 
 def swept(scene: Scene, trajectories: Mapping[str, Trajectory], end: float) -> SweepResult:
     """The first contact from 0 s to `end` [s]; without one the least clearance, as `check` does."""
-    search = Search(scene, scene.path(trajectories, 0.0, end))
+    search = PathSearch(scene, scene.path(trajectories, 0.0, end))
     found = search.first_contact()
     return search.refined(found) if found.contact is None else found
 

@@ -378,9 +378,9 @@ def _calibrations(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, A
         )
         return {}, _judged(fit, item, free, fit.identifiable, "")
     from flexdt.twin.calibration.pipeline import Request, Scan, calibrate
-    from flexdt.twin.calibration.studies.rendered_runs import Camera, render
+    from flexdt.twin.calibration.studies.rendered_runs import Rendering, render
 
-    camera = Camera(counts=item.counts, blur_px=plan.calibrate.blur_px)
+    camera = Rendering(counts=item.counts, blur_px=plan.calibrate.blur_px)
     key = [int(v) for v in seed_of(plan, item.index, NOISE).generate_state(4)]
     frames = render(item.phantom.scene, model, item.poses, item.truth, camera, key, item.shape)
     result = calibrate(

@@ -27,7 +27,7 @@ from flexdt.clients.calibration.markers import (
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.phantoms import Phantom, load_phantom
 from flexdt.phantoms.files.phantom_files import read_phantom_file
-from flexdt.twin.calibration.detect.detection import Detector
+from flexdt.twin.calibration.detect.detection import SpotFinder
 from flexdt.twin.calibration.diagnose.finding import Finding, Severity
 from flexdt.twin.calibration.fit.image_quantities import image_quantities
 from flexdt.twin.calibration.fit.priors import prior_widths
@@ -137,12 +137,12 @@ def calibrate_datasets(
     unknown = phantom == UNKNOWN
     want = request or Request(free=("dO_x",) if unknown else SIX)
     frames = [DatasetFrames(d) for d in datasets]
-    low, high = Detector().radius_px
+    low, high = SpotFinder().radius_px
     sought = None
     if radius_px is not None:
         if not low <= radius_px <= high:
             raise TwinError(f"radius {radius_px:g} px; allowed: {low:g} to {high:g}")
-        sought = Detector((0.65 * radius_px, 1.5 * radius_px))
+        sought = SpotFinder((0.65 * radius_px, 1.5 * radius_px))
     if (unknown or markers is not None) and len(datasets) != 1:
         raise TwinError(
             f"{len(datasets)} data sets with markers or an unknown phantom; allowed: one",

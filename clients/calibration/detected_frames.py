@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.clients.datasets.data_set import DataSet
-from flexdt.twin.calibration.detect.detection import Detector, coarseness, coarser
+from flexdt.twin.calibration.detect.detection import SpotFinder, coarseness, coarser
 from flexdt.twin.calibration.detect.windows import Windows
-from flexdt.twin.calibration.frame_source import FrameState, Look, look_in_parts, nothing
+from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, look_in_parts, nothing
 from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.dataset.normalise import MIN_COUNTS, LineIntegrals
 from flexdt.twin.geometry.conventions import Float32Array
@@ -111,15 +111,15 @@ class DatasetFrames:
         self._keep = True
         self._each(self._counts)
 
-    def look(self, detector: Detector) -> list[Look]:
+    def look(self, detector: SpotFinder) -> list[FrameSpots]:
         """Detect the beads of every frame; only what may hold one is normalised."""
         factor = coarseness(detector)
         light = _Light.of(self._dataset.normalisation, factor)
 
-        def one(index: int) -> Look:
+        def one(index: int) -> FrameSpots:
             counts = self._counts(index)
             if counts is None:
-                return Look(nothing(self.shape), FrameState.MISSING)
+                return FrameSpots(nothing(self.shape), FrameState.MISSING)
             return look_in_parts(
                 light.coarse(counts), factor, self.shape, partial(light.part, counts), detector
             )

@@ -24,10 +24,10 @@ from flexdt.clients.datasets.data_set import DataSet
 from flexdt.phantoms import Phantom
 from flexdt.server.files.dataset_folder import Frame, read_text
 from flexdt.twin.calibration.bead_model import BeadModel
-from flexdt.twin.calibration.detect.detection import Detections, Detector
+from flexdt.twin.calibration.detect.detection import Detections, SpotFinder
 from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.fit.problem import SIX
-from flexdt.twin.calibration.frame_source import Frames, FrameState, Look, SpotFrames
+from flexdt.twin.calibration.frame_source import Frames, FrameSpots, FrameState, SpotFrames
 from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate
 from flexdt.twin.calibration.unknown_markers import (
     ANYWHERE_MM,
@@ -191,7 +191,7 @@ def seen_alone(data: DataSet, markers: Markers) -> tuple[list[DataSet], Markers]
     return [data[some]], replace(markers, tracks=markers.tracks[some], sigma=markers.sigma[some])
 
 
-def spots_of(markers: Markers, shape: tuple[int, int]) -> tuple[list[Look], Index]:
+def spots_of(markers: Markers, shape: tuple[int, int]) -> tuple[list[FrameSpots], Index]:
     """Markers as spots of each frame, and the number of each marker's spot (-1: unseen)."""
     seen = markers.seen
     looks, index = [], np.full(seen.shape, -1, dtype=np.int64)
@@ -200,7 +200,7 @@ def spots_of(markers: Markers, shape: tuple[int, int]) -> tuple[list[Look], Inde
         index[i, row] = np.arange(k)
         nothing, whole = np.full(k, np.nan), np.ones(k, dtype=bool)
         looks.append(
-            Look(
+            FrameSpots(
                 Detections(
                     markers.tracks[i, row],
                     markers.sigma[i, row][:, None, None] ** 2 * np.eye(2),
@@ -239,7 +239,7 @@ def calibrate_unknown(
     markers: Markers | None,
     request: Request,
     scale: Scale | None = None,
-    detector: Detector | None = None,
+    detector: SpotFinder | None = None,
 ) -> tuple[Calibration, dict[str, object]]:
     """Calibrate from three or more markers of unknown positions.
 
@@ -266,7 +266,7 @@ def calibrate_unknown(
     if markers is None:
         if images is None:
             raise TwinError("neither images nor markers: there is nothing to calibrate from")
-        looks = images.look(detector or Detector())
+        looks = images.look(detector or SpotFinder())
         index, places, at = link([look.detections for look in looks], poses, request.start)
         names = tuple(str(k) for k in range(len(places)))
         radii = _radii(looks, index, poses)
@@ -325,7 +325,7 @@ def calibrate_unknown(
 
 def _calibrated(
     data: DataSet,
-    looks: Sequence[Look],
+    looks: Sequence[FrameSpots],
     index: Index,
     model: BeadModel | Phantom,
     request: Request,
@@ -346,7 +346,7 @@ def _numbered(names: Sequence[str], name: str) -> int:
     return names.index(name)
 
 
-def _radii(looks: Sequence[Look], index: Index, poses: Poses) -> FloatArray:
+def _radii(looks: Sequence[FrameSpots], index: Index, poses: Poses) -> FloatArray:
     """Of the balls whose spots have the sizes seen [mm], (k,)."""
     scale = np.linalg.norm(poses.u, axis=1) * poses.sod / poses.sdd
     return np.array(

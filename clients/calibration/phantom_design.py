@@ -41,7 +41,7 @@ GRID_STEP_MM = 4.0
 
 
 @dataclass(frozen=True)
-class Body:
+class BeadHolder:
     """What holds the beads.
 
     Attributes:
@@ -126,7 +126,12 @@ def script_poses(text: str, machine: Machine, profile: Profile) -> tuple[Poses, 
 
 
 def run_design(
-    body: Body, scans: PlannedScans, request: DesignRequest, *, out: Path | None = None, tell: Tell
+    body: BeadHolder,
+    scans: PlannedScans,
+    request: DesignRequest,
+    *,
+    out: Path | None = None,
+    tell: Tell,
 ) -> dict[str, Any]:
     """Design, compare, check, and write `out`; the document of `--json`.
 
@@ -208,7 +213,7 @@ HEADER = ("parameter", "unit", "design", "measured", "spiral", "measured", "gain
 
 
 def write(
-    out: Path, phantom: Phantom, body: Body, request: DesignRequest, document: dict[str, Any]
+    out: Path, phantom: Phantom, body: BeadHolder, request: DesignRequest, document: dict[str, Any]
 ) -> list[str]:
     """Write phantom.json, phantom.stl, build.html, one PNG per picture and design.json; names."""
     out.mkdir(parents=True, exist_ok=True)
@@ -233,7 +238,7 @@ def write(
     return names
 
 
-def _search(body: Body, scans: PlannedScans, request: DesignRequest) -> Design:
+def _search(body: BeadHolder, scans: PlannedScans, request: DesignRequest) -> Design:
     radius, where = request.radius_mm, dict[str, Any]()
     if body.bricks is not None:
         seats = body.bricks.seats(radius)
@@ -248,7 +253,7 @@ def _search(body: Body, scans: PlannedScans, request: DesignRequest) -> Design:
     )  # fmt: skip
 
 
-def _phantom(body: Body, found: Design, request: DesignRequest) -> Phantom:
+def _phantom(body: BeadHolder, found: Design, request: DesignRequest) -> Phantom:
     name = f"designed-{request.beads}"
     if body.bricks is not None:
         return body.bricks.phantom(name, found.beads, request.radius_mm, request.bead_material)
@@ -265,7 +270,7 @@ def _phantom(body: Body, found: Design, request: DesignRequest) -> Phantom:
     return replace(made, assumed=(f"body of {body.material}, beads of {request.bead_material}",))
 
 
-def _spiral(body: Body, request: DesignRequest) -> tuple[np.typing.NDArray[np.float64], str]:
+def _spiral(body: BeadHolder, request: DesignRequest) -> tuple[np.typing.NDArray[np.float64], str]:
     """The thesis's beads for the same body and number, to compare with."""
     if body.bricks == Brickwork() and request.beads == 5:
         return lego_phantom().beads, "lego (thesis 6.5.1)"
@@ -276,7 +281,7 @@ def _spiral(body: Body, request: DesignRequest) -> tuple[np.typing.NDArray[np.fl
     return spiral_positions(size, request.beads, request.radius_mm), "spiral of the same size"
 
 
-def _solid(phantom: Phantom, body: Body) -> trimesh.Trimesh:
+def _solid(phantom: Phantom, body: BeadHolder) -> trimesh.Trimesh:
     """What the STL holds: bricks and beads as they are, or the block with beads as cavities."""
     mesh = phantom.mesh()
     if body.bricks is not None:

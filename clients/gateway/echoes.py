@@ -15,7 +15,7 @@ from flexdt.clients.gateway.vocabulary import component_type
 from flexdt.protocol.acquila import Event, Exchange
 from flexdt.protocol.state_model import AxisState, JobStatus, State
 from flexdt.twin.script import grammar
-from flexdt.twin.script.lexer import Row, rows
+from flexdt.twin.script.lexer import CodeLine, rows
 from flexdt.twin.script.parse import read_script
 
 Key = tuple[str, str]
@@ -47,7 +47,7 @@ def script_lines(script: bytes) -> tuple[ScriptLine, ...]:
     return tuple(found)
 
 
-def _texts(row: Row) -> tuple[str, ...]:
+def _texts(row: CodeLine) -> tuple[str, ...]:
     """Component, command and two arguments; in the space-padded form a command has many words."""
     texts = [f.text for f in (row.columns if row.columns is not None else row.words())]
     matched = None if row.columns is not None else grammar.match(texts[0], texts[1:])

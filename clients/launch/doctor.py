@@ -27,7 +27,7 @@ SLOW_SYNC_S: Final = 0.05
 
 
 @dataclass(frozen=True)
-class Finding:
+class Checked:
     """What one check found; `advice` where something can be done."""
 
     what: str
@@ -36,30 +36,30 @@ class Finding:
     advice: str = ""
 
 
-def examine(data: Path, ports: Sequence[tuple[str, int]]) -> Iterator[Finding]:
+def examine(data: Path, ports: Sequence[tuple[str, int]]) -> Iterator[Checked]:
     """All checks, one after the other.
 
     Args:
         data: the data directory, which need not exist.
         ports: what is to listen there, and the port.
     """
-    checks: list[Callable[[], Finding]] = [python, packages, kernels, threads, memory, gpu]
+    checks: list[Callable[[], Checked]] = [python, packages, kernels, threads, memory, gpu]
     checks += [lambda what=what, port=port: listening(what, port) for what, port in ports]  # type: ignore[misc]
     checks.append(lambda: disk(data))
     for check in checks:
         try:
             yield check()
         except Exception as error:  # a check that fails is a finding, and the others go on
-            yield Finding(check.__name__, "error", f"{type(error).__name__}: {error}")
+            yield Checked(check.__name__, "error", f"{type(error).__name__}: {error}")
 
 
-def python() -> Finding:
+def python() -> Checked:
     """The interpreter."""
     found = f"{platform.python_implementation()} {platform.python_version()}, {platform.system()}"
-    return Finding("python", "ok", f"{found} {platform.machine()}, flexdt {version('flexdt')}")
+    return Checked("python", "ok", f"{found} {platform.machine()}, flexdt {version('flexdt')}")
 
 
-def packages() -> Finding:
+def packages() -> Checked:
     """What flexdt says it needs, extras apart."""
     have, lack = [], []
     for name in needed():
@@ -68,8 +68,8 @@ def packages() -> Finding:
         except PackageNotFoundError:
             lack.append(name)
     if lack:
-        return Finding("packages", "error", f"missing: {', '.join(lack)}", "pip install flexdt")
-    return Finding("packages", "ok", ", ".join(have))
+        return Checked("packages", "error", f"missing: {', '.join(lack)}", "pip install flexdt")
+    return Checked("packages", "ok", ", ".join(have))
 
 
 def needed() -> tuple[str, ...]:
@@ -79,7 +79,7 @@ def needed() -> tuple[str, ...]:
     return tuple(re.split(r"[^A-Za-z0-9._-]", line, maxsplit=1)[0] for line in wanted)
 
 
-def kernels() -> Finding:
+def kernels() -> Checked:
     """Compile and run: the shadow of a sphere in parallel to its closed form."""
     import numpy as np
 
@@ -102,38 +102,38 @@ def kernels() -> Finding:
     worst = float(np.abs(image - right).max() / right.max())
     found = f"a sphere's shadow is right to {worst:.1e}; first use took {first:.1f} s"
     if worst > WORST_ERROR:
-        return Finding("kernels", "error", found, "reinstall numba; see docs/performance.md")
-    return Finding("kernels", "ok", found)
+        return Checked("kernels", "error", found, "reinstall numba; see docs/performance.md")
+    return Checked("kernels", "ok", found)
 
 
-def threads() -> Finding:
+def threads() -> Checked:
     """Cores and numba's threads."""
     import numba
 
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     found = f"{usable} of {os.cpu_count()} cores usable, {numba.get_num_threads()} numba threads"
     if usable is not None and numba.get_num_threads() < usable:
-        return Finding("threads", "warning", found, "NUMBA_NUM_THREADS is below the cores")
-    return Finding("threads", "ok", found)
+        return Checked("threads", "warning", found, "NUMBA_NUM_THREADS is below the cores")
+    return Checked("threads", "ok", found)
 
 
-def memory() -> Finding:
+def memory() -> Checked:
     """What the projector may fill."""
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     found = f"{total / 2**30:.1f} GiB; the projector holds volumes up to half of it"
-    return Finding("memory", "ok" if total > 3 << 30 else "warning", found)
+    return Checked("memory", "ok" if total > 3 << 30 else "warning", found)
 
 
-def gpu() -> Finding:
+def gpu() -> Checked:
     """A CUDA device is an option, so its absence is no fault."""
     from flexdt.twin.projection.gpu import availability
 
     found = availability()
     computes = f"{found.reason} computes" if found.present else f"the processor: {found.reason}"
-    return Finding("gpu", "warning" if "failed" in found.reason else "ok", computes)
+    return Checked("gpu", "warning" if "failed" in found.reason else "ok", computes)
 
 
-def listening(what: str, port: int) -> Finding:
+def listening(what: str, port: int) -> Checked:
     """Whether a server may listen, or one of ours does already."""
     name = f"port {port}"
     with socket.socket() as probe:
@@ -143,15 +143,15 @@ def listening(what: str, port: int) -> Finding:
         except OSError as error:
             taken = error
         else:
-            return Finding(name, "ok", f"free for the {what}")
+            return Checked(name, "ok", f"free for the {what}")
     answer = _greeting(port) if what == "twin" else ""
     if answer:
-        return Finding(name, "ok", f"{answer} listens")
+        return Checked(name, "ok", f"{answer} listens")
     advice = f"fine if that is your {what}; else choose another port"
-    return Finding(name, "warning", f"in use ({taken.strerror})", advice)
+    return Checked(name, "warning", f"in use ({taken.strerror})", advice)
 
 
-def disk(data: Path) -> Finding:
+def disk(data: Path) -> Checked:
     """Whether data sets can be written: room, rights, speed of a flush."""
     folder = data.absolute()
     while not folder.exists():
@@ -164,14 +164,14 @@ def disk(data: Path) -> Finding:
             os.fsync(file.fileno())
             took = time.perf_counter() - begun
     except OSError as error:
-        return Finding("disk", "error", f"{folder} cannot be written: {error.strerror}", "--data")
+        return Checked("disk", "error", f"{folder} cannot be written: {error.strerror}", "--data")
     free = shutil.disk_usage(folder).free
     found = f"{folder}: {free / 2**30:.1f} GiB free, 1 MiB reaches the disk in {1000 * took:.1f} ms"
     if free < LITTLE_ROOM:
-        return Finding("disk", "warning", found, "a scan of 1500 frames takes 2 to 4 GiB")
+        return Checked("disk", "warning", found, "a scan of 1500 frames takes 2 to 4 GiB")
     if took > SLOW_SYNC_S:
-        return Finding("disk", "warning", found, "slow; scans at full speed will wait for it")
-    return Finding("disk", "ok", found)
+        return Checked("disk", "warning", found, "slow; scans at full speed will wait for it")
+    return Checked("disk", "ok", found)
 
 
 def _greeting(port: int) -> str:

@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ALGORITHMS",
-    "Views",
+    "ScanFrames",
     "VolumeRequest",
     "grid_of",
     "preview",
@@ -140,7 +140,7 @@ class VolumeRequest:
 
 
 @dataclass(frozen=True, eq=False)
-class Views:
+class ScanFrames:
     """The frames of a reconstruction: geometry, reading, corrections.
 
     Attributes:
@@ -191,7 +191,7 @@ class Views:
 
 def views_of(
     dataset: DataSet, parameters: Offsets | None = None, *, binning: int = 1, every: int = 1
-) -> Views:
+) -> ScanFrames:
     """The frames that are there, and their geometry.
 
     Args:
@@ -214,10 +214,10 @@ def views_of(
     cone_vec = dataset.corrected(parameters)[np.array(indices)]
     if binning > 1:
         cone_vec = cone_vec.binned(binning, dataset.shape)
-    return Views(dataset, indices, cone_vec, binning)
+    return ScanFrames(dataset, indices, cone_vec, binning)
 
 
-def grid_of(views: Views, request: VolumeRequest) -> Grid:
+def grid_of(views: ScanFrames, request: VolumeRequest) -> Grid:
     """The grid of a requested volume."""
     whole = field_of_view(views.cone_vec, views.shape, request.voxel_mm)
     if request.shape is None:
@@ -299,7 +299,9 @@ def _untold(done: float, total: float) -> None:
     """Progress that is not reported."""
 
 
-def _here(views: Views, grid: Grid, request: VolumeRequest, out: Path, tell: Progress) -> list[str]:
+def _here(
+    views: ScanFrames, grid: Grid, request: VolumeRequest, out: Path, tell: Progress
+) -> list[str]:
     """Reconstruct into a file; returns what is doubtful."""
     with volume_writer(out, grid) as write:
         if request.algorithm != "fdk":
@@ -324,7 +326,7 @@ def _doubts(truncation: Truncation | None) -> list[str]:
 
 
 def _by_workers(
-    views: Views, grid: Grid, request: VolumeRequest, out: Path, pool: Executor, tell: Progress
+    views: ScanFrames, grid: Grid, request: VolumeRequest, out: Path, pool: Executor, tell: Progress
 ) -> list[str]:
     """As `_here`, by workers."""
     from flexdt.clients.reconstruction.on_workers import SlabWork, fdk_on_workers
@@ -381,7 +383,7 @@ def reconstruct_volume(
 
 def _task(
     dataset: DataSet, request: VolumeRequest | None, parameters: Offsets | None
-) -> tuple[VolumeRequest, Views, Grid]:
+) -> tuple[VolumeRequest, ScanFrames, Grid]:
     """A request that can be met, its views, not yet corrected, and its grid."""
     wanted = VolumeRequest() if request is None else request
     if wanted.algorithm not in ALGORITHMS:
@@ -417,7 +419,7 @@ def preview(
     return reconstruct_dataset(dataset, out, request, parameters=parameters, progress=progress)
 
 
-def _corrected(views: Views, request: VolumeRequest) -> Views:
+def _corrected(views: ScanFrames, request: VolumeRequest) -> ScanFrames:
     """The views with the requested corrections."""
     if request.scatter_correction is not None:
         views = _without_scatter(views, request.scatter_correction, request)
@@ -434,7 +436,9 @@ def _corrected(views: Views, request: VolumeRequest) -> Views:
     return views
 
 
-def _without_scatter(views: Views, names: tuple[str, ...], request: VolumeRequest) -> Views:
+def _without_scatter(
+    views: ScanFrames, names: tuple[str, ...], request: VolumeRequest
+) -> ScanFrames:
     """The views less the scatter of an object of these materials.
 
     Raises:
@@ -457,7 +461,7 @@ def _without_scatter(views: Views, names: tuple[str, ...], request: VolumeReques
     factor = max(1, min(max(views.shape) // SCATTER_PIXELS, min(views.shape) // 2))
     each = max(1, len(views.indices) // SCATTER_VIEWS)
     geometry = views.cone_vec[::each].binned(factor, views.shape)
-    coarse = Views(views.dataset, views.indices[::each], geometry, views.binning * factor)
+    coarse = ScanFrames(views.dataset, views.indices[::each], geometry, views.binning * factor)
     stack = np.concatenate(list(coarse.parts()))
     if request.scatter_method == "kernel":
         kernels = kernel_scatter(stack, geometry, chain, kV, None, (views.cone_vec, views.shape))
@@ -534,7 +538,7 @@ def _memory() -> int:
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
-def _iterative(views: Views, grid: Grid, request: VolumeRequest, tell: Progress) -> Volume:
+def _iterative(views: ScanFrames, grid: Grid, request: VolumeRequest, tell: Progress) -> Volume:
     # Stacks of images and grids of voxels that the algorithm holds at a time.
     stacks, grids = (6, 13) if request.algorithm == "tv" else (3, 5)
     need = stacks * 4 * len(views.indices) * math.prod(views.shape) + grids * grid.bytes

@@ -29,7 +29,7 @@ from flexdt.twin.calibration.studies.experiments import (
     EXPERIMENTS,
     NOISE_PX,
     VARIANTS,
-    Task,
+    WorkUnit,
     tasks,
 )
 from flexdt.twin.calibration.studies.experiments import FIDELITIES as ALL_FIDELITIES
@@ -139,7 +139,7 @@ def _collected(results: Iterable[list[Run]], names: Sequence[str], say: Tell) ->
     return runs
 
 
-def run_task(task: Task) -> list[Run]:
+def run_task(task: WorkUnit) -> list[Run]:
     """All runs of one task; a plain function, so that it can be sent to another process."""
     phantom = load_phantom(task.phantom) if task.variant == "printed" else authors(task.phantom)
     model = bead_model(phantom)
@@ -176,7 +176,7 @@ def _basin(spread: Map, say: Tell, fidelity: str, seed: int) -> tuple[list[Run],
 
 
 def real_task(
-    task: tuple[str, real.Truth, int, bool, Sequence[int] | None],
+    task: tuple[str, real.GroupTruth, int, bool, Sequence[int] | None],
 ) -> tuple[list[Run], Document]:
     """One scan of experiment 4: (scan, truth of its group, seed, exact points, counts)."""
     name, truth, seed, exact, used = task

@@ -15,7 +15,7 @@ import viser
 
 from flexdt.clients.viewer.page_params import Form
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
-from flexdt.clients.viewer.scenes.sample import Look
+from flexdt.clients.viewer.scenes.sample import SampleLook
 from flexdt.clients.viewer.scenes.standpoints import FREE
 from flexdt.clients.viewer.scenes.world import world_of
 from flexdt.clients.viewer.scrubbed_plan import Scrubbed
@@ -53,7 +53,7 @@ def replay_file(
     machine: Machine,
     profile: Profile,
     state: State,
-    look: Look,
+    look: SampleLook,
     planned: Scrubbed,
     looks: Mapping[str, bytes] | None,
     form: Form,
@@ -73,7 +73,7 @@ def _replay(
     machine: Machine,
     profile: Profile,
     state: State,
-    look: Look,
+    look: SampleLook,
     planned: Scrubbed,
     looks: Mapping[str, bytes] | None,
 ) -> Any:

@@ -16,7 +16,7 @@ import viser
 
 from flexdt.clients.viewer.front import SCENE_PATH
 from flexdt.clients.viewer.scenes.sample import MM
-from flexdt.clients.viewer.scenes.standpoints import FIXED, Camera
+from flexdt.clients.viewer.scenes.standpoints import FIXED, Standpoint
 from flexdt.clients.viewer.viser_gate import Scenes
 from flexdt.twin.geometry.conventions import FloatArray
 
@@ -45,9 +45,9 @@ class SceneClients:
         self._scenes, self._server = scenes, scenes.server
         self._lock = threading.Lock()
         self._who: dict[int, Who] = {}
-        self._sent: dict[int, Camera] = {}
+        self._sent: dict[int, Standpoint] = {}
         self._dark: dict[str, bool] = {}
-        self.cameras: dict[str, Camera] = {}
+        self.cameras: dict[str, Standpoint] = {}
         self.joined: Callable[[viser.ClientHandle, str], None] = lambda client, page: None
         """Called in one of viser's threads with a new frame and its page."""
         self._server.on_client_connect(self._connected)
@@ -66,7 +66,7 @@ class SceneClients:
             who = None if client_id is None else self._who.get(client_id)
         return None if who is None else who.page
 
-    def follow(self, view: str, camera: Camera) -> None:
+    def follow(self, view: str, camera: Standpoint) -> None:
         """Move every client of `view` to `camera`, now and when they connect."""
         self.cameras[view] = camera
         with self._lock:
@@ -102,7 +102,7 @@ class SceneClients:
         """Drop the clients of a page that has closed."""
         self._dark.pop(page, None)
 
-    def _aim(self, id: int, camera: Camera) -> None:
+    def _aim(self, id: int, camera: Standpoint) -> None:
         if self._sent.get(id) == camera:
             return
         client = self._server.get_clients().get(id)
@@ -130,7 +130,7 @@ class SceneClients:
             self._sent.pop(client.client_id, None)
 
 
-def roomy(camera: Camera, aspect: float) -> Camera:
+def roomy(camera: Standpoint, aspect: float) -> Standpoint:
     """Farther away where the picture is narrow, so that the machine still fits."""
     if aspect >= WIDE:
         return camera
@@ -139,7 +139,7 @@ def roomy(camera: Camera, aspect: float) -> Camera:
     return replace(camera, position=(x, y, z))
 
 
-def aim(client: viser.ClientHandle, camera: Camera) -> None:
+def aim(client: viser.ClientHandle, camera: Standpoint) -> None:
     """Set a client's camera."""
     with client.atomic():
         client.camera.up_direction = camera.up

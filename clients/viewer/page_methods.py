@@ -161,7 +161,7 @@ async def recorded(viewer: Viewer, page: Page, params: p.Recorded) -> object:
         for feed in viewer.feeds.values():
             feed.again()
     elif told["same_machine"] and viewer.state is not None:
-        page.plan = plans.Recorded.of(told)
+        page.plan = plans.RecordedPositions.of(told)
         taken = np.array(told["kinds"], dtype=str) == "projection"
         at = {n: np.array(v, dtype=float)[taken] for n, v in told["positions"].items()}
         page.orbit = plans.source_path(at, lab.machine, lab.profile, viewer.state)

@@ -54,14 +54,14 @@ class Planned:
 
 
 @dataclass(frozen=True, eq=False)
-class Recorded:
+class RecordedPositions:
     """Motor positions at the images of a data set; straight lines between them."""
 
     times: FloatArray
     motors: Mapping[str, FloatArray]
 
     @classmethod
-    def of(cls, told: Mapping[str, Any]) -> Recorded | None:
+    def of(cls, told: Mapping[str, Any]) -> RecordedPositions | None:
         """Of what `dataset.get` tells; None where poses are not known. Images without times are a
         second apart."""
         motors = {n: np.array(values, dtype=float) for n, values in told["positions"].items()}
@@ -82,7 +82,7 @@ class Recorded:
         return {n: float(np.interp(time, self.times, v)) for n, v in self.motors.items()}
 
 
-Scrubbed = Planned | Recorded
+Scrubbed = Planned | RecordedPositions
 """What a page may scrub through."""
 
 

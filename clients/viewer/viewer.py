@@ -32,7 +32,7 @@ from flexdt.clients.viewer.scenes import sample as shapes
 from flexdt.clients.viewer.scenes import standpoints as views
 from flexdt.clients.viewer.scenes.clearance import Near
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
-from flexdt.clients.viewer.scenes.sample import NOTHING, Look, Wardrobe
+from flexdt.clients.viewer.scenes.sample import NOTHING, SampleLook, Wardrobe
 from flexdt.clients.viewer.scenes.world import World, beads_on, world_of
 from flexdt.clients.viewer.viser_gate import Scenes
 from flexdt.protocol import RpcError
@@ -106,7 +106,7 @@ class Viewer:
         self.lab: ShownMachine | None = None
         self.state: State | None = None
         self.world: World | None = None
-        self.look: Look = NOTHING
+        self.look: SampleLook = NOTHING
         self.window: tuple[float, float] | None = None
         self.wardrobe = Wardrobe()
         self.planners = Workers(plans.PLANNERS, plans.PLAN_BYTES, plans.PLAN_S)

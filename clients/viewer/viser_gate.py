@@ -39,7 +39,7 @@ from viser._messages import (
 from websockets.asyncio.client import ClientConnection, unix_connect
 from websockets.typing import Subprotocol
 
-from flexdt.clients.viewer.scenes.standpoints import Camera
+from flexdt.clients.viewer.scenes.standpoints import Standpoint
 from flexdt.protocol.fields import Params
 from flexdt.server.runtime.log import log
 
@@ -129,7 +129,7 @@ def clear_left_behind(folder: Path) -> None:
                 shutil.rmtree(left, ignore_errors=True)
 
 
-def look_from(serializer: Any, camera: Camera) -> None:
+def look_from(serializer: Any, camera: Standpoint) -> None:
     """Set the first camera of a recorded scene.
 
     `server.initial_camera` would say it too, but also overrule the cameras of pages that come.

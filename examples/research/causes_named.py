@@ -23,7 +23,7 @@ from faults_drawn import KINDS, Faulty, drawn
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections
-from flexdt.twin.calibration.frame_source import FrameState, Look, SpotFrames, nothing
+from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, SpotFrames, nothing
 from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.offsets import Offsets
@@ -71,11 +71,11 @@ def calibrated(scan: Faulty) -> Calibration:
     looks = []
     for frame in scan.spots:
         if frame is None:
-            looks.append(Look(nothing(scan.shape), FrameState.MISSING))
+            looks.append(FrameSpots(nothing(scan.shape), FrameState.MISSING))
             continue
         spots = Detections.of_points(frame[:, :2], scan.noise_px, frame[:, 2], scan.shape)
         outlines = replace(spots, bias=np.ones(len(frame)))
-        looks.append(Look(outlines, FrameState.USABLE))
+        looks.append(FrameSpots(outlines, FrameState.USABLE))
     b = scan.believed
     poses = Poses.upright([0, 0, 0], [0, b.sod, 0], [0, b.sdd, 0], b.pixel, np.radians(b.angles))
     request = Request(

@@ -17,12 +17,12 @@ from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import Request, Scan, calibrate
 from flexdt.twin.calibration.studies.experiments import SHAPE
-from flexdt.twin.calibration.studies.rendered_runs import Camera, exposures, line_integrals
+from flexdt.twin.calibration.studies.rendered_runs import Rendering, exposures, line_integrals
 from flexdt.twin.projection.analytic_solids import Scene
 
-DEMO = Camera(counts=48_000.0, blur_px=0.0, fine=1)
+DEMO = Rendering(counts=48_000.0, blur_px=0.0, fine=1)
 """Images as the twin makes them without blur: one ray a pixel, 12 000 counts of 4 photons."""
-BLURRED = Camera(counts=12_000.0, blur_px=0.7, fine=4)
+BLURRED = Rendering(counts=12_000.0, blur_px=0.7, fine=4)
 """Pixels that integrate, blur, fewer photons: closer to a real detector."""
 CAMERAS = {"demo": DEMO, "blurred": BLURRED}
 
@@ -48,7 +48,7 @@ class Draw:
     warnings: tuple[str, ...]
 
 
-def draw(seed: int, model: BeadModel, scene: Scene, camera: Camera, frames: int = 36) -> Draw:
+def draw(seed: int, model: BeadModel, scene: Scene, camera: Rendering, frames: int = 36) -> Draw:
     """Make, calibrate and compare one scan.
 
     Args:

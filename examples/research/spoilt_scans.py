@@ -19,7 +19,7 @@ from flexdt.twin.calibration.fit.image_quantities import axis_in_image, image_qu
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import Calibration, Scan, calibrate
 from flexdt.twin.calibration.studies.experiments import SHAPE, scenario
-from flexdt.twin.calibration.studies.rendered_runs import Camera, exposures, line_integrals
+from flexdt.twin.calibration.studies.rendered_runs import Rendering, exposures, line_integrals
 from flexdt.twin.calibration.studies.runs import errors_of
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
@@ -63,7 +63,7 @@ def corrupt(kind: str, seed: int, phantom: BeadModel, scene: Scene, other: Scene
     nominal, truth = careful_scan(rng, FRAMES)
     scan = Spoilt(
         scene, phantom, scene, phantom, nominal, nominal, truth,
-        Camera(counts=float(rng.uniform(3000, 20000)), blur_px=float(rng.uniform(0.4, 1.0))),
+        Rendering(counts=float(rng.uniform(3000, 20000)), blur_px=float(rng.uniform(0.4, 1.0))),
     )  # fmt: skip
     chosen = KINDS[kind]
     if kind == "wrong_phantom":

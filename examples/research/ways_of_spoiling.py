@@ -21,7 +21,7 @@ from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.pipeline import Request
 from flexdt.twin.calibration.studies.experiment_4_images import moved_beads
 from flexdt.twin.calibration.studies.experiments import SHAPE
-from flexdt.twin.calibration.studies.rendered_runs import Camera
+from flexdt.twin.calibration.studies.rendered_runs import Rendering
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
@@ -54,7 +54,7 @@ class Spoilt:
     poses: Poses
     nominal: Poses
     truth: Offsets
-    camera: Camera
+    camera: Rendering
     images: tuple[Float32Array | None, ...] = ()
     request: Request = field(default_factory=Request)
 

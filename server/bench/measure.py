@@ -29,7 +29,7 @@ does hides the best of a few short calls."""
 
 
 @dataclass(frozen=True)
-class Timing:
+class CallTime:
     """Seconds a call: the best, the median, and how many calls."""
 
     best: float
@@ -42,7 +42,7 @@ def interleaved(
     *,
     once: frozenset[str] = frozenset(),
     budget_s: float = BUDGET_S,
-) -> dict[str, Timing]:
+) -> dict[str, CallTime]:
     """Time contestants turn by turn.
 
     Args:
@@ -69,7 +69,7 @@ def interleaved(
             if name in once or _enough(len(seen), sum(seen), budget_s):
                 wanting.discard(name)
     return {
-        name: Timing(min(seen), float(np.median(seen)), len(seen)) for name, seen in times.items()
+        name: CallTime(min(seen), float(np.median(seen)), len(seen)) for name, seen in times.items()
     }
 
 

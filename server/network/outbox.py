@@ -19,18 +19,18 @@ from pydantic import BaseModel
 from flexdt.protocol import Connection, Failure, Message, Prepared, Response, RpcError
 from flexdt.protocol.messages import to_plain
 from flexdt.protocol.rpc_errors import internal
-from flexdt.server.runtime.access import Limits
+from flexdt.server.runtime.access import ConnectionLimits
 from flexdt.server.runtime.log import log
 
 A_WRITE = 1 << 18
 """Bytes given to the transport at a time, since it copies what it cannot send at once."""
 
 
-class Link(Protocol):
+class SendTarget(Protocol):
     """A connection as its send queue sees it."""
 
     wire: Connection
-    limits: Limits
+    limits: ConnectionLimits
     transport: asyncio.Transport
     name: str
 
@@ -41,7 +41,7 @@ class Link(Protocol):
 class Outbox:
     """The send queue: replies and ordered events in order, then the newest value of each slot."""
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: SendTarget) -> None:
         self.link = link
         self.ready = asyncio.Event()
         self.ready.set()

@@ -63,8 +63,8 @@ from flexdt.server.network.shell_application import (
     unobserved,
 )
 from flexdt.server.network.shell_parts import Deadlines, TokenCheck, TurnedAway, answered
-from flexdt.server.network.turns import FIRST, ORDINARY, URGENT, Turns
-from flexdt.server.runtime.access import Limits, check_bind
+from flexdt.server.network.turns import FIRST, ORDINARY, URGENT, LoopTurns
+from flexdt.server.runtime.access import ConnectionLimits, check_bind
 from flexdt.server.runtime.log import log
 from flexdt.server.runtime.loop import ListeningServer, tune
 
@@ -89,7 +89,7 @@ class TcpServer(ListeningServer):
     """A listening server; made by `serve`."""
 
     app: App
-    limits: Limits
+    limits: ConnectionLimits
     token: str | None
     methods: Mapping[str, Method]
     observe: Observe = unobserved
@@ -98,7 +98,7 @@ class TcpServer(ListeningServer):
     def __post_init__(self) -> None:
         self.links: set[_Link] = set()
         self.turned_away: set[TurnedAway] = set()
-        self.turns = Turns()
+        self.turns = LoopTurns()
         self.urgent = tuple(m.name.encode() for m in self.methods.values() if m.urgent)
         self._to_look_at: dict[_Link, None] = {}  # in the order in which they came
         self._look_due = False
@@ -140,7 +140,7 @@ async def serve(
     host: str = "127.0.0.1",
     port: int = 0,
     *,
-    limits: Limits | None = None,
+    limits: ConnectionLimits | None = None,
     token: str | None = None,
     ssl: tls.SSLContext | None = None,
     methods: Mapping[str, Method] = METHODS,
@@ -164,7 +164,7 @@ async def serve(
         OSError: the address is taken or not ours.
     """
     check_bind(host, token)
-    limits = limits or Limits()
+    limits = limits or ConnectionLimits()
     server = TcpServer(app, limits, token, methods, observe, read)
     await server.listen(lambda: _Link(server), host, port, ssl)
     return server

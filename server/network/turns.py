@@ -13,7 +13,7 @@ FIRST, URGENT, ORDINARY = range(3)
 """Lanes by priority: E-stop; stop, abort and ping; everything else."""
 
 
-class Turns:
+class LoopTurns:
     """One turn is given in each turn of the loop; within a lane, connections alternate."""
 
     def __init__(self) -> None:

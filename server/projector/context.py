@@ -30,7 +30,7 @@ SPARE: Final = 4096
 """Room for everything but the payload in a frame."""
 
 
-class Client(Customer):
+class JobClient(Customer):
     """One connection, its jobs and its requests that are under way."""
 
     def __init__(self, link: FrameLink, token: str | None) -> None:
@@ -67,18 +67,18 @@ class Context:
     store: VolumeStore
     token: str | None
     facts: Mapping[str, object]
-    clients: dict[FrameLink, Client] = field(default_factory=dict)
+    clients: dict[FrameLink, JobClient] = field(default_factory=dict)
     instance: str = field(default_factory=lambda: uuid.uuid4().hex)
     started: float = field(default_factory=time.monotonic)
     views: int = 0
     superseded: int = 0
 
-    def start(self, client: Client, id: Id, job: ComputeJob) -> ComputeJob:
+    def start(self, client: JobClient, id: Id, job: ComputeJob) -> ComputeJob:
         """Submit a job, known by its request's id until that is answered."""
         client.jobs[id] = job
         return self.compute.submit(job)
 
-    async def run(self, client: Client, id: Id, step: Callable[[], object]) -> object:
+    async def run(self, client: JobClient, id: Id, step: Callable[[], object]) -> object:
         """One step in the compute thread; returns its value.
 
         Raises:
@@ -86,26 +86,26 @@ class Context:
         """
         return await self.start(client, id, ComputeJob(client, iter((step,)))).next()
 
-    def took(self, client: Client, job: ComputeJob) -> None:
+    def took(self, client: JobClient, job: ComputeJob) -> None:
         """A client has taken a block: the next may be computed."""
         client.took(job)
         self.compute.queue.wake()
 
-    def finish(self, client: Client, id: Id) -> None:
+    def finish(self, client: JobClient, id: Id) -> None:
         """A request has been answered."""
         job = client.jobs.pop(id, None)
         if job is not None:
             client.finish(job)
             self.compute.queue.wake()
 
-    def supersede(self, client: Client, key: str) -> None:
+    def supersede(self, client: JobClient, key: str) -> None:
         """End this client's interactive jobs of that key that have not been computed."""
         self.superseded += self.compute.give_up(
             lambda job: job.customer is client and job.key == key, superseded(key)
         )
 
     async def send_array(
-        self, client: Client, id: Id, array: npt.NDArray[np.generic]
+        self, client: JobClient, id: Id, array: npt.NDArray[np.generic]
     ) -> dict[str, object]:
         """An array as the result of a request; what does not fit has gone before, in parts."""
         if array.nbytes + SPARE <= MAX_FRAME:
@@ -114,7 +114,7 @@ class Context:
         return {"dtype": array.dtype.name, "shape": list(array.shape), "parts": parts}
 
     async def send_parts(
-        self, client: Client, id: Id, array: npt.NDArray[np.generic], start: int
+        self, client: JobClient, id: Id, array: npt.NDArray[np.generic], start: int
     ) -> int:
         """Send an array as parts of a result, from its element `start` on; how many."""
         flat = np.ascontiguousarray(array).reshape(-1)

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from flexdt.process_settings import ProjectorSettings, parse
-from flexdt.server.runtime.access import Limits, read_token, server_tls, with_limits
+from flexdt.server.runtime.access import ConnectionLimits, read_token, server_tls, with_limits
 from flexdt.server.runtime.log import LEVELS, set_up
 from flexdt.server.runtime.metrics import Requests
 from flexdt.server.runtime.process import OK, announce, run_process, stop_signal
@@ -49,7 +49,7 @@ async def run(options: ProjectorSettings) -> int:
         memory_limit=limit,
         begin=lambda: begin(threads),
         facts={"backend": backend(), "threads": threads},
-        limits=with_limits(options.limit, Limits()),
+        limits=with_limits(options.limit, ConnectionLimits()),
         observe=requests.observe,
         token=read_token(options.token_file),
         ssl=server_tls(options.tls_cert, options.tls_key),

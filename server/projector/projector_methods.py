@@ -31,16 +31,16 @@ from flexdt.protocol.projector import (
 )
 from flexdt.protocol.rpc_errors import cancelled, invalid_params, too_large
 from flexdt.server.projector.compute import ComputeJob, projection_steps, views_a_block
-from flexdt.server.projector.context import SPARE, Client, Context
+from flexdt.server.projector.context import SPARE, Context, JobClient
 from flexdt.twin.projection import TriangleMesh, Volume, back
 from flexdt.twin.projection.operators import as_cone_vec
 
 MAX_VIEW_BYTES: Final = 512 * 2**20
 
-Answer = Callable[[Context, Client, Id, Any], Awaitable[object]]
+Answer = Callable[[Context, JobClient, Id, Any], Awaitable[object]]
 
 
-async def hello(context: Context, client: Client, id: Id, p: Hello) -> object:
+async def hello(context: Context, client: JobClient, id: Id, p: Hello) -> object:
     """Check the token."""
     await client.token_check.check(p.token, client.link.peer)
     client.let_in = True
@@ -51,7 +51,7 @@ async def hello(context: Context, client: Client, id: Id, p: Hello) -> object:
     }  # fmt: skip
 
 
-async def volume_put(context: Context, client: Client, id: Id, p: VolumePut) -> object:
+async def volume_put(context: Context, client: JobClient, id: Id, p: VolumePut) -> object:
     """Store a scene, or a chunk of voxels or of a mesh."""
     if p.scene is not None:
         context.store.put(p.name, scene_from_dict(p.scene))
@@ -69,7 +69,7 @@ async def volume_put(context: Context, client: Client, id: Id, p: VolumePut) -> 
     return {"name": p.name, "received": received, "total": what.nbytes, "complete": complete}
 
 
-async def volume_get(context: Context, client: Client, id: Id, p: VolumeRef) -> object:
+async def volume_get(context: Context, client: JobClient, id: Id, p: VolumeRef) -> object:
     """Send a volume's voxels."""
     volume = context.store.get(p.name)
     if not isinstance(volume, Volume):
@@ -80,7 +80,7 @@ async def volume_get(context: Context, client: Client, id: Id, p: VolumeRef) -> 
     return await context.send_array(client, id, whole)
 
 
-async def volume_list(context: Context, client: Client, id: Id, p: Params) -> object:
+async def volume_list(context: Context, client: JobClient, id: Id, p: Params) -> object:
     """Volumes and memory."""
     return {
         "volumes": context.store.describe(),
@@ -89,12 +89,12 @@ async def volume_list(context: Context, client: Client, id: Id, p: Params) -> ob
     }
 
 
-async def volume_remove(context: Context, client: Client, id: Id, p: VolumeRef) -> object:
+async def volume_remove(context: Context, client: JobClient, id: Id, p: VolumeRef) -> object:
     """Forget a volume."""
     return {"removed": context.store.remove(p.name)}
 
 
-async def project(context: Context, client: Client, id: Id, p: Project) -> object:
+async def project(context: Context, client: JobClient, id: Id, p: Project) -> object:
     """Line integrals, view block by view block."""
     volume = context.store.get(p.volume)
     view = math.prod(p.detector)
@@ -119,7 +119,7 @@ async def project(context: Context, client: Client, id: Id, p: Project) -> objec
     return {"dtype": "float32", "shape": [len(rows), *p.detector], "parts": parts}
 
 
-async def backproject(context: Context, client: Client, id: Id, p: Backproject) -> object:
+async def backproject(context: Context, client: JobClient, id: Id, p: Backproject) -> object:
     """The adjoint, answered or added to a named volume."""
     if len(p.projections) != len(p.cone_vec):
         raise invalid_params(
@@ -136,7 +136,7 @@ async def backproject(context: Context, client: Client, id: Id, p: Backproject) 
     return await context.send_array(client, id, np.asarray(made.data))
 
 
-async def health(context: Context, client: Client, id: Id, p: Params) -> object:
+async def health(context: Context, client: JobClient, id: Id, p: Params) -> object:
     """Figures about the server."""
     return {
         "instance": context.instance,
@@ -153,7 +153,7 @@ async def health(context: Context, client: Client, id: Id, p: Params) -> object:
     }
 
 
-async def cancel(context: Context, client: Client, id: Id, p: Cancel) -> object:
+async def cancel(context: Context, client: JobClient, id: Id, p: Cancel) -> object:
     """Give up a request."""
     job = client.jobs.get(p.request)
     if job is None:
@@ -164,7 +164,7 @@ async def cancel(context: Context, client: Client, id: Id, p: Cancel) -> object:
     return {"cancelled": True}
 
 
-async def discover(context: Context, client: Client, id: Id, p: Params) -> object:
+async def discover(context: Context, client: JobClient, id: Id, p: Params) -> object:
     """The OpenRPC document."""
     return _document()
 

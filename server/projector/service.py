@@ -43,11 +43,11 @@ from flexdt.protocol.rpc_errors import (
 from flexdt.server.network.shell_application import Observe, unobserved
 from flexdt.server.network.shell_parts import answered
 from flexdt.server.projector.compute import ComputeThread
-from flexdt.server.projector.context import Client, Context
+from flexdt.server.projector.context import Context, JobClient
 from flexdt.server.projector.projector_methods import ANSWERS
 from flexdt.server.projector.volumes import VolumeStore
 from flexdt.server.projector.wire import FrameLink
-from flexdt.server.runtime.access import Limits, check_bind
+from flexdt.server.runtime.access import ConnectionLimits, check_bind
 from flexdt.server.runtime.http_pages import Pages, watching_pages
 from flexdt.server.runtime.log import current, log
 from flexdt.server.runtime.loop import ListeningServer
@@ -63,7 +63,7 @@ class ProjectorServer(ListeningServer):
     """A listening projector; made by `serve_projector`."""
 
     context: Context
-    limits: Limits
+    limits: ConnectionLimits
     observe: Observe
 
     async def close(self) -> None:
@@ -83,7 +83,7 @@ class ProjectorServer(ListeningServer):
 
     def made(self, link: FrameLink) -> None:
         """A client has connected."""
-        client = Client(link, self.context.token)
+        client = JobClient(link, self.context.token)
         self.context.clients[link] = client
         if len(self.context.clients) > self.limits.max_clients:
             allowed = {"allowed": self.limits.max_clients}
@@ -122,7 +122,7 @@ class ProjectorServer(ListeningServer):
 
     # -- requests ----------------------------------------------------------------------------
 
-    async def _serve(self, client: Client, body: memoryview) -> None:
+    async def _serve(self, client: JobClient, body: memoryview) -> None:
         request: Id = None
         link, calls = client.link, client.calls
         try:
@@ -157,7 +157,11 @@ class ProjectorServer(ListeningServer):
                 client.link.transport.resume_reading()
 
     async def _call(
-        self, client: Client, id: Id, name: str, given: Mapping[str, object] | list[object] | None
+        self,
+        client: JobClient,
+        id: Id,
+        name: str,
+        given: Mapping[str, object] | list[object] | None,
     ) -> Response | Failure:
         return await answered(
             self._try(client, id, name, given), name, trace=str(id), client=client.link.peer,
@@ -165,7 +169,11 @@ class ProjectorServer(ListeningServer):
         )  # fmt: skip
 
     async def _try(
-        self, client: Client, id: Id, name: str, given: Mapping[str, object] | list[object] | None
+        self,
+        client: JobClient,
+        id: Id,
+        name: str,
+        given: Mapping[str, object] | list[object] | None,
     ) -> Response | Failure:
         try:
             if not client.let_in and name != "session.hello":
@@ -191,7 +199,7 @@ async def serve_projector(
     memory_limit: int,
     begin: Callable[[], None] = lambda: None,
     facts: Mapping[str, object] | None = None,
-    limits: Limits | None = None,
+    limits: ConnectionLimits | None = None,
     token: str | None = None,
     ssl: tls.SSLContext | None = None,
     observe: Observe = unobserved,
@@ -213,7 +221,7 @@ async def serve_projector(
         OSError: the address is taken or not ours.
     """
     check_bind(host, token)
-    limits = limits or Limits()
+    limits = limits or ConnectionLimits()
     compute = ComputeThread(begin)
     facts = {"backend": "numba", "threads": 0} if facts is None else facts
     server = ProjectorServer(

@@ -26,7 +26,7 @@ class AccessFileError(AccessError):
 
 
 @dataclass(frozen=True)
-class Limits:
+class ConnectionLimits:
     """What one connection, and all of them, may cost. Sizes in bytes, times in real seconds.
 
     Attributes:
@@ -92,7 +92,7 @@ class ViewerLimits:
     max_pages: int = 64
 
 
-_L = TypeVar("_L", Limits, TwinLimits, ViewerLimits)
+_L = TypeVar("_L", ConnectionLimits, TwinLimits, ViewerLimits)
 
 
 def with_limits(words: Sequence[str], default: _L, others: Collection[str] = ()) -> _L:
@@ -127,7 +127,7 @@ def with_limits(words: Sequence[str], default: _L, others: Collection[str] = ())
     return out
 
 
-def limit_names(limits: Limits | TwinLimits | ViewerLimits) -> tuple[str, ...]:
+def limit_names(limits: ConnectionLimits | TwinLimits | ViewerLimits) -> tuple[str, ...]:
     """Names that `with_limits` takes."""
     return tuple(f.name for f in fields(limits))
 

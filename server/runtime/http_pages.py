@@ -28,7 +28,7 @@ OPEN_PAGES = ("/healthz",)
 
 
 @dataclass(frozen=True)
-class Page:
+class HttpResponse:
     """The response to a request."""
 
     text: str
@@ -36,7 +36,7 @@ class Page:
     content_type: str = "application/json"
 
 
-Pages = Mapping[str, Callable[[], Page]]
+Pages = Mapping[str, Callable[[], HttpResponse]]
 
 
 class HttpServer(ListeningServer):
@@ -62,7 +62,7 @@ class HttpServer(ListeningServer):
         try:
             async with asyncio.timeout(TIMEOUT_S):
                 if len(self._clients) > MAX_CLIENTS:
-                    page, head = Page("{}", HTTPStatus.SERVICE_UNAVAILABLE), False
+                    page, head = HttpResponse("{}", HTTPStatus.SERVICE_UNAVAILABLE), False
                 else:
                     page, head = await self._answer(reader)
                 body = page.text.encode()
@@ -83,27 +83,27 @@ class HttpServer(ListeningServer):
             with contextlib.suppress(ConnectionError, TimeoutError):
                 await writer.wait_closed()
 
-    async def _answer(self, reader: asyncio.StreamReader) -> tuple[Page, bool]:
+    async def _answer(self, reader: asyncio.StreamReader) -> tuple[HttpResponse, bool]:
         try:
             text = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1")
         except asyncio.LimitOverrunError:
-            return Page("{}", HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE), False
+            return HttpResponse("{}", HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE), False
         except asyncio.IncompleteReadError:
-            return Page("{}", HTTPStatus.BAD_REQUEST), False
+            return HttpResponse("{}", HTTPStatus.BAD_REQUEST), False
         first, *fields = text.split("\r\n")
         words = first.split(" ")
         if len(words) != 3 or not words[2].startswith("HTTP/1."):
-            return Page("{}", HTTPStatus.BAD_REQUEST), False
+            return HttpResponse("{}", HTTPStatus.BAD_REQUEST), False
         if words[0] not in ("GET", "HEAD"):
-            return Page("{}", HTTPStatus.METHOD_NOT_ALLOWED), False
+            return HttpResponse("{}", HTTPStatus.METHOD_NOT_ALLOWED), False
         path = words[1].split("?", 1)[0]
         if path not in self._pages:
-            return Page("{}", HTTPStatus.NOT_FOUND), words[0] == "HEAD"
+            return HttpResponse("{}", HTTPStatus.NOT_FOUND), words[0] == "HEAD"
         if self._token is not None and path not in OPEN_PAGES:
             given = [f.partition(":")[2].strip() for f in fields if f.lower().startswith("auth")]
             bearer = given[0].removeprefix("Bearer ") if given else None
             if not token_matches(bearer, self._token):
-                return Page("{}", HTTPStatus.UNAUTHORIZED), False
+                return HttpResponse("{}", HTTPStatus.UNAUTHORIZED), False
         return self._pages[path](), words[0] == "HEAD"
 
 
@@ -168,13 +168,13 @@ def watching_pages(
         failed: whether a part of the server has died; then `/healthz` answers 503.
     """
 
-    def healthz() -> Page:
+    def healthz() -> HttpResponse:
         dead = failed()
         document = {"status": "failed" if dead else "ok", **health()}
         status = HTTPStatus.SERVICE_UNAVAILABLE if dead else HTTPStatus.OK
-        return Page(json.dumps(document) + "\n", status)
+        return HttpResponse(json.dumps(document) + "\n", status)
 
-    def metrics() -> Page:
+    def metrics() -> HttpResponse:
         page = [*(requests or Requests()).figures(), *figures()]
         page.append(
             counter("flexdt_log_dropped_total", "Log lines nobody took in time.", dropped())
@@ -185,7 +185,7 @@ def watching_pages(
             page.append(Figure("flexdt_loop_hold_seconds", "histogram", what, (({}, holds.turns),)))
             worst = "The longest turn since the last scrape."
             page.append(gauge("flexdt_loop_hold_worst_seconds", worst, holds.worst()))
-        return Page(render(page), content_type=CONTENT_TYPE)
+        return HttpResponse(render(page), content_type=CONTENT_TYPE)
 
     return {"/healthz": healthz, "/metrics": metrics}
 

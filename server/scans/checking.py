@@ -106,7 +106,7 @@ class Matter:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ScanVerdict:
     """What a sound scan comes to.
 
     Attributes:
@@ -122,7 +122,7 @@ class Verdict:
     warnings: list[str]
 
     @classmethod
-    def of(cls, report: CheckReport) -> Verdict:
+    def of(cls, report: CheckReport) -> ScanVerdict:
         """The verdict.
 
         Raises:
@@ -154,15 +154,15 @@ class Checks:
             return await self._threaded(lambda: _encoded(matter, codec))
         return await self._workers.ask(work, _asked("report", matter, codec))
 
-    async def verdict(self, matter: Matter) -> Verdict:
-        """Whether it may run, and what it comes to; raises as `Verdict.of`."""
+    async def verdict(self, matter: Matter) -> ScanVerdict:
+        """Whether it may run, and what it comes to; raises as `ScanVerdict.of`."""
         if self._here(matter):
-            return await self._threaded(lambda: Verdict.of(matter.report()))
+            return await self._threaded(lambda: ScanVerdict.of(matter.report()))
         [answer] = await self._workers.ask(work, _asked("verdict", matter))
-        return Verdict(**json.loads(answer))
+        return ScanVerdict(**json.loads(answer))
 
     async def plan(self, matter: Matter) -> ScanPlan:
-        """Its plan, if it may run; raises as `Verdict.of`."""
+        """Its plan, if it may run; raises as `ScanVerdict.of`."""
         if self._here(matter):
             report = await self._threaded(matter.report)
             require_sound(report)
@@ -208,7 +208,7 @@ def work(parts: list[bytes]) -> list[bytes]:
         case "report":
             return _encoded(matter, codec)
         case "verdict":
-            return [json.dumps(Verdict.of(matter.report()).__dict__).encode()]
+            return [json.dumps(ScanVerdict.of(matter.report()).__dict__).encode()]
     report = matter.report()
     require_sound(report)
     return _pieces_of(report.plan)

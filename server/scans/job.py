@@ -11,7 +11,7 @@ from pathlib import Path
 
 from flexdt.protocol.rpc_errors import Code
 from flexdt.protocol.state_model import JobPhase
-from flexdt.server.scans.checking import Verdict
+from flexdt.server.scans.checking import ScanVerdict
 from flexdt.server.scans.runner import Produce, Progress, ScanRunner
 from flexdt.server.scans.twin_clock import SpeedUp
 from flexdt.server.storage.dataset_writer import DatasetWriter
@@ -25,7 +25,7 @@ ENDED: tuple[JobPhase, ...] = ("done", "failed", "aborted", "incomplete")
 
 
 @dataclass(frozen=True)
-class Scan:
+class JobInputs:
     """What a job needs to run; made when its turn comes."""
 
     plan: ScanPlan
@@ -33,8 +33,8 @@ class Scan:
     produce: Produce
 
 
-Prepare = Callable[[], Awaitable[Scan]]
-Extent = ScanPlan | Verdict
+Prepare = Callable[[], Awaitable[JobInputs]]
+Extent = ScanPlan | ScanVerdict
 """How much a scan is: a plan, or what a check of it came to."""
 
 

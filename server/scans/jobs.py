@@ -19,7 +19,7 @@ from pathlib import Path
 from flexdt.protocol.rpc_errors import RpcError, busy
 from flexdt.protocol.state_model import JobPhase, JobStatus
 from flexdt.server.runtime.log import log, traced
-from flexdt.server.scans.job import ENDED, Extent, Job, Prepare, Scan, recalled
+from flexdt.server.scans.job import ENDED, Extent, Job, JobInputs, Prepare, recalled
 from flexdt.server.scans.retry import Retry, transient
 from flexdt.server.scans.runner import JobAborted, Produce, ScanRunner
 from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
@@ -349,7 +349,7 @@ class Jobs:
             scan.store.close()
         return "done"
 
-    async def _runner_of(self, job: Job, scan: Scan) -> ScanRunner:
+    async def _runner_of(self, job: Job, scan: JobInputs) -> ScanRunner:
         """Made in a thread: it puts the events of a long plan in order."""
         self._preparing = True
         try:
@@ -369,7 +369,7 @@ class Jobs:
     def _stopped(self) -> Exception | None:
         return self._interrupted  # a call: it may change while others run
 
-    def _mark(self, job: Job, scan: Scan, reason: str) -> None:
+    def _mark(self, job: Job, scan: JobInputs, reason: str) -> None:
         elapsed = 0.0 if job.runner is None else job.runner.progress.tau
         try:
             scan.store.mark_incomplete(reason, duration_s=elapsed)

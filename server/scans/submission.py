@@ -23,8 +23,8 @@ from flexdt.server.files.image_files import dated_name
 from flexdt.server.files.own_documents import used_bytes
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.scans.acquisition import Acquisition, Shown
-from flexdt.server.scans.checking import Checks, Matter, Verdict
-from flexdt.server.scans.job import Job, Prepare, Scan
+from flexdt.server.scans.checking import Checks, Matter, ScanVerdict
+from flexdt.server.scans.job import Job, JobInputs, Prepare
 from flexdt.server.scans.jobs import Jobs
 from flexdt.server.scans.scan_record import FOLDER, Beginning, Sidecar, Wish
 from flexdt.server.scans.stage import Stage
@@ -173,7 +173,7 @@ class Submissions:
 
     async def _ready(
         self, asked: Sidecar, name: str, resume: bool, still: Callable[[], None]
-    ) -> tuple[Verdict, Prepare, list[str]]:
+    ) -> tuple[ScanVerdict, Prepare, list[str]]:
         """Check all of a scan, and say how it is begun."""
         begin = asked.begin
         verdict = await self._checks.verdict(
@@ -190,7 +190,7 @@ class Submissions:
                 warnings.insert(1, f"its images go on showing {a}, although {b} is on the stage")
         still()
 
-        async def prepare() -> Scan:
+        async def prepare() -> JobInputs:
             begun = asked
             if not resume:  # others may have moved since, and put something else on the stage
                 begin = replace(asked.begin, start=self._start(), sample=self.scanner.sample)
@@ -230,7 +230,7 @@ class Submissions:
             xrays_on=s.tube.on,
         )
 
-    def _open(self, asked: Sidecar, plan: ScanPlan, name: str, resume: bool) -> Scan:
+    def _open(self, asked: Sidecar, plan: ScanPlan, name: str, resume: bool) -> JobInputs:
         """Make (or take up) the data set and all that runs the plan; in a worker thread."""
         begin = asked.begin
         radiography = replace(self.radiography, physics=begin.physics, scatter=begin.scatter)
@@ -259,7 +259,7 @@ class Submissions:
         acquisition = Acquisition(
             plan, radiography, begin.sample, begin.seed, writer.put, begin.moments, self.shown
         )
-        return Scan(plan, writer, acquisition.produce)
+        return JobInputs(plan, writer, acquisition.produce)
 
     def _resumable(self, name: str, wish: Wish) -> Beginning | None:
         """What an interrupted data set of that name started from; None if there is none.

@@ -27,14 +27,14 @@ A_TURN = 4
 
 
 @dataclass(frozen=True)
-class View:
+class ImageWish:
     """How a subscriber wants images: kind, and the mean over binning x binning pixels."""
 
     kind: Literal["line_integral", "counts"] = "line_integral"
     binning: int = 1
 
 
-Render = Callable[[View], object]
+Render = Callable[[ImageWish], object]
 """Makes an event's data for one view; called at most once a view."""
 
 
@@ -53,9 +53,9 @@ class _Event:
     ) -> None:
         self.topic, self.seq, self.time, self._data = topic, seq, time, data
         self.slot = None if slot is None else f"{topic}:{slot}"
-        self._made: dict[View, Prepared] = {}
+        self._made: dict[ImageWish, Prepared] = {}
 
-    def prepared(self, view: View) -> Prepared:
+    def prepared(self, view: ImageWish) -> Prepared:
         if view not in self._made:
             data = self._data(view) if callable(self._data) else self._data
             self._made[view] = Prepared(event(self.topic, self.seq, self.time, data))
@@ -66,7 +66,7 @@ class _Event:
 class _Subscription:
     """One topic of one listener."""
 
-    view: View
+    view: ImageWish
     min_interval_s: float
     next_at: float = 0.0
     timer: asyncio.TimerHandle | None = None
@@ -106,7 +106,7 @@ class Hub:
         listener: Listener,
         topics: Iterable[Topic],
         max_rate_hz: float | None = None,
-        view: View | None = None,
+        view: ImageWish | None = None,
     ) -> None:
         """Send events of `topics` to `listener`, kept ones first.
 
@@ -116,7 +116,7 @@ class Hub:
             RpcError: -32003, more subscriptions or views than there may be; nothing has changed.
         """
         interval = 0.0 if max_rate_hz is None else 1.0 / max_rate_hz
-        topics, view = set(topics), view or View()
+        topics, view = set(topics), view or ImageWish()
         self._require_room(listener, topics, view)
         for topic in sorted(topics):
             self.unsubscribe(listener, [topic])
@@ -127,7 +127,7 @@ class Hub:
                 if earlier.seq > told:
                     self._deliver(listener, subscription, earlier)
 
-    def _require_room(self, listener: Listener, topics: set[Topic], view: View) -> None:
+    def _require_room(self, listener: Listener, topics: set[Topic], view: ImageWish) -> None:
         views = [
             s.view
             for topic, listeners in self._listeners.items()
@@ -163,7 +163,7 @@ class Hub:
         """How many events of `topic` there have been."""
         return self._seq.get(topic, 0)
 
-    def views(self, topic: Topic) -> set[View]:
+    def views(self, topic: Topic) -> set[ImageWish]:
         """Views that subscribers of `topic` want."""
         return {s.view for s in self._listeners.get(topic, {}).values()}
 

@@ -23,7 +23,7 @@ from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.runtime.log import log
 from flexdt.server.scans.twin_clock import TwinClock
-from flexdt.server.twin.hub import Hub, View
+from flexdt.server.twin.hub import Hub, ImageWish
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -83,7 +83,7 @@ def image_of(
     radiograph: Radiograph,
     cone: ConeVec,
     shot: Shot,
-    view: View,
+    view: ImageWish,
     radiography: Radiography,
     rng: np.random.Generator | None,
 ) -> r.Projection:
@@ -207,7 +207,7 @@ class LiveView:
         self._count += 1
         count, views = self._count, self.hub.views("projection")
 
-        def make(view: View) -> object:
+        def make(view: ImageWish) -> object:
             rng = np.random.default_rng([count])
             return image_of(radiograph, cone, shot, view, self.radiography, rng)
 

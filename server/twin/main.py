@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from flexdt import machines
 from flexdt.process_settings import TwinSettings, addresses, parse
 from flexdt.server.runtime.access import (
-    Limits,
+    ConnectionLimits,
     TwinLimits,
     check_bind,
     client_tls,
@@ -93,7 +93,7 @@ async def run(options: TwinSettings) -> int:
         physics=options.physics,
         scatter=options.scatter,
         projectors=len(clients),
-        limits=with_limits(options.limit, TwinLimits(), limit_names(Limits())),
+        limits=with_limits(options.limit, TwinLimits(), limit_names(ConnectionLimits())),
     )
     sample = None if options.fresh else twin.recall()
     if sample is None or options.sample is not None:
@@ -106,7 +106,7 @@ async def run(options: TwinSettings) -> int:
         options.port,
         token=read_token(options.token_file),
         ssl=server_tls(options.tls_cert, options.tls_key),
-        limits=with_limits(options.limit, Limits(), limit_names(TwinLimits())),
+        limits=with_limits(options.limit, ConnectionLimits(), limit_names(TwinLimits())),
         observe=requests.observe,
         read=reader,
     )

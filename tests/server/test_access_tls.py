@@ -22,7 +22,7 @@ from flexdt.server.network.tcp import serve
 from flexdt.server.projector.service import serve_projector
 from flexdt.server.runtime.access import (
     AccessError,
-    Limits,
+    ConnectionLimits,
     check_bind,
     client_tls,
     is_loopback,
@@ -134,7 +134,7 @@ def test_the_twin_server_speaks_tls_and_only_tls() -> None:
 
 def test_one_too_many_is_told_so_over_tls() -> None:
     async def main() -> None:
-        limits = Limits(max_clients=1)
+        limits = ConnectionLimits(max_clients=1)
         server = await serve(_Echo(), ssl=server_tls(CERTIFICATE, KEY), limits=limits)
 
         def talk() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from flexdt.protocol import RpcError
-from flexdt.server.scans.job import Scan
+from flexdt.server.scans.job import JobInputs
 from flexdt.server.scans.jobs import Jobs
 from flexdt.server.scans.twin_clock import TwinClock
 from flexdt.twin.errors import LimitError
@@ -26,7 +26,7 @@ def test_nothing_is_changed_while_a_job_is_being_opened(tmp_path: Path) -> None:
         jobs = Jobs(ScannerTwin(M, P, clock.now()), clock, lambda job: None)
         asked, answer = asyncio.Event(), asyncio.Event()
 
-        async def prepare() -> Scan:
+        async def prepare() -> JobInputs:
             asked.set()
             await answer.wait()
             raise LimitError("it does not hold after all")

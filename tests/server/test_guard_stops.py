@@ -11,7 +11,7 @@ import pytest
 from in_process import Client, Lab, run, script
 
 from flexdt.protocol import RpcError
-from flexdt.twin.scanner.joining import Prepared
+from flexdt.twin.scanner.joining import UnsweptProgramme
 
 FLY = {"frames": 60, "speed": 5.0, "exposure": 500.0}
 
@@ -82,7 +82,7 @@ def test_nothing_is_moved_or_set_while_the_rest_of_a_scan_is_swept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The scan went on with another voltage, or took the motors away from who moved them."""
-    swept, certified = threading.Event(), Prepared.certified
+    swept, certified = threading.Event(), UnsweptProgramme.certified
     wait = lambda self: (swept.wait(60.0), certified(self))[1]  # noqa: E731
 
     async def body(lab: Lab) -> None:
@@ -90,7 +90,7 @@ def test_nothing_is_moved_or_set_while_the_rest_of_a_scan_is_swept(
         job = await in_a_scan(lab, client)
         await client.call("job.pause", job=job)
         await client.call("tube.set", kV=50.0)
-        monkeypatch.setattr(Prepared, "certified", wait)
+        monkeypatch.setattr(UnsweptProgramme, "certified", wait)
         resumed = asyncio.ensure_future(client.call("job.resume", job=job))
         await asyncio.sleep(0)
         for method, params in (

@@ -12,7 +12,7 @@ import pytest
 
 from flexdt.protocol import Codec, Connection, Message, Prepared, RpcError
 from flexdt.server.twin.control import Control
-from flexdt.server.twin.hub import Hub, View
+from flexdt.server.twin.hub import Hub, ImageWish
 from tests.support.simulated_loop import SimulatedLoop
 
 
@@ -60,8 +60,9 @@ def test_subscriptions_and_views_have_a_limit_and_a_refusal_changes_nothing() ->
     async def main() -> None:
         hub = Hub(lambda: 0.0, most=3, most_views=2)
         a, b, c = Ear(), Ear(), Ear()
-        hub.subscribe(a, ["state", "projection"], view=View("counts", 2))
-        hub.subscribe(a, ["state", "projection"], view=View("counts", 4))  # instead, not besides
+        hub.subscribe(a, ["state", "projection"], view=ImageWish("counts", 2))
+        again = ImageWish("counts", 4)  # instead, not besides
+        hub.subscribe(a, ["state", "projection"], view=again)
         with pytest.raises(RpcError, match="4 subscriptions") as refused:
             hub.subscribe(b, ["state", "job"])
         assert refused.value.code == -32003
@@ -72,11 +73,11 @@ def test_subscriptions_and_views_have_a_limit_and_a_refusal_changes_nothing() ->
             hub.subscribe(c, ["log"])
         hub.unsubscribe(a, ["state"])
         with pytest.raises(RpcError, match="3 different views") as refused:
-            hub.subscribe(c, ["projection"], view=View("counts", 8))
+            hub.subscribe(c, ["projection"], view=ImageWish("counts", 8))
         assert refused.value.data == {"asked": 3, "allowed": 2}
-        hub.subscribe(c, ["projection"], view=View("counts", 4))
+        hub.subscribe(c, ["projection"], view=ImageWish("counts", 4))
         hub.drop(b)
-        hub.subscribe(c, ["projection"], view=View("counts", 8))
+        hub.subscribe(c, ["projection"], view=ImageWish("counts", 8))
         hub.publish("projection", lambda view: view.binning)
         assert (a.values, b.values, c.values) == ([4], [], [8])
 
@@ -114,10 +115,12 @@ def test_each_view_is_rendered_once_however_many_listen() -> None:
         hub = Hub(lambda: 0.0)
         ears = [Ear() for _ in range(6)]
         for i, ear in enumerate(ears):
-            hub.subscribe(ear, ["projection"], view=View("counts", 2) if i % 2 else View())
-        made: list[View] = []
+            hub.subscribe(
+                ear, ["projection"], view=ImageWish("counts", 2) if i % 2 else ImageWish()
+            )
+        made: list[ImageWish] = []
 
-        def render(view: View) -> object:
+        def render(view: ImageWish) -> object:
             made.append(view)
             return view.kind
 

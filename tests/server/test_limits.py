@@ -20,7 +20,13 @@ from flexdt.clients.client.client import TwinClient
 from flexdt.protocol import METHODS, Connection, Failure, RpcError
 from flexdt.protocol.method_table import compatible
 from flexdt.server.files.own_documents import used_bytes
-from flexdt.server.runtime.access import AccessError, Limits, TwinLimits, limit_names, with_limits
+from flexdt.server.runtime.access import (
+    AccessError,
+    ConnectionLimits,
+    TwinLimits,
+    limit_names,
+    with_limits,
+)
 from flexdt.server.scans import retry as retry_module
 from flexdt.server.scans.retry import Retry, transient
 from flexdt.server.twin.control import Control
@@ -38,10 +44,10 @@ P = builtin_profile(M.default_profile)
 
 def test_limits_by_name() -> None:
     words = ["max_clients=7", "send_timeout_s=2.5", "max_jobs=3", "disk_quota=1e9"]
-    limits = with_limits(words, Limits(), limit_names(TwinLimits()))
+    limits = with_limits(words, ConnectionLimits(), limit_names(TwinLimits()))
     assert (limits.max_clients, limits.send_timeout_s) == (7, 2.5)
-    assert limits.max_message == Limits().max_message
-    twins = with_limits(words, TwinLimits(), limit_names(Limits()))
+    assert limits.max_message == ConnectionLimits().max_message
+    twins = with_limits(words, TwinLimits(), limit_names(ConnectionLimits()))
     assert (twins.max_jobs, twins.disk_quota) == (3, 1_000_000_000)
 
 
@@ -52,7 +58,7 @@ NO_LIMITS = ("max_jobs", "max_jobs=", "max_jobs=many", "max_jobs=0", "max_jobs=-
 @pytest.mark.parametrize("word", NO_LIMITS)
 def test_limits_that_are_none(word: str) -> None:
     with pytest.raises(AccessError, match=r"max_jobs|no limit called"):
-        with_limits([word], TwinLimits(), limit_names(Limits()))
+        with_limits([word], TwinLimits(), limit_names(ConnectionLimits()))
 
 
 @pytest.mark.timeout(120)

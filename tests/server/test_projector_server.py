@@ -20,7 +20,7 @@ from flexdt.server.projector import compute as kernels
 from flexdt.server.projector import projector_methods as answers
 from flexdt.server.projector.service import ProjectorServer, serve_projector
 from flexdt.server.projector.wire import LinkLost, ProjectorLink
-from flexdt.server.runtime.access import AccessError, Limits
+from flexdt.server.runtime.access import AccessError, ConnectionLimits
 from flexdt.server.wire_errors import ProjectorUnavailable
 from flexdt.twin.projection import Volume, back, forward, gpu, project_scene
 from flexdt.twin.projection.analytic_solids import (
@@ -529,7 +529,7 @@ def test_a_client_that_never_reads_is_cut_off_and_others_are_served() -> None:
         assert views_made < 200  # nothing was computed for long that nobody took
         writer.close()
 
-    run(body, limits=Limits(send_timeout_s=0.5))
+    run(body, limits=ConnectionLimits(send_timeout_s=0.5))
 
 
 def test_a_restarted_server_gets_the_volumes_again() -> None:

@@ -30,7 +30,7 @@ from flexdt.protocol.fields import Params
 from flexdt.server.network import shell_parts as refusal
 from flexdt.server.network.shell_application import Peer
 from flexdt.server.network.tcp import TcpServer, serve
-from flexdt.server.runtime.access import AccessError, Limits
+from flexdt.server.runtime.access import AccessError, ConnectionLimits
 
 TOKEN = "0123456789abcdef"
 
@@ -231,7 +231,7 @@ def test_half_frames_and_clients_gone_in_mid_request_cost_nothing() -> None:
         assert "result" in (await ask(reader, writer, call("state.get")))[0]
         writer.close()
 
-    run(body, limits=Limits(end_timeout_s=0.2))
+    run(body, limits=ConnectionLimits(end_timeout_s=0.2))
 
 
 def test_requests_of_a_connection_are_served_in_order_but_stop_overtakes() -> None:
@@ -344,7 +344,7 @@ def test_a_client_that_never_reads_loses_values_and_then_only_its_own_connection
         writer.close()
         deaf.close()
 
-    run(body, limits=Limits(send_timeout_s=2.0))
+    run(body, limits=ConnectionLimits(send_timeout_s=2.0))
 
 
 def test_newest_value_wins_per_slot_and_ordered_events_keep_their_order() -> None:
@@ -383,7 +383,7 @@ def test_too_many_unread_ordered_events_cut_the_connection() -> None:
             await asyncio.sleep(0.01)
         writer.close()
 
-    run(body, limits=Limits(max_events=50))
+    run(body, limits=ConnectionLimits(max_events=50))
 
 
 def test_a_client_that_pipelines_without_reading_is_held_back() -> None:
@@ -394,7 +394,7 @@ def test_a_client_that_pipelines_without_reading_is_held_back() -> None:
         assert got == list(range(5000))
         writer.close()
 
-    run(body, limits=Limits(max_waiting=10, max_unsent=1000))
+    run(body, limits=ConnectionLimits(max_waiting=10, max_unsent=1000))
 
 
 def test_urgent_requests_of_a_client_that_does_not_read_are_held_back_too() -> None:
@@ -416,7 +416,7 @@ def test_urgent_requests_of_a_client_that_does_not_read_are_held_back_too() -> N
         await task
         writer.close()
 
-    run(body, limits=Limits(max_waiting=50, max_unsent=10_000))
+    run(body, limits=ConnectionLimits(max_waiting=50, max_unsent=10_000))
 
 
 async def _write_all(writer: asyncio.StreamWriter, line: bytes, count: int) -> None:
@@ -457,7 +457,7 @@ def test_a_silent_client_without_a_token_is_cut_off() -> None:
         assert await reader.read() == b""
         writer.close()
 
-    run(body, token=TOKEN, limits=Limits(hello_timeout_s=0.05))
+    run(body, token=TOKEN, limits=ConnectionLimits(hello_timeout_s=0.05))
 
 
 def test_slowloris_is_cut_off_but_a_steady_talker_is_not() -> None:
@@ -477,7 +477,7 @@ def test_slowloris_is_cut_off_but_a_steady_talker_is_not() -> None:
         writer.close()
         other.close()
 
-    run(body, limits=Limits(message_timeout_s=2.0))
+    run(body, limits=ConnectionLimits(message_timeout_s=2.0))
 
 
 def test_http_is_turned_away_before_its_body_is_read() -> None:
@@ -507,7 +507,7 @@ def test_limits_on_clients_rate_and_broken_messages() -> None:
         assert await reader.read() == b""
         writer.close()
 
-    run(body, limits=Limits(max_clients=1, requests_per_s=20.0, malformed=5))
+    run(body, limits=ConnectionLimits(max_clients=1, requests_per_s=20.0, malformed=5))
 
 
 def test_one_too_many_is_told_in_its_own_codec() -> None:
@@ -539,7 +539,7 @@ def test_one_too_many_is_told_in_its_own_codec() -> None:
         waits.close()
         writer.close()
 
-    run(body, limits=Limits(max_clients=1))
+    run(body, limits=ConnectionLimits(max_clients=1))
 
 
 def test_one_too_many_that_says_nothing_or_does_not_go_is_cut_off() -> None:
@@ -558,7 +558,7 @@ def test_one_too_many_that_says_nothing_or_does_not_go_is_cut_off() -> None:
         for writer in (first, one, two):
             writer.close()
 
-    run(body, limits=Limits(max_clients=1, hello_timeout_s=2.0))
+    run(body, limits=ConnectionLimits(max_clients=1, hello_timeout_s=2.0))
 
 
 def test_many_too_many_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -576,7 +576,7 @@ def test_many_too_many_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
             writer.close()
         await asyncio.gather(*ends, return_exceptions=True)
 
-    run(body, limits=Limits(max_clients=1))
+    run(body, limits=ConnectionLimits(max_clients=1))
 
 
 def test_another_version_is_not_let_in_with_the_right_token() -> None:

@@ -14,8 +14,8 @@ from flexdt.protocol.fields import Params
 from flexdt.server.network import tcp
 from flexdt.server.network.shell_application import Peer
 from flexdt.server.network.tcp import READ_AHEAD, TcpServer, _Link
-from flexdt.server.network.turns import FIRST, ORDINARY, URGENT, Turns
-from flexdt.server.runtime.access import Limits
+from flexdt.server.network.turns import FIRST, ORDINARY, URGENT, LoopTurns
+from flexdt.server.runtime.access import ConnectionLimits
 
 
 class Transport(asyncio.Transport):
@@ -87,7 +87,7 @@ class Bench:
 
     def __init__(self, **limits: Any) -> None:
         self.app = App()
-        self.server = TcpServer(self.app, Limits(**limits), None, METHODS)
+        self.server = TcpServer(self.app, ConnectionLimits(**limits), None, METHODS)
 
     def dial(self) -> tuple[_Link, Transport]:
         link, transport = _Link(self.server), Transport()
@@ -234,7 +234,7 @@ def test_a_message_that_has_begun_is_read_to_its_end() -> None:
 
 def test_a_turn_of_who_has_gone_is_given_to_the_next() -> None:
     async def body() -> None:
-        turns, got = Turns(), list[str]()
+        turns, got = LoopTurns(), list[str]()
 
         async def take(who: str, lane: int) -> None:
             await turns.take(who, lane)
@@ -274,7 +274,7 @@ def test_floods_of_urgent_requests_are_looked_at_once_in_a_turn(
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(lambda loop, context: None)
         turns, seen = [0], list[tuple[int, object]]()
-        server = TcpServer(None, Limits(), None, METHODS)  # type: ignore[arg-type]
+        server = TcpServer(None, ConnectionLimits(), None, METHODS)  # type: ignore[arg-type]
         floods = [_Flood(server, turns, seen) for _ in range(3)]
         for flood in (*floods, *floods):
             server.look_soon(flood)  # type: ignore[arg-type]

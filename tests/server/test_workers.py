@@ -17,7 +17,7 @@ from flexdt.protocol import Codec, Connection, RpcError
 from flexdt.protocol.rpc_errors import Code
 from flexdt.server.runtime.workers import Workers
 from flexdt.server.scans import checking
-from flexdt.server.scans.checking import Checks, Matter, Verdict
+from flexdt.server.scans.checking import Checks, Matter, ScanVerdict
 from flexdt.server.scans.scan_record import PoseList, Sidecar, Wish
 from flexdt.server.twin import message_reading
 from flexdt.server.twin.message_reading import MAX_PARAMS, Reader
@@ -67,7 +67,7 @@ def test_a_plan_made_apart_is_the_plan_made_here(wish: Wish) -> None:
         plan = await checks.plan(there)
         assert same(plan, there.report().plan)
         assert plan.machine is M
-        assert await checks.verdict(there) == Verdict.of(there.report())
+        assert await checks.verdict(there) == ScanVerdict.of(there.report())
         for codec in Codec:
             report = b"".join(await checks.report(there, codec))
             wire = Connection(codec)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from flexdt.twin.collision.collision_scene import Scene
-from flexdt.twin.collision.scene_search import Search, SweepResult
+from flexdt.twin.collision.scene_search import PathSearch, SweepResult
 from flexdt.twin.motion.profiles import Trajectory
 
 
@@ -11,6 +11,6 @@ def sweep(
     scene: Scene, trajectories: Mapping[str, Trajectory], start: float, end: float
 ) -> SweepResult:
     """The first contact; without one the least clearance, refined."""
-    search = Search(scene, scene.path(trajectories, start, end))
+    search = PathSearch(scene, scene.path(trajectories, start, end))
     found = search.first_contact()
     return search.refined(found) if found.contact is None else found

@@ -1,7 +1,7 @@
 """Geometric calibration from a bead phantom: detect, identify, fit, certify, predict."""
 
 from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
-from flexdt.twin.calibration.detect.detection import Detections, Detector, detect_beads
+from flexdt.twin.calibration.detect.detection import Detections, SpotFinder, detect_beads
 from flexdt.twin.calibration.fit.certificate import Certificate, Estimate
 from flexdt.twin.calibration.fit.fit import (
     FitResult,
@@ -24,7 +24,6 @@ __all__ = [
     "Centre",
     "Certificate",
     "Detections",
-    "Detector",
     "Direction",
     "Estimate",
     "FitResult",
@@ -33,6 +32,7 @@ __all__ = [
     "Reading",
     "Search",
     "Solver",
+    "SpotFinder",
     "bead_model",
     "detect_beads",
     "estimate_geometry",

@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from flexdt.twin.calibration.detect.detection import (
     Detections,
-    Detector,
     Part,
+    SpotFinder,
     detect_beads,
     detect_in_parts,
 )
@@ -40,14 +40,14 @@ class FrameState(enum.Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class FrameSpots:
     """What was found in one frame."""
 
     detections: Detections
     state: FrameState
 
 
-def without_repeats(looks: Sequence[Look]) -> tuple[Look, ...]:
+def without_repeats(looks: Sequence[FrameSpots]) -> tuple[FrameSpots, ...]:
     """Looks in which a frame that shows exactly what the one before shows is not used.
 
     Noise never repeats: such a frame is a copy, of a camera that stuttered. Where most frames are
@@ -58,7 +58,7 @@ def without_repeats(looks: Sequence[Look]) -> tuple[Look, ...]:
         a, b = looks[i - 1].detections, looks[i].detections
         same = len(a) == len(b) >= 2 and bool(np.abs(a.centers - b.centers).max() < 1e-7)
         if same and looks[i].state is FrameState.USABLE:
-            out[i] = Look(b, FrameState.REPEATED)
+            out[i] = FrameSpots(b, FrameState.REPEATED)
     repeated = sum(look.state is FrameState.REPEATED for look in out)
     return tuple(looks) if 2 * repeated > len(out) else tuple(out)
 
@@ -72,7 +72,7 @@ class Frames(Protocol):
 
     def __len__(self) -> int: ...
 
-    def look(self, detector: Detector) -> list[Look]:
+    def look(self, detector: SpotFinder) -> list[FrameSpots]:
         """Detect the beads of every frame."""
 
     def windows(self, plan: Windows) -> Float32Array:
@@ -84,22 +84,22 @@ def nothing(shape: tuple[int, int]) -> Detections:
     return Detections.of_points(np.zeros((0, 2)), 0.0, 0.0, shape)
 
 
-def look_at(image: Float32Array, detector: Detector) -> Look:
+def look_at(image: Float32Array, detector: SpotFinder) -> FrameSpots:
     """Detect the beads of one line-integral image, unless it is dark."""
     shape = (image.shape[0], image.shape[1])
     if float(np.median(image[::16, ::16])) > DARK:
-        return Look(nothing(shape), FrameState.DARK)
-    return Look(detect_beads(image, detector), FrameState.USABLE)
+        return FrameSpots(nothing(shape), FrameState.DARK)
+    return FrameSpots(detect_beads(image, detector), FrameState.USABLE)
 
 
 def look_in_parts(
-    coarse: Float32Array, factor: int, shape: tuple[int, int], part: Part, detector: Detector
-) -> Look:
+    coarse: Float32Array, factor: int, shape: tuple[int, int], part: Part, detector: SpotFinder
+) -> FrameSpots:
     """The same where only parts of the image need be made; see `detect.detect_in_parts`."""
     step = max(16 // factor, 1)
     if float(np.median(coarse[::step, ::step])) > DARK:
-        return Look(nothing(shape), FrameState.DARK)
-    return Look(detect_in_parts(coarse, factor, shape, part, detector), FrameState.USABLE)
+        return FrameSpots(nothing(shape), FrameState.DARK)
+    return FrameSpots(detect_in_parts(coarse, factor, shape, part, detector), FrameState.USABLE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,10 +117,10 @@ class ArrayFrames:
     def __len__(self) -> int:
         return len(self.images)
 
-    def look(self, detector: Detector) -> list[Look]:
+    def look(self, detector: SpotFinder) -> list[FrameSpots]:
         """See `Frames`."""
         return [
-            Look(nothing(self.shape), FrameState.MISSING)
+            FrameSpots(nothing(self.shape), FrameState.MISSING)
             if image is None
             else look_at(np.ascontiguousarray(image, dtype=np.float32), detector)
             for image in self.images
@@ -145,7 +145,7 @@ class SpotFrames:
         images: where they were detected; None where there are none, only positions.
     """
 
-    looks: Sequence[Look]
+    looks: Sequence[FrameSpots]
     images: Frames | None = None
 
     @property
@@ -156,7 +156,7 @@ class SpotFrames:
     def __len__(self) -> int:
         return len(self.looks)
 
-    def look(self, detector: Detector) -> list[Look]:
+    def look(self, detector: SpotFinder) -> list[FrameSpots]:
         """See `Frames`."""
         return list(self.looks)
 

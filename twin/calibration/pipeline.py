@@ -15,8 +15,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
-from flexdt.twin.calibration.detect.detection import Detector
-from flexdt.twin.calibration.detect.refine import FEW_WINDOWS, Measured, contrast_of, measure_beads
+from flexdt.twin.calibration.detect.detection import SpotFinder
+from flexdt.twin.calibration.detect.refine import FEW_WINDOWS, Refined, contrast_of, measure_beads
 from flexdt.twin.calibration.detect.windows import plan_windows
 from flexdt.twin.calibration.diagnose.data import (
     explain_identification,
@@ -63,7 +63,13 @@ from flexdt.twin.calibration.fit.problem import (
 )
 from flexdt.twin.calibration.fit.solver import Solver
 from flexdt.twin.calibration.fit.weak_directions import BOUND
-from flexdt.twin.calibration.frame_source import FrameState, Look, Scan, nothing, without_repeats
+from flexdt.twin.calibration.frame_source import (
+    FrameSpots,
+    FrameState,
+    Scan,
+    nothing,
+    without_repeats,
+)
 from flexdt.twin.calibration.identify import (
     Identification,
     Search,
@@ -169,8 +175,8 @@ class Calibration:
     fit: FitResult | None
     identifications: tuple[Identification, ...]
     findings: tuple[Finding, ...]
-    looks: tuple[tuple[Look, ...], ...]
-    measured: tuple[Measured, ...]
+    looks: tuple[tuple[FrameSpots, ...], ...]
+    measured: tuple[Refined, ...]
     scans: tuple[Scan, ...]
     model: BeadModel
     motion: MotionFit | None = None
@@ -202,7 +208,7 @@ def calibrate(
     request: Request | None = None,
     *,
     scene: Scene | None = None,
-    detector: Detector | None = None,
+    detector: SpotFinder | None = None,
 ) -> Calibration:
     """Calibrate from images.
 
@@ -308,7 +314,7 @@ def calibrate(
     )
 
 
-def detector_for(model: BeadModel, poses: Poses) -> Detector:
+def detector_for(model: BeadModel, poses: Poses) -> SpotFinder:
     """A detector for the sizes the beads' spots can have at a rough geometry."""
     pitch = np.linalg.norm(poses.u, axis=1)
     scale = poses.sdd / poses.sod / pitch
@@ -316,10 +322,10 @@ def detector_for(model: BeadModel, poses: Poses) -> Detector:
     high = float(model.bead_radius_mm.max() * scale.max())
     sizes = model.bead_radius_mm
     same = math.inf if sizes.max() > 1.2 * sizes.min() else 1.6
-    return Detector(radius_px=(0.65 * low, 1.5 * high), same=same)
+    return SpotFinder(radius_px=(0.65 * low, 1.5 * high), same=same)
 
 
-def _require_different(scans: Sequence[Scan], looks: Sequence[Sequence[Look]]) -> None:
+def _require_different(scans: Sequence[Scan], looks: Sequence[Sequence[FrameSpots]]) -> None:
     """The same images twice would count as twice the evidence, also some of them: no two images
     have the same noise, so none has all its spots where another has them, to the last digit."""
     known: dict[bytes, int] = {}

@@ -16,7 +16,7 @@ from flexdt.twin.collision.collision_scene import Scene, build_scene
 from flexdt.twin.collision.convex_solids import Cylinder, Solid
 from flexdt.twin.collision.paths import Path, path_of
 from flexdt.twin.collision.relative import START, Moment
-from flexdt.twin.collision.scene_search import Contact, Search, clearance_trace
+from flexdt.twin.collision.scene_search import Contact, PathSearch, clearance_trace
 from flexdt.twin.collision.sweep import sweep_pair
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
@@ -61,7 +61,7 @@ def collision_report(plan: ScanPlan, scene: Scene) -> Clearance:
         scene: what may touch what.
     """
     path = path_of(scene.axes, plan.paths, 0.0, plan.duration_s)
-    search = Search(scene, path)
+    search = PathSearch(scene, path)
     contacts = _contacts(search)
     least, pair = _least(search, contacts)
     points = clearance_trace(scene, path, _trace_times(path, TRACE_POINTS))
@@ -75,7 +75,7 @@ def collision_report(plan: ScanPlan, scene: Scene) -> Clearance:
     )
 
 
-def _least(search: Search, contacts: Sequence[Contact]) -> tuple[float, tuple[str, str] | None]:
+def _least(search: PathSearch, contacts: Sequence[Contact]) -> tuple[float, tuple[str, str] | None]:
     if contacts:
         worst = min(contacts, key=lambda c: c.clearance_mm)
         return worst.clearance_mm, worst.pair
@@ -90,7 +90,7 @@ def _from_size(size: SampleSize | None) -> tuple[Solid, ...]:
     return (Cylinder((0.0, 0.0, 0.0), 0.5 * size.diameter_mm, height),)
 
 
-def _contacts(search: Search) -> list[Contact]:
+def _contacts(search: PathSearch) -> list[Contact]:
     """All contacts, in the order of time; of several pieces of a sample, the first."""
     limits = search.scene.limits
     found = []
@@ -106,7 +106,7 @@ def _contacts(search: Search) -> list[Contact]:
     return list(first.values())
 
 
-def _contacts_of(search: Search, k: int) -> list[Contact]:
+def _contacts_of(search: PathSearch, k: int) -> list[Contact]:
     """Contacts of one pair: after each it must come free again to count anew."""
     motion, limits = search.motion(k), search.scene.limits
     separate = search.scene.separation(search.pairs[k])

@@ -75,11 +75,11 @@ class SweepResult:
 
 def first_contact(scene: Scene, path: Path) -> Contact | None:
     """The first contact along a path, without its clearances."""
-    return Search(scene, path).first_contact(only_contacts=True).contact
+    return PathSearch(scene, path).first_contact(only_contacts=True).contact
 
 
 @dataclass(frozen=True, eq=False)
-class Search:
+class PathSearch:
     """A scene on a path: the pairs that move relative to each other, nearest boxes first."""
 
     scene: Scene

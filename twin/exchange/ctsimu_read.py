@@ -64,7 +64,7 @@ class _Deviation:
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class PlacedPart:
     """Where something is: centre [mm], axes as columns (3, 3), and how it moves."""
 
     center: FloatArray
@@ -142,7 +142,7 @@ class ScenarioReader:
 
     def _poses(
         self,
-        parts: Mapping[str, Part],
+        parts: Mapping[str, PlacedPart],
         angle: FloatArray,
         pitch: Sequence[float],
         real: bool,
@@ -171,10 +171,10 @@ class ScenarioReader:
             raise self._error("acquisition.direction", "CW or CCW")
         return -angles if direction == "CW" else angles
 
-    def _part(self, name: str) -> Part:
+    def _part(self, name: str) -> PlacedPart:
         return self._placed(self._at("geometry", name), f"geometry.{name}", (WORLD,))
 
-    def _placed(self, part: Mapping[str, Any], where: str, allowed: tuple[str, ...]) -> Part:
+    def _placed(self, part: Mapping[str, Any], where: str, allowed: tuple[str, ...]) -> PlacedPart:
         """Source, detector, stage (u, w) or sample (r, t), in one of the `allowed` references."""
         if part.get("deviation") or part.get("centre"):
             raise self._error(where, "the form of file format 1.0 and later (center, deviations)")
@@ -199,7 +199,7 @@ class ScenarioReader:
         if not isinstance(deviations, list):
             raise self._error(f"{where}.deviations", "a list")
         rest = [PerFrame(m.known - s, m.real - s) for m, s in zip(moves, start, strict=True)]
-        return Part(
+        return PlacedPart(
             np.array(start),
             axes,
             (rest[0], rest[1], rest[2]),
@@ -365,7 +365,7 @@ def seen_from(pose: Pose, center: FloatArray, axes: FloatArray) -> FloatArray:
 
 
 def place(
-    part: Part,
+    part: PlacedPart,
     turn: FloatArray,
     frame: int,
     real: bool,

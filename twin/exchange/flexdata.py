@@ -18,7 +18,7 @@ import numpy as np
 
 from flexdt.twin.exchange.geometry import (
     SAME_MM,
-    Circle,
+    CircularScan,
     ExchangeError,
     ScanGeometry,
     circle_of,
@@ -94,7 +94,7 @@ def _toml(value: object) -> str:
     return repr(value)
 
 
-def _equal_steps(circle: Circle, tolerance_mm: float) -> tuple[float, float]:
+def _equal_steps(circle: CircularScan, tolerance_mm: float) -> tuple[float, float]:
     """First and last angle [rad].
 
     Raises:
@@ -173,7 +173,7 @@ def read_flexdata(
     pixel = get.number("det_pixel")
     first, last = get.list_of("ang_range")
     angles = np.linspace(first, last, count)
-    circle = Circle(
+    circle = CircularScan(
         np.radians(angles),
         np.array([-moved[1], -moved[2]]),
         np.array([get.number("src_tan", 0.0) - axis, -sod, get.number("src_ort", 0.0)]),

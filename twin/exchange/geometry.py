@@ -88,7 +88,7 @@ def _upside_down(cone_vec: ConeVec) -> ConeVec:
 
 
 @dataclass(frozen=True, eq=False)
-class Circle:
+class CircularScan:
     """One circle about an axis parallel to z.
 
     Attributes:
@@ -113,7 +113,7 @@ class Circle:
         )
 
 
-def circle_of(cone_vec: ConeVec, format_name: str, tolerance_mm: float = SAME_MM) -> Circle:
+def circle_of(cone_vec: ConeVec, format_name: str, tolerance_mm: float = SAME_MM) -> CircularScan:
     """The circle that `cone_vec` is.
 
     Args:
@@ -142,7 +142,7 @@ def circle_of(cone_vec: ConeVec, format_name: str, tolerance_mm: float = SAME_MM
     moved = cone_vec.moved(np.eye(3), np.array([-center[0], -center[1], 0.0]))
     world = moved.moved(rotation_z(-angle), np.zeros(3))
     middle = world.rows.mean(axis=0)
-    found = Circle(angle, center, middle[0:3], middle[3:6], middle[6:9], middle[9:12])
+    found = CircularScan(angle, center, middle[0:3], middle[3:6], middle[6:9], middle[9:12])
     miss = np.abs(found.cone_vec().rows - cone_vec.rows)
     if miss.max() > tolerance_mm:
         view = int(np.argmax(miss.max(axis=1)))

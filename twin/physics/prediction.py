@@ -33,7 +33,7 @@ GRAY_PER_KEV_PER_G: Final = 1.602176634e-13
 
 
 @dataclass(frozen=True)
-class Reading:
+class PixelValue:
     """A pixel of one saved image.
 
     Attributes:
@@ -52,7 +52,7 @@ def pixel_reading(
     flux: float,
     paths_mm: Sequence[float] = (),
     detail: tuple[Substance, float] | None = None,
-) -> Reading:
+) -> PixelValue:
     """What a pixel reads behind materials, in surroundings that are like it.
 
     Args:
@@ -90,10 +90,10 @@ def pixel_reading(
     quanta = float(noise @ through) * scale * kept
     per_count = panel.electrons_per_count(camera)
     variance = (quanta + panel.read_noise(camera) ** 2) / exposure.averages / per_count**2
-    return Reading(float(signal @ through) * scale / per_count, math.sqrt(variance + 1.0 / 12.0))
+    return PixelValue(float(signal @ through) * scale / per_count, math.sqrt(variance + 1.0 / 12.0))
 
 
-def contrast_to_noise(background: Reading, detail: Reading) -> float:
+def contrast_to_noise(background: PixelValue, detail: PixelValue) -> float:
     """Difference of two readings over the background's noise, of one pixel of one image."""
     return abs(background.signal - detail.signal) / background.noise
 

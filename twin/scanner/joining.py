@@ -342,7 +342,7 @@ def _ways(drives: Mapping[str, Drive], names: Ways) -> dict[str, Trajectory]:
 
 
 @dataclass(frozen=True)
-class Prepared:
+class UnsweptProgramme:
     """A programme that has to be swept before it may be followed, and all that the sweep needs.
 
     Frozen, so that the sweep may run in another thread while the scanner lives on.
@@ -373,5 +373,5 @@ class Prepared:
 class CertifiedProgramme:
     """What the sweep of a programme found; it holds for the version it was prepared for."""
 
-    prepared: Prepared
+    prepared: UnsweptProgramme
     contact: Contact | None

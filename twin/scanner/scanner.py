@@ -34,8 +34,8 @@ from flexdt.twin.scanner.joining import (
     Jog,
     Joined,
     Lookahead,
-    Prepared,
     Stopping,
+    UnsweptProgramme,
 )
 from flexdt.twin.scanner.readout import readout
 from flexdt.twin.scanner.safety import (
@@ -335,7 +335,7 @@ class ScannerTwin:
         programme: Mapping[str, Sequence[Trajectory]],
         now: float,
         start: Mapping[str, float] | None = None,
-    ) -> Prepared:
+    ) -> UnsweptProgramme:
         """A programme with all that its sweep needs; `certified` on it may run in another thread.
 
         Args:
@@ -353,7 +353,7 @@ class ScannerTwin:
         for name in programme:
             self.machine.axis(name)
         stand = {**self.final_positions(), **(start or {})}
-        return Prepared(programme, stand, (self._stage, self._stops), self.guard)
+        return UnsweptProgramme(programme, stand, (self._stage, self._stops), self.guard)
 
     def may_follow(self, certificate: CertifiedProgramme, now: float) -> bool:
         """Whether all is as it was prepared for: the stage, no stop since, the motors at rest."""

@@ -42,7 +42,7 @@ class Field:
 
 
 @dataclass(frozen=True)
-class Row:
+class CodeLine:
     """One line that is neither blank nor a comment.
 
     Attributes:
@@ -94,13 +94,13 @@ def is_log(text: str | bytes) -> bool:
     return LOG_STAMP.search(encode(text) if isinstance(text, str) else text) is not None
 
 
-def rows(data: str | bytes) -> Iterator[Row]:
+def rows(data: str | bytes) -> Iterator[CodeLine]:
     """The rows of a script, blank lines and comment lines left out."""
     for number, text in _lines(decode(data)):
         if _BLOB.match(text) and "\t" in text:
-            yield Row(number, text, _blob_columns(text))
+            yield CodeLine(number, text, _blob_columns(text))
         elif text.strip(_BLANK) and _WORD.search(text) and not _COMMENT.match(text):
-            yield Row(number, text, _columns(text) if "\t" in text else None)
+            yield CodeLine(number, text, _columns(text) if "\t" in text else None)
 
 
 def line_count(data: str | bytes) -> int:

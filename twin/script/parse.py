@@ -15,7 +15,7 @@ from flexdt.twin.outward import PathLike, outward
 from flexdt.twin.script import commands as c
 from flexdt.twin.script import grammar
 from flexdt.twin.script.grammar import ArgumentError, Spec, shorten
-from flexdt.twin.script.lexer import Field, Row, is_log, is_utf16, line_count, rows
+from flexdt.twin.script.lexer import CodeLine, Field, is_log, is_utf16, line_count, rows
 from flexdt.twin.script.problems import Problem, ScriptError, in_order
 
 _COMMENT_MARKS = ("#", "//", ";")
@@ -77,7 +77,7 @@ def read_script(text: Source) -> tuple[c.Script, tuple[Problem, ...]]:
     return c.Script(tuple(made), warnings, line_count(text)), ordered
 
 
-def read_row(row: Row, problems: list[Problem]) -> c.Command | None:
+def read_row(row: CodeLine, problems: list[Problem]) -> c.Command | None:
     """The command of one row, or None; what is wrong with it is added to `problems`."""
     return _Line(row, problems).command()
 
@@ -105,7 +105,7 @@ class _Parts:
 class _Line:
     """Reads one row and notes what is wrong with it."""
 
-    def __init__(self, row: Row, problems: list[Problem]) -> None:
+    def __init__(self, row: CodeLine, problems: list[Problem]) -> None:
         self.row, self.problems = row, problems
         self.component = row.columns[0] if row.columns else row.words()[0]
 

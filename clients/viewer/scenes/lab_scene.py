@@ -16,7 +16,7 @@ from flexdt.clients.viewer.scenes import collision_bodies as bodies
 from flexdt.clients.viewer.scenes import parts, world
 from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.gizmos import Drag, Gizmos
-from flexdt.clients.viewer.scenes.sample import MM, Look
+from flexdt.clients.viewer.scenes.sample import MM, SampleLook
 from flexdt.clients.viewer.scenes.world import PlanDrawing, World, motors, quaternion
 from flexdt.protocol.state_model import State
 from flexdt.twin.collision.collision_scene import build_scene
@@ -70,7 +70,7 @@ class LabScene:
         self._looks: list[Any] = []
         self._sent: dict[str, tuple[float, ...]] = {}
         self._skins: list[Any] = []
-        self._look: Look | None = None
+        self._look: SampleLook | None = None
         self._hulls: dict[str, Any] = {}
         self._margins: dict[str, Any] = {}
         self._hot: frozenset[str] = frozenset()
@@ -273,7 +273,7 @@ class LabScene:
         """Draw an image (rows, cols, 3) on the panel."""
         self._image.image = rgb
 
-    def wear(self, look: Look) -> None:
+    def wear(self, look: SampleLook) -> None:
         """Put a sample on the stage."""
         if look is self._look:
             return
@@ -292,7 +292,7 @@ class LabScene:
             ]  # fmt: skip
             self._stand(look)
 
-    def _stand(self, look: Look) -> None:
+    def _stand(self, look: SampleLook) -> None:
         """A thin rod from the mount to the sample: drawn only, X-rays do not see it."""
         name = f"{STAND}/rod"
         mount = next((p for p in self._machine.components if p.role == "sample_mount"), None)

@@ -17,11 +17,11 @@ import numpy as np
 import trimesh
 
 from flexdt.clients.viewer.scenes import sample as s
-from flexdt.clients.viewer.scenes.sample import Piece
+from flexdt.clients.viewer.scenes.sample import PaintedMesh
 from flexdt.phantoms.files.mesh_files import read_part
 from flexdt.twin.machine.description import Component, Machine
 
-Builder = Callable[[Component], list[Piece]]
+Builder = Callable[[Component], list[PaintedMesh]]
 
 
 def own_looks(machine: Machine, folder: Path) -> dict[str, bytes]:
@@ -39,27 +39,27 @@ def own_looks(machine: Machine, folder: Path) -> dict[str, bytes]:
         if part.mesh:
             mesh = read_part(file := folder / part.mesh)
             own = file.suffix.lower() == ".glb"  # with its colours
-            looks[part.name] = file.read_bytes() if own else s.glb([Piece(mesh, s.ALUMINIUM)])
+            looks[part.name] = file.read_bytes() if own else s.glb([PaintedMesh(mesh, s.ALUMINIUM)])
     return looks
 
 
-def pieces_of(part: Component) -> list[Piece]:
+def pieces_of(part: Component) -> list[PaintedMesh]:
     """The part's painted meshes, in its own frame [mm]."""
     if part.points_mm:
-        return [Piece(trimesh.convex.convex_hull(np.array(part.points_mm)), s.ALUMINIUM)]
+        return [PaintedMesh(trimesh.convex.convex_hull(np.array(part.points_mm)), s.ALUMINIUM)]
     builder = BUILDERS.get(part.name)
     if builder is None:
         builder = ROLES.get(part.role, _generic)
     return builder(part)
 
 
-def _generic(part: Component) -> list[Piece]:
+def _generic(part: Component) -> list[PaintedMesh]:
     if part.shape == "cylinder":
         return [s.cylinder(part.size_mm[0], part.size_mm[2], part.center_mm, s.ALUMINIUM)]
     return [s.bevelled(part.size_mm, part.center_mm, s.ALUMINIUM)]
 
 
-def _platform(part: Component) -> list[Piece]:
+def _platform(part: Component) -> list[PaintedMesh]:
     (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
     top = cz + z / 2
     pieces = [
@@ -72,7 +72,7 @@ def _platform(part: Component) -> list[Piece]:
     return pieces
 
 
-def _rail(part: Component) -> list[Piece]:
+def _rail(part: Component) -> list[PaintedMesh]:
     (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
     return [
         s.bevelled((x * 1.9, y, z * 0.55), (cx, cy, cz - z * 0.225), s.ANODISED, 2.0),
@@ -80,7 +80,7 @@ def _rail(part: Component) -> list[Piece]:
     ]
 
 
-def _plate(part: Component) -> list[Piece]:
+def _plate(part: Component) -> list[PaintedMesh]:
     (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
     pieces = [
         s.bevelled((x, y, z * 0.55), (cx, cy, cz + z * 0.225), s.ALUMINIUM, 4.0),
@@ -92,7 +92,7 @@ def _plate(part: Component) -> list[Piece]:
     return pieces
 
 
-def _tower(part: Component) -> list[Piece]:
+def _tower(part: Component) -> list[PaintedMesh]:
     (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
     top = cz + z / 2
     return [
@@ -103,7 +103,7 @@ def _tower(part: Component) -> list[Piece]:
     ]
 
 
-def _tube(part: Component) -> list[Piece]:
+def _tube(part: Component) -> list[PaintedMesh]:
     """A microfocus tube: housing beside the tower, a nose that ends in the focal spot."""
     (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
     back, front = cy - y / 2, cy + y / 2
@@ -125,7 +125,7 @@ def _tube(part: Component) -> list[Piece]:
     ]
 
 
-def _base(part: Component) -> list[Piece]:
+def _base(part: Component) -> list[PaintedMesh]:
     (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
     return [
         s.bevelled((x, y, z), part.center_mm, s.ANODISED, 5.0),
@@ -134,7 +134,7 @@ def _base(part: Component) -> list[Piece]:
     ]
 
 
-def _holder(part: Component) -> list[Piece]:
+def _holder(part: Component) -> list[PaintedMesh]:
     """The turntable, with ticks on its rim so that one sees it turn."""
     (d, _, z), (cx, cy, cz) = part.size_mm, part.center_mm
     pieces = [s.cylinder(d, z, part.center_mm, s.ALUMINIUM, sections=96)]
@@ -150,7 +150,7 @@ def _holder(part: Component) -> list[Piece]:
     return pieces
 
 
-def _mount(part: Component) -> list[Piece]:
+def _mount(part: Component) -> list[PaintedMesh]:
     (d, _, z), (cx, cy, cz) = part.size_mm, part.center_mm
     return [
         s.cylinder(d * 0.7, z, part.center_mm, s.BRASS),
@@ -159,7 +159,7 @@ def _mount(part: Component) -> list[Piece]:
     ]
 
 
-def _carriage(part: Component) -> list[Piece]:
+def _carriage(part: Component) -> list[PaintedMesh]:
     """What runs along the detector's tower, and the cross slide that it carries."""
     (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
     return [
@@ -170,7 +170,7 @@ def _carriage(part: Component) -> list[Piece]:
     ]
 
 
-def _panel(part: Component) -> list[Piece]:
+def _panel(part: Component) -> list[PaintedMesh]:
     """The flat panel: its front face is where the image is drawn."""
     (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
     return [

@@ -60,14 +60,14 @@ RUBBER = Paint((34, 37, 43), 0.0, 0.8)
 
 
 @dataclass(frozen=True, eq=False)
-class Piece:
+class PaintedMesh:
     """A mesh [mm] and its paint."""
 
     mesh: trimesh.Trimesh
     paint: Paint
 
 
-def bevelled(size: Vector, center: Vector, paint: Paint, bevel: float = 2.0) -> Piece:
+def bevelled(size: Vector, center: Vector, paint: Paint, bevel: float = 2.0) -> PaintedMesh:
     """A box [mm] whose edges are cut, so that they catch the light."""
     h = np.asarray(size, dtype=float) / 2.0
     b = min(bevel, 0.35 * float(h.min()))
@@ -77,7 +77,7 @@ def bevelled(size: Vector, center: Vector, paint: Paint, bevel: float = 2.0) -> 
     )
     mesh = trimesh.convex.convex_hull(points)
     mesh.apply_translation(center)
-    return Piece(mesh, paint)
+    return PaintedMesh(mesh, paint)
 
 
 def cylinder(
@@ -87,7 +87,7 @@ def cylinder(
     paint: Paint,
     axis: str = "z",
     sections: int = 48,
-) -> Piece:
+) -> PaintedMesh:
     """A cylinder [mm] along z (or y)."""
     mesh = trimesh.creation.cylinder(radius=diameter / 2, height=height, sections=sections)
     return _standing(mesh, center, paint, axis)
@@ -95,21 +95,21 @@ def cylinder(
 
 def lathe(
     profile: Sequence[tuple[float, float]], center: Vector, paint: Paint, axis: str = "z"
-) -> Piece:
+) -> PaintedMesh:
     """A body of revolution [mm]: (radius, height) from bottom to top, about z (or y)."""
     mesh = trimesh.creation.revolve(np.asarray(profile, dtype=float), sections=64)
     return _standing(mesh, center, paint, axis)
 
 
-def _standing(mesh: trimesh.Trimesh, center: Vector, paint: Paint, axis: str) -> Piece:
+def _standing(mesh: trimesh.Trimesh, center: Vector, paint: Paint, axis: str) -> PaintedMesh:
     """What was made about z, about z or y."""
     if axis == "y":
         mesh.apply_transform(turn_matrix((1, 0, 0), -np.pi / 2))
     mesh.apply_translation(center)
-    return Piece(mesh, paint)
+    return PaintedMesh(mesh, paint)
 
 
-def column(size: Vector, center: Vector, paint: Paint) -> list[Piece]:
+def column(size: Vector, center: Vector, paint: Paint) -> list[PaintedMesh]:
     """An upright aluminium profile [mm] with two T-slots in each of its four faces."""
     x, y, z = size
     cx, cy, cz = center
@@ -124,7 +124,7 @@ def column(size: Vector, center: Vector, paint: Paint) -> list[Piece]:
     return pieces
 
 
-def glb(pieces: Iterable[Piece]) -> bytes:
+def glb(pieces: Iterable[PaintedMesh]) -> bytes:
     """One binary glTF of the pieces, in metres; pieces of one paint share a mesh."""
     groups: dict[Paint, list[trimesh.Trimesh]] = {}
     for piece in pieces:
@@ -211,7 +211,7 @@ class Skin:
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class SampleLook:
     """A sample as the scene needs it.
 
     Attributes:
@@ -234,7 +234,7 @@ class Look:
 DEFAULT_MATERIAL = "abs"
 Key = tuple[str | None, str | None, str | None]
 
-NOTHING = Look((), np.zeros((0, 3)))
+NOTHING = SampleLook((), np.zeros((0, 3)))
 
 
 def _key(sample: SampleState) -> Key:
@@ -246,7 +246,7 @@ class Wardrobe:
 
     def __init__(self) -> None:
         self._uploads: OrderedDict[Key, Phantom] = OrderedDict()
-        self._known: OrderedDict[tuple[object, ...], Look] = OrderedDict()
+        self._known: OrderedDict[tuple[object, ...], SampleLook] = OrderedDict()
 
     def lacks(self, sample: SampleState) -> bool:
         """Whether the sample is an upload whose mesh has not arrived yet."""
@@ -270,7 +270,7 @@ class Wardrobe:
         for key in [k for k in self._known if k[0] == sample.name]:
             del self._known[key]
 
-    def look(self, sample: SampleState) -> Look:
+    def look(self, sample: SampleState) -> SampleLook:
         """How `sample` looks; it may take a second."""
         if sample.name is None:
             return NOTHING
@@ -281,7 +281,7 @@ class Wardrobe:
                 self._known.popitem(last=False)
         return self._known[key]
 
-    def _make(self, sample: SampleState) -> Look:
+    def _make(self, sample: SampleState) -> SampleLook:
         phantom = self._uploads.get(_key(sample))
         if sample.name is not None and sample.revision is None:
             with suppress(TwinError):
@@ -289,7 +289,7 @@ class Wardrobe:
         return _box(sample) if phantom is None else _skins(phantom)
 
 
-def _skins(phantom: Phantom) -> Look:
+def _skins(phantom: Phantom) -> SampleLook:
     groups: dict[str, list[trimesh.Trimesh]] = {}
     for part in phantom.parts():
         mesh = part.mesh
@@ -306,15 +306,15 @@ def _skins(phantom: Phantom) -> Look:
         name = "".join(c if c.isalnum() else "_" for c in material)
         dense = material == "steel" and len(groups) > 1
         skins.append(Skin(name, vertices, faces, COLORS.get(material, OTHER), dense))
-    return Look(tuple(skins), np.asarray(phantom.beads))
+    return SampleLook(tuple(skins), np.asarray(phantom.beads))
 
 
-def _box(sample: SampleState) -> Look:
+def _box(sample: SampleState) -> SampleLook:
     if sample.size_mm is None:
         return NOTHING
     vertices, faces = plain(trimesh.creation.box(extents=sample.size_mm))
     skin = Skin("size", vertices, faces, OTHER, False)
-    return Look((skin,), np.zeros((0, 3)), exact=False)
+    return SampleLook((skin,), np.zeros((0, 3)), exact=False)
 
 
 CHUNK: Final = 4 << 20

@@ -22,7 +22,7 @@ camera looks at the panel's centre instead and the frame is no longer exact."""
 
 
 @dataclass(frozen=True)
-class Camera:
+class Standpoint:
     """A camera: metres, and its vertical opening angle [rad]."""
 
     position: Vector
@@ -47,14 +47,14 @@ class Framing:
     exact: bool
 
 
-ISO = Camera((1.94, -1.16, 1.22), (0.0, 0.42, 0.05), (0.0, 0.0, 1.0), math.radians(38.0))
-SIDE = Camera((3.15, 0.52, 0.1), (0.0, 0.52, 0.1), (0.0, 0.0, 1.0), math.radians(30.0))
-FREE = Camera((-0.95, 0.1, 0.52), (0.0, 0.72, 0.0), (0.0, 0.0, 1.0), math.radians(45.0))
+ISO = Standpoint((1.94, -1.16, 1.22), (0.0, 0.42, 0.05), (0.0, 0.0, 1.0), math.radians(38.0))
+SIDE = Standpoint((3.15, 0.52, 0.1), (0.0, 0.52, 0.1), (0.0, 0.0, 1.0), math.radians(30.0))
+FREE = Standpoint((-0.95, 0.1, 0.52), (0.0, 0.72, 0.0), (0.0, 0.0, 1.0), math.radians(45.0))
 FIXED = {"iso": ISO, "side": SIDE, "free": FREE}
 """View -> camera, for those that do not follow the machine."""
 
 
-def beam_view(world: World) -> tuple[Camera, Framing]:
+def beam_view(world: World) -> tuple[Standpoint, Framing]:
     """The beam's eye of a geometry."""
     rows, cols = world.shape
     pu, pv = float(np.linalg.norm(world.u)), float(np.linalg.norm(world.v))
@@ -73,11 +73,11 @@ def beam_view(world: World) -> tuple[Camera, Framing]:
             height / width,
             True,
         )
-        return Camera(_m(world.source), _m(world.foot), up, fov), frame
+        return Standpoint(_m(world.source), _m(world.foot), up, fov), frame
     distance = float(np.linalg.norm(world.detector - world.source))
     fov = 2.0 * math.atan2(0.5 * height, distance)
     frame = Framing(1.0, height / width, 0.0, 0.0, height / width, False)
-    return Camera(_m(world.source), _m(world.detector), up, fov), frame
+    return Standpoint(_m(world.source), _m(world.detector), up, fov), frame
 
 
 def document(framing: Framing, world: World) -> dict[str, object]:

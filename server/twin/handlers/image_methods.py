@@ -21,7 +21,7 @@ from flexdt.server.storage.stored_samples import EMPTY
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client
 from flexdt.server.twin.handlers.setting_methods import camera_change
-from flexdt.server.twin.hub import View
+from flexdt.server.twin.hub import ImageWish
 from flexdt.server.twin.live import Shot, image_of
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -51,7 +51,7 @@ async def get_projection(twin: TwinServer, client: Client, params: p.ProjectionG
 
     def work() -> Encoded:
         """Apart: an image is some megabytes."""
-        view, way = View(params.kind, params.binning), twin.radiography
+        view, way = ImageWish(params.kind, params.binning), twin.radiography
         rng = None if elsewhere else np.random.default_rng()
         made = image_of(radiograph, cone, shot, view, way, rng)
         if params.marks:

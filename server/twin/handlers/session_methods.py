@@ -13,7 +13,7 @@ from flexdt.protocol.fields import Empty, Nothing
 from flexdt.server.scans.job import ENDED
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client
-from flexdt.server.twin.hub import View
+from flexdt.server.twin.hub import ImageWish
 
 
 def hello(twin: TwinServer, client: Client, params: p.Hello) -> r.HelloResult:
@@ -61,7 +61,7 @@ def get_state(twin: TwinServer, client: Client, params: Empty) -> w.State:
 
 def subscribe(twin: TwinServer, client: Client, params: p.Subscribe) -> Nothing:
     """Events from now on; the present state, image and jobs come at once."""
-    view = View(params.projection_kind, params.projection_binning)
+    view = ImageWish(params.projection_kind, params.projection_binning)
     twin.hub.subscribe(client.peer, params.topics, params.max_rate_hz, view)
     if "state" in params.topics:
         twin.hub.snapshot(client.peer, "state", twin.state())

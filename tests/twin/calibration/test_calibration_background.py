@@ -11,9 +11,9 @@ from flexdt.twin.calibration.detect.background import survey
 from flexdt.twin.calibration.detect.detection import Detections, detect_beads
 from flexdt.twin.calibration.detect.refine import measure_beads
 from flexdt.twin.calibration.detect.windows import crop, lattice, plan_windows
-from flexdt.twin.calibration.frame_source import FrameState, Look, without_repeats
+from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, without_repeats
 from flexdt.twin.calibration.studies.experiments import SHAPE, scenario
-from flexdt.twin.calibration.studies.rendered_runs import Camera, exposures, line_integrals
+from flexdt.twin.calibration.studies.rendered_runs import Rendering, exposures, line_integrals
 
 SIDE = 61
 NOISE = 0.01
@@ -81,13 +81,13 @@ def test_no_two_rays_of_a_pixel_share_a_column_or_a_row(fine: int) -> None:
     }
 
 
-def look(centers: np.ndarray) -> Look:
+def look(centers: np.ndarray) -> FrameSpots:
     k = len(centers)
     one = np.ones(k)
     found = Detections(
         centers, np.tile(np.eye(2), (k, 1, 1)), 10 * one, one, 0 * one, one > 0, one, SHAPE
     )
-    return Look(found, FrameState.USABLE)
+    return FrameSpots(found, FrameState.USABLE)
 
 
 def test_a_copy_of_the_frame_before_is_not_used() -> None:
@@ -112,7 +112,7 @@ def test_positions_are_unbiased_where_a_bead_stays_at_one_place_of_the_pixel_gri
     model = bead_model(phantom)
     poses, truth = scenario("G0", 12)
     cone = poses.cone_vec(truth)
-    images = list(exposures(phantom.scene, model, cone, Camera(None, 0.6, 4), [1]))
+    images = list(exposures(phantom.scene, model, cone, Rendering(None, 0.6, 4), [1]))
     plan = plan_windows(model, cone, SHAPE)
     cut = np.stack([crop(image, plan, i) for i, image in enumerate(images)])
     result = measure_beads(cut, plan, cone, model, 6.0, phantom.scene)
@@ -127,7 +127,7 @@ def test_detection_in_parts_sees_what_the_whole_image_shows() -> None:
     phantom = load_phantom("normal-4")
     model = bead_model(phantom)
     poses, truth = scenario("G0", 3)
-    camera = Camera(5000.0, 0.7, 2)
+    camera = Rendering(5000.0, 0.7, 2)
     counts = next(iter(exposures(phantom.scene, model, poses.cone_vec(truth), camera, [4])))
     image = line_integrals(counts, 5000.0)
     found = detect_beads(image, radius_px=(10.0, 30.0))

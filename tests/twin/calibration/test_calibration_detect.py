@@ -138,10 +138,10 @@ def test_a_bead_cut_by_the_edge_is_fitted() -> None:
 
 
 def test_two_sizes_of_beads_when_asked() -> None:
-    from flexdt.twin.calibration.detect.detection import Detector
+    from flexdt.twin.calibration.detect.detection import SpotFinder
 
     image = ball((200, 200), 60.2, 90.7, 16.0, 4.0) + ball((200, 200), 140.4, 95.6, 8.0, 2.0)
-    both = detect_beads(image, Detector(radius_px=(5.0, 20.0), same=float("inf")))
+    both = detect_beads(image, SpotFinder(radius_px=(5.0, 20.0), same=float("inf")))
     assert len(both) == 2
     assert len(detect_beads(image)) == 1
 

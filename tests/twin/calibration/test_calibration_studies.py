@@ -13,7 +13,12 @@ from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import bead_model
 from flexdt.twin.calibration.studies.basin import METHODS, Cell
 from flexdt.twin.calibration.studies.experiment_4_images import hidden_phantom, off_truth
-from flexdt.twin.calibration.studies.experiments import EXPERIMENTS, Task, placement_scenario, tasks
+from flexdt.twin.calibration.studies.experiments import (
+    EXPERIMENTS,
+    WorkUnit,
+    placement_scenario,
+    tasks,
+)
 from flexdt.twin.errors import UnknownNameError
 
 
@@ -82,7 +87,7 @@ def test_rendered_noisy_images_with_unknown_identities() -> None:
 
 def test_cut_beads_solve_the_tall_phantom() -> None:
     """In G3 one whole bead stays in view: the two at the edge are fitted (calibration.md)."""
-    task = Task(
+    task = WorkUnit(
         "phantoms", "tall", "G3", "tall-3", ("dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z"),
         0.0, (12,), "images", 1, 0.2,
     )  # fmt: skip

@@ -13,7 +13,7 @@ import pytest
 import timing_ranges
 
 from flexdt.twin.machine.description import Spread, Timing
-from flexdt.twin.script.planning.log_fit import Row
+from flexdt.twin.script.planning.log_fit import LogRow
 from flexdt.twin.script.planning.plan import total_range
 
 
@@ -47,7 +47,7 @@ def test_what_a_total_is_uncertain_by(n: int, count: int, squares: float) -> Non
     """Variances of a sum whose terms share the error of a mean, worked out by hand."""
     spread = {"xrayon": Spread(p5_s=1.0, p95_s=6.0, n=n)}
     timing = Timing(source="measured", xrayon_s=2.0, drift=0.1, spread=spread)
-    rows = [Row(1, "on", 2.0, 2.0, None, None, "xrayon")] * count
+    rows = [LogRow(1, "on", 2.0, 2.0, None, None, "xrayon")] * count
     low, high = total_range(rows, 2.0 * count + 50.0, timing) or (0.0, 0.0)
     assert 2.0 * count + 50.0 - low == pytest.approx(1.0 * math.sqrt(squares) + 0.2 * count)
     assert high - 2.0 * count - 50.0 == pytest.approx(4.0 * math.sqrt(squares) + 0.2 * count)

@@ -38,7 +38,7 @@ _TURNS: Final = np.radians(np.arange(10.0, 351.0, 5.0))
 
 
 @dataclass(frozen=True, eq=False)
-class Forecast:
+class BeadForecast:
     """What the planned scans would determine with some beads.
 
     Attributes:
@@ -70,11 +70,11 @@ class Design:
 
     beads: FloatArray
     seats: npt.NDArray[np.int64]
-    forecast: Forecast
+    forecast: BeadForecast
     discarded: int
 
 
-def forecast(model: BeadModel, planned: PlannedScans, criterion: Criterion = "a") -> Forecast:
+def forecast(model: BeadModel, planned: PlannedScans, criterion: Criterion = "a") -> BeadForecast:
     """Predicted uncertainties, touching spots left out.
 
     Args:
@@ -88,7 +88,7 @@ def forecast(model: BeadModel, planned: PlannedScans, criterion: Criterion = "a"
     names = seats.names
     covariance = inverse(information)[0]
     sigma = np.sqrt(np.diag(covariance)) * seats.tolerances
-    return Forecast(
+    return BeadForecast(
         dict(zip(names, sigma.tolist(), strict=True)),
         float(score_of(information, criterion)[0]),
         float(masks.mean()),

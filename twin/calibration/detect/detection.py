@@ -73,7 +73,7 @@ class Detections:
 
 
 @dataclass(frozen=True)
-class Detector:
+class SpotFinder:
     """What to look for.
 
     Attributes:
@@ -93,7 +93,7 @@ class Detector:
 
 def detect_beads(
     image: npt.ArrayLike,
-    detector: Detector | None = None,
+    detector: SpotFinder | None = None,
     *,
     radius_px: tuple[float, float] | None = None,
 ) -> Detections:
@@ -118,7 +118,7 @@ def detect_beads(
     >>> detect_beads(0.1 * chord, radius_px=(5, 20)).centers.round(2) + 0.0
     array([[90., 50.]])
     """
-    how = Detector() if detector is None else detector
+    how = SpotFinder() if detector is None else detector
     if radius_px is not None:
         how = replace(how, radius_px=radius_px)
     data = np.ascontiguousarray(image, dtype=np.float32)
@@ -133,7 +133,7 @@ def detect_beads(
     return detect_in_parts(coarser(data, factor), factor, shape, lambda r, c: data[r, c], how)
 
 
-def coarseness(how: Detector) -> int:
+def coarseness(how: SpotFinder) -> int:
     """Pixels along a side of one of the coarse image in which candidates are sought."""
     low = how.radius_px[0]
     return 4 if low >= 4.5 else 2 if low >= 2.5 else 1
@@ -155,7 +155,7 @@ Part = Callable[[slice, slice], Float32Array]
 
 
 def detect_in_parts(
-    coarse: Float32Array, factor: int, shape: tuple[int, int], part: Part, how: Detector
+    coarse: Float32Array, factor: int, shape: tuple[int, int], part: Part, how: SpotFinder
 ) -> Detections:
     """`detect_beads` where only the parts of an image that hold candidates need to be made.
 
@@ -178,7 +178,7 @@ _Candidate = tuple[float, float, float]
 
 
 def _candidates(
-    coarse: Float32Array, factor: int, how: Detector
+    coarse: Float32Array, factor: int, how: SpotFinder
 ) -> tuple[list[_Candidate], list[_Candidate]]:
     """Compact bright blobs: those wholly inside, and those at the image's edge."""
     low, high = how.radius_px
@@ -250,7 +250,7 @@ def _window(
 
 
 def _measure(
-    part: Part, shape: tuple[int, int], spot: _Candidate, how: Detector
+    part: Part, shape: tuple[int, int], spot: _Candidate, how: SpotFinder
 ) -> FloatArray | None:
     x, y, radius = spot
     result = np.zeros(kernels.RESULTS)
@@ -288,7 +288,7 @@ def _distinct(found: list[FloatArray]) -> list[FloatArray]:
     return out
 
 
-def _alike(found: list[FloatArray], how: Detector) -> list[FloatArray]:
+def _alike(found: list[FloatArray], how: SpotFinder) -> list[FloatArray]:
     """Keep the spots that resemble the strongest group: beads of a phantom are alike."""
     if math.isinf(how.same) or len(found) < 2:
         return found

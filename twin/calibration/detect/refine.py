@@ -79,7 +79,7 @@ SHARP_SAMPLING_PX = 0.0001
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class Refined:
     """Bead positions of n frames, (n, k, ...), nan where there is none.
 
     Attributes:
@@ -112,7 +112,7 @@ def measure_beads(
     scene: Scene | None = None,
     *,
     draft: bool = False,
-) -> Measured:
+) -> Refined:
     """Measure every bead in its window.
 
     Args:
@@ -179,7 +179,7 @@ def _measured(
     alone: Float32Array | None,
     body: Float32Array | None,
     sharp: Sharp,
-) -> Measured:
+) -> Refined:
     """Centroids and fits, less what the same measurement of the same beads rendered without noise
     (`alone`; None leaves them as they are) shows to be their systematic error.
 
@@ -242,7 +242,7 @@ def _discount(results: FloatArray, behind: Background, expected: FloatArray) -> 
         results[worst, kernels.OK] = 0.0
 
 
-def _accept(results: FloatArray, windows: Windows, contrast: FloatArray, sharp: Sharp) -> Measured:
+def _accept(results: FloatArray, windows: Windows, contrast: FloatArray, sharp: Sharp) -> Refined:
     """What passes the checks of place, size, contrast and likeness."""
     whole = windows.whole
     place = results[..., [kernels.X, kernels.Y]] + windows.corner
@@ -256,7 +256,7 @@ def _accept(results: FloatArray, windows: Windows, contrast: FloatArray, sharp: 
         & (np.abs(np.log(np.maximum(peak, 1e-9) / contrast)) < math.log(1.6)),
         results[..., kernels.NOISE] < MISFIT,
     )
-    return Measured(
+    return Refined(
         np.where(good[..., None], place, np.nan),
         np.where(good[..., None, None], covariances_of(results), np.nan),
         np.where(good, results[..., kernels.BIAS], 0.0),

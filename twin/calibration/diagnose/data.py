@@ -14,13 +14,13 @@ from dataclasses import replace
 import numpy as np
 
 from flexdt.twin.calibration.bead_model import BeadModel
-from flexdt.twin.calibration.detect.detection import Detections, Detector
+from flexdt.twin.calibration.detect.detection import Detections, SpotFinder
 from flexdt.twin.calibration.diagnose.finding import Finding, Severity, error, warning
 from flexdt.twin.calibration.diagnose.moving import moving, named_turn
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
 from flexdt.twin.calibration.fit.fitted_motion import MotionFit
 from flexdt.twin.calibration.fit.priors import ASSUMED
-from flexdt.twin.calibration.frame_source import FrameState, Look, Scan
+from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, Scan
 from flexdt.twin.calibration.identify import Identification, Search, attempt
 from flexdt.twin.geometry.poses import Poses
 
@@ -61,7 +61,7 @@ _STATES = {
 }
 
 
-def judge_frames(name: str, looks: Sequence[Look], sought: Detector) -> list[Finding]:
+def judge_frames(name: str, looks: Sequence[FrameSpots], sought: SpotFinder) -> list[Finding]:
     """Missing and dark frames, and frames without any spot like those that were `sought`."""
     out = []
     n = len(looks)
@@ -97,14 +97,14 @@ def judge_frames(name: str, looks: Sequence[Look], sought: Detector) -> list[Fin
 
 
 def judge_emptiness(
-    scans: Sequence[Scan], looks: Sequence[Sequence[Look]], model: BeadModel
+    scans: Sequence[Scan], looks: Sequence[Sequence[FrameSpots]], model: BeadModel
 ) -> list[Finding]:
     """Where no bead of the expected size was found: are there spots of another size?"""
     out = []
     for scan, some in zip(scans, looks, strict=True):
         if any(len(look.detections) for look in some):
             continue
-        anything = scan.frames.look(Detector())
+        anything = scan.frames.look(SpotFinder())
         radii = [look.detections.radii_px for look in anything if len(look.detections)]
         if len(radii) < 0.5 * len(anything) or not radii:
             continue

@@ -12,11 +12,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy import stats
 
-from flexdt.twin.calibration.detect.refine import Measured
+from flexdt.twin.calibration.detect.refine import Refined
 from flexdt.twin.calibration.diagnose.finding import Finding, Severity, error, warning
 from flexdt.twin.calibration.diagnose.moving import moving
 from flexdt.twin.calibration.fit.fit import FitResult
-from flexdt.twin.calibration.frame_source import FrameState, Look, nothing
+from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, nothing
 from flexdt.twin.calibration.identify import Identification
 from flexdt.twin.geometry.conventions import FloatArray
 
@@ -39,7 +39,7 @@ Refit = Callable[..., FitResult]
 """Fit again with something else free: options of `pipeline._refit`."""
 
 
-def judge_places(fit: FitResult, looks: Sequence[Sequence[Look]]) -> Finding | None:
+def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Finding | None:
     """Frames whose spots are not where the fit says: wrong angles, a slip, a repeated image.
 
     Either most of a frame's spots are far from every prediction, or most of its positions had to
@@ -103,7 +103,7 @@ def judge_offsets(fit: FitResult) -> Finding | None:
 
 
 def judge_first_size(
-    found: Identification, looks: Sequence[Look], radii: FloatArray
+    found: Identification, looks: Sequence[FrameSpots], radii: FloatArray
 ) -> Finding | None:
     """A coarse size check from the first measurement: beads more than a sixth off are other beads.
 
@@ -121,7 +121,7 @@ def judge_first_size(
     return _judge_ratios(ratios, 1.0 / 6.0)
 
 
-def judge_size(measured: Sequence[Measured]) -> Finding | None:
+def judge_size(measured: Sequence[Refined]) -> Finding | None:
     """Do the spots have the size the phantom's beads should cast at the fitted geometry?
 
     A phantom of another scale at another distance gives the same bead positions; only the beads'
@@ -142,7 +142,7 @@ def _judge_ratios(ratios: Sequence[float], allowed: float) -> Finding | None:
     )
 
 
-def judge_body(measured: Sequence[Measured]) -> Finding | None:
+def judge_body(measured: Sequence[Refined]) -> Finding | None:
     """Is the phantom's body where the phantom's description has it?"""
     bodies = [m.body for m in measured if np.isfinite(m.body.factor)]
     if any(body.factor == 0.0 for body in bodies):

@@ -64,7 +64,7 @@ class Centre(enum.Enum):
 
 
 @dataclass(frozen=True)
-class Layout:
+class ColumnLayout:
     """Which column of the normal equations means what.
 
     Attributes:
@@ -121,7 +121,7 @@ def layout(
     beads: int,
     free_beads: bool,
     priors: Sequence[str] = (),
-) -> Layout:
+) -> ColumnLayout:
     """Assign columns.
 
     Args:
@@ -174,7 +174,7 @@ def layout(
         bead_column = len(names)
         names += [f"bead {k} {axis}" for k in range(beads) for axis in "xyz"]
     active = np.array([NAMES.index(n) for n in (*wanted, *extra)], dtype=np.int64)
-    return Layout(tuple(names), asked, colmap, bead_column, active, tuple(held))
+    return ColumnLayout(tuple(names), asked, colmap, bead_column, active, tuple(held))
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +204,7 @@ class Problem:
     seen: npt.NDArray[np.bool_]
     group: npt.NDArray[np.int64]
     base: FloatArray
-    layout: Layout
+    layout: ColumnLayout
     reading: Reading
     bias: FloatArray
     geometry: FloatArray

@@ -51,7 +51,7 @@ GROUPS: Final = (slice(0, 6), slice(6, 11))
 
 
 @dataclass(frozen=True)
-class Truth:
+class GroupTruth:
     """What a group of scans has in common.
 
     Attributes:
@@ -161,7 +161,7 @@ def binary_centroids(centres: FloatArray, radius_px: float) -> FloatArray:
     return np.asarray(base + np.stack([across, down], axis=-1))
 
 
-def physical_truth(group: slice, model: BeadModel) -> Truth:
+def physical_truth(group: slice, model: BeadModel) -> GroupTruth:
     """The truth of a group: fixed point at which the simulated estimates at N = 360 differ from the
     logged ones by a median of nothing over the group's scans."""
     names = scan_names()[group]
@@ -179,7 +179,7 @@ def physical_truth(group: slice, model: BeadModel) -> Truth:
         rest = (log[1] ** 2 - 2.0 * fit.cost / (20 * FITTED)) / NOISE_SHARE
         excess.setdefault(_sod(name), []).append(rest)
     noise = {sod: math.sqrt(max(float(np.median(rest)), 0.0)) for sod, rest in excess.items()}
-    return Truth(values, noise)
+    return GroupTruth(values, noise)
 
 
 def _sod(name: str) -> float:
@@ -189,7 +189,7 @@ def _sod(name: str) -> float:
 def real_runs(
     name: str,
     model: BeadModel,
-    truth: Truth,
+    truth: GroupTruth,
     seed: int = 1,
     *,
     exact: bool = False,

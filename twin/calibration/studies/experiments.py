@@ -1,6 +1,6 @@
 """What the experiments vary: scenarios, phantoms, bead counts, damping, placements, noise.
 
-A `Task` is one unit of work that can run in any process: one setting in one scenario, for all
+A `WorkUnit` is one unit of work that can run in any process: one setting in one scenario, for all
 numbers of projections.
 """
 
@@ -41,7 +41,7 @@ DAMPING: Final = {"GN": 0.0, "LM_low": 1e-4, "LM_normal": 1e-2, "LM_high": 1.0}
 
 
 @dataclass(frozen=True)
-class Task:
+class WorkUnit:
     """One setting in one scenario, all numbers of projections.
 
     Attributes:
@@ -114,7 +114,7 @@ def tasks(
     counts: Sequence[int] | None = None,
     seed: int = 1,
     variant: str = "printed",
-) -> list[Task]:
+) -> list[WorkUnit]:
     """All tasks of an experiment.
 
     Args:
@@ -137,9 +137,9 @@ def tasks(
     n = projection_counts() if counts is None else tuple(counts)
     scenarios = tuple(thesis()["scenarios"])
 
-    def six(setting: str, phantom: str, damping: float) -> list[Task]:
+    def six(setting: str, phantom: str, damping: float) -> list[WorkUnit]:
         return [
-            Task(experiment, setting, g, phantom, SIX, damping, n, fidelity, seed, 0.2, variant)
+            WorkUnit(experiment, setting, g, phantom, SIX, damping, n, fidelity, seed, 0.2, variant)
             for g in scenarios
         ]
 
@@ -156,6 +156,6 @@ def tasks(
         case _:
             home = placements()["scenario"]
             return [
-                Task(experiment, g, home, "normal-3", EIGHT, 1e-2, n, fidelity, seed, 1.0)
+                WorkUnit(experiment, g, home, "normal-3", EIGHT, 1e-2, n, fidelity, seed, 1.0)
                 for g in placements()["sets"]
             ]

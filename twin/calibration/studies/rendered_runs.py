@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel
-from flexdt.twin.calibration.detect.detection import Detector
+from flexdt.twin.calibration.detect.detection import SpotFinder
 from flexdt.twin.calibration.detect.windows import (
     Windows,
     blur_kernel,
@@ -27,9 +27,9 @@ from flexdt.twin.calibration.detect.windows import (
     window_intensities,
 )
 from flexdt.twin.calibration.fit.priors import exact
-from flexdt.twin.calibration.frame_source import Look, look_at
+from flexdt.twin.calibration.frame_source import FrameSpots, look_at
 from flexdt.twin.calibration.pipeline import Request, Scan, calibrate, detector_for
-from flexdt.twin.calibration.studies.experiments import SHAPE, Task
+from flexdt.twin.calibration.studies.experiments import SHAPE, WorkUnit
 from flexdt.twin.calibration.studies.runs import Run, geometry_of, run_of
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
@@ -47,7 +47,7 @@ FINE = 4
 
 
 @dataclass(frozen=True)
-class Camera:
+class Rendering:
     """How images are made. counts: open-beam photons, None for no noise; blur in pixels."""
 
     counts: float | None = COUNTS
@@ -55,7 +55,7 @@ class Camera:
     fine: int = FINE
 
 
-CLEAN = Camera(counts=None, blur_px=0.0, fine=1)
+CLEAN = Rendering(counts=None, blur_px=0.0, fine=1)
 """Line integrals exactly as the projector makes them: one ray a pixel, no blur, no noise."""
 
 
@@ -90,14 +90,14 @@ class RenderedFrames:
 
     kept: tuple[npt.NDArray[np.generic], ...]
     corner: tuple[tuple[int, int], ...]
-    looks: tuple[Look, ...]
+    looks: tuple[FrameSpots, ...]
     shape: tuple[int, int]
-    camera: Camera
+    camera: Rendering
 
     def __len__(self) -> int:
         return len(self.kept)
 
-    def look(self, detector: Detector) -> list[Look]:
+    def look(self, detector: SpotFinder) -> list[FrameSpots]:
         """What was found when the frames were made (the detector is the same)."""
         return list(self.looks)
 
@@ -145,7 +145,7 @@ def render(
     model: BeadModel,
     poses: Poses,
     truth: Offsets,
-    camera: Camera,
+    camera: Rendering,
     seed: Sequence[int],
     shape: tuple[int, int] = SHAPE,
 ) -> RenderedFrames:
@@ -162,7 +162,7 @@ def render(
     detector = detector_for(model, poses)
     kept: list[npt.NDArray[np.generic]] = []
     corner: list[tuple[int, int]] = []
-    looks: list[Look] = []
+    looks: list[FrameSpots] = []
     for image in exposures(scene, model, poses.cone_vec(truth), camera, seed, shape):
         if camera.counts is None:
             rows, cols = np.nonzero(image.any(axis=1))[0], np.nonzero(image.any(axis=0))[0]
@@ -184,7 +184,7 @@ def exposures(
     scene: Scene,
     model: BeadModel,
     cone: ConeVec,
-    camera: Camera,
+    camera: Rendering,
     seed: Sequence[int],
     shape: tuple[int, int] = SHAPE,
 ) -> Iterator[npt.NDArray[np.generic]]:
@@ -249,7 +249,7 @@ def _rendered(
     placements: str | bool,
     scenario: str,
     frames: int,
-    camera: Camera,
+    camera: Rendering,
     seed: int,
     rest: _Key,
 ) -> tuple[RenderedFrames, ...]:
@@ -261,13 +261,13 @@ def _rendered(
     )
 
 
-def image_runs(task: Task, model: BeadModel, scene: Scene) -> list[Run]:
+def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
     """All numbers of projections of a task in rendered images, identities unknown.
 
     The images of the largest N are made once; smaller N take every so many of them, as far as
     they divide it (the thesis's do), with the same noise.
     """
-    camera = CLEAN if task.fidelity == "clean" else Camera()
+    camera = CLEAN if task.fidelity == "clean" else Rendering()
     most = max(task.counts)
     everything, truth = geometry_of(task, most)
     made = _rendered(task.phantom, task.experiment == "detector" and task.setting, task.scenario,

@@ -20,7 +20,7 @@ from flexdt.twin.calibration.studies.algorithm_2 import algorithm_2
 from flexdt.twin.calibration.studies.experiments import (
     NOISE_PX,
     SHAPE,
-    Task,
+    WorkUnit,
     placement_scenario,
     scenario,
 )
@@ -103,7 +103,7 @@ def _cleaned(value: object) -> object:
     return value
 
 
-def point_runs(task: Task, model: BeadModel) -> list[Run]:
+def point_runs(task: WorkUnit, model: BeadModel) -> list[Run]:
     """All numbers of projections of a task in exact or noisy points (identities known)."""
     out = []
     for n in task.counts:
@@ -119,7 +119,7 @@ def point_runs(task: Task, model: BeadModel) -> list[Run]:
     return out
 
 
-def geometry_of(task: Task, n: int) -> tuple[list[Poses], Offsets]:
+def geometry_of(task: WorkUnit, n: int) -> tuple[list[Poses], Offsets]:
     """Nominal poses (one set for each placement) and truth of a task."""
     if task.experiment == "detector":
         return placement_scenario(task.setting, n)
@@ -128,7 +128,7 @@ def geometry_of(task: Task, n: int) -> tuple[list[Poses], Offsets]:
 
 
 def run_of(
-    task: Task,
+    task: WorkUnit,
     n: int,
     fit: FitResult | None,
     truth: Offsets,
@@ -194,7 +194,7 @@ def errors_of(values: dict[str, float], truth: Offsets) -> dict[str, float]:
     }
 
 
-def _algorithm_2(task: Task, n: int, problem: Problem, truth: Offsets) -> Run | None:
+def _algorithm_2(task: WorkUnit, n: int, problem: Problem, truth: Offsets) -> Run | None:
     """What Algorithm 2 makes of the same tracks; nothing if beads are unknowns too."""
     if problem.layout.bead_column >= 0:
         return None

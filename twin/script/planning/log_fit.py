@@ -63,7 +63,7 @@ class Fit:
     samples: Mapping[str, tuple[float, ...]]
     axes: Mapping[str, tuple[MotorReply, ...]]
     frame_period_s: tuple[float, ...]
-    lines: Comparison
+    lines: LogFit
 
     @property
     def cross_validated_s(self) -> float:
@@ -104,7 +104,7 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Row:
+class LogRow:
     """A line of a log beside its prediction [s]."""
 
     line: int
@@ -134,7 +134,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class LogFit:
     """An executed script beside its prediction.
 
     Attributes:
@@ -144,13 +144,13 @@ class Comparison:
     """
 
     machine: Machine
-    rows: tuple[Row, ...]
+    rows: tuple[LogRow, ...]
     problems: tuple[Problem, ...] = ()
 
     HEADER: ClassVar = ("line", "real [s]", "predicted [s]", "90 %", "error [s]", "what")
 
     @classmethod
-    def of(cls, log: Log, machine: Machine) -> Comparison:
+    def of(cls, log: Log, machine: Machine) -> LogFit:
         """Predict each line of `log` on `machine`."""
         return cls(machine, tuple(against_log(log, machine)), unlike(log, machine))
 
@@ -175,7 +175,7 @@ class Comparison:
         return total_range(self.rows, self.total_predicted_s, self.machine.timing)
 
     @property
-    def by_error(self) -> list[Row]:
+    def by_error(self) -> list[LogRow]:
         """The lines, greatest absolute error first."""
         return sorted(self.rows, key=lambda row: -abs(row.error_s))
 
@@ -258,15 +258,15 @@ def fit_machine(logs: Sequence[Log], base: Machine, source: str) -> Fit:
         if isinstance(x.command, c.TakeSequence)
     )
     checked = Machine.model_validate(machine.model_dump(by_alias=True))
-    return Fit(checked, samples, replies, periods, Comparison(checked, rows))
+    return Fit(checked, samples, replies, periods, LogFit(checked, rows))
 
 
-def against_log(log: Log, machine: Machine) -> list[Row]:
+def against_log(log: Log, machine: Machine) -> list[LogRow]:
     """Each line of an executed script beside its prediction, in the log's order."""
     rows = []
     for x, step in zip(log, _plan(log, machine).steps, strict=True):
         low, high = step_range(step, machine.timing) or (None, None)
-        rows.append(Row(x.line, step.what, x.own_s, step.holds_s, low, high, step.kind))
+        rows.append(LogRow(x.line, step.what, x.own_s, step.holds_s, low, high, step.kind))
     return rows
 
 

@@ -22,7 +22,13 @@ from flexdt.twin.script.grammar import shorten
 from flexdt.twin.script.planning import smooth_scan as smooth
 from flexdt.twin.script.planning.image_names import image_name, kind_of, sequence_names
 from flexdt.twin.script.planning.plan import ExposureGroup, FlyScan, ImageKind
-from flexdt.twin.script.planning.planned_scanner import Camera, Motors, Span, Trigger, Tube
+from flexdt.twin.script.planning.planned_scanner import (
+    Motors,
+    PlannedCamera,
+    PlannedTube,
+    Span,
+    Trigger,
+)
 from flexdt.twin.script.problems import Severity
 
 Note = Callable[[Severity, str, str], None]
@@ -33,15 +39,15 @@ _MISMATCH_STEPS = 0.05
 """Steps by which stated frames may miss a whole turn before it is worth a warning."""
 
 
-class Imaging:
+class ImageCollector:
     """Collects images; lives only while a plan is made."""
 
     def __init__(
         self,
         machine: Machine,
         motors: Motors,
-        tube: Tube,
-        camera: Camera,
+        tube: PlannedTube,
+        camera: PlannedCamera,
         note: Note,
         averages: int | None,
     ) -> None:

@@ -121,7 +121,7 @@ class Motors:
 
 
 @dataclass
-class Tube:
+class PlannedTube:
     """X-ray tube."""
 
     kV: float
@@ -167,7 +167,7 @@ class Tube:
         return tuple(self.beam)
 
 
-class Camera:
+class PlannedCamera:
     """The camera's settings, which of them the script stated, and when it is free again."""
 
     def __init__(self, settings: CameraSettings) -> None:

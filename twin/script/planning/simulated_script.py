@@ -19,8 +19,15 @@ from flexdt.twin.script import commands as c
 from flexdt.twin.script.grammar import is_reserved, own_name
 from flexdt.twin.script.planning.describe import describe
 from flexdt.twin.script.planning.plan import SampleSize, Settings, StartState, Step
-from flexdt.twin.script.planning.planned_images import Imaging
-from flexdt.twin.script.planning.planned_scanner import Camera, Motors, Span, Trigger, Tube, clamp
+from flexdt.twin.script.planning.planned_images import ImageCollector
+from flexdt.twin.script.planning.planned_scanner import (
+    Motors,
+    PlannedCamera,
+    PlannedTube,
+    Span,
+    Trigger,
+    clamp,
+)
 from flexdt.twin.script.planning.sample_info import sample_size
 from flexdt.twin.script.problems import Problem, Severity
 
@@ -33,9 +40,11 @@ class Simulation:
         self.now = 0.0
         self.motors = Motors(machine, start)
         on = start.xrays_on
-        self.tube = Tube(start.kV, start.power_W, on is True, on is not None)
-        self.camera = Camera(start.camera)
-        self.imaging = Imaging(machine, self.motors, self.tube, self.camera, self.note, averages)
+        self.tube = PlannedTube(start.kV, start.power_W, on is True, on is not None)
+        self.camera = PlannedCamera(start.camera)
+        self.imaging = ImageCollector(
+            machine, self.motors, self.tube, self.camera, self.note, averages
+        )
         self.settings: Settings | None = None
         self.sample: SampleSize | None = None
         self.steps: list[Step] = []

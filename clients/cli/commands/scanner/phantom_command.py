@@ -127,9 +127,9 @@ def design(
     )
     if grid == "lego":
         stack = Brickwork(_studs(studs), bricks)
-        holder = work.Body(stack, stack.size_mm)
+        holder = work.BeadHolder(stack, stack.size_mm)
     else:
-        holder = work.Body(None, _size(size), body)
+        holder = work.BeadHolder(None, _size(size), body)
     document = work.run_design(holder, scans, request, out=out, tell=note)
     if json:
         emit(document)
