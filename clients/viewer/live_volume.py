@@ -1,9 +1,10 @@
 """A volume that grows while its scan runs: FDK of the images so far, in a process of its own.
 
 `python -m flexdt.clients.viewer.live_volume FOLDER SIDE` follows a data set's folder and prints a
-line of JSON whenever its slices have changed: views so far and of how many, and the three middle
-slices as 8-bit grey. The geometry of all images is written when a scan begins, so each view has its
-final weight at once, and the values of a grown volume are those of the finished one.
+line of JSON whenever its slices have changed: views so far and of how many, the three middle slices
+as 8-bit grey, and points on the surface of what is dense, for the scenes. The geometry of all
+images is written when a scan begins, so each view has its final weight at once, and the values of a
+grown volume are those of the finished one.
 
 The process has a low priority and one thread, and ends with its viewer: neither twin nor viewer
 waits for it.
@@ -12,11 +13,12 @@ waits for it.
 from __future__ import annotations
 
 import asyncio
+import base64
 import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -30,7 +32,7 @@ from flexdt.server.files.dataset_folder import read_image
 from flexdt.server.runtime.workers import ENVIRONMENT
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import TwinError
-from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import as_volume
 from flexdt.twin.reconstruction.fdk import OnProcessor, fdk_parts
 from flexdt.twin.reconstruction.rectify import field_of_view
@@ -40,6 +42,9 @@ MOST_VIEWS: Final = 360
 LOOK_S: Final = 0.1
 TELL_S: Final = 0.4
 """Between two lines, at least."""
+COARSE: Final = 64
+"""Cells along the longest side of the grid on which the surface is looked for."""
+MOST_POINTS: Final = 12_000
 LINE_BYTES: Final = 4 << 20
 NICENESS: Final = 10
 
@@ -96,6 +101,7 @@ def grow(folder: Path, side: int, tell: Tell, alive: Callable[[], bool] = lambda
                 "side": side,
                 "voxel_mm": voxel_mm,
                 **slices(target),
+                "surface": surface(target.volume(), like.voxel_mm, like.center_mm),
             }
         )
 
@@ -126,6 +132,37 @@ def slices(target: OnProcessor) -> dict[str, Any]:
             for name, part in middle.items()
         },
     }
+
+
+def surface(grown: Float32Array, voxel_mm: Any, center_mm: Any) -> dict[str, Any]:
+    """Where what is dense ends, on a coarse grid: `MOST_POINTS` points at most [mm, object frame].
+
+    Dense is what lies above the middle between most voxels and the densest.
+
+    Args:
+        grown: (y, x, z).
+        voxel_mm, center_mm: of the volume (x, y, z), as `Volume` has them.
+    """
+    factor = -(-max(grown.shape) // COARSE)
+    shape = [n // factor for n in grown.shape]
+    cut = grown[tuple(slice(n * factor) for n in shape)]
+    blocks = [part for n in shape for part in (n, factor)]
+    coarse = cut.reshape(blocks).mean(axis=(1, 3, 5))
+    usual, densest = np.percentile(coarse, (50.0, 99.8))
+    dense = np.pad(coarse > 0.5 * (usual + densest), 1)
+    inside = np.all([np.roll(dense, s, axis=k) for k in range(3) for s in (-1, 1)], axis=0)
+    found = np.argwhere((dense & ~inside)[1:-1, 1:-1, 1:-1])
+    found = found[:: max(1, -(-len(found) // MOST_POINTS))]
+    steps = ((found + 0.5) * factor - np.array(grown.shape) / 2)[:, [1, 0, 2]]
+    points = np.asarray(center_mm) + steps * np.asarray(voxel_mm)
+    data = base64.b64encode(points.astype("<f4").tobytes()).decode("ascii")
+    return {"points": data, "size_mm": factor * float(np.max(voxel_mm))}
+
+
+def points_of(told: Mapping[str, Any]) -> FloatArray:
+    """The points (n, 3) of a `surface` [mm, object frame]."""
+    points = np.frombuffer(base64.b64decode(told["points"]), "<f4")
+    return points.reshape(-1, 3).astype(np.float64)
 
 
 def _wait(path: Path, alive: Callable[[], bool]) -> None:

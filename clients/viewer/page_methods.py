@@ -216,8 +216,7 @@ async def live(viewer: Viewer, page: Page, params: p.Live) -> object:
     """Grow a volume of a data set from the images so far, for all pages that want one."""
     page.live = params.name is not None
     if params.name is None:
-        if not any(other.live for other in viewer.pages.values()):
-            viewer.grower.stop()
+        viewer.ungrow()
         return {}
     folder = _data(viewer) / plain_name(params.name, "data set")
     if folder.is_symlink() or not folder.is_dir():

@@ -25,7 +25,7 @@ from flexdt.clients.client.transport import ConnectionLost
 from flexdt.clients.viewer import scrubbed_plan as plans
 from flexdt.clients.viewer.feed import ImageFeed, ShownImage, grey, packed, window_of
 from flexdt.clients.viewer.front import Download, Front
-from flexdt.clients.viewer.live_volume import Grower
+from flexdt.clients.viewer.live_volume import Grower, points_of
 from flexdt.clients.viewer.page import TRY_AGAIN, Page, watched, without_bytes
 from flexdt.clients.viewer.page_cameras import SceneClients
 from flexdt.clients.viewer.scenes import sample as shapes
@@ -347,7 +347,7 @@ class Viewer:
             window = self.window or window_of(image)
             small = image.pixels[::2, ::2] if coarse else image.pixels
             shown = ShownImage(small, image.kind, image.cone_vec, image.time, image.seq)
-            lab.scene.show_image(grey(shown, window))
+            lab.scene.show_image(grey(shown, window), small, world)
         assert self._loop is not None
         self._loop.call_soon_threadsafe(self._send_image, image.kind, content)
 
@@ -356,10 +356,22 @@ class Viewer:
             if page.kind == kind and page.recorded is None:
                 page.show("image", content)
 
-    def _grown(self, slices: str) -> None:
+    def _grown(self, line: str) -> None:
+        told = json.loads(line)
+        surface = told.pop("surface", None)
+        if surface is not None and self.lab is not None:
+            self.lab.scene.show_surface(points_of(surface), surface["size_mm"])
+        slices = json.dumps(told)
         for page in self.pages.values():
             if page.live:
                 page.show("volume", slices)
+
+    def ungrow(self) -> None:
+        """Reconstruct no longer once no page wants it."""
+        if not any(page.live for page in self.pages.values()):
+            self.grower.stop()
+            if self.lab is not None:
+                self.lab.scene.show_surface(None)
 
     # -- pages -------------------------------------------------------------------------------
 
@@ -385,8 +397,7 @@ class Viewer:
             if self.pages.get(id) is page:
                 del self.pages[id]
                 self.clients.forget(id)
-            if not any(other.live for other in self.pages.values()):
-                self.grower.stop()
+            self.ungrow()
             self.refresh_feeds()
 
     def refresh_feeds(self) -> None:

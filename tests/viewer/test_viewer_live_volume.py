@@ -16,7 +16,7 @@ import numpy.typing as npt
 import pytest
 import tifffile
 
-from flexdt.clients.viewer.live_volume import Grower, grow
+from flexdt.clients.viewer.live_volume import MOST_POINTS, Grower, grow, points_of, surface
 from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.twin.dataset.flexdt_json import parse_document
 from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
@@ -141,6 +141,29 @@ def test_no_slice_is_a_mirror_image(tmp_path: Path, seed: int) -> None:
         from_middle = cols.mean() - (grey.shape[1] - 1) / 2, (grey.shape[0] - 1) / 2 - rows.mean()
         at_mm = np.array(from_middle) * told[-1]["voxel_mm"]
         np.testing.assert_allclose(at_mm, (right, up), atol=0.7 * told[-1]["voxel_mm"])
+    # Points of the surface, on the stage: all about the ball, and everywhere on it.
+    points, size = points_of(told[-1]["surface"]), told[-1]["surface"]["size_mm"]
+    from_ball = points - [x, y, z]
+    apart = np.linalg.norm(from_ball, axis=1)
+    assert np.abs(apart - 5.5).max() < 1.5 * size
+    directions = rng.normal(size=(50, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    assert (directions @ (from_ball / apart[:, None]).T).max(axis=1).min() > 0.9
+
+
+def test_a_surface_has_few_points_whatever_the_volume() -> None:
+    """A box in a large volume of voxels that are no cubes: its faces, a cell off at most."""
+    grown = np.random.default_rng(1).normal(0.0, 0.01, (200, 150, 260)).astype(np.float32)
+    grown[40:160, 30:90, 50:200] += 1.0  # (y, x, z)
+    told = surface(grown, (0.5, 0.4, 0.3), (10.0, -20.0, 5.0))
+    points, size = points_of(told), told["size_mm"]
+    assert size == 5 * 0.5
+    assert 500 < len(points) <= MOST_POINTS
+    low = np.array([10 + (30 - 75) * 0.5, -20 + (40 - 100) * 0.4, 5 + (50 - 130) * 0.3])
+    high = np.array([10 + (90 - 75) * 0.5, -20 + (160 - 100) * 0.4, 5 + (200 - 130) * 0.3])
+    np.testing.assert_allclose([points.min(axis=0), points.max(axis=0)], [low, high], atol=size)
+    to_face = np.minimum(np.abs(points - low), np.abs(points - high)).min(axis=1)
+    assert to_face.max() < size
 
 
 def test_nobody_waits_for_a_scan_that_nobody_looks_at(scan: tuple[Path, list[Path]]) -> None:

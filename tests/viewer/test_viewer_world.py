@@ -25,6 +25,7 @@ from flexdt.clients.viewer.scenes import collision_bodies as bodies
 from flexdt.clients.viewer.scenes import parts
 from flexdt.clients.viewer.scenes import sample as shapes
 from flexdt.clients.viewer.scenes import sample as solids
+from flexdt.clients.viewer.scenes.beam_shade import MOST, fans
 from flexdt.clients.viewer.scenes.gizmos import Gizmos
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.sample import Wardrobe
@@ -301,6 +302,12 @@ def test_the_scene_draws_the_machines_own_margin() -> None:
         scene.highlight(("xray_source", "sample_holder"))
         for layer in (scene._margins, scene._hulls):
             assert {n for n, h in layer.items() if h.visible} == {"xray_source", "sample_holder"}
+        for points in (np.ones((3, 3)), np.arange(6.0).reshape(2, 3), None, None):
+            scene.show_surface(points, 2.0)
+            there = server.scene.get_handle_by_name("/object/surface")
+            assert (there is None) == (points is None)
+            if points is not None:
+                np.testing.assert_allclose(there.points, points / 1000.0, atol=1e-5)
         for layer, drawn in scene.shown.items():
             scene.show(layer, not drawn)
             assert scene.shown[layer] is not drawn
@@ -366,3 +373,57 @@ def _state() -> Any:
     return State.model_construct(
         axes={}, camera=camera_view(CAMERA, MACHINE), correction=None, sample=SampleState(name=None)
     )
+
+
+def test_the_beam_in_the_air_has_the_transmission_of_the_pixels_behind_it() -> None:
+    """Where a place's ray ends on the panel is found here, from the rows of the geometry alone."""
+    rng = np.random.default_rng(4)
+    for _ in range(4):
+        at = {**AT, "ver_tube": rng.uniform(20, 80), "tra_det": rng.uniform(0, 60)}
+        world = placed(MACHINE, PROFILE, CAMERA, at, CORRECTION)
+        rows, cols = world.shape
+        lines = rng.uniform(0.0, 3.0, (rows, cols))
+        source, middle, u, v = world.view.rows[0].reshape(4, 3)
+        for k, plane in enumerate(fans(world, lines, 25.0)):
+            upright, behind, seen = k < 2, k % 2 == 1, 0
+            size, other = (rows, cols) if upright else (cols, rows)
+            for r, c in zip(rng.integers(0, 160, 200), rng.integers(20, 192, 200), strict=True):
+                place = plane.center + plane.axes[:, :2] @ (
+                    np.array(plane.size) * [(c + 0.5) / 192 - 0.5, (r + 0.5) / 160 - 0.5]
+                )
+                depth = (place - world.sample.shift) @ plane.axes[:, 0]
+                assert depth > 25.0 if behind else depth < -25.0
+                a, b, _ = np.linalg.solve(np.stack([u, v, source - place], axis=1), source - middle)
+                along, across = (b + rows / 2, a + cols / 2)[:: 1 if upright else -1]
+                assert across == pytest.approx(other / 2, abs=1e-6)
+                if abs(along % 1.0 - 0.5) > 0.49:
+                    continue  # between two pixels
+                light = float(0.0 < along < size)
+                if light and behind:
+                    pixel = (int(along), cols // 2) if upright else (rows // 2, int(along))
+                    light = math.exp(-lines[pixel])
+                assert plane.rgba[r, c, 3] == pytest.approx(MOST * light, abs=1.0)
+                seen += light > 0.0
+            assert seen > 60
+
+
+def test_what_is_drawn_of_axis_and_beam_follows_stage_and_tube() -> None:
+    with redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host="127.0.0.1", port=0)
+    try:
+        scene = LabScene(server, MACHINE, PROFILE)
+        for sod, on in ((640.0, False), (500.0, False), (500.0, True), (400.0, True)):
+            world = placed(MACHINE, PROFILE, CAMERA, {**AT, "mag_obj": sod})
+            lines = np.full(world.shape, 0.5)
+            scene.show_image(np.zeros((8, 8, 3), np.uint8), lines, world)
+            scene._show_beam(cast(State, SimpleNamespace(tube=SimpleNamespace(on=on))), world)
+            np.testing.assert_allclose(scene._axis.position, world.axis / 1000.0, atol=1e-9)
+            shade = server.scene.get_handle_by_name("/beam/shade1")
+            assert shade is not None
+            assert shade.visible == on
+            if on:  # the light begins behind the sample
+                begins = shade.position[1] - shade.render_width / 2
+                assert begins == pytest.approx((world.sample.shift[1] + 1.0) / 1000.0, abs=0.002)
+    finally:
+        with redirect_stdout(io.StringIO()):
+            server.stop()

@@ -15,6 +15,7 @@ import viser
 from flexdt.clients.viewer.scenes import collision_bodies as bodies
 from flexdt.clients.viewer.scenes import parts, world
 from flexdt.clients.viewer.scenes import sample as solids
+from flexdt.clients.viewer.scenes.beam_shade import BeamShade
 from flexdt.clients.viewer.scenes.gizmos import Drag, Gizmos
 from flexdt.clients.viewer.scenes.sample import MM, SampleLook
 from flexdt.clients.viewer.scenes.world import PlanDrawing, World, motors, quaternion
@@ -33,11 +34,11 @@ BEAM_ON = (255, 176, 32)
 SCREEN: Any = {"thickness_units": "screen"}
 """Lines have a width in pixels."""
 BEAM_OFF = (120, 140, 165)
+SURFACE = (70, 190, 255)
 FLOOR = (140, 150, 165)
 RANGE = (240, 150, 40)
 RED = (230, 50, 40)
 AMBER = (255, 160, 30)
-CONE = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]], dtype=np.uint32)
 STAND = "/object/stand"
 GAP_MM = 0.6
 """Distance of the image from the panel's face, in front of which it floats."""
@@ -71,6 +72,7 @@ class LabScene:
         self._sent: dict[str, tuple[float, ...]] = {}
         self._skins: list[Any] = []
         self._look: SampleLook | None = None
+        self._surface: Any = None
         self._hulls: dict[str, Any] = {}
         self._margins: dict[str, Any] = {}
         self._hot: frozenset[str] = frozenset()
@@ -138,10 +140,7 @@ class LabScene:
             "/panel", blank, 0.1, 0.1, format="jpeg", jpeg_quality=80,
             cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
-        self._cone = scene.add_mesh_simple(
-            "/beam/cone", np.zeros((5, 3), dtype=np.float32), CONE, color=BEAM_ON, opacity=0.1,
-            side="double", cast_shadow=False, receive_shadow=False, flat_shading=True,
-        )  # fmt: skip
+        self._shade = BeamShade(scene)
         self._edges = scene.add_line_segments(
             "/beam/edges",
             np.zeros((8, 2, 3), dtype=np.float32),
@@ -236,12 +235,16 @@ class LabScene:
     def _show_beam(self, state: State, world: World) -> None:
         on = state.tube.on
         points = np.concatenate([world.source[None], world.corners]) * MM
-        key = (*points.reshape(-1).tolist(), float(on))
+        key = (
+            *points.reshape(-1).tolist(),
+            *world.axis.tolist(),
+            *world.stage.turn.flat,
+            float(on),
+        )
         if self._sent.get("beam") == key:
             return
         self._sent["beam"] = key
-        self._cone.vertices = points.astype(np.float32)
-        self._cone.visible = on
+        self._shade.light(on)
         a, b, c, d, e = points
         lines = [(a, b), (a, c), (a, d), (a, e), (b, c), (c, d), (d, e), (e, b)]
         self._edges.points = np.array(lines, dtype=np.float32)
@@ -269,9 +272,29 @@ class LabScene:
 
     # -- what is seen ------------------------------------------------------------------------
 
-    def show_image(self, rgb: npt.NDArray[np.uint8]) -> None:
-        """Draw an image (rows, cols, 3) on the panel."""
+    def show_image(
+        self, rgb: npt.NDArray[np.uint8], lines: npt.NDArray[np.generic], world: World
+    ) -> None:
+        """Draw an image (rows, cols, 3) on the panel, and its line integrals in the air."""
         self._image.image = rgb
+        with self._server.atomic():
+            self._shade.show(world, lines, 0.0 if self._look is None else self._look.radius_mm)
+
+    def show_surface(self, points: FloatArray | None, size_mm: float = 1.0) -> None:
+        """Draw what a scan has reconstructed so far, on the stage; None: no longer.
+
+        Args:
+            points: (n, 3) [mm, object frame].
+            size_mm: of a point.
+        """
+        if self._surface is not None:
+            self._surface.remove()
+            self._surface = None
+        if points is not None and len(points):
+            self._surface = self._server.scene.add_point_cloud(
+                "/object/surface", (points * MM).astype(np.float32), SURFACE,
+                point_size=size_mm * MM, point_shape="rounded",
+            )  # fmt: skip
 
     def wear(self, look: SampleLook) -> None:
         """Put a sample on the stage."""
