@@ -134,7 +134,9 @@ class Radiography:
             value = getattr(self.panel, name)
             if name.startswith("long_lag") and not self.traps:
                 continue  # as before there was any, so that older scans go on
-            if isinstance(value, tuple):
+            if name == "response":
+                figures |= {f"response_{energy:g}_keV": float(left) for energy, left in value}
+            elif isinstance(value, tuple):
                 high, low = value
                 figures |= {f"{name}_high": float(high), f"{name}_low": float(low)}
             elif isinstance(value, str):

@@ -165,6 +165,9 @@ class DetectorSpec(_Frozen):
     """Part of the charge that traps keep for later images."""
     long_lag_s: Positive = 10.0
     """Time constant with which they give it back."""
+    response: tuple[tuple[Positive, Annotated[float, Field(ge=0)]], ...] = ()
+    """Measured: photon energy and the energy that a photon leaves on average [keV]; straight
+    between the points, and from the first one to nothing at 0. None: computed for CsI."""
 
     @property
     def sensor(self) -> Sensor:
@@ -192,6 +195,13 @@ class DetectorSpec(_Frozen):
             check_roi(Roi(*self.roi), self.sensor, binning)
         except LimitError as error:
             raise _refused("roi", self.roi, error.message) from None
+        for i, (energy, left) in enumerate(self.response):
+            if left > energy:
+                most = f"at most the photon's energy, {energy:g} keV"
+                raise _refused(f"response.{i}", [energy, left], most)
+            if i and energy <= self.response[i - 1][0]:
+                most = f"at a higher energy than the point before, {self.response[i - 1][0]:g} keV"
+                raise _refused(f"response.{i}", [energy, left], most)
         return self
 
 
@@ -488,6 +498,10 @@ class Machine(_Frozen):
             if quantity in self.fixed and not self.geometry.get(quantity):
                 most = "left out where no stage on the turntable moves along it"
                 raise _refused(f"fixed.{quantity}", self.fixed[quantity], most)
+        response = self.detector.response
+        if response and response[-1][0] < self.tube.max_kV:
+            most = f"measured up to the tube's max_kV, {self.tube.max_kV:g} keV"
+            raise _refused("detector.response", response[-1], most)
         taken = [*_COMPONENTS_OF_SCRIPTS, self.tube.name.lower()]
         for name in (*self.axes, *self.virtual_axes):
             if name.lower() in taken:

@@ -45,6 +45,8 @@ class Panel:
         long_lag_fraction, long_lag_s: part of the charge that traps take from its own frame, and
             the time constant with which they give it back.
         serial: seed of the fixed pattern: another panel has another one.
+        response: measured: energy of a photon and what it leaves on average [keV], instead of what
+            is computed for the scintillator.
     """
 
     columns: int = 1944
@@ -70,6 +72,7 @@ class Panel:
     long_lag_s: float = 10.0
     serial: int = 1512
     row_pitch_mm: float | None = None
+    response: tuple[tuple[float, float], ...] = ()
 
     @property
     def full_scale(self) -> int:
@@ -101,10 +104,16 @@ class Panel:
         """
         full = Substance.parse(self.scintillator)
         layer = replace(full, density_g_cm3=full.density_g_cm3 * self.packing)
-        kept = deposited(Filter(layer, self.scintillator_mm))
-        charge = tables().energy_keV * self.electrons_per_keV
-        mean = kept.mean * charge
-        return mean, kept.square * charge**2 / self.swank + mean
+        part, square = deposited(Filter(layer, self.scintillator_mm))
+        energy = tables().energy_keV
+        if self.response:
+            # What one photon leaves is spread as computed, for want of another measurement.
+            spread, points = square / part, np.array([(0.0, 0.0), *self.response])
+            part = np.interp(energy, *points.T) / energy
+            square = part * np.maximum(spread, part)
+        charge = energy * self.electrons_per_keV
+        mean = part * charge
+        return mean, square * charge**2 / self.swank + mean
 
 
 def _well(camera: CameraSettings) -> int:
@@ -136,6 +145,7 @@ LABELS: Final[Mapping[str, str]] = {
     "long_lag_s": "assumed: between the 3 and 20 s of amorphous silicon (literature)",
     "serial": "assumed",
     "row_pitch_mm": "literature: as pitch_mm",
+    "response": "assumed: computed for the scintillator",
 }
 """Provenance of each default."""
 
@@ -145,7 +155,7 @@ def panel_of(spec: DetectorSpec) -> Panel:
     return Panel(
         columns=spec.columns, rows=spec.rows, pitch_mm=spec.pitch_mm, bits=spec.bits,
         row_pitch_mm=spec.row_pitch_mm, long_lag_fraction=spec.long_lag_fraction,
-        long_lag_s=spec.long_lag_s,
+        long_lag_s=spec.long_lag_s, response=spec.response,
     )  # fmt: skip
 
 
