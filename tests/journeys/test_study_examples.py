@@ -1,5 +1,6 @@
 """The studies behind docs/physics.md and docs/reconstruction.md, small, with what they must show:
-physics_figures, reference_scan, and, where the peers are installed, compare_fdk and compare_gvxr.
+physics_figures, detector_figures, reference_scan, and, where the peers are installed, compare_fdk
+and compare_gvxr.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -48,6 +50,24 @@ def test_physics_figures() -> None:
     assert detector["read_noise_over_truth"] == pytest.approx(1.0, abs=0.02)
     assert detector["brightest"] == 16383
     assert 2.0 < detector["half_modulation_lp_per_mm"] < 4.0
+
+
+def test_detector_figures() -> None:
+    """Noise power and modulation of images are theory's; the energy kept is as published."""
+    import detector_figures as study
+
+    theory = study.Theory.of(0.1496, study.TIME_MS)
+    f, power = study.noise_power(0.1496, 12, 128)
+    assert np.mean(power / theory.noise_power(f)) == pytest.approx(1.0, abs=0.03)
+    at, modulation = study.edge(0.0748, 4)
+    wanted = study.Theory.of(0.0748, study.TIME_MS).mtf(at)
+    np.testing.assert_allclose(modulation[at < 0.25], wanted[at < 0.25], atol=0.01)
+    stopped, kept, published = study.thick_response()
+    np.testing.assert_allclose(stopped, published, rtol=0.004)
+    assert (kept <= published * 1.004).all()
+    ours, nist = study.thin_response("CsI")  # no L photons escape here
+    assert (ours / nist).min() > 1.0
+    assert (ours / nist).max() < 1.07
 
 
 @pytest.mark.slow

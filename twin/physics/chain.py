@@ -8,11 +8,14 @@ The blur has the requested variance, however narrow it is. From 0.7 pixels on it
 Gaussian at the pixels' centres, whose modulation is a Gaussian's up to the Nyquist frequency.
 Samples of a narrower one would lose variance: there it is the discrete Gaussian exp(-t) I_n(t),
 whose modulation is exp(-2 t sin^2(pi f)) and so more than a Gaussian's at high frequencies.
+
+Noise of the X-rays is blurred as light is that spreads before pixels collect it: its spectrum is
+that of light and aperture together, folded back at the Nyquist frequency.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -34,6 +37,8 @@ SAMPLED = 0.7
 """Standard deviation from which samples of a Gaussian have its variance [pixels]."""
 NARROWEST = 0.02
 """Standard deviation below which nothing is done [pixels]."""
+FREQUENCIES, FOLDS = 512, 20
+"""Samples of a noise spectrum, and spectra on either side that are folded into it."""
 
 
 def kernel(sigma_px: float) -> Float32Array:
@@ -47,7 +52,30 @@ def kernel(sigma_px: float) -> Float32Array:
     return np.asarray(weights / weights.sum(), dtype=np.float32)
 
 
-def blurred(image: Float32Array, sigma_px: float, across_px: float | None = None) -> Float32Array:
+@lru_cache(maxsize=16)
+def noise_kernel(sigma_px: float) -> Float32Array:
+    """Weights that give white noise of the pixels' photons the spectrum it has where light spreads
+    with `sigma_px` before pixels collect it, (2 r + 1,); see `noise_spectrum`."""
+    frequency = np.fft.fftfreq(FREQUENCIES).astype(np.float64)
+    modulation = np.sqrt(noise_spectrum(frequency, sigma_px))
+    weights = np.fft.ifft(modulation).real
+    reach = int(np.ceil(4.0 * sigma_px + 3.0))
+    return np.asarray(weights[np.arange(-reach, reach + 1)], dtype=np.float32)
+
+
+def noise_spectrum(frequency: FloatArray, sigma_px: float) -> FloatArray:
+    """Noise power of a flat image by frequency [cycles a pixel], 1 at none: light's and aperture's
+    modulation squared, with all that is folded back."""
+    f = frequency[..., None] + np.arange(-FOLDS, FOLDS + 1)
+    return np.asarray((np.sinc(f) ** 2 * np.exp(-((2.0 * np.pi * f * sigma_px) ** 2))).sum(axis=-1))
+
+
+def blurred(
+    image: Float32Array,
+    sigma_px: float,
+    across_px: float | None = None,
+    weights: Callable[[float], Float32Array] = kernel,
+) -> Float32Array:
     """`image` (rows, cols) blurred along its rows and, by default alike, across them; edges go on
     as their last pixel."""
     across = sigma_px if across_px is None else across_px
@@ -55,7 +83,7 @@ def blurred(image: Float32Array, sigma_px: float, across_px: float | None = None
         return image
     import cv2
 
-    u, v = kernel(sigma_px), kernel(across)
+    u, v = weights(sigma_px), weights(across)
     out = cv2.sepFilter2D(image, cv2.CV_32F, u, v, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(out, dtype=np.float32)
 
@@ -211,16 +239,18 @@ def read_out(
         given = -np.expm1(-exposure.duration_s / panel.long_lag_s) / averages
         charge += np.float32(given) * trapped
         charge -= np.float32(panel.long_lag_fraction) * expected.mean_e
-    if rng is not None:
-        charge = _with_quantum_noise(charge, variance, averages, rng)
-    charge = blurred(charge, *panel.blur_px(camera))
+    blur = panel.blur_px(camera)
+    noise = None if rng is None else _quantum_noise(charge, variance, averages, rng)
+    charge = blurred(charge, *blur)
+    if noise is not None:
+        charge = charge + blurred(noise, *blur, weights=noise_kernel)
     fixed = pattern(panel, camera.binning, camera.roi.edges)
     charge = charge * fixed.gain
     charge += np.float32(panel.dark_e_per_s * camera.binning**2 * exposure.exposure_ms / 1000.0)
     per_count = panel.electrons_per_count(camera)
     if rng is not None:
-        noise = np.float32(panel.read_noise(camera) / np.sqrt(averages))
-        charge += noise * rng.standard_normal(shape, dtype=np.float32)
+        electronic = np.float32(panel.read_noise(camera) / np.sqrt(averages))
+        charge += electronic * rng.standard_normal(shape, dtype=np.float32)
     counts = charge * np.float32(1.0 / per_count)
     counts += fixed.offset + np.float32(panel.offset_counts)
     np.rint(counts, out=counts)
@@ -252,21 +282,21 @@ def trapped_after(
     return left
 
 
-def _with_quantum_noise(
+def _quantum_noise(
     mean: Float32Array, variance: Float32Array, averages: int, rng: np.random.Generator
 ) -> Float32Array:
-    """One draw of the charge with this mean and variance / averages.
+    """One draw of what the charge has more than its mean, of variance / averages.
 
     Gaussian where many quanta come; where few do, whole quanta of the size that gives the variance.
     """
-    noise = rng.standard_normal(mean.shape, dtype=np.float32)
-    out = mean + noise * np.sqrt(variance * np.float32(1.0 / averages))
+    out = rng.standard_normal(mean.shape, dtype=np.float32)
+    out *= np.sqrt(variance * np.float32(1.0 / averages))
     with np.errstate(divide="ignore", invalid="ignore"):
         quanta = mean * mean * np.float32(averages) / variance
     few = np.flatnonzero((quanta < FEW).ravel() & (mean > 0.0).ravel())
     if len(few):
         each = mean.ravel()[few] / quanta.ravel()[few]
-        out.ravel()[few] = rng.poisson(quanta.ravel()[few]) * each
+        out.ravel()[few] = (rng.poisson(quanta.ravel()[few]) - quanta.ravel()[few]) * each
     return np.asarray(out)
 
 

@@ -21,7 +21,7 @@ from flexdt.twin.attenuation.scattering import ELECTRON_KEV, cross_sections
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.camera import CameraSettings
-from flexdt.twin.physics.chain import NARROWEST, Chain, kernel, mAs, weights_of
+from flexdt.twin.physics.chain import NARROWEST, Chain, mAs, noise_kernel, weights_of
 from flexdt.twin.physics.exposure import ExposureSettings
 from flexdt.twin.physics.spectrum import tube_spectrum
 
@@ -85,7 +85,7 @@ def pixel_reading(
     through = np.exp(-depth)
     scale, panel = mAs(exposure) * flux, chain.panel
     sigmas = panel.blur_px(camera)
-    kept = math.prod(float((kernel(s).astype(np.float64) ** 2).sum()) for s in sigmas)
+    kept = math.prod(float((noise_kernel(s).astype(np.float64) ** 2).sum()) for s in sigmas)
     kept = kept if max(sigmas) >= NARROWEST else 1.0
     quanta = float(noise @ through) * scale * kept
     per_count = panel.electrons_per_count(camera)
