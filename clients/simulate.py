@@ -35,6 +35,7 @@ from flexdt.twin.physics.chain import (
     read_out,
     spot_blur_px,
     spot_views,
+    without_spot,
 )
 from flexdt.twin.physics.exposure import Counts, ExposureSettings, frame_rng
 from flexdt.twin.physics.panel import Panel, panel_of
@@ -118,8 +119,7 @@ class Truth:
         chain, moments = self.chain, self.rays**2 * self.spot_points
         spot_mm = chain.tube.focal_spot_mm(self.exposure.power_W)
         if self.spot_points > 1:
-            sharp = replace(chain.tube, spot_mm_per_W=0.0, smallest_spot_mm=0.0)
-            chain = replace(chain, tube=sharp)
+            chain = without_spot(chain)
         each = max(1, BATCH_BYTES // (4 * rows * cols * moments * max(1, len(self.parts))))
         for start in range(0, len(self.geometry), each):
             views = slice(start, min(start + each, len(self.geometry)))

@@ -31,6 +31,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec, check_cone_vec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings, Sensor
+from flexdt.twin.physics.chain import spot_views
 from flexdt.twin.physics.scatter.simulation import Object
 from flexdt.twin.projection import Body, TriangleMesh
 from flexdt.twin.projection.analytic_solids import Scene
@@ -118,8 +119,12 @@ class Imaging:
         *,
         times: npt.ArrayLike | None = None,
         truth: TrueGeometry | None = None,
+        spot: tuple[float, int] = (0.0, 1),
     ) -> tuple[tuple[Channel, ...], Float32Array, FloatArray]:
         """Paths through each material of `sample` at n nominal poses; arguments as above.
+
+        `spot` is the focal spot's size [mm] and the number of its points that rays start from: so
+        many views of each pose, one after another.
 
         Returns:
             The materials (m), float32 (m, n, rows, cols) [mm], and the true geometry (n, 12), which
@@ -130,11 +135,13 @@ class Imaging:
         """
         cone = (truth or self.truth).cone_vec(poses, sample.offset, times)
         check_cone_vec(cone, camera.pixels_mm(self.sensor))
+        if spot[1] > 1:
+            cone = ConeVec(spot_views(cone.rows, *spot))
         channels: tuple[Channel, ...] = ()
         names: list[str] = []
         if sample.name:
             _, channels, names = await self._sent(sample, "material")
-        out = np.empty((len(channels), len(poses), *camera.shape), dtype=np.float32)
+        out = np.empty((len(channels), len(cone), *camera.shape), dtype=np.float32)
         for i, name in enumerate(names):
             out[i] = await self.projector.project(name, cone, camera.shape)
         return channels, out, cone.rows

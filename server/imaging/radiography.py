@@ -24,7 +24,7 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
-from flexdt.twin.physics.chain import Chain, Expected, read_out
+from flexdt.twin.physics.chain import Chain, Expected, read_out, without_spot
 from flexdt.twin.physics.exposure import Counts, DetectorModel, ExposureSettings, expose, open_beam
 from flexdt.twin.physics.panel import Panel, panel_of
 from flexdt.twin.physics.radiograph import Radiograph, radiographs
@@ -180,12 +180,22 @@ class Radiography:
             if len(lines) == count:
                 return [Radiograph(one) for one in lines]
             return [Radiograph(part) for part in lines.reshape(count, -1, *lines.shape[1:])]
+        points, moments = self.tube.spot_points, len(poses) // count
+        if points > 1 and count > 1:  # one by one: each holds the paths of all its points
+            at = np.broadcast_to(0.0 if times is None else times, len(poses))
+            parts = [slice(i * moments, (i + 1) * moments) for i in range(count)]
+            return [
+                (await self.take(sample, poses[p], camera, [e], times=at[p], truth=truth))[0]
+                for p, e in zip(parts, exposures, strict=True)
+            ]
+        spot = self.tube.focal_spot_mm(exposures[0].power_W), points
         channels, paths, views = await self.imaging.path_lengths(
-            sample, poses, camera, times=times, truth=truth
+            sample, poses, camera, times=times, truth=truth, spot=spot
         )
         mono_keV = stated_keV() if self.physics == "mono" else None
         chain = chain_through(channels, self.panel, self.tube, mono_keV)
-        moments = len(poses) // count
+        if points > 1:
+            chain, moments = without_spot(chain), moments * points
         added: list[Scattered] = []
         if self.scatter != "off" and channels:
             thing = await self.imaging.scatterer(sample, self._settings.voxels)

@@ -260,6 +260,40 @@ def test_filters_and_focal_spot_are_the_machine_file_s(tmp_path: Path) -> None:
         tube_spectrum(20.0, TubeModel((Filter(Substance.parse("Pb@11.3"), 100.0),)))
 
 
+def test_rays_from_points_of_the_focal_spot_blur_each_depth_as_it_is(tmp_path: Path) -> None:
+    """The witness: transmission averaged over a grid of sources."""
+    fwhm, keV = 0.4, stated_keV()
+    spot = f"smallest_spot_mm = {fwhm}\nspot_points = 48"
+    own = parse_machine(re.sub("smallest_spot_mm = .*", spot, FLEXRAY.read_text()), "own.toml")
+    way = radiography(tmp_path, "mono")
+    made = Radiography.of(way.imaging, way.model, own, "mono")
+    assert TubeModel.of_figures(made.record()) == made.tube
+    seen = CameraSettings("HW2SW1High", Roi(932, 628, 975, 907))  # 22 x 140 image pixels
+    pose = poses(M, P, seen, {"mag_obj": [150.0], "rot_obj": [20.0]})
+    found, one_blur = (
+        asyncio.run(one.take(Sample("lego"), pose, seen, [LISTING_1]))[0].integrals
+        for one in (made, replace(made, tube=replace(made.tube, spot_points=1)))
+    )
+    row = TrueGeometry().cone_vec(pose, Sample("lego").offset, None).rows[0]
+    at = np.linspace(-3.3, 3.3, 23)
+    places = np.array([(x, y) for x in at for y in at])
+    weight = np.exp(-(places**2).sum(axis=1) / 2)
+    edges = np.array([row[i : i + 3] / np.linalg.norm(row[i : i + 3]) for i in (6, 9)])
+    moved = np.repeat(row[None], len(places), axis=0)
+    moved[:, :3] += fwhm / 2.35482 * places @ edges
+    depth = np.zeros((len(places), *seen.shape))
+    for part in channels(load_phantom("lego")):
+        mu = part.material.substance.attenuation_at(keV)
+        depth += mu * project_body(part.body, ConeVec(moved), seen.shape)
+    through = np.tensordot(weight / weight.sum(), np.exp(-depth), 1)
+    error, plain = (np.abs(np.exp(-image) - through) for image in (found, one_blur))
+    assert error.max() < 0.3 * plain.max()
+    assert error.mean() < 0.3 * plain.mean()
+    several = asyncio.run(made.take(Sample("lego"), poses(M, P, seen, {"mag_obj": [150.0, 300.0],
+                          "rot_obj": [20.0, 0.0]}), seen, [LISTING_1] * 2))  # fmt: skip
+    assert np.array_equal(several[0].integrals, found)
+
+
 def test_tube_and_camera_have_their_effect(tmp_path: Path) -> None:
     way = radiography(tmp_path, "poly", dead_fraction=0.0)
     pose = poses(M, P, MIDDLE, {})

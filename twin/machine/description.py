@@ -242,6 +242,9 @@ class TubeSpec(_Frozen):
     """Focal spot a watt, full width at half maximum (assumed: usual for microfocus tubes)."""
     smallest_spot_mm: float = Field(0.007, ge=0, le=10)
     """Focal spot at little power (assumed)."""
+    spot_points: int = Field(1, ge=1, le=1024)
+    """Of the focal spot, from which rays start: each depth of the sample has its own blur. With 1
+    all of it is blurred as the rotation axis is."""
 
     @model_validator(mode="after")
     def _starts_within(self) -> TubeSpec:
@@ -250,6 +253,8 @@ class TubeSpec(_Frozen):
             raise _refused("kV", self.kV, most)
         if self.power_W > self.max_W:
             raise _refused("power_W", self.power_W, f"at most max_W, {self.max_W:g}")
+        if self.spot_points == 2:
+            raise _refused("spot_points", 2, "1, or 3 to 1024")
         return self
 
 

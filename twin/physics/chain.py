@@ -74,6 +74,7 @@ def blurred(
     image: Float32Array,
     sigma_px: float,
     across_px: float | None = None,
+    *,
     weights: Callable[[float], Float32Array] = kernel,
 ) -> Float32Array:
     """`image` (rows, cols) blurred along its rows and, by default alike, across them; edges go on
@@ -332,6 +333,11 @@ def spot_views(rows: FloatArray, spot_mm: float, points: int) -> FloatArray:
     out = np.repeat(rows[:, None], points, axis=1)
     out[:, :, :3] += np.einsum("ak,nax->nkx", places, edges)
     return out.reshape(-1, 12)
+
+
+def without_spot(chain: Chain) -> Chain:
+    """The chain for views from `spot_views`, whose mean has the spot's blur already."""
+    return replace(chain, tube=replace(chain.tube, spot_mm_per_W=0.0, smallest_spot_mm=0.0))
 
 
 def flux_of(view: npt.ArrayLike, shape: tuple[int, int]) -> Float32Array:

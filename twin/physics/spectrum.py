@@ -42,11 +42,13 @@ class TubeModel:
         spot_mm_per_W: the electron beam of microfocus tubes is widened with power so that the
             anode does not melt; about a micrometre a watt is usual.
         smallest_spot_mm: focal spot at little power (full width at half maximum).
+        spot_points: from which the twin's rays start; 1 for one blur of the whole image.
     """
 
     filters: tuple[Filter, ...] = field(default_factory=lambda: (Filter(ALUMINIUM, 0.5),))
     spot_mm_per_W: float = 0.001
     smallest_spot_mm: float = 0.007
+    spot_points: int = 1
 
     def focal_spot_mm(self, power_W: float) -> float:
         """Full width at half maximum of the focal spot [mm]."""
@@ -61,6 +63,7 @@ class TubeModel:
         return {
             "tube_spot_mm_per_W": self.spot_mm_per_W,
             "tube_smallest_spot_mm": self.smallest_spot_mm,
+            **({"tube_spot_points": float(self.spot_points)} if self.spot_points > 1 else {}),
             **layers,
         }
 
@@ -78,6 +81,7 @@ class TubeModel:
             tuple(Filter(Substance.parse(name), thick) for name, thick in layers.items()),
             figures["tube_spot_mm_per_W"],
             figures["tube_smallest_spot_mm"],
+            int(figures.get("tube_spot_points", 1)),
         )
 
 
@@ -87,6 +91,7 @@ def tube_of(spec: TubeSpec) -> TubeModel:
         tuple(Filter(Substance.parse(f.material), f.thickness_mm) for f in spec.filters),
         spec.spot_mm_per_W,
         spec.smallest_spot_mm,
+        spec.spot_points,
     )
 
 
