@@ -378,7 +378,7 @@ def check_rays(rays: int) -> None:
     Raises:
         LimitError: says what is allowed.
     """
-    if rays not in range(1, MOST_RAYS + 1):
+    if not isinstance(rays, int | np.integer) or rays not in range(1, MOST_RAYS + 1):
         raise LimitError(
             f"rays is {rays}; allowed: 1 to {MOST_RAYS} along each side of a pixel",
             {"asked": rays, "allowed": [1, MOST_RAYS]},

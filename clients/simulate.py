@@ -213,7 +213,8 @@ def simulate(
     if noise is not None and (not isinstance(noise, int | np.integer) or noise < 0):
         raise LimitError(f"noise is {noise}; allowed: a seed >= 0, or None", {"asked": noise})
     check_rays(rays)
-    if spot_points != 1 and spot_points not in range(3, MOST_POINTS + 1):
+    allowed = (1, *range(3, MOST_POINTS + 1))
+    if not isinstance(spot_points, int | np.integer) or spot_points not in allowed:
         raise LimitError(
             f"spot_points is {spot_points}; allowed: 1, or 3 to {MOST_POINTS}",
             {"asked": spot_points, "allowed": [1, 3, MOST_POINTS]},

@@ -134,6 +134,24 @@ def test_any_program_s_geometry_goes_with_marked_beads(
         assert abs(p[name]["value"] - true) < 4 * p[name]["sigma"]
 
 
+@pytest.mark.parametrize(
+    ("columns", "named"), [(slice(9, 12), "rows upwards"), (slice(6, 9), "from right to left")]
+)
+def test_a_panel_counted_the_other_way_is_named(
+    columns: slice, named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """ASTRA's own `cone` geometry has v upwards; beads then lay "behind the source"."""
+    angles = 36.0 * np.arange(10)
+    np.save(tmp_path / "seen.npy", pixels(load_phantom("lego").beads, angles, SOD, {}))
+    rows = study.geometry(angles).rows.copy()
+    rows[:, columns] *= -1.0
+    np.save(tmp_path / "vectors.npy", rows)
+    words = ["calibrate", "--markers", str(tmp_path / "seen.npy"), "--phantom", "lego",
+             "--geometry", str(tmp_path / "vectors.npy"), "--shape", "760,956"]  # fmt: skip
+    assert run(words) != 0
+    assert named in capsys.readouterr().err
+
+
 def test_compressed_images_of_another_writer_are_read(tmp_path: Path) -> None:
     images = np.random.default_rng(4).integers(900, 1000, (3, 40, 50)).astype(np.uint16)
     lzw, packbits = 5, 32773

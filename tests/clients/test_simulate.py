@@ -125,6 +125,9 @@ def test_a_pixel_averages_the_signals_of_its_rays() -> None:
     assert np.abs(transmission(one) - transmission(scan)).max() > 5e-3
     with pytest.raises(LimitError, match="rays is 17; allowed: 1 to 16"):
         simulate(ball, cone, shape=SHAPE, rays=17)
+    for name in ("rays", "spot_points"):
+        with pytest.raises(LimitError, match=rf"{name} is 4\.0; allowed: 1"):
+            simulate(ball, cone, shape=SHAPE, **{name: 4.0})
 
 
 @pytest.mark.parametrize(("metal", "keV"), [("Cu@8.96", 50.0), ("Gd@7.9", 50.2), ("Gd@7.9", 50.3)])

@@ -77,7 +77,7 @@ from flexdt.twin.calibration.identify import (
     identified,
     shadow_radii,
 )
-from flexdt.twin.errors import TwinError
+from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.geometry.motion import Motion, require_movable
 from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
@@ -222,6 +222,7 @@ def calibrate(
 
     Raises:
         TwinError: a scan has no frames, or the same images as another.
+        GeometryError: rows counted upwards, or columns from right to left.
     """
     want = Request() if request is None else request
     model = bead_model(phantom)
@@ -232,6 +233,7 @@ def calibrate(
                 f"{scan.name}: {len(scan.frames)} frames and {len(scan.poses)} poses; allowed: as "
                 "many of both, at least one"
             )
+        _require_seen_from_the_source(scan)
     sought = [detector or detector_for(model, scan.poses) for scan in scans]
     looks = tuple(
         without_repeats(scan.frames.look(how)) for scan, how in zip(scans, sought, strict=True)
@@ -323,6 +325,23 @@ def detector_for(model: BeadModel, poses: Poses) -> SpotFinder:
     sizes = model.bead_radius_mm
     same = math.inf if sizes.max() > 1.2 * sizes.min() else 1.6
     return SpotFinder(radius_px=(0.65 * low, 1.5 * high), same=same)
+
+
+def _require_seen_from_the_source(scan: Scan) -> None:
+    """Refuse rows that are counted upwards and columns that are counted from right to left."""
+    p = scan.poses
+    beam = ((p.detector - p.source) * np.cross(p.u, p.v)).sum(axis=1)
+    for wrong, what, way in (
+        (p.v[:, 2] > 0.0, "rows upwards (v points up)", "top to bottom"),
+        (beam < 0.0, "columns from right to left, seen from the source", "left to right"),
+    ):
+        if wrong.any():
+            raise GeometryError(
+                f"{scan.name}: the geometry counts {what} in view {int(np.argmax(wrong))}; "
+                "allowed: row 0 on top, column 0 on the left. Negate this vector, and flip the "
+                f"images {way} if they are counted so, too (docs/exchange.md, rows up or down)",
+                {"asked": what, "allowed": "row 0 on top, column 0 on the left"},
+            )
 
 
 def _require_different(scans: Sequence[Scan], looks: Sequence[Sequence[FrameSpots]]) -> None:

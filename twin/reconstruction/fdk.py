@@ -455,6 +455,14 @@ def _fdk(
     if on_its_side(cone_vec):
         parts = (part.transpose(0, 2, 1) for part in parts)
         cone_vec, shape = swapped(cone_vec), (shape[1], shape[0])
+    if shape[1] < 2:
+        raise GeometryError(
+            "rows of 1 pixel, which cannot be filtered; allowed: 2 or more",
+            {"asked": shape[1], "allowed": 2},
+        )
+    if shape[0] == 1:  # A row of detectors sees as high as it is, not only its middle's plane.
+        parts = (part.repeat(2, axis=1) for part in parts)
+        cone_vec, shape = ConeVec(cone_vec.rows), (2, shape[1])
     tilted, seen = not is_upright(cone_vec), shape
     if leans(cone_vec):
         shape = (shape[0], round(FINER * shape[1]))

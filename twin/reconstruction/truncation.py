@@ -52,17 +52,27 @@ STARTS = (1.1, 1.5, 2.2)
 """Radii that the fit starts from, relative to the field of view's."""
 TURNS = (0.0, 0.4, 0.8, 1.2)
 """Angles against the best ellipse that the fit of a rectangle starts from [rad]."""
-LONGER = ((0.0, 0.0), (0.2, 0.0), (0.0, 0.2))
-"""Logarithms of what half axes are multiplied by where the last fit starts."""
+NEARBY = (
+    (0.0, 0.0, 0.0), (0.2, 0.0, -0.1), (0.0, 0.2, -0.1), (0.0, 0.0, -0.1), (0.0, 0.0, -0.2),
+    (0.0, 0.0, 0.1),
+)  # fmt: skip
+"""Logarithms of what half axes and attenuation are multiplied by where the last fit starts."""
+FEW = 15.0
+"""Per cent of the rays that at least meet nothing denser, or less dense, than the outline's own
+material."""
 DOUBTFUL = 0.03
 """Misfit above which an outline is unlike an ellipse or a rectangle."""
+EVEN_THERE = 6.0
+"""The lower quartile of the deviations counts as so many times itself: other things in the object
+hide an outline from half of the rays, but not from three quarters of them."""
 ROUGH = 0.01
 """Deviations from an ellipse, relative to large line integrals, beyond which they are taken for
 other things in the object and count less and less."""
 FINE = 0.003
 """The same in the last fit, which begins near: other things in the object then pull much less."""
 HUGE = 50.0
-"""Logarithm of an attenuation that no fit takes: what goes beyond counts as this."""
+"""Logarithm of an attenuation, or of its inverse, that no fit takes: what goes beyond counts as
+this."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,8 +165,9 @@ class Truncation:
     Attributes:
         rows: (b,) middle row of each band.
         prisms: one a band; None where the band's rows are whole.
-        misfit: of the worst band: median deviation of what was seen from the prism, relative to
-            large line integrals; infinite where none is fitted, which is so for a helix.
+        misfit: of the worst band: median deviation of what was seen from the prism, or
+            `EVEN_THERE` times the lower quartile, relative to large line integrals; infinite where
+            none is fitted, which is so for a helix.
     """
 
     rows: FloatArray
@@ -253,6 +264,8 @@ def truncation_of(
         ]
     # Beyond the near edge of a panel moved to one side the opposite views say what is there.
     circle = circle_of(cone_vec)
+    if shape[1] < 2:
+        return None
     before, after = columns_beyond(circle, panels, shape[1])
     # A helix sees other layers in the same rows at each turn, which no prism stands for.
     return _fitted(images, panels, shape, np.array([before <= 1, after <= 1]), not circle.rise)
@@ -343,10 +356,19 @@ class _Band:
         """A large line integral."""
         return float(np.percentile(self.seen, 99.0))
 
+    def excess(self, prism: Outline) -> FloatArray:
+        """Logarithms (2,) of what was seen over the prism's integrals where that is little, and
+        where it is much."""
+        large = self.seen > 0.3 * self.top
+        expected = prism.integrals(self.source, self.rays)[large]
+        ratio = self.seen[large] / np.maximum(expected, 1e-3 * self.top)
+        return np.log(np.clip(np.percentile(ratio, [FEW, 100.0 - FEW]), 0.5, 2.0))
+
     def misfit(self, prism: Outline) -> float:
-        """Median deviation from a prism, relative to large line integrals."""
+        """Deviations from a prism, relative to large line integrals; see `Truncation`."""
         wrong = np.abs(prism.integrals(self.source, self.rays) - self.seen)
-        return float(np.median(wrong[self.seen > 0.1 * self.top]) / self.top)
+        few, half = np.percentile(wrong[self.seen > 0.1 * self.top], [25.0, 50.0])
+        return float(max(EVEN_THERE * few, half) / self.top)
 
     @property
     def field(self) -> float:
@@ -395,7 +417,7 @@ class _Band:
         field = self.field
 
         def prism(x: FloatArray) -> ThreeSided:
-            return ThreeSided(x[:3], field * x[3:6], float(np.exp(x[6])))
+            return ThreeSided(x[:3], field * x[3:6], _attenuation(x[6]))
 
         begun = [
             np.array([*s.turns, *(s.distances / field), np.log(s.attenuation)]) for s in starts
@@ -412,7 +434,7 @@ class _Band:
         def prism(round: bool, x: FloatArray) -> Prism:
             half = field * np.exp(x[2:4])
             centre, axes = (x[0] * field, x[1] * field), (float(half[0]), float(half[1]))
-            return Prism(round, centre, axes, float(x[4]), float(np.exp(min(x[5], HUGE))))
+            return Prism(round, centre, axes, float(x[4]), _attenuation(x[5]))
 
         def fit(
             round: bool, start: npt.ArrayLike, rough: float = ROUGH
@@ -435,10 +457,16 @@ class _Band:
             start = [*best[:2], *(best[2:4] - 0.12), best[4] + turn, best[5]]
             found.append(fit(False, start))
         _, round, best = min(found, key=lambda f: f[0])
-        # Things in an object may have shortened one of its axes and made up for it by density.
-        found = [fit(round, best + [0, 0, a, b, 0, -(a + b) / 2], FINE) for a, b in LONGER]
+        # Dense things in an object may have made it denser, and shorter to make up for that.
+        nearby = [*NEARBY, *((0.0, 0.0, more) for more in self.excess(prism(round, best)))]
+        steps = [np.array([0.0, 0.0, a, b, 0.0, c]) for a, b, c in nearby]
+        found = [fit(round, best + step, FINE) for step in steps]
         _, round, best = min(found, key=lambda f: f[0])
         return prism(round, best)
+
+
+def _attenuation(logarithm: float) -> float:
+    return float(np.exp(np.clip(logarithm, -HUGE, HUGE)))
 
 
 def _centred(count: int) -> FloatArray:

@@ -224,18 +224,24 @@ def test_objects_wider_than_the_panel_come_out_even():
         assert float((found - truth)[even & middle].mean()) / 0.02 == pytest.approx(0.0, abs=0.03)
 
 
-@pytest.mark.parametrize("seed", [1, 7])
-def test_dense_things_do_not_pull_the_outline(seed):
-    """A random ellipse with four dense ones in it: 1.8 and 0.7 % off by the first fit alone."""
+def with_four_dense_things(seed: int, field: float) -> list[Ellipse]:
+    """A random ellipse wider than the field of view, and four denser ones in it."""
     rng = np.random.default_rng(seed)
-    scan = circle(60, pixel=1.6, sod=300.0, sdd=600.0)
-    field = 300.0 * np.sin(np.arctan2(64.0, 600.0))
-    at = np.linspace(-field, field, 61)
     half = field * rng.uniform(1.05, 2.0), field * rng.uniform(0.8, 2.0)
     parts = [(*(field * rng.uniform(-0.2, 0.2, 2)), *half, rng.uniform(0.0, 3.0), 0.02)]
     for _ in range(4):
         axes, place = field * rng.uniform(0.05, 0.25, 2), field * rng.uniform(-0.6, 0.6, 2)
         parts.append((*place, *axes, 0.0, 0.02 * rng.uniform(0.6, 2.0)))
+    return parts
+
+
+@pytest.mark.parametrize("seed", [4, 11])
+def test_dense_things_do_not_pull_the_outline(seed):
+    """4.9 and 1.9 % off where the last fit starts at the first one's density only."""
+    scan = circle(60, pixel=1.6, sod=300.0, sdd=600.0)
+    field = 300.0 * np.sin(np.arctan2(64.0, 600.0))
+    at = np.linspace(-field, field, 61)
+    parts = with_four_dense_things(seed, field)
     data = ellipses(parts, scan, (4, 80))
     found = fdk(data, scan, Grid((1, 61, 61), float(at[1] - at[0])).blank()).data[0]
     truth, even = layer_of(parts, at)
@@ -313,6 +319,43 @@ def test_an_outline_that_is_not_understood_is_said():
     data = project_scene(Scene(tuple(Solid(arm, "a", 0.02) for arm in arms)), scan, (4, 40))
     with pytest.warns(UserWarning, match="wider than the panel"):
         fdk(data, scan, Grid((1, 8, 8), 4.0).blank())
+
+
+def test_a_hexagon_twice_as_wide_as_the_field_is_said():
+    """As an ellipse it comes out 3 % off; half of its rays hardly show that it is none."""
+    scan = circle(24, pixel=6.4, sod=300.0, sdd=600.0)
+    field = 300.0 * np.sin(np.arctan2(64.0, 600.0))
+    turns = (0.2 + np.pi / 3.0 * np.arange(6)).tolist()
+    normals = [(float(np.cos(t)), float(np.sin(t)), 0.0) for t in turns]
+    shape = ConvexPolyhedron(
+        (*normals, (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)), (*[2.0 * field] * 6, 200.0, 200.0)
+    )
+    data = project_scene(Scene((Solid(shape, "a", 0.02),)), scan, (1, 20))
+    found = truncation_of(lambda view: data[view], scan, (1, 20))
+    assert found is not None
+    assert "wider than the panel" in str(found.doubt)
+
+
+def test_half_a_dead_panel_ends_in_a_volume_and_a_warning():
+    scan = circle(60, pixel=1.6, sod=300.0, sdd=600.0)
+    parts = with_four_dense_things(0, 300.0 * np.sin(np.arctan2(64.0, 600.0)))
+    data = ellipses(parts, scan, (4, 80))
+    data[:, :, 40:] = 0.0
+    with pytest.warns(UserWarning, match="wider than the panel"):
+        found = fdk(data, scan, Grid((1, 8, 8), 4.0).blank())
+    assert np.isfinite(found.data).all()
+
+
+def test_a_row_of_detectors_is_a_panel():
+    """A single row, and a single column, which no filter can do anything with."""
+    scan, row = circle(120, pixel=1.0, sod=300.0, sdd=600.0), Cylinder((4, -3, 0), 9.0, 50.0)
+    data = project_scene(Scene((Solid(row, "a", 0.02),)), scan, (1, 80))
+    found = fdk(data, scan, Grid((1, 61, 61), 0.5).blank()).data[0]
+    x, y = np.meshgrid(*[np.linspace(-15.0, 15.0, 61)] * 2)
+    inside = np.hypot(x - 4, y + 3) < 8.0
+    assert float(found[inside].mean()) == pytest.approx(0.02, rel=0.01)
+    with pytest.raises(GeometryError, match="2 or more"):
+        fdk(data[:, :, :1], scan, Grid((1, 8, 8), 4.0).blank())
 
 
 @pytest.mark.parametrize(("cycles", "kept"), [(0.1, 0.995), (0.25, 0.97), (0.33, 0.9)])
