@@ -382,7 +382,7 @@ def main() -> int:
         "--seconds", type=float, default=40.0, help="of a processor, for the tests of one mutant"
     )
     parser.add_argument("--list", action="store_true", help="print the draw, run nothing")
-    parser.add_argument("--again", action="store_true", help="judge known survivors once more")
+    parser.add_argument("--again", action="store_true", help="judge survivors once more")
     parser.add_argument("--work", type=Path, default=ROOT / "build" / "mutations")
     options = parser.parse_args()
     files = sorted(
@@ -413,8 +413,10 @@ def main() -> int:
     fates: dict[Mutant, str] = {}
     for mutant in drawn:
         fate = earlier.get((*mutant.name, digests[mutant.file]))
+        if fate == "survived":
+            fate = fate_of(mutant, 0, known)
         if fate is not None and not (options.again and fate == "survived"):
-            fates[mutant] = fate_of(mutant, 0, known) if fate == "survived" else fate
+            fates[mutant] = fate
     print(f"{len(fates)} are known, after {time.monotonic() - begun:.0f} s", flush=True)
     chosen = [(m, tests.of(m, options.seconds)) for m in drawn if m not in fates]
     jobs = [((m, t), 60.0 + 10 * sum(sum(f.values()) for _, f in t)) for m, t in chosen]
