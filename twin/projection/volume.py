@@ -389,6 +389,14 @@ class DeviceVolume:
         there = replace(layout, flat=gpu.demand(lambda: gpu.zeros(layout.flat.size)))
         return cls(there, like.shape, like.voxel_xyz, like.center_mm)
 
+    @classmethod
+    def sharing(cls, like: Volume, flat: Any, strides: tuple[int, int]) -> DeviceVolume:
+        """Voxels that are there, on the grid of `like`: voxel (z, y, x) at flat[y * strides[0] +
+        x * strides[1] + z].
+        """
+        layout = replace(blank_layout(like), flat=flat, stride_y=strides[0], stride_x=strides[1])
+        return cls(layout, like.shape, like.voxel_xyz, like.center_mm)
+
     @property
     def strides(self) -> tuple[int, int, int]:
         """Bytes from voxel to voxel along z, y, x."""

@@ -10,6 +10,7 @@ from flexdt.twin.errors import GeometryError, NotBuiltError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Operator, Volume
 from flexdt.twin.reconstruction.iterative import cgls
+from tests.support.device_simulator import run_simulated
 
 SHAPE = (5, 6)
 LIKE = Volume(np.zeros((2, 3, 4)), (1.0, 1.2, 0.9), (0.3, -0.2, 0.1))
@@ -145,6 +146,78 @@ def test_torch_trains_a_network_through_the_projector(torch, operator):
         train.step()
         losses.append(float(loss.detach()))
     assert losses[-1] < 0.6 * losses[0]
+
+
+ON_DEVICE = """
+from unittest.mock import Mock
+import numpy as np, torch
+from numba import cuda
+from numba.cuda.simulator.cudadrv.devicearray import FakeCUDAArray
+from flexdt.twin.projection import Grid, Operator, gpu
+from flexdt.twin.projection.frameworks import for_torch
+from flexdt.twin.projection.kernels import gpu_kernels
+from tests.twin.projection.conftest import _circle
+
+# The simulator's arrays are of the host: its tensors stand for those of a device.
+gpu_kernels.BLOCK, gpu.LINEAR = (4, 2), 16
+assert gpu.availability().present
+as_tensor, to_device, moved, waited = torch.as_tensor, cuda.to_device, [], []
+for_torch._is_there = lambda tensor: True
+cuda.as_cuda_array = lambda tensor: FakeCUDAArray(tensor.numpy())
+torch.cuda.current_stream = lambda device: waited.append(device) or Mock()
+
+def shared(x, **options):
+    if not hasattr(x, "copy_to_host") and not hasattr(x, "layout"):
+        return as_tensor(x, **options)
+    flat = x.layout.flat._ary if hasattr(x, "layout") else x._ary
+    return torch.from_numpy(np.lib.stride_tricks.as_strided(flat, x.shape, x.strides))
+
+def sent(array, *rest):
+    moved.append(array.nbytes)
+    return to_device(array, *rest)
+
+def fetched(*_):
+    raise AssertionError("an array came back to the host")
+
+torch.as_tensor, cuda.to_device, FakeCUDAArray.copy_to_host = shared, sent, fetched
+rng = np.random.default_rng(7)
+for counts in ((3, 4, 5), (1, 4, 3), (4, 1, 1)):
+    scan, shape = _circle(2, 30.0, 50.0, 1.0, start=0.2, roll=0.1, height=1.0), (4, 3)
+    A = Operator(scan, Grid(counts, 0.7, (0.1, -0.2, 0.3)), shape)
+    x, y = rng.random((2, *counts)), rng.random((2, *shape), dtype=np.float32)
+    with gpu.switched_off():
+        exact, spread = np.stack([A @ one for one in x]), A.T @ y
+    moved.clear()
+    voxels = torch.tensor(x, requires_grad=True)
+    rows = torch.tensor(scan.rows, requires_grad=True)
+    project = A.torch()
+    images = project(voxels)
+    assert np.abs(images.detach().numpy() - exact).max() < 3e-6 * exact.max()
+    (images[1] * torch.tensor(y)).sum().backward()
+    assert not voxels.grad[0].any()
+    assert np.abs(voxels.grad[1].numpy() - spread).max() < 3e-6 * spread.max()
+    assert set(moved) == {2 * 13 * 8} and len(moved) == 4, moved  # the views, and nothing else
+    found = A.T @ torch.tensor(y)  # z is contiguous, so it can be projected as it is
+    assert np.abs(found.numpy() - spread).max() < 3e-6 * spread.max()
+    pointers = []
+    taken, gpu.taken = gpu.taken, lambda a: (pointers.append(a.data_ptr()), taken(a))[1]
+    again = A @ found
+    gpu.taken = taken
+    assert pointers == [found.data_ptr()]
+    with gpu.switched_off():
+        wanted = A @ spread
+    assert np.abs(again.numpy() - wanted).max() < 3e-6 * wanted.max()
+    (project(torch.tensor(x[0]), rows) * torch.tensor(y)).sum().backward()
+    with gpu.switched_off():
+        wanted = A.gradient(x[0], y)
+    assert np.allclose(rows.grad.numpy(), wanted, rtol=1e-6)
+    assert project(torch.zeros(0, *counts)).shape == (0, 2, *shape)
+assert waited
+"""
+
+
+def test_torch_tensors_of_a_device_stay_there(torch):
+    run_simulated(ON_DEVICE)
 
 
 def test_odl_solvers(siddon, operator, scan):

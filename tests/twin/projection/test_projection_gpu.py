@@ -73,53 +73,32 @@ assert np.array_equal(back(y, geometry, volume).data, fits)
 
 TWO_DEVICES = """
 import numpy as np
-from numba import cuda
-from flexdt.twin.projection import Volume, forward, gpu, level_axis
+from flexdt.twin.projection import Volume, back, forward, gpu, level_axis, room_like
 from flexdt.twin.projection.kernels import gpu_kernels
+from tests.support.device_simulator import two_devices
 from tests.twin.projection.conftest import _circle
 
 assert gpu.availability().present
-gpu_kernels.BLOCK, gpu.VIEWS_A_THREAD = (4, 2), 0.0
+gpu_kernels.BLOCK, gpu.VIEWS_A_THREAD, gpu.LINEAR = (4, 2), 0.0, 16
 level_axis.level_axes = lambda rays, *_: np.zeros(len(rays), int)
-inside, seen = [], []
+launches, upload, uploads, seen = two_devices(), gpu.upload, [], []
+there = gpu.project_there
 
-class Device:
-    def __init__(self, number):
-        self.number = number
-    def __enter__(self):
-        inside.append(self.number)
-    def __exit__(self, *_):
-        inside.pop()
-    def get_memory_info(self):
-        raise AssertionError
-
-cuda.gpus.lst = (Device(0), Device(1))
-there, upload = gpu.project_there, cuda.to_device
-
-class Tagged:  # an array of one device: nothing may touch it from the other
-    def __init__(self, array):
-        self.array, self.device = array, inside[-1]
-    def copy_to_host(self, out):
-        assert inside[-1] == self.device
-        self.array.copy_to_host(out)
+def sent(flat, device=0):
+    uploads.append(device)
+    return upload(flat, device)
 
 def project_there(box, voxels, views, shape):
-    assert voxels.device == inside[-1]
-    seen.append((inside[-1], len(views)))
-    return Tagged(there(box, voxels.array, views, shape))
+    before = len(launches)
+    images = there(box, voxels, views, shape)
+    assert len(set(launches[before:])) == 1
+    seen.append((launches[-1], len(views)))
+    return images
 
-gpu.project_there = project_there
-uploads = []
-def to_device(array, *rest):
-    made = upload(array, *rest)
-    if array.ndim == 1 and array.dtype == np.float32:
-        uploads.append(inside[-1])
-        return Tagged(made)
-    return made
-cuda.to_device = to_device
-
-data = np.random.default_rng(1).random((4, 5, 3), dtype=np.float32)
-volume = Volume(data, 0.5)
+gpu.upload, gpu.project_there = sent, project_there
+rng = np.random.default_rng(1)
+data = rng.random((5, 5, 3), dtype=np.float32)
+volume = Volume(data, 0.5, (0.1, -0.2, 0.3))
 for count, chunk, portions in ((19, 10**9, [(0, 10), (1, 9)]), (7, 10**9, [(0, 7)]),
                                (17, 4 * 20 * 4, [(0, 4), (1, 4), (0, 4), (1, 4), (0, 1)])):
     gpu.CHUNK_BYTES = chunk
@@ -131,10 +110,28 @@ for count, chunk, portions in ((19, 10**9, [(0, 10), (1, 9)]), (7, 10**9, [(0, 7
         exact = forward(volume, scan, (4, 5))
     assert np.abs(images - exact).max() < 3e-6 * exact.max() and exact.max() > 0
 assert sorted(uploads) == [0, 1], uploads  # the volume goes to each device once
+
+# The adjoint: layers on each device where that is worth the images' way, and no volume goes there.
+y = rng.random(images.shape, dtype=np.float32)
+with gpu.switched_off():
+    right = back(y, scan, volume).data
+room = room_like(volume)
+for worth, wanted in ((1, {0, 1}), (10**6, {0})):
+    gpu.VOXELS_A_PIXEL = worth
+    room[...] = 7
+    found = []
+    for options in ({}, {"out": room}, {"deterministic": True}):
+        launches.clear(), uploads.clear()
+        found.append(back(y, scan, volume, **options).data.copy())
+        assert np.abs(found[-1] - right).max() < 3e-6 * right.max(), (worth, options)
+        assert set(launches) == wanted, launches
+        assert uploads == [0] * (worth > 1 and "out" in options), uploads
+    same = found[-1] if worth == 1 else same
+assert np.array_equal(found[-1], same)  # whole numbers: of one device the bytes of two
 """
 
 
-def test_views_are_dealt_to_two_devices_that_share_nothing() -> None:
+def test_views_and_layers_are_dealt_to_two_devices_that_share_nothing() -> None:
     run_simulated(TWO_DEVICES)
 
 

@@ -63,6 +63,28 @@ for case in range(4):
     assert worst < 3e-6, (case, worst)
 """
 
+TWO_DEVICES = """
+import numpy as np
+from flexdt.twin.projection import gpu
+from flexdt.twin.reconstruction import Grid, fdk, gpu_fdk_kernels
+from tests.support.device_simulator import two_devices
+from tests.twin.reconstruction.scans import ball, circle
+
+gpu_fdk_kernels.BLOCK = gpu_fdk_kernels.PLANE = (4, 2)
+assert gpu.availability().present
+launches, gpu.LINEAR, gpu.VIEWS_A_DEVICE, shape = two_devices(), 16, 2, (9, 11)
+scan, like = circle(5, 360.0, pixel=6.0, aside=10.0), Grid((7, 2, 3), 2.0, (0.4, -0.3, 0.7))
+images = ball(scan, shape) + np.random.default_rng(4).random((5, *shape), dtype=np.float32)
+with gpu.switched_off():
+    right = fdk(images, scan, like).data
+for room in (None, 4 * (6 * 32 * 9 * 11 + 2 * 2 * 3)):  # for all, and for two layers on each
+    gpu.free_bytes = lambda: room and room + gpu.SPARE_BYTES
+    launches.clear()
+    found = fdk(images, scan, like).data
+    assert np.abs(found - right).max() < 3e-6 * np.abs(right).max() and (right != 0).mean() > 0.5
+    assert launches.count(0) == launches.count(1) == (4 if room is None else 8), launches
+"""
+
 ITERATED = """
 import numpy as np
 from flexdt.twin.errors import GeometryError
@@ -142,7 +164,9 @@ assert not gpu.availability().present and "lost" in gpu.availability().reason
 """
 
 
-@pytest.mark.parametrize("program", [SIMULATED, ITERATED], ids=["fdk", "iterative"])
+@pytest.mark.parametrize(
+    "program", [SIMULATED, TWO_DEVICES, ITERATED], ids=["fdk", "two", "iterative"]
+)
 def test_what_runs_in_the_simulator_gives_the_processors_numbers(program: str) -> None:
     run_simulated(program)
 

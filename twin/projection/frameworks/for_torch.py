@@ -17,19 +17,22 @@ import torch
 
 from flexdt.twin.errors import GeometryError, NotBuiltError
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.projection import gpu
 from flexdt.twin.projection.arrays import check_host
 from flexdt.twin.projection.geometry_gradient import geometry_gradient
 from flexdt.twin.projection.operators import Shape2, back, forward
-from flexdt.twin.projection.volume import Volume
+from flexdt.twin.projection.volume import DeviceVolume, Volume
 
 
 @dataclass(frozen=True, eq=False)
 class TorchOperator:
     """The projector as a function of tensors: call it, and call `T` for its transpose.
 
-    Tensors are on the processor, of any floating type; arrays of other libraries come in by DLPack.
-    The values are computed and returned as float32, gradients in the type of their tensor.
+    Tensors are of any floating type, on the processor or on a CUDA device, where the results stay
+    then and memory is shared in and out; only voxels whose z is not contiguous (as it is in what
+    `T` gives) are brought into that order first, there, and the derivative by the geometry is
+    computed on the processor. Arrays of other libraries come in by DLPack. The values are computed
+    and returned as float32, gradients in the type of their tensor.
 
     Attributes:
         geometry: the scan, where none is given with the call.
@@ -63,8 +66,9 @@ class TorchOperator:
 
         Raises:
             GeometryError: a shape does not fit.
-            NotBuiltError: a tensor is on a device, or a second derivative with respect to the
-                geometry is asked for.
+            NotBuiltError: a tensor is on a device other than CUDA's, or a second derivative with
+                respect to the geometry is asked for.
+            DeviceError: the device failed; the log says of what.
         """
         values = _tensor(values)
         rows = _tensor(self.geometry.rows if rows is None else rows)
@@ -92,11 +96,8 @@ class _Project(torch.autograd.Function):
         ctx.save_for_backward(x, rows)
         ctx.a = a
         cone_vec = _cone_vec(rows)
-        return _each(
-            lambda one: forward(a.like.like(one), cone_vec, a.detector_shape),
-            x,
-            (len(rows), *a.detector_shape),
-        )
+        images = (len(rows), *a.detector_shape)
+        return _each(lambda one: forward(_volume(one, a.like), cone_vec, images[1:]), x, images)
 
     @staticmethod
     def backward(ctx: Any, g: Any) -> Any:
@@ -114,9 +115,7 @@ class _Spread(torch.autograd.Function):
         ctx.save_for_backward(y, rows)
         ctx.a = a
         cone_vec = _cone_vec(rows)
-        return _each(
-            lambda one: np.array(back(one, cone_vec, a.like).data, order="C"), y, a.like.shape
-        )
+        return _each(lambda one: _voxels(back(_memory(one), cone_vec, a.like)), y, a.like.shape)
 
     @staticmethod
     def backward(ctx: Any, g: Any) -> Any:
@@ -133,10 +132,10 @@ class _ByRows(torch.autograd.Function):
     def forward(ctx: Any, x: Any, y: Any, rows: Any, a: TorchOperator) -> Any:
         cone_vec = _cone_vec(rows)
         total = np.zeros((len(rows), 12))
-        images = y.detach().reshape(-1, len(rows), *a.detector_shape)
-        for one, weights in zip(x.detach().reshape(-1, *a.like.shape), images, strict=True):
+        images = y.detach().cpu().reshape(-1, len(rows), *a.detector_shape)
+        for one, weights in zip(x.detach().cpu().reshape(-1, *a.like.shape), images, strict=True):
             total += geometry_gradient(a.like.like(one.numpy()), cone_vec, weights.numpy())
-        return torch.as_tensor(total, dtype=rows.dtype)
+        return torch.as_tensor(total, dtype=rows.dtype, device=rows.device)
 
     @staticmethod
     def backward(ctx: Any, g: Any) -> Any:
@@ -150,21 +149,57 @@ def _tensor(values: Any) -> Any:
     if isinstance(values, np.ndarray):
         values = values if values.flags.writeable else values.copy()  # no tensor is read-only
     tensor = values if isinstance(values, torch.Tensor) else torch.from_dlpack(values)
-    check_host(tensor.device.type == "cpu", f"the tensor on {tensor.device}")
+    usable = _is_there(tensor) and gpu.availability().present
+    check_host(usable or tensor.device.type == "cpu", f"the tensor on {tensor.device}")
     return tensor
 
 
+def _is_there(tensor: Any) -> bool:
+    return bool(tensor.device.type == "cuda")
+
+
 def _cone_vec(rows: Any) -> ConeVec:
-    return ConeVec(rows.detach().to(torch.float64).numpy())
+    return ConeVec(rows.detach().to(torch.float64).cpu().numpy())
 
 
-def _each(
-    function: Callable[[Float32Array], Float32Array], values: Any, shape: tuple[int, int, int]
-) -> Any:
-    """A function of one array (three dimensions) for each member of a batch."""
-    batch, one = values.shape[:-3], values.shape[-3:]
-    members = values.detach().to(torch.float32).reshape(-1, *one)
-    results = [torch.from_numpy(function(member.numpy())) for member in members]
+def _memory(one: Any) -> Any:
+    """A tensor as numpy's or numba's array, which shares its memory."""
+    return gpu.taken(one.contiguous()) if _is_there(one) else one.numpy()
+
+
+def _volume(one: Any, like: Volume) -> Volume | DeviceVolume:
+    """Voxels (nz, ny, nx); on a device they share the tensor's memory if z is contiguous."""
+    if not _is_there(one):
+        return like.like(one.numpy())
+    columns = one.permute(1, 2, 0)
+    if len(one) > 1 and columns.stride(2) != 1:
+        columns = columns.contiguous()
+    y, x, _ = columns.stride()
+    ny, nx, nz = columns.shape
+    flat = columns.as_strided(((ny - 1) * y + (nx - 1) * x + nz,), (1,))
+    return DeviceVolume.sharing(like, gpu.taken(flat), (y, x))
+
+
+def _voxels(volume: Volume | DeviceVolume) -> Any:
+    """What `back` gave, in C order where it is numpy's."""
+    return volume if isinstance(volume, DeviceVolume) else np.array(volume.data, order="C")
+
+
+def _each(function: Callable[[Any], Any], values: Any, shape: tuple[int, int, int]) -> Any:
+    """A function of a tensor of three dimensions for each member of a batch, on its device.
+
+    PyTorch's streams and the kernels' own know nothing of each other: each waits for the other.
+    """
+    batch, device = values.shape[:-3], values.device
+    members = values.detach().to(torch.float32).reshape(-1, *values.shape[-3:])
+    if _is_there(values):
+        with gpu.on(device.index or 0):
+            torch.cuda.current_stream(device).synchronize()
+            results = [torch.as_tensor(function(member), device=device) for member in members]
+            gpu.finish()
+    else:
+        results = [torch.from_numpy(function(member)) for member in members]
     if len(results) == 1:
         return results[0].reshape(*batch, *shape)
-    return torch.stack(results).reshape(*batch, *shape) if results else torch.zeros(*batch, *shape)
+    whole = torch.stack(results) if results else torch.zeros(0, device=device)
+    return whole.reshape(*batch, *shape)
