@@ -245,7 +245,8 @@ class ProjectionGet(Params):
         default=False, description="say which pixels are saturated, starved or cut off as well"
     )
     positions: Targets | None = Field(
-        default=None, description="motor -> [mm, deg] there; others stand as they do"
+        default=None,
+        description="motor -> [mm, deg] there, beyond its travel too; others stand as they do",
     )
     tube: TubeSet | None = Field(default=None, description="as though set so")
     camera: CameraSet | None = Field(default=None, description="as though set so")

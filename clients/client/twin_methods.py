@@ -393,7 +393,7 @@ def projection(
         kind: line_integral (float32) or counts (uint16).
         binning: average so many pixels along each side, for a quick look.
         marks: also mark pixels that are saturated, starved or where the sample is cut off.
-        positions: motor -> [mm, deg] there; others stand as they do.
+        positions: motor -> [mm, deg] there, beyond its travel too; others stand as they do.
         tube: as though set so: kV, power_W, on.
         camera: as though set so: exposure_ms, mode, roi, averages.
 
