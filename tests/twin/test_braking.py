@@ -202,3 +202,46 @@ def test_a_stop_is_as_short_as_the_weakest_motor_allows(seed: int, hard: bool) -
         assert way.position(end) == way.target
         low, high = (f([t.target for t in drives[name].trajectories] + [0.0]) for f in (min, max))
         assert low - 1e-6 <= at.min() <= at.max() <= high + 1e-6
+
+
+@pytest.mark.parametrize("hair", [3e-7, 1e-5, 5e-5, 9e-5])
+def test_a_stop_begun_just_before_a_motor_has_sped_up_is_smooth(hair: float) -> None:
+    """The cell up to the end of the ramp is too short for two halves."""
+    way = motion.move(0.0, 0.0, 400.0, 50.0, 25.0, 0.0)
+    stop = braked_along({"mag_obj": Drive(50.0, 25.0, (way,))}, 2.0 - hair)["mag_obj"]
+    assert stop.end == pytest.approx(4.0, abs=1e-3)
+    for one, following in pairwise(stop.pieces):
+        dt = following.start - one.start
+        gained = one.velocity + one.acceleration * dt
+        assert gained == pytest.approx(following.velocity, abs=1e-6)
+
+
+@pytest.mark.parametrize("acceleration", [20.0, 50.0, 90.0])
+@pytest.mark.parametrize("most", [90.0, 120.0, 300.0])
+def test_a_stop_while_motors_speed_up_is_cut_no_finer_than_its_error_asks(
+    acceleration: float, most: float
+) -> None:
+    drives = {
+        "mag_obj": Drive(50.0, 50.0, (motion.move(0.0, 0.0, 4000.0, 400.0, acceleration, 0.0),)),
+        "mag_det": Drive(50.0, 50.0, (motion.move(0.0, 0.0, -3000.0, 30.0, 50.0, 0.0),)),
+    }
+    stop = braked_along(drives, 2.0, {"mag_obj": most, "mag_det": most})
+    assert 0.1 * PATH_ERROR < distance_to_path(drives, stop, 2.0) <= PATH_ERROR
+
+
+@pytest.mark.parametrize("share", [-1.0, 0.5, 2.0])
+def test_motors_of_one_virtual_axis_stop_in_step_whatever_their_shares(share: float) -> None:
+    """Both take the 5 s of the slower: from 10 mm/s by 2 mm/s2, each times its share."""
+    virtual = M.virtual_axes["ver_obj"]
+    shares = {"ver_tube": 1.0, "ver_det": share}
+    machine = M.model_copy(update={
+        "virtual_axes": {"ver_obj": virtual.model_copy(update={"moves": shares})}
+    })  # fmt: skip
+    drives = {
+        name: Drive(50.0, 50.0, (motion.jog(0.0, 10.0 * f, 10.0 * f, 60.0, pace, 0.0),))
+        for (name, f), pace in zip(shares.items(), (50.0, 2.0 * abs(share)), strict=True)
+    }
+    stop = braked_apart(machine, drives, 1.0)
+    assert [way.end for way in stop.values()] == [pytest.approx(6.0)] * 2
+    for name, f in shares.items():
+        assert stop[name].target == pytest.approx(f * (10.0 + 25.0))

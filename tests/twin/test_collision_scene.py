@@ -13,9 +13,11 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from swept import sweep
 
-from flexdt.twin.collision.collision_scene import Scene, build_scene
+from flexdt.twin.collision.collision_scene import PairStack, Scene, build_scene, scene_of
 from flexdt.twin.collision.convex_solids import Cylinder, box
 from flexdt.twin.collision.scene_search import clearance, touching
+from flexdt.twin.collision.stages import Body
+from flexdt.twin.collision.sweep import Limits
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NAMES, Offsets
 from flexdt.twin.machine.description import builtin_machine, builtin_profile, builtin_profiles
@@ -297,6 +299,7 @@ def test_a_rolled_panel_is_rolled_as_its_pixels_are() -> None:
 def test_pairs_are_neither_fixed_to_each_other_nor_allowed() -> None:
     s = scene(M.default_profile, box((10, 10, 10)))
     pairs = {frozenset(s.names(p)) for p in (*s.pairs, *s.distant)}
+    assert len(pairs) == len(s.pairs) + len(s.distant)
     assert frozenset(("sample", "sample_holder")) not in pairs
     assert frozenset(("sample_mount", "sample_holder")) not in pairs
     assert frozenset(("detector_tower", "detector_platform")) not in pairs
@@ -332,3 +335,61 @@ def test_the_triangles_of_a_box_are_its_surface_seen_from_outside(
     assert (outward > 0.0).all()
     assert outward.sum() / 3.0 == pytest.approx(x * y * z)
     assert np.abs(areas).sum() == pytest.approx(2.0 * (x * y + y * z + z * x))
+    edges = {(f[i], f[i - 1]) for f in solid.faces.tolist() for i in range(3)}
+    assert len(edges) == 36  # each once: closed, nothing twice
+    assert edges == {(end, start) for start, end in edges}
+
+
+def drawn_bodies(rng: np.random.Generator, axes: int) -> list[Body]:
+    """Boxes that slide along x, y and z with drawn shares of the motors, or not at all."""
+    return [
+        Body(str(i), box(rng.uniform(1, 30, 3), rng.uniform(-9, 9, 3)), rng.uniform(-40, 40, 3),
+             rng.normal(size=(axes, 3)) * (rng.random((axes, 3)) < 0.4), np.zeros(axes), str(i),
+             ("world", "object", "object", "detector")[i % 4])
+        for i in range(9)
+    ]  # fmt: skip
+
+
+def apart_along(a: Body, b: Body, reach: FloatArray) -> FloatArray:
+    """(3,) gaps along x, y and z that no position within reach closes: those of all its corners."""
+    corners = np.array(list(itertools.product(*reach)))
+    (low_a, high_a), (low_b, high_b) = (
+        [x.origin + corners @ x.slides + end for end in x.solid.bounds()] for x in (a, b)
+    )
+    return np.maximum((low_a - high_b).min(axis=0), (low_b - high_a).min(axis=0))
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_bounds_of_boxes_that_slide_are_what_their_corners_keep(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    bodies = drawn_bodies(rng, 3)
+    reach = np.sort(rng.uniform(-6, 6, (3, 2)), axis=1)
+    for size in (1, 5, 36):
+        pairs = list(itertools.combinations(range(9), 2))[-size:]
+        got = PairStack.of(3, bodies, pairs).clearances(reach[:, 0], reach[:, 1])
+        kept = np.array([apart_along(bodies[i], bodies[j], reach) for i, j in pairs])
+        assert_allclose(got, np.linalg.norm(np.maximum(kept, 0.0), axis=1), atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_pairs_of_one_stage_or_at_different_levels_are_set_aside_where_they_stay_apart(
+    seed: int,
+) -> None:
+    rng = np.random.default_rng(seed)
+    bodies, limits = drawn_bodies(rng, 2), Limits(0.1, 0.01, (0.1, 0.02))
+    reach = np.sort(rng.uniform(-6, 6, (2, 2)), axis=1)
+    made = scene_of(("p", "q"), bodies, (), reach=reach, home=np.zeros(2), limits=limits)
+    wanted = set()
+    for i, j in itertools.combinations(range(9), 2):
+        a, b = bodies[i], bodies[j]
+        gaps = apart_along(a, b, reach)
+        still = (a.slides == b.slides).all(axis=0)
+        built_in = a.stage == b.stage or "world" in (a.stage, b.stage) or (gaps[still] > 0.0).any()
+        if built_in and np.linalg.norm(np.maximum(gaps, 0.0)) > 0.11:
+            wanted.add((i, j))
+    assert set(made.distant) == wanted
+    assert sorted((*made.pairs, *made.distant)) == list(itertools.combinations(range(9), 2))
+
+
+def test_the_least_clearance_of_a_machine_is_right_to_a_tenth_or_two_percent() -> None:
+    assert [scene().limits.slack(mm) for mm in (1.0, 5.0, 50.0)] == [0.1, 0.1, 1.0]

@@ -19,9 +19,9 @@ from swept import sweep
 from flexdt.twin.collision.collision_scene import Scene, build_scene, scene_of
 from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid, box, hull
 from flexdt.twin.collision.guard import SceneGuard, _Overlap
-from flexdt.twin.collision.nearest import separation_of
+from flexdt.twin.collision.nearest import _farthest, separation_of
 from flexdt.twin.collision.paths import path_of
-from flexdt.twin.collision.relative import RelativeMotion
+from flexdt.twin.collision.relative import Moment, RelativeMotion, _Bound
 from flexdt.twin.collision.scene_search import (
     SweepResult,
     clearance,
@@ -652,3 +652,140 @@ def test_upright_boxes_are_as_far_apart_as_their_corners_say(seed: int) -> None:
         assert np.linalg.norm(normal) == pytest.approx(1.0)
         middle = separation_of(box(sizes[0]), box(sizes[1]))(turn @ off, turn, turn)[0]
         assert middle == pytest.approx(distance, abs=2e-5)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_two_turntables_on_each_other_meet_a_wall_where_trigonometry_says(seed: int) -> None:
+    """The farthest of a bar's corners, as high above the axis as sine and cosine of both turns."""
+    rng = np.random.default_rng(seed)
+    half, wide = rng.uniform(40, 90), rng.uniform(2, 20)
+    ways = {name: drawn_motion(rng, 60.0) for name in ("first", "second")}
+    end = max(way.end for way in ways.values())
+    times = np.linspace(0.0, end, 20_001)
+    turn = np.radians(sum(way.positions(times) for way in ways.values()))
+    high = np.abs(np.sin(turn)) * half + np.abs(np.cos(turn)) * wide
+    meets = high.max() - high[0] > 3.0 and seed % 2 == 0
+    wall = float(high.max() + MARGIN + (-1.0 if meets else 0.1))
+    none = np.zeros((2, 3))
+    bodies = [
+        Body("bar", box((2 * half, 2 * wide, 9)), np.zeros(3), none, np.radians([1.0, 1.0]), "bar",
+             "object", np.array([0.0, 0.0, 1.0])),
+        Body("wall", box((500, 9, 9), (0, wall + 4.5, 0)), np.zeros(3), none, np.zeros(2), "",
+             "detector"),
+    ]  # fmt: skip
+    limits = Limits(MARGIN, TOLERANCE, (0.1, 0.02))
+    scene = scene_of(tuple(ways), bodies, (), reach=np.tile([-1e6, 1e6], (2, 1)),
+                     home=np.zeros(2), limits=limits)  # fmt: skip
+    found = sweep(scene, ways, 0.0, end)
+    assert (found.contact is not None) == meets
+    if found.contact is not None:
+        first = times[np.argmax(wall - high <= MARGIN + TOLERANCE)]
+        last = times[np.argmax(wall - high <= MARGIN)]
+        assert first - 1e-3 <= found.contact.time <= last + 1e-3
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_bound_in_pieces_falls_first_where_it_has_the_level_and_had_more_before(
+    seed: int,
+) -> None:
+    rng = np.random.default_rng(seed)
+    for _ in range(20):
+        count = int(rng.integers(1, 14))
+        rate, growth = rng.normal(size=(2, count)) * (3.0, 6.0)[seed % 2] + seed % 3
+        lengths = rng.uniform(0.1, 2.0, count)
+        at = Moment(int(rng.integers(count)), 0.0)
+        at = Moment(at.segment, float(rng.uniform(0.0, lengths[at.segment])))
+
+        value, level = 5.0, float(rng.uniform(0.0, 4.9))
+        found = _Bound(rate, growth).first_fall(at, lengths, value, level)
+        height, since, seen = value, at.dt, []
+        for j in range(at.segment, count):
+            here = found is not None and found.segment == j
+            stop = found.dt if found is not None and here else lengths[j]
+            dt = np.linspace(since, stop, 500)
+            seen.append(height + rate[j] * (dt - since) + growth[j] * (dt**2 - since**2) / 2.0)
+            height, since = float(seen[-1][-1]), 0.0
+            if here:
+                assert height == pytest.approx(level, abs=1e-9)
+                break
+        assert np.concatenate(seen).min() >= level - 1e-9
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_end_that_is_nearest_along_a_direction_is_found(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    ways = {name: drawn_motion(rng, 40.0) for name in AXES}
+    end = max(way.end for way in ways.values())
+    path = path_of(AXES, {n: AxisPath.along(t) for n, t in ways.items()}, 0.0, end)
+    thing, wall = one_against(box((9, 8, 7)), [box((5, 5, 5), (70, 70, 0))]).bodies
+    moves = RelativeMotion(thing, wall, path)
+    begin = int(rng.integers(len(moves)))
+    at = Moment(begin, float(rng.uniform(0.0, moves.lengths[begin])))
+    look = moves.look(at, separation_of(thing.solid, wall.solid))
+    ends = (moves.times + moves.lengths).tolist()
+
+    def along(time: float) -> float:
+        where = np.array([ways["x"].position(time), ways["y"].position(time), 0.0])
+        return float(where @ look.normal)
+
+    found = moves.nearest_end(look)
+    assert moves.time(found) in [pytest.approx(t) for t in ends[begin:]]
+    assert along(moves.time(found)) <= min(along(t) for t in ends[begin:]) + 1e-7
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_farthest_point_along_a_direction_is_one_of_the_solid(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    round_one = Cylinder(tuple(rng.uniform(-9, 9, 3)), 5.0, 8.0)
+    for direction in (np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]), rng.normal(size=3)):
+        for solid in (random_solid(rng), round_one):
+            point = _farthest(solid, direction)
+            assert point @ direction >= (solid_points(solid) @ direction).max() - 1e-9
+            if isinstance(solid, Cylinder):
+                across, along = (point - solid.center)[:2], (point - solid.center)[2]
+                assert math.hypot(*across) <= solid.radius + 1e-9
+                assert abs(along) <= solid.height / 2 + 1e-9
+            else:
+                assert (solid_points(solid) == point).all(axis=1).any()
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_path_begun_before_or_during_its_motions_is_where_they_are(seed: int) -> None:
+    """Jogs that turn round within a piece, each begun at a time of its own."""
+    rng = np.random.default_rng(seed)
+    ways = {}
+    for name in AXES:
+        begin = float(rng.uniform(0.5, 4.0))
+        legs = [motion.at_rest(float(rng.uniform(-9, 9)), begin)]
+        for now in (begin + np.cumsum([0.0, *rng.uniform(0.3, 2.0, 3)])).tolist():
+            here = legs[-1].position(now), legs[-1].velocity(now)
+            wanted, lease, pace = rng.uniform(-30, 30), rng.uniform(0.5, 4), rng.uniform(5, 40)
+            legs.append(motion.jog(*here, float(wanted), float(lease), float(pace), now))
+        ways[name] = motion.joined(legs)
+    end = max(way.end for way in ways.values())
+    tables = {n: AxisPath.along(t) for n, t in ways.items()}
+    for start in (-1.0, float(rng.uniform(1.0, 3.0)), float(rng.uniform(3.0, 5.0))):
+        path = path_of(AXES, tables, start, end)
+        times = np.sort(rng.uniform(start, end, 200))
+        truth = np.array([[ways[n].position(t) for n in AXES] for t in times])
+        assert_allclose(path.vectors(times), truth, atol=1e-7)
+        later = path.v + np.diff(path.times)[:, None] * path.a
+        assert (path.v * later >= -1e-6).all()  # none turns round within a segment
+
+
+def test_a_solid_that_turns_about_a_direction_never_comes_nearer_along_it() -> None:
+    rng = np.random.default_rng(2)
+    for sense in (-1.0, 0.0, 1.0):
+        solid = hull(rng.normal(size=(8, 3)) * 20)
+        up = np.array([0.0, 0.0, 1.0])
+        body = Body("b", solid, np.zeros(3), np.zeros((1, 3)), np.ones(1), "b", "object", up)
+        assert body.turn_until(up, 0.5, sense) >= (1e3 if sense == 0.0 else math.pi)
+
+
+def test_a_motion_without_an_end_is_looked_at_ahead() -> None:
+    """A held jog of 2 mm/s from 100 mm away: the margin is reached after 99 mm."""
+    scene = one_against(box((20, 20, 20)), [box((20, 200, 200), (120, 0, 0))])
+    held = Trajectory((Piece(7.0, 0.0, 2.0, 0.0),), math.inf, math.inf)
+    contact = SceneGuard(scene)({"x": held}, 7.0)
+    assert contact is not None
+    assert contact.time == pytest.approx(7.0 + 99.0 / 2.0)
