@@ -36,7 +36,7 @@ def outer_hull(points: npt.ArrayLike, most: int = MAX_POINTS) -> Polytope:
         >>> ball = np.random.default_rng(1).normal(size=(3000, 3))
         >>> ball *= 50.0 / np.linalg.norm(ball, axis=1, keepdims=True)
         >>> around = outer_hull(ball)
-        >>> len(around.vertices) <= 256, around.bounds()[1].max() < 50.1
+        >>> len(around.vertices) <= 256, float(around.bounds()[1].max()) < 50.1
         (True, True)
     """
     exact = hull(points)
