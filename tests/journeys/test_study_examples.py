@@ -14,7 +14,6 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-import numpy as np
 import pytest
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -57,23 +56,6 @@ def test_detector_figures() -> None:
     """Noise power and modulation of images are theory's; the energy kept is as published."""
     import detector_figures as study
 
-    theory = study.Theory.of(0.1496, study.TIME_MS)
-    f, power = study.noise_power(0.1496, 12, 128)
-    assert np.mean(power / theory.noise_power(f)) == pytest.approx(1.0, abs=0.03)
-    at, modulation = study.edge(0.0748, 4)
-    wanted = study.Theory.of(0.0748, study.TIME_MS).mtf(at)
-    np.testing.assert_allclose(modulation[at < 0.25], wanted[at < 0.25], atol=0.01)
-    stopped, kept, published = study.thick_response()
-    np.testing.assert_allclose(stopped, published, rtol=0.004)
-    assert (kept <= published * 1.004).all()
-    ours, nist = study.thin_response("CsI")  # no L photons escape here
-    assert (ours / nist).min() > 1.0
-    assert (ours / nist).max() < 1.07
-
-
-def test_detector_figures() -> None:
-    """Noise power and modulation of images are theory's; the energy kept is as published."""
-    study = load("research/detector_figures")
     theory = study.Theory.of(0.1496, study.TIME_MS)
     f, power = study.noise_power(0.1496, 12, 128)
     assert np.mean(power / theory.noise_power(f)) == pytest.approx(1.0, abs=0.03)

@@ -58,7 +58,6 @@ from flexdt.twin.script.parse import parse_script
 from flexdt.twin.script.planning.planner import plan_script
 
 FLEXRAY = Path(__file__).parents[2] / "twin" / "data" / "machines" / "flexray.toml"
-FLEXRAY = Path(__file__).parents[2] / "twin" / "data" / "machines" / "flexray.toml"
 M = builtin_machine()
 P = builtin_profile(M.default_profile)
 MIDDLE = CameraSettings("HW2SW1High", Roi(572, 568, 1371, 967))  # 400 x 200 image pixels
@@ -397,48 +396,6 @@ def test_the_machine_file_states_the_traps(tmp_path: Path) -> None:
     assert made.traps
     assert not replace(made, physics="ideal").traps
     assert not way.traps
-
-
-def test_the_machine_file_gives_a_measured_response(tmp_path: Path) -> None:
-    """Behind aluminium, beside a sum over the spectrum with the curve written out."""
-    text = FLEXRAY.read_text()
-    curve = "response = [[20, 16], [33, 19], [34, 23], [100, 20], [300, 9]]"
-    own = parse_machine(text.replace("[detector]", f"[detector]\n{curve}", 1), "own.toml")
-    way = radiography(tmp_path, "poly")
-    made = Radiography.of(way.imaging, way.model, own, "poly")
-    assert made.record()["response_34_keV"] == 23.0
-    aluminium = Substance.parse("Al@2.70")
-    spectrum = tube_spectrum(90.0, made.tube)
-    energy, fluence = spectrum.energy_keV, spectrum.fluence
-    left = np.zeros_like(energy)
-    points = [(0, 0), (20, 16), (33, 19), (34, 23), (100, 20), (300, 9)]
-    for (e0, d0), (e1, d1) in itertools.pairwise(points):
-        part = (energy > e0) & (energy <= e1)
-        left[part] = d0 + (d1 - d0) * (energy[part] - e0) / (e1 - e0)
-    behind = fluence * np.exp(-20.0 * aluminium.attenuation())
-    chain = Chain(made.panel, made.tube, (aluminium,), (40.0,))
-    signal, noise = weights_of(chain, 90.0)
-    through = np.exp(-20.0 * aluminium.attenuation())
-    assert signal @ through / signal.sum() == pytest.approx(behind @ left / (fluence @ left))
-    assert (noise >= signal**2 / np.maximum(fluence, 1e-300)).all()  # no less than Poisson's
-    plain = weights_of(Chain(Panel(), made.tube, (aluminium,), (40.0,)), 90.0)[0]
-    assert abs(plain @ through / plain.sum() / (signal @ through / signal.sum()) - 1.0) > 0.02
-
-
-@pytest.mark.parametrize(
-    ("curve", "said"),
-    [
-        ("[[20, 21], [300, 9]]", "at most the photon's energy, 20 keV"),
-        ("[[20, 1], [20, 9]]", "at a higher energy than the point before, 20 keV"),
-        ("[[20, 1], [30, 9]]", "measured up to the tube's max_kV"),
-        ("[[20, -1], [300, 9]]", "greater than or equal to 0"),
-        ("[[20]]", "response.0"),
-    ],
-)
-def test_responses_that_no_detector_has(curve: str, said: str) -> None:
-    text = FLEXRAY.read_text()
-    with pytest.raises(MachineFileError, match=re.escape(said)):
-        parse_machine(text.replace("[detector]", f"[detector]\nresponse = {curve}", 1), "own.toml")
 
 
 def test_the_machine_file_gives_a_measured_response(tmp_path: Path) -> None:

@@ -309,29 +309,6 @@ def test_neighbours_share_the_noise_of_light_that_reaches_both(blur_mm: float) -
         assert both == pytest.approx(share * shares[0], abs=0.012)
 
 
-
-@pytest.mark.parametrize("blur_mm", [0.03, 0.06, 0.15])
-def test_neighbours_share_the_noise_of_light_that_reaches_both(blur_mm: float) -> None:
-    """Covariance of pixels, beside the light of two points integrated over two squares."""
-    panel = Panel(gain_sigma=0.0, offset_sigma_counts=0.0, dead_fraction=0.0, blur_mm=blur_mm,
-                  read_noise_e=(0.0, 0.0))  # fmt: skip
-    cam = CameraSettings("HW1SW1High", Roi(0, 0, 599, 599))
-    bright = replace(LISTING_1, exposure_ms=400.0)
-    expected = expected_signal(Chain(panel), np.zeros((0, 600, 600), np.float32), VIEW, bright)
-    image = read_out(panel, expected, cam, bright, frame_rng(3, 0)).astype(float)
-    image = (image - image.mean())[10:-10, 10:-10] * panel.electrons_per_count(cam)
-    wide = blur_mm / panel.pitch_mm * np.sqrt(2.0)
-    x = (np.arange(2000) + 0.5) / 1000.0 - 1.0  # from one place in a pixel to one in the other
-    shares = [
-        np.sum((1 - abs(x)) * np.exp(-((x - n) ** 2) / (2 * wide**2))) / (1000 * wide * np.sqrt(2 * np.pi))
-        for n in (0, 1, 2)
-    ]
-    variance = float(expected.variance_e.mean())
-    for n, share in enumerate(shares):
-        both = (image[:, : image.shape[1] - n] * image[:, n:]).mean() / variance
-        assert both == pytest.approx(share * shares[0], abs=0.012)
-
-
 def test_edge_gives_the_modulation_of_its_blur():
     rows, cols, sigma = 60, 80, 0.9
     y, x = np.mgrid[:rows, :cols]
