@@ -44,7 +44,8 @@ EQUIVALENT = Path(__file__).with_name("mutants_equivalent.toml")
 UNDER = ("protocol", "twin/geometry", "twin/machine", "twin/motion", "twin/script", "twin/dataset",
          "twin/collision")  # fmt: skip
 TESTS = (
-    "protocol/test_*.py", "dataset/test_*.py", "twin/script/test_*.py", "twin/test_[!ceps]*.py",
+    "protocol/test_*.py", "cli/test_cli_machine_new.py", "dataset/test_*.py",
+    "twin/script/test_*.py", "twin/test_[!ceps]*.py",
     "twin/test_collision_*.py", "twin/test_scanner_*.py", "twin/test_script_*.py",
     "twin/exchange/test_exchange_r*.py", "twin/calibration/test_calibration_model.py",
     "twin/projection/test_projection_hard.py",

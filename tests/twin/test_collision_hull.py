@@ -10,6 +10,7 @@ import pytest
 import trimesh
 from scipy.optimize import linprog, nnls
 
+from flexdt.twin.collision import outer_hull as hulls
 from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.collision.outer_hull import outer_hull
 from flexdt.twin.collision.scene_search import clearance
@@ -83,6 +84,22 @@ def test_a_body_around_points_leaves_none_outside_and_is_tight(seed: int, many: 
     out = (body.vertices @ directions.T).max(axis=0) - (points @ directions.T).max(axis=0)
     assert out.min() > -1e-9
     assert out.max() < 1e-6 + (many > MAX_POINTS) * 0.03 * np.ptp(points, axis=0).max()
+
+
+def test_planes_that_cut_different_corners_are_taken_together(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each plane adds about two corners, so that 256 take 120 rounds one by one, 15 by eights."""
+    rounds = []
+
+    def counted(planes: list[Points], inside: Points) -> Points:
+        rounds.append(len(planes))
+        return corners(planes, inside)
+
+    corners = hulls._corners
+    monkeypatch.setattr(hulls, "_corners", counted)
+    outer_hull(drawn(np.random.default_rng(1), 1500))
+    assert len(rounds) < 40
 
 
 def test_flat_faces_of_a_turned_part_stay_flat() -> None:

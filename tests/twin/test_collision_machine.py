@@ -258,10 +258,15 @@ def test_what_has_a_role_follows_every_offset() -> None:
 def test_a_motor_of_the_turntables_stage_leaves_the_panel_as_it_is() -> None:
     text = (
         'base = "micro_ct"\nname = "both"\n[geometry]\ndetector_z = { CX = 1.0 }\n'
-        "mount_x = { CX = 1.0, CY = 1.0 }\n[fixed]\nmount_x = -300.0\n[axes.CY]\nlower = 295.0\n"
+        "mount_x = { CX = 1.0, CY = 1.0 }\n[fixed]\nmount_x = -300.0\n[axes.CX]\nlower = -2.0\n"
+        "upper = 8.0\n[axes.CY]\nlower = 295.0\n"
         'upper = 305.0\nhome = 300.0\n[[components]]\nname = "panel"\naxis = "CX"\n'
     )
     machine = parse_machine(text)
     panel = next(b for b in stage_bodies(machine, profile_of(machine)) if b.name == "panel")
     lower, upper = panel.solid.bounds()
     np.testing.assert_allclose([lower[0], upper[0]], [-70.0, 70.0])
+    # The sample: 5 mm from its middle, which goes from -2 + 295 - 300 to 8 + 305 - 300 along x.
+    [sample] = sample_bodies(machine, profile_of(machine), (box((10.0, 20.0, 30.0)),))
+    lower, upper = sample.solid.bounds()
+    np.testing.assert_allclose([lower[:2], upper[:2]], [[-12.0, 285.0], [18.0, 315.0]])

@@ -784,6 +784,17 @@ def test_a_solid_that_turns_about_a_direction_never_comes_nearer_along_it() -> N
         assert body.turn_until(up, 0.5, sense) >= (1e3 if sense == 0.0 else math.pi)
 
 
+@pytest.mark.parametrize("seed", range(12))
+def test_the_clearance_of_a_pose_is_that_of_the_turned_corners(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    moving, wall = box(rng.uniform(5, 30, 3)), box(rng.uniform(5, 30, 3), (45.0, 0.0, 0.0))
+    x, y, turn = rng.uniform(-20, 5), rng.uniform(-9, 9), rng.uniform(10, 80)
+    c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
+    points = moving.vertices @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + (x, y, 0)
+    near = clearance(one_against(moving, [wall]), {"x": x, "y": y, "turn": turn})
+    assert near.mm == pytest.approx(true_distance(points, wall.vertices), abs=1e-4)
+
+
 def test_a_motion_without_an_end_is_looked_at_ahead() -> None:
     """A held jog of 2 mm/s from 100 mm away: the margin is reached after 99 mm."""
     scene = one_against(box((20, 20, 20)), [box((20, 200, 200), (120, 0, 0))])

@@ -117,6 +117,22 @@ def test_a_plane_cuts_a_convex_solid_into_two_that_fill_it(seed: int) -> None:
             points = half.reshape(-1, 3)
             volume += ConvexHull(points).volume
         assert volume == pytest.approx(float(whole.volume), rel=1e-9)
+        beside = [_clip(np.asarray(whole.triangles), axis, low - 1.0, side) for side in (-1.0, 1.0)]
+        assert [len(half) for half in beside] == [0, len(whole.triangles)]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_three_planes_cut_a_convex_solid_into_eight_that_fill_it(seed: int) -> None:
+    """Where the planes meet inside it, only the caps over the cuts hold the eighths' corner."""
+    rng = np.random.default_rng(seed)
+    corners = rng.normal(size=(60, 3))
+    corners *= 20.0 / np.linalg.norm(corners, axis=1, keepdims=True)
+    whole = trimesh.convex.convex_hull(corners)
+    parts = [np.asarray(whole.triangles)]
+    for axis, at in enumerate(rng.uniform(-9.0, 9.0, 3).tolist()):
+        parts = [_clip(part, axis, at, side) for part in parts for side in (-1.0, 1.0)]
+    volume = sum(ConvexHull(part.reshape(-1, 3)).volume for part in parts)
+    assert volume == pytest.approx(float(whole.volume), rel=1e-9)
 
 
 def test_a_sample_is_turned_first_and_then_shifted() -> None:
@@ -359,6 +375,18 @@ def test_a_scan_of_1440_steps_is_swept_step_by_step() -> None:
     assert panel[0].last_free["rot_obj"] == pytest.approx(angle, abs=0.04)
 
 
+def test_a_pair_that_comes_free_for_a_moment_counts_anew() -> None:
+    """At cruise through the panel and out, then into it again while braking: two contacts."""
+    plan = plan_script(parse_script(script("mag_det 715", "rot_obj 275")), M, P)
+    found = collision_check([BAR])(plan, M, P, None)
+    reach = math.hypot(150, 10)
+    first = math.degrees(math.asin((715 + P.c_det - 600 - P.c_obj - 1) / reach))
+    first -= math.degrees(math.atan2(10, 150))
+    panel = [c for c in found.collisions if set(c.pair) == {"detector", "sample"}]
+    turns = [c.last_free["rot_obj"] for c in panel]
+    assert turns == [pytest.approx(first, abs=0.04), pytest.approx(first + 180.0, abs=0.04)]
+
+
 # Planning ---------------------------------------------------------------------------------------
 
 
@@ -412,6 +440,13 @@ def test_no_way_where_there_is_none() -> None:
                      {"mag_obj": 900.0, "mag_det": 300.0}) is None  # fmt: skip
     assert free_moves(scene, M, {}, {"mag_det": 570.0}) is None
     assert free_moves(scene, M, {}, {"mag_obj": 600.0}) == []
+
+
+def test_an_excursion_is_shortened_by_halves_where_nothing_is_in_the_way() -> None:
+    search = _Planner(build_scene(M, P), M, {"mag_det": 700.0}, {})
+    way = [("mag_det", 900.0), ("tra_det", 8.0), ("mag_det", 700.0)]
+    shorter = [("mag_det", 712.5), ("tra_det", 8.0), ("mag_det", 700.0)]
+    assert search.shortened(way, {"tra_det": 8.0}) == shorter
 
 
 @pytest.mark.parametrize(

@@ -73,6 +73,9 @@ def test_a_number_of_views_is_a_full_turn() -> None:
     for none in (0, [], np.zeros((2, 2)), math.nan):
         with pytest.raises(GeometryError, match="allowed: a number of views from 1"):
             ConeVec.circular(angles=none, **SCAN)
+    with pytest.raises(GeometryError) as error:
+        ConeVec.circular(angles="all" * 500, **SCAN)
+    assert len(error.value.data["asked"]) == 100  # an answer is not as long as any question
 
 
 def pixel_of(  # type: ignore[no-untyped-def]

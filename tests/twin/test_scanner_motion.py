@@ -18,7 +18,7 @@ from flexdt.twin.machine.description import (
     profile_of,
 )
 from flexdt.twin.motion.braking import braked_apart
-from flexdt.twin.motion.drives import home, plan_move
+from flexdt.twin.motion.drives import home, plan_jog, plan_move
 from flexdt.twin.motion.profiles import at_rest
 from flexdt.twin.scanner.scanner import ScannerTwin
 
@@ -281,6 +281,12 @@ def test_a_jog_faster_than_the_motor_is_refused_either_way(sign: float) -> None:
     s.jog("mag_obj", sign * fastest, 0.1, 0.0)
     with pytest.raises(LimitError, match=f"mag_obj allows {fastest:g}"):
         s.jog("mag_obj", sign * fastest * 1.001, 0.1, 1.0)
+
+
+@pytest.mark.parametrize("lease", [0.0, -1.0, math.inf, math.nan])
+def test_a_jog_without_a_finite_time_is_refused(lease: float) -> None:
+    with pytest.raises(LimitError, match="must be positive and finite"):
+        plan_jog(M, home(M, 0.0), "mag_obj", 1.0, lease, 0.0)
 
 
 def test_coupled_jog_halts_both_at_the_first_limit() -> None:

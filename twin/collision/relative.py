@@ -254,10 +254,9 @@ class RelativeMotion:
 
     def nearest_end(self, look: Look) -> Moment:
         """The segment end after a look that lies farthest towards b along its normal, unturned."""
-        i, dt = look.at.segment, look.at.dt
+        i = look.at.segment
         slide, lengths = self._slide(look.normal), self.lengths[i:]
         change = lengths * (slide.rate[i:] + 0.5 * slide.growth[i:] * lengths)
-        change[0] -= dt * (slide.rate[i] + 0.5 * slide.growth[i] * dt)
         j = i + int(np.argmin(np.cumsum(change)))
         return Moment(j, float(self.lengths[j]))
 
