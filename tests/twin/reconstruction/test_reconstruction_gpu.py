@@ -165,7 +165,12 @@ assert not gpu.availability().present and "lost" in gpu.availability().reason
 
 
 @pytest.mark.parametrize(
-    "program", [SIMULATED, TWO_DEVICES, ITERATED], ids=["fdk", "two", "iterative"]
+    "program",
+    [
+        pytest.param(SIMULATED, id="fdk", marks=pytest.mark.slow),
+        pytest.param(TWO_DEVICES, id="two"),
+        pytest.param(ITERATED, id="iterative", marks=pytest.mark.slow),
+    ],
 )
 def test_what_runs_in_the_simulator_gives_the_processors_numbers(program: str) -> None:
     run_simulated(program)
