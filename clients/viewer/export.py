@@ -60,23 +60,6 @@ def replay_file(
     dark: bool,
 ) -> bytes:
     """A plan, or a scan that was made, as a file that plays it."""
-    return _file(_replay(machine, profile, state, look, planned, looks), form, dark)
-
-
-def _file(serializer: Any, form: Form, dark: bool) -> bytes:
-    if form == "html":
-        return str(serializer.as_html(dark_mode=dark)).encode()
-    return bytes(serializer.serialize())
-
-
-def _replay(
-    machine: Machine,
-    profile: Profile,
-    state: State,
-    look: SampleLook,
-    planned: Scrubbed,
-    looks: Mapping[str, bytes] | None,
-) -> Any:
     scenes = Scenes()
     server = scenes.server
     try:
@@ -89,9 +72,15 @@ def _replay(
             moved = at_positions(state, planned.positions(float(time_s)))
             scene.update(moved, world_of(machine, profile, moved))
             serializer.insert_sleep(REPLAY_S / FRAMES)
-        return serializer
     finally:
         scenes.stop()
+    return _file(serializer, form, dark)
+
+
+def _file(serializer: Any, form: Form, dark: bool) -> bytes:
+    if form == "html":
+        return str(serializer.as_html(dark_mode=dark)).encode()
+    return bytes(serializer.serialize())
 
 
 def at_positions(state: State, positions: dict[str, float]) -> State:

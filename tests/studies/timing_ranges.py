@@ -31,7 +31,7 @@ from typing import Any
 
 from flexdt.twin.machine.description import Machine, Timing, builtin_machine
 from flexdt.twin.script.executed_log import Executed, read_log
-from flexdt.twin.script.planning.log_fit import LogFit, fit_machine
+from flexdt.twin.script.planning.log_fit import LogComparison, fit_machine
 
 FAMILIES = ("lognormal", "bimodal", "drifting")
 DAILY = "daily"
@@ -203,7 +203,7 @@ def lines(log: bytes) -> tuple[Executed, ...]:
     return found
 
 
-def next_scan(rig: Rig, logs: int) -> tuple[LogFit, int]:
+def next_scan(rig: Rig, logs: int) -> tuple[LogComparison, int]:
     """The scan after `logs` others, beside its prediction; and how many limits are fitted wrong."""
     read = [lines(Scan(rig).run()) for _ in range(logs)]
     machine = fit_machine(read, base(), "simulated").machine
@@ -217,7 +217,7 @@ def next_scan(rig: Rig, logs: int) -> tuple[LogFit, int]:
         for name, axis in machine.axes.items()
     }
     machine = machine.model_copy(update={"axes": stands})
-    return LogFit.of(lines(Scan(rig).run()), machine), wrong
+    return LogComparison.of(lines(Scan(rig).run()), machine), wrong
 
 
 def share(parts: list[list[bool]]) -> dict[str, float]:

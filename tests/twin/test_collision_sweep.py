@@ -20,7 +20,7 @@ from flexdt.twin.collision.collision_scene import Scene, build_scene, scene_of
 from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid, box, hull
 from flexdt.twin.collision.guard import SceneGuard, _Overlap
 from flexdt.twin.collision.nearest import _farthest, separation_of
-from flexdt.twin.collision.paths import path_of
+from flexdt.twin.collision.paths import Path, path_of
 from flexdt.twin.collision.relative import Moment, RelativeMotion, _Bound
 from flexdt.twin.collision.scene_search import (
     SweepResult,
@@ -602,12 +602,18 @@ def test_every_distance_that_is_evaluated_counts_as_a_look(seed: int) -> None:
     assert lowest - 1e-4 <= least <= lowest + 0.1
 
 
+def drawn_path(rng: np.random.Generator) -> tuple[dict[str, Trajectory], Path]:
+    """A motion of each axis, and their path until the last has ended."""
+    ways = {name: drawn_motion(rng, 40.0) for name in AXES}
+    end = max(way.end for way in ways.values())
+    return ways, path_of(AXES, {n: AxisPath.along(t) for n, t in ways.items()}, 0.0, end)
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_a_path_cut_anywhere_is_the_same_motion_and_turns_round_where_it_shows(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    ways = {name: drawn_motion(rng, 40.0) for name in AXES}
-    end = max(t.end for t in ways.values())
-    path = path_of(AXES, {n: AxisPath.along(t) for n, t in ways.items()}, 0.0, end)
+    ways, path = drawn_path(rng)
+    end = max(way.end for way in ways.values())
     times = np.sort(rng.uniform(0.0, end, 300))
     truth = np.array([[ways[n].position(t) for n in AXES] for t in times])
     cuts = np.concatenate([times[::60], path.times[1:3]])
@@ -716,9 +722,7 @@ def test_a_bound_in_pieces_falls_first_where_it_has_the_level_and_had_more_befor
 @pytest.mark.parametrize("seed", range(12))
 def test_the_end_that_is_nearest_along_a_direction_is_found(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    ways = {name: drawn_motion(rng, 40.0) for name in AXES}
-    end = max(way.end for way in ways.values())
-    path = path_of(AXES, {n: AxisPath.along(t) for n, t in ways.items()}, 0.0, end)
+    ways, path = drawn_path(rng)
     thing, wall = one_against(box((9, 8, 7)), [box((5, 5, 5), (70, 70, 0))]).bodies
     moves = RelativeMotion(thing, wall, path)
     begin = int(rng.integers(len(moves)))

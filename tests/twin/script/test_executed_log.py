@@ -38,7 +38,7 @@ from flexdt.twin.script.executed_log import (
     motor_reply,
     read_log,
 )
-from flexdt.twin.script.planning.log_fit import Fit, LogFit, first_difference, fit_machine
+from flexdt.twin.script.planning.log_fit import Fit, LogComparison, first_difference, fit_machine
 from flexdt.twin.script.planning.plan import step_range, total_range
 
 DATA = Path(__file__).parents[2] / "data" / "logs"
@@ -507,6 +507,6 @@ def test_a_log_of_another_machine_is_said_with_its_axes(
 def test_predictions_do_not_see_the_log(log: tuple[Executed, ...], fitted: Fit) -> None:
     """Times of the log changed: what is predicted on a given machine stays as it is."""
     slow = tuple(Executed(x.command, 2.0 * x.own_s, x.sent_s, x.reply, x.motor) for x in log)
-    before, after = (LogFit.of(x, fitted.machine) for x in (log, slow))
+    before, after = (LogComparison.of(x, fitted.machine) for x in (log, slow))
     assert [r.predicted_s for r in before.rows] == [r.predicted_s for r in after.rows]
     assert after.total_real_s == pytest.approx(2.0 * before.total_real_s)

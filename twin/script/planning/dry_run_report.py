@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterable, Sequence
 
 from flexdt.twin.script.planning.dry_run import HOME_ASSUMED, CheckReport, Optics, Trace
-from flexdt.twin.script.planning.log_fit import LogFit
+from flexdt.twin.script.planning.log_fit import LogComparison
 from flexdt.twin.script.planning.plan import Range, Step, step_range, total_range
 from flexdt.twin.script.problems import Problem
 
@@ -64,7 +64,7 @@ def _page(title: str, mark: str = "") -> list[str]:
     ]
 
 
-def against_html(found: LogFit, name: str = "script") -> str:
+def against_html(found: LogComparison, name: str = "script") -> str:
     """Predicted beside executed as one self-contained HTML page.
 
     Args:
@@ -81,7 +81,7 @@ def against_html(found: LogFit, name: str = "script") -> str:
     return "\n".join([*_page(f"{name}: predicted and executed"), *parts, "</body></html>"])
 
 
-def against_summary(found: LogFit) -> Facts:
+def against_summary(found: LogComparison) -> Facts:
     """The figures of a comparison as (label, value)."""
     ranges = [row.inside for row in found.rows if row.inside is not None]
     return [

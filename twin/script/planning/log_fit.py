@@ -63,7 +63,7 @@ class Fit:
     samples: Mapping[str, tuple[float, ...]]
     axes: Mapping[str, tuple[MotorReply, ...]]
     frame_period_s: tuple[float, ...]
-    lines: LogFit
+    lines: LogComparison
 
     @property
     def cross_validated_s(self) -> float:
@@ -134,7 +134,7 @@ class LogRow:
 
 
 @dataclass(frozen=True)
-class LogFit:
+class LogComparison:
     """An executed script beside its prediction.
 
     Attributes:
@@ -150,7 +150,7 @@ class LogFit:
     HEADER: ClassVar = ("line", "real [s]", "predicted [s]", "90 %", "error [s]", "what")
 
     @classmethod
-    def of(cls, log: Log, machine: Machine) -> LogFit:
+    def of(cls, log: Log, machine: Machine) -> LogComparison:
         """Predict each line of `log` on `machine`."""
         return cls(machine, tuple(against_log(log, machine)), unlike(log, machine))
 
@@ -258,7 +258,7 @@ def fit_machine(logs: Sequence[Log], base: Machine, source: str) -> Fit:
         if isinstance(x.command, c.TakeSequence)
     )
     checked = Machine.model_validate(machine.model_dump(by_alias=True))
-    return Fit(checked, samples, replies, periods, LogFit(checked, rows))
+    return Fit(checked, samples, replies, periods, LogComparison(checked, rows))
 
 
 def against_log(log: Log, machine: Machine) -> list[LogRow]:

@@ -323,7 +323,8 @@ class ImageCollector:
         for name, what, value in defaults:
             if name not in self.camera.said:
                 self._default(name, what, value)
-        if not {"averages"} & (self.camera.said | self._complained) and self.hint is None:
+        known = self.hint is not None or "averages" in self.camera.said
+        if not known and "averages" not in self._complained:
             self._complained.add("averages")
             self.note(
                 "warning", "averages_unsaid", "the number of averages is not set; 1 is assumed"

@@ -98,7 +98,7 @@ def compare(script: Path, log: Path, machine: str | None, html: Path | None, jso
     from flexdt.twin.script import parse_script
     from flexdt.twin.script.lexer import is_log
     from flexdt.twin.script.planning.dry_run_report import against_html, against_summary
-    from flexdt.twin.script.planning.log_fit import LogFit, first_difference
+    from flexdt.twin.script.planning.log_fit import LogComparison, first_difference
 
     lines = read_log_file(log)
     data = script.read_bytes()
@@ -106,7 +106,7 @@ def compare(script: Path, log: Path, machine: str | None, html: Path | None, jso
         different = first_difference(parse_script(data).commands, lines)
         if different is not None:
             raise CommandError(f"{script}: {different}; {log} is not a log of it", INVALID)
-    found = LogFit.of(lines, machines.machine(machine))
+    found = LogComparison.of(lines, machines.machine(machine))
     tell(found.problems, str(log))
     if html is not None:
         html.write_text(against_html(found, script.name), encoding="utf-8")
