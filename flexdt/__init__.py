@@ -9,6 +9,7 @@ checkers; a test compares the three and asks each name for a docstring with an e
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
@@ -36,6 +37,11 @@ if TYPE_CHECKING:
     from flexdt.twin.reconstruction.tv import tv
 
     __version__: str
+
+if not os.path.isdir(os.path.join(__path__[0], "twin")):
+    # In a clone the other parts lie beside this folder, and Python that is started there finds it
+    # before any flexdt that is installed.
+    __path__.append(os.path.dirname(__path__[0]))
 
 _HOMES: Final = {
     "AsyncTwinClient": "flexdt.clients",

@@ -109,6 +109,15 @@ def outside(installed: Path, tmp_path: Path, *words: str) -> subprocess.Complete
     )  # fmt: skip
 
 
+def environment_with(folder: Path, *more: Path) -> Path:
+    """A new environment with the dependencies of this one, without flexdt; its Python."""
+    venv.create(folder, with_pip=False)
+    (site,) = folder.glob("lib/python*/site-packages")
+    dependencies = [p for p in sys.path if p.endswith("site-packages")]
+    (site / "dependencies.pth").write_text("\n".join([*map(str, more), *dependencies]) + "\n")
+    return folder / "bin" / "python"
+
+
 @pytest.mark.slow
 def test_the_wheel_holds_only_flexdt(wheel: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
@@ -116,7 +125,7 @@ def test_the_wheel_holds_only_flexdt(wheel: Path) -> None:
         "flexdt",
         next(n.split("/")[0] for n in names if n.endswith(".dist-info/METADATA")),
     }
-    assert not [n for n in names if "__pycache__" in n or n.endswith((".nbi", ".nbc"))]
+    assert not [n for n in names if "__pycache__" in n or n.endswith((".nbi", ".nbc", ".ts"))]
 
 
 @pytest.mark.slow
@@ -148,6 +157,39 @@ def test_the_installed_command_answers(installed: Path, tmp_path: Path) -> None:
     done = outside(installed, tmp_path, str(installed / "bin" / "flexdt"), "--help")
     assert done.returncode == 0, done.stderr
     assert "Usage: flexdt" in done.stdout
+
+
+@pytest.mark.slow
+def test_a_folder_of_its_name_does_not_stand_in_an_installed_flexdts_way(
+    installed: Path, tmp_path: Path
+) -> None:
+    """Who installs without `-e` goes on in the clone, whose folder `flexdt/` Python finds first."""
+    python = environment_with(tmp_path / "venv", installed)
+    (tmp_path / "flexdt").mkdir()
+    (tmp_path / "flexdt" / "__init__.py").write_text("raise SystemExit('the wrong one')\n")
+    program = tmp_path / "programs" / "program.py"
+    program.parent.mkdir()
+    program.write_text(
+        "import flexdt as fx\n"
+        "with fx.LocalTwin() as twin:\n"
+        "    print(len(twin.state().axes), fx.__file__)\n"
+    )
+    done = subprocess.run(
+        [python, program], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["9", str(installed / "flexdt" / "__init__.py")]
+
+
+def test_a_clone_is_the_package_where_python_starts_in_it(tmp_path: Path) -> None:
+    python = environment_with(tmp_path / "venv")
+    words = [
+        python,
+        "-c",
+        "import flexdt as fx; print(fx.ConeVec.__name__, fx.TwinClient.__name__)",
+    ]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("ConeVec TwinClient\n", "")
 
 
 @pytest.mark.slow
@@ -211,12 +253,8 @@ def test_links_for_type_checkers_follow_new_and_removed_modules(tmp_path: Path) 
 @pytest.mark.slow
 def test_a_users_type_checker_sees_the_types(tmp_path: Path) -> None:
     """What `make install` does for type checkers, in an environment of its own."""
-    venv.create(tmp_path / "venv", with_pip=False)
-    python = tmp_path / "venv" / "bin" / "python"
-    where = "import sysconfig; print(sysconfig.get_path('purelib'))"
-    site = Path(subprocess.check_output([python, "-c", where], text=True).strip())
-    dependencies = [p for p in sys.path if p.endswith("site-packages")]
-    (site / "dependencies.pth").write_text("\n".join(dependencies) + "\n")
+    python = environment_with(tmp_path / "venv")
+    (site,) = (tmp_path / "venv").glob("lib/python*/site-packages")
     subprocess.run(
         [sys.executable, str(ROOT / ".ci" / "link_types.py"), "--site-packages", str(site)],
         check=True,

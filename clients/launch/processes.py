@@ -73,6 +73,7 @@ class Servers:
         self._process = subprocess.Popen(
             [
                 sys.executable,
+                "-P",
                 "-m",
                 "flexdt.server.runtime.child",
                 "flexdt.clients.launch.up",

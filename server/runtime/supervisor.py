@@ -181,6 +181,7 @@ class Supervisor:
         try:
             process = await asyncio.create_subprocess_exec(
                 sys.executable,
+                "-P",  # the installed package, not what the current folder has of that name
                 "-m",
                 "flexdt.server.runtime.child",
                 *service.command(dict(self.addresses)),

@@ -40,8 +40,8 @@ class Worker:
         environment = {k: v for k, v in os.environ.items() if k != "FLEXDT_TOKEN"}
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "flexdt.server.runtime.worker", str(theirs.fileno()),
-                 str(memory_bytes)],
+                [sys.executable, "-P", "-m", "flexdt.server.runtime.worker",
+                 str(theirs.fileno()), str(memory_bytes)],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
