@@ -66,8 +66,9 @@ class Scored:
         return self.offered and self.worst > WRONG_SIGMAS and not self.conditional
 
 
-def calibrated(scan: Faulty) -> Calibration:
-    """The calibration of a drawn scan from its spots, told only what the operator believes."""
+def calibrated(scan: Faulty, per_frame: tuple[str, ...] = ()) -> Calibration:
+    """The calibration of a drawn scan from its spots, told only what the operator believes; and
+    what may differ from frame to frame."""
     looks = []
     for frame in scan.spots:
         if frame is None:
@@ -79,8 +80,9 @@ def calibrated(scan: Faulty) -> Calibration:
     b = scan.believed
     poses = Poses.upright([0, 0, 0], [0, b.sod, 0], [0, b.sdd, 0], b.pixel, np.radians(b.angles))
     request = Request(
-        free=b.free, start=Offsets.from_edge(b.held), priors=b.priors, second_look=False
-    )
+        free=b.free, start=Offsets.from_edge(b.held), priors=b.priors, second_look=False,
+        per_frame=per_frame,
+    )  # fmt: skip
     return calibrate([Scan(SpotFrames(looks), poses)], BeadModel(b.beads, b.radii), request)
 
 
@@ -148,6 +150,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "offered": len(offered), "conditional": sum(s.conditional for s in offered),
         "wrong": len(wrong),
         "largest_sigmas": max((s.worst for s in offered if not s.conditional), default=math.nan),
+        "with_a_condition": max((s.worst for s in offered if s.conditional), default=math.nan),
     }  # fmt: skip
     if args.json:
         print(json.dumps({**summary, "each": [asdict(s) for s in all_of_them]}))

@@ -141,7 +141,7 @@ def summary(kind: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "kind": kind,
         "scans": len(rows),
         "refused": len(rows) - len(good),
-        "before_px": float(np.median([r["before_px"] for r in good])),
+        "before_px": float(np.nanmedian([r["before_px"] for r in good])),
         "after_px": float(np.max([r["after_px"] for r in good])),
         "error_um": float(np.max([r["error_um"] for r in good])),
         "pull": float(np.sqrt(np.mean(pulls**2))),

@@ -50,10 +50,8 @@ class BeadModel:
     def __post_init__(self) -> None:
         beads = np.array(self.beads, dtype=np.float64, ndmin=2, order="C")
         if beads.shape[1:] != (3,) or len(beads) == 0 or not np.isfinite(beads).all():
-            raise TwinError(
-                f"beads have shape {np.shape(self.beads)}; allowed: finite (k, 3) with k >= 1",
-                {"asked": list(np.shape(self.beads)), "allowed": ["k >= 1", 3]},
-            )
+            shape = np.shape(self.beads)
+            raise TwinError.of_shape("beads", shape, ("k", 3), ", finite, with k >= 1")
         radius = np.broadcast_to(
             np.asarray(self.bead_radius_mm, dtype=np.float64), (len(beads),)
         ).copy()

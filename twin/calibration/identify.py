@@ -10,7 +10,7 @@ equally well with another angle, the result is reported as ambiguous.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -35,6 +35,13 @@ LOOSE_PX = 0.6
 """Root mean square distance of spots from their beads above which panel and axis are loosened."""
 LOOSE = 15.0
 """So many times as wide are their priors then."""
+WIDE_PX, NARROW_PX = (120.0, 60.0, 40.0), (25.0, 15.0, 10.0)
+"""Gates of the rounds from all start angles, and of those from the promising ones."""
+FINALISTS = 4
+"""Hypotheses finished on all frames."""
+RIVAL = 25.0
+"""A hypothesis is a rival if its squared residuals, in units of the best one's variance, exceed the
+best's by less than this."""
 
 
 @dataclass(frozen=True)
@@ -44,19 +51,12 @@ class Search:
     Attributes:
         starts: number of start angles round the circle.
         frames: at most so many frames take part in the search.
-        gates_px: gate of each round, wide to narrow.
-        finalists: hypotheses finished on all frames.
         gate_px: final gate; a spot further from its prediction is not that bead.
-        ratio: a hypothesis is a rival if its squared residuals, in units of the best one's
-            variance, exceed the best's by less than this.
     """
 
     starts: int = 18
     frames: int = 20
-    gates_px: tuple[float, ...] = (120.0, 60.0, 40.0, 25.0, 15.0, 10.0)
-    finalists: int = 4
     gate_px: float = 6.0
-    ratio: float = 25.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,6 @@ def identify_beads(
     geometry: Poses | ConeVec,
     *,
     start: Offsets = NOMINAL,
-    search: Search | None = None,
 ) -> FloatArray:
     """Tracks (n, beads, 2) in pixels, nan where unseen; see `identify` for more about them.
 
@@ -108,7 +107,6 @@ def identify_beads(
         phantom: the beads.
         geometry: rough geometry of each frame; see `identify`.
         start: offsets at which the search starts.
-        search: settings of the search; None is the default.
 
     Raises:
         TwinError: as `identify`, and if the assignment is ambiguous (a symmetric phantom).
@@ -130,7 +128,7 @@ def identify_beads(
     >>> bool(np.median(np.abs(tracks - truth)) < 0.01)
     True
     """
-    found = identify(detections, phantom, geometry, start=start, search=search)
+    found = identify(detections, phantom, geometry, start=start)
     if found.ambiguous:
         angles = [p.to_edge()["alpha"] for p in (found.parameters, *found.rivals)]
         raise TwinError(
@@ -185,23 +183,16 @@ def identify(
         shape=shapes[chosen],
     )  # fmt: skip
     base = np.array([getattr(start, n) for n in SIX])
-    hypotheses = []
-    for i in range(how.starts):
-        x = base.copy()
-        x[3] += 2.0 * math.pi * i / how.starts
-        hypotheses.append(_Hypothesis(x, math.inf, 0))
+    turn = np.eye(len(SIX))[SIX.index("alpha")] * 2.0 * math.pi / how.starts
+    hypotheses = [_Hypothesis(base + i * turn, math.inf, 0) for i in range(how.starts)]
     # All start angles get the wide rounds; only the promising ones the narrow.
-    half = len(how.gates_px) // 2
-    hypotheses = [_rounds(problem, some, h, how.gates_px[:half]) for h in hypotheses]
-    hypotheses.sort(key=lambda h: h.loss)
-    hypotheses = hypotheses[: max(how.finalists, how.starts // 2)]
-    hypotheses = [_rounds(problem, some, h, how.gates_px[half:]) for h in hypotheses]
-    hypotheses.sort(key=lambda h: h.loss)
+    hypotheses = _best_first(_rounds(problem, some, h, WIDE_PX) for h in hypotheses)
+    hypotheses = hypotheses[: max(FINALISTS, how.starts // 2)]
+    hypotheses = _best_first(_rounds(problem, some, h, NARROW_PX) for h in hypotheses)
     whole = build_problem(
         np.full((len(poses), len(model), 2), np.nan), model, poses, free=SIX, shape=shapes
     )
-    finals = [_finish(whole, scene, h, how) for h in _different(hypotheses)[: how.finalists]]
-    finals.sort(key=lambda h: h.loss)
+    finals = _best_first(_finish(whole, scene, h, how) for h in _different(hypotheses)[:FINALISTS])
     if finals and (loose or finals[0].loss > LOOSE_PX**2):
         # A rolled panel or a leaning axis looks like another phantom: only loose priors tell. Where
         # the six explain the spots, this is not needed.
@@ -209,9 +200,8 @@ def identify(
             np.full((len(poses), len(model), 2), np.nan), model, poses, free=SIX, shape=shapes,
             start=start, priors={n: LOOSE * w for n, w in ASSUMED.items()} | dict(loose or {}),
         )  # fmt: skip
-        finals = [_finish(whole, scene, h, how, wide_px=60.0) for h in finals]
-        finals.sort(key=lambda h: h.loss)
-    return _report(whole, scene, finals, model, poses, shapes, start, how)
+        finals = _best_first(_finish(whole, scene, h, how, wide_px=60.0) for h in finals)
+    return _report(whole, scene, finals, shapes, start, how)
 
 
 def attempt(
@@ -285,6 +275,10 @@ class _Hypothesis:
     matches: int
 
 
+def _best_first(hypotheses: Iterable[_Hypothesis]) -> list[_Hypothesis]:
+    return sorted(hypotheses, key=lambda h: h.loss)
+
+
 def _spread(frames: npt.NDArray[np.intp], count: int) -> npt.NDArray[np.intp]:
     if len(frames) <= count:
         return frames
@@ -351,7 +345,6 @@ def _rounds(
     problem: Problem, shadows: _Shadows, h: _Hypothesis, gates: Sequence[float]
 ) -> _Hypothesis:
     x = h.x if math.isfinite(h.loss) else _vote(problem, shadows, h.x)
-    matches = h.matches
     quick = Solver(huber=2.0, trim=math.inf, max_iterations=3, tolerance=0.05)
     try:
         for gate in gates:
@@ -440,12 +433,11 @@ def _report(
     problem: Problem,
     shadows: _Shadows,
     finals: Sequence[_Hypothesis],
-    model: BeadModel,
-    poses: Poses,
     shapes: FloatArray,
     start: Offsets,
     how: Search,
 ) -> Identification:
+    model, poses = problem.model, problem.poses
     if not finals or not math.isfinite(finals[0].loss):
         raise TwinError(
             "the shadows found do not fit the phantom in any orientation",
@@ -470,7 +462,7 @@ def _report(
             continue
         # Difference of squared residuals in units of the best one's variance.
         excess = (h.loss - best.loss) * max(int(np.minimum(shadows.counts, len(model)).sum()), 1)
-        if excess < how.ratio * max(spread, 0.02) ** 2:
+        if excess < RIVAL * max(spread, 0.02) ** 2:
             rivals.append(_at(problem, h.x, start))
     view = visible_beads(model, poses, shapes, geometry) & ~touching
     return Identification(

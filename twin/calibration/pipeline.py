@@ -11,6 +11,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from flexdt.twin.calibration.detect.detection import SpotFinder
 from flexdt.twin.calibration.detect.refine import FEW_WINDOWS, Refined, contrast_of, measure_beads
 from flexdt.twin.calibration.detect.windows import plan_windows
 from flexdt.twin.calibration.diagnose.data import (
+    WIDE_GATE_PX,
     explain_identification,
     judge_emptiness,
     judge_frames,
@@ -44,6 +46,7 @@ from flexdt.twin.calibration.diagnose.fixed_parameters import (
     loosened,
     narrow_priors,
 )
+from flexdt.twin.calibration.diagnose.moving import OF_MOTION
 from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry, with_start
 from flexdt.twin.calibration.fit.fitted_motion import (
@@ -109,7 +112,6 @@ class Request:
         bead_tolerance_mm: > 0: bead positions are unknowns with this prior. 0: they are where the
             phantom says. None: unknowns only if the residuals ask for it.
         second_look: measure again where the first fit predicts the beads.
-        search: of the identification.
         priors: standard deviations [mm, deg, 1] in place of the scans' own; 0 is exactly known. The
             scans' apply to what is not free, these to anything.
         bound: sigma [mm, deg] beyond which the result is not identifiable.
@@ -129,7 +131,6 @@ class Request:
     start: Offsets = NOMINAL
     bead_tolerance_mm: float | None = None
     second_look: bool = True
-    search: Search = field(default_factory=Search)
     priors: Mapping[str, float] = field(default_factory=dict)
     bound: float = BOUND
     known_sizes: bool = True
@@ -248,22 +249,8 @@ def calibrate(
     if any(f.forbids for f in findings):
         more = judge_emptiness(scans, looks, model) if detector is None else []
         return replace(state, findings=_sorted([*more, *findings]))
-    identifications: list[Identification] = []
-    for scan, some in zip(scans, looks, strict=True):
-        unseen = nothing(scan.frames.shape)
-        detections = [
-            unseen if look.state is FrameState.REPEATED else look.detections for look in some
-        ]
-        if scan.index is not None:
-            identifications.append(identified(scan.index, detections, want.start))
-            continue
-        found = attempt(detections, model, scan.poses, start=want.start, search=want.search)
-        findings += _given(
-            explain_identification(found, detections, model, scan.poses, scan.name, want.search)
-        )
-        if found is None:
-            break
-        identifications.append(found)
+    identifications, told = _identified(state, want)
+    findings += told
     state = replace(state, identifications=tuple(identifications), findings=_sorted(findings))
     if state.errors:
         return state
@@ -293,8 +280,11 @@ def calibrate(
     if implausible is not None:  # Nothing else that such a fit shows has a meaning.
         return replace(state, fit=fit, findings=_sorted([*findings, implausible]))
     fit, explained = _explain(state, want, fit)
-    if not any(f.code in OF_RESIDUALS and f.forbids for f in explained):
-        findings += _given(judge_places(fit, looks))  # of what moves, all frames are elsewhere
+    if not any(f.forbids and f.code != "misfit" for f in explained):
+        # Of what moves, or turns otherwise than is said, all frames are elsewhere.
+        findings += _given(judge_places(fit, looks))
+    if any(f.code == "bead_displaced" for f in explained):  # the other spots are that bead's
+        findings = [f for f in findings if f.code != "extra_spots"]
     wide = fit
     fit, explained = _with_held(state, asked, want, wide, explained)
     narrower = list(fit.values) != list(wide.values)
@@ -314,6 +304,32 @@ def calibrate(
         fit=with_start(fit, want.start, iterations),
         findings=_sorted([*findings, *explained]),
     )
+
+
+def _identified(state: Calibration, want: Request) -> tuple[list[Identification], list[Finding]]:
+    """Which spot is which bead, scan by scan until one tells nothing, and what is wrong with it."""
+    out: list[Identification] = []
+    findings: list[Finding] = []
+    for scan, some in zip(state.scans, state.looks, strict=True):
+        unseen = nothing(scan.frames.shape)
+        detections = [
+            unseen if look.state is FrameState.REPEATED else look.detections for look in some
+        ]
+        if scan.index is not None:
+            out.append(identified(scan.index, detections, want.start))
+            continue
+        seek = partial(attempt, detections, state.model, scan.poses, start=want.start)
+        found = seek()
+        told = explain_identification(found, detections, state.model, scan.poses, scan.name)
+        if want.per_frame and told is not None and told.code in OF_MOTION:
+            # It may move, so its spots may be far from where one geometry has them.
+            found = seek(search=Search(gate_px=WIDE_GATE_PX)) or found
+            told = None
+        findings += _given(told)
+        if found is None:
+            break
+        out.append(found)
+    return out, findings
 
 
 def detector_for(model: BeadModel, poses: Poses) -> SpotFinder:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from causes_named import scored
-from faults_drawn import KINDS
+from causes_named import calibrated, scored
+from faults_drawn import KINDS, drawn
 from prior_coverage import PIXEL, SDD, SHAPE, SOD, pixels
 
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import bead_model
 from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.diagnose.data import explain_identification
-from flexdt.twin.calibration.identify import Search, identify
+from flexdt.twin.calibration.identify import identify
 from flexdt.twin.geometry.poses import Poses
 
 LEGO = bead_model(load_phantom("lego"))
@@ -41,7 +41,7 @@ def spots(angles, keep, seed: int = 0) -> list[Detections]:  # type: ignore[no-u
 
 def codes(detections: list[Detections]) -> list[tuple[str, str]]:
     found = identify(detections, LEGO, POSES)
-    told = explain_identification(found, detections, LEGO, POSES, "scan", Search())
+    told = explain_identification(found, detections, LEGO, POSES, "scan")
     return [] if told is None else [(told.code, told.severity.value)]
 
 
@@ -51,7 +51,7 @@ def test_beads_that_are_lost_are_named() -> None:
     assert codes(spots(ANGLES, [1, 2, 4])) == [("beads_missing", "warning")]
     detections = spots(ANGLES, [1, 2, 4])
     found = identify(detections, LEGO, POSES)
-    told = explain_identification(found, detections, LEGO, POSES, "scan", Search())
+    told = explain_identification(found, detections, LEGO, POSES, "scan")
     assert told is not None
     assert "bead 0, 3 of 'lego' has no spot in any frame" in told.text
 
@@ -114,3 +114,36 @@ def test_what_is_held_exactly_and_wrongly_is_never_offered_in_silence(kind: str)
         else:
             assert "held_parameter" in codes, found
         assert found.verdict == "right"
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [
+        pytest.param(
+            "gap", 303, marks=pytest.mark.slow
+        ),  # both the last half and the last third fit by themselves
+        pytest.param(
+            "screw", 303, marks=pytest.mark.slow
+        ),  # panel and axis had taken up a part of it
+        ("angle_factor", 300),  # its last frames are where no others put them
+        ("angle_factor", 301),  # a fifth of the frames was left out
+        ("spot_drift", 1002),  # its last frames were
+        ("bead_displaced", 1001),  # its spots are not another ball's
+        ("scanner_held", 303),
+    ],
+)
+def test_what_once_had_another_name_beside_or_instead(kind: str, seed: int) -> None:
+    found = scored(kind, seed)
+    assert found.verdict == "right", found.said
+
+
+@pytest.mark.slow
+def test_a_large_motion_that_may_be_followed_is() -> None:
+    """A screw of 1.3 mm was called a drift and refused although it was to be followed."""
+    scan = drawn("screw", 303)
+    result = calibrated(scan, ("dO_y",))
+    assert result.identifiable, result.findings
+    assert result.fit is not None
+    assert result.fit.certificate.rms_px < 2 * scan.noise_px
+    low, high = scan.truth["dO_y"]
+    assert abs(np.ptp(result.motions[0].values) - (high - low)) < 0.005

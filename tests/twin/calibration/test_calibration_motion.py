@@ -27,7 +27,15 @@ def test_what_moves_is_found_and_what_does_not_is_not(kind: str) -> None:
     assert np.abs(found["pulls"]).max() < 4.5
     if kind != "nothing":
         assert found["before_px"] > 1.5 * study.NOISE_PX
-        assert 0.2 < np.sqrt(np.mean(np.square(found["deviation_pulls"]))) < 3.0
+        assert np.sqrt(np.mean(np.square(found["deviation_pulls"]))) < 3.0
+
+
+def test_a_drift_that_breaks_off_is_no_turn_of_the_table() -> None:
+    """Errors over sigmas of tau_z, of deviations: drifts level at the ends made them 2.6, 1.9."""
+    rows = [study.one(seed, "spot", images=False) for seed in range(1, 6)]
+    place = study.SIX.index("tau_z")
+    assert np.sqrt(np.mean([r["pulls"][place] ** 2 for r in rows])) < 2.0
+    assert 0.3 < np.sqrt(np.mean(np.square([r["deviation_pulls"] for r in rows]))) < 1.5
 
 
 @pytest.mark.slow
@@ -41,7 +49,7 @@ def test_a_runout_is_found_in_radiographs() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_bands_and_means_equal_a_dense_model(seed: int) -> None:
-    """Likelihood, deviations and sigmas beside full matrices with cosines written out."""
+    """Likelihood, deviations and sigmas beside full matrices of second differences."""
     rng = np.random.default_rng(seed)
     sizes, g, p, each = (7, 9), 3, 2, 6
     n = sum(sizes)
@@ -62,10 +70,12 @@ def test_bands_and_means_equal_a_dense_model(seed: int) -> None:
             z[np.arange(n * each), frame] = slopes[:, i]
             blocks = []
             for size, amplitudes in zip(sizes, model.spectrum(i, pick), strict=True):
-                place = (np.arange(size) + 0.5) / size
-                wave = np.cos(np.pi * np.outer(place, np.arange(size))) * np.sqrt(2 / size)
-                wave[:, 0] /= np.sqrt(2)
-                blocks.append(wave @ np.diag(amplitudes) @ wave.T)
+                bends = np.diff(np.eye(size), 2, axis=0)
+                waves = pick[1]
+                stiff = (2 * np.sin(np.pi * waves / (2 * size))) ** 2 if waves < size else np.inf
+                blocks.append(
+                    amplitudes[0] * linalg.inv(np.eye(size) + (bends.T @ bends) / stiff**2)
+                )
             k = linalg.block_diag(*blocks)
             variance += z @ k @ z.T
             parts.append(z)

@@ -24,6 +24,10 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 CAP = 6.0
 """Line integrals above the background are cut here at the latest; noise may ask for less."""
+FAINTEST = 0.12
+"""Least height of a bead, as a share of the strongest small structure's in the image."""
+LIKENESS = 0.90
+"""Smallest correlation with a ball's profile."""
 MISFIT = 0.3
 """Largest misfit of a fitted ball, as a share of its spot's contrast."""
 BLUR_PX = 0.7
@@ -78,16 +82,11 @@ class SpotFinder:
 
     Attributes:
         radius_px: smallest and largest radius of a bead's spot.
-        contrast: smallest line integral of a bead above its background, or None: 12 % of the
-            strongest small structure in the image, at least 8 times the noise.
-        likeness: smallest correlation with a ball's profile.
         same: a spot whose contrast and radius differ from the typical ones by more than this
             factor is dropped; inf keeps beads of several sizes.
     """
 
     radius_px: tuple[float, float] = (1.5, 60.0)
-    contrast: float | None = None
-    likeness: float = 0.90
     same: float = 1.6
 
 
@@ -101,7 +100,7 @@ def detect_beads(
 
     Args:
         image: (rows, cols) line integrals.
-        detector: size and contrast of the spots to look for; None is the default.
+        detector: size of the spots to look for; None is the default.
         radius_px: (smallest, largest) radius of a spot, instead of the detector's.
 
     Returns:
@@ -123,9 +122,7 @@ def detect_beads(
         how = replace(how, radius_px=radius_px)
     data = np.ascontiguousarray(image, dtype=np.float32)
     if data.ndim != 2 or data.size == 0:
-        raise TwinError(
-            f"image has shape {data.shape}; allowed: (rows, cols)", {"asked": list(data.shape)}
-        )
+        raise TwinError.of_shape("an image", data.shape, ("rows", "cols"))
     if not np.isfinite(data).all():
         data = np.nan_to_num(data, nan=0.0, posinf=16.0, neginf=0.0)
     factor = coarseness(how)
@@ -195,7 +192,7 @@ def _candidates(
     sample = small[::3, ::3].ravel()
     noise = 1.4826 * _middle(np.abs(sample - _middle(sample))) + 1e-4
     top = float(small.max())
-    floor = max(8.0 * noise, 0.12 * top) if how.contrast is None else 0.4 * how.contrast
+    floor = max(8.0 * noise, FAINTEST * top)
     inside: list[_Candidate] = []
     edge: list[_Candidate] = []
     level = 0.5 * top
@@ -267,9 +264,8 @@ def _measure(
     good = (
         result[kernels.OK] > 0
         and low <= result[kernels.RADIUS] <= high
-        and result[kernels.SCORE] >= how.likeness
+        and result[kernels.SCORE] >= LIKENESS
         and result[kernels.PEAK] > 5.0 * result[kernels.NOISE]
-        and (how.contrast is None or result[kernels.PEAK] >= how.contrast)
     )
     return result if good else None
 

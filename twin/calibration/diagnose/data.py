@@ -20,8 +20,10 @@ from flexdt.twin.calibration.diagnose.moving import moving, named_turn
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
 from flexdt.twin.calibration.fit.fitted_motion import MotionFit
 from flexdt.twin.calibration.fit.priors import ASSUMED
+from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, Scan
 from flexdt.twin.calibration.identify import Identification, Search, attempt
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 
 GOOD_SHARE = 0.7
@@ -127,7 +129,6 @@ def explain_identification(
     model: BeadModel,
     poses: Poses,
     name: str,
-    search: Search,
 ) -> Finding | None:
     """Judge an assignment; if it is poor, find the mistake that explains the spots."""
     most = max((len(d) for d in detections), default=0)
@@ -172,7 +173,7 @@ def explain_identification(
             f"{name}: in each frame {_left_over(found, detections):.1f} of the spots are none "
             f"of the beads of {model.name!r}: other balls, or something round; not used",
         )
-    explanation = _alternative(found, detections, model, poses, search)
+    explanation = _alternative(found, detections, model, poses)
     if explanation is not None:
         code, text = explanation
         return error(code, f"{name}: {text}")
@@ -266,7 +267,6 @@ def _alternative(
     detections: Sequence[Detections],
     model: BeadModel,
     poses: Poses,
-    search: Search,
 ) -> tuple[str, str] | None:
     """The first mistake under which phantom and spots agree."""
     n = len(poses)
@@ -305,7 +305,7 @@ def _alternative(
         )  # fmt: skip
     best: tuple[float, float, str, str] | None = None
     for code, text, beads, geometry, shadows in trials:
-        other = attempt(shadows, beads, geometry, search=search)
+        other = attempt(shadows, beads, geometry)
         if other is None:
             continue
         better = (
@@ -323,29 +323,31 @@ def _alternative(
     if found is not None and _plausible(found) and found.typical_px > 0.3 * found.rms_px:
         return None  # The right beads in about the right places: the residuals will tell.
     return (
-        _in_motion(detections, model, poses, search)
-        or _in_parts(detections, model, poses, search)
-        or _other_turn(detections, model, poses, search)
-        or _one_by_one(detections, model, poses, search)
+        _in_motion(detections, model, poses)
+        or _in_parts(detections, model, poses)
+        or _other_turn(detections, model, poses)
+        or _one_by_one(detections, model, poses)
     )
 
 
 def _in_motion(
-    detections: Sequence[Detections], model: BeadModel, poses: Poses, search: Search
+    detections: Sequence[Detections], model: BeadModel, poses: Poses
 ) -> tuple[str, str] | None:
     """Whether the spots are those of the phantom, but for something that moves."""
-    found = attempt(detections, model, poses, search=replace(search, gate_px=WIDE_GATE_PX))
+    found = attempt(detections, model, poses, search=Search(gate_px=WIDE_GATE_PX))
     if found is None or min(found.explained, found.found) < GOOD_SHARE:
         return None
     if len(poses) < LEAST_FRAMES:
         return None
     shape = np.array([d.shape for d in detections], dtype=np.float64)
     here = poses
+    # Of a large motion panel and axis have taken up a part: they begin where they should be.
+    still = replace(NOMINAL, **{name: getattr(found.parameters, name) for name in SIX})
 
     def fitted(motion: MotionFit | None = None) -> FitResult:
         moved = here if motion is None else motion.motions[0].applied(here)
         return estimate_geometry(
-            found.tracks, model, moved, shape=shape, start=found.parameters, centre=found.bias,
+            found.tracks, model, moved, shape=shape, start=still, centre=found.bias,
             priors=ASSUMED, bound=math.inf,
         )  # fmt: skip
 
@@ -354,28 +356,28 @@ def _in_motion(
 
 
 def _in_parts(
-    detections: Sequence[Detections], model: BeadModel, poses: Poses, search: Search
+    detections: Sequence[Detections], model: BeadModel, poses: Poses
 ) -> tuple[str, str] | None:
     """Whether the first or the last frames by themselves are those of the phantom; if both are, by
     what they differ."""
     n = len(poses)
-    parts = []
+    ends: dict[str, tuple[slice, Offsets]] = {}
     for share in (2, 3, 4):
-        for part in (slice(0, n // share), slice(n - n // share, n)):
-            own = attempt(detections[part], model, poses[part], search=search)
+        for end, part in (("first", slice(0, n // share)), ("last", slice(n - n // share, n))):
+            own = attempt(detections[part], model, poses[part])
             if own is not None and _convincing(own):
-                parts.append((part, own.parameters))
-        if len(parts) > 1:
+                ends.setdefault(end, (part, own.parameters))
+        if len(ends) > 1:
             break
-    if not parts:
+    if not ends:
         return None
-    if len(parts) == 1 or parts[0][0].start == parts[-1][0].start:
-        part = parts[0][0]
+    if len(ends) == 1:
+        ((part, _),) = ends.values()
         return "frame_numbers", (
             f"frames {part.start} to {part.stop - 1} by themselves fit the phantom, all of "
             "them do not: frames are missing, or their numbers or angles are wrong"
         )
-    first, last = parts[0][1].to_edge(), parts[-1][1].to_edge()
+    first, last = (ends[end][1].to_edge() for end in ("first", "last"))
     turn = (last["alpha"] - first["alpha"] + 180.0) % 360.0 - 180.0
     if abs(turn) > LEAST_TURN_DEG:
         code, text = named_turn(turn, poses.angle)
@@ -388,7 +390,7 @@ def _in_parts(
 
 
 def _other_turn(
-    detections: Sequence[Detections], model: BeadModel, poses: Poses, search: Search
+    detections: Sequence[Detections], model: BeadModel, poses: Poses
 ) -> tuple[str, str] | None:
     """Whether the stage turns by another angle than is stated, as neighbouring frames tell."""
     turned = poses.angle - poses.angle[0]
@@ -398,7 +400,7 @@ def _other_turn(
     best = (GOOD_RMS_PX, 1.0)
     for factor in TURNS:
         some = replace(poses, angle=poses.angle[0] + factor * turned)[:n]
-        own = attempt(detections[:n], model, some, search=search, loose=TURN_WIDTH)
+        own = attempt(detections[:n], model, some, loose=TURN_WIDTH)
         if own is not None and _convincing(own) and own.rms_px < best[0]:
             best = own.rms_px, factor * own.parameters.angle_scale
     if abs(best[1] - 1.0) < LEAST_TURN:
@@ -411,14 +413,14 @@ def _other_turn(
 
 
 def _one_by_one(
-    detections: Sequence[Detections], model: BeadModel, poses: Poses, search: Search
+    detections: Sequence[Detections], model: BeadModel, poses: Poses
 ) -> tuple[str, str] | None:
     """Whether frames show the phantom each by itself."""
     chosen = np.linspace(0, len(poses) - 1, SAMPLED).astype(int).tolist()
     good = 0
     for i in chosen:
         alone = slice(i, i + 1)
-        own = attempt(detections[alone], model, poses[alone], search=replace(search, starts=36))
+        own = attempt(detections[alone], model, poses[alone], search=Search(starts=36))
         if own is not None and len(detections[i]) >= 5:
             good += _convincing(own) and own.explained > SOME_SPOTS
     if good < 0.7 * len(chosen):

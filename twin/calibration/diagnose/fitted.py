@@ -26,6 +26,8 @@ OF_RESIDUALS = frozenset(
 """Findings about what a fit leaves: they hold for that fit alone."""
 MISFIT_PX = 0.10
 """Residual of the final fit above which its numbers are not to be used unless explained."""
+MOST_USED = 0.9
+"""Share of the positions below which a fit is good only because it left the others out."""
 SIZE = 0.04
 """Deviation of the spots' radii from the expected ones that betrays a wrong scale."""
 BODY = 0.5
@@ -68,7 +70,8 @@ def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Findi
     n = len(detections)
     block = len(bad) >= 2 and bad[-1] - bad[0] == len(bad) - 1 and (bad[0] == 0 or bad[-1] == n - 1)
     listed = f"{bad[0]} to {bad[-1]}" if block else ", ".join(str(i) for i in bad[:12])
-    if block:
+    # A drift of something else leaves its ends out, too.
+    if block and all(d.column.split("@")[0] == "alpha" for d in fit.certificate.drifts):
         return error(
             "angle_step",
             f"in frames {listed} of {n} the shadows are not where the others put them: frames "
@@ -186,7 +189,7 @@ def explain_residuals(
     if certificate.rms_px < 0.03 or not (structured or certificate.rms_px >= misfit_px):
         return fit, out
     bad = certificate.rms_px >= misfit_px
-    if bad:
+    if bad or certificate.used.sum() < MOST_USED * fit.problem.seen.sum():
         explained = _angle_scale(fit, refit)
         if explained is not None:
             return fit, [explained]
@@ -281,7 +284,7 @@ def _explained(better: FitResult, fit: FitResult) -> bool:
         better.identifiable
         and rms < 0.5 * fit.certificate.rms_px
         and rms < MISFIT_PX
-        and better.certificate.used.sum() >= 0.9 * fit.certificate.used.sum()
+        and better.certificate.used.sum() >= MOST_USED * fit.certificate.used.sum()
     )
 
 

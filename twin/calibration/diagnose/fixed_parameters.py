@@ -33,7 +33,8 @@ MOST_TOLD: Final = 0.5
 """Images that lower the variance of such a loose prior by a smaller share say nothing about it. (At
 0.9 an SDD 13 mm off its prior of 1 mm, which images told to 5 mm, was offered 12 sigmas off.)"""
 EXACT: Final = 3.0
-"""What is said to be exact and cannot be checked is named where a sigma would be so much larger."""
+"""What is said to be exact and cannot be checked is named where a sigma would be so much larger,
+or where images narrow its usual prior by less."""
 NARROW: Final = 0.01
 """Priors are widened where right ones would be contradicted as much less often than that."""
 
@@ -129,12 +130,15 @@ def judge_exact(fit: FitResult, freed: FitResult, exact: Mapping[str, float]) ->
         for n, e in fit.certificate.estimates.items()
         if n in after and e.sigma > 0 and after[n].sigma > EXACT * e.sigma
     }
+    own = {n: after[n].prior or math.inf for n in exact if n in after}
     causes = dict.fromkeys(c for n in growth for c in after[n].priors if c in exact)
+    causes |= dict.fromkeys(n for n, prior in own.items() if EXACT * after[n].sigma > prior)
     if not causes:
         return None
-    worst = sorted(growth, key=lambda n: -growth[n])[:3]
+    worst = sorted(growth, key=lambda n: -growth[n])[:3] or list(causes)
     listed = ", ".join(
-        f"{n} to {after[n].sigma:.2g} {after[n].unit} instead of {fit.sigmas[n]:.2g}" for n in worst
+        f"{n} to {after[n].sigma:.2g} {after[n].unit} instead of {fit.sigmas.get(n, 0.0):.2g}"
+        for n in worst
     )
     said = ", ".join(f"{n} = {exact[n]:g}" for n in causes)
     return warning(

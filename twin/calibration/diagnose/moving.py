@@ -16,6 +16,8 @@ from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import UNITS, to_edge
 
+OF_MOTION: Final = frozenset(("drift", "vibration", "angles_wrong"))
+"""What is called so may be followed from frame to frame."""
 EXPLAINED_PX: Final = 0.2
 """Residual that may remain of a motion that is named."""
 MOST_FRAMES: Final = 720

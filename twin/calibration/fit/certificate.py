@@ -56,7 +56,6 @@ class Conditioning:
         names: columns.
         unit_covariance: (p, p) (J'J)^-1 in edge units; inf on columns touched by a null direction.
         rank, condition: of the column-scaled Jacobian; condition is inf if rank-deficient.
-        singular: its singular values, largest first.
         null: directions that are not determined.
         weak: directions that are determined badly.
     """
@@ -65,7 +64,6 @@ class Conditioning:
     unit_covariance: FloatArray
     rank: int
     condition: float
-    singular: FloatArray
     null: tuple[Direction, ...]
     weak: tuple[Direction, ...]
 
@@ -141,7 +139,7 @@ def spectrum(
         advice = f"worse than {bound:g} mm or deg: add a placement at another SOD, frames or beads"
         null.append(Direction(((names[worst], 1.0),), float(sigma[worst]), advice))
         rank -= 1
-    return Conditioning(tuple(names), covariance, rank, condition, s, tuple(null), tuple(weak))
+    return Conditioning(tuple(names), covariance, rank, condition, tuple(null), tuple(weak))
 
 
 def _singular(j: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -6,11 +6,10 @@
 
 from __future__ import annotations
 
-import inspect
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ParamSpec
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,15 +27,14 @@ from flexdt.twin.calibration.fit.problem import (
     from_printed_reading,
     values_in,
 )
-from flexdt.twin.calibration.fit.solver import Solution, Solver, solve
+from flexdt.twin.calibration.fit.solver import Solution, Solver, cost_at, solve
 from flexdt.twin.calibration.fit.weak_directions import BOUND
 from flexdt.twin.errors import NotIdentifiableError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
-
-_P = ParamSpec("_P")
+from flexdt.twin.signatures import with_arguments_of
 
 LEAST_NOISE = 1e-4
 """Exact data are weighed as if their whitened residuals had this spread: a prior then still keeps
@@ -202,19 +200,7 @@ def estimate_geometry(
     )
 
 
-def _with_arguments_of(
-    other: Callable[_P, FitResult],
-) -> Callable[[Callable[..., FitResult]], Callable[_P, FitResult]]:
-    """Gives a function that passes its arguments on to `other` the signature of that."""
-
-    def typed(function: Callable[..., FitResult]) -> Callable[_P, FitResult]:
-        function.__signature__ = inspect.signature(other)  # type: ignore[attr-defined]
-        return function
-
-    return typed
-
-
-@_with_arguments_of(estimate_geometry)
+@with_arguments_of(estimate_geometry)
 def fit_geometry(*args: Any, **options: Any) -> FitResult:
     """Fit offsets to measured bead positions; an undetermined parameter is an error.
 
@@ -271,13 +257,10 @@ def with_start(result: FitResult, start: Offsets, iterations: int) -> FitResult:
         start: offsets at which the first fit started; the start cost is computed there.
         iterations: of all fits together.
     """
-    problem, use = result.problem, result.solution.use
+    problem = result.problem
     base = np.array([values_in(from_printed_reading(start, problem.reading))] * len(problem.base))
-    try:
-        norms = problem.with_base(base).residuals(problem.with_base(base).start, use)[1]
-        cost = float(0.5 * np.sum(norms[use] ** 2))
-    except TwinError:
-        cost = math.inf
+    begun = problem.with_base(base)
+    cost = cost_at(begun, begun.start, result.solution.use)
     return replace(result, start_cost=cost, iterations=iterations)
 
 

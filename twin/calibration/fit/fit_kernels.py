@@ -481,7 +481,7 @@ def _prior_cost(x, prior_mean, prior_weight):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def levenberg(  # type: ignore[no-untyped-def]
-    data, use, huber_factor, floor, prior_mean, prior_weight, x, max_iterations, tolerance, history
+    data, use, huber_factor, floor, prior_mean, prior_weight, x, max_iterations, tolerance
 ):
     """Levenberg-Marquardt with Marquardt's diagonal from `x`, in place.
 
@@ -491,7 +491,7 @@ def levenberg(  # type: ignore[no-untyped-def]
     residuals' rms by less than `tolerance` (whitened units) plus a millionth of it.
 
     Returns:
-        (iterations, cost, huber threshold, converged). history[i] is the cost after iteration i.
+        (iterations, huber threshold, converged).
     """
     n = x.shape[0]
     params = np.empty_like(data.base)
@@ -518,9 +518,8 @@ def levenberg(  # type: ignore[no-untyped-def]
         huber = max(floor, huber_factor * _median_norm(norms) / 1.1774)
     cost = evaluate(data, params, beads, use, huber, full, predicted, norms, dummy, hess, grad)
     cost += _prior_cost(x, prior_mean, prior_weight)
-    history[0] = cost
     if not cost < np.inf:
-        return 0, cost, huber, False
+        return 0, huber, False
     damping = 1e-9
     iterations = 0
     converged = n == 0
@@ -553,7 +552,6 @@ def levenberg(  # type: ignore[no-untyped-def]
                 break
             damping = max(damping * 10.0, 1e-4)
         if not accepted:
-            history[iterations] = cost
             converged = small
             break
         gain = cost - new
@@ -567,7 +565,6 @@ def levenberg(  # type: ignore[no-untyped-def]
         norms, trial_norms = trial_norms, norms
         hess, trial_hess = trial_hess, hess
         grad, trial_grad = trial_grad, grad
-        history[iterations] = cost
         converged = small
         if huber_factor < np.inf and not converged:
             fresh = max(floor, huber_factor * _median_norm(norms) / 1.1774)
@@ -578,4 +575,4 @@ def levenberg(  # type: ignore[no-untyped-def]
                     cost = evaluate(data, params, beads, use, huber, full, predicted, norms, dummy,
                                     hess, grad)  # fmt: skip
                     cost += _prior_cost(x, prior_mean, prior_weight)
-    return iterations, cost, huber, converged
+    return iterations, huber, converged

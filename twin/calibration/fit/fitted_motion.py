@@ -1,10 +1,11 @@
 """Motion during a scan: parameters that differ from frame to frame, found from bead tracks.
 
 A parameter that moves is its value in the fit plus a deviation in each frame, whose mean over the
-scan is zero. Deviations are sums of cosines of the frame's number with normal amplitudes, smaller
-at higher frequencies, by a width and a smoothness that maximise the restricted likelihood of the
-tracks (REML; Patterson and Thompson, Biometrika 58 (1971) 545). So a screw, a drift and a wobble
-come out smooth, jitter comes out frame by frame, and what the tracks do not show stays zero.
+scan is zero. Deviations are normal, smaller where they bend more, by a width and a smoothness that
+maximise the restricted likelihood of the tracks (REML; Patterson and Thompson, Biometrika 58 (1971)
+545). So a screw, a drift and a wobble come out smooth, jitter comes out frame by frame, and what
+the tracks do not show stays zero. Nothing is said of the slope at either end: deviations that are
+taken to be level there make a drift, which is not, look like what turns once with the table.
 
 The estimate is linear in small deviations. The caller puts them into the poses, fits again, and
 estimates what remains, until they stay.
@@ -206,9 +207,9 @@ _Choice = tuple[tuple[float, float] | None, ...]
 class _Mixed:
     """Linear mixed model: the fit's g columns, and p parameters' deviations in n frames.
 
-    The prior precision of a parameter's deviations is (1 + L^2 / l^2) / v, with L the second
-    differences of frames (no slope at either end), whose eigenvectors are the cosines: L^2 has
-    five diagonals, so everything is solved in bands.
+    The prior precision of a parameter's deviations is (1 + D'D / l^2) / v, with D the second
+    differences of frames: it has five diagonals, so everything is solved in bands. Its directions
+    are nearly cosines of the frame's number.
 
     Attributes:
         plain: (g, g) normal equations of the fit's columns, scaled, with their priors.
@@ -269,7 +270,8 @@ class _Mixed:
         )
 
     def spectrum(self, i: int, pick: tuple[float, float]) -> list[FloatArray]:
-        """Variance of the amplitude of each scan's cosines, from none to the most half waves."""
+        """Variance of the amplitude of each scan's cosines, from none to the most half waves, for
+        deviations that are level at the ends; the first is that of the width."""
         width, waves = pick
         one_frame = 1.0 / max(float(self.pairs[:, i, i].mean()), 1e-300)
         out = []
@@ -283,13 +285,11 @@ class _Mixed:
         """The three lower diagonals (3, n) of the prior precision of a parameter's deviations."""
         parts = []
         for size, variance in zip(self.sizes, self.spectrum(i, pick), strict=True):
-            twice = np.full(size, 2.0)
-            twice[[0, -1]] = 1.0
-            # Of L^2, with -1 beside the diagonal of L: products of neighbouring rows.
-            diagonal = twice**2 + np.r_[1.0, np.full(size - 2, 2.0), 1.0]
-            beside = np.r_[-(twice[:-1] + twice[1:]), 0.0]
-            after = np.r_[np.ones(size - 2), 0.0, 0.0]
-            squared = np.stack([diagonal, beside, after]) / _stiffness(size, pick[1]) ** 2
+            inner = np.ones(size - 2)  # frames with a second difference [1, -2, 1]
+            diagonal = np.convolve(inner, [1.0, 4.0, 1.0])
+            beside = np.r_[np.convolve(inner, [-2.0, -2.0]), 0.0]
+            squared = np.stack([diagonal, beside, np.r_[inner, 0.0, 0.0]])
+            squared /= _stiffness(size, pick[1]) ** 2
             squared[0] += 1.0
             parts.append(squared / variance[0])
         return np.concatenate(parts, axis=1)
@@ -332,12 +332,10 @@ class _Mixed:
         found = linalg.solve_triangular(lower, part.push, lower=True)
         rest = max(self.total - part.explained - float(np.sum(found**2)), LEAST_NOISE**2)
         volume = 2.0 * (np.log(np.diag(lower)).sum() + np.log(part.band[0]).sum())
-        volume += sum(
-            float(np.log(variance).sum())
-            for i, pick in enumerate(choice)
-            if pick is not None
-            for variance in self.spectrum(i, pick)
-        )
+        for i, pick in enumerate(choice):
+            if pick is not None:
+                alone = linalg.cholesky_banded(self._diagonals(i, pick), lower=True)
+                volume -= 2.0 * float(np.log(alone[0]).sum())
         return float(-0.5 * (volume + self.freedom * math.log(rest)))
 
     def solved(self, choice: _Choice) -> _Answer:

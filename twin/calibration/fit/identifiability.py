@@ -16,7 +16,7 @@ from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_mode
 from flexdt.twin.calibration.fit.certificate import Conditioning, spectrum
 from flexdt.twin.calibration.fit.nominal import Shape, as_poses, frame_shapes
 from flexdt.twin.calibration.fit.priors import require_widths
-from flexdt.twin.calibration.fit.problem import SIX, Reading, build_problem, require_tolerance
+from flexdt.twin.calibration.fit.problem import SIX, build_problem, require_tolerance
 from flexdt.twin.calibration.fit.weak_directions import BOUND, Direction, tolerance_of
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
@@ -81,16 +81,12 @@ def identifiability(
     free: Sequence[str] = SIX,
     *,
     shape: Shape = None,
-    groups: npt.ArrayLike | None = None,
-    per_group: Sequence[str] = (),
     at: Offsets = NOMINAL,
-    reading: Reading = Reading.AXIS_AT_O_PLUS_TAU,
     bead_tolerance_mm: float = 0.0,
     priors: Mapping[str, float] | None = None,
     bound: float = BOUND,
-    advise: bool = True,
 ) -> Prediction:
-    """Predict the uncertainty of a calibration.
+    """Predict the uncertainty of a calibration, and what changes to the plan would make of it.
 
     Args:
         phantom: the beads.
@@ -99,11 +95,9 @@ def identifiability(
         free: parameters to be estimated.
         shape: detector (rows, cols); None is the default machine's camera. Beads that would not
             lie wholly on it do not count.
-        groups, per_group, reading: as for `estimate_geometry`.
         at: the geometry to predict at.
         bead_tolerance_mm: > 0: bead positions are unknowns with this prior.
         priors, bound: as for `estimate_geometry`.
-        advise: also evaluate changes to the plan.
 
     Returns:
         Predicted sigmas, rank, directions not determined, and suggestions.
@@ -127,19 +121,18 @@ def identifiability(
     require_tolerance(bead_tolerance_mm)
     model = bead_model(phantom)
     poses = as_poses(geometry)
-    labels = np.zeros(len(poses), dtype=np.int64) if groups is None else np.asarray(groups)
 
     def predict(
-        beads: BeadModel, plan: Poses, marks: npt.NDArray[np.int64], sizes: FloatArray
+        beads: BeadModel, plan: Poses, sizes: FloatArray
     ) -> tuple[Conditioning, dict[str, float], FloatArray, npt.NDArray[np.bool_]]:
         visible = visible_beads(beads, plan, sizes, at)
         pixels = plan.cone_vec(at).project_points(beads.beads, (1, 1))
         origin = (sizes[:, ::-1] - 1) / 2
         tracks = np.where(visible[..., None], pixels + origin[:, None], np.nan)
         problem = build_problem(
-            tracks, beads, plan, free=free, shape=sizes, noise_px=noise_px, groups=marks,
-            per_group=per_group, free_beads=bead_tolerance_mm > 0, start=at, reading=reading,
-            bead_tolerance_mm=bead_tolerance_mm, priors=require_widths(priors or {}),
+            tracks, beads, plan, free=free, shape=sizes, noise_px=noise_px,
+            free_beads=bead_tolerance_mm > 0, start=at, bead_tolerance_mm=bead_tolerance_mm,
+            priors=require_widths(priors or {}),
         )  # fmt: skip
         rows = np.concatenate([problem.jacobian(problem.start), np.diag(1.0 / problem.prior_sigma)])
         names, count = problem.layout.names, problem.layout.asked
@@ -150,11 +143,11 @@ def identifiability(
         return spec, sigmas, covariance, visible
 
     sizes = frame_shapes(shape, len(poses))
-    spec, sigmas, covariance, visible = predict(model, poses, labels, sizes)
+    spec, sigmas, covariance, visible = predict(model, poses, sizes)
     suggestions: list[Suggestion] = []
     before = _worst(sigmas)
-    if advise and (spec.null or spec.weak or before > 1.0):
-        for change, make in _changes(model, poses, labels, sizes):
+    if spec.null or spec.weak or before > 1.0:
+        for change, make in _changes(model, poses, sizes):
             after = predict(*make())[1]
             worst = _worst(after)
             if worst < before * 0.8 or (not np.isfinite(before) and np.isfinite(worst)):
@@ -197,17 +190,16 @@ def _worst(sigmas: dict[str, float]) -> float:
     return max((s / tolerance_of(n) for n, s in sigmas.items()), default=0.0)
 
 
-_Plan = tuple[BeadModel, Poses, npt.NDArray[np.int64], FloatArray]
+_Plan = tuple[BeadModel, Poses, FloatArray]
 
 
 def _changes(
-    model: BeadModel, poses: Poses, labels: npt.NDArray[np.int64], sizes: FloatArray
+    model: BeadModel, poses: Poses, sizes: FloatArray
 ) -> list[tuple[str, Callable[[], _Plan]]]:
     """Changes worth trying: what to do, and the plan it gives."""
 
     def with_more(more: Poses) -> _Plan:
-        marks, shapes = np.concatenate([labels, labels]), np.concatenate([sizes, sizes])
-        return model, Poses.concatenate([poses, more]), marks, shapes
+        return model, Poses.concatenate([poses, more]), np.concatenate([sizes, sizes])
 
     def placement(step: tuple[float, float, float]) -> Callable[[], _Plan]:
         return lambda: with_more(replace(poses, axis=poses.axis + np.array(step)))
@@ -223,7 +215,7 @@ def _changes(
         extra = centre + spread * np.array([[-0.5, 0.25, 0.3], [0.4, -0.5, -0.4]])
         radius = np.append(model.bead_radius_mm, [model.bead_radius_mm.mean()] * 2)
         beads = BeadModel(np.concatenate([model.beads, extra]), radius, model.tolerance_mm)
-        return beads, poses, labels, sizes
+        return beads, poses, sizes
 
     sod = float(np.median(poses.sod))
     near = -round(0.25 * sod / 10) * 10

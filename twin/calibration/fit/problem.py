@@ -324,10 +324,7 @@ def build_problem(
     t = np.array(tracks, dtype=np.float64)
     n, k = len(poses), len(model)
     if t.shape != (n, k, 2):
-        raise TwinError(
-            f"tracks have shape {t.shape}; {n} frames and {k} beads need ({n}, {k}, 2)",
-            {"asked": list(t.shape), "allowed": [n, k, 2]},
-        )
+        raise TwinError.of_shape("tracks", t.shape, (n, k, 2), f" for {n} frames and {k} beads")
     seen = np.ascontiguousarray(np.isfinite(t).all(axis=2))
     origin = (frame_shapes(shape, n)[:, ::-1] - 1) / 2
     measured = np.where(seen[:, :, None], t - origin[:, None, :], 0.0)
@@ -335,7 +332,7 @@ def build_problem(
     if groups is not None:
         labels = np.asarray(groups)
         if labels.shape != (n,):
-            raise TwinError(f"groups have shape {labels.shape}; allowed: ({n},)")
+            raise TwinError.of_shape("groups", labels.shape, (n,))
         group = np.unique(labels, return_inverse=True)[1].astype(np.int64).reshape(n)
     count = int(group.max()) + 1 if n else 1
     starts = [start] * count if isinstance(start, Offsets) else list(start)
@@ -391,7 +388,7 @@ def bias_factors(centre: Centre | npt.ArrayLike, shape: tuple[int, int]) -> Floa
     try:
         out = np.array(np.broadcast_to(np.asarray(value, dtype=np.float64), shape))
     except ValueError:
-        raise TwinError(f"centre has shape {np.shape(value)}; allowed: {shape}") from None
+        raise TwinError.of_shape("centre", np.shape(value), shape) from None
     return np.nan_to_num(out)
 
 
@@ -411,7 +408,7 @@ def whitening(
         return out
     c = np.asarray(covariances, dtype=np.float64)
     if c.shape != (*seen.shape, 2, 2):
-        raise TwinError(f"covariances have shape {c.shape}; allowed: {(*seen.shape, 2, 2)}")
+        raise TwinError.of_shape("covariances", c.shape, (*seen.shape, 2, 2))
     cc, cr, rr = c[..., 0, 0], c[..., 0, 1], c[..., 1, 1]
     bad = seen & ~((rr > 0) & (cc * rr - cr * cr > 0))
     if bad.any():

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from flexdt.twin.calibration.fit import fit_kernels as kernels
 from flexdt.twin.calibration.fit.problem import Problem
+from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 
 RAYLEIGH_MEDIAN = 1.1774100225154747
@@ -103,8 +104,8 @@ def solve(
         x=value,
         use=use,
         iterations=iterations,
-        start_cost=_cost(problem, first, use),
-        cost=_cost(problem, value, use),
+        start_cost=cost_at(problem, first, use),
+        cost=cost_at(problem, value, use),
         converged=converged,
     )
 
@@ -128,16 +129,16 @@ def _levenberg(
     weight: FloatArray,
 ) -> tuple[int, float, bool]:
     floor = how.floor_px * how.huber if math.isfinite(how.huber) else 0.0
-    iterations, _, huber, converged = kernels.levenberg(
-        p.data, use, how.huber, floor, mean, weight, x, how.max_iterations, how.tolerance,
-        np.zeros(how.max_iterations + 1),
-    )  # fmt: skip
+    iterations, huber, converged = kernels.levenberg(
+        p.data, use, how.huber, floor, mean, weight, x, how.max_iterations, how.tolerance
+    )
     return int(iterations), float(huber), bool(converged)
 
 
-def _cost(problem: Problem, x: FloatArray, use: npt.NDArray[np.bool_]) -> float:
+def cost_at(problem: Problem, x: FloatArray, use: npt.NDArray[np.bool_]) -> float:
+    """Half the sum of squared whitened residuals; inf where a bead would be behind the source."""
     try:
         norms = problem.residuals(x)[1]
-    except ValueError:
+    except TwinError:
         return math.inf
     return float(0.5 * np.sum(norms[use] ** 2))
