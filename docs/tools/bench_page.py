@@ -1,4 +1,5 @@
-"""The figures of docs/performance.md, from the document that `flexdt bench --out DIR` writes.
+"""The figures of docs/performance.md, from the document that `flexdt bench --out DIR` or
+`examples/research/further_bench.py` writes.
 
     flexdt bench --out out/bench
     python docs/tools/bench_page.py out/bench/bench.json [--page docs/performance.md]

@@ -41,9 +41,7 @@ def main() -> None:
         # Here and in the processes that this one starts.
         os.environ["NUMBA_DISABLE_CUDA"] = "1"
         with gpu.switched_off():
-            document = run_bench(
-                only=only, with_peers=not options.no_peers, extra=not options.quick, tell=to_stderr
-            )
+            document = run_bench(only=only, with_peers=not options.no_peers, tell=to_stderr)
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
         name = "device" if options.device else "bench"

@@ -1,4 +1,4 @@
-"""The benchmark from end to end: cases, peers, further cases, document, figure, table."""
+"""The benchmark from end to end: cases, peers, document."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from flexdt.server.bench import further_cases
 from flexdt.server.bench.cases import Case, all_cases
 from flexdt.server.bench.measure import errors, exact_images, sorted_crossings, timed
-from flexdt.server.bench.peers import Peer, Runner, mesh_peers, peers
+from flexdt.server.bench.peers import Peer, Runner, peers
 from flexdt.twin.projection import forward, gpu, warm_up
 from flexdt.twin.projection.cpu import threads
 
@@ -22,49 +21,23 @@ CHECKED = 300
 """Rays of each case that are checked by a second, independent exact method."""
 
 Tell = Callable[[str], None]
-Wanted = Callable[[str], bool]
 Document = dict[str, Any]
-
-
-GROUPS: Mapping[tuple[str, ...], Callable[[Wanted, frozenset[str]], list[Document]]] = {
-    ("scene-C1", "scene-C3"): lambda wanted, part: further_cases.scenes(),
-    ("mesh",): lambda wanted, part: further_cases.meshes(part),
-    tuple(further_cases.adjoint_names()): lambda wanted, part: further_cases.adjoint(wanted),
-    ("FDK",): lambda wanted, part: [further_cases.fdk_entry(part)],
-    ("cold-cached", "cold-uncached"): lambda wanted, part: further_cases.cold_start(),
-    ("server-C1",): lambda wanted, part: further_cases.through_server(),
-}
-"""Names of cases beyond projection -> what measures them, given the names of peers taking part."""
-
-CURVES: Mapping[str, Callable[[], list[Document]]] = {
-    "rays": lambda: further_cases.growth_with_rays(),
-    "voxels": lambda: further_cases.growth_with_voxels(),
-    "threads": lambda: further_cases.growth_with_threads(),
-}
 
 
 def case_names() -> list[str]:
     """What `only` may name."""
-    return [
-        *(case.name for case in all_cases()),
-        *(name for names in GROUPS for name in names),
-        "growth",
-        *(f"growth-{key}" for key in CURVES),
-        "memory",
-    ]
+    return [case.name for case in all_cases()]
 
 
 def listing() -> list[str]:
-    """A line for every name, with what it is where it is a projection of voxels."""
-    what = {case.name: case.what for case in all_cases()}
-    return [f"{name:24} {what.get(name, '')}".rstrip() for name in case_names()]
+    """A line for every name, with what it is."""
+    return [f"{case.name:24} {case.what}" for case in all_cases()]
 
 
 def run_bench(
     *,
     only: Sequence[str] = (),
     with_peers: bool = True,
-    extra: bool = True,
     tell: Tell = lambda line: None,
 ) -> Document:
     """Measure and return the benchmark document.
@@ -72,46 +45,26 @@ def run_bench(
     Args:
         only: names of cases to run, see `case_names`; all if empty.
         with_peers: run other projectors beside ours.
-        extra: scenes, meshes, adjoint, FDK, growth, cold start, server, memory.
         tell: told a line of text as each result comes in.
 
     Returns:
         {machine, cases: [{name, views, ms_per_view, median_ms_per_view, mean_error, worst_error,
-        peers: {name: {ms_per_view, mean_error}}, ratio: {name: x}, ...}], growth}; errors are
+        peers: {name: {ms_per_view, mean_error}}, ratio: {name: x}, ...}], growth: {}}; errors are
         shares of the maximum against double-precision exact lengths, ratios are peer / flexdt.
     """
     warm_up()
     found = peers() if with_peers else []
-    missing = {p.name: p.missing for p in found} | (mesh_peers() if with_peers else {})
-    part = frozenset(name for name, why in missing.items() if why is None)
+    missing = {p.name: p.missing for p in found}
     document: Document = {"machine": machine(missing), "cases": [], "growth": {}}
     began = document["machine"]["measured"]
 
-    def wanted(name: str) -> bool:
-        return not only or name in only
-
-    def add(entry: Document) -> None:
+    for case in all_cases():
+        if only and case.name not in only:
+            continue
+        entry = run_case(case, [p for p in found if p.missing is None and case.peers])
         entry["load"], entry["measured"] = load(), began
         document["cases"].append(entry)
         tell(line_of(entry))
-
-    for case in all_cases():
-        if not wanted(case.name):
-            continue
-        ready = [p for p in found if p.name in part and case.peers]
-        add(run_case(case, ready))
-    if not extra:
-        return document
-    for names, measure in GROUPS.items():
-        if any(wanted(name) for name in names):
-            for entry in measure(wanted, part):
-                add(entry)
-    for key, curve in CURVES.items():
-        if wanted("growth") or wanted(f"growth-{key}"):
-            document["growth"][key] = curve()
-            tell(f"growth with {key}")
-    if wanted("memory"):
-        document["machine"]["memory_read"] = further_cases.bandwidth()
     return document
 
 
@@ -192,9 +145,6 @@ def line_of(entry: Document) -> str:
         text += f"   mean {entry['mean_error']:.1e} worst {entry['worst_error']:.1e}"
     for name, ratio in entry["ratio"].items():
         text += f"   {ratio:5.1f} x {name} ({entry['peers'][name]['ms_per_view']:.1f} ms)"
-    for key in ("times_forward", "added_ms", "dot_product_error"):
-        if key in entry:
-            text += f"   {key} {entry[key]:.3g}"
     return text
 
 

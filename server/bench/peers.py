@@ -17,7 +17,7 @@ import numpy as np
 from flexdt.server.bench import rtk_peer as rtk
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.projection import TriangleMesh, Volume
+from flexdt.twin.projection import Volume
 from flexdt.twin.projection.operators import voxel_rays
 
 
@@ -57,17 +57,13 @@ class Peer:
 def peers() -> list[Peer]:
     """All peers this benchmark knows, installed or not."""
     return [
-        Peer("itk-rtk", _absent("itk-rtk"), False, joseph),
-        Peer("diffdrr", _absent("diffdrr"), True, DiffDrr),
+        Peer("itk-rtk", absent("itk-rtk"), False, joseph),
+        Peer("diffdrr", absent("diffdrr"), True, DiffDrr),
     ]
 
 
-def mesh_peers() -> dict[str, str | None]:
-    """Peers that take triangles: name to why it cannot take part, or None."""
-    return {"embreex": _absent("embreex")}
-
-
-def _absent(package: str) -> str | None:
+def absent(package: str) -> str | None:
+    """Why a package on PyPI cannot take part, or None."""
     # Asked of the installer: a look for the module itself would load itk into this process.
     try:
         metadata.distribution(package)
@@ -129,40 +125,6 @@ class DiffDrr:
     def images(self) -> Float32Array:
         """See `Runner`."""
         return self._result
-
-    def close(self) -> None:
-        """See `Runner`."""
-
-
-class Embree:
-    """Path lengths through a convex mesh by embreex: the first hit from either side."""
-
-    def __init__(self, mesh: TriangleMesh, view: ConeVec, shape: tuple[int, int]) -> None:
-        from embreex import rtcore_scene
-        from embreex.mesh_construction import TriangleMesh as EmbreeMesh
-
-        self._scene = rtcore_scene.EmbreeScene()
-        EmbreeMesh(self._scene, mesh.vertices[mesh.faces].astype(np.float32))
-        ends = view.pixel_centers(shape)[0].reshape(-1, 3)
-        ray = ends - view.source[0]
-        self._length = np.linalg.norm(ray, axis=1)
-        self._ahead = np.ascontiguousarray((ray / self._length[:, None]).astype(np.float32))
-        self._behind = np.ascontiguousarray(-self._ahead)
-        origins = np.broadcast_to(view.source[0], ends.shape)
-        self._source = np.ascontiguousarray(origins.astype(np.float32))
-        self._ends = np.ascontiguousarray(ends.astype(np.float32))
-        self._shape = (1, *shape)
-        self._result = np.zeros(0)
-
-    def run(self) -> None:
-        """See `Runner`."""
-        enter = self._scene.run(self._source, self._ahead, query="DISTANCE")
-        leave = self._scene.run(self._ends, self._behind, query="DISTANCE")
-        self._result = np.where(enter < 1e30, self._length - enter - leave, 0.0)
-
-    def images(self) -> Float32Array:
-        """See `Runner`."""
-        return self._result.reshape(self._shape).astype(np.float32)
 
     def close(self) -> None:
         """See `Runner`."""

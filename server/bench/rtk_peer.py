@@ -1,8 +1,8 @@
-"""itk-rtk at work in a process of its own: its Joseph projector and its FDK.
+"""itk-rtk at work in a process of its own: its Joseph projector.
 
 ITK's wrappers can end the interpreter that has loaded them with a segmentation fault while it shuts
 down, which would turn a good run into a bad exit code. The process times each call itself, so the
-way there and back costs nothing. Only its functions `joseph` and `fdk` import itk.
+way there and back costs nothing. Only the functions below it import itk.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Rtk:
     """A process that has prepared one piece of work.
 
     Args:
-        build: `joseph` or `fdk`.
+        build: `joseph`, or another function of a module that gives `Work`.
         arguments: of `build`.
 
     Raises:
@@ -112,9 +112,9 @@ def joseph(
 
     kind = itk.Image[itk.F, 3]
     project = rtk.JosephForwardProjectionImageFilter[kind, kind].New()
-    project.SetInput(0, _stack(np.zeros((len(rows), *shape), np.float32), rows))
-    project.SetInput(1, _volume(data, voxel_mm, center_mm))
-    project.SetGeometry(_geometry(rows))
+    project.SetInput(0, rtk_stack(np.zeros((len(rows), *shape), np.float32), rows))
+    project.SetInput(1, rtk_volume(data, voxel_mm, center_mm))
+    project.SetGeometry(rtk_geometry(rows))
     project.InPlaceOff()
 
     def run() -> None:
@@ -124,37 +124,7 @@ def joseph(
     return run, lambda: np.array(itk.array_from_image(project.GetOutput()), dtype=np.float32)
 
 
-def fdk(
-    images: Float32Array,
-    rows: FloatArray,
-    counts: tuple[int, int, int],
-    voxel_mm: tuple[float, float, float],
-    center_mm: tuple[float, float, float],
-) -> Work:
-    """RTK's FDK of projections (n, rows, cols) into a grid of counts (nz, ny, nx)."""
-    import itk
-    from itk import RTK as rtk
-
-    kind = itk.Image[itk.F, 3]
-    stack, geometry = _stack(images, rows), _geometry(rows)
-    grid = _volume(np.zeros(counts, np.float32), voxel_mm, center_mm)
-    made: list[Float32Array] = []
-
-    def run() -> None:
-        reconstruct = rtk.FDKConeBeamReconstructionFilter[kind].New()
-        reconstruct.SetInput(0, grid)
-        reconstruct.SetInput(1, stack)
-        reconstruct.SetGeometry(geometry)
-        reconstruct.GetRampFilter().SetTruncationCorrection(0.0)
-        reconstruct.GetRampFilter().SetHannCutFrequency(0.0)
-        reconstruct.Update()
-        # Back from (-y, z, x).
-        made[:] = [itk.array_from_image(reconstruct.GetOutput())[::-1].transpose(1, 0, 2)]
-
-    return run, lambda: np.ascontiguousarray(made[0])
-
-
-def _geometry(rows: FloatArray) -> Any:
+def rtk_geometry(rows: FloatArray) -> Any:
     """RTK's geometry object of cone_vec rows."""
     import itk
     from itk import RTK as rtk
@@ -171,7 +141,7 @@ def _geometry(rows: FloatArray) -> Any:
     return geometry
 
 
-def _volume(
+def rtk_volume(
     data: Float32Array, voxel_mm: tuple[float, float, float], center_mm: tuple[float, float, float]
 ) -> Any:
     """A volume (z, y, x) as an ITK image in RTK's axes."""
@@ -186,7 +156,7 @@ def _volume(
     return image
 
 
-def _stack(images: Float32Array, rows: FloatArray) -> Any:
+def rtk_stack(images: Float32Array, rows: FloatArray) -> Any:
     """Projections as an ITK image, pixel (0, 0) first."""
     import itk
 

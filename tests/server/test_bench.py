@@ -8,14 +8,13 @@ import time
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-import numba
+import further_bench
 import numpy as np
 import pytest
 from loaded_script import load
 
 from flexdt.server.bench import __main__ as command
 from flexdt.server.bench import benchmark as run
-from flexdt.server.bench import further_cases
 from flexdt.server.bench.cases import (
     Case,
     circle,
@@ -25,8 +24,7 @@ from flexdt.server.bench.cases import (
 )
 from flexdt.server.bench.measure import errors, exact_images, interleaved, sorted_crossings
 from flexdt.server.bench.peers import Peer
-from flexdt.twin.projection import forward, gpu, project_mesh, project_scene
-from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
+from flexdt.twin.projection import forward, gpu
 from tests.support.device_simulator import run_simulated
 
 SHAPE = (30, 40)
@@ -64,12 +62,11 @@ def small(monkeypatch):
             Peer("absent", "not installed", False, Doubled),
         ],
     )
-    monkeypatch.setattr(run, "mesh_peers", lambda: {"triangles": "not installed"})
     monkeypatch.setenv("NUMBA_DISABLE_CUDA", "0")  # the command sets it: undone after the test
 
 
 def test_document_has_the_published_shape(small) -> None:
-    document = run.run_bench(extra=False)
+    document = run.run_bench()
     (case,) = document["cases"]
     assert case["name"] == "C1"
     assert case["views"] == 2
@@ -81,9 +78,7 @@ def test_document_has_the_published_shape(small) -> None:
     # The peer's error is the mean of the images themselves, as a share of the maximum.
     assert 0.01 < case["peers"]["doubled"]["mean_error"] < 1
     assert case["ratio"]["doubled"] > 0
-    assert document["machine"]["peers"] == {
-        "doubled": "took part", "absent": "not installed", "triangles": "not installed",
-    }  # fmt: skip
+    assert document["machine"]["peers"] == {"doubled": "took part", "absent": "not installed"}
     assert case["measured"] == document["machine"]["measured"]
     json.dumps(document)
 
@@ -118,7 +113,7 @@ def test_figure_shows_ratios_and_growth() -> None:
 
 
 def test_a_page_gets_its_figures_between_the_marks(small) -> None:
-    document = run.run_bench(extra=False)
+    document = run.run_bench()
     page = f"# Title\n{PAGE.BEGIN}\nold\n{PAGE.END}\nthe rest\n"
     renewed = PAGE.into_page(page, document, "images/bench.svg")
     assert "old" not in renewed
@@ -134,11 +129,12 @@ def test_a_page_keeps_what_was_not_run_again(small, monkeypatch, tmp_path) -> No
     page = tmp_path / "performance.md"
     page.write_text(f"# Title\n{PAGE.BEGIN}\n{PAGE.END}\n", "utf-8")
     monkeypatch.setattr(
-        further_cases, "growth_with_threads", lambda: [{"series": "level", "x": 1, "ms": 7.5}]
+        further_bench, "growth_with_threads", lambda: [{"series": "level", "x": 1, "ms": 7.5}]
     )
-    for arguments in (["--quick"], ["--no-peers", "--only", "growth-threads"]):
+    further = ["--no-peers", "--only", "growth-threads"]
+    for main, arguments in ((command.main, ["--quick"]), (further_bench.main, further)):
         monkeypatch.setattr(sys, "argv", ["bench", "--out", str(tmp_path / "out"), *arguments])
-        command.main()
+        main()
         document = str(tmp_path / "out" / "bench.json")
         monkeypatch.setattr(sys, "argv", ["bench_page.py", document, "--page", str(page)])
         PAGE.main()
@@ -152,40 +148,6 @@ def test_a_page_keeps_what_was_not_run_again(small, monkeypatch, tmp_path) -> No
     together = PAGE.merged(kept, once_more)
     assert [(c["name"], c.get("views")) for c in together["cases"]] == [("C1", 9), ("new", None)]
     assert together["growth"] == kept["growth"]
-
-
-def test_growth_with_threads_takes_turns(monkeypatch) -> None:
-    monkeypatch.setattr(further_cases, "C1_SHAPE", (8, 8, 8))
-    before = numba.get_num_threads()
-    rounds = []
-
-    def fewer(calls, budget_s):
-        rounds.append(list(calls))
-        return interleaved(calls, budget_s=0.0)
-
-    monkeypatch.setattr(further_cases, "interleaved", fewer)
-    points = further_cases.growth_with_threads()
-    assert len(rounds) == 1
-    assert numba.get_num_threads() == before
-    assert {p["x"] for p in points if p["series"] == "tilted, 36 views"} == {
-        2**k for k in range(before.bit_length())
-    }
-    assert all(p["ms"] > 0 for p in points)
-
-
-def test_the_adjoint_is_measured_beside_the_forward(monkeypatch) -> None:
-    view = circle(2, SHAPE, pitch=0.5)
-    case = Case("C1", lambda: noise((16, 12, 10)), view, SHAPE, True, "small")
-    monkeypatch.setattr(further_cases, "peer_cases", lambda: [case])
-    monkeypatch.setattr(further_cases, "untuned_cases", list)
-    chosen = ("adjoint-C1", "adjoint-C1-new")
-    assert set(chosen) < set(further_cases.adjoint_names())
-    entries = further_cases.adjoint(lambda name: name in chosen)
-    assert [entry["name"] for entry in entries] == list(chosen)
-    for entry in entries:
-        assert entry["dot_product_error"] < 1e-6
-        assert entry["times_forward"] > 0
-        assert not entry["peers"]
 
 
 def test_short_calls_get_more_rounds() -> None:
@@ -249,31 +211,6 @@ def test_errors_are_shares_of_the_maximum() -> None:
     assert errors(exact + np.float32(0.5), exact) == (0.125, 0.125)
 
 
-def test_bead_scene_and_mesh_are_what_they_say() -> None:
-    assert len(further_cases.bead_scene().solids) == 6
-    mesh = further_cases.ball_mesh(2)
-    assert len(mesh.faces) == 320
-    assert mesh.volume_mm3 == pytest.approx(4 / 3 * np.pi * 1000, rel=0.04)
-
-
-def test_scenes_and_meshes_are_compared_with_a_second_way() -> None:
-    view = circle(1, SHAPE, pitch=3.0, tilt_deg=(3.0, 2.0, 1.0))
-    scene = further_cases.bead_scene()
-    exact = further_cases.scene_chords(scene, view, SHAPE)
-    assert exact.max() > 0.3
-    assert errors(project_scene(scene, view, SHAPE), exact)[1] < 1e-6
-    # A bead left out is found.
-    assert errors(project_scene(Scene(scene.solids[:-1]), view, SHAPE), exact)[1] > 0.1
-    mesh = further_cases.ball_mesh(1)
-    paths = project_mesh(mesh, view, SHAPE)
-    pixels = np.argwhere(paths[0])
-    again = further_cases.mesh_paths(mesh, view, SHAPE, pixels)
-    assert len(pixels) > 20
-    assert errors(paths[0][tuple(pixels.T)], again)[1] < 1e-6
-    ball = Scene((Solid(Sphere((0, 0, 0), 10.0), "abs", 1.0),))
-    assert errors(project_scene(ball, view, SHAPE)[0][tuple(pixels.T)], again)[1] > 0.01
-
-
 def entry(name, **figures):
     return {"name": name, "mean_error": None, "worst_error": None, "ratio": {}, **figures}
 
@@ -310,7 +247,7 @@ def test_targets_are_judged_from_the_document() -> None:
 
 
 def test_a_page_says_which_cases_are_of_another_run(small) -> None:
-    document = run.run_bench(extra=False)
+    document = run.run_bench()
     old = {**document, "cases": [dict(document["cases"][0], name=n) for n in ("A", "B", "C1")]}
     for case in old["cases"]:
         case["measured"] = "2001-01-01T00:00+00:00"
@@ -319,25 +256,10 @@ def test_a_page_says_which_cases_are_of_another_run(small) -> None:
     assert "another run" not in PAGE.into_page(f"{PAGE.BEGIN}{PAGE.END}", document, "")
 
 
-def test_no_peers_means_none(small, monkeypatch) -> None:
-    def refuse(*arguments):
-        raise AssertionError("a peer was prepared")
-
-    parts = []
-    monkeypatch.setattr(run, "GROUPS", {("mesh",): lambda wanted, part: parts.append(part) or []})
-    monkeypatch.setattr(run, "mesh_peers", lambda: {"embreex": None})
-    monkeypatch.setattr(run, "CURVES", {})
-    assert run.run_bench(only=["mesh"], with_peers=False)["machine"]["peers"] == {}
-    run.run_bench(only=["mesh"])
-    assert parts == [frozenset(), {"doubled", "embreex"}]
-    monkeypatch.setattr(further_cases, "Embree", refuse)
-    monkeypatch.setattr(further_cases, "BINNED", SHAPE)
-    monkeypatch.setattr(further_cases, "circle", lambda n, shape: circle(n, shape, pitch=1.5))
-    monkeypatch.setattr(further_cases, "CHECKED", 20)
-    for made in further_cases.meshes(frozenset()):
-        assert made["worst_error"] < 1e-6
-    with pytest.raises(AssertionError, match="prepared"):
-        further_cases.meshes(frozenset({"embreex"}))
+def test_no_peers_means_none(small) -> None:
+    document = run.run_bench(with_peers=False)
+    assert document["machine"]["peers"] == {}
+    assert not document["cases"][0]["peers"]
 
 
 def test_the_list_names_every_case(monkeypatch, capsys) -> None:
@@ -380,6 +302,7 @@ command.main()
 """
 
 
+@pytest.mark.slow
 def test_the_page_of_a_device_has_every_target(tmp_path) -> None:
     run_simulated(DEVICE, str(tmp_path))
     document = json.loads((tmp_path / "device.json").read_text("utf-8"))

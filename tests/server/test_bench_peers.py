@@ -7,17 +7,17 @@ import sys
 
 import numpy as np
 import pytest
+from further_bench import Embree, ball_mesh, rtk_fdk
 
 from flexdt.server.bench import rtk_peer as rtk
 from flexdt.server.bench.cases import TILT_DEG, circle
-from flexdt.server.bench.further_cases import ball_mesh
-from flexdt.server.bench.peers import DiffDrr, Embree, joseph, mesh_peers, peers
+from flexdt.server.bench.peers import DiffDrr, absent, joseph
 from flexdt.twin.projection import Volume, forward, project_mesh, project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 from flexdt.twin.reconstruction import fdk
 
 SHAPE = (30, 40)
-MISSING = {peer.name: peer.missing for peer in peers()} | mesh_peers()
+MISSING = {name: absent(name) for name in ("itk-rtk", "diffdrr", "embreex")}
 
 
 def needs(name):
@@ -66,7 +66,7 @@ def test_rtk_fdk_in_its_own_process() -> None:
     ball = Scene((Solid(Sphere((4.0, -3.0, 2.0), 6.0), "abs", 0.02),))
     images = project_scene(ball, view, SHAPE)
     grid = Volume(np.zeros((20, 24, 28), np.float32), 1.0)
-    other = rtk.Rtk(rtk.fdk, images, view.rows, grid.shape, grid.voxel_xyz, grid.center_mm)
+    other = rtk.Rtk(rtk_fdk, images, view.rows, grid.shape, grid.voxel_xyz, grid.center_mm)
     try:
         other.run()
         theirs = other.images()

@@ -1,7 +1,10 @@
-"""What is measured besides projections of voxels: the adjoint, scenes and meshes, FDK, growth, cold
-start, memory, and the way through the projector server.
+"""What `flexdt bench` leaves out: the adjoint, scenes and meshes, FDK, growth, cold start, memory,
+and the way through the projector server.
 
-Each function returns entries for the document; none prints.
+    python examples/research/further_bench.py --out out/further [--only FDK growth] [--no-peers]
+
+writes `bench.json`, of the form that `flexdt bench` writes: `docs/tools/bench_page.py` takes both.
+`--list` names what there is.
 
 Growth is time against the number of rays, voxels along an edge and threads; the points of a curve
 are timed in rotation, so that a disturbance affects all of them alike.
@@ -11,6 +14,7 @@ Scenes and meshes are compared with the same integrals in plain NumPy of double 
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import json
 import os
@@ -19,13 +23,16 @@ import sys
 import tempfile
 import time
 import timeit
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import numpy as np
+from numba import njit, prange
 
 from flexdt.server.bench import rtk_peer as rtk
+from flexdt.server.bench.benchmark import Document, line_of, load, machine, to_stderr
 from flexdt.server.bench.cases import (
     BINNED,
     C1_SHAPE,
@@ -38,10 +45,19 @@ from flexdt.server.bench.cases import (
     untuned_cases,
 )
 from flexdt.server.bench.measure import Entry, errors, interleaved, plain, timed
-from flexdt.server.bench.peers import Embree
+from flexdt.server.bench.peers import absent
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.projection import Volume, back, forward, project_mesh, project_scene, room_like
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.projection import (
+    Volume,
+    back,
+    forward,
+    gpu,
+    project_mesh,
+    project_scene,
+    room_like,
+    warm_up,
+)
 from flexdt.twin.projection.analytic_solids import Box, Scene, Solid, Sphere
 from flexdt.twin.projection.cpu import threads
 from flexdt.twin.projection.mesh import TriangleMesh
@@ -110,7 +126,7 @@ def fdk_entry(part: frozenset[str]) -> Entry:
     calls: dict[str, Callable[[], object]] = {"flexdt": ours}
     other = None
     if "itk-rtk" in part:
-        other = rtk.Rtk(rtk.fdk, images, geometry.rows, grid.shape, grid.voxel_xyz, grid.center_mm)
+        other = rtk.Rtk(rtk_fdk, images, geometry.rows, grid.shape, grid.voxel_xyz, grid.center_mm)
         calls["itk-rtk"] = other.run
     try:
         what = "360 views of 478 x 380 into 256^3; error: of the ball's mean"
@@ -123,6 +139,36 @@ def fdk_entry(part: frozenset[str]) -> Entry:
         if other is not None:
             other.close()
     return entry
+
+
+def rtk_fdk(
+    images: Float32Array,
+    rows: FloatArray,
+    counts: tuple[int, int, int],
+    voxel_mm: tuple[float, float, float],
+    center_mm: tuple[float, float, float],
+) -> rtk.Work:
+    """RTK's FDK of projections (n, rows, cols) into a grid of counts (nz, ny, nx)."""
+    import itk
+    from itk import RTK
+
+    kind = itk.Image[itk.F, 3]
+    stack, geometry = rtk.rtk_stack(images, rows), rtk.rtk_geometry(rows)
+    grid = rtk.rtk_volume(np.zeros(counts, np.float32), voxel_mm, center_mm)
+    made: list[Float32Array] = []
+
+    def run() -> None:
+        reconstruct = RTK.FDKConeBeamReconstructionFilter[kind].New()
+        reconstruct.SetInput(0, grid)
+        reconstruct.SetInput(1, stack)
+        reconstruct.SetGeometry(geometry)
+        reconstruct.GetRampFilter().SetTruncationCorrection(0.0)
+        reconstruct.GetRampFilter().SetHannCutFrequency(0.0)
+        reconstruct.Update()
+        # Back from (-y, z, x).
+        made[:] = [itk.array_from_image(reconstruct.GetOutput())[::-1].transpose(1, 0, 2)]
+
+    return run, lambda: np.ascontiguousarray(made[0])
 
 
 def _ball_error(volume: Volume) -> float:
@@ -161,9 +207,12 @@ def cold_start() -> list[Entry]:
 
 def through_server() -> list[Entry]:
     """C1 asked for over TCP beside the same projection in this process."""
-    command = [sys.executable, "-m", "flexdt.server.runtime.child", "flexdt.server.projector.main"]
+    command = [sys.executable, "-P", "-m", "flexdt.server.runtime.child"]
     with subprocess.Popen(
-        [*command, "--port", "0"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [*command, "flexdt.server.projector.main", "--port", "0"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     ) as process:
         try:
             assert process.stdout is not None
@@ -200,10 +249,22 @@ async def _through(host: str, port: int) -> list[Entry]:
     return [entry]
 
 
+@njit(parallel=True, nogil=True, cache=True, fastmath=True)
+def read_all(data, workers):
+    """Sum of an array, shared out evenly; the sum is returned so that nothing is left out."""
+    sums = np.zeros(workers * 16)
+    each = data.size // workers
+    for w in prange(workers):
+        part = data[w * each : (w + 1) * each]
+        total = np.float32(0)
+        for i in range(part.size):
+            total += part[i]
+        sums[w * 16] = total
+    return sums.sum()
+
+
 def bandwidth() -> Entry:
     """Bytes a second that plain reading gets from memory, with one thread and with all."""
-    from flexdt.server.bench.bandwidth_kernels import read_all
-
     data = np.ones(2**27, np.float32)
     entry: Entry = {}
     for name, workers in (("one_thread", 1), ("all_threads", threads())):
@@ -374,6 +435,40 @@ def meshes(part: frozenset[str]) -> list[Entry]:
     return entries
 
 
+class Embree:
+    """Path lengths through a convex mesh by embreex: the first hit from either side."""
+
+    def __init__(self, mesh: TriangleMesh, view: ConeVec, shape: tuple[int, int]) -> None:
+        from embreex import rtcore_scene
+        from embreex.mesh_construction import TriangleMesh as EmbreeMesh
+
+        self._scene = rtcore_scene.EmbreeScene()
+        EmbreeMesh(self._scene, mesh.vertices[mesh.faces].astype(np.float32))
+        ends = view.pixel_centers(shape)[0].reshape(-1, 3)
+        ray = ends - view.source[0]
+        self._length = np.linalg.norm(ray, axis=1)
+        self._ahead = np.ascontiguousarray((ray / self._length[:, None]).astype(np.float32))
+        self._behind = np.ascontiguousarray(-self._ahead)
+        origins = np.broadcast_to(view.source[0], ends.shape)
+        self._source = np.ascontiguousarray(origins.astype(np.float32))
+        self._ends = np.ascontiguousarray(ends.astype(np.float32))
+        self._shape = (1, *shape)
+        self._result = np.zeros(0)
+
+    def run(self) -> None:
+        """See `Runner`."""
+        enter = self._scene.run(self._source, self._ahead, query="DISTANCE")
+        leave = self._scene.run(self._ends, self._behind, query="DISTANCE")
+        self._result = np.where(enter < 1e30, self._length - enter - leave, 0.0)
+
+    def images(self) -> Float32Array:
+        """See `Runner`."""
+        return self._result.reshape(self._shape).astype(np.float32)
+
+    def close(self) -> None:
+        """See `Runner`."""
+
+
 def mesh_paths(
     mesh: TriangleMesh, view: ConeVec, shape: tuple[int, int], pixels: np.ndarray[tuple[int, ...]]
 ) -> FloatArray:
@@ -401,3 +496,82 @@ def mesh_paths(
         away = -np.sign(scale[hit])
         result[i] = float(np.sum(away * np.clip(t[hit], 0.0, 1.0)) * np.linalg.norm(ray))
     return result
+
+
+Wanted = Callable[[str], bool]
+GROUPS: Mapping[tuple[str, ...], Callable[[Wanted, frozenset[str]], list[Entry]]] = {
+    ("scene-C1", "scene-C3"): lambda wanted, part: scenes(),
+    ("mesh",): lambda wanted, part: meshes(part),
+    tuple(adjoint_names()): lambda wanted, part: adjoint(wanted),
+    ("FDK",): lambda wanted, part: [fdk_entry(part)],
+    ("cold-cached", "cold-uncached"): lambda wanted, part: cold_start(),
+    ("server-C1",): lambda wanted, part: through_server(),
+}
+"""Names of cases -> what measures them, given the names of peers taking part."""
+
+CURVES: Mapping[str, Callable[[], list[Entry]]] = {
+    "rays": lambda: growth_with_rays(),
+    "voxels": lambda: growth_with_voxels(),
+    "threads": lambda: growth_with_threads(),
+}
+
+
+FURTHER = ("times_forward", "added_ms", "dot_product_error")
+"""Figures of an entry that its line ends with."""
+
+
+def names() -> list[str]:
+    """What `--only` may name."""
+    cases = [name for group in GROUPS for name in group]
+    return [*cases, "growth", *(f"growth-{key}" for key in CURVES), "memory"]
+
+
+def run(only: Sequence[str], with_peers: bool) -> Document:
+    """Measure what is named, everything if nothing is, and return the document."""
+    warm_up()
+    missing = {name: absent(name) for name in ("itk-rtk", "embreex")} if with_peers else {}
+    part = frozenset(name for name, why in missing.items() if why is None)
+    document: Document = {"machine": machine(missing), "cases": [], "growth": {}}
+
+    def wanted(name: str) -> bool:
+        return not only or name in only
+
+    for group, measure in GROUPS.items():
+        if any(wanted(name) for name in group):
+            for entry in measure(wanted, part):
+                entry["load"], entry["measured"] = load(), document["machine"]["measured"]
+                document["cases"].append(entry)
+                more = (f"   {key} {entry[key]:.3g}" for key in FURTHER if key in entry)
+                to_stderr(line_of(entry) + "".join(more))
+    for key, curve in CURVES.items():
+        if wanted("growth") or wanted(f"growth-{key}"):
+            document["growth"][key] = curve()
+            to_stderr(f"growth with {key}")
+    if wanted("memory"):
+        document["machine"]["memory_read"] = bandwidth()
+    return document
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, help="write bench.json here, do not print it")
+    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", choices=names())
+    parser.add_argument("--no-peers", action="store_true", help="do not run other programs")
+    parser.add_argument("--list", action="store_true", help="name the cases, measure nothing")
+    options = parser.parse_args()
+    if options.list:
+        print("\n".join(names()))
+        return
+    os.environ["NUMBA_DISABLE_CUDA"] = "1"  # for the processes that this one starts
+    with gpu.switched_off():
+        document = run(options.only, not options.no_peers)
+    text = json.dumps(document, indent=1)
+    if options.out is None:
+        print(text)
+    else:
+        options.out.mkdir(parents=True, exist_ok=True)
+        (options.out / "bench.json").write_text(text + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    main()
