@@ -107,7 +107,7 @@ METHODS: Final = _table(
     _check("trajectory.check", p.TrajectoryInput, r.CheckResult, "plan and check poses"),
     _submit("trajectory.submit", p.TrajectoryInput, r.SubmitResult, "run poses as a job"),
     _read("job.status", p.JobRef, s.JobStatus, "how far a job is"),
-    _move("job.pause", p.JobRef, s.JobStatus, "pause a job after the current frame"),
+    _move("job.pause", p.JobRef, s.JobStatus, "pause a job; a frame under exposure is taken again"),
     _move("job.resume", p.JobRef, s.JobStatus, "return to the pose of the pause and go on"),
     _move("job.step", p.JobRef, s.JobStatus, "run a paused job for one step"),
     Method("job.abort", p.JobRef, s.JobStatus, "end a job, its data set incomplete", urgent=True),

@@ -25,6 +25,7 @@ from flexdt.protocol.fields import (
     Params,
     Payload,
     PixelAsked,
+    Place,
     Power,
     RoiAsked,
     ShortText,
@@ -377,6 +378,18 @@ class CalibrationGet(Params):
 Parameters = Annotated[list[AxisName], MaxLen(17)]
 
 
+class Mark(Params):
+    """Where a bead was seen in a projection; pixel (0, 0) is the middle of the upper left one."""
+
+    frame: Annotated[int, Ge(0), Le(10_000_000)] = Field(description="projection, counted from 0")
+    marker: AxisName = Field(description="number of the bead in its phantom, counted from 0")
+    column: Place
+    row: Place
+    sigma: Annotated[float, Ge(1e-3), Le(1e4)] | None = Field(
+        default=None, description="standard deviation of each [px]; 0.5 if left out"
+    )
+
+
 class CalibrationFit(Params):
     """Data sets of a bead phantom, and what to estimate from them."""
 
@@ -397,6 +410,9 @@ class CalibrationFit(Params):
     residuals: bool = Field(default=False, description="tell those of every bead in every frame")
     tracks: bool = Field(
         default=False, description="tell where beads are, and were put before and after"
+    )
+    markers: Annotated[list[Mark], Len(1, 10_000)] | None = Field(
+        default=None, description="where beads were seen in the one data set; default: found there"
     )
 
 

@@ -253,6 +253,9 @@ class DatasetFrameResult(ImageValue):
     index: int
     file: str
     image: ImageKind
+    projection: int | None = Field(
+        default=None, description="its number among the projections, as calibration.fit counts them"
+    )
     kind: Literal["line_integral", "counts"]
     time_s: float | None = None
     exposure_ms: float | None = None

@@ -18,6 +18,7 @@ import numpy as np
 
 from flexdt.clients.calibration.detected_frames import DatasetFrames
 from flexdt.clients.calibration.markers import (
+    Mark,
     Scale,
     calibrate_known,
     calibrate_unknown,
@@ -113,7 +114,7 @@ def calibrate_datasets(
     phantom: str | Phantom,
     request: Request | None = None,
     *,
-    markers: str | PathLike[str] | None = None,
+    markers: str | PathLike[str] | Sequence[Mark] | None = None,
     scale: Scale | None = None,
     radius_px: float | None = None,
 ) -> Outcome:
@@ -124,8 +125,8 @@ def calibrate_datasets(
         phantom: a phantom, its name, the path of a phantom file, or UNKNOWN: markers of unknown
             positions, in one data set.
         request: what to estimate; None is the thesis's six parameters, or dO_x for unknown markers.
-        markers: file that says where they are seen, in one data set (see `read_markers`); None:
-            they are detected in the images.
+        markers: where they are seen in one data set, or the file that says it (see
+            `read_markers`); None: they are detected in the images.
         scale: a known distance of two unknown markers.
         radius_px: of their spots; None: any from 1.5 px up.
 

@@ -11,7 +11,8 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
+import operator
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -53,6 +54,11 @@ NAMES: Final = {
     "row": ("row", "y", "v"),
 }
 """What the columns of a CSV file may be called."""
+
+
+Mark = tuple[int, str, float, float, float | None]
+"""Where a marker was seen: frame (counted from 0), marker, column, row and sigma [px], None for
+`ASSUMED_PX`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,17 +112,19 @@ class Scale:
         return found
 
 
-def read_markers(file: str | PathLike[str], views: int) -> Markers:
-    """Markers of a CSV or NumPy file.
+def read_markers(source: str | PathLike[str] | Sequence[Mark], views: int) -> Markers:
+    """Markers of a CSV or NumPy file, or marks.
 
     Args:
-        file: its path; .npy is a NumPy file, anything else a CSV file.
+        source: the file's path (.npy is a NumPy file, anything else a CSV file), or the marks.
         views: how many frames there are.
 
     Raises:
-        TwinError: the file cannot be read, or does not hold; says where.
+        TwinError: the file cannot be read, or what is in it does not hold; says where.
     """
-    path = Path(file)
+    if not isinstance(source, str | PathLike):
+        return _gathered((_mark(f"mark {i}", row) for i, row in enumerate(source)), views)
+    path = Path(source)
     if path.suffix.lower() == ".npy":
         try:
             tracks = np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
@@ -137,19 +145,41 @@ def read_markers(file: str | PathLike[str], views: int) -> Markers:
             "row and, optionally, sigma"
         )
     width = head.index("sigma") if "sigma" in head else -1
-    seen: dict[tuple[int, str], tuple[float, float, float]] = {}
+    marks: list[tuple[str, Mark]] = []
     for line, row in enumerate(rows[1:], start=2):
         if not any(word.strip() for word in row):
             continue
         try:
             frame, name = int(row[at["frame"]]), row[at["marker"]].strip()
             x, y = (float(row[at[n]] or "nan") for n in ("column", "row"))
-            sigma = float(row[width]) if width >= 0 else ASSUMED_PX
+            sigma = float(row[width]) if width >= 0 else None
         except (ValueError, IndexError):
             raise TwinError(f"{path}, line {line}: {','.join(row)!r} is not {head}") from None
+        marks.append((f"{path}, line {line}", (frame, name, x, y, sigma)))
+    return _gathered(marks, views)
+
+
+def _mark(where: str, row: Mark) -> tuple[str, Mark]:
+    """A mark of whoever calls the library, with the types it should have; a number is a name."""
+    try:
+        frame, name, column, line, sigma = row
+        stated = None if sigma is None else float(sigma)
+        return where, (operator.index(frame), str(name), float(column), float(line), stated)
+    except (TypeError, ValueError):
+        raise TwinError(
+            f"{where} is {row!r}; allowed: (frame, marker, column, row, sigma), sigma None where "
+            "it is not known"
+        ) from None
+
+
+def _gathered(marks: Iterable[tuple[str, Mark]], views: int) -> Markers:
+    """Marks, each with words for where it stands, as a table."""
+    seen: dict[tuple[int, str], tuple[float, float, float]] = {}
+    for where, (frame, name, x, y, stated) in marks:
+        sigma = ASSUMED_PX if stated is None else stated
         if not 0 <= frame < views or (frame, name) in seen or not sigma > 0:
             raise TwinError(
-                f"{path}, line {line}: marker {name!r} in frame {frame}, sigma {sigma:g} px; "
+                f"{where}: marker {name!r} in frame {frame}, sigma {sigma:g} px; "
                 f"allowed: frames 0 to {views - 1}, each marker once in each, sigma above 0"
             )
         seen[frame, name] = x, y, sigma
@@ -218,18 +248,20 @@ def calibrate_known(
     """Calibrate from the marked beads of a phantom; marker "3" is its bead 3, counted from 0.
 
     Raises:
-        TwinError: a marker is no bead of the phantom.
+        TwinError: a marker is no bead of the phantom, or two are the same one ("3" and "03").
     """
     beads = len(phantom.beads)
     odd = [n for n in markers.names if not n.isdecimal() or int(n) >= beads]
+    numbers = [int(n) for n in markers.names if n not in odd]
+    odd += [n for n in markers.names if n not in odd and numbers.count(int(n)) > 1]
     if odd:
         raise TwinError(
-            f"marker {odd[0]!r} is no bead of {phantom.name!r}; allowed: 0 to {beads - 1}, or "
-            "phantom unknown"
+            f"marker {odd[0]!r} is no bead of {phantom.name!r}; allowed: 0 to {beads - 1}, each "
+            "once, or phantom unknown"
         )
     looks, index = spots_of(markers, data.shape)
     every = np.full((len(data), beads), -1, dtype=np.int64)
-    every[:, [int(n) for n in markers.names]] = index
+    every[:, numbers] = index
     return _calibrated(data, looks, every, phantom, request)
 
 

@@ -5,13 +5,11 @@ It has the methods, results and policy of `TwinClient`, which waits for it in an
 
 from __future__ import annotations
 
-import asyncio
-import inspect
 import ssl as tls
 from typing import TypeVar
 
 from flexdt.clients.client.events import AsyncSubscription
-from flexdt.clients.client.flows import Ask, Effect, Flow, Sleep, Tell, adrive
+from flexdt.clients.client.flows import Flow, adrive
 from flexdt.clients.client.policy import Core
 from flexdt.clients.client.shared_methods import SharedMethods
 from flexdt.clients.client.transport import TcpTransport, Transport
@@ -97,7 +95,7 @@ class AsyncTwinClient(SharedMethods):
 
     async def run(self, flow: Flow[_R]) -> _R:
         """Run a flow of `twin_methods`, or your own made of them."""
-        return await adrive(flow, self._perform)
+        return await adrive(flow, self.core.call)
 
     def subscribe(
         self,
@@ -128,15 +126,3 @@ class AsyncTwinClient(SharedMethods):
             topics or ("state",), max_queue,
             lambda made: core.subscribe(made, options), core.connected, core.unsubscribe,
         )  # fmt: skip
-
-    async def _perform(self, effect: Effect) -> object:
-        match effect:
-            case Ask():
-                return await self.core.call(effect)
-            case Sleep(seconds):
-                await asyncio.sleep(seconds)
-            case Tell(function, args):
-                told = function(*args)
-                if inspect.isawaitable(told):
-                    await told
-        return None

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 from flexdt.clients.client.async_client import AsyncTwinClient
 from flexdt.clients.client.events import Subscription
-from flexdt.clients.client.flows import Effect, Flow, Tell, drive
+from flexdt.clients.client.flows import Effect, Flow, Tell, drive, perform
 from flexdt.clients.client.shared_methods import SharedMethods
 from flexdt.clients.client.transport import Transport
 from flexdt.clients.client.twin_methods import Kind, Topic
@@ -156,4 +156,4 @@ class TwinClient(SharedMethods):
     def _perform(self, effect: Effect) -> object:
         if isinstance(effect, Tell):  # in the thread that calls, where it may call the client
             return effect.function(*effect.args)
-        return _result(self._client._perform(effect))
+        return _result(perform(effect, self._client.core.call))

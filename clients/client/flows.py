@@ -5,16 +5,15 @@ The blocking and the asynchronous client drive the same flows; they differ only 
 
 from __future__ import annotations
 
+import asyncio
+import inspect
 from collections.abc import Awaitable, Callable, Generator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from pydantic import BaseModel
 
 from flexdt.protocol import parse_result
-
-if TYPE_CHECKING:
-    pass
 
 _R = TypeVar("_R")
 _M = TypeVar("_M", bound=BaseModel)
@@ -83,13 +82,27 @@ def drive(flow: Flow[_R], perform: Callable[[Effect], object]) -> _R:
         return result
 
 
-async def adrive(flow: Flow[_R], perform: Callable[[Effect], Awaitable[object]]) -> _R:
-    """Run a flow to its end by awaiting `perform`."""
+async def perform(effect: Effect, call: Callable[[Ask], Awaitable[object]]) -> object:
+    """Perform an effect on an event loop; `call` asks the server."""
+    match effect:
+        case Ask():
+            return await call(effect)
+        case Sleep(seconds):
+            await asyncio.sleep(seconds)
+        case Tell(function, args):
+            told = function(*args)
+            if inspect.isawaitable(told):
+                await told
+    return None
+
+
+async def adrive(flow: Flow[_R], call: Callable[[Ask], Awaitable[object]]) -> _R:
+    """Run a flow to its end by `perform`."""
     try:
         effect = next(flow)
         while True:
             try:
-                given = await perform(effect)
+                given = await perform(effect, call)
             except BaseException as error:
                 effect = flow.throw(error)
             else:

@@ -23,6 +23,7 @@ from flexdt.protocol import image as wire_image
 from flexdt.protocol import results as r
 from flexdt.protocol import state_model as s
 from flexdt.protocol.fields import Result
+from flexdt.protocol.params import Mark
 from flexdt.protocol.results import Projection as WireProjection
 
 if TYPE_CHECKING:
@@ -588,7 +589,7 @@ def job_status(job: str | None = None) -> Flow[s.JobStatus]:
 
 
 def pause_job(job: str | None = None) -> Flow[s.JobStatus]:
-    """Pause after the current frame.
+    """Pause; a frame under exposure is discarded and taken again.
 
     Example:
         >>> job = twin.submit_trajectory([{"rot_obj": 0.0}] * 20, 9000.0, speed_up=1.0).job
@@ -837,6 +838,7 @@ def fit_calibration(
     steps: int = 0,
     residuals: bool = False,
     tracks: bool = False,
+    markers: Sequence[tuple[int, str, float, float, float | None]] | None = None,
 ) -> Flow[r.CalibrationFitResult]:
     """Calibrate from data sets of the twin's data directory; nothing is applied.
 
@@ -851,6 +853,8 @@ def fit_calibration(
         steps: tell the covariance after so many parts of the frames.
         residuals: tell those of every bead in every frame.
         tracks: tell where beads were seen, and were put before and after.
+        markers: where beads were seen, (frame, bead, column, row, sigma) [px], sigma None where it
+            is not known; default: they are detected in the images.
 
     Raises:
         RpcError: -32602, there is no such data set or phantom; -32008, it takes too long.
@@ -861,10 +865,14 @@ def fit_calibration(
         ...
         flexdt.protocol.rpc_errors.RpcError: no data set 'gone' in the data directory
     """
+    marks = None if markers is None else [
+        dict(zip(Mark.model_fields, row, strict=True)) for row in markers
+    ]  # fmt: skip
     params = {
         "datasets": list(datasets), "phantom": phantom, "free": free and list(free),
         "priors": dict(priors or {}), "per_frame": list(per_frame), "steps": steps,
         "residuals": residuals, "tracks": tracks,
+        "markers": marks,
     }  # fmt: skip
     return ask("calibration.fit", params, r.CalibrationFitResult, patience_s=None)
 

@@ -32,6 +32,10 @@ class Upload:
     head: Mapping[str, object]
     data: bytes
 
+    def __post_init__(self) -> None:
+        if not self.data:
+            raise ValueError(f"nothing to upload as {self.head['name']!r}: the data are empty")
+
     def chunks(self) -> Iterator[dict[str, object]]:
         """Parameters of `sample.upload`, chunk by chunk."""
         for start in range(0, len(self.data), CHUNK):
@@ -65,7 +69,7 @@ def mesh(
             f"got name {name!r}, format {format!r}"
         )
     head = {"name": name, "kind": "mesh", "format": format, "unit": unit, "material": material}
-    return _filled(Upload(head, data))
+    return Upload(head, data)
 
 
 def scene(source: str | Path | Phantom, name: str | None) -> Upload:
@@ -83,7 +87,7 @@ def scene(source: str | Path | Phantom, name: str | None) -> Upload:
         path = Path(source)
         phantom, name = read_phantom_file(path), path.stem if name is None else name
     head = {"name": name, "kind": "scene", "format": "json"}
-    return _filled(Upload(head, json.dumps(phantom.to_dict()).encode()))
+    return Upload(head, json.dumps(phantom.to_dict()).encode())
 
 
 def voxels(
@@ -103,10 +107,4 @@ def voxels(
         "name": name, "kind": "voxels", "format": "raw", "material": material,
         "shape": list(raw.shape), "voxel_mm": [float(v) for v in size],
     }  # fmt: skip
-    return _filled(Upload(head, raw.tobytes()))
-
-
-def _filled(upload: Upload) -> Upload:
-    if not upload.data:
-        raise ValueError(f"nothing to upload as {upload.head['name']!r}: the data are empty")
-    return upload
+    return Upload(head, raw.tobytes())

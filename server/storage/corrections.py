@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from flexdt.protocol.fields import ShortText
 from flexdt.protocol.rpc_errors import invalid_params
@@ -33,8 +32,6 @@ from flexdt.twin.errors import UnknownNameError
 from flexdt.twin.geometry.offsets import Offsets, require_plausible
 from flexdt.twin.scanner.state import Correction
 
-OLD_HISTORY = "in_force.json"
-"""Where servers before this one kept the history."""
 KEPT = 1000
 """Corrections put in force that `revert` can go back through."""
 
@@ -48,32 +45,24 @@ class CorrectionFile(CorrectionPart):
     source: ShortText | None = None
 
 
-class _OldHistory(BaseModel):
-    """What servers before this one kept."""
-
-    history: History
-
-
 class Corrections:
     """All corrections of one data directory.
 
     Args:
         folder: where they are kept; made when the first is stored.
-        history: names in the order in which they were put in force; None for what a server before
-            this one left in the folder.
+        history: names in the order in which they were put in force.
     """
 
-    def __init__(self, folder: Path, history: Sequence[str | None] | None = None) -> None:
+    def __init__(self, folder: Path, history: Sequence[str | None] = ()) -> None:
         self._folder = folder
         self._all: dict[str, Correction] = {}
         self._sources: dict[str, str | None] = {}
         sweep(folder)
         for file in ours(folder):
-            if file.name != OLD_HISTORY:
-                found = read_or_set_aside(file, _read, "a correction cannot be read; without it")
-                if found is not None:
-                    self.know(*found)
-        known = self._old_history() if history is None else list(history)
+            found = read_or_set_aside(file, _read, "a correction cannot be read; without it")
+            if found is not None:
+                self.know(*found)
+        known = list(history)
         self.lost: str | None = None
         """The correction that was in force and is not there any more."""
         if known and known[-1] is not None and known[-1] not in self._all:
@@ -157,11 +146,6 @@ class Corrections:
             self._all[correction.name] = correction
             self._sources[correction.name] = source
 
-    def forget_old_history(self) -> None:
-        """Once the state holds the history: the file of servers before this one is stale."""
-        with suppress(OSError):
-            (self._folder / OLD_HISTORY).unlink()
-
     def _free_name(self, date: str) -> str:
         base = f"correction-{date[:10]}"
         taken = sum(name.startswith(base) for name in self._all)
@@ -169,18 +153,9 @@ class Corrections:
             taken += 1
         return name
 
-    def _old_history(self) -> History:
-        file = self._folder / OLD_HISTORY
-        found = read_or_set_aside(file, _names, "which correction was in force is not known")
-        return [] if found is None else found
-
 
 def _read(data: bytes) -> tuple[Correction, str | None]:
     document = CorrectionFile.model_validate(read_json(data))
     correction = correction_of(document)
     require_plausible(correction.parameters, math.inf)
     return correction, document.source
-
-
-def _names(data: bytes) -> History:
-    return _OldHistory.model_validate(read_json(data)).history

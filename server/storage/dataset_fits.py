@@ -35,9 +35,13 @@ def fit(root: Path, asked: p.CalibrationFit, *_: object) -> r.CalibrationFitResu
         phantom = load_phantom_file(str(_there(root, phantom, "phantom")))
     elif not is_shipped(phantom):
         load_phantom(phantom)  # says which there are
+    marks = None
+    if asked.markers is not None:
+        marks = [(m.frame, m.marker, m.column, m.row, m.sigma) for m in asked.markers]
     found = _face().calibrate(
         [_there(root, name, "data set") for name in asked.datasets], phantom,
         free=asked.free, priors=asked.priors, per_frame=asked.per_frame,
+        markers=marks,
     )  # fmt: skip
     told = dict(found.document)
     fitted = found.calibration.fit

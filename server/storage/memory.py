@@ -73,8 +73,7 @@ class Memory(_Part):
     """The document.
 
     Attributes:
-        corrections: names in the order in which they were put in force; None in it is nominal. None
-            instead of it: this server's predecessor kept it elsewhere.
+        corrections: names in the order in which they were put in force; None is nominal.
     """
 
     schema_version: Literal[1] = Field(alias="schema")
@@ -84,7 +83,7 @@ class Memory(_Part):
     estop: bool = False
     jobs: list[JobMemory] = Field(default_factory=list)
     jobs_made: Count = 0
-    corrections: list[str | None] | None = None
+    corrections: list[str | None] = Field(default_factory=list)
 
 
 def remember(
@@ -92,7 +91,7 @@ def remember(
     now: float,
     jobs: list[JobMemory],
     made: int,
-    corrections: list[str | None] | None = None,
+    corrections: list[str | None],
     *,
     ended: bool = False,
 ) -> Memory:

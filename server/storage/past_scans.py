@@ -521,6 +521,7 @@ def _frame(root: Path, asked: p.DatasetFrame, around: Around, codec: Codec) -> r
         pixels = _normal(root, asked.name, folder, images, counts.shape)(counts)
     small = binned_mean(pixels.astype(np.float32), asked.binning)
     small = np.rint(small).astype(np.uint16) if asked.kind == "counts" else small
+    before = sum(f.kind == "projection" for f in images[: asked.index])
     kV, power_W = scan.beam
     size = small.nbytes if codec is Codec.MSGPACK else small.nbytes * 4 // 3
     if size > (most := MAX_ANSWER[codec] - (1 << 16)):  # beside the pixels
@@ -531,6 +532,7 @@ def _frame(root: Path, asked: p.DatasetFrame, around: Around, codec: Codec) -> r
         index=asked.index,
         file=frame.file,
         image=frame.kind,
+        projection=before if frame.kind == "projection" else None,
         kind=asked.kind,
         time_s=frame.time_s,
         exposure_ms=frame.exposure_ms,

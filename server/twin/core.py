@@ -114,10 +114,8 @@ class TwinServer:
         for folder in (root, root / FOLDER, root / "samples"):
             sweep(folder)
         self.remembered = read_memory(root)
-        known = None if self.remembered is None else self.remembered.corrections
+        known = [] if self.remembered is None else self.remembered.corrections
         self.corrections = Corrections(root / "corrections", known)
-        if known is not None:
-            self.corrections.forget_old_history()
         self._apply_last()
         self.stage_turn = asyncio.Lock()
         """Held while the stage is changed: such changes come one after the other."""
@@ -258,7 +256,7 @@ class TwinServer:
         job = self.jobs.current
         return w.State(
             time=snapshot.time,
-            axes={name: views.axis_view(axis) for name, axis in snapshot.axes.items()},
+            axes={name: w.AxisState(**vars(axis)) for name, axis in snapshot.axes.items()},
             tube=views.tube_view(snapshot.tube, snapshot.time),
             camera=views.camera_view(snapshot.camera, self.machine),
             sample=self.sample_state(),
@@ -275,7 +273,7 @@ class TwinServer:
 
     def _clearance(self, snapshot: ScannerState) -> NearestPair | None:
         guard = self.scanner.guard  # its scene is the one in force, and has been made
-        motors = {name: axis.position for name, axis in snapshot.axes.items() if axis.motor}
+        motors = {name: axis.position for name, axis in snapshot.axes.items() if not axis.virtual}
         return clearance(guard.scene, motors) if isinstance(guard, SceneGuard) else None
 
     def sample_state(self) -> w.SampleState:

@@ -12,25 +12,10 @@ from flexdt.twin.errors import GeometryError
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.scanner.joining import Stopping
-from flexdt.twin.scanner.state import AxisState, Correction, Readout, Safety, TubeState
+from flexdt.twin.scanner.state import Correction, Readout, Safety, TubeState
 
 SAFETY_NAMES = {"ready": "ok", "blocked": "aborted", "estopped": "estop"}
 """The twin's safety states as the wire names them."""
-
-
-def axis_view(axis: AxisState) -> w.AxisState:
-    """One axis."""
-    return w.AxisState(
-        position=axis.position,
-        target=axis.target,
-        velocity=axis.velocity + 0.0,  # no negative zero
-        limits=(axis.lower, axis.upper),
-        moving=axis.moving,
-        unit="deg" if axis.unit == "deg" else "mm",
-        speed=axis.speed,
-        acceleration=axis.acceleration,
-        virtual=not axis.motor,
-    )
 
 
 def tube_view(tube: TubeState, now: float) -> w.TubeState:

@@ -107,6 +107,16 @@ def test_annotated_beads_of_a_known_phantom(tmp_path: Path) -> None:
         p = found.parameters[name]
         assert abs(p["value"] - true) < 4 * p["sigma"]  # type: ignore[operator]
     assert found.document["detections"] == 49
+    rows = [
+        (i, str(k), *tracks[i, k].tolist(), None) for i, k in np.ndindex(10, 5) if (i, k) != (2, 1)
+    ]
+    same = fx.calibrate(None, "lego", geometry=scan, markers=rows)
+    assert same.parameters == found.parameters
+    numbered = [(i, int(k), *rest) for i, k, *rest in rows]
+    assert fx.calibrate(None, "lego", geometry=scan, markers=numbered).parameters == same.parameters
+    for bad in (7, (0, "1", 3.0, 4.0), (0.5, "1", 3.0, 4.0, None), (0, "1", "left", 4.0, None)):
+        with pytest.raises(TwinError, match=r"mark 1 is .* allowed: \(frame, marker, column, row"):
+            fx.calibrate(None, "lego", geometry=scan, markers=[rows[0], bad])
     with pytest.raises(TwinError, match="marker '4' is no bead of 'normal-4'; allowed: 0 to 3"):
         fx.calibrate(None, "normal-4", geometry=scan, markers=tmp_path / "seen.npy")
     with pytest.raises(TwinError, match="no data: allowed with geometry and markers"):

@@ -196,6 +196,7 @@ def test_both_clients_do_every_method_of_the_wire(shell: Shell, tmp_path: Path) 
     twin.revert_calibration()
     for asked in (
         lambda: twin.fit_calibration(["gone"], "lego"),
+        lambda: twin.fit_calibration(["gone"], "lego", markers=[(0, "0", 3.0, 4.0, None)]),
         lambda: twin.align_dataset("gone"),
     ):
         with pytest.raises(RpcError, match="no data set 'gone'"):

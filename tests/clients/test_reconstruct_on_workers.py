@@ -7,7 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import flexdt as fx
 from flexdt.clients.cli.entry import run
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.reconstruction import zarr_volume
+from flexdt.clients.reconstruction.on_workers import as_made
 from flexdt.clients.reconstruction.reconstruct import VolumeRequest as Request
 from flexdt.clients.reconstruction.reconstruct import reconstruct_dataset
 from flexdt.twin.errors import LimitError, TwinError
@@ -66,6 +67,21 @@ def files(path: Path) -> dict[str, bytes]:
     if path.is_file():
         return {"": path.read_bytes()}
     return {str(f.relative_to(path)): f.read_bytes() for f in path.rglob("*") if f.is_file()}
+
+
+def test_who_is_interrupted_between_two_results_leaves_no_task_behind() -> None:
+    made, waits = Future[int](), Future[int]()
+    made.set_result(7)
+
+    def interrupted() -> None:
+        with closing(as_made([made, waits])) as results:
+            for result in results:
+                raise KeyboardInterrupt(result)
+
+    with pytest.raises(KeyboardInterrupt, match="7") as kept:
+        interrupted()
+    assert kept.tb is not None  # with the frames, which would keep the tasks alive
+    assert waits.cancelled()
 
 
 def test_workers_make_what_the_local_command_makes(scan: Path, tmp_path: Path) -> None:

@@ -115,28 +115,6 @@ def test_an_upload_may_come_again_after_it_was_set_aside(whole: Path, tmp_path: 
         assert sim.call(sim.client(), "state.get")["sample"]["name"] == "cube"
 
 
-def test_a_history_of_servers_before_is_taken_over(tmp_path: Path) -> None:
-    """Which correction is in force stood in a file of its own."""
-    with Simulation(tmp_path) as sim:
-        sim.start()
-        client = sim.client()
-        sim.call(client, "calibration.apply", parameters={"dD_x": 0.5}, name="one")
-        sim.stop()
-        state = sim.data / "state.json"
-        document = json.loads(state.read_text())
-        del document["corrections"]
-        state.write_text(json.dumps(document))
-        history = sim.data / "corrections" / "in_force.json"
-        history.write_text(json.dumps({"schema": 1, "history": ["one"]}))
-        sim.start()
-        assert sim.call(sim.client(), "calibration.get")["correction"]["name"] == "one"
-        sim.call(sim.client(), "calibration.revert")
-        sim.stop()
-        sim.start()  # the old file does not come back
-        assert sim.call(sim.client(), "calibration.get")["correction"] is None
-        assert not history.exists()
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_server_starts_whatever_bit_is_another_one(whole: Path, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from bead_scan import bead_scan
 from in_process import Lab, M, run
 
 import flexdt as fx
+from flexdt.phantoms import load_phantom
 from flexdt.protocol import Codec, RpcError
 from flexdt.protocol import params as p
 from flexdt.server.storage.past_scans import PastScans
@@ -74,6 +76,84 @@ def test_a_fit_over_the_wire_is_that_of_the_package(data: Path, own: Any) -> Non
             if residual is not None:
                 assert np.subtract(seen, after) == pytest.approx(residual, abs=2e-3)
     assert {q["code"] for q in told["problems"]} == {f.code for f in own.calibration.findings}
+
+
+def marks(views: range, truth: dict[str, float], noise_px: float) -> list[dict[str, object]]:
+    """Where the beads stand in the scan's images (SOD 600, SDD 1059, 478 x 380 pixels of 0.2992 mm,
+    15 degrees from one to the next), by sines and cosines alone."""
+    rng = np.random.default_rng(5)
+    told: list[dict[str, object]] = []
+    for view in views:
+        turn = math.radians(15.0 * view + truth["alpha"])
+        for k, (x, y, z) in enumerate(load_phantom("lego").beads.tolist()):
+            across = x * math.cos(turn) + y * math.sin(turn) + truth["dO_x"]
+            deep = 600.0 + truth["dO_z"] - x * math.sin(turn) + y * math.cos(turn)
+            scale = 1059.0 / deep / 0.2992
+            column, row = 238.5 + scale * across, 189.5 - scale * (z + truth["dO_y"])
+            off = noise_px * rng.normal(size=2)
+            told.append({"frame": view, "marker": str(k), "column": column + off[0],
+                         "row": row + off[1], "sigma": noise_px})  # fmt: skip
+    return told
+
+
+def test_marks_take_the_place_of_what_is_in_the_images(data: Path) -> None:
+    other = {"dO_x": -1.4, "dO_y": 0.8, "dO_z": -3.0, "alpha": 71.0}
+    seen = marks(range(0, 25, 3), other, 0.2)
+    told = called(data, "calibration.fit", datasets=["lego"], phantom="lego", markers=seen,
+                  tracks=True)  # fmt: skip
+    assert told["identifiable"]
+    assert told["rms_px"] == pytest.approx(0.2, rel=0.3)
+    for name, true in other.items():
+        e = told["parameters"][name]
+        assert e["sigma"] < 2.0
+        assert abs(e["value"] - true) < 4 * e["sigma"]
+    [tracked] = told["tracks"]["datasets"]
+    files = [f"scan_{view:06d}.tif" for view in range(0, 25, 3)]
+    assert [frame["file"] for frame in tracked["frames"]] == files
+    assert tracked["frames"][1]["measured"][2] == pytest.approx(
+        [seen[7]["column"], seen[7]["row"]], abs=1e-3
+    )
+
+
+def test_marks_that_do_not_hold_are_refused(data: Path) -> None:
+    mark: dict[str, Any] = {"frame": 0, "marker": "0", "column": 200.0, "row": 180.0}
+    wrong = [
+        ([mark, mark], "mark 1: marker '0' in frame 0"),
+        ([mark | {"frame": 25}], "allowed: frames 0 to 24"),
+        ([mark | {"marker": "5"}], "marker '5' is no bead of 'lego'; allowed: 0 to 4"),
+        ([mark, mark | {"marker": "00"}], "allowed: 0 to 4, each once"),
+        ([mark | {"marker": "left one"}], "'left one' is no bead"),
+        ([mark | {"frame": -1}], "frame"),
+        ([mark | {"frame": 0.5}], "frame"),
+        ([mark | {"marker": 0}], "marker"),
+        ([mark | {"column": "200"}], "column"),
+        ([mark | {"row": 1e6}], "row"),
+        ([mark | {"sigma": 0}], "sigma"),
+        ([mark | {"u": 3}], "u"),
+        ([[0, "0", 200.0, 180.0]], "markers"),
+        ([], "markers"),
+        ([mark] * 10_001, "markers"),
+    ]
+
+    async def body(lab: Lab) -> None:
+        client = lab.client()
+        for markers, says in wrong:
+            error = await client.error(
+                "calibration.fit", datasets=["lego"], phantom="lego", markers=markers
+            )
+            assert (error.code, says in f"{error.message} {error.data}") == (-32602, True), says
+        both = await client.error(
+            "calibration.fit", datasets=["lego", "lego"], phantom="lego", markers=[mark]
+        )
+        assert "2 data sets with markers" in both.message
+        # Too few of them are no error: the answer says that they do not determine anything.
+        few = await client.call(
+            "calibration.fit", datasets=["lego"], phantom="lego", markers=[mark], tracks=True
+        )
+        assert not few["identifiable"]
+        assert few["problems"]
+
+    run(data, body)
 
 
 def test_an_alignment_over_the_wire_is_that_of_the_package(data: Path) -> None:

@@ -98,6 +98,8 @@ def test_a_scan_is_told_as_its_folder_says(server: Process, data: Path) -> None:
             assert about.cone_vec == frames[index]["cone_vec"]
             assert about.positions == frames[index]["positions"]
             assert (about.image, about.file) == (frames[index]["kind"], frames[index]["file"])
+            number = int(about.file[5:11]) if about.file.startswith("scan_") else None
+            assert about.projection == number
         dark, flat = (
             np.mean([i for i, f in zip(images, frames, strict=True) if f["kind"] == kind], axis=0)
             for kind in ("dark", "flat")
