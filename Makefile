@@ -1,11 +1,12 @@
-# make install | demo | quick | test | slow (studies, page) | failed | docs | lint | typecheck | lowest |
-# newest. Everything lives in .venv; PYTHON picks another interpreter.
+# make install | demo | quick | test | slow (studies, page) | failed | docs | web | lint | typecheck |
+# lowest | newest. Everything lives in .venv; PYTHON picks another interpreter.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 TEST_STAMP := $(VENV)/.installed-test
 TYPES := .typing/.linked
+WEB_STAMP := node_modules/.installed
 
 # Tests of the pure core for `make quick`: those that take at most a second or two each.
 TWIN := frames frames_astra frames_off_centre values machine exposure physics_source scanner_tube
@@ -13,7 +14,7 @@ QUICK := tests/protocol tests/twin/script $(TWIN:%=tests/twin/test_%.py) \
   $(filter-out %_voxels.py %_lego.py,$(wildcard tests/phantoms/test_*.py)) \
   $(filter-out %_rtk.py %_astra.py,$(wildcard tests/twin/exchange/test_*.py))
 
-.PHONY: install demo quick test slow studies page failed docs lint typecheck lowest newest clean
+.PHONY: install demo quick test slow studies page failed docs web lint typecheck lowest newest clean
 
 install: $(STAMP) $(TYPES)
 
@@ -26,6 +27,11 @@ $(STAMP): pyproject.toml constraints.txt
 $(TEST_STAMP): $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'
 	touch $@
+
+# TypeScript and eslint for the page. Without npm's registry the tests that need them are skipped.
+$(WEB_STAMP): $(TEST_STAMP) package-lock.json
+	@(PATH="$(CURDIR)/$(BIN):$$PATH" npm ci --no-audit --no-fund --silent --fetch-retries=1 && touch $@) \
+	  || echo "npm could not install TypeScript and eslint: the page's source is not checked"
 
 # Type checkers and import-linter need to see the folders as the one package that they install as.
 $(TYPES): $(STAMP) .ci/link_types.py $(wildcard flexdt/*.py)
@@ -46,7 +52,7 @@ typecheck: install $(TEST_STAMP)
 quick: lint typecheck
 	$(BIN)/pytest -q -n 2 --dist loadfile -m 'not slow' $(QUICK)
 
-test: lint typecheck $(TEST_STAMP)
+test: lint typecheck $(TEST_STAMP) $(WEB_STAMP)
 	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'not slow and not browser'
 
 slow: studies page
@@ -62,6 +68,10 @@ page: $(TEST_STAMP)
 # What failed in the last of these, once more and one after the other.
 failed: lint typecheck $(TEST_STAMP)
 	$(BIN)/pytest --last-failed --last-failed-no-failures none
+
+# The page from its TypeScript, after changes there or in the wire.
+web: install $(WEB_STAMP)
+	$(BIN)/python tests/viewer/test_page_source.py
 
 # The site, notebooks executed; warnings are errors. Result: docs/_build/html/index.html
 docs: $(TEST_STAMP)

@@ -18,7 +18,7 @@ from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.sample import SampleLook
 from flexdt.clients.viewer.scenes.standpoints import FREE
 from flexdt.clients.viewer.scenes.world import world_of
-from flexdt.clients.viewer.scrubbed_plan import Scrubbed
+from flexdt.clients.viewer.scrubbed_plan import Scrubbed, positions_at
 from flexdt.clients.viewer.viser_gate import Scenes, look_from
 from flexdt.protocol.state_model import State
 from flexdt.twin.machine.description import Machine, Profile
@@ -69,7 +69,7 @@ def replay_file(
         scene.wear(look)
         serializer = server.get_scene_serializer()
         for time_s in np.linspace(0.0, planned.duration_s, FRAMES):
-            moved = at_positions(state, planned.positions(float(time_s)))
+            moved = at_positions(state, positions_at(planned, float(time_s)))
             scene.update(moved, world_of(machine, profile, moved))
             serializer.insert_sleep(REPLAY_S / FRAMES)
     finally:

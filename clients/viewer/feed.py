@@ -23,9 +23,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.clients.client.events import Event, Projection
 from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress
 from flexdt.clients.viewer.page import watched
-from flexdt.protocol import image as wire_image
 from flexdt.server.runtime.log import log
 from flexdt.twin.geometry.conventions import Float32Array
 
@@ -254,21 +254,11 @@ def radiograph(params: Mapping[str, object]) -> ShownImage:
     """The image of a `projection` event.
 
     Raises:
-        RpcError, KeyError, TypeError, ValueError: the event holds no image.
+        RpcError: the event holds no image.
     """
-    data, seq, time = params["data"], params["seq"], params["time"]
-    if not isinstance(data, Mapping):
-        raise TypeError("an image is an object with pixels")
-    pixels = np.asarray(wire_image.decode(data))
-    if pixels.ndim != 2:
-        raise ValueError("an image has rows and columns")
-    cone = tuple(float(v) for v in data["cone_vec"])
-    stamp = data.get("time")
-    return ShownImage(
-        pixels,
-        str(data["kind"]),
-        cone,
-        float(time if stamp is None else stamp),  # type: ignore[arg-type]
-        int(seq),  # type: ignore[call-overload]
-        data.get("flags"),
-    )
+    event = Event.from_wire(params)
+    shot = event.data
+    assert isinstance(shot, Projection)
+    time = event.time if shot.time is None else shot.time
+    flags = None if shot.flags is None else shot.flags.model_dump()
+    return ShownImage(shot.image, shot.kind, shot.cone_vec, time, event.seq, flags)

@@ -205,7 +205,7 @@ class Grower:
 
     async def _follow(self, folder: str, side: int) -> None:
         process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", __name__, folder, str(side),
+            sys.executable, "-P", "-m", __name__, folder, str(side),
             stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.DEVNULL,
             env={**os.environ, **ENVIRONMENT}, limit=LINE_BYTES,

@@ -10,7 +10,8 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
-from typing import TextIO
+from importlib.metadata import version
+from typing import TYPE_CHECKING, TextIO
 
 from flexdt import machines
 from flexdt.clients.client.kept_connection import TwinAddress
@@ -22,7 +23,9 @@ from flexdt.server.runtime.access import (
     server_tls,
     with_limits,
 )
+from flexdt.server.runtime.http_pages import Pages, served_pages, watching_pages
 from flexdt.server.runtime.log import LEVELS, set_up
+from flexdt.server.runtime.metrics import Figure, counter, gauge
 from flexdt.server.runtime.process import (
     FAILED,
     OK,
@@ -34,6 +37,9 @@ from flexdt.server.runtime.process import (
 )
 from flexdt.twin.machine.description import parse_profile
 
+if TYPE_CHECKING:
+    from flexdt.clients.viewer.viewer import Viewer
+
 
 async def run(options: ViewerSettings, out: TextIO) -> int:
     """Serve until SIGTERM or SIGINT, or until a part has died that nothing is shown without.
@@ -43,8 +49,6 @@ async def run(options: ViewerSettings, out: TextIO) -> int:
     from flexdt.clients.viewer.page_methods import ANSWERS
     from flexdt.clients.viewer.scenes.parts import own_looks
     from flexdt.clients.viewer.viewer import Viewer
-    from flexdt.clients.viewer.viewer_health import viewer_pages
-    from flexdt.server.runtime.http_pages import served_pages
 
     token = read_token(options.token_file)
     ssl = client_tls(options.twin_cert, any_name=True)
@@ -70,6 +74,32 @@ async def run(options: ViewerSettings, out: TextIO) -> int:
     finally:
         await viewer.stop()
     return FAILED if viewer.failed.is_set() else OK
+
+
+def viewer_pages(viewer: Viewer) -> Pages:
+    """The pages for monitoring of a viewer that runs."""
+
+    def health() -> dict[str, object]:
+        return {
+            "server": f"flexdt viewer {version('flexdt')}",
+            "twin": "connected" if viewer.link.connected else "not connected",
+        }
+
+    def figures() -> list[Figure]:
+        front = viewer.front
+        return [
+            gauge("flexdt_pages", "Pages open.", len(viewer.open_pages)),
+            counter("flexdt_pages_total", "Pages that ever opened.", viewer.opened),
+            counter("flexdt_scene_messages_dropped_total", "Messages of pages kept from viser.",
+                    0 if front is None else front.doorkeeper.dropped),
+            gauge("flexdt_scenes", "Views open.", 0 if front is None else front.scenes),
+            counter("flexdt_states_drawn_total", "States drawn.", viewer.drawn),
+            gauge("flexdt_twin_connected", "Whether there is one.", float(viewer.link.connected)),
+            counter("flexdt_wrong_tokens_total", "Wrong tokens shown.",
+                    0 if front is None else front.wrong_tokens),
+        ]  # fmt: skip
+
+    return watching_pages(health, figures, failed=viewer.failed.is_set)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

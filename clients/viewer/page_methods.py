@@ -140,7 +140,7 @@ async def plan(viewer: Viewer, page: Page, params: p.Plan) -> object:
         lab.scene.plan.orbit(clients, None)
         return {}
     made = await plans.make(viewer.planners, text, lab.machine, lab.profile, viewer.state)
-    page.plan = made.planned
+    page.plan = made.plan
     if made.path is not None:
         page.orbit = made.path
         lab.scene.plan.orbit(viewer.clients.of(page.id), page.orbit)
@@ -176,7 +176,8 @@ async def recorded_image(viewer: Viewer, page: Page, params: p.RecordedImage) ->
         raise RpcError(Code.INVALID_PARAMS, "open a data set first: there is nothing to show")
     asked = {"name": name, "index": params.index, "kind": params.kind}
     told: Any = await page.link.request("dataset.frame", asked)
-    about = {k: told[k] for k in ("name", "index", "file", "image", "time_s", "positions")}
+    names = ("name", "index", "file", "image", "projection", "time_s", "positions")
+    about = {key: told[key] for key in names}
     about["problem"] = ""
     pixels, virtual = wire_image.decode(told), None
     if params.virtual and told["image"] == "projection" and told["positions"]:
@@ -256,7 +257,7 @@ async def compose(viewer: Viewer, page: Page, params: p.Compose) -> object:
 def _moved(text: str, lab: ShownMachine, state: State) -> dict[str, tuple[float, float]]:
     """Axis -> (where it stands, where a script's projections have it), for axes that stand neither
     there nor at home; axes that the script moves between projections are its own."""
-    plan = plans.plan_text(text, lab.machine, lab.profile, state).plan
+    plan = plans.plan_text(text, lab.machine, lab.profile, state)
     stands, found = motors(lab.machine, state), {}
     for axis, there in plans.projection_positions(plan).items():
         if not len(there) or np.ptp(there) > APART:
@@ -304,7 +305,7 @@ async def scrub(viewer: Viewer, page: Page, params: p.Scrub) -> object:
         return {"positions": None}
     if page.plan is None:
         raise RpcError(Code.INVALID_PARAMS, "plan a script first: there is nothing to scrub")
-    positions = page.plan.positions(time_s)
+    positions = plans.positions_at(page.plan, time_s)
     lab.scene.plan.ghost(viewer.clients.of(page.id), positions)
     return {"positions": positions}
 

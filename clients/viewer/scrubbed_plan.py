@@ -37,23 +37,6 @@ PLAN_S = 20.0
 
 
 @dataclass(frozen=True, eq=False)
-class Planned:
-    """A plan that pages scrub through."""
-
-    plan: ScanPlan
-
-    @property
-    def duration_s(self) -> float:
-        """Of the plan [s]."""
-        return self.plan.duration_s
-
-    def positions(self, time: float) -> dict[str, float]:
-        """Motor positions at `time` [s of the plan]."""
-        at = np.clip(np.array([time]), 0.0, self.plan.duration_s)
-        return {name: float(values[0]) for name, values in self.plan.positions(at).items()}
-
-
-@dataclass(frozen=True, eq=False)
 class RecordedPositions:
     """Motor positions at the images of a data set; straight lines between them."""
 
@@ -77,20 +60,26 @@ class RecordedPositions:
         """To the last image [s]."""
         return float(self.times[-1])
 
-    def positions(self, time: float) -> dict[str, float]:
-        """Motor positions at `time` [s of the scan's clock]."""
-        return {n: float(np.interp(time, self.times, v)) for n, v in self.motors.items()}
+    def positions(self, times: FloatArray) -> dict[str, FloatArray]:
+        """Motor positions at `times` [s of the scan's clock], same shape."""
+        return {n: np.interp(times, self.times, v) for n, v in self.motors.items()}
 
 
-Scrubbed = Planned | RecordedPositions
+Scrubbed = ScanPlan | RecordedPositions
 """What a page may scrub through."""
+
+
+def positions_at(scrubbed: Scrubbed, time: float) -> dict[str, float]:
+    """Motor positions at `time` [s]; before the start and after the end as there."""
+    at = np.clip([time], 0.0, scrubbed.duration_s)
+    return {name: float(values[0]) for name, values in scrubbed.positions(at).items()}
 
 
 @dataclass(frozen=True, eq=False)
 class Made:
     """A plan with all that is drawn of it; no path where no state is known."""
 
-    planned: Planned
+    plan: ScanPlan
     path: FloatArray | None
     document: dict[str, Any]
 
@@ -117,15 +106,17 @@ def work(parts: Sequence[bytes]) -> list[bytes]:
 
 
 def _made(text: str, machine: Machine, profile: Profile, state: State | None) -> Made:
-    planned = plan_text(text, machine, profile, state)
-    images = sum(len(group) for group in planned.plan.groups)
+    plan = plan_text(text, machine, profile, state)
+    images = sum(len(group) for group in plan.groups)
     if images > MAX_IMAGES:
         raise too_large("a plan to scrub", images, MAX_IMAGES, "images")
-    path = None if state is None else orbit(planned, machine, profile, state)
-    return Made(planned, path, document(planned))
+    path = None
+    if state is not None:
+        path = source_path(projection_positions(plan), machine, profile, state)
+    return Made(plan, path, document(plan))
 
 
-def plan_text(text: str, machine: Machine, profile: Profile, state: State | None) -> Planned:
+def plan_text(text: str, machine: Machine, profile: Profile, state: State | None) -> ScanPlan:
     """Plan a script.
 
     Raises:
@@ -134,12 +125,11 @@ def plan_text(text: str, machine: Machine, profile: Profile, state: State | None
     start = StartState.of(machine)
     if state is not None:
         start = replace(start, positions={**start.positions, **motors(machine, state)})
-    return Planned(plan_script(parse_script(text), machine, profile, start=start))
+    return plan_script(parse_script(text), machine, profile, start=start)
 
 
-def document(planned: Planned) -> dict[str, Any]:
+def document(plan: ScanPlan) -> dict[str, Any]:
     """What a page needs to draw the timeline."""
-    plan = planned.plan
     times = np.linspace(0.0, plan.duration_s, CURVE_POINTS)
     curves = plan.positions(times)
     moving = {
@@ -162,11 +152,6 @@ def document(planned: Planned) -> dict[str, Any]:
         ],
         "problems": [p.to_dict() for p in plan.problems],
     }
-
-
-def orbit(planned: Planned, machine: Machine, profile: Profile, state: State) -> FloatArray:
-    """The focal spot's path as the sample sees it while images are taken, (n, 3) [mm]."""
-    return source_path(projection_positions(planned.plan), machine, profile, state)
 
 
 def projection_positions(plan: ScanPlan) -> dict[str, FloatArray]:

@@ -30,13 +30,12 @@ from flexdt.clients.viewer.page import TRY_AGAIN, Page, watched, without_bytes
 from flexdt.clients.viewer.page_cameras import SceneClients
 from flexdt.clients.viewer.scenes import sample as shapes
 from flexdt.clients.viewer.scenes import standpoints as views
-from flexdt.clients.viewer.scenes.clearance import Near
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.sample import NOTHING, SampleLook, Wardrobe
 from flexdt.clients.viewer.scenes.world import World, beads_on, world_of
 from flexdt.clients.viewer.viser_gate import Scenes
 from flexdt.protocol import RpcError
-from flexdt.protocol.state_model import SampleState, State
+from flexdt.protocol.state_model import SafetyState, SampleState, State
 from flexdt.server.runtime.access import ViewerLimits
 from flexdt.server.runtime.log import log
 from flexdt.server.runtime.workers import Workers
@@ -55,8 +54,17 @@ SCENES_A_PAGE: Final = 8
 """Four views, and those that are just being closed."""
 
 
+CLOSE_MM: Final = 20.0
+"""Clearance below which the page warns."""
+
 PageMethod = Callable[["Viewer", Page, Mapping[str, Any]], Awaitable[object]]
 """Answers one request of a page from its raw parameters."""
+
+
+def nearest(safety: SafetyState) -> dict[str, Any]:
+    """The nearest parts that may not touch, for pages; `close` where that is worth a warning."""
+    mm = safety.clearance_mm
+    return {"mm": mm, "pair": safety.pair or [], "close": mm is not None and mm < CLOSE_MM}
 
 
 @dataclass
@@ -274,9 +282,9 @@ class Viewer:
         if first:  # images that came before could not be drawn
             for feed in self.feeds.values():
                 feed.again()
-        near = Near.of(state.safety)
+        near = nearest(state.safety)
         lab.scene.update(state, world)
-        lab.scene.highlight(near.pair if near.close else ())
+        lab.scene.highlight(near["pair"] if near["close"] else ())
         if lab.scene.shown["ranges"] and time.monotonic() - self._ranges_at > RANGES_S:
             self._ranges_at = time.monotonic()
             lab.scene.draw_ranges(state)
@@ -288,7 +296,7 @@ class Viewer:
                 "state": without_bytes(raw),
                 "framing": views.document(framing, world),
                 "cone_vec": world.cone_vec.rows[0].tolist(),
-                "near": near.document(),
+                "near": near,
                 "at": time.time(),
             }
         )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -11,8 +13,11 @@ import pytest
 
 from flexdt.clients.client.client import TwinClient
 from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.phantoms import load_phantom
 from flexdt.twin.geometry.offsets import Offsets
-from tests.viewer.looking import begun, film
+from flexdt.twin.machine.description import builtin_machine, profile_of
+from flexdt.twin.script.compose import ScanRequest, compose_script
+from tests.viewer.looking import begun, film, point_at
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]
@@ -46,7 +51,7 @@ def on_top(page: Any, selector: str) -> bool:
     ))  # fmt: skip
 
 
-AMBER, GREEN = (255, 180, 84), (54, 226, 143)
+AMBER, GREEN, PINK = (255, 180, 84), (54, 226, 143), (255, 60, 160)
 
 
 def scanned(page: Any, twin: TwinClient, wait: Wait, frames: int) -> str:
@@ -147,3 +152,54 @@ def test_what_cannot_be_fitted_is_told(page: Any, twin: TwinClient, wait: Wait) 
     page.click("#fit")
     page.locator(".note.error", has_text="no-such-phantom").first.wait_for(timeout=600_000)
     assert page.locator("#fit:not([disabled])").count() == 1
+
+
+def test_beads_marked_by_clicking_are_what_is_fitted(page: Any, twin: TwinClient) -> None:
+    """Clicked are places that sines and cosines put 2 mm aside and 1 mm up: the fit says so."""
+    machine, aside, up = builtin_machine(), 2.0, 1.0
+    wish = ScanRequest("step", frames=13, mode="HW4SW1High")
+    twin.control("force")
+    twin.set_sample("lego")
+    twin.submit_script(compose_script(wish, machine, profile_of(machine)), "marked", "max")
+    assert twin.wait_job().state == "done"
+    folder = str(twin.job_status().dataset)
+    twin.control("release")
+    angles = load_dataset(folder).positions["rot_obj"]
+    page.click("#tabs [data-tab=data]")
+    page.get_by_role("button", name=re.compile("^marked")).click()
+    page.locator("#record-at", has_text="scan_000000.tif").wait_for()
+    first = int(page.locator("#record").get_attribute("data-index"))
+    page.get_by_role("button", name="Mark beads").click()
+    for view in (0, 3, 6, 9):
+        page.get_by_label("Image", exact=True).fill(str(first + view))
+        page.locator("#record-at", has_text=f"scan_{view:06d}.tif").wait_for()
+        page.get_by_label("bead", exact=True).fill("0")
+        turn = math.radians(float(angles[view]))
+        for x, y, z in load_phantom("lego").beads.tolist():
+            scale = 1059.0 / (600.0 - x * math.sin(turn) + y * math.cos(turn)) / 0.2992
+            column = 238.5 + scale * (x * math.cos(turn) + y * math.sin(turn) + aside)
+            row = 189.5 - scale * (z + up)
+            point_at(page, (column + 0.5) / 478, (row + 0.5) / 380)
+            page.mouse.down()
+            page.mouse.up()
+    page.get_by_text("20 marks in 4 images").wait_for()
+    # One too many, and it goes again.
+    point_at(page, 0.1, 0.1)
+    page.mouse.down()
+    page.mouse.up()
+    page.get_by_text("21 marks in 4 images").wait_for()
+    drawn = coloured(film(page), PINK)
+    page.get_by_role("button", name="5 ×").click()
+    page.get_by_text("20 marks in 4 images").wait_for()
+    assert 40 < coloured(film(page), PINK) < drawn
+    page.get_by_role("button", name="Calibrate from these").click()
+    page.locator("#fit-report .verdict.ok").wait_for(timeout=600_000)
+    assert "4 frames" in page.inner_text("#fit-report")
+    cells = [row.split("\t") for row in page.locator("#fit-report tr").all_inner_texts()]
+    told = {name: (float(value), float(sigma.removeprefix("± "))) for name, value, sigma, _ in cells
+            if sigma.strip()}  # fmt: skip
+    for name, true in (("dO_x", aside), ("dO_y", up)):
+        value, sigma = told[name]
+        assert abs(value - true) < 4 * sigma
+        assert sigma < 0.3
+    page.keyboard.press("Escape")

@@ -24,6 +24,7 @@ Wait = Callable[..., Any]
 def scans(lab: Any) -> Iterator[Any]:
     """A scan; the same cut short, with a damaged image; a folder of images alone."""
     with lab.client() as twin:
+        twin.set_tube(on=False, kV=90, power_W=20)  # whatever other tests have left
         twin.set_sample("lego")
         twin.submit_script(fly_script(frames=FRAMES), "whole scan", "max")
         assert twin.wait_job().state == "done"

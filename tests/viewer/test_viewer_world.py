@@ -31,7 +31,12 @@ from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.sample import Wardrobe
 from flexdt.clients.viewer.scenes.standpoints import beam_view
 from flexdt.clients.viewer.scenes.world import World, beads_on, placed, quaternion
-from flexdt.clients.viewer.scrubbed_plan import document, orbit, plan_text
+from flexdt.clients.viewer.scrubbed_plan import (
+    document,
+    plan_text,
+    projection_positions,
+    source_path,
+)
 from flexdt.phantoms import load_phantom, phantom_names
 from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SampleState, State
@@ -361,7 +366,7 @@ def test_orbit_of_a_turn_is_a_circle_about_the_axis() -> None:
     assert sum(kind == "projection" for _, kind in doc["images"]) == 90
     assert "rot_obj" in doc["curves"]
     state = _state()
-    points = orbit(planned, MACHINE, PROFILE, state)
+    points = source_path(projection_positions(planned), MACHINE, PROFILE, state)
     radius = np.hypot(points[:, 0], points[:, 1])
     np.testing.assert_allclose(radius, 600.0, atol=0.01)
 

@@ -1,155 +1,175 @@
 // The Move tab: a slider, a number and two hold-to-jog buttons for every axis, and the keys.
-import { $, el, field, fixed, parsed } from "./dom.js";
-import { call, command, emit, on, store } from "./link.js";
-
+import { $, $input, $select, el, field, fixed, parsed } from "./dom.js";
+import { call, command, emit, Failure, on, store } from "./link.js";
 const LEASE_S = 0.5, MOST_S = 10, RENEW_MS = 180, SETTLE_MS = 400;
 const GROUPS = [
-  ["Source", "#ffb020", ["ver_tube", "tra_tube"]],
-  ["Sample", "#3aa0ff", ["mag_obj", "tra_obj", "rot_obj", "ver_obj"]],
-  ["Detector", "#7a5cff", ["mag_det", "ver_det", "tra_det"]],
+    ["Source", "#ffb020", ["ver_tube", "tra_tube"]],
+    ["Sample", "#3aa0ff", ["mag_obj", "tra_obj", "rot_obj", "ver_obj"]],
+    ["Detector", "#7a5cff", ["mag_det", "ver_det", "tra_det"]],
 ];
 const WHAT = {
-  ver_tube: "height", tra_tube: "sideways",
-  mag_obj: "to the detector", tra_obj: "sideways", rot_obj: "turn", ver_obj: "source and detector, up and down",
-  mag_det: "distance", ver_det: "height", tra_det: "to the left",
+    ver_tube: "height", tra_tube: "sideways",
+    mag_obj: "to the detector", tra_obj: "sideways", rot_obj: "turn", ver_obj: "source and detector, up and down",
+    mag_det: "distance", ver_det: "height", tra_det: "to the left",
 };
 const JOG_FALLBACK = { mm: 50, deg: 45 };
 const rows = new Map();
 const held = new Map();
-
 export function jogStart(axis, direction, token) {
-  if (held.has(token)) return;
-  const renew = () => {
-    const state = store.state?.axes[axis];
-    if (!state) return;
-    // The lease runs on the twin's clock, the renewals on ours.
-    const pace = store.state.clock?.speed_up, lease = Math.min(MOST_S, LEASE_S * Math.max(1, Number(pace) || 1));
-    const top = state.speed ?? JOG_FALLBACK[state.unit];
-    const velocity = direction * top * Number($("#jog-speed").value);
-    command("axes.jog", { axis, velocity, lease_s: lease }, `Cannot jog ${axis}`).then((answer) => {
-      // Refused once is enough said: it stops without a second note.
-      if (answer === null && drop(token)) call("axes.jog", { axis, velocity: 0 }).catch(() => {});
-    });
-  };
-  held.set(token, { axis, timer: setInterval(renew, RENEW_MS) });
-  renew();
+    if (held.has(token))
+        return;
+    const renew = () => {
+        const all = store.state, state = all?.axes[axis];
+        if (!all || !state)
+            return;
+        // The lease runs on the twin's clock, the renewals on ours.
+        const pace = all.clock.speed_up, lease = Math.min(MOST_S, LEASE_S * Math.max(1, Number(pace) || 1));
+        const top = state.speed ?? JOG_FALLBACK[state.unit];
+        const velocity = direction * top * Number($select("#jog-speed").value);
+        void command("axes.jog", { axis, velocity, lease_s: lease }, `Cannot jog ${axis}`).then((answer) => {
+            // Refused once is enough said: it stops without a second note.
+            if (answer === null && drop(token))
+                call("axes.jog", { axis, velocity: 0 }).catch(() => { });
+        });
+    };
+    held.set(token, { axis, timer: window.setInterval(renew, RENEW_MS) });
+    renew();
 }
 function drop(token) {
-  const hold = held.get(token);
-  if (hold) clearInterval(hold.timer);
-  held.delete(token);
-  return hold;
+    const hold = held.get(token);
+    if (hold)
+        clearInterval(hold.timer);
+    held.delete(token);
+    return hold;
 }
 export function jogStop(token) {
-  const hold = drop(token);
-  if (hold) command("axes.jog", { axis: hold.axis, velocity: 0 }, `Cannot stop ${hold.axis}`);
+    const hold = drop(token);
+    if (hold)
+        void command("axes.jog", { axis: hold.axis, velocity: 0 }, `Cannot stop ${hold.axis}`);
 }
-export function jogStopAll() { for (const token of [...held.keys()]) jogStop(token); }
-
+export function jogStopAll() { for (const token of [...held.keys()])
+    jogStop(token); }
 // What came of a refused move, in a few words.
 function title(axis, error) {
-  const halts = error.data?.halts_at ?? {};
-  if (axis in halts) return `${axis} goes to ${fixed(halts[axis], 2)} and halts there`;
-  return Object.keys(halts).length ? `${axis} halts on its way` : `${axis} does not move`;
+    const halts = (error instanceof Failure ? error.data?.halts_at : null) ?? {};
+    if (axis in halts)
+        return `${axis} goes to ${fixed(halts[axis], 2)} and halts there`;
+    return Object.keys(halts).length ? `${axis} halts on its way` : `${axis} does not move`;
 }
-
 // Whether the axis was sent there.
 async function move(axis, value) {
-  const answer = await command("axes.move", { targets: { [axis]: value }, plan: $("#around").checked }, (error) => title(axis, error));
-  for (const warning of answer?.warnings ?? []) emit("note", "warning-note", axis, warning);
-  return answer !== null;
+    const answer = await command("axes.move", { targets: { [axis]: value }, plan: $input("#around").checked }, (error) => title(axis, error));
+    for (const warning of answer?.warnings ?? [])
+        emit("note", "warning-note", axis, warning);
+    return answer !== null;
 }
-
 function jogButton(axis, direction, sign) {
-  const token = `${axis}:${direction}`;
-  const button = el("button", { title: `Hold to jog ${axis} (or hold Enter)`, "aria-label": `jog ${axis} ${direction > 0 ? "up" : "down"}` }, sign);
-  button.dataset.jog = token;
-  const stop = () => { button.classList.remove("held"); jogStop(token); };
-  const start = () => { button.classList.add("held"); jogStart(axis, direction, token); };
-  button.addEventListener("pointerdown", (e) => { e.preventDefault(); button.setPointerCapture(e.pointerId); start(); });
-  button.addEventListener("keydown", (e) => { if (e.key === "Enter" && !e.repeat) start(); });
-  button.addEventListener("keyup", (e) => { if (e.key === "Enter") stop(); });
-  for (const name of ["pointerup", "pointercancel", "lostpointercapture", "blur"]) button.addEventListener(name, stop);
-  return button;
+    const token = `${axis}:${direction}`;
+    const button = el("button", { title: `Hold to jog ${axis} (or hold Enter)`, "aria-label": `jog ${axis} ${direction > 0 ? "up" : "down"}` }, sign);
+    button.dataset.jog = token;
+    const stop = () => { button.classList.remove("held"); jogStop(token); };
+    const start = () => { button.classList.add("held"); jogStart(axis, direction, token); };
+    button.addEventListener("pointerdown", (e) => { e.preventDefault(); button.setPointerCapture(e.pointerId); start(); });
+    button.addEventListener("keydown", (e) => { if (e.key === "Enter" && !e.repeat)
+        start(); });
+    button.addEventListener("keyup", (e) => { if (e.key === "Enter")
+        stop(); });
+    for (const name of ["pointerup", "pointercancel", "lostpointercapture", "blur"])
+        button.addEventListener(name, stop);
+    return button;
 }
-
 function build(state) {
-  const groups = GROUPS.map(([title, tint, names]) => [title, tint, names.filter((n) => n in state.axes)]);
-  const known = new Set(groups.flatMap((g) => g[2]));
-  const others = Object.keys(state.axes).filter((n) => !known.has(n));
-  if (others.length) groups.push(["Others", "#999", others]);
-  const box = $("#axes"); box.textContent = ""; rows.clear();
-  for (const [title, tint, names] of groups) {
-    if (!names.length) continue;
-    const group = el("div", { class: "group" }, el("h2", {}, title)); group.style.setProperty("--tint", tint);
-    for (const name of names) group.append(axisRow(name, state.axes[name]));
-    box.append(group);
-  }
+    const groups = GROUPS.map(([title, tint, names]) => [title, tint, names.filter((n) => n in state.axes)]);
+    const known = new Set(groups.flatMap((g) => g[2]));
+    const others = Object.keys(state.axes).filter((n) => !known.has(n));
+    if (others.length)
+        groups.push(["Others", "#999", others]);
+    const box = $("#axes");
+    box.textContent = "";
+    rows.clear();
+    for (const [title, tint, names] of groups) {
+        if (!names.length)
+            continue;
+        const group = el("div", { class: "group" }, el("h2", {}, title));
+        group.style.setProperty("--tint", tint);
+        for (const name of names)
+            group.append(axisRow(name, state.axes[name]));
+        box.append(group);
+    }
 }
-
 function axisRow(name, axis) {
-  const [low, high] = axis.limits;
-  const slider = el("input", { type: "range", min: low, max: high, step: 0.1, value: axis.target, "aria-label": `${name} slider` });
-  const number = field({ "aria-label": `${name} value` }, enter, () => number.blur());
-  const now = el("span", { class: "now" });
-  const row = { name, slider, number, now, low, high, from: low, to: high, turn: NaN, dragging: false, asked: 0, waiting: 0 };
-  function enter() {
-    const text = number.value, value = parsed(text);
-    number.blur();
-    if (Number.isFinite(value)) move(name, value);
-    else emit("note", "error", `${name} does not move`, `“${text}” is not a number`);
-  }
-  number.addEventListener("blur", () => draw(row));
-  const letGo = () => setTimeout(() => { row.dragging = false; draw(row); }); // after the change, if there is one
-  slider.addEventListener("input", () => { row.dragging = true; number.value = fixed(Number(slider.value), 3); number.classList.add("typed"); });
-  for (const event of ["pointerup", "pointercancel", "blur"]) slider.addEventListener(event, letGo);
-  slider.addEventListener("change", async () => {
-    row.dragging = false;
-    const mine = row.waiting = ++row.asked;
-    // The state that shows the motion may come a little after the answer.
-    const wait = (await move(name, Number(slider.value))) ? SETTLE_MS : 0;
-    setTimeout(() => { if (row.waiting === mine) { row.waiting = 0; draw(row); } }, wait);
-  });
-  row.box = el("div", { class: "axis" },
-    el("div", { class: "top" },
-      el("span", { title: WHAT[name] ?? "" }, el("span", { class: "name" }, name), el("span", { class: "what" }, WHAT[name] ?? "")),
-      el("span", {}, number, el("span", { class: "unit" }, axis.unit === "deg" ? "°" : "mm"))),
-    el("div", { class: "line" }, jogButton(name, -1, "−"), el("div", { class: "track" }, slider, now), jogButton(name, +1, "+")));
-  row.box.dataset.axis = name;
-  rows.set(name, row);
-  return row.box;
+    const [low, high] = axis.limits;
+    const slider = el("input", { type: "range", min: low, max: high, step: 0.1, value: axis.target, "aria-label": `${name} slider` });
+    const number = field({ "aria-label": `${name} value` }, enter, () => number.blur());
+    const now = el("span", { class: "now" });
+    const box = el("div", { class: "axis" });
+    const row = { name, box, slider, number, now, low, high, from: low, to: high, turn: NaN, dragging: false, asked: 0, waiting: 0 };
+    function enter() {
+        const text = number.value, value = parsed(text);
+        number.blur();
+        if (Number.isFinite(value))
+            void move(name, value);
+        else
+            emit("note", "error", `${name} does not move`, `“${text}” is not a number`);
+    }
+    number.addEventListener("blur", () => draw(row));
+    const letGo = () => setTimeout(() => { row.dragging = false; draw(row); }); // after the change, if there is one
+    slider.addEventListener("input", () => { row.dragging = true; number.value = fixed(Number(slider.value), 3); number.classList.add("typed"); });
+    for (const event of ["pointerup", "pointercancel", "blur"])
+        slider.addEventListener(event, letGo);
+    const slid = async () => {
+        row.dragging = false;
+        const mine = row.waiting = ++row.asked;
+        // The state that shows the motion may come a little after the answer.
+        const wait = (await move(name, Number(slider.value))) ? SETTLE_MS : 0;
+        setTimeout(() => { if (row.waiting === mine) {
+            row.waiting = 0;
+            draw(row);
+        } }, wait);
+    };
+    slider.addEventListener("change", () => void slid());
+    box.append(el("div", { class: "top" }, el("span", { title: WHAT[name] ?? "" }, el("span", { class: "name" }, name), el("span", { class: "what" }, WHAT[name] ?? "")), el("span", {}, number, el("span", { class: "unit" }, axis.unit === "deg" ? "°" : "mm"))), el("div", { class: "line" }, jogButton(name, -1, "−"), el("div", { class: "track" }, slider, now), jogButton(name, 1, "+")));
+    box.dataset.axis = name;
+    rows.set(name, row);
+    return box;
 }
-
 function refresh(state) {
-  if (!rows.size || Object.keys(state.axes).some((n) => !rows.has(n))) build(state);
-  for (const row of rows.values()) draw(row);
+    if (!rows.size || Object.keys(state.axes).some((n) => !rows.has(n)))
+        build(state);
+    for (const row of rows.values())
+        draw(row);
 }
-
 // A slider over many turns is of no use: it goes over the present one.
 function turned(row, position) {
-  if (Math.abs(position - row.turn) <= 180) return;
-  row.turn = 360 * Math.round(position / 360);
-  row.from = Math.max(row.low, row.turn - 180); row.to = Math.min(row.high, row.turn + 180);
-  row.slider.min = row.from; row.slider.max = row.to;
-  row.slider.title = `${row.from}° to ${row.to}°; the number takes all turns`;
+    if (Math.abs(position - row.turn) <= 180)
+        return;
+    row.turn = 360 * Math.round(position / 360);
+    row.from = Math.max(row.low, row.turn - 180);
+    row.to = Math.min(row.high, row.turn + 180);
+    row.slider.min = String(row.from);
+    row.slider.max = String(row.to);
+    row.slider.title = `${row.from}° to ${row.to}°; the number takes all turns`;
 }
-
 // A row as the last state has it, but for what a person is just doing there.
 function draw(row) {
-  const axis = store.state?.axes[row.name];
-  if (!axis) return;
-  if (!row.dragging && !row.waiting && document.activeElement !== row.number) {
-    const text = fixed(axis.position, 3);
-    if (axis.unit === "deg" && row.high - row.low > 720) turned(row, axis.position);
-    row.slider.value = axis.moving ? axis.target : axis.position;
-    if (row.number.value !== text) row.number.value = text;
-    row.number.classList.remove("typed");
-  }
-  const at = (axis.position - row.from) / (row.to - row.from);
-  row.now.style.left = `calc(8px + (100% - 16px) * ${Math.min(1, Math.max(0, at)).toFixed(4)})`;
-  row.box.classList.toggle("moving", axis.moving);
-  row.box.classList.toggle("limit", !axis.moving && (axis.position - row.low < 0.5 || row.high - axis.position < 0.5));
+    const axis = store.state?.axes[row.name];
+    if (!axis)
+        return;
+    if (!row.dragging && !row.waiting && document.activeElement !== row.number) {
+        const text = fixed(axis.position, 3);
+        if (axis.unit === "deg" && row.high - row.low > 720)
+            turned(row, axis.position);
+        row.slider.value = String(axis.moving ? axis.target : axis.position);
+        if (row.number.value !== text)
+            row.number.value = text;
+        row.number.classList.remove("typed");
+    }
+    const at = (axis.position - row.from) / (row.to - row.from);
+    row.now.style.left = `calc(8px + (100% - 16px) * ${Math.min(1, Math.max(0, at)).toFixed(4)})`;
+    row.box.classList.toggle("moving", axis.moving);
+    row.box.classList.toggle("limit", !axis.moving && (axis.position - row.low < 0.5 || row.high - axis.position < 0.5));
 }
-
 on("state", refresh);
-on("connection", () => { if (!store.viewer || !store.twin) for (const token of [...held.keys()]) drop(token); });
+on("connection", () => { if (!store.viewer || !store.twin)
+    for (const token of [...held.keys()])
+        drop(token); });

@@ -1,244 +1,307 @@
 // The Data tab: a browser of data sets; one that is open goes through its images, radiograph and machine together.
-import { $, el, fixed, seconds, setText } from "./dom.js";
+import { $, $$, $button, $dialog, $select, download, el, fixed, putGrey, seconds, setText, within, words } from "./dom.js";
 import { call, command, emit, on, store } from "./link.js";
 import { asked, remember } from "./address.js";
 import { draw as drawTimeline } from "./timeline.js";
 import * as compare from "./compare.js";
-
+import * as marks from "./marks.js";
 const SEARCH_MS = 250, AGAIN_MS = 500, PLAYED = 300, LEAST_MS = 60;
 const WORDS = { complete: "complete", incomplete: "incomplete", running: "running", unknown: "cannot be read in full" };
 let listed = [], told = null, plan = null, index = 0, next = null, asking = false, playing = false, number = 0;
-
 const search = el("input", { type: "text", id: "data-search", placeholder: "Search: name, sample, date, 90kV, incomplete …", "aria-label": "Search data sets" });
-$("#tab-data").append(
-  el("div", { class: "card" }, el("h2", {}, "Data sets"), search, el("div", { id: "data-list" }),
-    el("div", { class: "row between small-text" }, el("span", { id: "data-count", class: "muted" }),
-      el("button", { id: "data-more", class: "small", hidden: true, onclick: () => list(listed.length) }, "More"))));
+$("#tab-data").append(el("div", { class: "card" }, el("h2", {}, "Data sets"), search, el("div", { id: "data-list" }), el("div", { class: "row between small-text" }, el("span", { id: "data-count", class: "muted" }), el("button", { id: "data-more", class: "small", hidden: true, onclick: () => list(listed.length) }, "More"))));
 const slider = el("input", { type: "range", id: "record-frame", min: 0, step: 1, value: 0, "aria-label": "Image", oninput: () => show(Number(slider.value)) });
 const canvas = el("canvas", { id: "record-line", role: "img", "aria-label": "Motors, clearance and counts over time" });
 const button = (id, text, title, f) => el("button", { id, class: "small", title, onclick: f }, text);
-const panel = el("div", { id: "record", hidden: true },
-  el("div", { class: "row head" }, el("b", { id: "record-name", class: "cut" }), el("span", { id: "record-state", class: "muted cut" }), el("span", { class: "spacer" }),
-    button("record-fit", "Calibrate", "Calibrate from this data set: its sample is the phantom", () => emit("calibrate", told.info.name, told.info.sample)),
-    button("record-align", "Align", "Find the axis of this scan without a phantom", () => emit("align", told.info.name)),
-    button("record-script", "Script", "Bring its script into the Scan tab", script), button("record-replay", "Replay file", "This scan as one HTML file that plays it", replay),
-    button("record-close", "Close", "Back to what is live (Escape)", () => open(null, null, true))),
-  el("div", { class: "row head" }, button("record-play", "▶", "Play", () => play(!playing)), button("record-back", "‹", "The image before", () => show(index - 1)),
-    slider, button("record-next", "›", "The next image", () => show(index + 1)), el("span", { id: "record-at", class: "mono small-text cut" })),
-  compare.row, el("div", { class: "lanes" }, canvas), el("div", { id: "record-note", class: "muted small-text cut" }));
+const panel = el("div", { id: "record", hidden: true }, el("div", { class: "row head" }, el("b", { id: "record-name", class: "cut" }), el("span", { id: "record-state", class: "muted cut" }), el("span", { class: "spacer" }), button("record-fit", "Calibrate", "Calibrate from this data set: its sample is the phantom", () => { if (told)
+    emit("calibrate", told.info.name, told.info.sample); }), button("record-align", "Align", "Find the axis of this scan without a phantom", () => { if (told)
+    emit("align", told.info.name); }), button("record-script", "Script", "Bring its script into the Scan tab", script), button("record-replay", "Replay file", "This scan as one HTML file that plays it", replay), button("record-close", "Close", "Back to what is live (Escape)", () => open(null, null, true))), el("div", { class: "row head" }, button("record-play", "▶", "Play", () => play(!playing)), button("record-back", "‹", "The image before", () => show(index - 1)), slider, button("record-next", "›", "The next image", () => show(index + 1)), el("span", { id: "record-at", class: "mono small-text cut" })), compare.row, marks.row((all) => { if (told)
+    emit("calibrate", told.info.name, told.info.sample, all); }), el("div", { class: "lanes" }, canvas), el("div", { id: "record-note", class: "muted small-text cut" }));
 $("#stage").append(panel);
-
 // Thumbnails come as 8-bit grey.
 function thumbnail(small) {
-  const c = el("canvas", { width: 1, height: 1 });
-  if (!small) return c;
-  const [rows, cols] = small.shape, raw = atob(small.data), x = c.getContext("2d");
-  c.width = cols; c.height = rows;
-  const out = x.createImageData(cols, rows), d = new Uint32Array(out.data.buffer);
-  for (let k = 0; k < d.length; k++) d[k] = 0xff000000 | (raw.charCodeAt(k) * 0x010101);
-  x.putImageData(out, 0, 0);
-  return c;
+    const c = el("canvas", { width: 1, height: 1 });
+    if (!small)
+        return c;
+    const raw = atob(small.data);
+    putGrey(c, small.shape, (k) => raw.charCodeAt(k));
+    return c;
 }
 const dated = (info) => (info.started ? info.started.slice(0, 16).replace("T", " ") : new Date(1000 * info.modified).toISOString().slice(0, 16).replace("T", " "));
 function settings(info) {
-  const frames = info.present < info.projections ? `${info.present} of ${info.projections} images` : `${info.projections} images`;
-  const beam = info.kV === null ? null : `${fixed(info.kV, 0)} kV ${fixed(info.power_W, 0)} W`;
-  return [frames, beam, info.exposure_ms === null ? null : `${fixed(info.exposure_ms, 0)} ms`, info.sample || null].filter(Boolean).join(" · ");
+    const frames = info.present < info.projections ? `${info.present} of ${info.projections} images` : `${info.projections} images`;
+    const beam = info.kV === null ? null : `${fixed(info.kV, 0)} kV ${fixed(info.power_W, 0)} W`;
+    return [frames, beam, info.exposure_ms === null ? null : `${fixed(info.exposure_ms, 0)} ms`, info.sample || null].filter(Boolean).join(" · ");
 }
 function row(info) {
-  const why = info.problem || info.reason;
-  const node = el("button", { class: "data-set", title: why, onclick: () => open(info.name, null, true) }, thumbnail(info.thumbnail),
-    el("span", {}, el("b", {}, info.name), el("span", { class: "muted" }, dated(info)), el("span", {}, settings(info)),
-      el("span", { class: `state ${info.state}` }, info.state === "incomplete" && why ? `incomplete: ${why}` : info.state === "unknown" && why ? why : WORDS[info.state])));
-  node.dataset.name = info.name;
-  node.setAttribute("aria-current", String(info.name === told?.info.name));
-  return node;
+    const why = info.problem || info.reason;
+    const node = el("button", { class: "data-set", title: why, onclick: () => open(info.name, null, true) }, thumbnail(info.thumbnail), el("span", {}, el("b", {}, info.name), el("span", { class: "muted" }, dated(info)), el("span", {}, settings(info)), el("span", { class: `state ${info.state}` }, info.state === "incomplete" && why ? `incomplete: ${why}` : info.state === "unknown" && why ? why : WORDS[info.state])));
+    node.dataset.name = info.name;
+    node.setAttribute("aria-current", String(info.name === told?.info.name));
+    return node;
 }
 async function list(start = 0) {
-  const mine = ++number;
-  let answer;
-  try { answer = await call("viewer.datasets", { search: search.value.trim().slice(0, 200), start }); }
-  catch (error) { if (mine === number) setText($("#data-count"), error.message); return; }
-  if (mine !== number) return;
-  listed = [...(start ? listed : []), ...answer.datasets];
-  const key = JSON.stringify(listed);
-  if (key !== drawn) $("#data-list").replaceChildren(...listed.map(row)); // a click is lost with its row
-  drawn = key;
-  $("#data-more").hidden = listed.length >= answer.total;
-  const left = answer.left_out ? ` · ${answer.left_out} folders left out` : "";
-  const none = search.value ? "none is found" : "none yet: run a scan", all = answer.total ? `${listed.length} of ${answer.total}${left}` : none;
-  setText($("#data-count"), answer.unread ? `${answer.total} data sets · reading ${answer.unread} more …` : all);
-  if (answer.unread && !$("#tab-data").hidden) setTimeout(() => { if (mine === number) list(); }, AGAIN_MS);
+    const mine = ++number;
+    const answer = await call("viewer.datasets", { search: search.value.trim().slice(0, 200), start }).catch(words);
+    if (mine !== number)
+        return;
+    if (typeof answer === "string") {
+        setText($("#data-count"), answer);
+        return;
+    }
+    listed = [...(start ? listed : []), ...answer.datasets];
+    const key = JSON.stringify(listed);
+    if (key !== drawn)
+        $("#data-list").replaceChildren(...listed.map(row)); // a click is lost with its row
+    drawn = key;
+    $button("#data-more").hidden = listed.length >= answer.total;
+    const left = answer.left_out ? ` · ${answer.left_out} folders left out` : "";
+    const none = search.value ? "none is found" : "none yet: run a scan", all = answer.total ? `${listed.length} of ${answer.total}${left}` : none;
+    setText($("#data-count"), answer.unread ? `${answer.total} data sets · reading ${answer.unread} more …` : all);
+    if (answer.unread && !$("#tab-data").hidden)
+        setTimeout(() => { if (mine === number)
+            void list(); }, AGAIN_MS);
 }
-let typing = null, drawn = "";
-search.addEventListener("input", () => { clearTimeout(typing); typing = setTimeout(list, SEARCH_MS); });
-on("tab", (tab) => { if (tab === "data" && store.session) list(); });
-on("session", () => { if (!$("#tab-data").hidden) list(); });
+let typing, drawn = "";
+function listSoon() { clearTimeout(typing); typing = window.setTimeout(list, SEARCH_MS); }
+search.addEventListener("input", listSoon);
+on("tab", (tab) => { if (tab === "data" && store.session)
+    void list(); });
+on("session", () => { if (!$("#tab-data").hidden)
+    void list(); });
 export const folder = (job) => (job?.dataset ?? "").split(/[\\/]/).pop() || "?";
 on("job", (job) => {
-  if (!$("#tab-data").hidden) { clearTimeout(typing); typing = setTimeout(list, SEARCH_MS); }
-  // Open while it was scanned: now it has more images, or all.
-  if (told?.info.state === "running" && folder(job) === told.info.name && !["queued", "running", "paused"].includes(job.state)) open(told.info.name, index);
+    if (!$("#tab-data").hidden)
+        listSoon();
+    // Open while it was scanned: now it has more images, or all.
+    if (told?.info.state === "running" && folder(job) === told.info.name && !["queued", "running", "paused"].includes(job.state))
+        void open(told.info.name, index);
 });
-
 // Opens a data set at an image, or closes the one that is open (null).
 export async function open(name, at = null, step = false) {
-  play(false); next = null;
-  const mine = ++opening;
-  const answer = name === null ? await call("viewer.recorded", { name }).catch(() => null) : await command("viewer.recorded", { name }, `${name} cannot be opened`);
-  if (mine !== opening || (name !== null && !answer)) return;
-  told = name === null ? null : answer; plan = null;
-  store.recorded = name; store.hidden = false; store.image = null; emit("image");
-  panel.hidden = told === null;
-  $("#stage").classList.toggle("recorded", told !== null);
-  for (const node of $("#data-list").children) node.setAttribute("aria-current", String(node.dataset.name === name));
-  clearTimeout(kept);
-  remember({ data: name, frame: at }, step);
-  emit("recorded", name);
-  if (!told) return;
-  const i = told.info, bare = !told.times_s;
-  setText($("#record-name"), i.name);
-  setText($("#record-state"), `${WORDS[i.state]}${i.problem || i.reason ? `: ${i.problem || i.reason}` : ""} · ${settings(i)}${i.duration_s ? ` · ${seconds(i.duration_s)}` : ""}`);
-  $("#record-state").title = $("#record-state").textContent;
-  compare.allow(told.same_machine ? "" : "not this twin’s machine and zeros, or poses that are not known");
-  $("#record-replay").disabled = bare || !told.same_machine;
-  slider.max = Math.max(0, told.images - 1);
-  setText($("#record-note"), note());
-  lanes();
-  await show(Math.min(Math.max(0, at ?? told.kinds.indexOf("projection")), told.images - 1));
-  const measured = await call("dataset.get", { name, points: 400, measure: true }).catch(() => null);
-  if (mine !== opening || !measured) return;
-  told = { ...measured, whole: told };
-  setText($("#record-note"), note());
-  lanes();
+    void play(false);
+    next = null;
+    const mine = ++opening;
+    const answer = name === null ? await call("viewer.recorded", { name }).catch(() => null) : await command("viewer.recorded", { name }, `${name} cannot be opened`);
+    if (mine !== opening || (name !== null && !answer))
+        return;
+    told = name === null ? null : answer;
+    plan = null;
+    store.recorded = name;
+    store.hidden = false;
+    store.image = null;
+    emit("image");
+    panel.hidden = told === null;
+    $("#stage").classList.toggle("recorded", told !== null);
+    for (const node of $$("#data-list > *"))
+        node.setAttribute("aria-current", String(node.dataset.name === name));
+    clearTimeout(kept);
+    remember({ data: name, frame: at }, step);
+    emit("recorded", name);
+    if (name === null || !told)
+        return;
+    const i = told.info, bare = !told.times_s;
+    setText($("#record-name"), i.name);
+    setText($("#record-state"), `${WORDS[i.state]}${i.problem || i.reason ? `: ${i.problem || i.reason}` : ""} · ${settings(i)}${i.duration_s ? ` · ${seconds(i.duration_s)}` : ""}`);
+    $("#record-state").title = $("#record-state").textContent;
+    compare.allow(told.same_machine ? "" : "not this twin’s machine and zeros, or poses that are not known");
+    $button("#record-replay").disabled = bare || !told.same_machine;
+    slider.max = String(Math.max(0, told.images - 1));
+    setText($("#record-note"), note());
+    lanes();
+    await show(Math.min(Math.max(0, at ?? told.kinds.indexOf("projection")), told.images - 1));
+    const measured = await call("dataset.get", { name, points: 400, measure: true }).catch(() => null);
+    if (mine !== opening || !measured)
+        return;
+    told = { ...measured, whole: told };
+    setText($("#record-note"), note());
+    lanes();
 }
 let opening = 0;
 function note() {
-  const parts = [];
-  if (!Object.keys(told.positions).length) parts.push("poses and times are not known: only images are shown");
-  else if (!told.same_machine) parts.push("another machine or other zeros than this twin's: its pose is not drawn in the scene");
-  if (compare.how() !== "recorded") {
-    const { sample, correction } = store.state ?? {};
-    const other = sample?.name === told.info.sample ? "" : ` (the scan says ${told.info.sample || "nothing of its sample"})`;
-    parts.push(`virtual: ${sample?.name || "empty stage"}${other}, ${correction ? `correction ${correction.name}` : "nominal geometry"}`);
-  }
-  if (told.clearance_of) parts.push(`clearance: ${told.clearance_of}`);
-  parts.push(told.counts === null ? "measuring counts and clearances …" : told.counts.some((c) => c === null) ? "gaps: images that cannot be read" : "");
-  return parts.filter(Boolean).join(" · ");
+    if (!told)
+        return "";
+    const parts = [];
+    if (!Object.keys(told.positions).length)
+        parts.push("poses and times are not known: only images are shown");
+    else if (!told.same_machine)
+        parts.push("another machine or other zeros than this twin's: its pose is not drawn in the scene");
+    if (compare.how() !== "recorded") {
+        const { sample, correction } = store.state ?? {};
+        const other = sample?.name === told.info.sample ? "" : ` (the scan says ${told.info.sample || "nothing of its sample"})`;
+        parts.push(`virtual: ${sample?.name || "empty stage"}${other}, ${correction ? `correction ${correction.name}` : "nominal geometry"}`);
+    }
+    if (told.clearance_of)
+        parts.push(`clearance: ${told.clearance_of}`);
+    parts.push(told.counts === null ? "measuring counts and clearances …" : told.counts.some((c) => c === null) ? "gaps: images that cannot be read" : "");
+    return parts.filter(Boolean).join(" · ");
 }
 function lanes() {
-  const times = told.times_s ?? told.indices, curves = {}, units = {};
-  for (const [name, values] of Object.entries(told.positions)) {
-    const known = values.filter((v) => v !== null), moves = known.some((v) => Math.abs(v - known[0]) > 1e-6);
-    if (moves) { curves[name] = values; units[name] = store.state?.axes[name]?.unit === "deg" ? "°" : "mm"; }
-  }
-  if (told.clearance_mm) { curves.clearance = told.clearance_mm; units.clearance = "mm"; }
-  if (told.counts) { curves["mean counts"] = told.counts; units["mean counts"] = ""; }
-  plan = { duration_s: times.at(-1) ?? 0, times, curves, units, images: times.map((t, k) => [t, told.kinds[k]]), axis: told.times_s ? "s" : "" };
-  redraw();
-}
-let moment = null, kept = null;
-function redraw() {
-  if (!plan || panel.hidden) return;
-  drawTimeline(canvas, plan, moment, null);
-  const rest = panel.offsetHeight - canvas.parentElement.offsetHeight + 2;
-  $("#stage").style.setProperty("--record", `${Math.min(rest + canvas.offsetHeight, 0.45 * $("#stage").clientHeight)}px`);
-}
-
-// The newest image asked for wins; one that cannot be shown leaves no other in its place.
-async function show(wanted) {
-  if (!told) return;
-  index = Math.min(Math.max(0, wanted), told.images - 1);
-  slider.value = index; next = index;
-  if (asking) return;
-  asking = true;
-  const name = told.info.name;
-  while (next !== null && told?.info.name === name) {
-    const at = next, kinds = (told.whole ?? told), k = kinds.indices.indexOf(at);
-    next = null;
-    // Dark and flat images have no line integrals; of an image between those told the answer says what it is.
-    const kind = k >= 0 && kinds.kinds[k] !== "projection" ? "counts" : $("#kind").value;
-    let about = null, why = "";
-    try { about = await call("viewer.recorded_image", { index: at, kind, virtual: compare.how() !== "recorded" }); }
-    catch (error) {
-      why = error.message;
-      if (kind !== "counts") about = await call("viewer.recorded_image", { index: at, kind: "counts" }).catch(() => null);
+    if (!told)
+        return;
+    const { kinds } = told, times = told.times_s ?? told.indices, curves = {}, units = {};
+    for (const [name, values] of Object.entries(told.positions)) {
+        const known = values.filter((v) => v !== null), moves = known.some((v) => Math.abs(v - (known[0] ?? v)) > 1e-6);
+        if (moves) {
+            curves[name] = values;
+            units[name] = store.state?.axes[name]?.unit === "deg" ? "°" : "mm";
+        }
     }
-    if (told?.info.name !== name) break;
-    moment = about ? about.time_s ?? at : told.times_s ? null : at;
-    store.hidden = !about;
-    if (!about) { store.image = null; emit("image"); }
-    panel.dataset.index = at; panel.dataset.shown = String(Boolean(about));
-    const facts = about && [about.file, about.time_s === null ? "" : `${fixed(about.time_s, 2)} s`, about.image === "projection" ? "" : about.image,
-      why && `counts: ${why}`, about.problem && `no virtual image: ${about.problem}`];
-    setText($("#record-at"), [`${at + 1} of ${told.images}`, ...(facts ?? [why])].filter(Boolean).join(" · "));
-    $("#record-at").title = $("#record-at").textContent;
+    if (told.clearance_mm) {
+        curves.clearance = told.clearance_mm;
+        units.clearance = "mm";
+    }
+    if (told.counts) {
+        curves["mean counts"] = told.counts;
+        units["mean counts"] = "";
+    }
+    plan = { duration_s: times.at(-1) ?? 0, times, curves, units, images: times.map((t, k) => [t, kinds[k]]), axis: told.times_s ? "s" : "" };
     redraw();
-  }
-  asking = false;
-  if (told && next !== null) { show(next); return; }
-  clearTimeout(kept);
-  kept = setTimeout(() => { if (told) remember({ frame: index }); }, SEARCH_MS);
+}
+let moment = null, kept;
+function redraw() {
+    if (!plan || panel.hidden)
+        return;
+    drawTimeline(canvas, plan, moment, null);
+    const rest = panel.offsetHeight - $(".lanes", panel).offsetHeight + 2;
+    $("#stage").style.setProperty("--record", `${Math.min(rest + canvas.offsetHeight, 0.45 * $("#stage").clientHeight)}px`);
+}
+// The newest image asked for wins; one that cannot be shown leaves no other in its place.
+const still = (name) => told?.info.name === name;
+const kindAsked = () => $select("#kind").value;
+async function show(wanted) {
+    if (!told)
+        return;
+    index = Math.min(Math.max(0, wanted), told.images - 1);
+    slider.value = String(index);
+    next = index;
+    if (asking)
+        return;
+    asking = true;
+    const name = told.info.name;
+    while (next !== null && still(name)) {
+        const at = next, kinds = told.whole ?? told, k = kinds.indices.indexOf(at);
+        next = null;
+        // Dark and flat images have no line integrals; of an image between those told the answer says what it is.
+        const kind = k >= 0 && kinds.kinds[k] !== "projection" ? "counts" : kindAsked();
+        let about = null, why = "";
+        try {
+            about = await call("viewer.recorded_image", { index: at, kind, virtual: compare.how() !== "recorded" });
+        }
+        catch (error) {
+            why = words(error);
+            if (kind !== "counts")
+                about = await call("viewer.recorded_image", { index: at, kind: "counts" }).catch(() => null);
+        }
+        if (!still(name))
+            break;
+        moment = about ? about.time_s ?? at : told.times_s ? null : at;
+        store.hidden = !about;
+        if (!about) {
+            store.image = null;
+            emit("image");
+        }
+        panel.dataset.index = String(at);
+        panel.dataset.shown = String(Boolean(about));
+        const facts = about && [about.file, about.time_s === null ? "" : `${fixed(about.time_s, 2)} s`, about.image === "projection" ? "" : about.image,
+            why && `counts: ${why}`, about.problem && `no virtual image: ${about.problem}`];
+        setText($("#record-at"), [`${at + 1} of ${told.images}`, ...(facts ?? [why])].filter(Boolean).join(" · "));
+        $("#record-at").title = $("#record-at").textContent;
+        redraw();
+    }
+    asking = false;
+    if (told && next !== null) {
+        void show(next);
+        return;
+    }
+    clearTimeout(kept);
+    kept = window.setTimeout(() => { if (told)
+        remember({ frame: index }); }, SEARCH_MS);
 }
 async function play(on) {
-  playing = on;
-  setText($("#record-play"), on ? "❚❚" : "▶"); $("#record-play").title = on ? "Pause" : "Play";
-  if (!on || !told) return;
-  if (index >= told.images - 1) index = -1;
-  const step = Math.max(1, Math.round(told.images / PLAYED));
-  while (playing && told && index < told.images - 1) {
-    const begun = performance.now();
-    await show(index + step);
-    await new Promise((done) => setTimeout(done, Math.max(0, LEAST_MS - (performance.now() - begun))));
-  }
-  if (playing) play(false);
+    playing = on;
+    setText($button("#record-play"), on ? "❚❚" : "▶");
+    $button("#record-play").title = on ? "Pause" : "Play";
+    if (!on || !told)
+        return;
+    if (index >= told.images - 1)
+        index = -1;
+    const step = Math.max(1, Math.round(told.images / PLAYED));
+    while (playing && told && index < told.images - 1) {
+        const begun = performance.now();
+        await show(index + step);
+        await new Promise((done) => setTimeout(done, Math.max(0, LEAST_MS - (performance.now() - begun))));
+    }
+    if (playing)
+        void play(false);
 }
 async function script() {
-  const answer = await command("dataset.get", { name: told.info.name, points: 2, script: true }, "No script");
-  if (answer) emit("script", answer.script);
+    if (!told)
+        return;
+    const answer = await command("dataset.get", { name: told.info.name, points: 2, script: true }, "No script");
+    if (answer?.script)
+        emit("script", answer.script);
 }
 async function replay() {
-  const a = await command("viewer.export", { format: "html", replay: true }, "No replay");
-  if (a) { const link = el("a", { href: a.url, download: a.name }); document.body.append(link); link.click(); link.remove(); }
+    const a = await command("viewer.export", { format: "html", replay: true }, "No replay");
+    if (a)
+        download(a.url, a.name);
 }
 // The virtual image goes with what the twin has in force.
 let force = "";
-const anew = () => { if (told) { setText($("#record-note"), note()); show(index); } };
+const anew = () => { if (told) {
+    setText($("#record-note"), note());
+    void show(index);
+} };
 on("compare", anew);
 on("state", ({ sample, correction }) => {
-  const now = JSON.stringify([sample, correction?.name]);
-  if (now !== force && told && compare.how() !== "recorded") anew();
-  force = now;
+    const now = JSON.stringify([sample, correction?.name]);
+    if (now !== force && told && compare.how() !== "recorded")
+        anew();
+    force = now;
 });
 const seek = (e) => {
-  if (!plan) return;
-  const b = canvas.getBoundingClientRect(), t = Math.min(1, Math.max(0, (e.clientX - b.left) / b.width)) * plan.duration_s;
-  const k = plan.times.reduce((best, v, i) => (Math.abs(v - t) < Math.abs(plan.times[best] - t) ? i : best), 0);
-  show(told.indices[k]);
+    if (!plan || !told)
+        return;
+    const b = canvas.getBoundingClientRect(), { times, duration_s } = plan, t = Math.min(1, Math.max(0, (e.clientX - b.left) / b.width)) * duration_s;
+    const k = times.reduce((best, v, i) => (Math.abs(v - t) < Math.abs(times[best] - t) ? i : best), 0);
+    void show(told.indices[k]);
 };
-canvas.addEventListener("pointerdown", (e) => { play(false); canvas.setPointerCapture(e.pointerId); seek(e); });
-canvas.addEventListener("pointermove", (e) => { if (e.buttons) seek(e); });
-slider.addEventListener("pointerdown", () => play(false));
+canvas.addEventListener("pointerdown", (e) => { void play(false); canvas.setPointerCapture(e.pointerId); seek(e); });
+canvas.addEventListener("pointermove", (e) => { if (e.buttons)
+    seek(e); });
+slider.addEventListener("pointerdown", () => void play(false));
 new ResizeObserver(redraw).observe(panel);
 new MutationObserver(redraw).observe(document.documentElement, { attributeFilter: ["data-theme"] });
-$("#kind").addEventListener("change", () => { if (told) show(index); });
+$select("#kind").addEventListener("change", () => { if (told)
+    void show(index); });
 window.addEventListener("keydown", (e) => {
-  if (e.key !== "Escape" || panel.hidden || $("#help-dialog").open || e.target.closest?.("input[type=text], textarea, select")) return;
-  open(null, null, true);
+    if (e.key !== "Escape" || panel.hidden || $dialog("#help-dialog").open || within(e.target, "input[type=text], textarea, select"))
+        return;
+    void open(null, null, true);
 });
 // A viewer that was started again knows nothing of it; a page that was loaded again asks for what its address
 // names: once the viewer has seen the twin, and this page has its own connection to it.
 let lost = false, first = true, seen = false;
 function ready() {
-  if (!seen || !store.session) return;
-  if (first) { first = false; restore(); }
-  else if (lost && told) { lost = false; open(told.info.name, index); }
+    if (!seen || !store.session)
+        return;
+    if (first) {
+        first = false;
+        restore();
+    }
+    else if (lost && told) {
+        lost = false;
+        void open(told.info.name, index);
+    }
 }
 on("open", () => { seen = false; lost = told !== null; });
 on("layers", () => { seen = true; ready(); });
 on("session", ready);
 export function restore() {
-  const name = asked("data"), at = asked("frame") === null ? null : Number(asked("frame")) || 0;
-  if (name !== (told?.info.name ?? null)) open(name, at);
-  else if (told && at !== null) show(at);
+    const name = asked("data"), at = asked("frame") === null ? null : Number(asked("frame")) || 0;
+    if (name !== (told?.info.name ?? null))
+        void open(name, at);
+    else if (told && at !== null)
+        void show(at);
 }

@@ -1,62 +1,116 @@
 // Small helpers for building the page.
-export const $ = (selector, root = document) => root.querySelector(selector);
+export const $ = (selector, root = document) => {
+    const found = root.querySelector(selector);
+    if (!found)
+        throw new Error(`the page has no ${selector}`);
+    return found;
+};
 export const $$ = (selector, root = document) => [...root.querySelectorAll(selector)];
+export const $input = (selector) => $(selector);
+export const $select = (selector) => $(selector);
+export const $button = (selector) => $(selector);
+export const $canvas = (selector) => $(selector);
+export const $dialog = (selector) => $(selector);
 export function el(tag, attributes = {}, ...children) {
-  const node = document.createElement(tag);
-  for (const [name, value] of Object.entries(attributes)) {
-    if (name.startsWith("on")) node.addEventListener(name.slice(2), value);
-    else if (name === "class") node.className = value;
-    else if (name in node && name !== "list") node[name] = value;
-    else node.setAttribute(name, value);
-  }
-  node.append(...children.filter((c) => c !== null && c !== undefined));
-  return node;
+    const node = document.createElement(tag);
+    for (const [name, value] of Object.entries(attributes)) {
+        if (typeof value === "function")
+            node.addEventListener(name.slice(2), value);
+        else if (name === "class")
+            node.className = String(value);
+        else if (name in node && name !== "list")
+            node[name] = value;
+        else
+            node.setAttribute(name, String(value));
+    }
+    node.append(...children.filter((c) => c !== null && c !== undefined));
+    return node;
 }
 // Attributes of what is pressed like a button and looks like none.
 export function pressed(f) {
-  return { role: "button", tabIndex: 0, onclick: f, onkeydown: (e) => { if (e.key === "Enter" && !e.repeat) f(e); } };
+    return { role: "button", tabIndex: 0, onclick: f, onkeydown: (e) => { if (e.key === "Enter" && !e.repeat)
+            f(); } };
 }
 export function fixed(value, digits = 2) {
-  if (!Number.isFinite(value)) return "–";
-  const text = value.toFixed(digits);
-  return Number(text) === 0 ? text.replace("-", "") : text;
+    if (!isNumber(value))
+        return "–";
+    const text = value.toFixed(digits);
+    return Number(text) === 0 ? text.replace("-", "") : text;
 }
+export const isNumber = (value) => Number.isFinite(value);
 // The number a person typed: a decimal comma is a point, and what is no number is none (never 0).
 export function parsed(text) {
-  const plain = text.trim().replace("−", "-").replace(",", ".");
-  return /^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$/i.test(plain) ? Number(plain) : NaN;
+    const plain = text.trim().replace("−", "-").replace(",", ".");
+    return /^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$/i.test(plain) ? Number(plain) : NaN;
 }
 // A field for a number (as text: browsers drop what they cannot read from number fields without a word).
 // What is typed is marked until Enter applies it or Escape takes it back.
 export function field(attributes, apply, back) {
-  const input = el("input", { type: "text", inputMode: "decimal", autocomplete: "off", ...attributes });
-  input.classList.add("num");
-  input.addEventListener("input", () => input.classList.add("typed"));
-  input.addEventListener("keydown", (e) => {
-    const step = { ArrowUp: 1, ArrowDown: -1 }[e.key], value = parsed(input.value);
-    if (e.key === "Enter" && !e.repeat) apply();
-    if (e.key === "Escape") back();
-    if (step && Number.isFinite(value)) { e.preventDefault(); input.value = String(Number((value + step).toFixed(4))); input.classList.add("typed"); }
-  });
-  return input;
+    const input = el("input", { type: "text", inputMode: "decimal", autocomplete: "off", ...attributes });
+    input.classList.add("num");
+    input.addEventListener("input", () => input.classList.add("typed"));
+    input.addEventListener("keydown", (e) => {
+        const step = e.key === "ArrowUp" ? 1 : e.key === "ArrowDown" ? -1 : 0, value = parsed(input.value);
+        if (e.key === "Enter" && !e.repeat)
+            apply();
+        if (e.key === "Escape")
+            back();
+        if (step && Number.isFinite(value)) {
+            e.preventDefault();
+            input.value = String(Number((value + step).toFixed(4)));
+            input.classList.add("typed");
+        }
+    });
+    return input;
 }
 export function seconds(s) {
-  if (!Number.isFinite(s)) return "–";
-  s = Math.round(s);
-  const h = Math.floor(s / 3600), m = Math.floor((s % 3600) / 60);
-  return h ? `${h} h ${String(m).padStart(2, "0")} min` : m ? `${m} min ${String(s % 60).padStart(2, "0")} s` : `${s} s`;
+    if (!isNumber(s))
+        return "–";
+    s = Math.round(s);
+    const h = Math.floor(s / 3600), m = Math.floor((s % 3600) / 60);
+    return h ? `${h} h ${String(m).padStart(2, "0")} min` : m ? `${m} min ${String(s % 60).padStart(2, "0")} s` : `${s} s`;
 }
 export function bytes(n) {
-  const units = ["B", "kB", "MB", "GB", "TB"];
-  let i = 0;
-  while (n >= 1000 && i < 4) { n /= 1000; i++; }
-  return `${n.toFixed(i ? 1 : 0)} ${units[i]}`;
+    const units = ["B", "kB", "MB", "GB", "TB"];
+    let i = 0;
+    while (n >= 1000 && i < 4) {
+        n /= 1000;
+        i++;
+    }
+    return `${n.toFixed(i ? 1 : 0)} ${units[i]}`;
 }
-export function setText(node, text) { if (node.textContent !== text) node.textContent = text; }
+export function setText(node, text) { if (node.textContent !== text)
+    node.textContent = text; }
 export function download(url, name) { const a = el("a", { href: url, download: name }); document.body.append(a); a.click(); a.remove(); }
 export function base64(buffer) {
-  const b = new Uint8Array(buffer);
-  let out = "";
-  for (let i = 0; i < b.length; i += 0x8000) out += String.fromCharCode(...b.subarray(i, i + 0x8000));
-  return btoa(out);
+    const b = new Uint8Array(buffer);
+    let out = "";
+    for (let i = 0; i < b.length; i += 0x8000)
+        out += String.fromCharCode(...b.subarray(i, i + 0x8000));
+    return btoa(out);
 }
+// A canvas's pixels in two dimensions, and one that was not refused.
+export function context2d(canvas) {
+    const context = canvas.getContext("2d");
+    if (!context)
+        throw new Error("this browser draws nothing");
+    return context;
+}
+// Grey values (0 to 255, row by row) as a picture.
+export function putGrey(canvas, [rows, cols], grey) {
+    canvas.width = cols;
+    canvas.height = rows;
+    const x = context2d(canvas), out = x.createImageData(cols, rows), d = new Uint32Array(out.data.buffer);
+    for (let k = 0; k < d.length; k++)
+        d[k] = 0xff000000 | (grey(k) * 0x010101);
+    x.putImageData(out, 0, 0);
+}
+// What went wrong, in words.
+export const words = (error) => (error instanceof Error ? error.message : String(error));
+// The element of a kind that an event happened within; elements of other frames are of other classes.
+export const within = (target, selector) => target?.closest?.(selector) ?? null;
+// Keeps a choice in this browser, if it has room.
+export function keep(key, value) { try {
+    localStorage.setItem(key, value);
+}
+catch { /* it has no room */ } }

@@ -1,23 +1,32 @@
+"use strict";
 // Runs in each viser frame before viser. Without a graphics processor (`gap` > 0, the page's choice)
 // a picture is drawn at most every `gap` ms and without smoothed edges, so that the rest stays quick.
 (() => {
-  const gap = Number(new URLSearchParams(location.search).get("gap") ?? 0);
-  if (!(gap > 0)) return;
-  const context = HTMLCanvasElement.prototype.getContext;
-  HTMLCanvasElement.prototype.getContext = function (kind, options, ...more) {
-    return context.call(this, kind, /^webgl/.test(kind) ? { ...options, antialias: false } : options, ...more);
-  };
-  const ask = window.requestAnimationFrame.bind(window);
-  let queue = new Map(), next = 1, last = -Infinity, due = false;
-  const run = (time) => {
-    const now = queue;
-    queue = new Map(); due = false; last = performance.now();
-    for (const callback of now.values()) callback(time);
-  };
-  window.requestAnimationFrame = (callback) => {
-    queue.set(next, callback);
-    if (!due) { due = true; setTimeout(() => ask(run), Math.max(0, last + gap - performance.now())); }
-    return next++;
-  };
-  window.cancelAnimationFrame = (id) => { queue.delete(id); };
+    const gap = Number(new URLSearchParams(location.search).get("gap") ?? 0);
+    if (!(gap > 0))
+        return;
+    // eslint-disable-next-line @typescript-eslint/unbound-method -- it is called with its canvas below
+    const context = HTMLCanvasElement.prototype.getContext;
+    HTMLCanvasElement.prototype.getContext = function (kind, options) {
+        return context.call(this, kind, /^webgl/.test(kind) ? { ...options, antialias: false } : options);
+    };
+    const ask = window.requestAnimationFrame.bind(window);
+    let queue = new Map(), next = 1, last = -Infinity, due = false;
+    const run = (time) => {
+        const now = queue;
+        queue = new Map();
+        due = false;
+        last = performance.now();
+        for (const callback of now.values())
+            callback(time);
+    };
+    window.requestAnimationFrame = (callback) => {
+        queue.set(next, callback);
+        if (!due) {
+            due = true;
+            setTimeout(() => ask(run), Math.max(0, last + gap - performance.now()));
+        }
+        return next++;
+    };
+    window.cancelAnimationFrame = (id) => { queue.delete(id); };
 })();

@@ -1,241 +1,288 @@
 // The Setup tab: tube, camera, sample on the stage (with upload), layers of the scene.
-import { $, base64, el, field, fixed, parsed } from "./dom.js";
+import { $, $$, $button, $canvas, $input, $select, base64, context2d, el, field, fixed, parsed, words } from "./dom.js";
 import { call, command, emit, on, store } from "./link.js";
-
 const CHUNK = 3 << 20;
 const MODES = ["HW1SW1High", "HW2SW1High", "HW2SW2High", "HW1SW1Low", "HW2SW1Low", "HW2SW2Low"];
 const FORMATS = ["stl", "obj", "ply", "glb", "off"];
 const LAYERS = {
-  beam: "X-ray cone", panel: "image on the panel", axis: "axis, piercing point", ranges: "travel ranges",
-  bodies: "collision bodies", margin: "safety margin", sample: "sample", machine: "machine",
-  orbit: "planned trajectory", gizmos: "handles to drag", labels: "names, axes, scale",
+    beam: "X-ray cone", panel: "image on the panel", axis: "axis, piercing point", ranges: "travel ranges",
+    bodies: "collision bodies", margin: "safety margin", sample: "sample", machine: "machine",
+    orbit: "planned trajectory", gizmos: "handles to drag", labels: "names, axes, scale",
 };
 const ROI = ["l", "t", "r", "b"], SIX = ["x", "y", "z", "rx", "ry", "rz"];
 // What is set here and not yet applied bears the class "typed"; everything else shows the state.
-const number = (id) => { const input = field({ id }, () => input.closest(".card").querySelector("[data-apply]").click(), () => takeBack(id)); return input; };
-const select = (id, ...options) => el("select", { id, onchange: (e) => e.target.classList.add("typed"), onkeydown: (e) => { if (e.key === "Escape") takeBack(id); } }, ...options);
+const number = (id) => { const input = field({ id }, () => input.closest(".card")?.querySelector("[data-apply]")?.click(), () => takeBack(id)); return input; };
+const select = (id, ...options) => {
+    const node = el("select", { id, onchange: () => node.classList.add("typed"), onkeydown: (e) => { if (e.key === "Escape")
+            takeBack(id); } }, ...options);
+    return node;
+};
 function label(text, ...inputs) {
-  if (inputs.length === 1) return [el("label", { class: "muted", htmlFor: inputs[0].id }, text), inputs[0]];
-  for (const input of inputs) input.setAttribute("aria-label", `${text.split(" ")[0]} ${input.id.split("-").pop()}`);
-  return [el("span", { class: "muted" }, text), el("div", { class: inputs.length === 4 ? "quad" : "triple" }, ...inputs)];
+    if (inputs.length === 1 && inputs[0])
+        return [el("label", { class: "muted", htmlFor: inputs[0].id }, text), inputs[0]];
+    for (const input of inputs)
+        input.setAttribute("aria-label", `${text.split(" ")[0]} ${input.id.split("-").pop() ?? ""}`);
+    return [el("span", { class: "muted" }, text), el("div", { class: inputs.length === 4 ? "quad" : "triple" }, ...inputs)];
 }
-
-const tube = el("div", { class: "card" }, el("h2", {}, "X-ray tube"), el("div", { class: "form" },
-  ...label("voltage [kV]", number("kV")), ...label("power [W]", number("power")),
-  el("button", { id: "tube-apply", "data-apply": "", class: "small", onclick: setTube }, "Apply"),
-  el("button", { id: "beam", onclick: () => command("tube.set", { on: !store.state.tube.on }, "The tube refuses") }, "X-rays on")));
-const beam = el("div", { class: "card" }, el("h2", {}, "Spectrum and physics"), el("div", { class: "form" },
-  el("span", { class: "muted" }, "physics"), el("b", { id: "physics" }, "–"),
-  el("span", { id: "physics-note", class: "wide muted small-text" }),
-  el("span", { class: "muted" }, "filters"), el("span", { id: "filters" }, "–"),
-  el("canvas", { id: "spectrum", role: "img", "aria-label": "Photons by energy" }),
-  el("span", { id: "spectrum-note", class: "wide muted small-text mono" }),
-  el("button", { id: "predict", class: "small", title: "Contrast to noise of a void of 0.5 mm on the darkest ray, with the sample on the stage", onclick: predict }, "Predict"),
-  el("span", { id: "predicted", class: "muted small-text" }, "image quality of a scan")));
-const camera = el("div", { class: "card" }, el("h2", {}, "Camera"), el("div", { class: "form" },
-  ...label("exposure [ms]", number("exposure")),
-  ...label("mode", select("mode", ...MODES.map((m) => el("option", {}, m)))),
-  ...label("averages", number("averages")),
-  ...label("ROI l t r b", ...ROI.map((k) => number(`roi-${k}`))),
-  el("button", { id: "camera-apply", "data-apply": "", class: "small", onclick: setCamera }, "Apply"), el("span", { id: "camera-shape", class: "muted mono" })));
-const sample = el("div", { class: "card" }, el("h2", {}, "Sample"), el("div", { class: "form" },
-  ...label("on the stage", select("sample")),
-  ...label("shift x y z", number("off-x"), number("off-y"), number("off-z")),
-  ...label("turn x y z [°]", number("off-rx"), number("off-ry"), number("off-rz")),
-  el("button", { id: "sample-apply", "data-apply": "", class: "small", onclick: setSample }, "Put on stage"), el("span", { id: "sample-note", class: "muted" }),
-  ...label("opacity", el("input", { type: "range", id: "opacity", min: 0.1, max: 1, step: 0.05, value: 0.6, onchange: (e) => command("viewer.layers", { opacity: Number(e.target.value) }) }))));
-const upload = el("div", { class: "card" }, el("h2", {}, "Upload a mesh"), el("div", { class: "form" },
-  ...label("file", el("input", { type: "file", id: "mesh-file", accept: FORMATS.map((f) => `.${f}`).join(",") })),
-  ...label("unit", el("select", { id: "mesh-unit" }, ...["mm", "um", "cm", "m", "inch"].map((u) => el("option", {}, u)))),
-  ...label("material", el("select", { id: "mesh-material" })),
-  el("button", { id: "mesh-upload", class: "small", onclick: sendMesh }, "Upload"), el("span", { id: "mesh-note", class: "muted" })));
-const layers = el("div", { class: "card" }, el("h2", {}, "Shown in the scenes"), ...Object.entries(LAYERS).map(([name, text]) =>
-  el("div", {}, el("label", {}, el("input", { type: "checkbox", id: `layer-${name}`, onchange: (e) => showLayer(name, e.target.checked) }), text))));
+const tube = el("div", { class: "card" }, el("h2", {}, "X-ray tube"), el("div", { class: "form" }, ...label("voltage [kV]", number("kV")), ...label("power [W]", number("power")), el("button", { id: "tube-apply", "data-apply": "", class: "small", onclick: setTube }, "Apply"), el("button", { id: "beam", onclick: () => command("tube.set", { on: !store.state?.tube.on }, "The tube refuses") }, "X-rays on")));
+const beam = el("div", { class: "card" }, el("h2", {}, "Spectrum and physics"), el("div", { class: "form" }, el("span", { class: "muted" }, "physics"), el("b", { id: "physics" }, "–"), el("span", { id: "physics-note", class: "wide muted small-text" }), el("span", { class: "muted" }, "filters"), el("span", { id: "filters" }, "–"), el("canvas", { id: "spectrum", role: "img", "aria-label": "Photons by energy" }), el("span", { id: "spectrum-note", class: "wide muted small-text mono" }), el("button", { id: "predict", class: "small", title: "Contrast to noise of a void of 0.5 mm on the darkest ray, with the sample on the stage", onclick: predict }, "Predict"), el("span", { id: "predicted", class: "muted small-text" }, "image quality of a scan")));
+const camera = el("div", { class: "card" }, el("h2", {}, "Camera"), el("div", { class: "form" }, ...label("exposure [ms]", number("exposure")), ...label("mode", select("mode", ...MODES.map((m) => el("option", {}, m)))), ...label("averages", number("averages")), ...label("ROI l t r b", ...ROI.map((k) => number(`roi-${k}`))), el("button", { id: "camera-apply", "data-apply": "", class: "small", onclick: setCamera }, "Apply"), el("span", { id: "camera-shape", class: "muted mono" })));
+const opacity = el("input", { type: "range", id: "opacity", min: 0.1, max: 1, step: 0.05, value: 0.6, onchange: () => command("viewer.layers", { opacity: Number(opacity.value) }) });
+const sample = el("div", { class: "card" }, el("h2", {}, "Sample"), el("div", { class: "form" }, ...label("on the stage", select("sample")), ...label("shift x y z", number("off-x"), number("off-y"), number("off-z")), ...label("turn x y z [°]", number("off-rx"), number("off-ry"), number("off-rz")), el("button", { id: "sample-apply", "data-apply": "", class: "small", onclick: setSample }, "Put on stage"), el("span", { id: "sample-note", class: "muted" }), ...label("opacity", opacity)));
+const upload = el("div", { class: "card" }, el("h2", {}, "Upload a mesh"), el("div", { class: "form" }, ...label("file", el("input", { type: "file", id: "mesh-file", accept: FORMATS.map((f) => `.${f}`).join(",") })), ...label("unit", el("select", { id: "mesh-unit" }, ...["mm", "um", "cm", "m", "inch"].map((u) => el("option", {}, u)))), ...label("material", el("select", { id: "mesh-material" })), el("button", { id: "mesh-upload", class: "small", onclick: sendMesh }, "Upload"), el("span", { id: "mesh-note", class: "muted" })));
+const layers = el("div", { class: "card" }, el("h2", {}, "Shown in the scenes"), ...Object.entries(LAYERS).map(([name, text]) => {
+    const box = el("input", { type: "checkbox", id: `layer-${name}`, onchange: () => showLayer(name, box.checked) });
+    return el("div", {}, el("label", {}, box, text));
+}));
 $("#tab-setup").append(tube, beam, camera, sample, upload, layers);
-
+// A field or a list of these.
+const of = (id) => $(`#${id}`);
 const typed = (id) => $(`#${id}`).classList.contains("typed");
 function put(id, value, digits = 0) {
-  const input = $(`#${id}`), text = typeof value === "number" ? String(Number(value.toFixed(digits))) : value;
-  input.title = typed(id) ? `not applied yet; the twin has ${text}` : "";
-  if (typed(id) || input.value === text) return;
-  if (input.options && ![...input.options].some((o) => o.value === text)) input.append(el("option", { value: text }, text));
-  input.value = text;
+    const input = of(id), text = typeof value === "number" ? String(Number(value.toFixed(digits))) : value ?? "";
+    input.title = typed(id) ? `not applied yet; the twin has ${text}` : "";
+    if (typed(id) || input.value === text)
+        return;
+    if (input instanceof HTMLSelectElement && ![...input.options].some((o) => o.value === text))
+        input.append(el("option", { value: text }, text));
+    input.value = text;
 }
 function takeBack(...ids) {
-  for (const id of ids) $(`#${id}`).classList.remove("typed");
-  if (store.state) show(store.state);
+    for (const id of ids)
+        $(`#${id}`).classList.remove("typed");
+    if (store.state)
+        show(store.state);
 }
 // The numbers of some fields; null, and they show the state again, if one is none.
 function numbers(...ids) {
-  const values = ids.map((id) => parsed($(`#${id}`).value)), wrong = ids.filter((id, i) => !Number.isFinite(values[i]));
-  for (const id of wrong) {
-    const input = $(`#${id}`), name = input.labels[0]?.textContent ?? input.getAttribute("aria-label");
-    emit("note", "error", "Not applied", `${name}: “${input.value}” is not a number`);
-  }
-  takeBack(...wrong);
-  return wrong.length ? null : values;
+    const values = ids.map((id) => parsed(of(id).value)), wrong = ids.filter((_, i) => !Number.isFinite(values[i]));
+    for (const id of wrong) {
+        const input = of(id), name = input.labels?.[0]?.textContent ?? input.getAttribute("aria-label") ?? id;
+        emit("note", "error", "Not applied", `${name}: “${input.value}” is not a number`);
+    }
+    takeBack(...wrong);
+    return wrong.length ? null : values;
 }
 // The fields in which nobody has typed anything else since: an answer may come late, and is theirs alone.
 function untouched(ids) {
-  const sent = ids.map((id) => $(`#${id}`).value);
-  return () => ids.filter((id, i) => $(`#${id}`).value === sent[i]);
+    const sent = ids.map((id) => of(id).value);
+    return () => ids.filter((id, i) => of(id).value === sent[i]);
 }
 // Sends what was typed into `fields` (parameter -> field or fields) as one command; after an error
 // the fields show the state again.
 async function apply(method, fields, title) {
-  const params = {}, ids = Object.values(fields).flat();
-  for (const [name, of] of Object.entries(fields)) {
-    const some = [of].flat();
-    if (!some.some(typed)) continue;
-    const values = $(`#${some[0]}`).options ? [$(`#${some[0]}`).value] : numbers(...some);
-    if (!values) return;
-    params[name] = Array.isArray(of) ? values : values[0];
-  }
-  if (!Object.keys(params).length) return;
-  const same = untouched(ids), taken = await command(method, params, title);
-  if (taken) for (const id of same()) $(`#${id}`).classList.remove("typed"); // the state comes by itself
-  else takeBack(...same());
+    const params = {}, ids = Object.values(fields).flat();
+    for (const [name, its] of Object.entries(fields)) {
+        const some = [its].flat();
+        if (!some.some(typed))
+            continue;
+        const list = of(some[0]), values = list instanceof HTMLSelectElement ? [list.value] : numbers(...some);
+        if (!values)
+            return;
+        params[name] = Array.isArray(its) ? values : values[0];
+    }
+    if (!Object.keys(params).length)
+        return;
+    const same = untouched(ids), taken = await command(method, params, title);
+    if (taken)
+        for (const id of same())
+            $(`#${id}`).classList.remove("typed"); // the state comes by itself
+    else
+        takeBack(...same());
 }
 function setTube() { return apply("tube.set", { kV: "kV", power_W: "power" }, "The tube refuses"); }
 function setCamera() { return apply("camera.set", { exposure_ms: "exposure", averages: "averages", mode: "mode", roi: ROI.map((k) => `roi-${k}`) }, "The camera refuses"); }
 async function setSample() {
-  const ids = SIX.map((k) => `off-${k}`), values = numbers(...ids);
-  if (!values) return;
-  const offset = Object.fromEntries(SIX.map((k, i) => [k, values[i]]));
-  const same = untouched(["sample", ...ids]), answer = await command("sample.set", { name: $("#sample").value, offset }, "The sample stays");
-  if (answer) for (const id of same()) $(`#${id}`).classList.remove("typed");
-  else takeBack(...same());
-  for (const warning of answer?.warnings ?? []) emit("note", "warning-note", "Sample", warning);
+    const ids = SIX.map((k) => `off-${k}`), values = numbers(...ids);
+    if (!values)
+        return;
+    const offset = Object.fromEntries(SIX.map((k, i) => [k, values[i]]));
+    const same = untouched(["sample", ...ids]), answer = await command("sample.set", { name: $select("#sample").value, offset }, "The sample stays");
+    if (answer)
+        for (const id of same())
+            $(`#${id}`).classList.remove("typed");
+    else
+        takeBack(...same());
+    for (const warning of answer?.warnings ?? [])
+        emit("note", "warning-note", "Sample", warning);
 }
-
 // The file's name without what names may not hold; neutral where nothing is left of it. A name that
 // had to be changed is never one that is taken, so nothing is overwritten by accident.
 export function sampleName(file, taken) {
-  const bare = file.replace(/\.[^.]*$/, "").normalize("NFC");
-  const name = bare.replace(/[\u0000-\u001f\u007f/\\:*?"<>|]+/g, "-").replace(/^[\s.-]+|[\s.-]+$/g, "").slice(0, 100);
-  const stem = name || "mesh";
-  if (name === bare || (name && !taken.includes(name))) return name;
-  let n = 1;
-  while (taken.includes(`${stem}-${n}`)) n++;
-  return `${stem}-${n}`;
+    const bare = file.replace(/\.[^.]*$/, "").normalize("NFC");
+    const name = bare.replace(/[\u0000-\u001f\u007f/\\:*?"<>|]+/g, "-").replace(/^[\s.-]+|[\s.-]+$/g, "").slice(0, 100);
+    const stem = name || "mesh";
+    if (name === bare || (name && !taken.includes(name)))
+        return name;
+    let n = 1;
+    while (taken.includes(`${stem}-${n}`))
+        n++;
+    return `${stem}-${n}`;
 }
 export async function sendMesh() {
-  const file = $("#mesh-file").files[0], note = $("#mesh-note");
-  if (!file) { emit("note", "warning-note", "Upload", "choose a file first"); return; }
-  const format = formatOf(file);
-  if (!FORMATS.includes(format)) { emit("note", "error", "Upload", `${file.name}: allowed are ${FORMATS.join(", ")}`); return; }
-  if (!file.size) { emit("note", "error", "Upload", `${file.name} is empty`); return; }
-  const known = await command("sample.list", {}, "No upload");
-  if (!known) return;
-  const name = sampleName(file.name, known.samples.map((s) => s.name)), total = file.size;
-  const common = { name, format, total, unit: $("#mesh-unit").value, material: $("#mesh-material").value || null };
-  let answer = null;
-  for (let start = 0; start < total; start += CHUNK) {
-    note.textContent = `${Math.round((100 * start) / total)} %`;
-    const data = base64(await file.slice(start, start + CHUNK).arrayBuffer());
-    answer = await command("sample.upload", { ...common, start, data }, `${file.name} was not taken`);
-    if (answer === null) { note.textContent = ""; return; }
-    for (const warning of answer.warnings ?? []) emit("note", "warning-note", name, warning);
-  }
-  note.textContent = answer.complete ? "uploaded" : "";
-  if (!answer.complete) { emit("note", "error", "Upload", `${file.name} did not arrive as a whole`); return; }
-  await list();
-  if (await command("sample.set", { name }, "The sample stays")) emit("note", "good", "Sample", `${name} is on the stage`);
+    const file = $input("#mesh-file").files?.[0], note = $("#mesh-note");
+    if (!file) {
+        emit("note", "warning-note", "Upload", "choose a file first");
+        return;
+    }
+    const format = FORMATS.find((f) => f === formatOf(file));
+    if (!format) {
+        emit("note", "error", "Upload", `${file.name}: allowed are ${FORMATS.join(", ")}`);
+        return;
+    }
+    if (!file.size) {
+        emit("note", "error", "Upload", `${file.name} is empty`);
+        return;
+    }
+    const known = await command("sample.list", {}, "No upload");
+    if (!known)
+        return;
+    const name = sampleName(file.name, known.samples.map((s) => s.name)), total = file.size;
+    const common = { name, format, total, unit: $select("#mesh-unit").value, material: $select("#mesh-material").value || null };
+    let answer = null;
+    for (let start = 0; start < total; start += CHUNK) {
+        note.textContent = `${Math.round((100 * start) / total)} %`;
+        const data = base64(await file.slice(start, start + CHUNK).arrayBuffer());
+        answer = await command("sample.upload", { ...common, start, data }, `${file.name} was not taken`);
+        if (answer === null) {
+            note.textContent = "";
+            return;
+        }
+        for (const warning of answer.warnings ?? [])
+            emit("note", "warning-note", name, warning);
+    }
+    note.textContent = answer?.complete ? "uploaded" : "";
+    if (!answer?.complete) {
+        emit("note", "error", "Upload", `${file.name} did not arrive as a whole`);
+        return;
+    }
+    await list();
+    if (await command("sample.set", { name }, "The sample stays"))
+        emit("note", "good", "Sample", `${name} is on the stage`);
 }
-const formatOf = (file) => file.name.split(".").pop().toLowerCase();
-$("#mesh-file").addEventListener("change", (e) => { if (e.target.files[0]) $("#mesh-unit").value = formatOf(e.target.files[0]) === "glb" ? "m" : "mm"; });
-
+const formatOf = (file) => (file.name.split(".").pop() ?? "").toLowerCase();
+$input("#mesh-file").addEventListener("change", () => { const file = $input("#mesh-file").files?.[0]; if (file)
+    $select("#mesh-unit").value = formatOf(file) === "glb" ? "m" : "mm"; });
 export async function list() {
-  let answer;
-  try { answer = await call("sample.list"); } catch { return; }
-  const select = $("#sample"), chosen = typed("sample") ? select.value : store.state?.sample.name ?? "empty";
-  select.textContent = "";
-  for (const s of answer.samples) select.append(el("option", { value: s.name, title: s.description }, s.uploaded ? `${s.name} (uploaded)` : s.name));
-  if (![...select.options].some((o) => o.value === chosen)) select.append(el("option", { value: chosen }, chosen));
-  select.value = chosen;
-  const materials = $("#mesh-material");
-  if (materials.options.length !== answer.materials.length) {
-    materials.replaceChildren(...answer.materials.map((m) => el("option", {}, m)));
-    if (answer.materials.includes("abs")) materials.value = "abs";
-  }
+    const answer = await call("sample.list").catch(() => null);
+    if (!answer)
+        return;
+    const select = $select("#sample"), chosen = typed("sample") ? select.value : store.state?.sample.name ?? "empty";
+    select.textContent = "";
+    for (const s of answer.samples)
+        select.append(el("option", { value: s.name, title: s.description }, s.uploaded ? `${s.name} (uploaded)` : s.name));
+    if (![...select.options].some((o) => o.value === chosen))
+        select.append(el("option", { value: chosen }, chosen));
+    select.value = chosen;
+    const materials = $select("#mesh-material");
+    if (materials.options.length !== answer.materials.length) {
+        materials.replaceChildren(...answer.materials.map((m) => el("option", {}, m)));
+        if (answer.materials.includes("abs"))
+            materials.value = "abs";
+    }
 }
 // What the physics that the twin was started with makes of voltage and filters.
 const PHYSICS = {
-  ideal: "Voltage does nothing to the line integrals here: one attenuation for each material. It makes counts brighter, as power and exposure do. Start the twin with --physics poly for spectra.",
-  mono: "Photons of one energy, as many as the spectrum below would make visible: voltage changes brightness and noise, not contrast.",
-  poly: "Photons of all energies below, through the filters: voltage changes contrast, brightness and noise.",
+    ideal: "Voltage does nothing to the line integrals here: one attenuation for each material. It makes counts brighter, as power and exposure do. Start the twin with --physics poly for spectra.",
+    mono: "Photons of one energy, as many as the spectrum below would make visible: voltage changes brightness and noise, not contrast.",
+    poly: "Photons of all energies below, through the filters: voltage changes contrast, brightness and noise.",
 };
 async function predict() {
-  const of = predictable(store.state);
-  predicted = null;
-  $("#predict").disabled = true; $("#predicted").textContent = "a few seconds …";
-  const p = await command("exposure.predict", {}, "No prediction");
-  $("#predict").disabled = false;
-  const setting = (s) => `${fixed(s.kV, 0)} kV${s.filter ? ` ${s.filter}` : ""}: ${fixed(s.cnr, 1)}`;
-  const told = () => [`contrast to noise of ${p.detail}: ${setting(p.asked)}`, ...p.best.slice(0, 1).map((s) => `best ${setting(s)}`),
-    `1 % of the pixels see ${fixed(100 * p.transmission.p1, 1)} % or less`];
-  $("#predicted").textContent = p ? told().join(" · ") : "";
-  if (p) predicted = of;
+    if (!store.state)
+        return;
+    const now = predictable(store.state);
+    predicted = null;
+    $button("#predict").disabled = true;
+    $("#predicted").textContent = "a few seconds …";
+    const p = await command("exposure.predict", {}, "No prediction");
+    $button("#predict").disabled = false;
+    const setting = (s) => `${fixed(s.kV, 0)} kV${s.filter ? ` ${s.filter}` : ""}: ${fixed(s.cnr, 1)}`;
+    const told = (p) => [`contrast to noise of ${p.detail}: ${setting(p.asked)}`, ...p.best.slice(0, 1).map((s) => `best ${setting(s)}`),
+        `1 % of the pixels see ${fixed(100 * p.transmission.p1, 1)} % or less`];
+    $("#predicted").textContent = p ? told(p).join(" · ") : "";
+    if (p)
+        predicted = now;
 }
 // What a prediction was made for; it goes with that.
 let predicted = null;
-const predictable = ({ sample, tube, camera, geometry: g }) =>
-  JSON.stringify([sample, tube.kV, tube.power_W, camera, g.SOD_mm.toFixed(2), g.SDD_mm.toFixed(2)]);
+const predictable = ({ sample, tube, camera, geometry: g }) => JSON.stringify([sample, tube.kV, tube.power_W, camera, g.SOD_mm.toFixed(2), g.SDD_mm.toFixed(2)]);
 let spectrumOf = null;
 async function spectrum(kV) {
-  if (spectrumOf === kV || $("#tab-setup").hidden) return;
-  spectrumOf = kV;
-  const kind = store.hello?.physics ?? null;
-  $("#physics").textContent = kind ?? "not told";
-  $("#physics-note").textContent = PHYSICS[kind] ?? "This twin does not say how it makes its images.";
-  const s = await call("viewer.spectrum", { kV }).catch((error) => ({ problem: error.message }));
-  if (spectrumOf !== kV) return;
-  $("#filters").textContent = s.filters?.map((f) => `${fixed(f.thickness_mm, 2)} mm ${f.material.split("@")[0]}`).join(", ") || (s.problem ? "–" : "none");
-  const used = kind === "ideal" ? " · not used by this physics" : "";
-  $("#spectrum-note").textContent = s.problem ?? `${fixed(kV, 0)} kV, behind the filters · mean ${fixed(s.mean_keV, 1)} keV${used}`;
-  const canvas = $("#spectrum"), x = canvas.getContext("2d"), w = (canvas.width = canvas.clientWidth * devicePixelRatio), h = (canvas.height = canvas.clientHeight * devicePixelRatio);
-  if (s.problem) return;
-  const most = Math.max(...s.photons), last = Math.max(kV, 1);
-  x.fillStyle = getComputedStyle(canvas).getPropertyValue("--accent"); x.beginPath(); x.moveTo(0, h);
-  s.photons.forEach((n, k) => x.lineTo((w * s.energy_keV[k]) / last, h - ((h - 2) * n) / most));
-  x.lineTo(w, h); x.fill();
+    if (spectrumOf === kV || $("#tab-setup").hidden)
+        return;
+    spectrumOf = kV;
+    const kind = store.hello?.physics ?? "not told";
+    $("#physics").textContent = kind;
+    $("#physics-note").textContent = PHYSICS[kind] ?? "This twin does not say how it makes its images.";
+    const s = await call("viewer.spectrum", { kV }).catch(words);
+    if (spectrumOf !== kV)
+        return;
+    const canvas = $canvas("#spectrum"), x = context2d(canvas), w = (canvas.width = canvas.clientWidth * devicePixelRatio), h = (canvas.height = canvas.clientHeight * devicePixelRatio);
+    if (typeof s === "string") {
+        $("#filters").textContent = "–";
+        $("#spectrum-note").textContent = s;
+        return;
+    }
+    $("#filters").textContent = s.filters.map((f) => `${fixed(f.thickness_mm, 2)} mm ${f.material.split("@")[0]}`).join(", ") || "none";
+    const used = kind === "ideal" ? " · not used by this physics" : "";
+    $("#spectrum-note").textContent = `${fixed(kV, 0)} kV, behind the filters · mean ${fixed(s.mean_keV, 1)} keV${used}`;
+    const most = Math.max(...s.photons), last = Math.max(kV, 1);
+    x.fillStyle = getComputedStyle(canvas).getPropertyValue("--accent");
+    x.beginPath();
+    x.moveTo(0, h);
+    s.photons.forEach((n, k) => x.lineTo((w * s.energy_keV[k]) / last, h - ((h - 2) * n) / most));
+    x.lineTo(w, h);
+    x.fill();
 }
-on("tab", () => { if (store.state) spectrum(store.state.tube.kV); });
+on("tab", () => { if (store.state)
+    void spectrum(store.state.tube.kV); });
 on("session", () => { spectrumOf = null; });
 let listed;
 on("session", list);
 on("state", show);
 function show(state) {
-  if (predicted !== null && predicted !== predictable(state)) { predicted = null; $("#predicted").textContent = "sample, beam, camera or distances have changed: predict again"; }
-  spectrum(state.tube.kV);
-  put("kV", state.tube.kV, 2); put("power", state.tube.power_W, 2);
-  const xrays = $("#beam");
-  xrays.textContent = state.tube.on ? "X-rays are ON" : "X-rays on"; xrays.classList.toggle("beam-on", state.tube.on);
-  const c = state.camera;
-  put("exposure", c.exposure_ms, 3); put("averages", c.averages); ROI.forEach((k, i) => put(`roi-${k}`, c.roi[i]));
-  put("mode", c.mode);
-  $("#camera-shape").textContent = `${c.shape[1]} × ${c.shape[0]} px, ${fixed(c.pixel_mm * 1000, 1)} µm`;
-  const s = state.sample;
-  for (const k of SIX) put(`off-${k}`, s.offset[k], 4);
-  put("sample", s.name);
-  $("#sample-note").textContent = s.size_mm ? s.size_mm.map((v) => fixed(v, 1)).join(" × ") + " mm" : "";
-  if (listed !== s.name) { listed = s.name; list(); }
+    if (predicted !== null && predicted !== predictable(state)) {
+        predicted = null;
+        $("#predicted").textContent = "sample, beam, camera or distances have changed: predict again";
+    }
+    void spectrum(state.tube.kV);
+    put("kV", state.tube.kV, 2);
+    put("power", state.tube.power_W, 2);
+    const xrays = $button("#beam");
+    xrays.textContent = state.tube.on ? "X-rays are ON" : "X-rays on";
+    xrays.classList.toggle("beam-on", state.tube.on);
+    const c = state.camera;
+    put("exposure", c.exposure_ms, 3);
+    put("averages", c.averages);
+    ROI.forEach((k, i) => put(`roi-${k}`, c.roi[i]));
+    put("mode", c.mode);
+    $("#camera-shape").textContent = `${c.shape[1]} × ${c.shape[0]} px, ${fixed(c.pixel_mm * 1000, 1)} µm`;
+    const s = state.sample;
+    for (const k of SIX)
+        put(`off-${k}`, s.offset[k], 4);
+    put("sample", s.name);
+    $("#sample-note").textContent = s.size_mm ? s.size_mm.map((v) => fixed(v, 1)).join(" × ") + " mm" : "";
+    if (listed !== s.name) {
+        listed = s.name;
+        void list();
+    }
 }
-
 // A box keeps what was chosen last until the viewer has answered: states that it sent before that are older.
 const choosing = new Map();
 async function showLayer(name, visible) {
-  choosing.set(name, (choosing.get(name) ?? 0) + 1);
-  await command("viewer.layers", { [name]: visible });
-  choosing.set(name, choosing.get(name) - 1);
-  drawLayers();
+    choosing.set(name, (choosing.get(name) ?? 0) + 1);
+    await command("viewer.layers", { [name]: visible });
+    choosing.set(name, (choosing.get(name) ?? 1) - 1);
+    drawLayers();
 }
 function drawLayers() {
-  for (const [name, visible] of Object.entries(store.layers)) {
-    const boxes = [$(`#layer-${name}`), name === "gizmos" ? $("#handles") : null];
-    for (const box of boxes) if (box && !choosing.get(name)) box.checked = visible;
-  }
-  $("#opacity").value = store.opacity;
+    for (const [name, visible] of Object.entries(store.layers)) {
+        const boxes = $$(name === "gizmos" ? "#layer-gizmos, #handles" : `#layer-${name}`);
+        for (const box of boxes)
+            if (!choosing.get(name))
+                box.checked = visible;
+    }
+    opacity.value = String(store.opacity);
 }
 on("layers", drawLayers);
-$("#handles").addEventListener("change", (e) => showLayer("gizmos", e.target.checked));
+$input("#handles").addEventListener("change", () => void showLayer("gizmos", $input("#handles").checked));

@@ -1,53 +1,54 @@
 // The Share tab: pictures, files that open anywhere, scenes to save and load.
-import { $, bytes, download, el } from "./dom.js";
-import { command, emit, store } from "./link.js";
+import { $, $input, $select, bytes, download, el, words } from "./dom.js";
+import { command, emit } from "./link.js";
 import { picture } from "./film.js";
 import { current } from "./views.js";
-
 async function offer(method, params, title) {
-  const a = await command(method, params, title);
-  if (!a) return;
-  download(a.url, a.name);
-  emit("note", "good", a.name, bytes(a.bytes));
+    const a = await command(method, params, title);
+    if (!a)
+        return;
+    download(a.url, a.name);
+    emit("note", "good", a.name, bytes(a.bytes));
 }
 function shot() {
-  if (current === "none") { emit("note", "error", "No picture", "open a view first"); return; }
-  const [width, height] = $("#shot-size").value.split("x").map(Number);
-  offer("viewer.screenshot", { view: current === "four" ? "iso" : current, width, height }, "No picture");
+    if (current === "none") {
+        emit("note", "error", "No picture", "open a view first");
+        return;
+    }
+    const [width, height] = $select("#shot-size").value.split("x").map(Number);
+    void offer("viewer.screenshot", { view: current === "four" ? "iso" : current ?? "iso", width, height }, "No picture");
 }
 function film() {
-  const png = picture();
-  if (png) download(png, "flexdt-radiograph.png");
-  else emit("note", "error", "No picture", "no radiograph has come yet");
+    const png = picture();
+    if (png)
+        download(png, "flexdt-radiograph.png");
+    else
+        emit("note", "error", "No picture", "no radiograph has come yet");
 }
 const scene = (format) => () => offer("viewer.export", { format }, "No export");
 const replay = (format) => () => offer("viewer.export", { format, replay: true }, "No replay");
 async function save() {
-  const a = await command("scene.save", {}, "Not saved");
-  if (!a) return;
-  const url = URL.createObjectURL(new Blob([JSON.stringify(a.document, null, 2)], { type: "application/json" }));
-  download(url, `flexdt-scene-${new Date().toISOString().slice(0, 19).replace(/[:T]/g, "-")}.json`);
-  setTimeout(() => URL.revokeObjectURL(url), 10000);
+    const a = await command("scene.save", {}, "Not saved");
+    if (!a)
+        return;
+    const url = URL.createObjectURL(new Blob([JSON.stringify(a.document, null, 2)], { type: "application/json" }));
+    download(url, `flexdt-scene-${new Date().toISOString().slice(0, 19).replace(/[:T]/g, "-")}.json`);
+    setTimeout(() => URL.revokeObjectURL(url), 10000);
 }
 const button = (id, text, f) => el("button", { id, class: "small", onclick: f }, text);
 const row = (...nodes) => el("div", { class: "row", style: "flex-wrap:wrap" }, ...nodes);
-$("#tab-share").append(
-  el("div", { class: "card" }, el("h2", {}, "Picture of a view"), row(
-    el("select", { id: "shot-size", "aria-label": "Size of the picture" }, ...["1280x800", "1920x1080", "3840x2160"].map((s) => el("option", {}, s))),
-    button("shot", "Save PNG", shot), button("shot-film", "Radiograph PNG", film))),
-  el("div", { class: "card" }, el("h2", {}, "The scene as it stands"), row(
-    button("export-html", "One HTML file", scene("html")), button("export-viser", ".viser", scene("viser"))),
-    el("p", { class: "muted" }, "The HTML opens in any browser, without a server.")),
-  el("div", { class: "card" }, el("h2", {}, "A scan as a replay"), row(
-    button("replay-html", "One HTML file", replay("html")), button("replay-viser", ".viser", replay("viser"))),
-    el("p", { class: "muted" }, "Of the script that was last scrubbed in the Scan tab.")),
-  el("div", { class: "card" }, el("h2", {}, "Scenes"), row(
-    button("scene-save", "Save", save), el("input", { type: "file", id: "scene-file", accept: ".json", hidden: true }),
-    button("scene-load", "Load…", () => $("#scene-file").click())),
-    el("p", { class: "muted" }, "Positions, tube, camera, sample and correction. Loading moves the machine.")));
-$("#scene-file").addEventListener("change", async (e) => {
-  const file = e.target.files[0];
-  e.target.value = "";
-  try { if (await command("scene.load", { document: JSON.parse(await file.text()) }, "Not loaded")) emit("note", "good", "Scene", `${file.name} is loaded`); }
-  catch (error) { emit("note", "error", "Scene", `${file?.name}: ${error.message}`); }
-});
+$("#tab-share").append(el("div", { class: "card" }, el("h2", {}, "Picture of a view"), row(el("select", { id: "shot-size", "aria-label": "Size of the picture" }, ...["1280x800", "1920x1080", "3840x2160"].map((s) => el("option", {}, s))), button("shot", "Save PNG", shot), button("shot-film", "Radiograph PNG", film))), el("div", { class: "card" }, el("h2", {}, "The scene as it stands"), row(button("export-html", "One HTML file", scene("html")), button("export-viser", ".viser", scene("viser"))), el("p", { class: "muted" }, "The HTML opens in any browser, without a server.")), el("div", { class: "card" }, el("h2", {}, "A scan as a replay"), row(button("replay-html", "One HTML file", replay("html")), button("replay-viser", ".viser", replay("viser"))), el("p", { class: "muted" }, "Of the script that was last scrubbed in the Scan tab.")), el("div", { class: "card" }, el("h2", {}, "Scenes"), row(button("scene-save", "Save", save), el("input", { type: "file", id: "scene-file", accept: ".json", hidden: true }), button("scene-load", "Load…", () => $input("#scene-file").click())), el("p", { class: "muted" }, "Positions, tube, camera, sample and correction. Loading moves the machine.")));
+async function load() {
+    const input = $input("#scene-file"), file = input.files?.[0];
+    input.value = "";
+    if (!file)
+        return;
+    try {
+        if (await command("scene.load", { document: JSON.parse(await file.text()) }, "Not loaded"))
+            emit("note", "good", "Scene", `${file.name} is loaded`);
+    }
+    catch (error) {
+        emit("note", "error", "Scene", `${file.name}: ${words(error)}`);
+    }
+}
+$input("#scene-file").addEventListener("change", () => void load());

@@ -2,93 +2,108 @@
 import { $, $$, el } from "./dom.js";
 import { call, emit, on, pageId, store } from "./link.js";
 import { remember } from "./address.js";
-
 const NAMES = { iso: "Isometric", beam: "Beam’s eye", side: "Side", free: "Free" };
 const WIDE = 1.35; // aspect for which the fixed cameras are made, as in clients.py
 const open = new Map();
 export let current = null;
-
 // Without a graphics processor every picture costs processor time that the radiograph needs more.
 const query = new URLSearchParams(location.search);
 export let webgl = true;
 export const software = (() => {
-  const gl = document.createElement("canvas").getContext("webgl"), info = gl?.getExtension("WEBGL_debug_renderer_info");
-  const name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
-  webgl = Boolean(gl);
-  gl?.getExtension("WEBGL_lose_context")?.loseContext();
-  return !gl || /swiftshader|llvmpipe|software|basic render/i.test(name);
+    const gl = document.createElement("canvas").getContext("webgl"), info = gl?.getExtension("WEBGL_debug_renderer_info");
+    const name = gl && info ? String(gl.getParameter(info.UNMASKED_RENDERER_WEBGL)) : "";
+    webgl = Boolean(gl);
+    gl?.getExtension("WEBGL_lose_context")?.loseContext();
+    return !gl || /swiftshader|llvmpipe|software|basic render/i.test(name);
 })();
 const GAP_MS = Number(query.get("gap") ?? (software ? 400 : 0));
 const DPR = query.get("dpr") ?? (devicePixelRatio > 1.5 && !software ? "" : "1");
-
 // The preset from the start, so that nothing jumps when the viewer sets it again.
 function preset(view, box) {
-  const camera = store.cameras?.[view];
-  if (!camera) return "";
-  const { position: p, look_at: l, fov } = camera, aspect = box.clientWidth / Math.max(1, box.clientHeight);
-  const away = view === "beam" ? 1 : Math.max(1, WIDE / Math.max(aspect, 0.3));
-  const from = p.map((v, i) => (l[i] + (v - l[i]) * away).toFixed(4));
-  return `initialCameraPosition=${from}&initialCameraLookAt=${l}&initialCameraFov=${fov}&`;
+    const camera = store.cameras?.[view];
+    if (!camera)
+        return "";
+    const { position: p, look_at: l, fov } = camera, aspect = box.clientWidth / Math.max(1, box.clientHeight);
+    const away = view === "beam" ? 1 : Math.max(1, WIDE / Math.max(aspect, 0.3));
+    const from = p.map((v, i) => (l[i] + (v - l[i]) * away).toFixed(4));
+    return `initialCameraPosition=${from.join()}&initialCameraLookAt=${l.join()}&initialCameraFov=${fov}&`;
 }
-
 function frame(view) {
-  const src = `/scene/${pageId}/${view}?${DPR ? `fixedDpr=${DPR}&` : ""}gap=${GAP_MS}`;
-  const iframe = el("iframe", { title: NAMES[view] });
-  iframe.addEventListener("load", () => emit("frame", iframe.contentWindow)); // keys.js listens in it, too
-  const tag = el("span", { class: "tag" }, NAMES[view]);
-  const box = el("div", { class: "view" });
-  box.dataset.view = view;
-  if (view === "beam") {
-    const crop = el("div", { class: "crop" }, iframe, el("div", { class: "shield" }));
-    box.append(crop, tag);
-    return { box, iframe, crop, tag, src };
-  }
-  const home = el("button", { class: "home", title: "Back to this view's preset", onclick: () => call("viewer.camera", { view }) }, "⌂");
-  const look = el("button", { class: "look", title: "Look at the sample", onclick: () => call("viewer.camera", { view, sample: true }) }, "◎");
-  box.append(iframe, tag, home, look);
-  return { box, iframe, tag, src };
+    const src = `/scene/${pageId}/${view}?${DPR ? `fixedDpr=${DPR}&` : ""}gap=${GAP_MS}`;
+    const iframe = el("iframe", { title: NAMES[view] });
+    iframe.addEventListener("load", () => { if (iframe.contentWindow)
+        emit("frame", iframe.contentWindow); }); // keys.js listens in it, too
+    const tag = el("span", { class: "tag" }, NAMES[view]);
+    const box = el("div", { class: "view" });
+    box.dataset.view = view;
+    if (view === "beam") {
+        const crop = el("div", { class: "crop" }, iframe, el("div", { class: "shield" }));
+        box.append(crop, tag);
+        return { box, iframe, crop, tag, src };
+    }
+    const home = el("button", { class: "home", title: "Back to this view's preset", onclick: () => call("viewer.camera", { view }) }, "⌂");
+    const look = el("button", { class: "look", title: "Look at the sample", onclick: () => call("viewer.camera", { view, sample: true }) }, "◎");
+    box.append(iframe, tag, home, look);
+    return { box, iframe, tag, src };
 }
-
 // Without WebGL there are no scenes; all the rest works.
 function bare() {
-  document.body.dataset.webgl = "none";
-  $("#views").replaceChildren(el("p", { class: "bare muted" }, "This browser draws no 3-D pictures (WebGL is off). Radiograph, axes and scans work without."));
-  for (const button of $$("#view-switch button")) button.disabled = true;
+    document.body.dataset.webgl = "none";
+    $("#views").replaceChildren(el("p", { class: "bare muted" }, "This browser draws no 3-D pictures (WebGL is off). Radiograph, axes and scans work without."));
+    for (const button of $$("#view-switch button"))
+        button.disabled = true;
 }
-
-export function layout(which, step = false) {
-  if (which === current) return;
-  remember({ view: which }, step);
-  current = which;
-  if (!webgl) { bare(); return; }
-  const wanted = which === "none" ? [] : which === "four" ? ["iso", "beam", "side", "free"] : [which];
-  const views = $("#views");
-  views.dataset.layout = which;
-  for (const [view, parts] of open) if (!wanted.includes(view)) { parts.box.remove(); open.delete(view); }
-  for (const view of wanted) if (!open.has(view)) open.set(view, frame(view));
-  for (const view of wanted) if (!open.get(view).box.isConnected) views.append(open.get(view).box);
-  for (const view of wanted) { const parts = open.get(view); if (!parts.iframe.src) parts.iframe.src = parts.src.replace("?", `?${preset(view, parts.box)}`); }
-  for (const button of $$("#view-switch button")) button.setAttribute("aria-pressed", String(button.dataset.layout === which));
-  localStorage.setItem("flexdt-layout", which);
-  fit(true);
+export function layout(asked, step = false) {
+    const which = asked;
+    if (which === current)
+        return;
+    remember({ view: which }, step);
+    current = which;
+    if (!webgl) {
+        bare();
+        return;
+    }
+    const wanted = which === "none" ? [] : which === "four" ? ["iso", "beam", "side", "free"] : [which];
+    const views = $("#views");
+    views.dataset.layout = which;
+    for (const [view, parts] of open)
+        if (!wanted.includes(view)) {
+            parts.box.remove();
+            open.delete(view);
+        }
+    for (const view of wanted) {
+        const parts = open.get(view) ?? frame(view);
+        open.set(view, parts);
+        if (!parts.box.isConnected)
+            views.append(parts.box);
+    }
+    for (const [view, { box, iframe, src }] of open)
+        if (!iframe.src)
+            iframe.src = src.replace("?", `?${preset(view, box)}`);
+    for (const button of $$("#view-switch button"))
+        button.setAttribute("aria-pressed", String(button.dataset.layout === which));
+    localStorage.setItem("flexdt-layout", which);
+    fit(true);
 }
-
 let last = "";
 // Size and place the beam's frame so that the detector's image fills the crop, whatever the piercing point.
 export function fit(force = false) {
-  const parts = open.get("beam"), f = store.framing;
-  if (!parts || !f) return;
-  const { clientWidth: w, clientHeight: h } = parts.box;
-  const key = JSON.stringify([f, w, h]);
-  if (!force && key === last) return;
-  last = key;
-  const width = Math.max(40, Math.min(w - 24, (h - 24) / f.aspect));
-  const set = (node, values) => { for (const [k, v] of Object.entries(values)) node.style[k] = `${v}px`; };
-  set(parts.crop, { width, height: width * f.aspect, left: (w - width) / 2, top: (h - width * f.aspect) / 2 });
-  set(parts.iframe, { width: f.width * width, height: f.height * width, left: -f.left * width, top: -f.top * width });
-  parts.tag.textContent = f.exact ? "Beam’s eye" : "Beam’s eye (oblique)";
+    const parts = open.get("beam"), f = store.framing;
+    if (!parts?.crop || !f)
+        return;
+    const { clientWidth: w, clientHeight: h } = parts.box;
+    const key = JSON.stringify([f, w, h]);
+    if (!force && key === last)
+        return;
+    last = key;
+    const width = Math.max(40, Math.min(w - 24, (h - 24) / f.aspect));
+    const set = (node, values) => { for (const [k, v] of Object.entries(values))
+        node.style.setProperty(k, `${v}px`); };
+    set(parts.crop, { width, height: width * f.aspect, left: (w - width) / 2, top: (h - width * f.aspect) / 2 });
+    set(parts.iframe, { width: f.width * width, height: f.height * width, left: -f.left * width, top: -f.top * width });
+    parts.tag.textContent = f.exact ? "Beam’s eye" : "Beam’s eye (oblique)";
 }
-
 on("state", () => fit());
-new ResizeObserver(() => fit()).observe(document.getElementById("views"));
-for (const button of $$("#view-switch button")) button.addEventListener("click", () => layout(button.dataset.layout, true));
+new ResizeObserver(() => fit()).observe($("#views"));
+for (const button of $$("#view-switch button"))
+    button.addEventListener("click", () => layout(button.dataset.layout ?? "iso", true));

@@ -1,47 +1,53 @@
 // The volume that grows while a scan runs: its three middle slices, from the images so far.
-import { $, el, fixed, setText } from "./dom.js";
+import { $, $canvas, el, fixed, keep, putGrey, setText, words } from "./dom.js";
 import { call, on, store } from "./link.js";
 import { folder } from "./data.js";
-
 const KEY = "flexdt-volume", PLANES = { top: "from above", front: "from the source", side: "from the side" };
-const size = el("select", { id: "volume-side", "aria-label": "Slices while a scan runs", onchange: choose },
-  el("option", { value: "" }, "off"), ...[128, 192, 256].map((n) => el("option", { value: n }, `${n} voxels a side`)));
+const size = el("select", { id: "volume-side", "aria-label": "Slices while a scan runs", onchange: choose }, el("option", { value: "" }, "off"), ...[128, 192, 256].map((n) => el("option", { value: n }, `${n} voxels a side`)));
 const note = el("span", { id: "volume-note", class: "muted small-text mono" });
 const plates = Object.entries(PLANES).map(([name, words]) => el("figure", {}, el("canvas", { id: `slice-${name}`, role: "img", "aria-label": `Middle slice, ${words}` }), el("figcaption", {}, words)));
 $("#volume-card").append(el("div", { class: "row between" }, el("h2", {}, "Slices so far"), size), el("div", { class: "slices", hidden: true }, ...plates), note);
 size.value = localStorage.getItem(KEY) ?? "";
-
 let asked = null;
 function ask() {
-  const name = store.job?.dataset && store.job.state !== "queued" ? folder(store.job) : null, wish = size.value && name ? `${name} ${size.value}` : "";
-  if (wish === (asked ?? "")) return;
-  const before = asked;
-  asked = wish;
-  // The folder comes a moment after the job: what is refused is asked again.
-  if (wish || before) call("viewer.live", wish ? { name, side: Number(size.value) } : {}).catch(({ message }) => {
-    if (asked !== wish) return;
-    setText(note, message);
-    setTimeout(() => { if (asked === wish) { asked = null; ask(); } }, 1000);
-  });
-  $(".slices").hidden = true;
-  setText(note, wish ? "starting; dark, flat and a first image are needed" : "");
+    const name = store.job?.dataset && store.job.state !== "queued" ? folder(store.job) : null, wish = size.value && name ? `${name} ${size.value}` : "";
+    if (wish === (asked ?? ""))
+        return;
+    const before = asked;
+    asked = wish;
+    // The folder comes a moment after the job: what is refused is asked again.
+    if (wish || before)
+        call("viewer.live", wish ? { name, side: Number(size.value) } : {}).catch((error) => {
+            if (asked !== wish)
+                return;
+            setText(note, words(error));
+            setTimeout(() => { if (asked === wish) {
+                asked = null;
+                ask();
+            } }, 1000);
+        });
+    $(".slices").hidden = true;
+    setText(note, wish ? "starting; dark, flat and a first image are needed" : "");
 }
-function choose() { try { localStorage.setItem(KEY, size.value); } catch { /* it has no room */ } ask(); }
+function choose() { keep(KEY, size.value); ask(); }
 on("job", () => { $("#volume-card").hidden = false; ask(); });
-on("state", (s) => { if (s.job) { $("#volume-card").hidden = false; ask(); } });
+on("state", (s) => { if (s.job) {
+    $("#volume-card").hidden = false;
+    ask();
+} });
 on("open", () => { asked = null; });
-
 on("volume", (m) => {
-  if (!asked?.startsWith(`${m.name} `)) return;
-  if (m.problem) { setText(note, m.problem); return; }
-  $(".slices").hidden = false;
-  const other = m.side === Number(size.value) ? "" : `${m.side} voxels a side, as another page chose · `;
-  setText(note, `${other}${m.views} of ${m.of} views · voxels of ${fixed(1000 * m.voxel_mm, 0)} µm · ${fixed(m.low, 4)} to ${fixed(m.high, 4)} per mm`);
-  for (const [name, { shape: [rows, cols], data }] of Object.entries(m.slices)) {
-    const canvas = $(`#slice-${name}`), x = canvas.getContext("2d"), raw = atob(data);
-    canvas.width = cols; canvas.height = rows;
-    const out = x.createImageData(cols, rows), d = new Uint32Array(out.data.buffer);
-    for (let k = 0; k < d.length; k++) d[k] = 0xff000000 | (raw.charCodeAt(k) * 0x010101);
-    x.putImageData(out, 0, 0);
-  }
+    if (!asked?.startsWith(`${m.name} `))
+        return;
+    if (m.problem) {
+        setText(note, m.problem);
+        return;
+    }
+    $(".slices").hidden = false;
+    const other = m.side === Number(size.value) ? "" : `${m.side} voxels a side, as another page chose · `;
+    setText(note, `${other}${m.views} of ${m.of} views · voxels of ${fixed(1000 * m.voxel_mm, 0)} µm · ${fixed(m.low, 4)} to ${fixed(m.high, 4)} per mm`);
+    for (const [name, { shape, data }] of Object.entries(m.slices)) {
+        const raw = atob(data);
+        putGrey($canvas(`#slice-${name}`), shape, (k) => raw.charCodeAt(k));
+    }
 });

@@ -1,0 +1,142 @@
+// The Calibrate tab: corrections there are, the one in force, applying and undoing, running a fit.
+import { $, $$, $button, $input, el, fixed, words } from "./dom.js";
+import { call, command, emit, on } from "./link.js";
+import type { FitReport } from "./viewer.js";
+import type { CalibrationAlignResult, Correction, Estimated, Requests } from "./wire.js";
+import { know } from "./compare.js";
+import { open } from "./data.js";
+
+$("#tab-calibrate").append(
+  el("div", { class: "card" }, el("h2", {}, "In force"), el("div", { id: "in-force" }),
+    el("div", { class: "row", style: "margin-top:7px" }, el("button", { id: "revert", class: "small", onclick: revert }, "Undo"))),
+  el("div", { class: "card", id: "fit-card" }, el("h2", {}, "Calibrate from data sets"),
+    el("div", { class: "list", id: "datasets" }),
+    el("div", { class: "form", style: "margin-top:7px" },
+      el("label", { class: "muted" }, "phantom"), el("input", { type: "text", id: "fit-phantom", value: "lego", "aria-label": "Phantom" }),
+      el("button", { id: "fit", class: "small primary", onclick: fit }, "Calibrate"), el("span", { id: "fit-note", class: "muted" })),
+    el("div", { class: "report", id: "fit-report" })),
+  el("div", { class: "card" }, el("h2", {}, "Apply a report"),
+    el("div", { class: "muted" }, "The JSON of “flexdt calibrate --json”, or parameter: value pairs."),
+    el("div", { class: "row", style: "margin-top:7px" }, el("input", { type: "file", id: "correction-file", accept: ".json", "aria-label": "A calibration's report" }))),
+  el("div", { class: "card" }, el("h2", {}, "History"), el("div", { class: "list", id: "corrections" })));
+
+type Parameters = Record<string, number | null>;
+const values = (parameters: object): Record<string, unknown> => Object.fromEntries(Object.entries(parameters).map(([k, v]: [string, unknown]) => [k, typeof v === "number" ? v : (v as { value?: unknown } | null)?.value]));
+// The parameters of a report, or of a plain list of them: all of them numbers, or none is taken.
+export function parametersOf(report: unknown): Record<string, number> {
+  const object = (o: unknown): o is Record<string, unknown> => o !== null && typeof o === "object" && !Array.isArray(o);
+  const given = object(report) && "parameters" in report ? report.parameters : report;
+  if (!object(report) || !object(given) || !Object.keys(given).length) throw new Error("there are no parameters in it");
+  if (report.identifiable === false) throw new Error("it says that its numbers are not identifiable");
+  const found = values(given), bad = Object.keys(found).filter((k) => !Number.isFinite(found[k]));
+  if (bad.length) throw new Error(`no number: ${bad.slice(0, 5).join(", ")}`);
+  return found as Record<string, number>;
+}
+const unit = (name: string) => (name === "angle_scale" ? "" : /^(alpha|det_|axis_tilt_)/.test(name) ? "°" : "mm");
+// Decimals that leave `digits` significant ones.
+const decimals = (v: number, digits: number) => Math.min(9, Math.max(0, digits - 1 - Math.floor(Math.log10(Math.abs(v) || 1))));
+function table(parameters: Parameters, sigmas: Record<string, number | null> = {}, units: Record<string, string> = {}) {
+  const shown = Object.entries(parameters).filter(([k, v]) => (k === "angle_scale" ? v !== 1 : v !== 0));
+  return el("table", { class: "plain mono" }, ...shown.map(([k, v]) => {
+    const sigma = sigmas[k] ?? 0, d = sigma > 0 ? decimals(sigma, 2) : decimals((v ?? 0) - (k === "angle_scale" ? 1 : 0), 3);
+    return el("tr", {}, el("td", {}, k), el("td", { class: "n" }, fixed(v, d)),
+      el("td", { class: "n muted" }, sigma > 0 ? `± ${fixed(sigma, d)}` : ""), el("td", { class: "muted" }, units[k] ?? unit(k)));
+  }));
+}
+export async function apply(parameters: Record<string, number>, source: string | null, comment = ""): Promise<void> {
+  const answer = await command("calibration.apply", { parameters, source, comment }, "Not applied");
+  if (!answer) return;
+  emit("note", "good", "Correction", `${answer.correction?.name ?? "correction"} is in force`); // warnings come by the log
+  void refresh();
+}
+async function revert() {
+  const answer = await command("calibration.revert", {}, "Not undone");
+  if (!answer) return;
+  const now = answer.correction ? `${answer.correction.name} is in force again` : "nominal geometry";
+  emit("note", "good", "Correction", `undone: ${now}`);
+  void refresh();
+}
+
+export async function refresh(): Promise<void> {
+  const answer = await call("calibration.list").catch(() => null);
+  if (!answer) return;
+  const box = $("#corrections");
+  box.textContent = "";
+  if (!answer.corrections.length) box.append(el("div", { class: "muted" }, "none yet"));
+  for (const c of [...answer.corrections].reverse()) {
+    const again = () => apply(c.parameters, c.source, `again: ${c.name}`);
+    box.append(el("div", {},
+      el("span", { title: c.comment }, c.name), el("span", { class: "muted small-text" }, dated(c)),
+      c.name === answer.current ? el("b", {}, "in force") : el("button", { class: "small", onclick: again }, "apply")));
+  }
+}
+const dated = (correction: Correction) => correction.date.slice(0, 16).replace("T", " ");
+async function applyFile() {
+  const input = $input("#correction-file"), file = input.files?.[0];
+  if (!file) return;
+  input.value = "";
+  try { await apply(parametersOf(JSON.parse(await file.text())), file.name); }
+  catch (error) { emit("note", "error", "Not applied", `${file.name}: ${words(error)}`); }
+}
+$input("#correction-file").addEventListener("change", () => void applyFile());
+
+async function datasets() {
+  const answer = await call("viewer.datasets").catch(() => null);
+  if (!answer) return;
+  const box = $("#datasets"), chosen = new Set(ticked());
+  box.textContent = "";
+  if (!answer.datasets.some((each) => each.present)) box.append(el("div", { class: "muted" }, "no data sets yet: run a scan"));
+  for (const d of answer.datasets.filter((each) => each.present)) {
+    const tick = el("input", { type: "checkbox", value: d.name, checked: chosen.has(d.name) });
+    box.append(el("div", {}, el("label", {}, tick, d.name), el("span", { class: "muted small-text" }, `${d.present} frames`)));
+  }
+}
+const ticked = () => $$<HTMLInputElement>("#datasets input:checked").map((i) => i.value);
+function fit() {
+  const names = ticked();
+  if (!names.length) { emit("note", "warning-note", "Calibrate", "choose a data set"); return; }
+  void estimate("calibration.fit", { datasets: names, phantom: $input("#fit-phantom").value, tracks: true }, names, "No calibration");
+}
+async function estimate<M extends "calibration.fit" | "calibration.align">(method: M, params: Requests[M], names: string[], title: string) {
+  $button("#fit").disabled = true; $("#fit-note").textContent = `${names.join(", ")}: running…`; $("#fit-report").textContent = "";
+  const r: Partial<FitReport & CalibrationAlignResult> | null = await command(method, params, title);
+  $button("#fit").disabled = false; $("#fit-note").textContent = "";
+  if (!r) return;
+  const scan = know(r.tracks?.datasets ?? []), { correction, parameters = {} } = r;
+  const of = <W extends keyof Estimated>(what: W) => Object.fromEntries(Object.entries(parameters).map(([k, v]) => [k, v[what]]));
+  const figures = r.tracks ? `  rms ${fixed(r.rms_px, 3)} px · ${r.frames} frames · cost −${fixed(r.cost_reduction_pct, 1)} %` : `  ${names[0]}, without a phantom`;
+  const applied = { id: "fit-apply", class: "small primary", disabled: !r.identifiable || !correction, onclick: () => { if (correction) void apply(correction, names.join(", ")); } };
+  const compared = { id: "fit-compare", class: "small", disabled: !scan, title: "Where the beads were predicted before and after, over the radiographs",
+    onclick: () => open(scan, null, true) };
+  $("#fit-report").append(
+    el("div", {},
+      el("span", { class: `verdict ${r.identifiable ? "ok" : "bad"}` }, r.identifiable ? "Identifiable" : "Not identifiable"),
+      el("span", { class: "muted" }, figures)),
+    table(of("value"), of("sigma"), of("unit")), ...(r.weak ?? []).map((w) => el("div", { class: "error" }, w)),
+    ...Object.entries(r.refused ?? {}).map(([name, why]) => el("div", { class: "muted" }, `${name}: ${why}`)), ...(r.warnings ?? []).map((w) => el("div", { class: "error" }, w)),
+    el("div", { class: "row", style: "margin-top:7px" },
+      el("button", applied, "Apply"), r.tracks ? el("button", compared, "Compare over a radiograph") : null));
+}
+on("calibrate", async (dataset, sample, markers) => {
+  emit("show-tab", "calibrate");
+  await datasets();
+  for (const tick of $$<HTMLInputElement>("#datasets input")) tick.checked = tick.value === dataset;
+  if (sample) $input("#fit-phantom").value = sample;
+  void estimate("calibration.fit", { datasets: [dataset], phantom: $input("#fit-phantom").value, tracks: true, markers: markers ?? null }, [dataset], "No calibration");
+});
+on("align", (dataset) => { emit("show-tab", "calibrate"); void estimate("calibration.align", { name: dataset }, [dataset], "Not aligned"); });
+let name: string | null | undefined;
+on("state", (state) => {
+  const c = state.correction;
+  $button("#revert").disabled = !c;
+  if (name === (c?.name ?? null)) return;
+  name = c?.name ?? null;
+  const box = $("#in-force");
+  box.textContent = "";
+  if (c) box.append(el("div", {}, el("b", {}, c.name), el("span", { class: "muted" }, `  ${dated(c)}`)), table(c.parameters));
+  else box.append(el("span", { class: "muted" }, "none: nominal geometry"));
+  void refresh();
+});
+on("session", () => { void refresh(); void datasets(); });
+on("job", (job) => { if (["done", "incomplete"].includes(job.state)) void datasets(); });
+on("tab", (tab) => { if (tab === "calibrate") { void refresh(); void datasets(); } });

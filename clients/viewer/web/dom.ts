@@ -1,0 +1,100 @@
+// Small helpers for building the page.
+export const $ = <E extends Element = HTMLElement>(selector: string, root: ParentNode = document): E => {
+  const found = root.querySelector<E>(selector);
+  if (!found) throw new Error(`the page has no ${selector}`);
+  return found;
+};
+export const $$ = <E extends Element = HTMLElement>(selector: string, root: ParentNode = document): E[] => [...root.querySelectorAll<E>(selector)];
+export const $input = (selector: string) => $<HTMLInputElement>(selector);
+export const $select = (selector: string) => $<HTMLSelectElement>(selector);
+export const $button = (selector: string) => $<HTMLButtonElement>(selector);
+export const $canvas = (selector: string) => $<HTMLCanvasElement>(selector);
+export const $dialog = (selector: string) => $<HTMLDialogElement>(selector);
+
+interface Handlers {
+  onclick?: (e: MouseEvent) => unknown;
+  onkeydown?: (e: KeyboardEvent) => unknown;
+  oninput?: (e: Event) => unknown;
+  onchange?: (e: Event) => unknown;
+  ontoggle?: (e: Event) => unknown;
+}
+export type Attributes = Handlers & { readonly [name: string]: string | number | boolean | null | undefined | Handlers[keyof Handlers] };
+export function el<T extends keyof HTMLElementTagNameMap>(tag: T, attributes: Attributes = {}, ...children: Array<Node | string | null | undefined>): HTMLElementTagNameMap[T] {
+  const node = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (typeof value === "function") node.addEventListener(name.slice(2), value as EventListener);
+    else if (name === "class") node.className = String(value);
+    else if (name in node && name !== "list") (node as unknown as Record<string, unknown>)[name] = value;
+    else node.setAttribute(name, String(value));
+  }
+  node.append(...children.filter((c) => c !== null && c !== undefined));
+  return node;
+}
+// Attributes of what is pressed like a button and looks like none.
+export function pressed(f: () => unknown) {
+  return { role: "button", tabIndex: 0, onclick: f, onkeydown: (e: KeyboardEvent) => { if (e.key === "Enter" && !e.repeat) f(); } };
+}
+export function fixed(value: number | null | undefined, digits = 2): string {
+  if (!isNumber(value)) return "–";
+  const text = value.toFixed(digits);
+  return Number(text) === 0 ? text.replace("-", "") : text;
+}
+export const isNumber = (value: unknown): value is number => Number.isFinite(value);
+// The number a person typed: a decimal comma is a point, and what is no number is none (never 0).
+export function parsed(text: string): number {
+  const plain = text.trim().replace("−", "-").replace(",", ".");
+  return /^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$/i.test(plain) ? Number(plain) : NaN;
+}
+// A field for a number (as text: browsers drop what they cannot read from number fields without a word).
+// What is typed is marked until Enter applies it or Escape takes it back.
+export function field(attributes: Attributes, apply: () => unknown, back: () => unknown): HTMLInputElement {
+  const input = el("input", { type: "text", inputMode: "decimal", autocomplete: "off", ...attributes });
+  input.classList.add("num");
+  input.addEventListener("input", () => input.classList.add("typed"));
+  input.addEventListener("keydown", (e) => {
+    const step = e.key === "ArrowUp" ? 1 : e.key === "ArrowDown" ? -1 : 0, value = parsed(input.value);
+    if (e.key === "Enter" && !e.repeat) apply();
+    if (e.key === "Escape") back();
+    if (step && Number.isFinite(value)) { e.preventDefault(); input.value = String(Number((value + step).toFixed(4))); input.classList.add("typed"); }
+  });
+  return input;
+}
+export function seconds(s: number | null | undefined): string {
+  if (!isNumber(s)) return "–";
+  s = Math.round(s);
+  const h = Math.floor(s / 3600), m = Math.floor((s % 3600) / 60);
+  return h ? `${h} h ${String(m).padStart(2, "0")} min` : m ? `${m} min ${String(s % 60).padStart(2, "0")} s` : `${s} s`;
+}
+export function bytes(n: number): string {
+  const units = ["B", "kB", "MB", "GB", "TB"];
+  let i = 0;
+  while (n >= 1000 && i < 4) { n /= 1000; i++; }
+  return `${n.toFixed(i ? 1 : 0)} ${units[i]}`;
+}
+export function setText(node: Element, text: string): void { if (node.textContent !== text) node.textContent = text; }
+export function download(url: string, name: string): void { const a = el("a", { href: url, download: name }); document.body.append(a); a.click(); a.remove(); }
+export function base64(buffer: ArrayBuffer): string {
+  const b = new Uint8Array(buffer);
+  let out = "";
+  for (let i = 0; i < b.length; i += 0x8000) out += String.fromCharCode(...b.subarray(i, i + 0x8000));
+  return btoa(out);
+}
+// A canvas's pixels in two dimensions, and one that was not refused.
+export function context2d(canvas: HTMLCanvasElement): CanvasRenderingContext2D {
+  const context = canvas.getContext("2d");
+  if (!context) throw new Error("this browser draws nothing");
+  return context;
+}
+// Grey values (0 to 255, row by row) as a picture.
+export function putGrey(canvas: HTMLCanvasElement, [rows, cols]: readonly number[], grey: (k: number) => number): void {
+  canvas.width = cols; canvas.height = rows;
+  const x = context2d(canvas), out = x.createImageData(cols, rows), d = new Uint32Array(out.data.buffer);
+  for (let k = 0; k < d.length; k++) d[k] = 0xff000000 | (grey(k) * 0x010101);
+  x.putImageData(out, 0, 0);
+}
+// What went wrong, in words.
+export const words = (error: unknown): string => (error instanceof Error ? error.message : String(error));
+// The element of a kind that an event happened within; elements of other frames are of other classes.
+export const within = (target: EventTarget | null, selector: string): Element | null => (target as Partial<Element> | null)?.closest?.(selector) ?? null;
+// Keeps a choice in this browser, if it has room.
+export function keep(key: string, value: string): void { try { localStorage.setItem(key, value); } catch { /* it has no room */ } }

@@ -1,0 +1,157 @@
+// Bar, readouts, warnings and notes: who holds control, how near things are, what went wrong.
+import { $, $$, $button, el, fixed, isNumber, setText } from "./dom.js";
+import type { State } from "./wire.js";
+import { command, OLD_S, on, store } from "./link.js";
+
+const ROWS: Array<[name: string, text: (s: State) => string]> = [
+  ["SOD", (s) => `${fixed(s.geometry.SOD_mm, 2)} mm`], ["SDD", (s) => `${fixed(s.geometry.SDD_mm, 2)} mm`],
+  ["magnification", (s) => `${fixed(s.geometry.magnification, 4)}×`], ["voxel", (s) => `${fixed(s.geometry.voxel_size_mm * 1000, 2)} µm`],
+  ["field of view", (s) => s.geometry.field_of_view_mm.map((v) => fixed(v, 1)).join(" × ") + " mm"],
+  ["cone angle", (s) => `${fixed(s.geometry.cone_angle_deg, 2)}°`],
+  ["piercing point", (s) => s.geometry.piercing_point_px.map((v) => fixed(v, 1)).join(", ") + " px"],
+  ["axis column", (s) => `${fixed(s.geometry.axis_column_px, 1)} px`],
+  ["beam", (s) => (s.tube.on ? !s.tube.ready && s.tube.ready_in_s !== null ? `ready in ${fixed(s.tube.ready_in_s, 0)} s` : `${fixed(s.tube.kV, 0)} kV, ${fixed(s.tube.power_W, 0)} W` : "off")],
+];
+const cells = ROWS.map(([name]) => { const dd = el("dd"); $("#readouts").append(el("dt", {}, name), dd); return dd; });
+
+export function note(kind: string, title: string, body = "", life = kind === "error" ? 12000 : 6000) {
+  const box = $("#notes");
+  $$("#notes > *").find((n) => n.dataset.key === title + body)?.remove();
+  const node = el("div", { class: `note ${kind}` }, el("b", {}, title), el("span", {}, body));
+  node.dataset.key = title + body;
+  node.append(el("button", { "aria-label": "close", onclick: () => node.remove() }, "×"));
+  box.append(node);
+  while (box.childElementCount > 5) box.firstChild?.remove();
+  setTimeout(() => node.remove(), life);
+}
+on("note", (kind, title, body) => note(kind, title, body));
+on("log", (entry) => { if (["warning", "error"].includes(entry.level)) note(entry.level === "error" ? "error" : "warning-note", "Twin", entry.message); });
+
+// Does the sample stay in the picture over a whole turn? The cylinder about the axis that holds it.
+export function truncated(s: State): string[] {
+  const size = s.sample.size_mm, g = s.geometry, c = s.camera;
+  const axis = g.axis_column_px;
+  if (!size || !isNumber(axis)) return [];
+  const o = s.sample.offset, upright = !o.rx && !o.ry;
+  const radius = (upright ? 0.5 * Math.hypot(size[0], size[1]) : 0.5 * Math.hypot(...size)) + Math.hypot(o.x, o.y);
+  const height = upright ? size[2] : 2 * radius, out: string[] = [];
+  if (radius >= g.SOD_mm) return ["the sample reaches the source"];
+  const reach = (radius * g.SDD_mm) / Math.sqrt(g.SOD_mm ** 2 - radius ** 2) / c.pixel_mm;
+  if (axis - reach < -0.5 || axis + reach > c.shape[1] - 0.5) out.push("truncated sideways over a full turn");
+  const near = g.SDD_mm / (g.SOD_mm - radius) / c.pixel_mm, middle = g.piercing_point_px[1] - ((o.z + aboveSource()) * g.magnification) / c.pixel_mm;
+  if (middle - (height / 2) * near < -0.5 || middle + (height / 2) * near > c.shape[0] - 0.5) out.push("truncated at top or bottom");
+  return out;
+}
+// Height of the sample's reference point above the focal spot [mm], from the frame's predicted geometry.
+function aboveSource() { const ref = store.framing?.sample_height_mm; return isNumber(ref) ? ref : 0; }
+
+// Axes that the page found at an end of their travel: a machine may well be at home there.
+let parked: Set<string> | null = null;
+
+function warnings(s: State) {
+  const list: Array<[kind: string, words: string]> = [];
+  if (s.safety.estop) list.push(["bad", "Emergency stop: nothing moves until it is reset"]);
+  else if (s.safety.state !== "ok") list.push(["bad", `Blocked: ${s.safety.message || "reset to go on"}`]);
+  for (const w of s.safety.warnings) list.push(["", w]);
+  if (store.near?.close) list.push([(store.near.mm ?? 0) < 2 ? "bad" : "", `${store.near.pair.join(" and ")} are ${fixed(store.near.mm, 1)} mm apart`]);
+  const there = Object.entries(s.axes).filter(([, a]) => !a.moving && !a.virtual && (Math.abs(a.position - a.limits[0]) < 0.05 || Math.abs(a.limits[1] - a.position) < 0.05)).map(([n]) => n);
+  parked ??= new Set(there);
+  for (const name of parked) if (!there.includes(name)) parked.delete(name);
+  const ends = there.filter((n) => !parked?.has(n));
+  if (ends.length) list.push(["", `${ends.join(", ")} at the end of travel`]);
+  const cut = truncated(s);
+  if (cut.length) list.push(["", `Sample ${cut.join(", ")}`]);
+  const flags = s.image, are = s.tube.on ? "are" : "would be"; // flags are judged as though X-rays were on
+  if (flags && flags.saturated > 0.001) list.push([flags.saturated > 0.05 ? "bad" : "", `${share(flags.saturated)} of the pixels ${are} saturated: less power, shorter exposure or more filter`]);
+  if (flags && flags.starved > 0.001) list.push(["", `${share(flags.starved)} of the pixels ${are} starved: hardly a count above dark`]);
+  if (s.job?.state === "paused") list.push(["", `Scan paused${typeof s.job.error?.message === "string" ? `: ${s.job.error.message}` : ""}`]);
+  return list;
+}
+const share = (part: number) => (part < 0.01 ? "some" : `${fixed(100 * part, 0)} %`);
+let lastWarnings = "";
+
+on("state", (s) => {
+  ROWS.forEach(([, f], i) => { let t: string; try { t = f(s); } catch { t = "–"; } setText(cells[i], t); });
+  const list = warnings(s), key = JSON.stringify(list);
+  if (key !== lastWarnings) { lastWarnings = key; $("#warnings").replaceChildren(...list.map(([kind, text]) => el("div", { class: `warning ${kind}` }, text))); }
+  const factor = s.clock.real_time_factor;
+  setText($("#clock"), `t = ${fixed(s.clock.time_s, 1)} s · ${factor ? `${factor >= 10 ? fixed(factor, 0) : fixed(factor, 2)}×` : s.clock.speed_up === "max" ? "max" : `${s.clock.speed_up}×`}`);
+  const estop = $button("#estop"), down = s.safety.estop || s.safety.state !== "ok";
+  if (s.safety.estop) { pressed = null; for (const n of $$("#notes .note")) if (n.dataset.key?.startsWith(UNCONFIRMED)) n.remove(); }
+  else if (pressed !== null && store.fresh !== null && performance.now() - Math.max(pressed, store.fresh) > 2000 * OLD_S) {
+    pressed = null;
+    note("error", "The emergency stop did not take effect", "press it again");
+  }
+  estop.dataset.on = String(down); setText(estop, down ? "RESET" : "E-STOP");
+  near(); holder();
+});
+
+function near() {
+  const n = store.near, mm = n?.mm, box = $("#near");
+  if (!box.childElementCount) box.append(el("div", { class: "row between" }, el("span", { class: "pair" }), el("b", { class: "mm mono" })), el("div", { class: "meter" }, el("i")));
+  setText($(".pair", box), n?.pair.length ? n.pair.join(" – ") : "–"); setText($(".mm", box), isNumber(mm) ? `${fixed(mm, 1)} mm` : "");
+  const meter = $(".meter", box);
+  meter.className = `meter ${n?.close ? ((mm ?? 0) < 2 ? "touch" : "close") : ""}`;
+  $("i", meter).style.width = isNumber(mm) ? `${Math.min(100, mm / 2).toFixed(0)}%` : "0";
+}
+
+function holder() {
+  const pill = $("#holder"), who = store.state?.controller ?? null, mine = who !== null && who === store.session;
+  pill.dataset.state = mine ? "mine" : who ? "other" : "none";
+  // Without the twin nobody knows who may; with it the next state says.
+  if (!store.twin) pill.dataset.state = "none";
+  setText(pill, !store.twin ? "control unknown" : mine ? "you control" : who ? `held by ${who}` : "nobody controls");
+  setText($button("#take"), mine ? "Release" : who ? "Take over" : "Take control");
+  $button("#take").disabled = !store.twin;
+}
+$button("#take").addEventListener("click", () => {
+  const who = store.state?.controller ?? null, action = who === null ? "acquire" : who === store.session ? "release" : "force";
+  void command("session.control", { action }, "Control");
+});
+const UNCONFIRMED = "E-stop not confirmed";
+// Who clicks twice in a hurry means to stop, not to reset. Pressed, and not confirmed by a state yet [ms].
+let pressed: number | null = null;
+export async function estop(): Promise<void> {
+  const mine = pressed = performance.now();
+  const answer = await command("safety.estop", {}, UNCONFIRMED);
+  if (answer?.safety.estop && pressed === mine) pressed = null;
+}
+$button("#estop").addEventListener("click", (e) => {
+  if (e.detail >= 2) return;
+  if ($button("#estop").dataset.on === "true") void command("safety.reset", {}, "Reset");
+  else void estop();
+});
+const BUTTON = "the machine's own emergency stop button is the one that counts";
+$button("#stop").addEventListener("click", () => void command("axes.stop", {}, "Stop"));
+
+// What is missing: nothing, the viewer's room for this page, the viewer, the twin, or news of either.
+function missing(): [word: string, title: string, why: string] {
+  if (store.refused) return ["sent away", "The viewer does not serve this page now", `${store.refused}; the page tries again by itself`];
+  if (!store.viewer) return ["no viewer", "The viewer is away", "it does not answer; the page comes back by itself"];
+  if (!store.twin) return ["no twin", "The twin is away", `${store.problem || "waiting for it"}; the page comes back by itself`];
+  if (store.state && store.age > OLD_S) return [`${fixed(store.age, 0)} s old`, `What you see is ${fixed(store.age, 0)} s old`,
+    "viewer or twin do not answer, or the network is slow; what is done here may come late or not at all"];
+  return ["connected", "", ""];
+}
+function connection() {
+  const pill = $("#connection"), [word, title, why] = missing(), up = title === "";
+  const unconfirmed = pressed !== null && performance.now() - pressed > 1000 * OLD_S;
+  pill.dataset.state = up ? "up" : "down";
+  setText(pill, word);
+  pill.title = store.problem ?? "";
+  $("#veil").hidden = up && !unconfirmed;
+  document.body.dataset.old = String(!up);
+  setText($("#veil-title"), unconfirmed ? `${UNCONFIRMED}${title && `. ${title}`}` : title);
+  setText($("#veil-text"), unconfirmed || !up ? [why, BUTTON].filter(Boolean).join("; ") : "");
+}
+on("age", () => {
+  connection();
+  const old = store.imageAge > OLD_S;
+  $("#film-old").hidden = !old;
+  if (old) setText($("#film-old"), `of another pose: ${fixed(store.imageAge, 0)} s old`);
+});
+on("connection", () => {
+  connection();
+  setText($("#machine"), store.hello ? `${store.hello.machine} · ${store.hello.profile ?? ""}` : "");
+  holder();
+});

@@ -1,0 +1,83 @@
+// What the viewer says beside the wire: its messages, its own methods' answers, and what the page makes of them.
+import type { CalibrationFitResult, CheckStep, DatasetListResult, DatasetResult, HelloResult, ImageFlags, JobStatus, Mark, State, WireAnswers } from "./wire.js";
+
+export type Pair = [number, number];
+export type Four = [number, number, number, number];
+export type Vector = [number, number, number];
+export type Kind = "line_integral" | "counts";
+export type View = "iso" | "beam" | "side" | "free";
+
+export interface Camera { position: Vector; look_at: Vector; fov: number }
+// Where the beam's frame goes, in parts of the detector's width and height.
+export interface Framing { width: number; height: number; left: number; top: number; aspect: number; exact: boolean; sample_height_mm: number }
+export interface Near { mm: number | null; pair: string[]; close: boolean }
+
+// A recorded image, and what cannot be said of it.
+export interface AboutImage { name: string; index: number; file: string; image: "dark" | "flat" | "projection"; projection: number | null; time_s: number | null; positions: Record<string, number> | null; problem: string }
+export interface ImageHead {
+  kind: Kind; code: "jpeg" | "deflate"; shape: Pair; pair: boolean; full: Pair; low: number; scale: number; time: number; cone_vec: number[]; seq: number;
+  flags: ImageFlags | null; window: Pair; beads: Pair[]; at: number; recorded?: AboutImage;
+}
+// An image as the page shows it: `signed` is a difference `of` one image `from` the pixels of another.
+export interface Shown extends ImageHead {
+  pixels: Uint16Array; virtual?: Uint16Array; at_ms: number; signed?: boolean; of?: Shown; from?: Uint16Array | number;
+}
+
+export interface Grey { shape: Pair; data: string }
+export interface VolumeMessage {
+  name: string; problem?: string; side: number; voxel_mm: number; views: number; of: number; low: number; high: number; slices: Record<string, Grey>;
+}
+interface Failure { code: number; message: string; data?: unknown }
+// Messages by their type.
+export interface Messages {
+  answer: { id: number; result: unknown; error?: Failure };
+  state: { state: State; framing: Framing; near: Near; cone_vec: number[]; at: number };
+  link: { connected: boolean; problem: string | null; cameras: Record<string, Camera>; twin: string; hello: HelloResult | null };
+  session: { connected: boolean; session: string | null };
+  volume: VolumeMessage;
+  layers: { shown: Record<string, boolean>; opacity: number };
+  job: { data: JobStatus };
+  note: { level: string; title: string; body: string };
+  log: { data: { level: string; message: string } };
+  beat: { at: number; silent_s: number };
+}
+
+export interface Offer { url: string; name: string; bytes: number }
+export interface PlanDocument { duration_s: number; frames: number; bytes: number; times: number[]; curves: Record<string, number[]>; images: Array<[number, string]>; steps: CheckStep[] }
+type Fitted = Pair | null;
+export interface TrackedFrame { file: string; measured: Fitted[]; before: Fitted[]; after: Fitted[] | null }
+export interface TrackedScan { dataset: string; folder: string; before: string; rms_before_px: number | null; rms_after_px: number | null; frames: TrackedFrame[] }
+// What `flexdt calibrate --json` writes beside what the wire names.
+export interface FitReport extends Omit<CalibrationFitResult, "tracks"> {
+  frames: number; cost_reduction_pct: number | null; weak: string[]; tracks: { phantom: string; datasets: TrackedScan[] } | null;
+}
+
+export interface Answers extends Omit<WireAnswers, "calibration.fit"> {
+  "calibration.fit": FitReport;
+  "viewer.layers": object;
+  "viewer.theme": object;
+  "viewer.camera": object;
+  "viewer.feed": object;
+  "viewer.window": object;
+  "viewer.ray": { paths_mm: Record<string, number>; length_mm: number };
+  "viewer.spectrum": { energy_keV: number[]; photons: number[]; mean_keV: number; filters: Array<{ material: string; thickness_mm: number }>; limits: { kV: Pair; power_W: Pair; exposure_ms: Pair } };
+  "viewer.plan": PlanDocument;
+  "viewer.recorded": DatasetResult;
+  "viewer.recorded_image": AboutImage;
+  "viewer.live": object;
+  "viewer.compose": { text: string; moved: Record<string, Pair> };
+  "viewer.datasets": DatasetListResult;
+  "viewer.scrub": { positions: Record<string, number> | null };
+  "viewer.screenshot": Offer;
+  "viewer.export": Offer;
+}
+
+// What the parts of the page tell each other: event -> what comes with it.
+export interface Events {
+  note: [level: string, title: string, body?: string];
+  connection: []; open: []; session: []; layers: []; age: []; compare: []; design: [];
+  state: [state: State]; job: [job: JobStatus]; volume: [volume: VolumeMessage]; image: [image?: Shown | null];
+  log: [entry: { level: string; message: string }];
+  tab: [name: string]; "show-tab": [name: string]; recorded: [name: string | null]; frame: [target: Window];
+  calibrate: [dataset: string, sample: string, markers?: Mark[]]; align: [dataset: string]; script: [text: string];
+}

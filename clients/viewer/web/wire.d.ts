@@ -1,0 +1,792 @@
+// Written by tests/viewer/test_page_source.py from the OpenRPC document of the wire and of the
+// viewer's own methods. Answers have all their fields; what a request may leave out bears a "?".
+export type AxisSet = {
+  axis: string;
+  speed?: number | null;
+  acceleration?: number | null;
+};
+export type AxisSetResult = {
+  axis: string;
+  speed: number;
+  acceleration: number;
+};
+export type AxisState = {
+  position: number;
+  target: number;
+  velocity: number;
+  limits: [number, number];
+  moving: boolean;
+  unit: "mm" | "deg";
+  speed: number | null;
+  acceleration: number | null;
+  virtual: boolean;
+};
+export type CalibrationAlign = {
+  name: string;
+};
+export type CalibrationAlignResult = {
+  identifiable: boolean;
+  parameters: Record<string, Estimated>;
+  refused: Record<string, string>;
+  warnings: Array<string>;
+  correction: Record<string, number> | null;
+};
+export type CalibrationFit = {
+  datasets: Array<string>;
+  phantom: string;
+  free?: Array<string> | null;
+  priors?: Record<string, number>;
+  per_frame?: Array<string>;
+  steps?: number;
+  residuals?: boolean;
+  tracks?: boolean;
+  markers?: Array<Mark> | null;
+};
+export type CalibrationFitResult = {
+  identifiable: boolean;
+  parameters: Record<string, Estimated>;
+  correction: Record<string, number> | null;
+  covariance: Array<Array<number | null>>;
+  rms_px: number | null;
+  rms_per_bead_px: Array<number | null>;
+  residuals_px: Array<Array<[number, number] | null>> | null;
+  steps: Array<CalibrationStep>;
+  tracks: Record<string, JsonValue> | null;
+  problems: Array<CalibrationProblem>;
+};
+export type CalibrationGet = {
+  name?: string | null;
+};
+export type CalibrationProblem = {
+  code: string;
+  severity: "error" | "warning";
+  text: string;
+};
+export type CalibrationStep = {
+  frames: number;
+  covariance: Array<Array<number>> | null;
+};
+export type Camera = {
+  view?: "iso" | "beam" | "side" | "free";
+  sample?: boolean;
+};
+export type CameraPart = {
+  mode: string;
+  roi: [number, number, number, number];
+  exposure_ms: number;
+  averages: number;
+  frames: number;
+};
+export type CameraSet = {
+  exposure_ms?: number | null;
+  mode?: string | null;
+  roi?: [number, number, number, number] | null;
+  averages?: number | null;
+  frames?: number | null;
+};
+export type CameraState = {
+  mode: string;
+  exposure_ms: number;
+  roi: [number, number, number, number];
+  averages: number;
+  frames: number;
+  shape: [number, number];
+  pixel_mm: number;
+};
+export type CheckCollision = {
+  line: number | null;
+  time_s: number;
+  pair: Array<string>;
+  last_free: Record<string, number>;
+};
+export type CheckResult = {
+  ok: boolean;
+  problems: Array<Problem>;
+  steps: Array<CheckStep>;
+  duration_s: number;
+  frames: number;
+  bytes: number;
+  collisions: Array<CheckCollision>;
+  min_clearance_mm: number | null;
+};
+export type CheckStep = {
+  line: number | null;
+  start_s: number;
+  duration_s: number;
+  what: string;
+};
+export type ClockSet = {
+  speed_up: number | "max";
+};
+export type ClockState = {
+  time_s: number;
+  speed_up: number | "max";
+  real_time_factor: number | null;
+};
+export type Compose = {
+  kind?: "fly" | "step" | "tiled" | "helical" | "calibration";
+  frames?: number;
+  exposure_ms?: number;
+  kV?: number | null;
+  power_W?: number | null;
+  voxel_um?: number | null;
+  keep?: Array<string>;
+};
+export type Control = {
+  action: "acquire" | "release" | "force";
+};
+export type ControlResult = {
+  controller: string | null;
+  yours: boolean;
+};
+export type Correct = {
+  parameters: Record<string, number>;
+  name?: string | null;
+  comment?: string;
+  source?: string | null;
+};
+export type Correction = {
+  name: string;
+  date: string;
+  parameters: Record<string, number>;
+  comment: string;
+  source: string | null;
+};
+export type CorrectionListResult = {
+  corrections: Array<Correction>;
+  current: string | null;
+};
+export type CorrectionPart = {
+  name: string;
+  date: string;
+  parameters: Record<string, number>;
+  comment?: string;
+};
+export type CorrectionResult = {
+  correction: Correction | null;
+  warnings: Array<string>;
+};
+export type DatasetFrame = {
+  name: string;
+  index: number;
+  kind?: "line_integral" | "counts";
+  binning?: number;
+};
+export type DatasetFrameResult = {
+  dtype: "uint8" | "int16" | "uint16" | "int32" | "uint32" | "float32" | "float64";
+  shape: Array<number>;
+  data: string;
+  name: string;
+  index: number;
+  file: string;
+  image: "dark" | "flat" | "projection";
+  projection: number | null;
+  kind: "line_integral" | "counts";
+  time_s: number | null;
+  exposure_ms: number | null;
+  positions: Record<string, number> | null;
+  cone_vec: Array<number> | null;
+  tube: Record<string, JsonValue> | null;
+  camera: Record<string, JsonValue> | null;
+};
+export type DatasetGet = {
+  name: string;
+  points?: number;
+  measure?: boolean;
+  script?: boolean;
+};
+export type DatasetInfo = {
+  name: string;
+  modified: number;
+  started: string | null;
+  duration_s: number | null;
+  state: "complete" | "incomplete" | "running" | "unknown";
+  reason: string;
+  projections: number;
+  present: number;
+  machine: string | null;
+  sample: string;
+  operator: string;
+  kV: number | null;
+  power_W: number | null;
+  exposure_ms: number | null;
+  mode: string | null;
+  shape: [number, number] | null;
+  problem: string;
+  thumbnail: ImageValue | null;
+};
+export type DatasetList = {
+  search?: string;
+  start?: number;
+  count?: number;
+  thumbnail?: number;
+};
+export type DatasetListResult = {
+  datasets: Array<DatasetInfo>;
+  total: number;
+  unread: number;
+  left_out: number;
+};
+export type DatasetResult = {
+  info: DatasetInfo;
+  images: number;
+  indices: Array<number>;
+  files: Array<string>;
+  kinds: Array<"dark" | "flat" | "projection">;
+  present: Array<boolean>;
+  times_s: Array<number> | null;
+  positions: Record<string, Array<number | null>>;
+  same_machine: boolean;
+  counts: Array<number | null> | null;
+  clearance_mm: Array<number | null> | null;
+  clearance_of: string;
+  script: string | null;
+};
+export type Datasets = {
+  search?: string;
+  start?: number;
+};
+export type Discovery = {
+  openrpc: string;
+  info: Record<string, JsonValue>;
+  methods: Array<Record<string, JsonValue>>;
+};
+export type Empty = Record<string, never>;
+export type Estimated = {
+  value: number | null;
+  sigma: number | null;
+  unit: string;
+};
+export type Export = {
+  format?: "html" | "viser";
+  replay?: boolean;
+};
+export type ExposurePredict = {
+  sample?: string | null;
+  kV?: number | null;
+  power_W?: number | null;
+  filter?: string;
+  exposure_ms?: number | null;
+  averages?: number | null;
+  frames?: number;
+  sod_mm?: number | null;
+  sdd_mm?: number | null;
+  detail?: string;
+};
+export type ExposurePrediction = {
+  sample: string;
+  transmission: TransmissionShares;
+  saturated: number;
+  starved: number;
+  detail: string;
+  asked: PredictedSetting;
+  best: Array<PredictedSetting>;
+  frames: number;
+  seconds: number;
+  bytes: number;
+  assumed: Array<string>;
+};
+export type Feed = {
+  kind: "line_integral" | "counts";
+};
+export type GeometryResult = {
+  cone_vec: Array<number>;
+  detector_shape: [number, number];
+  pixel_mm: number;
+};
+export type GeometryState = {
+  SOD_mm: number;
+  SDD_mm: number;
+  magnification: number;
+  voxel_size_mm: number;
+  piercing_point_px: [number, number];
+  field_of_view_mm: [number, number];
+  cone_angle_deg: number | null;
+  axis_column_px: number | null;
+};
+export type Hello = {
+  protocol: string | number;
+  client: string;
+  token?: string | null;
+};
+export type HelloResult = {
+  protocol: string;
+  server: string;
+  machine: string;
+  profile: string | null;
+  session: string | null;
+  physics: string | null;
+};
+export type ImageFlags = {
+  time: number | null;
+  saturated: number;
+  starved: number;
+  truncated: Array<"left" | "right" | "top" | "bottom">;
+  good_counts: [number, number] | null;
+  good_lines: [number, number] | null;
+};
+export type ImageValue = {
+  dtype: "uint8" | "int16" | "uint16" | "int32" | "uint32" | "float32" | "float64";
+  shape: Array<number>;
+  data: string;
+};
+export type JobListResult = {
+  jobs: Array<JobStatus>;
+};
+export type JobRef = {
+  job?: string | null;
+};
+export type JobStatus = {
+  job: string;
+  state: "queued" | "running" | "paused" | "done" | "failed" | "aborted" | "incomplete";
+  name: string;
+  dataset: string | null;
+  frames_done: number;
+  frames_total: number;
+  elapsed_s: number;
+  remaining_s: number | null;
+  time: number;
+  speed_up: number | "max";
+  real_time_factor: number | null;
+  error: Record<string, unknown> | null;
+  retry_s: number | null;
+  warnings: Array<string>;
+  step: number | null;
+  line: number | null;
+  what: string;
+};
+export type Jog = {
+  axis: string;
+  velocity: number;
+  lease_s?: number;
+};
+export type JsonValue = unknown;
+export type Layers = {
+  beam?: boolean | null;
+  axis?: boolean | null;
+  panel?: boolean | null;
+  ranges?: boolean | null;
+  bodies?: boolean | null;
+  margin?: boolean | null;
+  sample?: boolean | null;
+  machine?: boolean | null;
+  orbit?: boolean | null;
+  gizmos?: boolean | null;
+  labels?: boolean | null;
+  opacity?: number | null;
+};
+export type Live = {
+  name?: string | null;
+  side?: 128 | 192 | 256;
+};
+export type Mark = {
+  frame: number;
+  marker: string;
+  column: number;
+  row: number;
+  sigma?: number | null;
+};
+export type Move = {
+  targets: Record<string, number>;
+  relative?: boolean;
+  wait?: boolean;
+  plan?: boolean;
+  shortest?: boolean;
+};
+export type MoveResult = {
+  duration_s: number;
+  warnings: Array<string>;
+  moves: Array<Record<string, number>> | null;
+  arrived: boolean | null;
+};
+export type Nothing = Record<string, unknown>;
+export type Placement = {
+  x?: number;
+  y?: number;
+  z?: number;
+  rx?: number;
+  ry?: number;
+  rz?: number;
+};
+export type Plan = {
+  text?: string | null;
+};
+export type Pong = {
+  time: number;
+};
+export type PredictedSetting = {
+  kV: number;
+  filter: string;
+  exposure_ms: number;
+  averages: number;
+  cnr: number;
+  kerma_mGy: number;
+};
+export type Problem = {
+  severity: "error" | "warning";
+  code: string;
+  line: number | null;
+  column: number | null;
+  message: string;
+};
+export type Projection = {
+  dtype: "uint8" | "int16" | "uint16" | "int32" | "uint32" | "float32" | "float64";
+  shape: Array<number>;
+  data: string;
+  cone_vec: Array<number>;
+  kind: "line_integral" | "counts";
+  time: number | null;
+  flags: ImageFlags | null;
+  marks: ImageValue | null;
+};
+export type ProjectionGet = {
+  kind?: "line_integral" | "counts";
+  binning?: number;
+  marks?: boolean;
+  positions?: Record<string, number> | null;
+  tube?: TubeSet | null;
+  camera?: CameraSet | null;
+};
+export type Ray = {
+  pixel?: [number, number] | null;
+};
+export type RayGet = {
+  pixel: [number, number];
+};
+export type RayResult = {
+  paths_mm: Record<string, number>;
+};
+export type Recorded = {
+  name?: string | null;
+};
+export type RecordedImage = {
+  index: number;
+  kind?: "line_integral" | "counts";
+  virtual?: boolean;
+};
+export type SafetyState = {
+  state: string;
+  estop: boolean;
+  message: string;
+  blocked_attempts: number;
+  clearance_mm: number | null;
+  pair: Array<string> | null;
+  warnings: Array<string>;
+};
+export type SampleInfo = {
+  name: string;
+  kind: "phantom" | "mesh" | "voxels" | "scene";
+  description: string;
+  size_mm: [number, number, number] | null;
+  uploaded: boolean;
+};
+export type SampleListResult = {
+  samples: Array<SampleInfo>;
+  materials: Array<string>;
+};
+export type SampleMesh = {
+  start?: number;
+  count?: number;
+};
+export type SampleMeshResult = {
+  name: string;
+  revision: string | null;
+  format: "stl";
+  total: number;
+  start: number;
+  data: string;
+};
+export type SamplePart = {
+  name: "" | string;
+  material?: string | null;
+  offset?: Placement;
+};
+export type SamplePlacement = {
+  x: number;
+  y: number;
+  z: number;
+  rx: number;
+  ry: number;
+  rz: number;
+};
+export type SampleResult = {
+  sample: SampleState;
+  warnings: Array<string>;
+};
+export type SampleSet = {
+  name?: string | null;
+  file?: string | null;
+  material?: string | null;
+  offset?: Placement | null;
+};
+export type SampleState = {
+  name: string | null;
+  material: string | null;
+  offset: SamplePlacement;
+  size_mm: [number, number, number] | null;
+  description: string;
+  revision: string | null;
+};
+export type SampleUpload = {
+  name: string;
+  kind?: "mesh" | "voxels" | "scene";
+  format: "stl" | "obj" | "ply" | "glb" | "off" | "raw" | "json" | "toml";
+  total: number;
+  start?: number;
+  data: string;
+  unit?: "um" | "mm" | "cm" | "m" | "inch" | null;
+  material?: string | null;
+  shape?: [number, number, number] | null;
+  voxel_mm?: [number, number, number] | null;
+};
+export type Scene = {
+  schema: 1;
+  flexdt?: string;
+  name?: string;
+  saved?: string;
+  machine: string;
+  profile: string;
+  positions: Record<string, number>;
+  speeds?: Record<string, number>;
+  accelerations?: Record<string, number>;
+  tube: TubePart;
+  camera: CameraPart;
+  sample: SamplePart;
+  correction?: CorrectionPart | null;
+};
+export type SceneLoad = {
+  document: Scene;
+};
+export type SceneResult = {
+  document: Record<string, JsonValue>;
+};
+export type SceneSave = {
+  name?: string | null;
+};
+export type Screenshot = {
+  view?: "iso" | "beam" | "side" | "free";
+  width?: number;
+  height?: number;
+};
+export type ScriptInput = {
+  text?: string | null;
+  data_base64?: string | null;
+  name?: string | null;
+  speed_up?: number | "max" | null;
+  motion_samples?: number;
+  seed?: number | null;
+};
+export type Scrub = {
+  time_s?: number | null;
+};
+export type Spectrum = {
+  kV: number;
+};
+export type State = {
+  time: number;
+  axes: Record<string, AxisState>;
+  tube: TubeState;
+  camera: CameraState;
+  sample: SampleState;
+  geometry: GeometryState;
+  safety: SafetyState;
+  job: JobStatus | null;
+  correction: Correction | null;
+  clock: ClockState;
+  controller: string | null;
+  image: ImageFlags | null;
+};
+export type Stopped = {
+  time: number;
+  axes: Record<string, AxisState>;
+  tube: TubeState;
+  camera: CameraState;
+  sample: SampleState;
+  geometry: GeometryState;
+  safety: SafetyState;
+  job: JobStatus | null;
+  correction: Correction | null;
+  clock: ClockState;
+  controller: string | null;
+  image: ImageFlags | null;
+  stopping: Stopping | null;
+};
+export type Stopping = {
+  path: "along" | "apart" | "coasting";
+  duration_s: number;
+  distances: Record<string, number>;
+  would_hit: Array<string> | null;
+  would_hit_in_s: number | null;
+};
+export type SubmitResult = {
+  job: string;
+  dataset: string | null;
+  warnings: Array<string>;
+};
+export type Subscribe = {
+  topics: Array<"state" | "projection" | "job" | "log">;
+  max_rate_hz?: number | null;
+  projection_kind?: "line_integral" | "counts";
+  projection_binning?: number;
+};
+export type Theme = {
+  dark?: boolean;
+};
+export type TrajectoryInput = {
+  poses: Array<Record<string, number>>;
+  exposure_ms?: number | null;
+  name?: string | null;
+  speed_up?: number | "max" | null;
+  motion_samples?: number;
+  seed?: number | null;
+};
+export type TransmissionShares = {
+  least: number;
+  p1: number;
+  p5: number;
+  median: number;
+  edges: Array<number>;
+  shares: Array<number>;
+};
+export type TubePart = {
+  kV: number;
+  power_W: number;
+  on?: boolean;
+};
+export type TubeSet = {
+  kV?: number | null;
+  power_W?: number | null;
+  on?: boolean | null;
+};
+export type TubeState = {
+  on: boolean;
+  kV: number;
+  power_W: number;
+  ready: boolean;
+  ready_in_s: number | null;
+};
+export type Unsubscribe = {
+  topics: Array<"state" | "projection" | "job" | "log">;
+};
+export type UploadResult = {
+  name: string;
+  received: number;
+  complete: boolean;
+  sample: SampleInfo | null;
+  warnings: Array<string>;
+};
+export type Window = {
+  low?: number | null;
+  high?: number | null;
+};
+
+export interface Requests {
+  "session.hello": Hello;
+  "session.control": Control;
+  "session.ping": Empty;
+  "state.get": Empty;
+  "state.subscribe": Subscribe;
+  "state.unsubscribe": Unsubscribe;
+  "axes.move": Move;
+  "axes.jog": Jog;
+  "axes.set": AxisSet;
+  "axes.stop": Empty;
+  "safety.estop": Empty;
+  "safety.reset": Empty;
+  "clock.set": ClockSet;
+  "tube.set": TubeSet;
+  "camera.set": CameraSet;
+  "sample.set": SampleSet;
+  "sample.list": Empty;
+  "sample.mesh": SampleMesh;
+  "sample.upload": SampleUpload;
+  "projection.get": ProjectionGet;
+  "projection.ray": RayGet;
+  "geometry.get": Empty;
+  "exposure.predict": ExposurePredict;
+  "script.check": ScriptInput;
+  "script.submit": ScriptInput;
+  "trajectory.check": TrajectoryInput;
+  "trajectory.submit": TrajectoryInput;
+  "job.status": JobRef;
+  "job.pause": JobRef;
+  "job.resume": JobRef;
+  "job.step": JobRef;
+  "job.abort": JobRef;
+  "job.list": Empty;
+  "dataset.list": DatasetList;
+  "dataset.get": DatasetGet;
+  "dataset.frame": DatasetFrame;
+  "calibration.apply": Correct;
+  "calibration.get": CalibrationGet;
+  "calibration.list": Empty;
+  "calibration.revert": Empty;
+  "calibration.fit": CalibrationFit;
+  "calibration.align": CalibrationAlign;
+  "scene.save": SceneSave;
+  "scene.load": SceneLoad;
+  "rpc.discover": Empty;
+  "viewer.layers": Layers;
+  "viewer.theme": Theme;
+  "viewer.camera": Camera;
+  "viewer.feed": Feed;
+  "viewer.window": Window;
+  "viewer.ray": Ray;
+  "viewer.spectrum": Spectrum;
+  "viewer.plan": Plan;
+  "viewer.recorded": Recorded;
+  "viewer.recorded_image": RecordedImage;
+  "viewer.live": Live;
+  "viewer.compose": Compose;
+  "viewer.datasets": Datasets;
+  "viewer.scrub": Scrub;
+  "viewer.screenshot": Screenshot;
+  "viewer.export": Export;
+}
+export interface WireAnswers {
+  "session.hello": HelloResult;
+  "session.control": ControlResult;
+  "session.ping": Pong;
+  "state.get": State;
+  "state.subscribe": Nothing;
+  "state.unsubscribe": Nothing;
+  "axes.move": MoveResult;
+  "axes.jog": MoveResult;
+  "axes.set": AxisSetResult;
+  "axes.stop": Stopped;
+  "safety.estop": Stopped;
+  "safety.reset": State;
+  "clock.set": ClockState;
+  "tube.set": TubeState;
+  "camera.set": CameraState;
+  "sample.set": SampleResult;
+  "sample.list": SampleListResult;
+  "sample.mesh": SampleMeshResult;
+  "sample.upload": UploadResult;
+  "projection.get": Projection;
+  "projection.ray": RayResult;
+  "geometry.get": GeometryResult;
+  "exposure.predict": ExposurePrediction;
+  "script.check": CheckResult;
+  "script.submit": SubmitResult;
+  "trajectory.check": CheckResult;
+  "trajectory.submit": SubmitResult;
+  "job.status": JobStatus;
+  "job.pause": JobStatus;
+  "job.resume": JobStatus;
+  "job.step": JobStatus;
+  "job.abort": JobStatus;
+  "job.list": JobListResult;
+  "dataset.list": DatasetListResult;
+  "dataset.get": DatasetResult;
+  "dataset.frame": DatasetFrameResult;
+  "calibration.apply": CorrectionResult;
+  "calibration.get": CorrectionResult;
+  "calibration.list": CorrectionListResult;
+  "calibration.revert": CorrectionResult;
+  "calibration.fit": CalibrationFitResult;
+  "calibration.align": CalibrationAlignResult;
+  "scene.save": SceneResult;
+  "scene.load": State;
+  "rpc.discover": Discovery;
+}

