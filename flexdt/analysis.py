@@ -12,7 +12,7 @@ from pathlib import Path
 
 from flexdt.clients.calibration.align_dataset import Aligned, align_dataset
 from flexdt.clients.calibration.calibrate import UNKNOWN, Outcome, calibrate_datasets
-from flexdt.clients.calibration.markers import Scale, markers_alone
+from flexdt.clients.calibration.markers import Mark, Scale, markers_alone
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.datasets.dataset import load_dataset, read_tiffs
 from flexdt.clients.datasets.exchange import with_geometry
@@ -38,7 +38,7 @@ def calibrate(
     priors: Mapping[str, float] | None = None,
     start: Mapping[str, float] | None = None,
     geometry: ConeVec | str | PathLike[str] | None = None,
-    markers: str | PathLike[str] | None = None,
+    markers: str | PathLike[str] | Sequence[Mark] | None = None,
     scale: str | None = None,
     radius: float | None = None,
     per_frame: Sequence[str] = (),
@@ -56,8 +56,9 @@ def calibrate(
         start: offsets to begin with [mm, deg, 1], about which priors are centred.
         geometry: nominal geometry of all frames, or its file: in place of the data set's, or for a
             folder of anybody's TIFF images (see `read_tiffs`).
-        markers: CSV or NumPy file with the pixels at which markers were seen; default: they are
-            detected in the images.
+        markers: CSV or NumPy file with the pixels at which markers were seen, or such marks
+            themselves: (frame, marker, column, row, sigma), sigma None where it is not known;
+            default: they are detected in the images.
         scale: distance of two unknown markers, "A-B=MM" or "A-B=MM+-SIGMA".
         radius: of the spots of beads [px]; default: what the phantom says, or any.
         per_frame: parameters that may also move during the scan (dO_x, dO_y, dO_z, alpha, dS_x,
@@ -83,7 +84,8 @@ def calibrate(
     if data is None:
         if geometry is None or markers is None:
             raise TwinError("no data: allowed with geometry and markers")
-        sets = [markers_alone(geometry, Path(markers).stem)]
+        name = Path(markers).stem if isinstance(markers, str | PathLike) else "marks"
+        sets = [markers_alone(geometry, name)]
     else:
         several = [data] if isinstance(data, DataSet | str | PathLike) else list(data)
         sets = [_opened(d) if geometry is None else _posed(d, geometry) for d in several]

@@ -5,10 +5,12 @@ from __future__ import annotations
 from os import PathLike
 from pathlib import Path
 
-from flexdt.clients.cli.commands.scanner.script_commands import collisions
 from flexdt.machines import machine as find_machine
 from flexdt.machines import profile as find_profile
+from flexdt.phantoms import Phantom
 from flexdt.phantoms.samples import as_phantom
+from flexdt.twin.collision.plan_report import collision_check
+from flexdt.twin.collision.sample_hull import convex_pieces
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.outward import File
 from flexdt.twin.script import (
@@ -18,7 +20,7 @@ from flexdt.twin.script import (
     Script,
     plan_script,
 )
-from flexdt.twin.script.planning.dry_run import check_plan
+from flexdt.twin.script.planning.dry_run import CollisionCheck, check_plan
 from flexdt.twin.script.planning.plan import StartState
 
 
@@ -54,10 +56,7 @@ def plan(
     if isinstance(script, str) and "\n" not in script and _names_a_file(script):
         script = Path(script)
     chosen = machine if isinstance(machine, Machine) else find_machine(machine)
-    size = None
-    if sample is not None:
-        phantom = as_phantom(sample)
-        size = SampleSize.around(phantom.size_mm, phantom.name)
+    size = size_of(None if sample is None else as_phantom(sample))
     return plan_script(script, chosen, find_profile(profile, chosen), sample=size)
 
 
@@ -66,6 +65,16 @@ def check(plan: ScanPlan, sample: object = None) -> CheckReport:
     phantom = None if sample is None else as_phantom(sample)
     collision = collisions(phantom) if plan.machine.components else None
     return check_plan(plan, (), collision, "", plan.start != StartState.of(plan.machine))
+
+
+def size_of(phantom: Phantom | None) -> SampleSize | None:
+    """The size of a phantom on the stage; None leaves it to the script."""
+    return None if phantom is None else SampleSize.around(phantom.size_mm, phantom.name)
+
+
+def collisions(phantom: Phantom | None) -> CollisionCheck:
+    """The collision check with the phantom's mesh, or with the script's sample size."""
+    return collision_check(None if phantom is None else convex_pieces(phantom.mesh(around=True)))
 
 
 def read(path: File) -> bytes:

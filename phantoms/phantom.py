@@ -101,7 +101,7 @@ class Phantom(ArrayValue):
         """The scene side piece by piece: one closed mesh for each solid, with its material."""
         from flexdt.phantoms.surface import parts_of
 
-        return parts_of(self.scene, self.beads, self.surfaces, self.voxels)
+        return parts_of(self)
 
     def mesh(self, *, around: bool = False) -> trimesh.Trimesh:
         """The scene side: all surfaces as one mesh, holes turned inside out [mm, object frame].
@@ -114,7 +114,7 @@ class Phantom(ArrayValue):
         """
         from flexdt.phantoms.surface import joined, parts_of
 
-        return joined(parts_of(self.scene, self.beads, self.surfaces, self.voxels, around=around))
+        return joined(parts_of(self, around=around))
 
     def volume(self, voxel_mm: float | None = None, *, oversample: int = 2) -> Volume:
         """The X-ray side as voxels, computed anew at every call.

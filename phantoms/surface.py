@@ -10,24 +10,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import trimesh
 
-from flexdt.phantoms.pieces import PhantomError, Surface, Voxels
+from flexdt.phantoms.pieces import PhantomError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection.analytic_solids import (
     Box,
     ConvexPolyhedron,
     Cylinder,
     Ellipsoid,
-    Scene,
     Shape,
     Solid,
     Sphere,
 )
 from flexdt.twin.projection.convex import polyhedron_corners
+
+if TYPE_CHECKING:
+    from flexdt.phantoms.phantom import Phantom
 
 SPHERE_SUBDIVISIONS = 3
 CYLINDER_SECTIONS = 48
@@ -48,25 +50,19 @@ class Part:
     hole: bool
 
 
-def parts_of(
-    scene: Scene,
-    beads: FloatArray,
-    surfaces: Sequence[Surface],
-    voxels: Voxels | None,
-    *,
-    around: bool = False,
-) -> tuple[Part, ...]:
+def parts_of(phantom: Phantom, *, around: bool = False) -> tuple[Part, ...]:
     """See `Phantom.parts`; voxels appear as the box around them.
 
     Args:
-        scene: analytic solids.
-        beads: (k, 3) centres of balls that are never holes [mm].
-        surfaces: triangle meshes.
-        voxels: a grid, or None.
+        phantom: its beads are never holes.
         around: round solids lie inside their meshes, not the other way round.
     """
-    out = [Part(solid_mesh(s, around), s.material, hole=_is_hole(s, beads)) for s in scene.solids]
-    for surface in surfaces:
+    voxels = phantom.voxels
+    out = [
+        Part(solid_mesh(s, around), s.material, hole=_is_hole(s, phantom.beads))
+        for s in phantom.scene.solids
+    ]
+    for surface in phantom.surfaces:
         mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
         out.append(Part(mesh, surface.material, hole=False))
     if voxels is not None:

@@ -6,7 +6,7 @@ a program. The server maps the types to wire codes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Self
 
 
@@ -27,6 +27,22 @@ class TwinError(ValueError):
         self.message = message
         self.data: dict[str, object] = dict(data or {})
 
+    @classmethod
+    def of_shape(
+        cls, what: str, got: Sequence[int], allowed: Sequence[int | str], more: str = ""
+    ) -> Self:
+        """The error whose message is `what`, the shape it has and the one it must have, and `more`.
+
+        Example:
+            >>> print(TwinError.of_shape("points", (4, 2), ("...", 3), " [mm]"))
+            points of shape (4, 2); allowed: (..., 3) [mm]
+        """
+        wanted = f"({', '.join(map(str, allowed))}{',' if len(allowed) == 1 else ''})"
+        return cls(
+            f"{what} of shape {tuple(got)}; allowed: {wanted}{more}",
+            {"asked": list(got), "allowed": list(allowed)},
+        )
+
 
 class GeometryError(TwinError):
     """A geometry that no scanner can have (thesis 4.8.3): names the row and the check."""
@@ -38,6 +54,24 @@ class MachineFileError(TwinError):
 
 class LimitError(TwinError):
     """A target, speed or setting outside what the machine allows."""
+
+
+def require_within(what: str, value: float, low: float, high: float, unit: str = "") -> None:
+    """Check that a number is finite and from `low` to `high`.
+
+    Raises:
+        LimitError: it is not; the message says what it is.
+
+    Example:
+        >>> require_within("tube: kV", 300, 20, 240, "kV")
+        Traceback (most recent call last):
+        flexdt.twin.errors.LimitError: tube: kV is 300; allowed: 20 to 240 kV
+    """
+    if not low <= value <= high:
+        raise LimitError(
+            f"{what} is {value:g}; allowed: {low:g} to {high:g} {unit}".rstrip(),
+            {"asked": value, "allowed": [low, high], **({"unit": unit} if unit else {})},
+        )
 
 
 class CollisionError(TwinError):

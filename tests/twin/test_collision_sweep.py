@@ -719,6 +719,22 @@ def test_a_bound_in_pieces_falls_first_where_it_has_the_level_and_had_more_befor
         assert np.concatenate(seen).min() >= level - 1e-9
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_a_bound_that_only_dips_below_the_level_falls_there(seed: int) -> None:
+    """Each piece ends as high as it began, but one late piece is lower in its middle."""
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(8, 14))
+    lengths, depths = rng.uniform(0.3, 3.0, count), rng.uniform(0.1, 0.4, count)
+    dip = int(rng.integers(6, count))
+    depths[dip] = rng.uniform(0.6, 0.9)
+    growth = 8.0 * depths / lengths**2  # a parabola that starts and ends at the same height
+    found = _Bound(-growth * lengths / 2.0, growth).first_fall(Moment(0, 0.0), lengths, 1.0, 0.5)
+    assert found is not None
+    assert found.segment == dip
+    down = lengths[dip] / 2.0 * (1.0 - np.sqrt(1.0 - 0.5 / depths[dip]))
+    assert found.dt == pytest.approx(down)
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_the_end_that_is_nearest_along_a_direction_is_found(seed: int) -> None:
     rng = np.random.default_rng(seed)

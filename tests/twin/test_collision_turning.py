@@ -12,7 +12,7 @@ import pytest
 
 from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.collision.convex_solids import box, hull
-from flexdt.twin.collision.guard import scene_guard
+from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.relative import RelativeMotion
 from flexdt.twin.errors import CollisionError
 from flexdt.twin.machine.description import Machine, parse_machine, profile_of
@@ -74,7 +74,7 @@ def test_what_turns_round_between_two_turntables_is_seen(seed: int) -> None:
         made = machine(rng)
         profile = profile_of(made)
         bar = (box((2 * HALF, 2 * WIDE, 20.0)),)
-        guard = scene_guard(build_scene(made, profile, bar))
+        guard = SceneGuard(build_scene(made, profile, bar))
         twin = ScannerTwin(made, profile)
         twin.stand(Sample(), None, guard, 0.0)
         twin.move({"Z": rng.uniform(90.0, 130.0)}, 0.0)
@@ -123,7 +123,7 @@ def test_turns_after_the_first_are_not_looked_at_again(monkeypatch: pytest.Monke
         costs, ends = [], []
         for turns in (3, 90):
             twin = ScannerTwin(made, profile)
-            twin.stand(Sample(), None, scene_guard(build_scene(made, profile, (sample,))), 0.0)
+            twin.stand(Sample(), None, SceneGuard(build_scene(made, profile, (sample,))), 0.0)
             twin.move({"R": 45.0, "X": aside}, 0.0)
             twin.move({"Z": place}, start := twin.rest_time(0.0))
             start = twin.rest_time(start)

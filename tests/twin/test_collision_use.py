@@ -14,7 +14,7 @@ from swept import sweep
 from flexdt.phantoms import load_phantom
 from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.collision.convex_solids import box
-from flexdt.twin.collision.guard import scene_guard
+from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.obstacle_path import _Planner, direct_contact, free_moves
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.collision.sample_hull import Mesh, _clip, convex_pieces
@@ -160,7 +160,7 @@ def test_flat_and_bad_meshes() -> None:
 
 
 def scanner(sample: object = LEGO) -> ScannerTwin:
-    return ScannerTwin(M, P, guard=scene_guard(build_scene(M, P, [sample])))  # type: ignore[list-item]
+    return ScannerTwin(M, P, guard=SceneGuard(build_scene(M, P, [sample])))  # type: ignore[list-item]
 
 
 def test_a_move_into_the_detector_halts_free_and_blocks_the_third_time() -> None:
@@ -201,10 +201,10 @@ def test_a_jog_stops_short_of_contact() -> None:
 
 
 def test_a_guard_at_rest_tells_what_touches_already() -> None:
-    free = scene_guard(build_scene(M, P, [LEGO]))
+    free = SceneGuard(build_scene(M, P, [LEGO]))
     rest = {n: motion.at_rest(a.home) for n, a in M.axes.items()}
     assert free(rest, 5.0) is None
-    huge = scene_guard(build_scene(M, P, [box((1000, 1000, 20))]))
+    huge = SceneGuard(build_scene(M, P, [box((1000, 1000, 20))]))
     contact = huge(rest, 5.0)
     assert contact is not None
     assert "sample" in contact.pair
@@ -214,7 +214,7 @@ def test_a_guard_at_rest_tells_what_touches_already() -> None:
 def test_what_overlaps_already_may_come_apart_and_nothing_else() -> None:
     """A sample placed so that it stands in the detector tower: only a retreat gets it out."""
     long = box((40.0, 500.0, 40.0))
-    s = ScannerTwin(M, P, guard=scene_guard(build_scene(M, P, [long])))
+    s = ScannerTwin(M, P, guard=SceneGuard(build_scene(M, P, [long])))
     s.guard, guard = None, s.guard
     s.move({"mag_obj": 400.0, "mag_det": 560.0, "ver_tube": 100.0}, 0.0)
     now = s.rest_time(0.0)

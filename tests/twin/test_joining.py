@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from flexdt.twin.collision.collision_scene import Scene, build_scene
 from flexdt.twin.collision.convex_solids import Polytope, box, hull
-from flexdt.twin.collision.guard import SceneGuard, scene_guard
+from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.scene_search import clearance
 from flexdt.twin.errors import CollisionError, SafetyError
 from flexdt.twin.geometry.conventions import FloatArray
@@ -34,7 +34,7 @@ MOMENTS = 400
 
 
 def scanner(*stage: Polytope) -> ScannerTwin:
-    return ScannerTwin(M, P, guard=scene_guard(build_scene(M, P, stage)))
+    return ScannerTwin(M, P, guard=SceneGuard(build_scene(M, P, stage)))
 
 
 def moments(s: ScannerTwin, now: float) -> FloatArray:
@@ -84,7 +84,7 @@ def changed(seed: int) -> tuple[ScannerTwin, Scene, float, str, dict[str, Trajec
     shift = Correction("moved", "2026-01-01", Offsets(dD_z=rng.uniform(-20.0, 5.0)))
     scene = build_scene(M, P, [bar], shift.parameters)
     try:
-        change = s.stage_change(Sample("bar"), shift, scene_guard(scene), now).certified()
+        change = s.stage_change(Sample("bar"), shift, SceneGuard(scene), now).certified()
         halted = s.take_stage(change, now)
     except CollisionError:
         return s, scene, now, "refused", before, longest > 2
@@ -164,14 +164,14 @@ def test_a_programme_is_not_taken_over_where_the_world_has_changed_since_its_swe
 
 def test_a_start_that_touches_is_blocked_until_motion_has_brought_it_apart() -> None:
     s = ScannerTwin(M, P)
-    guard = scene_guard(build_scene(M, P, [box((1000.0, 1000.0, 20.0))]))
+    guard = SceneGuard(build_scene(M, P, [box((1000.0, 1000.0, 20.0))]))
     (warning,) = s.stand(Sample("slab"), None, guard, 0.0)
     assert "closer than the margin" in warning
     state = s.state(0.0).safety
     assert (state.state, "sample" in (state.contact or ())) == ("blocked", True)
     s.reset(0.0)
     assert s.state(0.0).safety.state == "blocked"
-    free = s.stage_change(Sample(), None, scene_guard(build_scene(M, P, ())), 0.0).certified()
+    free = s.stage_change(Sample(), None, SceneGuard(build_scene(M, P, ())), 0.0).certified()
     assert s.take_stage(free, 0.0) is None
     with pytest.raises(SafetyError, match="come apart"):
         s.move({"mag_det": 900.0}, 0.0)
@@ -234,7 +234,7 @@ def test_an_estop_of_category_0_coasts_says_what_it_hits_and_is_blocked_then() -
     coasting = dict.fromkeys(M.axes, 20.0)
     estop = M.estop.model_copy(update={"category": 0, "coasting": coasting})
     machine = M.model_copy(update={"estop": estop})
-    s = ScannerTwin(machine, P, guard=scene_guard(build_scene(M, P, ())))
+    s = ScannerTwin(machine, P, guard=SceneGuard(build_scene(M, P, ())))
     s.place({"mag_obj": 600.0, "mag_det": 760.0}, 0.0)
     with pytest.raises(CollisionError):
         s.move({"mag_det": 500.0}, 0.0)  # halts before the sample's base
@@ -337,7 +337,7 @@ def test_a_stage_change_that_is_one_halt_too_many_takes_the_halt_that_is_free() 
         now = rng.uniform(0.5, 4.0)
         scene = build_scene(M, P, [box((rng.uniform(250, 320), 20.0, 30.0))])
         with suppress(CollisionError):
-            change = s.stage_change(Sample("bar"), None, scene_guard(scene), now).certified()
+            change = s.stage_change(Sample("bar"), None, SceneGuard(scene), now).certified()
             if s.take_stage(change, now) is not None:
                 turned += 1
                 assert s.safety.state == "blocked"
@@ -355,7 +355,7 @@ def test_a_reset_waits_until_coasting_motors_rest() -> None:
     """Reset in motion, the state was ready when parts met, and a move passed its travel's end."""
     estop = M.estop.model_copy(update={"category": 0, "coasting": dict.fromkeys(M.axes, 10.0)})
     machine = M.model_copy(update={"estop": estop})
-    s = ScannerTwin(machine, P, guard=scene_guard(build_scene(M, P, ())))
+    s = ScannerTwin(machine, P, guard=SceneGuard(build_scene(M, P, ())))
     s.move({"mag_obj": 996.0}, 0.0)
     now = s.rest_time(0.0) - 1.0
     s.estop(now)
@@ -375,7 +375,7 @@ def test_a_certificate_of_another_stage_says_nothing_of_this_one() -> None:
     turn = {"rot_obj": (motion.move(0.0, 0.0, 90.0, 45.0, 22.5, 0.0),)}
     certificate = s.prepared(turn, 0.0).certified()
     assert certificate.contact is not None
-    empty = scene_guard(build_scene(M, P, ()))
+    empty = SceneGuard(build_scene(M, P, ()))
     s.take_stage(s.stage_change(Sample(), None, empty, 0.0).certified(), 0.0)
     with pytest.raises(SafetyError, match="another stage"):
         s.follow(certificate, 0.0)
@@ -402,7 +402,7 @@ def test_a_stage_that_overlaps_may_change_into_one_that_overlaps_less_and_no_dee
     """Overlaps had no depth: any other sample, or a correction, could go any deeper."""
 
     def bar(length: float) -> tuple[Sample, None, Guard]:
-        return Sample(f"{length}"), None, scene_guard(build_scene(M, P, [box((20, length, 20))]))
+        return Sample(f"{length}"), None, SceneGuard(build_scene(M, P, [box((20, length, 20))]))
 
     s = ScannerTwin(M, P)
     s.place({"mag_obj": 600.0, "mag_det": 700.0}, 0.0)
@@ -421,7 +421,7 @@ def test_a_retreat_of_a_sample_with_thousands_of_corners_is_judged_soon() -> Non
     ball = hull(150.0 * points / np.linalg.norm(points, axis=1)[:, None])
     s = ScannerTwin(M, P)
     s.place({"mag_obj": 600.0, "mag_det": 700.0}, 0.0)
-    s.stand(Sample("ball"), None, scene_guard(build_scene(M, P, [ball])), 0.0)
+    s.stand(Sample("ball"), None, SceneGuard(build_scene(M, P, [ball])), 0.0)
     with pytest.raises(CollisionError, match="nothing changes"):
         s.move({"mag_det": 690.0, "ver_det": 21.0}, 0.0)
     with pytest.raises(CollisionError, match="nothing changes"):
@@ -468,7 +468,7 @@ def test_what_was_stopped_by_a_late_clock_is_swept() -> None:
     rng = np.random.default_rng(3)
     for _ in range(60):
         now = 1.975e9 + rng.uniform(0.0, 1e6)
-        s = ScannerTwin(M, P, now=now, guard=scene_guard(build_scene(M, P, ())))
+        s = ScannerTwin(M, P, now=now, guard=SceneGuard(build_scene(M, P, ())))
         s.move({"tra_obj": 15.0, "tra_det": 5.0}, now)
         now += rng.uniform(0.05, 0.6)
         s.estop(now)

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
+import textwrap
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from image_quality import edge_mtf, photon_transfer, region
@@ -20,7 +25,7 @@ from flexdt.twin.physics.chain import (
 )
 from flexdt.twin.physics.effective import effective_beam
 from flexdt.twin.physics.exposure import ExposureSettings, frame_rng
-from flexdt.twin.physics.panel import LABELS, Panel, pattern
+from flexdt.twin.physics.panel import Panel, pattern
 from flexdt.twin.physics.spectrum import tube_spectrum
 
 ABS = Substance.of("abs", "C15H17N", 1.05)
@@ -331,7 +336,8 @@ def test_signal_to_noise():
 
 
 def test_every_default_says_where_it_comes_from():
-    assert set(LABELS) == set(Panel.__dataclass_fields__)
-    assert all(
-        text.split(":")[0] in ("measured", "literature", "assumed") for text in LABELS.values()
-    )
+    _, *body = ast.parse(textwrap.dedent(inspect.getsource(Panel))).body[0].body
+    fields = [(one, after) for one, after in pairwise(body) if isinstance(one, ast.AnnAssign)]
+    assert [one.target.id for one, _ in fields] == list(Panel.__dataclass_fields__)
+    for _, said in fields:
+        assert said.value.value.split(":")[0].rstrip(".") in ("Measured", "Literature", "Assumed")

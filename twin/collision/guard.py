@@ -25,7 +25,6 @@ from flexdt.twin.collision.collision_scene import Scene
 from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid
 from flexdt.twin.collision.paths import Path
 from flexdt.twin.collision.scene_search import (
-    Contact,
     Pair,
     bodies_touching,
     first_contact,
@@ -34,6 +33,7 @@ from flexdt.twin.collision.scene_search import (
 from flexdt.twin.collision.stages import Body
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.motion.profiles import Trajectory
+from flexdt.twin.scanner.safety import Contact
 
 STEPS = 400
 """Moments looked at along the motion, besides the ends of its segments."""
@@ -254,8 +254,3 @@ class SceneGuard:
                 gap = min(0.0, _Overlap.at(a, b, q).separation(q))
             out[scene.names(pair)] = min(gap, out.get(scene.names(pair), math.inf))
         return out
-
-
-def scene_guard(scene: Scene) -> SceneGuard:
-    """A guard that sweeps `scene`."""
-    return SceneGuard(scene)

@@ -16,11 +16,12 @@ from flexdt.twin.collision.collision_scene import Scene, build_scene
 from flexdt.twin.collision.convex_solids import Cylinder, Solid
 from flexdt.twin.collision.paths import Path, path_of
 from flexdt.twin.collision.relative import START, Moment
-from flexdt.twin.collision.scene_search import Contact, PathSearch, clearance_trace
+from flexdt.twin.collision.scene_search import PathSearch, clearance_trace
 from flexdt.twin.collision.sweep import sweep_pair
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.scanner.safety import Contact
 from flexdt.twin.script.commands import MoveAbsolute
 from flexdt.twin.script.planning.dry_run import Clearance, Collision, CollisionCheck
 from flexdt.twin.script.planning.plan import SampleSize, ScanPlan

@@ -18,32 +18,9 @@ from flexdt.twin.collision.paths import Path
 from flexdt.twin.collision.relative import START, RelativeMotion
 from flexdt.twin.collision.sweep import PairResult, refine_pair, sweep_pair
 from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.scanner.safety import Contact
 
 Pair = tuple[int, int]
-
-
-@dataclass(frozen=True)
-class Contact:
-    """Where a motion comes to the safety margin.
-
-    Attributes:
-        pair: names of the two components.
-        time: when [s].
-        positions: of every motor then [mm, deg].
-        last_free: positions at the last moment known to be free, a little before; where the
-            motion starts in contact, the start.
-        last_free_time: that moment [s].
-        clearance_mm: certified clearance at `time`.
-        free_before: whether there was a free moment before at all.
-    """
-
-    pair: tuple[str, str]
-    time: float
-    positions: Mapping[str, float]
-    last_free: Mapping[str, float]
-    last_free_time: float
-    clearance_mm: float
-    free_before: bool = True
 
 
 @dataclass(frozen=True)

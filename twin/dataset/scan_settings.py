@@ -53,6 +53,15 @@ class Figures:
         return self.sdd_mm / self.sod_mm
 
     @property
+    def stated(self) -> dict[str, Any]:
+        """The members of `ScanSettings` that say it."""
+        numbers = {name: value for name, value in vars(self).items() if name != "pixel_mm"}
+        return {
+            **numbers, "binned_pixel_mm": self.pixel_mm, "voxel_um": self.voxel_um,
+            "magnification": self.magnification,
+        }  # fmt: skip
+
+    @property
     def voxel_um(self) -> float:
         """pixel * SOD / SDD [um] (the thesis prints the ratio upside down)."""
         return 1000.0 * self.pixel_mm * self.sod_mm / self.sdd_mm
@@ -243,13 +252,7 @@ def settings_of(record: ScanRecord) -> ScanSettings:
         started=started.replace(microsecond=0, tzinfo=None),
         stopped=stopped.replace(microsecond=0, tzinfo=None),
         duration_minutes=float(round(record.duration_s / 60.0)),
-        cor_px=figures.cor_px,
-        vc_px=figures.vc_px,
-        hc_px=figures.hc_px,
-        sdd_mm=figures.sdd_mm,
-        sod_mm=figures.sod_mm,
-        voxel_um=figures.voxel_um,
-        magnification=figures.magnification,
+        **figures.stated,
         operator=record.operator,
         sample_name=sample.name,
         sample_owner=sample.owner,
@@ -276,7 +279,6 @@ def settings_of(record: ScanRecord) -> ScanSettings:
         original_pixel_mm=machine.detector.pitch_mm,
         mode=camera.mode,
         binning=camera.binning,
-        binned_pixel_mm=figures.pixel_mm,
         roi=camera.roi,
         motors=motor_lines(record),
         cancelled=not record.complete,

@@ -21,7 +21,8 @@ from flexdt.twin.exchange.geometry_json import read_json
 from flexdt.twin.exchange.number_tables import cone_vec_of
 from flexdt.twin.geometry.conventions import FloatArray, rotation_about
 
-MAX_FRAMES: Final = 1_000_000
+MOST: Final = 1_000_000
+"""Frames, rows and columns."""
 MAX_MINOR: Final = 2
 MM: Final = {"mm": 1.0, "m": 1000.0, "cm": 10.0, "dm": 100.0, "um": 1e-3, "nm": 1e-6}
 _RAD: Final = {"rad": 1.0, "deg": math.pi / 180.0}
@@ -96,9 +97,7 @@ class ScenarioReader:
     ) -> None:
         self._document, self._file, self._beside = document, file, beside
         self._check_version()
-        self._count = self._whole("acquisition", "number_of_projections")
-        if not 1 <= self._count <= MAX_FRAMES:
-            raise self._error("acquisition.number_of_projections", f"from 1 to {MAX_FRAMES}")
+        self._count = self._size("acquisition", "number_of_projections")
 
     def geometry(self) -> ScanGeometry:
         """The geometry of its frames."""
@@ -107,7 +106,7 @@ class ScenarioReader:
             raise self._error("geometry.source.type", "cone")
         parts = {name: self._part(name) for name in ("source", "detector", "stage")}
         pitch = [self._number(("detector", "pixel_pitch", axis), MM) for axis in "uv"]
-        cols, rows = (self._size(name) for name in ("columns", "rows"))
+        cols, rows = (self._size("detector", name) for name in ("columns", "rows"))
         bins = self._bins(rows, cols)
         if min(pitch) <= 0.0:
             raise self._error("detector.pixel_pitch", "above 0")
@@ -305,19 +304,11 @@ class ScenarioReader:
         value: object = self._at(*path[:-1]).get(path[-1])
         return self._value(value, ".".join(path), units)
 
-    def _size(self, name: str) -> int:
-        value = self._number(("detector", name), NUMBER)
-        if not value.is_integer() or not 1 <= value <= 1e6:
-            raise self._error(f"detector.{name}", "a whole number above 0")
+    def _size(self, *path: str) -> int:
+        value = self._number(path, NUMBER)
+        if not value.is_integer() or not 1 <= value <= MOST:
+            raise self._error(".".join(path), f"a whole number from 1 to {MOST}")
         return int(value)
-
-    def _whole(self, *path: str) -> int:
-        value = self._at(*path[:-1]).get(path[-1])
-        if isinstance(value, dict):
-            value = value.get("value")
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise self._error(".".join(path), "a whole number")
-        return value
 
     def _at(self, *path: str) -> Mapping[str, Any]:
         found: Any = self._document

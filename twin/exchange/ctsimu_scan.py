@@ -16,8 +16,8 @@ from flexdt.twin.attenuation.substances import Substance, mass_fractions, parse_
 from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import TwinError
 from flexdt.twin.exchange.ctsimu_read import (
-    MAX_FRAMES,
     MM,
+    MOST,
     NUMBER,
     STAGE,
     WORLD,
@@ -207,7 +207,7 @@ def _says_something(value: object) -> bool:
 class _ScanReader(ScenarioReader):
     def scan(self) -> ScenarioScan:
         self._notes: list[str] = []
-        size = [self._size(name) for name in ("rows", "columns")]
+        size = [self._size("detector", name) for name in ("rows", "columns")]
         bins = self._bins(*size)[::-1]
         geometry = self.geometry()
         self._substances = dict(self._material_of(one, f"materials[{i}]")
@@ -505,8 +505,8 @@ class _ScanReader(ScenarioReader):
     def _natural(self, *path: str, default: int = 1, least: int = 1) -> int:
         found = self._given(*path)
         value = default if found is None else found
-        if type(value) is not int or not least <= value <= MAX_FRAMES:
-            raise self._error(".".join(path), f"a whole number from {least} to {MAX_FRAMES}")
+        if type(value) is not int or not least <= value <= MOST:
+            raise self._error(".".join(path), f"a whole number from {least} to {MOST}")
         return value
 
     def _nothing(self, *path: str) -> None:

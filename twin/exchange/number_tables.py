@@ -54,10 +54,8 @@ def read_vectors_array(array: npt.NDArray[np.generic], file: str = "<array>") ->
         ExchangeError: another shape or kind.
     """
     if array.ndim != 2 or array.shape[1] != 12 or not _real(array):
-        raise ExchangeError(
-            f"{file}: an array of {array.dtype} with shape {array.shape}; allowed: numbers (n, 12)",
-            {"asked": list(array.shape), "allowed": ["n", 12]},
-        )
+        what = f"{file}: an array of {array.dtype}"
+        raise ExchangeError.of_shape(what, array.shape, ("n", 12), ", numbers")
     return cone_vec_of(array, file)
 
 
@@ -148,10 +146,8 @@ def read_tomosipo(
     shape = arrays["shape"]
     for name, array in zip(TOMOSIPO_NAMES[1:], vectors, strict=True):
         if array.ndim != 2 or array.shape != (len(vectors[0]), 3) or not _real(array):
-            raise ExchangeError(
-                f"{file}: {name} has shape {array.shape}; allowed: (n, 3) like the others",
-                {"asked": list(array.shape), "allowed": ["n", 3]},
-            )
+            what, like = f"{file}: {name}", " like the others"
+            raise ExchangeError.of_shape(what, array.shape, ("n", 3), like)
     if shape.shape != (2,) or not np.issubdtype(shape.dtype, np.integer) or shape.min() < 1:
         raise ExchangeError(f"{file}: shape must be two whole numbers (rows, columns)")
     source, detector, v, u = (np.asarray(a, dtype=np.float64)[:, ::-1] for a in vectors)

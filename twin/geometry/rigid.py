@@ -116,10 +116,7 @@ class Rigid:
             return other.moved(self.turn, self.shift)
         points = np.asarray(other, dtype=np.float64)
         if points.ndim == 0 or points.shape[-1] != 3:
-            raise GeometryError(
-                f"points of shape {points.shape}; allowed: (..., 3) [mm]",
-                {"asked": list(points.shape), "allowed": ["...", 3]},
-            )
+            raise GeometryError.of_shape("points", points.shape, ("...", 3), " [mm]")
         return points @ self.turn.T + self.shift
 
     def __eq__(self, other: object) -> bool:

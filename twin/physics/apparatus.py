@@ -6,12 +6,11 @@ the values that the chain works with: `TubeModel`, `Panel`, `CameraSettings`, `E
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 from flexdt.twin.attenuation.substances import Substance
-from flexdt.twin.errors import LimitError
+from flexdt.twin.errors import LimitError, require_within
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.physics.exposure import ExposureSettings
 from flexdt.twin.physics.panel import Panel
@@ -56,17 +55,18 @@ class Tube:
 
     def __post_init__(self) -> None:
         low, high = voltages()
-        _within("Tube", "kV", self.kV, low, high, "kV")
-        _within("Tube", "power_W", self.power_W, 1e-9, 1e6, "W")
+        require_within("Tube: kV", self.kV, low, high, "kV")
+        require_within("Tube: power_W", self.power_W, 1e-9, 1e6, "W")
         if self.spot_mm is not None:
-            _within("Tube", "spot_mm", self.spot_mm, 0.0, 10.0, "mm")
+            require_within("Tube: spot_mm", self.spot_mm, 0.0, 10.0, "mm")
         if self.mono_keV is not None:
             monochromatic(self.mono_keV)
         if self.filters is not None:
             layers = tuple(_filter(one) for one in self.filters)
             object.__setattr__(self, "filters", layers)
             for one in layers:
-                _within("Tube", f"filter {one.substance.name}", one.thickness_mm, 0.0, 1e3, "mm")
+                name = f"Tube: filter {one.substance.name}"
+                require_within(name, one.thickness_mm, 0.0, 1e3, "mm")
 
     def model(self, design: TubeModel | None = None) -> TubeModel:
         """Filters and focal spot; those of `design` where this tube states none.
@@ -152,7 +152,7 @@ class Detector:
         for name, (low, high) in _BOUNDS.items():
             value = getattr(self, name)
             if value is not None:
-                _within("Detector", name, value, low, high, "")
+                require_within(f"Detector: {name}", value, low, high)
         Substance.parse(self.scintillator)
         for name in ("bits", "averages", "serial"):
             if getattr(self, name) != int(getattr(self, name)):
@@ -261,11 +261,3 @@ def _filter(layer: tuple[str, float] | Filter) -> Filter:
         return layer
     material, thickness_mm = layer
     return Filter(Substance.parse(material), float(thickness_mm))
-
-
-def _within(what: str, name: str, value: float, low: float, high: float, unit: str) -> None:
-    if not (math.isfinite(value) and low <= value <= high):
-        raise LimitError(
-            f"{what}: {name} is {value:g}; allowed: {low:g} to {high:g} {unit}".rstrip(),
-            {"asked": value, "allowed": [low, high], "unit": unit},
-        )

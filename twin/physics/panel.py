@@ -1,15 +1,13 @@
 """The flat panel: light, charge, noise, blur, fixed pattern and the converter, with provenance.
 
 A pixel collects electrons in proportion to the energy its scintillator absorbs. `Panel` holds the
-constants; `LABELS` states for each whether it is measured, from the literature or assumed.
+constants, and says of each default whether it is measured, from the literature or assumed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +23,8 @@ from flexdt.twin.physics.spectrum import Filter
 
 @dataclass(frozen=True)
 class Panel:
-    """A CsI(Tl) panel; the defaults are for a Dexela 1512NDT. `LABELS` has their provenance.
+    """A CsI(Tl) panel; the defaults are for a Dexela 1512NDT. What stands below each says
+    where it comes from.
 
     Attributes:
         columns, rows, pitch_mm, bits: of the sensor, unbinned.
@@ -50,29 +49,53 @@ class Panel:
     """
 
     columns: int = 1944
+    """Literature: data sheet, thesis 2.3."""
     rows: int = 1536
+    """Literature: data sheet, thesis 2.3."""
     pitch_mm: float = 0.0748
+    """Literature: data sheet, thesis 2.3."""
     bits: int = 14
+    """Literature: thesis 2.3."""
     scintillator: str = "CsI@4.51"
+    """Literature: data sheet."""
     scintillator_mm: float = 0.15
+    """Assumed: a usual thickness for this family."""
     packing: float = 0.8
+    """Assumed: usual for columnar CsI."""
     swank: float = 0.9
+    """Assumed: usual for CsI(Tl)."""
     electrons_per_keV: float = 16.0
+    """Assumed: between 10 and 25 for CsI(Tl) on CMOS."""
     full_well_e: tuple[float, float] = (1.6e6, 0.5e6)
+    """Literature: Konstantinidis et al., NIM A 689 (2012) 12, the same sensor family."""
     read_noise_e: tuple[float, float] = (360.0, 165.0)
+    """Literature: Konstantinidis et al., NIM A 689 (2012) 12, the same family."""
     offset_counts: float = 100.0
+    """Assumed."""
     dark_e_per_s: float = 2000.0
+    """Assumed."""
     blur_mm: float = 0.06
+    """Assumed: half of the contrast at 3 line pairs a mm."""
     gain_sigma: float = 0.01
+    """Assumed."""
     offset_sigma_counts: float = 1.0
+    """Assumed."""
     dead_fraction: float = 1e-5
+    """Assumed."""
     lag_fraction: float = 0.002
+    """Assumed."""
     lag_s: float = 0.5
+    """Assumed."""
     long_lag_fraction: float = 0.0
+    """Assumed: none on CMOS; 0.001 to 0.004 of amorphous silicon (literature)."""
     long_lag_s: float = 10.0
+    """Assumed: between the 3 and 20 s of amorphous silicon (literature)."""
     serial: int = 1512
+    """Assumed."""
     row_pitch_mm: float | None = None
+    """Literature: as pitch_mm."""
     response: tuple[tuple[float, float], ...] = ()
+    """Assumed: computed for the scintillator."""
 
     @property
     def full_scale(self) -> int:
@@ -119,35 +142,6 @@ class Panel:
 def _well(camera: CameraSettings) -> int:
     """0 for modes of high full well, 1 for low ("High" means the full well: assumed)."""
     return 1 if camera.mode.strip().lower().endswith("low") else 0
-
-
-LABELS: Final[Mapping[str, str]] = {
-    "columns": "literature: data sheet, thesis 2.3",
-    "rows": "literature: data sheet, thesis 2.3",
-    "pitch_mm": "literature: data sheet, thesis 2.3",
-    "bits": "literature: thesis 2.3",
-    "scintillator": "literature: data sheet",
-    "scintillator_mm": "assumed: a usual thickness for this family",
-    "packing": "assumed: usual for columnar CsI",
-    "swank": "assumed: usual for CsI(Tl)",
-    "electrons_per_keV": "assumed: between 10 and 25 for CsI(Tl) on CMOS",
-    "full_well_e": "literature: Konstantinidis et al., NIM A 689 (2012) 12, the same sensor family",
-    "read_noise_e": "literature: Konstantinidis et al., NIM A 689 (2012) 12, the same family",
-    "offset_counts": "assumed",
-    "dark_e_per_s": "assumed",
-    "blur_mm": "assumed: half of the contrast at 3 line pairs a mm",
-    "gain_sigma": "assumed",
-    "offset_sigma_counts": "assumed",
-    "dead_fraction": "assumed",
-    "lag_fraction": "assumed",
-    "lag_s": "assumed",
-    "long_lag_fraction": "assumed: none on CMOS; 0.001 to 0.004 of amorphous silicon (literature)",
-    "long_lag_s": "assumed: between the 3 and 20 s of amorphous silicon (literature)",
-    "serial": "assumed",
-    "row_pitch_mm": "literature: as pitch_mm",
-    "response": "assumed: computed for the scintillator",
-}
-"""Provenance of each default."""
 
 
 def panel_of(spec: DetectorSpec) -> Panel:

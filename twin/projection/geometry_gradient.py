@@ -102,11 +102,8 @@ def geometry_change(
     geometry = as_cone_vec(cone_vec)
     moved = np.asarray(change, dtype=np.float64)
     if moved.shape not in ((12,), (len(geometry), 12)):
-        raise GeometryError(
-            f"the change of the geometry has shape {moved.shape}; allowed: ({len(geometry)}, 12) "
-            "or (12,)",
-            {"asked": list(moved.shape), "allowed": [len(geometry), 12]},
-        )
+        wanted = (len(geometry), 12)
+        raise GeometryError.of_shape("the geometry's change", moved.shape, wanted, " or (12,)")
     shape = geometry.of_shape(shape)
     result = np.zeros((len(geometry), *shape), np.float32)
     layout = volume.layout

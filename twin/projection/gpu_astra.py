@@ -96,19 +96,6 @@ class Resident:
         self._astra.data3d.delete([self._volume, self._images])
 
 
-def project(volume: Volume, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
-    """ASTRA's FP3D_CUDA of a volume, float32 (n, rows, cols).
-
-    Raises:
-        GeometryError: no GPU; asking ASTRA would end the process.
-    """
-    prepared = Resident(volume, cone_vec, shape)
-    try:
-        return np.ascontiguousarray(prepared.run().transpose(1, 0, 2))
-    finally:
-        prepared.close()
-
-
 def _link(astra: Any, array: Any) -> Any:
     """A contiguous array (z, y, x) on the device as ASTRA takes it."""
     z, y, x = array.shape

@@ -145,7 +145,7 @@ class Operator:
         """
         if not SMALLEST_TOLERANCE <= tolerance < 1.0:
             raise LimitError(
-                f"tolerance {tolerance:g}; allowed: {SMALLEST_TOLERANCE:g} to 1",
+                f"the tolerance is {tolerance:g}; allowed: {SMALLEST_TOLERANCE:g} to 1",
                 {"asked": tolerance, "allowed": [SMALLEST_TOLERANCE, 1.0]},
             )
         return norm_of(self._forward, self._back, np.ones(self.voxel_shape, np.float32), tolerance)
@@ -284,10 +284,7 @@ def _is_tensor(x: object) -> bool:
 
 def _check(got: tuple[int, ...], wanted: tuple[int, int, int], what: str) -> None:
     if got != wanted:
-        raise GeometryError(
-            f"{what} of shape {got}; allowed: {wanted} (flat vectors: linear_operator())",
-            {"asked": list(got), "allowed": list(wanted)},
-        )
+        raise GeometryError.of_shape(what, got, wanted, " (flat vectors: linear_operator())")
 
 
 def _same_grid(a: Volume | DeviceVolume, b: Volume) -> bool:

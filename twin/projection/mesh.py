@@ -76,17 +76,14 @@ def project_mesh(
     cone_vec: ConeVec | npt.ArrayLike,
     shape: Shape2 | None = None,
     out: Float32Array | None = None,
-    *,
-    mu_per_mm: float = 1.0,
 ) -> Float32Array:
-    """Path length through a mesh along every ray, times `mu_per_mm`.
+    """Path length [mm] through a mesh along every ray.
 
     Args:
         mesh: the solid.
         cone_vec: ConeVec or (n, 12) [mm], object frame.
         shape: detector (rows, cols); default: the geometry's own.
         out: float32 (n, rows, cols), C order, filled and returned if given.
-        mu_per_mm: attenuation [1/mm]; 1 gives path lengths in mm.
 
     Returns:
         float32 (n, rows, cols).
@@ -117,7 +114,6 @@ def project_mesh(
         mesh.faces,
         rays,
         np.ascontiguousarray(np.linalg.inv(basis)),
-        float(mu_per_mm),
         threads(),
         result,
     )

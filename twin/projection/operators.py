@@ -238,11 +238,8 @@ def check_projections(projections: npt.ArrayLike, n: int) -> Any:
     else:
         values = np.ascontiguousarray(projections, dtype=np.float32)
     if values.ndim != 3 or len(values) != n or 0 in values.shape[1:]:
-        raise GeometryError(
-            f"projections have shape {values.shape}; allowed: ({n}, rows, cols), one for each "
-            "row of cone_vec",
-            {"asked": list(values.shape), "allowed": [n, "rows", "cols"]},
-        )
+        wanted, why = (n, "rows", "cols"), ", one for each row of cone_vec"
+        raise GeometryError.of_shape("projections", values.shape, wanted, why)
     return values
 
 

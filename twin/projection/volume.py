@@ -60,25 +60,18 @@ class Layout:
     @property
     def resident(self) -> bool:
         """Whether the storage is on the CUDA device."""
-        return "on_device" in self.__dict__
+        return bool(self._there)
 
-    @cached_property
-    def on_device(self) -> Any:
-        """The storage on the CUDA device; uploaded once and cached with the layout."""
-        from flexdt.twin.projection import gpu
-
-        return gpu.upload(self.flat)
-
-    def on_devices(self, count: int) -> list[Any]:
+    def on_devices(self, count: int = 1) -> list[Any]:
         """The storage on each of the first devices; uploaded once and cached with the layout."""
         from flexdt.twin.projection import gpu
 
-        for device in range(1 + len(self._elsewhere), count):
-            self._elsewhere.append(gpu.upload(self.flat, device))
-        return [self.on_device, *self._elsewhere[: count - 1]]
+        for device in range(len(self._there), count):
+            self._there.append(gpu.upload(self.flat, device))
+        return self._there[:count]
 
     @cached_property
-    def _elsewhere(self) -> list[Any]:
+    def _there(self) -> list[Any]:
         return []
 
 
@@ -162,10 +155,8 @@ class Volume:
     def __post_init__(self) -> None:
         data = np.asarray(self.data, dtype=np.float32)
         if data.ndim != 3 or 0 in data.shape:
-            raise GeometryError(
-                f"volume data has shape {data.shape}; allowed: (nz, ny, nx), all positive",
-                {"asked": list(data.shape), "allowed": ["nz", "ny", "nx"]},
-            )
+            wanted = ("nz", "ny", "nx")
+            raise GeometryError.of_shape("volume data", data.shape, wanted, ", all positive")
         view = data.view()
         view.setflags(write=False)
         object.__setattr__(self, "data", view)
@@ -224,7 +215,7 @@ class Volume:
                 {"asked": device, "allowed": ["cpu", "cuda"]},
             )
         layout = self.layout
-        there = replace(layout, flat=gpu.demand(lambda: layout.on_device))
+        there = replace(layout, flat=gpu.demand(lambda: layout.on_devices()[0]))
         return DeviceVolume(there, self.shape, self.voxel_xyz, self.center_mm)
 
     def save(self, file: File) -> None:
@@ -308,10 +299,7 @@ class Volume:
             96.0
         """
         if data.shape != self.data.shape:
-            raise GeometryError(
-                f"values of shape {data.shape} do not fit a volume of {self.shape}",
-                {"asked": list(data.shape), "allowed": list(self.shape)},
-            )
+            raise GeometryError.of_shape("values", data.shape, self.shape, ", the volume's")
         return replace(self, data=np.asarray(data, dtype=np.float32))
 
     def in_order(self, order: tuple[int, int, int]) -> Volume:

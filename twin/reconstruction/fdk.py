@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -94,16 +94,6 @@ class Views:
         return n, wide, self.kept.stop - self.kept.start, self.up.shape[1]
 
 
-class Backprojector(Protocol):
-    """Weighs and filters views, and adds them to a volume."""
-
-    def add(self, views: Views) -> None:
-        """Add views."""
-
-    def volume(self) -> Float32Array:
-        """What has been added up, (ny, nx, nz)."""
-
-
 def device_takes(like: Volume, shape: tuple[int, int]) -> bool:
     """Whether there is a device that has room for the grid of `like` and images of (rows, cols)."""
     nz, ny, nx = like.shape
@@ -120,7 +110,7 @@ class OnProcessor:
         self._data = np.zeros((ny, nx, nz), np.float32)
 
     def add(self, views: Views) -> None:
-        """See `Backprojector`."""
+        """Weigh and filter views, and add them to the volume."""
         from flexdt.twin.reconstruction import fdk_kernels
 
         n, wide, cols, rows = views.sizes
@@ -134,7 +124,7 @@ class OnProcessor:
         )
 
     def volume(self) -> Float32Array:
-        """See `Backprojector`."""
+        """What has been added up, (ny, nx, nz)."""
         return self._data
 
 
@@ -181,7 +171,7 @@ class OnDevice:
         gpu.demand(prepare)
 
     def add(self, views: Views) -> None:
-        """See `Backprojector`."""
+        """See `OnProcessor`."""
         gpu.demand(lambda: self._add(views))
 
     def _add(self, views: Views) -> None:
@@ -243,7 +233,7 @@ class OnDevice:
         return part, copied
 
     def volume(self) -> Float32Array:
-        """See `Backprojector`."""
+        """See `OnProcessor`."""
         out = np.empty(self._shape, np.float32)
 
         def fetch() -> None:
@@ -271,13 +261,11 @@ def _taps(response: Float32Array, wide: int, more: int) -> FloatArray:
 
 def _grid(like: Volume) -> tuple[list[float], list[float]]:
     """Centre of the first voxel and steps (x, y, z) [mm]."""
-    nz, ny, nx = like.shape
-    steps = list(like.voxel_xyz)
-    counts = (nx, ny, nz)
-    first = [c - (n - 1) / 2 * d for c, n, d in zip(like.center_mm, counts, steps, strict=True)]
-    return first, steps
+    return [float(places[0]) for places in like.centers()], list(like.voxel_xyz)
 
 
+Backprojector = OnProcessor | OnDevice
+"""What weighs and filters views and adds them to a volume."""
 Window = Callable[[FloatArray], FloatArray]
 
 WINDOWS: Final[Mapping[str, Window]] = {

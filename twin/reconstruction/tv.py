@@ -35,6 +35,7 @@ from flexdt.twin.reconstruction.iterative import (
     ones,
     solved,
 )
+from flexdt.twin.signatures import with_arguments_of
 
 WEIGHT = 1e-2
 """Default strength as a part of max(A' b); see docs/operator.md for how it was chosen."""
@@ -75,37 +76,6 @@ class Minimised:
             f"<Minimised: {end} after {self.iterations} iterations, cost {self.costs[0]:.6g} to "
             f"{self.costs[-1]:.6g}>"
         )
-
-
-def tv(
-    projections: npt.ArrayLike,
-    cone_vec: ConeVec | npt.ArrayLike,
-    like: Volume | Grid,
-    *,
-    iterations: int = 100,
-    weight: float = WEIGHT,
-    tolerance: float = 1e-4,
-    subsets: int = 1,
-    start: Volume | None = None,
-    nonnegative: bool = True,
-    mask: npt.ArrayLike | None = None,
-    watch: Watch | None = None,
-) -> Volume:
-    """Least squares with total variation, see `minimise_tv`, of which this is the volume.
-
-    Examples:
-        >>> scan = ConeVec.circular(sod=600, sdd=1000, angles=12, shape=(8, 8), pixel=1)
-        >>> from flexdt.twin.projection import Operator
-        >>> grid = Grid((4, 4, 4), 1.0)
-        >>> images = Operator(scan, grid) @ np.full((4, 4, 4), 0.02)
-        >>> found = tv(images, scan, grid, weight=1e-4)
-        >>> bool(abs(found.data - 0.02).max() < 0.005)
-        True
-    """
-    return minimise_tv(
-        projections, cone_vec, like, iterations=iterations, weight=weight, tolerance=tolerance,
-        subsets=subsets, start=start, nonnegative=nonnegative, mask=mask, watch=watch,
-    ).volume  # fmt: skip
 
 
 def minimise_tv(
@@ -174,6 +144,22 @@ def minimise_tv(
         return _minimised(problem, kept, iterations, weight, tolerance, subsets, start, watch)
 
     return solved(problem, minimised)
+
+
+@with_arguments_of(minimise_tv)
+def tv(*args: Any, **options: Any) -> Volume:
+    """Least squares with total variation, see `minimise_tv`, of which this is the volume.
+
+    Examples:
+        >>> scan = ConeVec.circular(sod=600, sdd=1000, angles=12, shape=(8, 8), pixel=1)
+        >>> from flexdt.twin.projection import Operator
+        >>> grid = Grid((4, 4, 4), 1.0)
+        >>> images = Operator(scan, grid) @ np.full((4, 4, 4), 0.02)
+        >>> found = tv(images, scan, grid, weight=1e-4)
+        >>> bool(abs(found.data - 0.02).max() < 0.005)
+        True
+    """
+    return minimise_tv(*args, **options).volume
 
 
 def _minimised(
@@ -300,10 +286,7 @@ class Regular:
         else:
             allowed = np.ascontiguousarray(np.asarray(mask) != 0, dtype=np.uint8)
             if allowed.shape != like.shape:
-                raise GeometryError(
-                    f"the mask has shape {allowed.shape}; allowed: the grid's {like.shape}",
-                    {"asked": list(allowed.shape), "allowed": list(like.shape)},
-                )
+                raise GeometryError.of_shape("the mask", allowed.shape, like.shape, ", the grid's")
         edges = np.array(like.voxel_xyz[::-1])
         return cls(
             (edges.min() / edges).astype(np.float32),

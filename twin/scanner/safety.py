@@ -11,7 +11,7 @@ until a reset. `Guard` is the interface of contact detection; `collision` implem
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from flexdt.twin.errors import CollisionError, SafetyError
@@ -19,28 +19,28 @@ from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.scanner.state import Safety
 
 
-class Contact(Protocol):
-    """The first touch along planned trajectories."""
+@dataclass(frozen=True)
+class Contact:
+    """Where a motion comes to the safety margin.
 
-    @property
-    def pair(self) -> tuple[str, str]:
-        """Names of the two components."""
+    Attributes:
+        pair: names of the two components.
+        time: when [s].
+        positions: of every motor then [mm, deg].
+        last_free: positions at the last moment known to be free, a little before; where the
+            motion starts in contact, the start.
+        last_free_time: that moment [s].
+        clearance_mm: certified clearance at `time`.
+        free_before: whether there was a free moment before at all.
+    """
 
-    @property
-    def time(self) -> float:
-        """When they would touch (or come nearer than the margin) [s]."""
-
-    @property
-    def last_free(self) -> Mapping[str, float]:
-        """Motor positions at the last free moment before it [mm, deg]."""
-
-    @property
-    def last_free_time(self) -> float:
-        """That moment [s]."""
-
-    @property
-    def clearance_mm(self) -> float:
-        """Clearance of the two at `time`; 0 for an overlap."""
+    pair: tuple[str, str]
+    time: float
+    positions: Mapping[str, float]
+    last_free: Mapping[str, float]
+    last_free_time: float
+    clearance_mm: float
+    free_before: bool = True
 
 
 class Guard(Protocol):

@@ -621,10 +621,9 @@ class ScannerTwin:
         return AxisState(
             position=t.position(now),
             target=t.target,
-            velocity=t.velocity(now),
+            velocity=t.velocity(now) + 0.0,  # no negative zero
             moving=t.moving(now),
-            lower=axis.lower,
-            upper=axis.upper,
+            limits=(axis.lower, axis.upper),
             speed=drive.speed,
             acceleration=drive.acceleration,
             unit=axis.unit,
@@ -633,15 +632,14 @@ class ScannerTwin:
     def _virtual_state(self, name: str, other: AxisState, now: float) -> AxisState:
         """A virtual axis, read from the one motor it is defined by."""
         virtual = self.machine.virtual_axes[name]
-        ends = sorted(virtual.constant + virtual.factor * x for x in (other.lower, other.upper))
+        lower, upper = sorted(virtual.constant + virtual.factor * x for x in other.limits)
         return replace(
             other,
             position=virtual_reading(self.machine, name, self.positions(now)),
             target=virtual_reading(self.machine, name, self.targets(now)),
             velocity=virtual.factor * other.velocity + 0.0,  # no negative zero
-            lower=ends[0],
-            upper=ends[1],
+            limits=(lower, upper),
             speed=other.speed * abs(virtual.factor),
             acceleration=other.acceleration * abs(virtual.factor),
-            motor=False,
+            virtual=True,
         )

@@ -22,18 +22,17 @@ SafetyName = Literal["ready", "blocked", "estopped"]
 
 @dataclass(frozen=True)
 class AxisState:
-    """One motor, or a virtual axis (then `motor` is False): mm or deg, per second."""
+    """One motor or `virtual` axis: mm or deg, per second; the fields are those of the wire."""
 
     position: float
     target: float
     velocity: float
     moving: bool
-    lower: float
-    upper: float
+    limits: tuple[float, float]
     speed: float
     acceleration: float
     unit: str
-    motor: bool = True
+    virtual: bool = False
 
 
 @dataclass(frozen=True)

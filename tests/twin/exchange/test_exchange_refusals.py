@@ -129,7 +129,7 @@ def test_bad_tables() -> None:
     good = tomosipo_arrays(STILL)
     with pytest.raises(ExchangeError, match="lacks det_v"):
         read_tomosipo({k: v for k, v in good.items() if k != "det_v"})
-    with pytest.raises(ExchangeError, match="det_u has shape"):
+    with pytest.raises(ExchangeError, match="det_u of shape"):
         read_tomosipo(good | {"det_u": np.zeros((3, 3))})
 
 

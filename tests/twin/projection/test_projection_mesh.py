@@ -107,9 +107,9 @@ def test_meshes_that_do_not_close_are_refused() -> None:
         TriangleMesh(box.vertices[:, :2], box.faces)
 
 
-def test_mu_scales_and_out_is_filled(circle) -> None:
+def test_out_is_filled(circle) -> None:
     box = as_mesh(trimesh.creation.box((1.0, 1.0, 1.0)))
     out = np.empty((1, *SHAPE), np.float32)
     geometry = circle(1, 8.0, 16.0, 0.05)
-    assert project_mesh(box, geometry, SHAPE, out, mu_per_mm=0.2) is out
-    assert np.allclose(out, 0.2 * project_mesh(box, geometry, SHAPE))
+    assert project_mesh(box, geometry, SHAPE, out) is out
+    assert np.allclose(out, project_mesh(box, geometry, SHAPE))

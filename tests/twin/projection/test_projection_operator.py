@@ -68,8 +68,10 @@ def test_the_norm_is_the_largest_singular_value(operator, matrix, tolerance):
 
 
 def test_a_norm_beyond_single_precision(operator):
-    with pytest.raises(LimitError, match="tolerance 1e-09; allowed: 1e-05 to 1"):
+    with pytest.raises(LimitError, match="tolerance is 1e-09; allowed: 1e-05 to 1"):
         operator.norm(1e-9)
+    with pytest.raises(LimitError, match="tolerance is 1; "):
+        operator.norm(1.0)
 
 
 def test_an_operator_whose_rays_miss_the_grid(scan):

@@ -249,6 +249,7 @@ def test_dense_things_do_not_pull_the_outline(seed):
     assert abs(float((found - truth)[even & middle].mean())) / 0.02 < 0.004
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_triangles_wider_than_the_panel_come_out_even(seed):
     """Drawn ones, not centred, one with another material in it; 26 to 30 % off as ellipses."""

@@ -175,7 +175,7 @@ def test_few_noisy_views_of_few_materials():
     [({"weight": -1.0}, LimitError, "weight -1; allowed: 0 or more"),
      ({"tolerance": float("nan")}, LimitError, "tolerance nan"),
      ({"subsets": 0}, LimitError, "subsets 0; allowed: 1"),
-     ({"mask": np.ones((2, 2, 2))}, GeometryError, "the mask has shape")],
+     ({"mask": np.ones((2, 2, 2))}, GeometryError, "the mask of shape")],
 )  # fmt: skip
 def test_arguments_out_of_their_range(small, options, error, text):
     with pytest.raises(error, match=text):

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from flexdt.twin.attenuation.scattering import CrossSections, cross_sections
 from flexdt.twin.attenuation.substances import Substance
-from flexdt.twin.errors import GeometryError, LimitError
+from flexdt.twin.errors import GeometryError, LimitError, require_within
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.physics.chain import Chain, Expected, flux_of, mAs, weights_of
 from flexdt.twin.physics.exposure import ExposureSettings
@@ -79,12 +79,7 @@ class ScatterSettings:
                 {"asked": self.kind, "allowed": ["first", "mc"]},
             )
         for name, (low, high) in _BOUNDS.items():
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise LimitError(
-                    f"scatter: {name} is {value:g}; allowed: {low:g} to {high:g}",
-                    {"asked": value, "allowed": [low, high]},
-                )
+            require_within(f"scatter: {name}", getattr(self, name), low, high)
 
 
 _BOUNDS = {

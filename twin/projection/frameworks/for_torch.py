@@ -73,17 +73,11 @@ class TorchOperator:
         values = _tensor(values)
         rows = _tensor(self.geometry.rows if rows is None else rows)
         if rows.ndim != 2 or rows.shape[1] != 12:
-            raise GeometryError(
-                f"rows of shape {tuple(rows.shape)}; allowed: (n, 12)",
-                {"asked": list(rows.shape), "allowed": ["n", 12]},
-            )
+            raise GeometryError.of_shape("rows", rows.shape, ("n", 12))
         images = (len(rows), *self.detector_shape)
         wanted = images if self.transposed else self.like.shape
         if tuple(values.shape[-3:]) != wanted:
-            raise GeometryError(
-                f"values of shape {tuple(values.shape)}; allowed: (..., {str(wanted)[1:]}",
-                {"asked": list(values.shape), "allowed": list(wanted)},
-            )
+            raise GeometryError.of_shape("values", values.shape, ("...", *wanted))
         function = _Spread if self.transposed else _Project
         return function.apply(values, rows, self)
 

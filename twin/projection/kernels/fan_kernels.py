@@ -18,7 +18,7 @@ from flexdt.twin.projection.kernels import (
     fan_walk_kernels,
     siddon_kernels,
 )
-from flexdt.twin.projection.kernels.compiling import fetch_next, kernel, parallel, sources
+from flexdt.twin.projection.kernels.compiling import fetch_next, inline, kernel, parallel, sources
 from flexdt.twin.projection.kernels.fan_rays_kernels import (
     collect,
     columns_of,
@@ -32,49 +32,37 @@ from flexdt.twin.projection.kernels.fan_rays_kernels import (
 )
 from flexdt.twin.projection.kernels.fan_types import Box
 from flexdt.twin.projection.kernels.fan_walk_kernels import ZERO, walk
-from flexdt.twin.projection.kernels.siddon_kernels import open_column, project_one, spread_one
+from flexdt.twin.projection.kernels.siddon_kernels import open_column, walk_ray
 
 SOURCES = sources(fan_rays_kernels, fan_types, fan_walk_kernels, siddon_kernels)
 
 
-@kernel
-def project_fan(box, g, grid, found, rays, work, n, buffer):
-    """Integrals of one fan of n collected rays into the job's buffer."""
+@inline
+def carry_fan(box, g, grid, found, rays, work, n, buffer, transposed):
+    """Integrals of one fan of n collected rays into the job's buffer; transposed, adds the buffer's
+    values to the voxels.
+    """
     fan = describe(grid, found, n)
-    flat = box.flat
     if not fan.together:
         for q in range(n):
-            buffer[found.slot[q]] = project_one(box, g, found.row[q], found.column[q])
-        return
-    count = sort_by_slope(grid, fan, found, rays, work.bins, n)
-    if count == 0 or fan.j1 <= fan.j0:
-        return
-    start(grid, fan, rays, work, count)
-    walk(flat, box.spans, grid, fan, rays, work, count, False)
-    acc, slot, length = rays.acc, rays.slot, rays.length
-    for q in range(count):
-        buffer[slot[q]] = acc[q] * length[q]
-
-
-@kernel
-def spread_fan(box, g, grid, found, rays, work, n, buffer):
-    """The transpose of `project_fan`: adds the buffer's values to the voxels."""
-    fan = describe(grid, found, n)
-    flat = box.flat
-    if not fan.together:
-        for q in range(n):
-            value = buffer[found.slot[q]]
-            if value != ZERO:
-                spread_one(box, g, found.row[q], found.column[q], value)
+            at, r, c = found.slot[q], found.row[q], found.column[q]
+            if not transposed:
+                buffer[at] = walk_ray(box, g, r, c, ZERO, False)
+            elif buffer[at] != ZERO:
+                walk_ray(box, g, r, c, buffer[at], True)
         return
     count = sort_by_slope(grid, fan, found, rays, work.bins, n)
     if count == 0 or fan.j1 <= fan.j0:
         return
     start(grid, fan, rays, work, count)
     acc, slot, length = rays.acc, rays.slot, rays.length
-    for q in range(count):
-        acc[q] = buffer[slot[q]] * length[q]
-    walk(flat, box.spans, grid, fan, rays, work, count, True)
+    if transposed:
+        for q in range(count):
+            acc[q] = buffer[slot[q]] * length[q]
+    walk(box.flat, box.spans, grid, fan, rays, work, count, transposed)
+    if not transposed:
+        for q in range(count):
+            buffer[slot[q]] = acc[q] * length[q]
 
 
 @kernel
@@ -101,33 +89,26 @@ def take(image, buffer, starts, ends, width, top, bottom):
             buffer[at + c] = row[c]
 
 
-@kernel
-def project_job(box, g, lines, first, last, shadow, image, starts, ends, found, rays, work, buffer):
-    """Fill the columns of one image between two lines."""
+@inline
+def work_on(
+    box, g, lines, first, last, shadow, image, starts, ends, found, rays, work, buffer, transposed
+):
+    """A job: fill the columns of one image between two lines; transposed, from the image."""
     rows, cols = image.shape
     width = columns_of(lines, first, last, cols, starts, ends)
     top, bottom = shadow[0], shadow[1]
-    for i in range((bottom - top) * width):
-        buffer[i] = ZERO
+    if transposed:
+        take(image, buffer, starts, ends, width, top, bottom)
+    else:
+        for i in range((bottom - top) * width):
+            buffer[i] = ZERO
     for line in range(first, last):
         grid = oriented(box, g, lines, line, rows)
         n = collect(found, grid, g, lines, line, starts, width, shadow)
         if n > 0:
-            project_fan(box, g, grid, found, rays, work, n, buffer)
-    put(image, buffer, starts, ends, width, top, bottom)
-
-
-@kernel
-def spread_job(box, g, lines, first, last, shadow, image, starts, ends, found, rays, work, buffer):
-    """The transpose of `project_job`."""
-    rows, cols = image.shape
-    width = columns_of(lines, first, last, cols, starts, ends)
-    take(image, buffer, starts, ends, width, shadow[0], shadow[1])
-    for line in range(first, last):
-        grid = oriented(box, g, lines, line, rows)
-        n = collect(found, grid, g, lines, line, starts, width, shadow)
-        if n > 0:
-            spread_fan(box, g, grid, found, rays, work, n, buffer)
+            carry_fan(box, g, grid, found, rays, work, n, buffer, transposed)
+    if not transposed:
+        put(image, buffer, starts, ends, width, top, bottom)
 
 
 def _entry_points(key: int):  # type: ignore[no-untyped-def]
@@ -148,9 +129,9 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
             job = fetch_next(counter)
             while job < len(jobs):
                 view, first, last = jobs[job]
-                project_job(
+                work_on(
                     box, views[view], lines, first, last, shadows[view], out[view],
-                    starts, ends, found, rays, work, buffer,
+                    starts, ends, found, rays, work, buffer, False,
                 )  # fmt: skip
                 job = fetch_next(counter)
 
@@ -188,9 +169,9 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                         view, first, last = jobs[job]
                         g[:] = views[view]
                         g[2] -= low
-                        spread_job(
+                        work_on(
                             piece, g, lines, first, last, shadows[part, view], values[view],
-                            starts, ends, found, rays, work, buffer,
+                            starts, ends, found, rays, work, buffer, True,
                         )  # fmt: skip
                     item = fetch_next(counter)
 

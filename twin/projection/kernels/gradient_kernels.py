@@ -41,7 +41,7 @@ def faces(s, d, n):
 
 @kernel
 def walk_jumps(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz):
-    """Walks like `siddon_kernels.ray_integral` and gathers what the derivatives need.
+    """Walks like `siddon_kernels.walk_ray` and gathers what the derivatives need.
 
     Returns:
         sum of values times ray parameter; then sum of J and sum of J t over the planes across x,

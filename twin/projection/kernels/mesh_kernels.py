@@ -137,8 +137,8 @@ def make_band(vertices, cols):
 
 
 @parallel
-def project_triangles(vertices, faces, rays, inverses, scale, workers, out):
-    """Fill out (n, rows, cols) with path length [mm] times scale.
+def project_triangles(vertices, faces, rays, inverses, workers, out):
+    """Fill out (n, rows, cols) with path lengths [mm].
 
     rays (n, 12) [mm]: source, first pixel minus source, u, v; inverses (n, 3, 3): of the matrix
     with columns u, v, first pixel minus source.
@@ -168,5 +168,5 @@ def project_triangles(vertices, faces, rays, inverses, scale, workers, out):
                     dy = g[4] + c * g[7] + r * g[10]
                     dz = g[5] + c * g[8] + r * g[11]
                     length = math.sqrt(dx * dx + dy * dy + dz * dz)
-                    out[view, r, c] = np.float32(scale * total * length)
+                    out[view, r, c] = np.float32(total * length)
             job = fetch_next(counter)

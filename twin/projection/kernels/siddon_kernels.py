@@ -55,48 +55,6 @@ def first_step(s, d, n, enter, hop):
 
 
 @kernel
-def ray_integral(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz):
-    """Sum of values times ray parameter along s + t d, 0 <= t <= 1, in a box [0, n] of unit voxels.
-
-    Multiply by the length of d [mm] for the line integral. A component of d may be zero.
-    """
-    enter, leave = clip_to_box(nx, ny, nz, sx, sy, sz, dx, dy, dz)
-    if leave <= enter:
-        return 0.0
-    ix, left_x, next_x, every_x, hop_x = first_step(sx, dx, nx, enter, step_x)
-    iy, left_y, next_y, every_y, hop_y = first_step(sy, dy, ny, enter, step_y)
-    iz, left_z, next_z, every_z, hop_z = first_step(sz, dz, nz, enter, 1)
-    p = base + ix * step_x + iy * step_y + iz
-    t = enter
-    total = 0.0
-    while True:
-        # The nearest of the three next crossings ends the piece of the ray in voxel p.
-        upto = min(next_x, min(next_y, next_z))
-        if upto >= leave:
-            return total + (leave - t) * flat[p]
-        total += (upto - t) * flat[p]
-        t = upto
-        if next_x == upto:
-            left_x -= 1
-            if left_x == 0:
-                return total
-            next_x += every_x
-            p += hop_x
-        elif next_y == upto:
-            left_y -= 1
-            if left_y == 0:
-                return total
-            next_y += every_y
-            p += hop_y
-        else:
-            left_z -= 1
-            if left_z == 0:
-                return total
-            next_z += every_z
-            p += hop_z
-
-
-@kernel
 def open_column(flat, marks, at, first, nz):
     """Zero a voxel column, flat[first : first + nz], before the first addition to it.
 
@@ -105,52 +63,6 @@ def open_column(flat, marks, at, first, nz):
     if marks[at] == 0:
         marks[at] = 1
         flat[first : first + nz] = np.float32(0)
-
-
-@kernel
-def ray_spread(flat, marks, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz, value):
-    """The transpose of `ray_integral`: adds value times ray parameter to each voxel passed.
-
-    marks: two for each voxel column of the box, see `open_column`.
-    """
-    enter, leave = clip_to_box(nx, ny, nz, sx, sy, sz, dx, dy, dz)
-    if leave <= enter:
-        return
-    ix, left_x, next_x, every_x, hop_x = first_step(sx, dx, nx, enter, step_x)
-    iy, left_y, next_y, every_y, hop_y = first_step(sy, dy, ny, enter, step_y)
-    iz, left_z, next_z, every_z, hop_z = first_step(sz, dz, nz, enter, 1)
-    p = base + ix * step_x + iy * step_y + iz
-    t = enter
-    column, mark = p - iz, 2 * (iy * nx + ix)
-    mark_x, mark_y = (2 if hop_x > 0 else -2), (2 * nx if hop_y > 0 else -2 * nx)
-    open_column(flat, marks, mark, column, nz)
-    while True:
-        upto = min(next_x, min(next_y, next_z))
-        if upto >= leave:
-            flat[p] += np.float32((leave - t) * value)
-            return
-        flat[p] += np.float32((upto - t) * value)
-        t = upto
-        if next_x == upto:
-            left_x -= 1
-            if left_x == 0:
-                return
-            next_x += every_x
-            p, column, mark = p + hop_x, column + hop_x, mark + mark_x
-            open_column(flat, marks, mark, column, nz)
-        elif next_y == upto:
-            left_y -= 1
-            if left_y == 0:
-                return
-            next_y += every_y
-            p, column, mark = p + hop_y, column + hop_y, mark + mark_y
-            open_column(flat, marks, mark, column, nz)
-        else:
-            left_z -= 1
-            if left_z == 0:
-                return
-            next_z += every_z
-            p += hop_z
 
 
 @kernel
@@ -163,25 +75,57 @@ def ray_of(box, g, r, c):
     return dx, dy, dz, math.sqrt(x * x + y * y + z * z)
 
 
-@kernel
-def project_one(box, g, r, c):
-    """Line integral of the ray to pixel (r, c)."""
+@inline
+def walk_ray(box, g, r, c, value, transposed):
+    """Line integral of the ray to pixel (r, c); transposed, adds value times its length in each
+    voxel to that voxel, and box.spans are the marks of `open_column`, two for each voxel column.
+    """
     dx, dy, dz, length = ray_of(box, g, r, c)
-    t = ray_integral(
-        box.flat, box.base, box.hop_x, box.hop_y, box.nx, box.ny, box.nz,
-        g[0], g[1], g[2], dx, dy, dz,
-    )  # fmt: skip
-    return np.float32(t * length)
-
-
-@kernel
-def spread_one(box, g, r, c, value):
-    """The transpose of `project_one`; box.spans are the marks of `open_column`."""
-    dx, dy, dz, length = ray_of(box, g, r, c)
-    ray_spread(
-        box.flat, box.spans, box.base, box.hop_x, box.hop_y, box.nx, box.ny, box.nz,
-        g[0], g[1], g[2], dx, dy, dz, value * length,
-    )  # fmt: skip
+    nx, ny, nz = box.nx, box.ny, box.nz
+    enter, leave = clip_to_box(nx, ny, nz, g[0], g[1], g[2], dx, dy, dz)
+    if leave <= enter:
+        return np.float32(0)
+    ix, left_x, next_x, every_x, hop_x = first_step(g[0], dx, nx, enter, box.hop_x)
+    iy, left_y, next_y, every_y, hop_y = first_step(g[1], dy, ny, enter, box.hop_y)
+    iz, left_z, next_z, every_z, hop_z = first_step(g[2], dz, nz, enter, 1)
+    flat, marks = box.flat, box.spans
+    column, mark = box.base + ix * box.hop_x + iy * box.hop_y, 2 * (iy * nx + ix)
+    mark_x, mark_y = (2 if hop_x > 0 else -2), (2 * nx if hop_y > 0 else -2 * nx)
+    p, t, total, scaled = column + iz, enter, 0.0, value * length
+    if transposed:
+        open_column(flat, marks, mark, column, nz)
+    while True:
+        # The nearest of the three next crossings ends the piece of the ray in voxel p.
+        upto = min(next_x, min(next_y, next_z))
+        piece = min(upto, leave) - t
+        if transposed:
+            flat[p] += np.float32(piece * scaled)
+        else:
+            total += piece * flat[p]
+        if upto >= leave:
+            break
+        t = upto
+        if next_x == upto:
+            left_x -= 1
+            if left_x == 0:
+                break
+            next_x += every_x
+            p, column, mark = p + hop_x, column + hop_x, mark + mark_x
+        elif next_y == upto:
+            left_y -= 1
+            if left_y == 0:
+                break
+            next_y += every_y
+            p, column, mark = p + hop_y, column + hop_y, mark + mark_y
+        else:
+            left_z -= 1
+            if left_z == 0:
+                break
+            next_z += every_z
+            p += hop_z
+        if transposed:
+            open_column(flat, marks, mark, column, nz)
+    return np.float32(total * length)
 
 
 @parallel
@@ -198,7 +142,7 @@ def project_rays(box, views, chosen, out, tile):
         first = job % tiles * tile
         for c in range(first, min(cols, first + tile)):
             for r in range(rows):
-                out[view, r, c] = project_one(box, views[view], r, c)
+                out[view, r, c] = walk_ray(box, views[view], r, c, np.float32(0), False)
 
 
 @parallel
@@ -220,4 +164,4 @@ def spread_rays(box, views, chosen, values, slices, marks):
             for c in range(cols):
                 for r in range(rows):
                     if values[view, r, c] != np.float32(0):
-                        spread_one(piece, g, r, c, values[view, r, c])
+                        walk_ray(piece, g, r, c, values[view, r, c], True)
