@@ -1,7 +1,8 @@
-"""Files that appear under their name only when they are whole."""
+"""Files that appear under their name only when they are whole, and room for them."""
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 
@@ -10,3 +11,16 @@ def write_whole(path: Path, content: str | bytes) -> None:
     part = path.with_name(path.name + ".part")
     part.write_bytes(content.encode() if isinstance(content, str) else content)
     part.replace(path)
+
+
+def nearest_there(path: Path) -> Path:
+    """`path` if it is there, else the nearest folder above it that is."""
+    there = path.absolute()
+    while not there.exists():
+        there = there.parent
+    return there
+
+
+def free_bytes(path: Path) -> int:
+    """Bytes free where `path` is, or will be."""
+    return shutil.disk_usage(nearest_there(path)).free

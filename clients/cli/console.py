@@ -13,7 +13,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -52,25 +52,19 @@ def warn(texts: Iterable[str], about: object = None) -> None:
 
 
 def emit(document: object) -> None:
-    """Write the JSON document of `--json`; numbers that are not finite become null."""
-    say(json.dumps(plain(document), indent=2, allow_nan=False))
+    """Write the JSON document of `--json`."""
+    say(as_json(document))
 
 
-def plain(value: Any) -> Any:
-    """Convert a value to JSON's types: numbers, text, lists and objects."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, str | bool | int) or value is None:
-        return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if hasattr(value, "model_dump"):
-        return plain(value.model_dump(mode="json"))
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    if isinstance(value, Sequence):
-        return [plain(item) for item in value]
-    return str(value)
+def as_json(document: object) -> str:
+    """A document as JSON; numbers that are not finite become null, other things text."""
+    from pydantic_core import to_jsonable_python
+
+    def plain(value: Any) -> object:
+        return value.tolist() if hasattr(value, "tolist") else str(value)
+
+    known = to_jsonable_python(document, by_alias=False, inf_nan_mode="null", fallback=plain)
+    return json.dumps(known, indent=2, allow_nan=False)
 
 
 def table(rows: Iterable[Sequence[object]], header: Sequence[str] = ()) -> str:

@@ -115,21 +115,31 @@ def speed_up(word: str) -> float | Literal["max"]:
     return value
 
 
-def triple(word: str, what: str, form: str) -> tuple[float, float, float]:
-    """Three finite numbers, separated by commas.
+def numbers(
+    word: str, what: str, form: str, *counts: int, by: str = ",", whole: bool = False
+) -> list[float]:
+    """A list of finite numbers.
 
     Args:
         word: from the command line.
         what: is listed, for errors.
         form: of the list with an example, for errors: `X,Y,Z, e.g. 0,0,-5.5`.
+        counts: how many there may be.
+        by: what separates them.
+        whole: they are whole and above 0.
 
     Raises:
-        typer.BadParameter: another count, or a part that is not a finite number.
+        typer.BadParameter: another count, or a part that is no such number.
     """
-    parts = names(word)
-    if len(parts) != 3:
+    parts = [part.strip() for part in word.lower().split(by)]
+    if len(parts) not in counts or (whole and not all(p.isdecimal() and int(p) for p in parts)):
         raise typer.BadParameter(f"{what} {word!r} is not {form}")
-    x, y, z = (number(part, what) for part in parts)
+    return [number(part, what) for part in parts]
+
+
+def triple(word: str, what: str, form: str) -> tuple[float, float, float]:
+    """Three of `numbers`."""
+    x, y, z = numbers(word, what, form, 3)
     return x, y, z
 
 

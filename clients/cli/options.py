@@ -37,9 +37,6 @@ ProfileName = Annotated[
     str | None,
     typer.Option("--profile", metavar="NAME", help="Calibration profile: zero offsets."),
 ]
-Phantom = Annotated[
-    str | None, typer.Option("--phantom", metavar="NAME or FILE", help="What was scanned.")
-]
 Free = Annotated[
     str | None,
     typer.Option("--free", metavar="P,P,...", help="Parameters to estimate; default: six."),
@@ -53,10 +50,6 @@ Geometry = Annotated[
     typer.Option(
         "--geometry", metavar="FILE", help="Instead of the data set's: see flexdt import."
     ),
-]
-SpeedUp = Annotated[
-    str | None,
-    typer.Option("--speed-up", metavar="X or max", help="Twin seconds per second of yours."),
 ]
 Jobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Processes; one for each core.")]
 Scheduler = Annotated[

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from flexdt.clients.client import twin_methods as m
-from flexdt.clients.client.flows import Ask, Effect, Flow, Sleep, Tell, adrive
+from flexdt.clients.client.flows import Flow, adrive
 from flexdt.clients.client.kept_connection import KeptConnection
 from flexdt.clients.client.transport import ConnectionLost
 from flexdt.clients.client.twin_methods import FINAL_STATES
@@ -141,17 +141,7 @@ class ConnectedTwin:
 
     async def run(self, flow: Flow[_R]) -> _R:
         """The result of one of the client's methods (`twin_methods`); raises as `ask`."""
-        return await adrive(flow, self._perform)
-
-    async def _perform(self, effect: Effect) -> object:
-        match effect:
-            case Ask(method, params):
-                return await self.ask(method, params)
-            case Sleep(seconds):
-                await asyncio.sleep(seconds)
-            case Tell(function, args):
-                function(*args)
-        return None
+        return await adrive(flow, lambda asked: self.ask(asked.method, asked.params))
 
     async def state(self) -> State:
         """The twin's present state."""

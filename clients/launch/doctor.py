@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import platform
 import re
-import shutil
 import socket
 import tempfile
 import time
@@ -18,6 +17,8 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Final, Literal
+
+from flexdt.clients.whole_files import free_bytes, nearest_there
 
 Verdict = Literal["ok", "warning", "error"]
 WORST_ERROR: Final = 1e-5
@@ -153,9 +154,7 @@ def listening(what: str, port: int) -> Checked:
 
 def disk(data: Path) -> Checked:
     """Whether data sets can be written: room, rights, speed of a flush."""
-    folder = data.absolute()
-    while not folder.exists():
-        folder = folder.parent
+    folder = nearest_there(data)
     try:
         with tempfile.NamedTemporaryFile(dir=folder) as file:
             file.write(b"\0" * (1 << 20))
@@ -165,7 +164,7 @@ def disk(data: Path) -> Checked:
             took = time.perf_counter() - begun
     except OSError as error:
         return Checked("disk", "error", f"{folder} cannot be written: {error.strerror}", "--data")
-    free = shutil.disk_usage(folder).free
+    free = free_bytes(folder)
     found = f"{folder}: {free / 2**30:.1f} GiB free, 1 MiB reaches the disk in {1000 * took:.1f} ms"
     if free < LITTLE_ROOM:
         return Checked("disk", "warning", found, "a scan of 1500 frames takes 2 to 4 GiB")

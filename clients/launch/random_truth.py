@@ -49,6 +49,8 @@ def read(path: Path) -> dict[str, float]:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except tomllib.TOMLDecodeError as error:
         raise CommandError(f"{path}: not valid TOML: {error}") from None
+    except UnicodeDecodeError:
+        raise CommandError(f"{path}: no UTF-8 text") from None
     problems = []
     for name, value in content.items():
         if name not in NAMES:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.collision.convex_solids import box
-from flexdt.twin.collision.guard import scene_guard
+from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.errors import CollisionError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
@@ -100,7 +100,7 @@ class Lab:
     ) -> None:
         self.machine = builtin_machine() if machine is None else machine
         profile = profile_of(self.machine)
-        guard = scene_guard(build_scene(self.machine, profile, (box(size_mm),)))
+        guard = SceneGuard(build_scene(self.machine, profile, (box(size_mm),)))
         self.scanner = ScannerTwin(self.machine, profile, guard=guard)
         height = self.machine.sample_height_mm
         self.scanner.place({"ver_tube": height - profile.src_ort, "ver_det": height}, 0.0)

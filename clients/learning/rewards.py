@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -44,31 +44,6 @@ COARSE: Final = 10
 """Columns along each side of the model that a planner's forecast of quality uses."""
 
 
-class Task(Protocol):
-    """The interface of a task to its environment."""
-
-    size_mm: tuple[float, float, float]
-    features: int
-
-    def reset(self, lab: Lab, rng: np.random.Generator) -> None:
-        """A new hidden truth."""
-
-    def add(self, lab: Lab, poses: Poses, rng: np.random.Generator) -> float:
-        """Take one frame; what it was worth."""
-
-    def state(self) -> Float32Array:
-        """What an agent may know, (features,) in [-1, 1]."""
-
-    def show(self, lab: Lab, poses: Poses) -> Float32Array:
-        """Line integrals on the coarse detector, noise aside, (rows, cols)."""
-
-    def forecast(self, lab: Lab, poses: Poses) -> FloatArray:
-        """Expected gain of each of n poses, (n,), from what an agent may know."""
-
-    def info(self) -> dict[str, float]:
-        """Figures of the episode so far."""
-
-
 class InformationTask:
     """Calibrate with the LEGO phantom: worth is the Fisher information gained [nats].
 
@@ -98,7 +73,7 @@ class InformationTask:
         self._information = np.eye(len(SIX)) / PRIOR**2
 
     def add(self, lab: Lab, poses: Poses, rng: np.random.Generator) -> float:
-        """See `Task`."""
+        """Take one frame; what it was worth."""
         before = _log_det(self._information)
         self._information = self._information + self._of(lab, poses, self._truth)[0]
         return 0.5 * (_log_det(self._information) - before)
@@ -113,7 +88,7 @@ class InformationTask:
         return np.asarray(np.clip(2.0 * (np.log10(sigma) + 3.0) / span - 1.0, -1, 1), np.float32)
 
     def show(self, lab: Lab, poses: Poses) -> Float32Array:
-        """See `Task`."""
+        """Line integrals on the coarse detector, noise aside, (rows, cols)."""
         cone = lab.small(poses, self._truth)
         return np.asarray(project_scene(self.phantom.scene, cone, lab.small_shape)[0])
 
@@ -179,7 +154,7 @@ class QualityTask:
         self._start(phantom.volume(SIDE_MM / GRID), phantom.scene)
 
     def add(self, lab: Lab, poses: Poses, rng: np.random.Generator) -> float:
-        """See `Task`."""
+        """See `InformationTask`."""
         cone = lab.small(poses, NOMINAL)
         image = noisy(self.show(lab, poses), PHOTONS, rng)
         self.images.append(image)
@@ -204,7 +179,7 @@ class QualityTask:
         return np.array([min(self._residual, 1.0), min(max(known, 0.0), 1.0)], np.float32)
 
     def show(self, lab: Lab, poses: Poses) -> Float32Array:
-        """See `Task`."""
+        """See `InformationTask`."""
         cone = lab.small(poses, NOMINAL)
         return np.asarray(project_scene(self._scene, cone, lab.small_shape)[0])
 
@@ -317,6 +292,9 @@ def column_lengths(cone: ConeVec, cols: int, samples: int = 80) -> FloatArray:
 def _log_det(matrix: npt.NDArray[np.float64]) -> float:
     return float(np.linalg.slogdet(matrix)[1])
 
+
+Task = InformationTask | QualityTask
+"""What an environment may be for; both have the same methods."""
 
 TASKS: Final[Mapping[str, Callable[[], Task]]] = {
     "information": InformationTask,

@@ -182,7 +182,7 @@ class SharedQuality(QualityTask):
         self._ahead = False
 
     def show(self, lab: Lab, poses: Poses) -> Float32Array:
-        """See `Task`."""
+        """See `QualityTask`."""
         return np.asarray(self._clean[_sector(lab.position("rot_obj"))])
 
     def measure(self, sector: int, rng: np.random.Generator) -> None:
@@ -192,7 +192,7 @@ class SharedQuality(QualityTask):
         self._ahead = True
 
     def add(self, lab: Lab, poses: Poses, rng: np.random.Generator) -> float:
-        """See `Task`."""
+        """See `QualityTask`."""
         if not self._ahead:
             self.measure(_sector(lab.position("rot_obj")), rng)
             self.table.rays.solve([self])

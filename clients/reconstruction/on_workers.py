@@ -12,13 +12,14 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable
-from concurrent.futures import Executor, as_completed
+from collections.abc import Callable, Generator, Iterable, Sequence
+from concurrent.futures import Executor, Future, as_completed
+from contextlib import closing
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from flexdt.clients.extras import package
 from flexdt.clients.reconstruction import zarr_volume
@@ -31,6 +32,7 @@ from flexdt.twin.projection.gpu import availability
 from flexdt.twin.reconstruction import Truncation, fdk_parts
 
 STORE: Final = "volume.zarr"
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,22 +112,32 @@ def fdk_on_workers(
         os.replace(empty, store)
     numbers = range(len(zarr_volume.slabs(work.grid)))
     missing = [k for k in numbers if not zarr_volume.mark(store, k).exists()]
+    tell(0.0, len(missing))
     running = [pool.submit(make_slab, work, k, store, made_by) for k in missing]
     kinds = set()
-    try:
-        tell(0.0, len(missing))
-        for done, future in enumerate(as_completed(running), 1):
-            kinds.add(future.result())
+    with closing(as_made(running)) as made:
+        for done, on_device in enumerate(made, 1):
+            kinds.add(on_device)
             tell(done, len(missing))
-    finally:
-        for future in running:
-            future.cancel()
     _finish(store, out, work.grid)
     shutil.rmtree(home, ignore_errors=True)
     doubts = []
     if len(kinds) > 1:
         doubts.append("some slabs were made on devices, others on processors: last digits differ")
     return doubts
+
+
+def as_made(running: Sequence[Future[_T]]) -> Generator[_T, None, None]:
+    """Results in the order in which they come; what one of the tasks raises cancels the others.
+
+    Who may fail between two results closes it, so that this cancels the others, too.
+    """
+    try:
+        for future in as_completed(running):
+            yield future.result()
+    finally:
+        for future in running:
+            future.cancel()
 
 
 def folder_of(out: Path, identity: object) -> tuple[Path, str]:

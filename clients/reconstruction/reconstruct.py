@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import os
-import shutil
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -29,6 +28,7 @@ from flexdt.clients.reconstruction.volume_files import (
     volume_writer,
     write_slices,
 )
+from flexdt.clients.whole_files import free_bytes
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import LimitError, TwinError, UnknownNameError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -517,8 +517,8 @@ def _require_room(out: Path, grid: Grid) -> None:
     Raises:
         LimitError: says what is needed and what there is.
     """
-    folder = next((p for p in out.absolute().parents if p.exists()), Path("/"))
-    _require(f"free in {folder}", grid.bytes, shutil.disk_usage(folder).free, grid)
+    folder = out.absolute().parent
+    _require(f"free in {folder}", grid.bytes, free_bytes(folder), grid)
     layer = 3 * grid.bytes // grid.shape[0]
     _require("of memory for a layer and its filling", layer, _memory(), grid)
 

@@ -15,14 +15,15 @@ import math
 import os
 import shutil
 from collections.abc import Callable, Iterable
-from concurrent.futures import Executor, as_completed
+from concurrent.futures import Executor
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from flexdt.clients.reconstruction.on_workers import folder_of, same_version
+from flexdt.clients.reconstruction.on_workers import as_made, folder_of, same_version
 from flexdt.clients.reconstruction.volume_files import volume_writer
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
@@ -135,13 +136,9 @@ class Subsets:
         """Have every subset do `task`, whose last file is `made`; what one raises cancels all."""
         missing = [work for work in self.works if not work.file(made).exists()]
         running = [self.pool.submit(task, work, *args) for work in missing]
-        try:
-            for done, future in enumerate(as_completed(running), 1):
-                future.result()
+        with closing(as_made(running)) as results:
+            for done, _ in enumerate(results, 1):
                 self.tell(done / len(running))
-        finally:
-            for future in running:
-                future.cancel()
         return self.files(made)
 
     def square(self, volume: str, image: str, *, rest: bool) -> float:

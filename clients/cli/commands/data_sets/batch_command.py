@@ -13,6 +13,7 @@ from flexdt.clients.cli import options
 from flexdt.clients.cli.console import emit, note, say, size, table
 from flexdt.clients.cli.options import argument, option
 from flexdt.clients.failure import CommandError
+from flexdt.clients.whole_files import free_bytes
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -74,7 +75,7 @@ def batch(
     folder = Path(wanted.batch.name) if out is None else out
     if folder.exists() and not folder.is_dir():
         raise CommandError(f"{folder}: is a file")
-    whole, free = wanted.batch.items * item_bytes(wanted), _free(folder)
+    whole, free = wanted.batch.items * item_bytes(wanted), free_bytes(folder)
     more = f"; {size(free)} are free" if whole > free else ""
     note(f"{wanted.batch.items} items, {size(whole)} before compression{more}")
     last = 0.0
@@ -105,13 +106,3 @@ def batch(
         ]
         say(table(rows, ("parameter", "MAE", "error/sigma", "within 1.96 sigma")))
     say(f"{folder / 'manifest.json'}: items {summary['items_sha256'][:16]}")
-
-
-def _free(folder: Path) -> int:
-    """Bytes free where a folder is, or will be."""
-    import shutil
-
-    there = folder.absolute()
-    while not there.exists():
-        there = there.parent
-    return shutil.disk_usage(there).free

@@ -17,7 +17,7 @@ from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
 from flexdt.clients.cli.commands.data_sets.exchange_commands import said
 from flexdt.clients.cli.connecting import Twin, on_twin
-from flexdt.clients.cli.console import emit, note, say, table, warn
+from flexdt.clients.cli.console import as_json, emit, note, say, table, warn
 from flexdt.clients.cli.options import argument, option
 from flexdt.clients.failure import CommandError
 from flexdt.clients.whole_files import write_whole
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from flexdt.clients.client.client import TwinClient
     from flexdt.clients.datasets.data_set import DataSet
     from flexdt.clients.datasets.exchange import Given
+    from flexdt.twin.calibration.pipeline import Request
     from flexdt.twin.scanner.state import Correction
 
 ReadingName = Literal["axis", "mount"]
@@ -76,34 +77,19 @@ def calibrate(
     """
     if report is not None and report.suffix.lower() not in (".html", ".json"):
         raise typer.BadParameter(f"{report.name}: the report's ending must be .html or .json")
-    from flexdt.clients.calibration.calibrate import UNKNOWN, calibrate_datasets
+    from flexdt.clients.calibration.calibrate import calibrate_datasets
     from flexdt.clients.calibration.calibration_report import write_report
     from flexdt.clients.calibration.markers import Scale
     from flexdt.clients.studies.figures import require_plots
-    from flexdt.twin.calibration.fit.priors import exact
-    from flexdt.twin.calibration.fit.problem import SIX, Reading
-    from flexdt.twin.calibration.fit.weak_directions import BOUND
-    from flexdt.twin.calibration.pipeline import Request
-    from flexdt.twin.geometry.offsets import Offsets
 
-    usual = ("dO_x",) if phantom == UNKNOWN else SIX
-    chosen = usual if free is None else option_values.names(free)
-    request = Request(
-        free=chosen,
-        per_scan=option_values.names(per_scan),
-        reading={"axis": Reading.AXIS_AT_O_PLUS_TAU, "mount": Reading.MOUNT_SHIFT}[reading],
-        bead_tolerance_mm=bead_tolerance,
-        priors=exact(chosen) if prior == ["none"] else _assigned(prior),
-        bound=BOUND if bound is None else bound,
-        start=Offsets.from_edge(_assigned(start)),
-        per_frame=option_values.names(per_frame),
+    request = _request(
+        phantom, free, per_scan, per_frame, reading, bead_tolerance, prior, bound, start
     )
     target = _named(phantom)
     if per_scan and len(datasets or ()) > 1 and push:
         raise typer.BadParameter("--push: with --per-scan there is no one geometry to push")
     if push:
-        with twin():
-            pass  # a twin that does not answer is reported before the work, not after it
+        _require_answer(twin)
     if report is not None and report.suffix.lower() != ".json":
         require_plots()
     outcome = calibrate_datasets(
@@ -124,12 +110,36 @@ def calibrate(
     if not document["identifiable"]:
         raise CommandError("not identifiable: these numbers must not be used", NOT_IDENTIFIABLE)
     if push:
-        correction = outcome.correction
-        with twin() as client:
-            push_correction(client, correction, outcome.sources)
-        note(f"in force on the twin: {correction.name}")
+        _push(twin, outcome.correction, outcome.sources)
         if "motion" in document:
             note("warning: a twin's correction is the same in all frames, without the motion")
+
+
+def _request(
+    phantom: str | None, free: str | None, per_scan: str, per_frame: str, reading: ReadingName,
+    bead_tolerance: float | None, prior: list[str] | None, bound: float | None,
+    start: list[str] | None,
+) -> Request:  # fmt: skip
+    """What is to be estimated, and what is known of it."""
+    from flexdt.clients.calibration.calibrate import UNKNOWN
+    from flexdt.twin.calibration.fit.priors import exact
+    from flexdt.twin.calibration.fit.problem import SIX, Reading
+    from flexdt.twin.calibration.fit.weak_directions import BOUND
+    from flexdt.twin.calibration.pipeline import Request
+    from flexdt.twin.geometry.offsets import Offsets
+
+    usual = ("dO_x",) if phantom == UNKNOWN else SIX
+    chosen = usual if free is None else option_values.names(free)
+    return Request(
+        free=chosen,
+        per_scan=option_values.names(per_scan),
+        reading={"axis": Reading.AXIS_AT_O_PLUS_TAU, "mount": Reading.MOUNT_SHIFT}[reading],
+        bead_tolerance_mm=bead_tolerance,
+        priors=exact(chosen) if prior == ["none"] else _assigned(prior),
+        bound=BOUND if bound is None else bound,
+        start=Offsets.from_edge(_assigned(start)),
+        per_frame=option_values.names(per_frame),
+    )
 
 
 def _assigned(given: list[str] | None) -> dict[str, float]:
@@ -205,8 +215,7 @@ def align(
     from flexdt.clients.calibration.align_dataset import align_dataset
 
     if push:
-        with twin():
-            pass  # as for calibrate
+        _require_answer(twin)
     found = align_dataset(_opened([dataset], None if geometry is None else [geometry])[0])
     document: dict[str, Any] = found.document
     if out is not None:
@@ -227,15 +236,12 @@ def align(
         why = found.alignment.refused["axis_column_px"]
         raise CommandError(f"not identifiable: {why}", NOT_IDENTIFIABLE)
     if push:
-        correction = found.correction
-        with twin() as client:
-            push_correction(client, correction, found.dataset.name)
-        note(f"in force on the twin: {correction.name}")
+        _push(twin, found.correction, found.dataset.name)
 
 
 def compare(
     dataset: Path = argument(..., "DATASET"),
-    phantom: options.Phantom = None,
+    phantom: str | None = option(None, "What was scanned.", metavar="NAME or FILE"),
     tolerance: float = option(0.5, "Largest rms of the beads.", metavar="PX", min=0.0),
     out: Path | None = option(None, "Report and difference images.", metavar="DIR"),
     json: options.Json = False,
@@ -266,6 +272,18 @@ def compare(
     if not found.within:
         rms = _number(document["after"]["rms_px"], 4)
         raise CommandError(f"{dataset}: rms {rms} px after correction, allowed {tolerance:g} px")
+
+
+def _require_answer(twin: Twin) -> None:
+    """A twin that does not answer is reported before the work, not after it."""
+    with twin():
+        pass
+
+
+def _push(twin: Twin, correction: Correction, source: str) -> None:
+    with twin() as client:
+        push_correction(client, correction, source)
+    note(f"in force on the twin: {correction.name}")
 
 
 def push_correction(client: TwinClient, correction: Correction, source: str) -> None:
@@ -346,11 +364,7 @@ def parameter_rows(document: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 def write_json(path: Path, document: Mapping[str, object]) -> None:
     """Write a document under its final name only when it is whole."""
-    import json
-
-    from flexdt.clients.cli.console import plain
-
-    write_whole(path, json.dumps(plain(document), indent=2) + "\n")
+    write_whole(path, as_json(document) + "\n")
 
 
 def _number(value: float | None, digits: int) -> str:

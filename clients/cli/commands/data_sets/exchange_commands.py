@@ -13,11 +13,9 @@ import typer
 from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.console import emit, note, say, warn
 from flexdt.clients.cli.options import argument, option
-from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
     from flexdt.clients.datasets.exchange import Given
-    from flexdt.twin.geometry.offsets import Offsets
 
 Format = Literal["ctsimu", "rtk", "astra", "tomosipo", "flexdata", "csv"]
 Exported = Literal[Format, "nxtomo"]
@@ -53,21 +51,16 @@ def export(
     """
     if correction is not None and not corrected:
         raise typer.BadParameter("--correction and --nominal exclude each other")
-    from flexdt.clients.cli.commands.data_sets.reconstruct_command import moved, read_report
-    from flexdt.clients.datasets.dataset import load_dataset
+    from flexdt.clients.cli.commands.data_sets.reconstruct_command import read_report, scan_of
     from flexdt.clients.datasets.exchange import export_dataset
-    from flexdt.twin.geometry.offsets import NOMINAL
+    from flexdt.clients.launch.random_truth import read
+    from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 
-    parameters: Offsets | None = None if corrected else NOMINAL
-    report = None
-    if correction is not None:
-        report = read_report(correction)
-        parameters = report.parameters
-    data = load_dataset(dataset, ignore_document=texts)
-    if report is not None:
-        data = moved(data, report)
+    report = None if correction is None else read_report(correction)
+    parameters = report.parameters if report else None if corrected else NOMINAL
+    data = scan_of(dataset, texts, report)
     warn(data.warnings, dataset)
-    real = None if unknown is None else _truth(unknown)
+    real = None if unknown is None else Offsets.from_edge(read(unknown))
     written = export_dataset(
         data,
         out,
@@ -136,10 +129,12 @@ def said(
     like: Path | None, shape: str | None, pixel: str | None, views: int | None = None
 ) -> Given:
     """What the options say that a geometry's file does not."""
-    size = None if shape is None else _numbers(shape, "the shape", 2)
-    if size is not None and not all(s >= 1 and s.is_integer() for s in size):
-        raise typer.BadParameter(f"shape {shape!r} is not ROWS,COLS, e.g. 760,956")
-    pitch = None if pixel is None else _numbers(pixel, "the pixel pitch", 1, 2)
+    size = pitch = None
+    if shape is not None:
+        form = "ROWS,COLS, e.g. 760,956"
+        size = option_values.numbers(shape, "shape", form, 2, whole=True)
+    if pixel is not None:
+        pitch = option_values.numbers(pixel, "pixel pitch", "MM or U,V", 1, 2)
     if pitch is not None and min(pitch) <= 0.0:
         raise typer.BadParameter(f"pixel pitch {pixel!r} must be above 0")
     from flexdt.clients.datasets.dataset import load_dataset
@@ -151,21 +146,3 @@ def said(
         known.pitch_mm if pitch is None else (pitch[0], pitch[-1]),
         known.views if views is None else views,
     )
-
-
-def _numbers(text: str, what: str, *counts: int) -> list[float]:
-    words = option_values.names(text)
-    if len(words) not in counts:
-        wanted = " or ".join(map(str, counts))
-        raise typer.BadParameter(f"{what} {text!r} must be {wanted} numbers")
-    return [option_values.number(word, what) for word in words]
-
-
-def _truth(path: Path) -> Offsets:
-    from flexdt.clients.launch.random_truth import read
-    from flexdt.twin.geometry.offsets import Offsets
-
-    try:
-        return Offsets.from_edge(read(path))
-    except UnicodeDecodeError:
-        raise CommandError(f"{path}: no UTF-8 text") from None

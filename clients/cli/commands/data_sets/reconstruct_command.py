@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json as json_text
+from collections.abc import Iterable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -16,6 +18,8 @@ from flexdt.clients.cli.options import argument, option
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from flexdt.clients.datasets.data_set import DataSet
     from flexdt.twin.geometry.offsets import Offsets
 
@@ -73,78 +77,32 @@ def reconstruct(
         "scatter-correction": scatter_correction, "scatter-method": scatter_method,
         "scheduler": scheduler, "slurm": slurm,
     }  # fmt: skip
-    chosen = [name for name, value in own.items() if value is not None]
-    algorithm = algorithm or "fdk"
-    shared = scheduler is not None or slurm is not None
-    from flexdt.clients.reconstruction.volume_files import SUFFIXES
-
-    for wrong, name, why in (
-        *((preview, name, "--preview chooses for itself") for name in chosen),
-        (out.suffix.lower() not in SUFFIXES, "out",
-         f"{out}: the ending must be one of {', '.join(SUFFIXES)}"),
-        (kv is not None and material is None and scatter_correction is None, "kv",
-         "it is for --material and --scatter-correction"),
-        (scatter_method is not None and scatter_correction is None, "scatter-method",
-         "it is for --scatter-correction"),
-        (iterations is not None and algorithm == "fdk", "iterations", "fdk has none"),
-        (weight is not None and algorithm != "tv", "weight", f"{algorithm} has none"),
-        (window is not None and algorithm != "fdk", "window", f"{algorithm} has no filter"),
-        (scheduler is not None and slurm is not None, "slurm", "not together with --scheduler"),
-        (shared and algorithm in ("sart", "em"), "scheduler" if scheduler else "slurm",
-         f"{algorithm} is not done by workers; allowed: fdk, sirt, cgls, tv"),
-        (correction is not None and geometry is not None, "correction",
-         "no correction is added to a geometry from a file"),
-    ):  # fmt: skip
-        if wrong:
-            raise typer.BadParameter(f"--{name}: {why}")
-    wanted_shape = None if shape is None else _shape(shape)
-    wanted_center = None
-    if center is not None:
-        wanted_center = option_values.triple(center, "center", "X,Y,Z, e.g. 0,0,-5.5")
-    from flexdt.clients.batch.executors import dask_executor, read_slurm, slurm_executor
-    from flexdt.clients.datasets.dataset import load_dataset
+    other = {"kv": kv, "correction": correction, "geometry": geometry}
+    chosen = {name: value for name, value in (own | other).items() if value is not None}
+    _check_together(chosen, out, [name for name in own if name in chosen] if preview else [])
     from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_dataset
     from flexdt.clients.reconstruction.reconstruct import preview as quick_look
-    from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 
-    if not out.absolute().parent.is_dir():
-        raise CommandError(f"{out}: the folder does not exist")
-    parameters: Offsets | None
-    report: Report | None = None
-    match correction:
-        case None:
-            parameters = None
-        case "none":
-            parameters = NOMINAL
-        case "twin":
-            with twin() as client:
-                in_force = client.calibration()
-            parameters = NOMINAL if in_force is None else Offsets.from_edge(in_force.parameters)
-        case file:
-            report = read_report(Path(file))
-            parameters = report.parameters
-    # Workers have working directories of their own.
-    data = load_dataset(dataset.resolve() if shared else dataset, ignore_document=texts)
-    if geometry is not None:
-        from flexdt.clients.datasets.exchange import load_geometry, with_geometry
-
-        data = with_geometry(data, load_geometry(geometry))
-    if report is not None:
-        data = moved(data, report)
-    warn(data.warnings, dataset)
-    if data.missing:
-        note(f"{dataset}: warning: {len(data.missing)} frames are missing and are left out")
     request = VolumeRequest(
-        algorithm, voxel, wanted_shape, binning or 1, every or 1, iterations, window or "ram-lak",
-        wanted_center, rings, material, kv, png, weight,
+        algorithm or "fdk", voxel, None if shape is None else _shape(shape), binning or 1,
+        every or 1, iterations, window or "ram-lak",
+        None if center is None else option_values.triple(center, "center", "X,Y,Z, e.g. 0,0,-5.5"),
+        rings, material, kv, png, weight,
         None if scatter_correction is None else option_values.names(scatter_correction),
         scatter_method=scatter_method or "simulation",
     )  # fmt: skip
-    workers = None if scheduler is None else dask_executor(scheduler)
-    if slurm is not None:
-        workers = slurm_executor(read_slurm(slurm))
-    unit = "slabs" if algorithm == "fdk" else "iterations"
-    with ProgressBar(f"{algorithm} of {dataset.name}", unit) as bar:
+    if not out.absolute().parent.is_dir():
+        raise CommandError(f"{out}: the folder does not exist")
+    parameters, report = _correction(correction, twin)
+    # Workers have working directories of their own.
+    shared = scheduler is not None or slurm is not None
+    data = scan_of(dataset.resolve() if shared else dataset, texts, report, geometry)
+    warn(data.warnings, dataset)
+    if data.missing:
+        note(f"{dataset}: warning: {len(data.missing)} frames are missing and are left out")
+    workers = _workers(scheduler, slurm)
+    unit = "slabs" if request.algorithm == "fdk" else "iterations"
+    with ProgressBar(f"{request.algorithm} of {dataset.name}", unit) as bar:
         if preview:
             document = quick_look(data, out, parameters=parameters, progress=bar.update)
         else:
@@ -164,11 +122,75 @@ def reconstruct(
         say(f"  {file}")
 
 
+def _check_together(chosen: Mapping[str, object], out: Path, kept_out: Iterable[str]) -> None:
+    """Usage errors of options that do not go together; a preview keeps some out."""
+    from flexdt.clients.reconstruction.volume_files import SUFFIXES
+
+    algorithm = chosen.get("algorithm", "fdk")
+    corrects = {"material", "scatter-correction"} & chosen.keys()
+    for wrong, name, why in (
+        *((True, name, "--preview chooses for itself") for name in kept_out),
+        (out.suffix.lower() not in SUFFIXES, "out",
+         f"{out}: the ending must be one of {', '.join(SUFFIXES)}"),
+        ("kv" in chosen and not corrects, "kv", "it is for --material and --scatter-correction"),
+        ("scatter-method" in chosen and "scatter-correction" not in chosen, "scatter-method",
+         "it is for --scatter-correction"),
+        ("iterations" in chosen and algorithm == "fdk", "iterations", "fdk has none"),
+        ("weight" in chosen and algorithm != "tv", "weight", f"{algorithm} has none"),
+        ("window" in chosen and algorithm != "fdk", "window", f"{algorithm} has no filter"),
+        ({"scheduler", "slurm"} <= chosen.keys(), "slurm", "not together with --scheduler"),
+        *((algorithm in ("sart", "em"), name,
+           f"{algorithm} is not done by workers; allowed: fdk, sirt, cgls, tv")
+          for name in ("scheduler", "slurm") if name in chosen),
+        ({"correction", "geometry"} <= chosen.keys(), "correction",
+         "no correction is added to a geometry from a file"),
+    ):  # fmt: skip
+        if wrong:
+            raise typer.BadParameter(f"--{name}: {why}")
+
+
+def _correction(named: str | None, twin: Twin) -> tuple[Offsets | None, Report | None]:
+    """The correction that was asked for, None for the scan's own, and the report it is from."""
+    from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+
+    match named:
+        case None:
+            return None, None
+        case "none":
+            return NOMINAL, None
+        case "twin":
+            with twin() as client:
+                in_force = client.calibration()
+            return NOMINAL if in_force is None else Offsets.from_edge(in_force.parameters), None
+    report = read_report(Path(named))
+    return report.parameters, report
+
+
+def scan_of(
+    folder: Path, texts: bool, report: Report | None, geometry: Path | None = None
+) -> DataSet:
+    """The data set, with the motion of a report or the geometry of a file."""
+    from flexdt.clients.datasets.dataset import load_dataset
+
+    data = load_dataset(folder, ignore_document=texts)
+    if geometry is not None:
+        from flexdt.clients.datasets.exchange import load_geometry, with_geometry
+
+        data = with_geometry(data, load_geometry(geometry))
+    return data if report is None else moved(data, report)
+
+
+def _workers(scheduler: str | None, slurm: Path | None) -> AbstractContextManager[Executor] | None:
+    from flexdt.clients.batch.executors import dask_executor, read_slurm, slurm_executor
+
+    if slurm is not None:
+        return slurm_executor(read_slurm(slurm))
+    return None if scheduler is None else dask_executor(scheduler)
+
+
 def _shape(text: str) -> tuple[int, int, int]:
-    words = option_values.names(text)
-    if len(words) != 3 or not all(word.isascii() and word.isdigit() for word in words):
-        raise typer.BadParameter(f"shape {text!r} is not Z,Y,X, e.g. 300,400,400")
-    z, y, x = (int(word) for word in words)
+    form = "Z,Y,X, e.g. 300,400,400"
+    z, y, x = map(int, option_values.numbers(text, "shape", form, 3, whole=True))
     return z, y, x
 
 

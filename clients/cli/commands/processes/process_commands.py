@@ -170,4 +170,4 @@ def become(module: str, given: Mapping[str, object], more: Sequence[str] = ()) -
     """Replace this process by `python -m module` with the options `given` and `more` words."""
     sys.stdout.flush()
     sys.stderr.flush()
-    os.execv(sys.executable, [sys.executable, "-m", module, *words(given), *more])
+    os.execv(sys.executable, [sys.executable, "-P", "-m", module, *words(given), *more])

@@ -87,10 +87,10 @@ def follow(
 def _follower(
     machine: str | None, profile: str | None, script: Path | None, sample: str | None
 ) -> Follower:
-    from flexdt.clients.cli.commands.scanner.script_commands import collisions
     from flexdt.phantoms.samples import as_phantom
+    from flexdt.scripts import collisions, size_of
     from flexdt.twin.following.follower import Follower
-    from flexdt.twin.script import SampleSize, parse_script
+    from flexdt.twin.script import parse_script
 
     chosen = machines.machine(machine)
     phantom = None if sample is None else as_phantom(sample)
@@ -98,7 +98,7 @@ def _follower(
         chosen,
         machines.profile(profile, chosen, machine),
         None if script is None else parse_script(script.read_bytes()),
-        None if phantom is None else SampleSize.around(phantom.size_mm, phantom.name),
+        size_of(phantom),
         collisions(phantom),
     )
 

@@ -69,7 +69,8 @@ COMMANDS: Final = {
     "list": list_jobs,
     "status": _on_job("Show how far a job is.", lambda client, job: client.job_status(job)),
     "pause": _on_job(
-        "Pause a job after the current frame.", lambda client, job: client.pause_job(job)
+        "Pause a job; a frame under exposure is taken again.",
+        lambda client, job: client.pause_job(job),
     ),
     "resume": _on_job(
         "Return to the pose of the pause and go on.", lambda client, job: client.resume_job(job)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
@@ -105,17 +104,15 @@ def new(
     sdd = asked("SDD, mm: one if fixed, or least:greatest", sdd, usual[1])
     kv = asked("Tube, kV: at most, or least:most", kv, f"{like.tube.min_kV:g}:{like.tube.max_kV:g}")
     volts = None if kv is None else option_values.span(kv, "--kv")
-    columns, rows = (None, None) if size is None else _pair(size, int, "--detector")
+    pixels = None if size is None else _pair(size, "--detector", whole=True)
     lines = [word.partition("=") for word in limit or []]
     answers = Answers(
         name=name,
         base=base,
         scanner=scanner,
-        columns=columns,
-        rows=rows,
-        pitch_mm=None
-        if pitch is None
-        else _pair(pitch, lambda part: option_values.number(part, "--pitch"), "--pitch"),
+        columns=None if pixels is None else int(pixels[0]),
+        rows=None if pixels is None else int(pixels[1]),
+        pitch_mm=None if pitch is None else _pair(pitch, "--pitch"),
         bits=bits,
         sod_mm=None if sod is None else option_values.span(sod, "--sod"),
         sdd_mm=None if sdd is None else option_values.span(sdd, "--sdd"),
@@ -134,13 +131,9 @@ def new(
         f"{least if answers.min_kV is None else ''}; see: flexdt machine show {out}")  # fmt: skip
 
 
-def _pair(word: str, kind: Callable[[str], T], what: str) -> tuple[T, T]:
-    try:
-        found = [kind(part) for part in word.lower().split("x")]
-    except ValueError:
-        found = []
-    if len(found) not in (1, 2):
-        raise typer.BadParameter(f"{what}: {word!r} is not of the form NUMBERxNUMBER")
+def _pair(word: str, what: str, *, whole: bool = False) -> tuple[float, float]:
+    form = "of the form NUMBERxNUMBER"
+    found = option_values.numbers(word, f"{what}:", form, 1, 2, by="x", whole=whole)
     return found[0], found[-1]
 
 

@@ -141,10 +141,8 @@ def design(
 
 
 def _studs(text: str) -> tuple[int, int]:
-    parts = text.lower().split("x")
-    if len(parts) != 2 or not all(part.strip().isdigit() for part in parts):
-        raise typer.BadParameter(f"studs {text!r} are not NxM, e.g. 3x2")
-    return int(parts[0]), int(parts[1])
+    n, m = map(int, option_values.numbers(text, "studs", "NxM, e.g. 3x2", 2, by="x", whole=True))
+    return n, m
 
 
 def _size(text: str) -> tuple[float, float, float]:

@@ -33,11 +33,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from flexdt.clients.client.client import TwinClient
-    from flexdt.phantoms import Phantom
     from flexdt.protocol.state_model import JobStatus
     from flexdt.twin.script import CheckReport, Problem
     from flexdt.twin.script.executed_log import Executed
-    from flexdt.twin.script.planning.dry_run import CollisionCheck
 
 ScriptFile = Annotated[Path, typer.Argument(metavar="SCRIPT", help="Acquila scan script.")]
 
@@ -65,7 +63,8 @@ def check(
         compare(script, against, machine, html, json)
         return
     from flexdt.phantoms.samples import as_phantom
-    from flexdt.twin.script import SampleSize, check_script, html_report
+    from flexdt.scripts import collisions, size_of
+    from flexdt.twin.script import check_script, html_report
     from flexdt.twin.script.problems import in_order
 
     data = script.read_bytes()
@@ -75,7 +74,7 @@ def check(
         data,
         chosen,
         machines.profile(profile, chosen, machine),
-        sample=None if phantom is None else SampleSize.around(phantom.size_mm, phantom.name),
+        sample=size_of(phantom),
         collision=collisions(phantom) if chosen.components else None,
     )
     if phantom is not None and not report.errors:
@@ -136,14 +135,6 @@ def read_log_file(log: Path) -> tuple[Executed, ...]:
     return lines
 
 
-def collisions(phantom: Phantom | None) -> CollisionCheck:
-    """The collision check with the phantom's mesh, or with the script's sample size."""
-    from flexdt.twin.collision.plan_report import collision_check
-    from flexdt.twin.collision.sample_hull import convex_pieces
-
-    return collision_check(None if phantom is None else convex_pieces(phantom.mesh(around=True)))
-
-
 def exit_code(report: CheckReport) -> int:
     """Exit code of a check."""
     return verdict(p.code for p in report.problems if p.severity == "error")
@@ -181,7 +172,7 @@ def run(
     script: ScriptFile,
     out: str | None = option(None, "Name of the data set.", metavar="NAME"),
     sample: str | None = option(None, "Put this on the stage first.", metavar="NAME"),
-    speed_up: options.SpeedUp = None,
+    speed_up: str | None = option(None, "Twin seconds per second of yours.", metavar="X or max"),
     detach: bool = option(False, "Submit and leave.", "--detach"),
     json: options.Json = False,
 ) -> None:
@@ -291,6 +282,7 @@ def new(
     json: options.Json = False,
 ) -> None:
     """Write a valid scan script; one that `flexdt check` would reject is not written."""
+    from flexdt.scripts import collisions
     from flexdt.twin.machine.camera import Roi
     from flexdt.twin.script import check_script
     from flexdt.twin.script.compose import ScanRequest, compose_script
