@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from flexdt.phantoms import load_phantom
 from flexdt.twin.collision.collision_scene import Scene, build_scene, scene_of
 from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid, box, hull
-from flexdt.twin.collision.guard import scene_guard
+from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.collision.sample_hull import convex_pieces
 from flexdt.twin.collision.scene_search import PathSearch, SweepResult
@@ -332,7 +332,7 @@ def study_machine(moves: int, seed: int) -> dict[str, object]:
     """Times of sweeps of the whole FleX-ray with a LEGO-sized sample: 1 to 8 motors at once."""
     machine = builtin_machine()
     scene = build_scene(machine, builtin_profile(machine.default_profile), [box((24, 16, 49.8))])
-    guard = scene_guard(scene)
+    guard = SceneGuard(scene)
     rng = np.random.default_rng([seed, 1])
     full, only_contacts, stops = [], [], 0
     for _ in range(moves):

@@ -12,7 +12,7 @@ from flexdt.phantoms import Phantom
 from flexdt.server.storage.stored_samples import Phantoms
 from flexdt.twin.collision.collision_scene import Scene, build_scene
 from flexdt.twin.collision.convex_solids import Polytope
-from flexdt.twin.collision.guard import scene_guard
+from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.sample_hull import convex_pieces
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import Machine, Profile
@@ -95,7 +95,7 @@ class Stage:
             parameters: the correction in force.
         """
         scene = self.scene(sample, parameters)
-        return None if scene is None else scene_guard(scene)
+        return None if scene is None else SceneGuard(scene)
 
     def _content(self, sample: Sample) -> _Content:
         return sample, self._samples.revision(sample.name)

@@ -196,8 +196,9 @@ def test_servers_killed_while_they_start_come_back_on_their_ports(tmp_path: Path
     def kill_those_that_start() -> None:
         for pid in children(up.pid):
             try:
-                module = Path(f"/proc/{pid}/cmdline").read_text().split("\0")[3]
-            except (OSError, IndexError):  # it is only being made, or has gone
+                words = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
+                module = words[words.index("-m") + 2]
+            except (OSError, IndexError, ValueError):  # it is only being made, or has gone
                 continue
             if left.get(module, 0) and pid not in killed:
                 left[module] -= 1

@@ -9,7 +9,7 @@ import pytest
 
 from flexdt.server.scans.twin_clock import LATE_S, TwinClock
 from flexdt.twin.collision.collision_scene import build_scene
-from flexdt.twin.collision.guard import scene_guard
+from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.scanner.scanner import ScannerTwin
@@ -133,7 +133,7 @@ def test_a_clock_that_is_late_runs_in_real_time_and_motion_on_it_is_swept() -> N
     assert clock.now() == LATE_S + 15.0
     machine = builtin_machine()
     profile = builtin_profile(machine.default_profile)
-    guard = scene_guard(build_scene(machine, profile))
+    guard = SceneGuard(build_scene(machine, profile))
     scanner = ScannerTwin(machine, profile, LATE_S, guard)
     rng = np.random.default_rng(1)
     now = LATE_S

@@ -30,7 +30,7 @@ def test_a_write_that_is_under_way_does_not_undo_the_last(
     ended = threading.Event()
 
     def make(last: bool) -> Memory:
-        return remember(scanner, 0.0, [], 0, ended=last)
+        return remember(scanner, 0.0, [], 0, [], ended=last)
 
     class Late(Memory):
         """Encoded by its thread only after the server has ended."""

@@ -58,7 +58,7 @@ class Ports:
         found = {}
         for pid in Path(f"/proc/{self._up}/task/{self._up}/children").read_text().split():
             words = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
-            found[words[3]] = int(pid)
+            found[words[words.index("-m") + 2]] = int(pid)
         return found
 
     def megabytes(self, module: str) -> float:

@@ -34,7 +34,7 @@ from motion_oracle import (
 
 from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.collision.convex_solids import Polytope, hull
-from flexdt.twin.collision.guard import scene_guard
+from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.errors import CollisionError, TwinError
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import builtin_profile, parse_machine
@@ -173,7 +173,7 @@ class Episode:
 
     def _guard(self, sample: Json | None, correction: Json | None) -> Any:
         parameters = Offsets.from_edge(correction or {})
-        return scene_guard(build_scene(self.machine, self.profile, pieces(sample), parameters))
+        return SceneGuard(build_scene(self.machine, self.profile, pieces(sample), parameters))
 
     def stage(self) -> Stage:
         return Stage(self.model, placed(self.sample), self.correction)
