@@ -124,7 +124,7 @@ def test_from_scan_to_correction_and_back(page: Any, twin: TwinClient, wait: Wai
     wait(lambda: residue(page) < 0.2 * apart, "the virtual image goes with the correction")
     page.select_option("#compare-mode", "recorded")
     page.keyboard.press("Escape")
-    assert not page.locator("#record").is_visible()
+    page.locator("#record").wait_for(state="hidden")
     for parameter in WRONG:
         assert abs(applied.parameters[parameter]) < 4 * sigmas[parameter], applied.parameters
     # dO_z is told no better than the panel's height is known; what the images see of it is.
