@@ -11,7 +11,7 @@ from os import PathLike
 from pathlib import Path
 
 from flexdt.clients.calibration.align_dataset import Aligned, align_dataset
-from flexdt.clients.calibration.calibrate import UNKNOWN, Outcome, calibrate_datasets
+from flexdt.clients.calibration.calibrate import Outcome, calibrate_datasets
 from flexdt.clients.calibration.markers import Mark, Scale, markers_alone
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.datasets.dataset import load_dataset, read_tiffs
@@ -20,6 +20,7 @@ from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct
 from flexdt.phantoms import Phantom
 from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.pipeline import Request
+from flexdt.twin.calibration.unknown_markers import UNKNOWN
 from flexdt.twin.errors import TwinError
 from flexdt.twin.exchange.geometry import ScanGeometry
 from flexdt.twin.geometry.cone_vec import ConeVec

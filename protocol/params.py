@@ -382,7 +382,9 @@ class Mark(Params):
     """Where a bead was seen in a projection; pixel (0, 0) is the middle of the upper left one."""
 
     frame: Annotated[int, Ge(0), Le(10_000_000)] = Field(description="projection, counted from 0")
-    marker: AxisName = Field(description="number of the bead in its phantom, counted from 0")
+    marker: AxisName = Field(
+        description="number of the bead in its phantom, counted from 0; any name of an unknown one"
+    )
     column: Place
     row: Place
     sigma: Annotated[float, Ge(1e-3), Le(1e4)] | None = Field(
@@ -394,9 +396,14 @@ class CalibrationFit(Params):
     """Data sets of a bead phantom, and what to estimate from them."""
 
     datasets: Annotated[list[DataSetName], Len(1, 8)] = Field(description="of their folders")
-    phantom: Name = Field(description="one that ships, or a TOML or JSON file among the data sets")
+    phantom: Name = Field(
+        description="one that ships, a TOML or JSON file among the data sets, or unknown: markers "
+        "of which nobody knows where they are, in one data set"
+    )
     free: Annotated[Parameters, MinLen(1)] | None = Field(
-        default=None, description="what is estimated; default: dO_x, dO_y, dO_z, alpha, tau_*"
+        default=None,
+        description="what is estimated; default: dO_x, dO_y, dO_z, alpha, tau_*, of unknown "
+        "markers dO_x",
     )
     priors: Annotated[dict[AxisName, NonNegative], MaxLen(17), few(17)] = Field(
         default_factory=dict, description="name -> standard deviation [mm or deg]; 0: exactly known"
@@ -413,6 +420,9 @@ class CalibrationFit(Params):
     )
     markers: Annotated[list[Mark], Len(1, 10_000)] | None = Field(
         default=None, description="where beads were seen in the one data set; default: found there"
+    )
+    scale: Annotated[ShortText, MaxLen(300)] | None = Field(
+        default=None, description="distance of two unknown markers [mm]: A-B=MM or A-B=MM+-SIGMA"
     )
 
 

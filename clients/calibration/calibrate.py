@@ -34,13 +34,11 @@ from flexdt.twin.calibration.fit.image_quantities import image_quantities
 from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.fit.problem import SIX, from_printed_reading
 from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate
+from flexdt.twin.calibration.unknown_markers import UNKNOWN
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.offsets import NAMES, Offsets
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.scanner.state import Correction
-
-UNKNOWN: Final = "unknown"
-"""Name that stands for markers of unknown positions."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -839,6 +839,7 @@ def fit_calibration(
     residuals: bool = False,
     tracks: bool = False,
     markers: Sequence[tuple[int, str, float, float, float | None]] | None = None,
+    scale: str | None = None,
 ) -> Flow[r.CalibrationFitResult]:
     """Calibrate from data sets of the twin's data directory; nothing is applied.
 
@@ -846,8 +847,10 @@ def fit_calibration(
 
     Args:
         datasets: their names.
-        phantom: one that ships, or a TOML or JSON file among the data sets.
-        free: parameters to estimate; default: the six of a phantom on a stage.
+        phantom: one that ships, a TOML or JSON file among the data sets, or "unknown": markers of
+            which nobody knows where they are.
+        free: parameters to estimate; default: the six of a phantom on a stage, dO_x of unknown
+            markers.
         priors: name -> standard deviation [mm, deg]; 0 is exactly known.
         per_frame: parameters that may also move.
         steps: tell the covariance after so many parts of the frames.
@@ -855,8 +858,10 @@ def fit_calibration(
         tracks: tell where beads were seen, and were put before and after.
         markers: where beads were seen, (frame, bead, column, row, sigma) [px], sigma None where it
             is not known; default: they are detected in the images.
+        scale: distance of two unknown markers [mm], "A-B=MM" or "A-B=MM+-SIGMA".
 
     Raises:
+        ValueError: a row of `markers` has another length.
         RpcError: -32602, there is no such data set or phantom; -32008, it takes too long.
 
     Example:
@@ -865,6 +870,9 @@ def fit_calibration(
         ...
         flexdt.protocol.rpc_errors.RpcError: no data set 'gone' in the data directory
     """
+    for i, row in enumerate(markers or ()):
+        if len(row) != len(Mark.model_fields):
+            raise ValueError(f"mark {i} is {row!r}; allowed: ({', '.join(Mark.model_fields)})")
     marks = None if markers is None else [
         dict(zip(Mark.model_fields, row, strict=True)) for row in markers
     ]  # fmt: skip
@@ -872,7 +880,7 @@ def fit_calibration(
         "datasets": list(datasets), "phantom": phantom, "free": free and list(free),
         "priors": dict(priors or {}), "per_frame": list(per_frame), "steps": steps,
         "residuals": residuals, "tracks": tracks,
-        "markers": marks,
+        "markers": marks, "scale": scale,
     }  # fmt: skip
     return ask("calibration.fit", params, r.CalibrationFitResult, patience_s=None)
 

@@ -16,6 +16,7 @@ from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol.method_table import FIT_LIMITS
 from flexdt.twin.calibration.fit.covariance_steps import covariance_by_step
+from flexdt.twin.calibration.unknown_markers import UNKNOWN
 from flexdt.twin.dataset.dataset_errors import DatasetMissingError
 from flexdt.twin.dataset.file_names import plain_name
 
@@ -33,7 +34,7 @@ def fit(root: Path, asked: p.CalibrationFit, *_: object) -> r.CalibrationFitResu
     phantom: Any = asked.phantom
     if not is_shipped(phantom) and Path(phantom).suffix in FILES:
         phantom = load_phantom_file(str(_there(root, phantom, "phantom")))
-    elif not is_shipped(phantom):
+    elif phantom != UNKNOWN and not is_shipped(phantom):
         load_phantom(phantom)  # says which there are
     marks = None
     if asked.markers is not None:
@@ -41,7 +42,7 @@ def fit(root: Path, asked: p.CalibrationFit, *_: object) -> r.CalibrationFitResu
     found = _face().calibrate(
         [_there(root, name, "data set") for name in asked.datasets], phantom,
         free=asked.free, priors=asked.priors, per_frame=asked.per_frame,
-        markers=marks,
+        markers=marks, scale=asked.scale,
     )  # fmt: skip
     told = dict(found.document)
     fitted = found.calibration.fit

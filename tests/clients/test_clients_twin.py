@@ -201,6 +201,8 @@ def test_both_clients_do_every_method_of_the_wire(shell: Shell, tmp_path: Path) 
     ):
         with pytest.raises(RpcError, match="no data set 'gone'"):
             asked()
+    with pytest.raises(ValueError, match=r"mark 1 is \(0, '1', 3.0\); allowed: \(frame, marker, "):
+        twin.fit_calibration(["gone"], "lego", markers=[(0, "0", 3.0, 4.0, None), (0, "1", 3.0)])  # type: ignore[list-item]
     document = twin.save_scene("all of it")
     assert twin.load_scene(json.loads(json.dumps(document))).axes["mag_obj"].position == 585.0
     assert twin.estop().safety.estop

@@ -115,6 +115,32 @@ def test_marks_take_the_place_of_what_is_in_the_images(data: Path) -> None:
     )
 
 
+def test_markers_of_which_nobody_knows_where_they_are(data: Path) -> None:
+    other = {"dO_x": -1.4, "dO_y": 0.0, "dO_z": -3.0, "alpha": 0.0}
+    seen = marks(range(0, 25, 3), other, 0.2)
+    for mark in seen:
+        mark["marker"] = f"ball {mark['marker']}"
+    beads = load_phantom("lego").beads
+    apart = float(np.linalg.norm(beads[1] - beads[3]))
+    told = called(
+        data, "calibration.fit", datasets=["lego"], phantom="unknown", markers=seen, tracks=True,
+        scale=f"ball 1-ball 3={apart:.3f}", residuals=True, steps=2,
+    )  # fmt: skip
+    assert told["identifiable"]
+    assert told["scale"].startswith("ball 1-ball 3 = ")
+    for name in ("dO_x", "dO_z"):
+        e = told["parameters"][name]
+        assert e["sigma"] < 3.0
+        assert abs(e["value"] - other[name]) < 4 * e["sigma"]
+    found = np.array([m["position_mm"] for m in told["markers"]])
+    between = np.linalg.norm(found[:, None] - found, axis=2)
+    really = np.linalg.norm(beads[:, None] - beads, axis=2)
+    assert np.abs(between - really).max() < 0.5
+    assert len(told["residuals_px"]) == 9
+    free = called(data, "calibration.fit", datasets=["lego"], phantom="unknown", markers=seen)
+    assert free["scale"] == "free"
+
+
 def test_marks_that_do_not_hold_are_refused(data: Path) -> None:
     mark: dict[str, Any] = {"frame": 0, "marker": "0", "column": 200.0, "row": 180.0}
     wrong = [
@@ -142,6 +168,14 @@ def test_marks_that_do_not_hold_are_refused(data: Path) -> None:
                 "calibration.fit", datasets=["lego"], phantom="lego", markers=markers
             )
             assert (error.code, says in f"{error.message} {error.data}") == (-32602, True), says
+        for phantom, scale, says in (
+            ("lego", "0-1=3", "this phantom states its own size"),
+            ("unknown", "0-1", "allowed: A-B=MM"),
+            ("unknown", None, "1 markers; allowed: three or more"),
+        ):
+            asked = {"markers": [mark], "phantom": phantom} | ({"scale": scale} if scale else {})
+            error = await client.error("calibration.fit", datasets=["lego"], **asked)
+            assert (error.code, says in error.message) == (-32602, True), error
         both = await client.error(
             "calibration.fit", datasets=["lego", "lego"], phantom="lego", markers=[mark]
         )

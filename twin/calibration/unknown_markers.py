@@ -26,6 +26,8 @@ from flexdt.twin.geometry.poses import Poses
 
 Index = npt.NDArray[np.int64]
 
+UNKNOWN: Final = "unknown"
+"""Name that stands for markers of unknown positions."""
 ANYWHERE_MM: Final = 1e3
 """Standard deviation of the prior on the position of an unknown marker."""
 GATES_PX: Final = (12.0, 5.0, 3.0)

@@ -41,6 +41,7 @@ export type CalibrationFit = {
   residuals?: boolean;
   tracks?: boolean;
   markers?: Array<Mark> | null;
+  scale?: string | null;
 };
 export type CalibrationFitResult = {
   identifiable: boolean;

@@ -121,11 +121,11 @@ def _request(
     start: list[str] | None,
 ) -> Request:  # fmt: skip
     """What is to be estimated, and what is known of it."""
-    from flexdt.clients.calibration.calibrate import UNKNOWN
     from flexdt.twin.calibration.fit.priors import exact
     from flexdt.twin.calibration.fit.problem import SIX, Reading
     from flexdt.twin.calibration.fit.weak_directions import BOUND
     from flexdt.twin.calibration.pipeline import Request
+    from flexdt.twin.calibration.unknown_markers import UNKNOWN
     from flexdt.twin.geometry.offsets import Offsets
 
     usual = ("dO_x",) if phantom == UNKNOWN else SIX
