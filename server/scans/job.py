@@ -64,22 +64,20 @@ class Job:
         """How far it is, or was when it ended."""
         return self.last if self.runner is None else self.runner.progress
 
+    @property
+    def frames_done(self) -> int:
+        """Frames that are there."""
+        return 0 if self.where is None else self.where.frames_done
+
+    @property
+    def elapsed_s(self) -> float:
+        """Of the plan's time [s]."""
+        return 0.0 if self.where is None else max(0.0, self.where.tau)
+
     def memory(self) -> JobMemory:
         """What to know of it after a restart."""
-        p = self.where
-        return JobMemory(
-            id=self.id,
-            name=self.name,
-            folder=Path(self.folder).name,
-            phase=self.phase,
-            frames_total=self.frames_total,
-            frames_done=0 if p is None else p.frames_done,
-            duration_s=self.duration_s,
-            elapsed_s=0.0 if p is None else max(0.0, p.tau),
-            speed_up=self.speed_up,
-            warnings=self.warnings,
-            error=self.error,
-        )
+        known = {name: getattr(self, name) for name in JobMemory.model_fields}
+        return JobMemory(**known | {"folder": Path(self.folder).name})
 
 
 def recalled(memory: JobMemory, root: Path) -> Job:

@@ -146,17 +146,16 @@ class Jobs:
     def status(self, job: Job) -> JobStatus:
         """A job as the wire has it."""
         p = job.where
-        elapsed = 0.0 if p is None else p.tau
         step = None if p is None else p.step
         return JobStatus(
             job=job.id,
             state=job.phase,
             name=job.name,
             dataset=job.folder,
-            frames_done=0 if p is None else p.frames_done,
+            frames_done=job.frames_done,
             frames_total=job.frames_total,
-            elapsed_s=max(0.0, elapsed),
-            remaining_s=0.0 if job.phase in ENDED else max(0.0, job.duration_s - elapsed),
+            elapsed_s=job.elapsed_s,
+            remaining_s=0.0 if job.phase in ENDED else max(0.0, job.duration_s - job.elapsed_s),
             time=self._clock.now(),
             speed_up=self._clock.speed_up if job.speed_up is None else job.speed_up,
             real_time_factor=self._clock.real_time_factor,

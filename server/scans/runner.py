@@ -315,7 +315,7 @@ class ScanRunner:
         Raises:
             CollisionError: the way there, or anything of the plan that is still to come.
         """
-        paces = {axis: self.scanner.settings(axis)[1] for axis in self.scanner.machine.axes}
+        paces = {axis: pace[1] for axis, pace in self.scanner.paces.items()}
         way = rejoin(self.plan, tau, paces)
         for _ in range(CHECKS):
             # The stage may change and motors may be moved while all of it is swept in a thread.
@@ -409,8 +409,7 @@ class _Settings:
 
     @classmethod
     def of(cls, scanner: ScannerTwin) -> _Settings:
-        paces = {axis: scanner.settings(axis) for axis in scanner.machine.axes}
-        return cls(scanner.tube, scanner.camera, paces)
+        return cls(scanner.tube, scanner.camera, scanner.paces)
 
     def restore(self, scanner: ScannerTwin) -> None:
         """Put them back.

@@ -219,11 +219,10 @@ class Submissions:
     def _start(self) -> StartState:
         """The scanner at rest where its motors are bound."""
         s = self.scanner
-        paces = {axis: s.settings(axis) for axis in s.machine.axes}
         return StartState(
             positions=s.final_positions(),
-            speeds={axis: pace[0] for axis, pace in paces.items()},
-            accelerations={axis: pace[1] for axis, pace in paces.items()},
+            speeds={axis: pace[0] for axis, pace in s.paces.items()},
+            accelerations={axis: pace[1] for axis, pace in s.paces.items()},
             camera=s.camera,
             kV=s.tube.kV,
             power_W=s.tube.power_W,

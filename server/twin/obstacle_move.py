@@ -79,7 +79,7 @@ class Detours:
         scene = await asyncio.to_thread(self.stage.scene, scanner.sample, scanner.parameters)
         if scene is None:
             return Way((goal,), self._seconds(start, goal), ())
-        paces = {axis: scanner.settings(axis) for axis in scanner.machine.axes}
+        paces = scanner.paces
         found = await asyncio.to_thread(free_moves, scene, scanner.machine, start, goal, paces)
         if found is not None and len(found) <= 1:
             legs = tuple(found)

@@ -161,17 +161,12 @@ class ScanRecord(ArrayValue):
         """
         blocks = tuple(_blocks(plan))
         first = next((g for g in plan.groups if g.kind == "projection" and g.files), None)
-        if plan.settings is not None:
-            s = plan.settings
-            positions, speeds, accelerations = s.positions, s.speeds, s.accelerations
-            camera, kV, power = s.camera, s.kV, s.power_W
-        else:
+        shown = plan.start if plan.settings is None else plan.settings
+        positions = shown.positions
+        if plan.settings is None:
             at = first.starts[0] if first is not None else 0.0
             positions = {n: float(v) for n, v in plan.positions(at).items()}
-            speeds, accelerations = plan.start.speeds, plan.start.accelerations
-            camera, kV, power = plan.start.camera, plan.start.kV, plan.start.power_W
-        if first is not None:
-            camera, kV, power = first.camera, first.kV, first.power_W
+        lit = shown if first is None else first
         if sample is None:
             size = plan.sample
             sample = SampleRecord(
@@ -182,12 +177,12 @@ class ScanRecord(ArrayValue):
             name=name,
             machine=plan.machine,
             profile=plan.profile,
-            camera=camera,
-            kV=kV,
-            power_W=power,
+            camera=lit.camera,
+            kV=lit.kV,
+            power_W=lit.power_W,
             positions=dict(positions),
-            speeds=dict(speeds),
-            accelerations=dict(accelerations),
+            speeds=dict(shown.speeds),
+            accelerations=dict(shown.accelerations),
             blocks=blocks,
             smooth=any(g.moving for g in plan.groups if g.kind == "projection" and g.files),
             started=started,

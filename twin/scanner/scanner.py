@@ -145,6 +145,11 @@ class ScannerTwin:
         return self._drives[axis].speed, self._drives[axis].acceleration
 
     @property
+    def paces(self) -> dict[str, tuple[float, float]]:
+        """Motor -> speed and acceleration that its next motion will have."""
+        return {axis: self.settings(axis) for axis in self.machine.axes}
+
+    @property
     def parameters(self) -> Offsets:
         """The correction in force, as offsets; all nominal when there is none."""
         return NOMINAL if self.correction is None else self.correction.parameters

@@ -189,17 +189,11 @@ class FlyScan:
         return self.trigger + (self.frames - 1) * self.increment
 
 
-@dataclass(frozen=True)
-class Settings:
-    """The scanner at the moment of `write settings file`."""
+@dataclass(frozen=True, kw_only=True)
+class Settings(StartState):
+    """The scanner at the moment of `write settings file`, and when that was."""
 
     time_s: float
-    positions: Mapping[str, float]
-    speeds: Mapping[str, float]
-    accelerations: Mapping[str, float]
-    camera: CameraSettings
-    kV: float
-    power_W: float
     step: int
 
 

@@ -131,14 +131,15 @@ class Simulation:
     def _write_settings(self, _command: c.WriteSettingsFile) -> Span:
         motors = self.motors.all
         self.settings = Settings(
-            self.now,
             self.motors.positions(self.now),
             {n: m.speed for n, m in motors.items()},
             {n: m.acceleration for n, m in motors.items()},
             self.camera.settings,
             self.tube.kV,
             self.tube.power_W,
-            len(self.steps),
+            self.tube.on if self.tube.known else None,
+            time_s=self.now,
+            step=len(self.steps),
         )
         return self.timed("write_settings")
 
