@@ -16,11 +16,11 @@ from flexdt.clients.learning.moved_scanner import Lab
 from flexdt.phantoms import load_phantom
 from flexdt.phantoms.materials import material
 from flexdt.phantoms.phantom import Phantom
-from flexdt.twin.calibration.bead_model import bead_model
+from flexdt.twin.calibration.bead_model import bead_model, spot_radii
 from flexdt.twin.calibration.fit.identifiability import visible_beads
 from flexdt.twin.calibration.fit.problem import SIX, build_problem, edge_factor
 from flexdt.twin.calibration.fit.weak_directions import tolerance_of
-from flexdt.twin.calibration.identify import overlapping, shadow_radii
+from flexdt.twin.calibration.identify import overlapping
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
@@ -118,7 +118,7 @@ class InformationTask:
         rows = (problem.jacobian(problem.start) * scale).reshape(n, k, 2, -1)
         pixels = poses.cone_vec(at).project_points(self._model.beads, lab.shape)
         seen = visible_beads(self._model, poses, sizes, at)
-        seen &= ~overlapping(pixels, shadow_radii(self._model, poses, at))
+        seen &= ~overlapping(pixels, spot_radii(self._model, poses.cone_vec(at)))
         rows = rows * seen[..., None, None]
         return np.asarray(np.einsum("nkip,nkiq->npq", rows, rows))
 

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 
 
@@ -94,3 +95,13 @@ def bead_model(phantom: BeadPhantom | BeadModel | npt.ArrayLike) -> BeadModel:
             )
         case _:
             return BeadModel(np.asarray(phantom, dtype=np.float64), np.array(1.0))
+
+
+def spot_radii(model: BeadModel, cone: ConeVec) -> FloatArray:
+    """Radius of each bead's spot, (n, k) [px], to first order (minor semi-axis).
+
+    It is below 0 for a bead behind the source.
+    """
+    depth = np.einsum("nkj,nj->nk", model.beads[None] - cone.source[:, None], cone.normal)
+    scale = cone.source_detector_distance / np.linalg.norm(cone.u, axis=1)
+    return np.asarray(model.bead_radius_mm[None] * scale[:, None] / depth)

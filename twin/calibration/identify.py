@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
-from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
+from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model, spot_radii
 from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.fit.identifiability import visible_beads
 from flexdt.twin.calibration.fit.nominal import as_poses
@@ -449,7 +449,7 @@ def _report(
     geometry = _at(problem, best.x, start)
     turns = round((geometry.alpha - start.alpha) / (2.0 * math.pi))
     geometry = replace(geometry, alpha=geometry.alpha - 2.0 * math.pi * turns)
-    touching = overlapping(predicted, shadow_radii(model, poses, geometry))
+    touching = overlapping(predicted, spot_radii(model, poses.cone_vec(geometry)))
     index[touching] = -1
     seen = index >= 0
     tracks, covariances, bias = shadows.picked(index, problem.origin)
@@ -482,15 +482,6 @@ def _report(
 def _at(problem: Problem, x: FloatArray, start: Offsets) -> Offsets:
     names = [n for n in problem.layout.names if n in NAMES]
     return replace(start, **dict(zip(names, x.tolist(), strict=True)))
-
-
-def shadow_radii(model: BeadModel, poses: Poses, at: Offsets) -> FloatArray:
-    """Radius of each bead's spot, (n, k) [px], to first order (minor semi-axis)."""
-    cone = poses.cone_vec(at)
-    depth = np.einsum("nkj,nj->nk", model.beads[None] - cone.source[:, None], cone.normal)
-    pitch = np.linalg.norm(cone.u, axis=1)
-    scale = (cone.source_detector_distance / pitch)[:, None]
-    return np.asarray(model.bead_radius_mm[None] * scale / depth)
 
 
 def overlapping(predicted: FloatArray, radii: FloatArray) -> npt.NDArray[np.bool_]:

@@ -15,7 +15,7 @@ from functools import partial
 
 import numpy as np
 
-from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
+from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model, spot_radii
 from flexdt.twin.calibration.detect.detection import SpotFinder
 from flexdt.twin.calibration.detect.refine import FEW_WINDOWS, Refined, contrast_of, measure_beads
 from flexdt.twin.calibration.detect.windows import plan_windows
@@ -78,7 +78,6 @@ from flexdt.twin.calibration.identify import (
     Search,
     attempt,
     identified,
-    shadow_radii,
 )
 from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.geometry.motion import Motion, require_movable
@@ -264,7 +263,7 @@ def calibrate(
     iterations = fit.iterations
     sized = zip(state.scans, identifications, looks, strict=True) if want.known_sizes else ()
     for g, (scan, found_, some) in enumerate(sized):
-        radii = shadow_radii(model, scan.poses, fit.group_parameters[g])
+        radii = spot_radii(model, scan.poses.cone_vec(fit.group_parameters[g]))
         findings += _given(judge_first_size(found_, some, radii))
     if any(f.forbids for f in findings):
         return replace(state, fit=fit, findings=_sorted(findings))
@@ -334,10 +333,8 @@ def _identified(state: Calibration, want: Request) -> tuple[list[Identification]
 
 def detector_for(model: BeadModel, poses: Poses) -> SpotFinder:
     """A detector for the sizes the beads' spots can have at a rough geometry."""
-    pitch = np.linalg.norm(poses.u, axis=1)
-    scale = poses.sdd / poses.sod / pitch
-    low = float(model.bead_radius_mm.min() * scale.min())
-    high = float(model.bead_radius_mm.max() * scale.max())
+    low = float(model.bead_radius_mm.min() * poses.pixels_per_mm.min())
+    high = float(model.bead_radius_mm.max() * poses.pixels_per_mm.max())
     sizes = model.bead_radius_mm
     same = math.inf if sizes.max() > 1.2 * sizes.min() else 1.6
     return SpotFinder(radius_px=(0.65 * low, 1.5 * high), same=same)

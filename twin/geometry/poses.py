@@ -144,6 +144,11 @@ class Poses:
         """Source-detector distance along the beam, (n,) [mm]."""
         return np.asarray(self.detector[:, 1] - self.source[:, 1])
 
+    @property
+    def pixels_per_mm(self) -> FloatArray:
+        """Columns for each mm at the rotation axis, (n,)."""
+        return np.asarray(self.sdd / self.sod / np.linalg.norm(self.u, axis=1))
+
     def cone_vec(self, parameters: Offsets = NOMINAL) -> ConeVec:
         """The geometry in the object's frame, with `parameters` added to nominal.
 

@@ -15,13 +15,11 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.bead_model import BeadModel, spot_radii
 from flexdt.twin.calibration.fit.identifiability import visible_beads
 from flexdt.twin.calibration.fit.problem import SIX, build_problem, edge_factor
 from flexdt.twin.calibration.fit.weak_directions import tolerance_of
-from flexdt.twin.calibration.identify import shadow_radii
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.geometry.poses import Poses
 
 Criterion = Literal["a", "d", "worst"]
@@ -106,7 +104,7 @@ class SeatTable:
             tolerances,
             blocks.reshape(*blocks.shape[:2], -1),
             planned.poses.cone_vec().project_points(places, (1, 1)).transpose(1, 0, 2),
-            shadow_radii(model, planned.poses, NOMINAL).T,
+            spot_radii(model, planned.poses.cone_vec()).T,
             visible_beads(model, planned.poses, planned.sizes()).T,
             prior,
         )

@@ -11,12 +11,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.bead_model import BeadModel, spot_radii
 from flexdt.twin.calibration.design.information_table import PlannedScans
 from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.fit.fit import estimate_geometry
 from flexdt.twin.calibration.fit.identifiability import visible_beads
-from flexdt.twin.calibration.identify import Search, identify, overlapping, shadow_radii
+from flexdt.twin.calibration.identify import Search, identify, overlapping
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
@@ -91,7 +91,7 @@ def _tracks(model: BeadModel, planned: PlannedScans, at: Offsets) -> FloatArray:
     """(n, k, 2) pixels of the spots that count, nan elsewhere."""
     cone = planned.poses.cone_vec(at)
     pixels = cone.project_points(model.beads, planned.shape)
-    hidden = overlapping(pixels, shadow_radii(model, planned.poses, at))
+    hidden = overlapping(pixels, spot_radii(model, planned.poses.cone_vec(at)))
     hidden |= ~visible_beads(model, planned.poses, planned.sizes(), at)
     return np.where(hidden[..., None], np.nan, pixels)
 
@@ -101,7 +101,7 @@ def _shadows(
 ) -> tuple[list[Detections], list[npt.NDArray[np.intp]]]:
     """Simulated detections in random order, and the bead of each."""
     tracks = _tracks(model, planned, truth)
-    radii = shadow_radii(model, planned.poses, truth)
+    radii = spot_radii(model, planned.poses.cone_vec(truth))
     out, owners = [], []
     for frame, points in enumerate(tracks):
         seen = rng.permutation(np.flatnonzero(np.isfinite(points[:, 0])))

@@ -110,8 +110,7 @@ def judge_emptiness(
         radii = [look.detections.radii_px for look in anything if len(look.detections)]
         if len(radii) < 0.5 * len(anything) or not radii:
             continue
-        scale = scan.poses.sdd / scan.poses.sod / np.linalg.norm(scan.poses.u, axis=1)
-        expected = float(np.median(model.bead_radius_mm) * np.median(scale))
+        expected = float(np.median(model.bead_radius_mm) * np.median(scan.poses.pixels_per_mm))
         seen = float(np.median(np.concatenate(radii)))
         out.append(
             error(
@@ -187,8 +186,7 @@ def explain_identification(
             f"{100 * found.found:.0f} % of the beads in view have a shadow, and they lie "
             f"{found.rms_px:.2f} px off"
         )
-    scale = float(np.median(poses.sdd / poses.sod / np.linalg.norm(poses.u, axis=1)))
-    expected = float(np.median(model.bead_radius_mm)) * scale
+    expected = float(np.median(model.bead_radius_mm) * np.median(poses.pixels_per_mm))
     radius = float(np.median(np.concatenate([d.radii_px for d in detections])))
     if abs(math.log(radius / expected)) > math.log(OTHER_SIZE):
         why += (

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
+from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model, spot_radii
 from flexdt.twin.calibration.fit.certificate import Conditioning, spectrum
 from flexdt.twin.calibration.fit.nominal import Shape, as_poses, frame_shapes
 from flexdt.twin.calibration.fit.priors import require_widths
@@ -178,12 +178,10 @@ def visible_beads(
     """
     cone = poses.cone_vec(at)
     pixels = cone.project_points(model.beads, (1, 1))
-    depth = np.einsum("nkj,nj->nk", model.beads[None] - cone.source[:, None], cone.normal)
-    pitch = np.linalg.norm(cone.u, axis=1)
-    radius = model.bead_radius_mm[None] * (cone.source_detector_distance / pitch)[:, None] / depth
+    radius = spot_radii(model, cone)
     half = shape[:, None, ::-1] / 2
     inside = (np.abs(pixels) + radius[..., None] <= half).all(axis=2)
-    return np.asarray(inside & (depth > 0))
+    return np.asarray(inside & (radius > 0))
 
 
 def _worst(sigmas: dict[str, float]) -> float:
