@@ -27,9 +27,9 @@ from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.launch.processes import Servers
 from flexdt.clients.reconstruction.reconstruct import (
     VolumeRequest,
-    read_volume,
     reconstruct_dataset,
 )
+from flexdt.clients.reconstruction.volume_files import read_volume
 from flexdt.phantoms import lego_phantom
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.projection import Volume

@@ -24,7 +24,6 @@ from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.reconstruction.volume_files import (
     check_name,
     read_values,
-    read_volume,
     volume_writer,
     write_slices,
 )
@@ -57,18 +56,6 @@ if TYPE_CHECKING:
     from flexdt.twin.physics.scatter.simulation import ScanScatter
     from flexdt.twin.physics.spectrum import TubeModel
     from flexdt.twin.reconstruction import Hardening
-
-__all__ = [
-    "ALGORITHMS",
-    "ScanFrames",
-    "VolumeRequest",
-    "grid_of",
-    "preview",
-    "read_volume",
-    "reconstruct_dataset",
-    "reconstruct_volume",
-    "views_of",
-]
 
 Progress = Callable[[float, float], None]
 """Called with the work done and the whole, in the algorithm's own units."""

@@ -18,9 +18,9 @@ from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.launch.local_twin import LocalTwin
 from flexdt.clients.reconstruction.reconstruct import (
     VolumeRequest,
-    read_volume,
     reconstruct_dataset,
 )
+from flexdt.clients.reconstruction.volume_files import read_volume
 from flexdt.phantoms import lego_phantom
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.offsets import Offsets

@@ -20,10 +20,9 @@ from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.reconstruction.reconstruct import VolumeRequest as Request
 from flexdt.clients.reconstruction.reconstruct import (
     preview,
-    read_volume,
     reconstruct_dataset,
 )
-from flexdt.clients.reconstruction.volume_files import middle_slices, read_values
+from flexdt.clients.reconstruction.volume_files import middle_slices, read_values, read_volume
 from flexdt.phantoms import lego_phantom
 from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.radiography import Radiography
