@@ -109,11 +109,7 @@ def _geometry(data: DataSet) -> tuple[str, bytes]:
             full_scale=data.full_scale,
         )  # fmt: skip
         return GEOMETRY, geometry_text(geometry).encode()
-    c = data.correction
-    entry = None
-    if c is not None:
-        parameters = c.parameters.to_edge()
-        entry = CorrectionEntry(name=c.name, date=c.date, note=c.note, parameters=parameters)
+    entry = CorrectionEntry.of(data.correction)
     return DOCUMENT, document.model_copy(update={"correction": entry}).to_json().encode()
 
 

@@ -159,7 +159,6 @@ class ReadOnlyTwin:
                 position=at, target=at, velocity=0.0, limits=(ends[0], ends[1]), moving=of.moving,
                 virtual=True,
             )  # fmt: skip
-        camera, sensor = mirror.camera, machine.detector.sensor
         near = self._nearest(positions)
         return w.State(
             time=now - self._began,
@@ -168,15 +167,7 @@ class ReadOnlyTwin:
                 on=bool(mirror.xrays_on), kV=mirror.kV, power_W=mirror.power_W,
                 ready=bool(mirror.xrays_on) and now >= mirror.ready_s,
             ),
-            camera=w.CameraState(
-                mode=camera.mode,
-                exposure_ms=camera.exposure_ms,
-                roi=camera.roi.edges,
-                averages=camera.averages,
-                frames=camera.frames,
-                shape=camera.shape,
-                pixel_mm=camera.pixel_mm(sensor),
-            ),
+            camera=w.CameraState(**mirror.camera.facts(machine.detector.sensor)),
             sample=w.SampleState(name=None),
             geometry=self._geometry(mirror, positions),
             safety=w.SafetyState(
@@ -219,15 +210,7 @@ class ReadOnlyTwin:
         found = readout(poses, mirror.camera, f.machine.detector.sensor)
         if found is None:
             raise GeometryError("the axis or the detector is not in front of the source", {})
-        return w.GeometryState(
-            SOD_mm=found.sod_mm,
-            SDD_mm=found.sdd_mm,
-            magnification=found.magnification,
-            voxel_size_mm=found.voxel_mm,
-            piercing_point_px=found.piercing_point_px,
-            field_of_view_mm=found.field_of_view_mm,
-            axis_column_px=found.axis_column_px,
-        )
+        return w.GeometryState(**vars(found))
 
     def _warnings(self, mirror: Mirror, now: float) -> list[str]:
         age = mirror.age_s(now)

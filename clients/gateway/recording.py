@@ -30,7 +30,6 @@ from flexdt.twin.dataset.flexdt_json import DatasetDocument, FrameEntry, parse_d
 from flexdt.twin.dataset.record import FrameBlock, FrameKind, ScanRecord
 from flexdt.twin.dataset.scan_settings_text import format_scan_settings
 from flexdt.twin.dataset.xre import format_xre
-from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.scanner.state import Correction
@@ -248,9 +247,7 @@ def _positions(state: State) -> Mapping[str, float]:
 
 def _correction(state: State) -> Correction | None:
     c = state.correction
-    if c is None:
-        return None
-    return Correction(c.name, c.date, Offsets.from_edge(c.parameters), c.comment)
+    return None if c is None else Correction.from_edge(c.name, c.date, c.parameters, c.comment)
 
 
 def _blocks(frames: Sequence[FrameEntry], start: float) -> list[FrameBlock]:

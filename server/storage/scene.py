@@ -11,7 +11,6 @@ from typing import Any
 from flexdt.protocol.rpc_errors import invalid_params
 from flexdt.protocol.scene_document import CameraPart, CorrectionPart, SamplePart, Scene, TubePart
 from flexdt.protocol.scene_document import Placement as WirePlacement
-from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.machine.kinematics import resolve_targets
 from flexdt.twin.scanner.scanner import ScannerTwin
@@ -22,9 +21,6 @@ def save_scene(
     scanner: ScannerTwin, now: float, *, name: str = "", saved: str = "", version: str = ""
 ) -> Scene:
     """The scanner as a document; a motor under way is saved where it is bound."""
-    camera = asdict(scanner.camera) | {"roi": scanner.camera.roi.edges}
-    del camera["modes"]
-    paces = {axis: scanner.settings(axis) for axis in scanner.machine.axes}
     return Scene(
         schema=1,
         flexdt=version,
@@ -33,10 +29,10 @@ def save_scene(
         machine=scanner.machine.name,
         profile=scanner.profile.name,
         positions=scanner.targets(now),
-        speeds={axis: pace[0] for axis, pace in paces.items()},
-        accelerations={axis: pace[1] for axis, pace in paces.items()},
+        speeds={axis: pace[0] for axis, pace in scanner.paces.items()},
+        accelerations={axis: pace[1] for axis, pace in scanner.paces.items()},
         tube=TubePart(kV=scanner.tube.kV, power_W=scanner.tube.power_W, on=scanner.tube.on),
-        camera=CameraPart(**camera),
+        camera=CameraPart(**scanner.camera.stated),
         sample=SamplePart(
             name=scanner.sample.name,
             material=scanner.sample.material,
@@ -64,7 +60,7 @@ def correction_of(part: CorrectionPart) -> Correction:
     Raises:
         UnknownNameError: a name that is not a parameter.
     """
-    return Correction(part.name, part.date, Offsets.from_edge(part.parameters), part.comment)
+    return Correction.from_edge(part.name, part.date, part.parameters, part.comment)
 
 
 def require_fit(scene: Scene, scanner: ScannerTwin) -> None:
@@ -90,10 +86,9 @@ def require_fit(scene: Scene, scanner: ScannerTwin) -> None:
 
 def paces_of(scene: Scene, scanner: ScannerTwin) -> dict[str, tuple[float, float]]:
     """Motor -> (speed, acceleration) with the scene's where it has them."""
-    now = {axis: scanner.settings(axis) for axis in scanner.machine.axes}
     return {
         axis: (scene.speeds.get(axis, speed), scene.accelerations.get(axis, acceleration))
-        for axis, (speed, acceleration) in now.items()
+        for axis, (speed, acceleration) in scanner.paces.items()
     }
 
 

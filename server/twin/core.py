@@ -260,7 +260,7 @@ class TwinServer:
             tube=views.tube_view(snapshot.tube, snapshot.time),
             camera=views.camera_view(snapshot.camera, self.machine),
             sample=self.sample_state(),
-            geometry=views.geometry_view(snapshot.readout, snapshot.camera),
+            geometry=views.geometry_view(snapshot.readout),
             safety=views.safety_view(
                 snapshot.safety, self._clearance(snapshot), self.machine.safety_margin_mm
             ),

@@ -31,18 +31,10 @@ def tube_view(tube: TubeState, now: float) -> w.TubeState:
 
 def camera_view(camera: CameraSettings, machine: Machine) -> w.CameraState:
     """The camera."""
-    return w.CameraState(
-        mode=camera.mode,
-        exposure_ms=camera.exposure_ms,
-        roi=camera.roi.edges,
-        averages=camera.averages,
-        frames=camera.frames,
-        shape=camera.shape,
-        pixel_mm=camera.pixel_mm(machine.detector.sensor),
-    )
+    return w.CameraState(**camera.facts(machine.detector.sensor))
 
 
-def geometry_view(readout: Readout | None, camera: CameraSettings) -> w.GeometryState:
+def geometry_view(readout: Readout | None) -> w.GeometryState:
     """Derived geometry.
 
     Raises:
@@ -52,21 +44,7 @@ def geometry_view(readout: Readout | None, camera: CameraSettings) -> w.Geometry
         raise GeometryError(
             "the rotation axis or the detector is not in front of the source", {"check": "sod"}
         )
-    rows = camera.shape[0]
-    row = readout.piercing_point_px[1]
-    pixel, distance = readout.field_of_view_mm[1] * readout.magnification / rows, readout.sdd_mm
-    up = math.atan2((row + 0.5) * pixel, distance)
-    down = math.atan2((rows - 0.5 - row) * pixel, distance)
-    return w.GeometryState(
-        SOD_mm=readout.sod_mm,
-        SDD_mm=readout.sdd_mm,
-        magnification=readout.magnification,
-        voxel_size_mm=readout.voxel_mm,
-        piercing_point_px=readout.piercing_point_px,
-        field_of_view_mm=readout.field_of_view_mm,
-        cone_angle_deg=math.degrees(up + down),
-        axis_column_px=readout.axis_column_px,
-    )
+    return w.GeometryState(**vars(readout))
 
 
 def safety_view(safety: Safety, clearance: NearestPair | None, margin_mm: float) -> w.SafetyState:

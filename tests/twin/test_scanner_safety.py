@@ -176,11 +176,11 @@ def test_readouts_of_listing_1() -> None:
     r = s.state(1e3).readout
     assert r is not None
     # By hand: SOD 660 + 14.9192, SDD 1059 + 40.0008; voxel = pixel * SOD / SDD.
-    assert r.sod_mm == pytest.approx(674.9192)
-    assert r.sdd_mm == pytest.approx(1099.0008)
+    assert r.SOD_mm == pytest.approx(674.9192)
+    assert r.SDD_mm == pytest.approx(1099.0008)
     assert r.magnification == pytest.approx(1099.0008 / 674.9192)
-    assert r.voxel_mm == pytest.approx(0.1496 * 674.9192 / 1099.0008)
-    assert r.field_of_view_mm[0] == pytest.approx(956 * r.voxel_mm)
+    assert r.voxel_size_mm == pytest.approx(0.1496 * 674.9192 / 1099.0008)
+    assert r.field_of_view_mm[0] == pytest.approx(956 * r.voxel_size_mm)
     assert r.piercing_point_px[0] == pytest.approx(477.5, abs=0.02)
     # ver_tube - 6.2917 = 33.7083 against ver_det 33.6969: the foot is 0.0114 mm above the centre.
     # The axis stands at axs_tan = -0.5405: magnified, in pixels of 0.1496 mm, from the centre.
@@ -200,7 +200,7 @@ def test_a_correction_replaces_the_last_and_shows_in_cone_vec_and_readout() -> N
     assert s.cone_vec(0.0) == s.poses(0.0).cone_vec(Offsets(dO_z=5.0, tau_x=1.0))
     before, after = s.poses(0.0).sod[0], s.state(0.0).readout
     assert after is not None
-    assert after.sod_mm == pytest.approx(before + 5.0)
+    assert after.SOD_mm == pytest.approx(before + 5.0)
     s.take_stage(s.stage_change(Sample(), None, None, 0.0).certified(), 0.0)
     assert s.cone_vec(0.0) == nominal
     with pytest.raises(GeometryError):

@@ -22,7 +22,6 @@ from flexdt.twin.dataset.file_names import DOCUMENT, plain_name
 from flexdt.twin.dataset.record import FrameBlock, FrameKind, NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine import kinematics
 from flexdt.twin.machine.camera import CameraSettings, Roi
@@ -96,6 +95,14 @@ class CorrectionEntry(_Model):
     note: str = ""
     parameters: dict[str, float]
 
+    @classmethod
+    def of(cls, correction: Correction | None) -> CorrectionEntry | None:
+        """The entry of a correction."""
+        c = correction
+        if c is None:
+            return None
+        return cls(name=c.name, date=c.date, note=c.note, parameters=c.parameters.to_edge())
+
 
 class DatasetDocument(_Model):
     """The content of `flexdt.json`."""
@@ -127,7 +134,6 @@ class DatasetDocument(_Model):
         """The document of a scan."""
         camera = record.camera
         rows, cols = camera.shape
-        correction = record.correction
         return cls(
             schema=SCHEMA,
             flexdt=record.version,
@@ -146,21 +152,11 @@ class DatasetDocument(_Model):
                 cols=cols,
                 pixel_mm=camera.pixel_mm(record.machine.detector.sensor),
                 bits=record.machine.detector.bits,
-                mode=camera.mode,
-                roi=camera.roi.edges,
-                exposure_ms=camera.exposure_ms,
-                averages=camera.averages,
+                **camera.stated,
             ),
             sample=record.sample,
             noise=record.noise,
-            correction=None
-            if correction is None
-            else CorrectionEntry(
-                name=correction.name,
-                date=correction.date,
-                note=correction.note,
-                parameters=correction.parameters.to_edge(),
-            ),
+            correction=CorrectionEntry.of(record.correction),
             settings_positions=dict(record.positions),
             frames=[entry for block in record.blocks for entry in _entries(record, block)],
         )
@@ -229,9 +225,7 @@ class DatasetDocument(_Model):
     def correction_in_force(self) -> Correction | None:
         """The correction, in internal units."""
         c = self.correction
-        if c is None:
-            return None
-        return Correction(c.name, c.date, Offsets.from_edge(c.parameters), c.note)
+        return None if c is None else Correction.from_edge(c.name, c.date, c.parameters, c.note)
 
     def machine_of(self, file: str = DOCUMENT) -> Machine:
         """The scanner.
@@ -300,10 +294,7 @@ def _entries(record: ScanRecord, block: FrameBlock) -> Sequence[FrameEntry]:
             file=file,
             kind=block.kind,
             time_s=time,
-            exposure_ms=block.camera.exposure_ms,
-            averages=block.camera.averages,
-            mode=block.camera.mode,
-            roi=block.camera.roi.edges,
+            **block.camera.stated,
             xrays_on=block.xrays_on,
             positions=dict(zip(names, values, strict=True)),
             cone_vec=row,

@@ -227,13 +227,7 @@ class Mirror:
                 for name, a in self.axes.items()
             },
             "tube": {"on": self.xrays_on, "kV": self.kV, "power_W": self.power_W},
-            "camera": {
-                "mode": self.camera.mode,
-                "exposure_ms": self.camera.exposure_ms,
-                "averages": self.camera.averages,
-                "frames": self.camera.frames,
-                "roi": [int(edge) for edge in str(self.camera.roi).split()],
-            },
+            "camera": {**self.camera.stated, "roi": list(self.camera.roi.edges)},
             "waiting": [w.heard.text for w in self.waiting.values()],
             "next_line": self.next_line,
             "alarms": [

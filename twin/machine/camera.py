@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from flexdt.twin.errors import LimitError
 
@@ -72,6 +73,21 @@ class CameraSettings:
         """Image (rows, cols); a surplus that does not fill a binned pixel is cut off."""
         b, r = self.binning, self.roi
         return (r.bottom - r.top + 1) // b, (r.right - r.left + 1) // b
+
+    @property
+    def stated(self) -> dict[str, Any]:
+        """What is set, by name; the ROI as its edges."""
+        return {
+            "mode": self.mode,
+            "exposure_ms": self.exposure_ms,
+            "roi": self.roi.edges,
+            "averages": self.averages,
+            "frames": self.frames,
+        }
+
+    def facts(self, sensor: Sensor) -> dict[str, Any]:
+        """What is set and the image's `shape` and `pixel_mm`: the wire's camera."""
+        return {**self.stated, "shape": self.shape, "pixel_mm": self.pixel_mm(sensor)}
 
     def pixel_mm(self, sensor: Sensor) -> float:
         """Binned pixel pitch from column to column [mm]."""

@@ -44,14 +44,14 @@ def readout(
     on_axis = [tau[0], tau[1], cone.source[0, 2]]
     axis_column = cone.project_points(on_axis, (rows, cols))[0, 0, 0]
     scale = sod / sdd
+    up, down = (x * row_pixel / sdd for x in (row + 0.5, rows - 0.5 - row))
     return Readout(
-        sod_mm=sod,
-        sdd_mm=sdd,
+        SOD_mm=sod,
+        SDD_mm=sdd,
         magnification=sdd / sod,
-        pixel_mm=pixel,
-        voxel_mm=pixel * scale,
+        voxel_size_mm=pixel * scale,
         field_of_view_mm=(cols * pixel * scale, rows * row_pixel * scale),
         piercing_point_px=(float(column), float(row)),
+        cone_angle_deg=math.degrees(math.atan(up) + math.atan(down)),
         axis_column_px=float(axis_column),
-        angle_deg=math.degrees(float(poses.angle[0])),
     )

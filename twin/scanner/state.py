@@ -124,6 +124,15 @@ class Correction:
     parameters: Offsets = NOMINAL
     note: str = ""
 
+    @classmethod
+    def from_edge(cls, name: str, date: str, values: Mapping[str, float], note: str) -> Correction:
+        """The correction with these values [mm, deg].
+
+        Raises:
+            UnknownNameError: a name that is not a parameter.
+        """
+        return cls(name, date, Offsets.from_edge(values), note)
+
 
 @dataclass(frozen=True)
 class Safety:
@@ -147,29 +156,27 @@ class Safety:
 
 @dataclass(frozen=True)
 class Readout:
-    """Derived quantities of one geometry, as scanners show them.
+    """Derived quantities of one geometry, as scanners show them; the fields are those of the wire.
 
     Attributes:
-        sod_mm: source-object distance along the beam.
-        sdd_mm: source-detector distance along the beam.
-        magnification: sdd / sod.
-        pixel_mm: binned pixel pitch.
-        voxel_mm: pixel * sod / sdd.
+        SOD_mm: source-object distance along the beam.
+        SDD_mm: source-detector distance along the beam.
+        magnification: SDD / SOD.
+        voxel_size_mm: binned pixel pitch * SOD / SDD.
         field_of_view_mm: (width, height) of the image, scaled back to the rotation axis.
         piercing_point_px: (column, row) of the foot of the perpendicular from the focal spot.
+        cone_angle_deg: full vertical opening angle.
         axis_column_px: column of the rotation axis at the height of the focal spot.
-        angle_deg: accumulated stage angle.
     """
 
-    sod_mm: float
-    sdd_mm: float
+    SOD_mm: float
+    SDD_mm: float
     magnification: float
-    pixel_mm: float
-    voxel_mm: float
+    voxel_size_mm: float
     field_of_view_mm: tuple[float, float]
     piercing_point_px: tuple[float, float]
+    cone_angle_deg: float
     axis_column_px: float
-    angle_deg: float
 
 
 @dataclass(frozen=True)
