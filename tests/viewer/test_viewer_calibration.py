@@ -154,6 +154,12 @@ def test_what_cannot_be_fitted_is_told(page: Any, twin: TwinClient, wait: Wait) 
     assert page.locator("#fit:not([disabled])").count() == 1
 
 
+def told_place(page: Any) -> tuple[float, float]:
+    """Column and row of the last mark, as the page says them."""
+    column, row = page.inner_text("#mark-row [aria-live]").split(" at ")[1].split(", ")
+    return float(column), float(row)
+
+
 def test_beads_marked_by_clicking_are_what_is_fitted(page: Any, twin: TwinClient) -> None:
     """Clicked are places that sines and cosines put 2 mm aside and 1 mm up: the fit says so."""
     machine, aside, up = builtin_machine(), 2.0, 1.0
@@ -187,6 +193,20 @@ def test_beads_marked_by_clicking_are_what_is_fitted(page: Any, twin: TwinClient
     point_at(page, 0.1, 0.1)
     page.mouse.down()
     page.mouse.up()
+    page.get_by_text("21 marks in 4 images · 5 at").wait_for()
+    # A drag moves it, arrows by a tenth of a pixel; Enter marks the middle.
+    page.mouse.down()
+    point_at(page, 0.2, 0.15)
+    page.mouse.up()
+    column, row = told_place(page)
+    assert (column, row) == pytest.approx((0.2 * 478 - 0.5, 0.15 * 380 - 0.5), abs=1.0)
+    page.locator("#film-canvas").focus()
+    for key in ("ArrowRight", "ArrowRight", "ArrowUp", "Shift+ArrowDown"):
+        page.keyboard.press(key)
+    assert told_place(page) == pytest.approx((column + 0.2, row + 4.9), abs=0.11)
+    page.keyboard.press("Enter")
+    page.get_by_text("22 marks in 4 images · 6 at 238.5, 189.5").wait_for()
+    page.get_by_role("button", name="6 ×").click()
     page.get_by_text("21 marks in 4 images").wait_for()
     drawn = coloured(film(page), PINK)
     page.get_by_role("button", name="5 ×").click()

@@ -3,15 +3,10 @@ import { $, $input, $select, el, field, fixed, parsed } from "./dom.js";
 import { call, command, emit, Failure, on, store } from "./link.js";
 const LEASE_S = 0.5, MOST_S = 10, RENEW_MS = 180, SETTLE_MS = 400;
 const GROUPS = [
-    ["Source", "#ffb020", ["ver_tube", "tra_tube"]],
-    ["Sample", "#3aa0ff", ["mag_obj", "tra_obj", "rot_obj", "ver_obj"]],
-    ["Detector", "#7a5cff", ["mag_det", "ver_det", "tra_det"]],
+    ["Source", "#ffb020", { ver_tube: "height", tra_tube: "sideways" }],
+    ["Sample", "#3aa0ff", { mag_obj: "to the detector", tra_obj: "sideways", rot_obj: "turn", ver_obj: "source and detector, up and down" }],
+    ["Detector", "#7a5cff", { mag_det: "distance", ver_det: "height", tra_det: "to the left" }],
 ];
-const WHAT = {
-    ver_tube: "height", tra_tube: "sideways",
-    mag_obj: "to the detector", tra_obj: "sideways", rot_obj: "turn", ver_obj: "source and detector, up and down",
-    mag_det: "distance", ver_det: "height", tra_det: "to the left",
-};
 const JOG_FALLBACK = { mm: 50, deg: 45 };
 const rows = new Map();
 const held = new Map();
@@ -65,8 +60,7 @@ async function move(axis, value) {
 }
 function jogButton(axis, direction, sign) {
     const token = `${axis}:${direction}`;
-    const button = el("button", { title: `Hold to jog ${axis} (or hold Enter)`, "aria-label": `jog ${axis} ${direction > 0 ? "up" : "down"}` }, sign);
-    button.dataset.jog = token;
+    const button = el("button", { "data-jog": token, title: `Hold to jog ${axis} (or hold Enter)`, "aria-label": `jog ${axis} ${direction > 0 ? "up" : "down"}` }, sign);
     const stop = () => { button.classList.remove("held"); jogStop(token); };
     const start = () => { button.classList.add("held"); jogStart(axis, direction, token); };
     button.addEventListener("pointerdown", (e) => { e.preventDefault(); button.setPointerCapture(e.pointerId); start(); });
@@ -79,30 +73,22 @@ function jogButton(axis, direction, sign) {
     return button;
 }
 function build(state) {
-    const groups = GROUPS.map(([title, tint, names]) => [title, tint, names.filter((n) => n in state.axes)]);
-    const known = new Set(groups.flatMap((g) => g[2]));
-    const others = Object.keys(state.axes).filter((n) => !known.has(n));
-    if (others.length)
-        groups.push(["Others", "#999", others]);
+    const others = Object.keys(state.axes).filter((name) => !GROUPS.some(([, , axes]) => name in axes));
     const box = $("#axes");
     box.textContent = "";
     rows.clear();
-    for (const [title, tint, names] of groups) {
-        if (!names.length)
-            continue;
-        const group = el("div", { class: "group" }, el("h2", {}, title));
-        group.style.setProperty("--tint", tint);
-        for (const name of names)
-            group.append(axisRow(name, state.axes[name]));
-        box.append(group);
+    for (const [title, tint, axes] of [...GROUPS, ["Others", "#999", Object.fromEntries(others.map((name) => [name, ""]))]]) {
+        const found = Object.entries(axes).filter(([name]) => name in state.axes).map(([name, what]) => axisRow(name, state.axes[name], what));
+        if (found.length)
+            box.append(el("div", { class: "group", style: `--tint:${tint}` }, el("h2", {}, title), ...found));
     }
 }
-function axisRow(name, axis) {
+function axisRow(name, axis, what) {
     const [low, high] = axis.limits;
     const slider = el("input", { type: "range", min: low, max: high, step: 0.1, value: axis.target, "aria-label": `${name} slider` });
     const number = field({ "aria-label": `${name} value` }, enter, () => number.blur());
     const now = el("span", { class: "now" });
-    const box = el("div", { class: "axis" });
+    const box = el("div", { class: "axis", "data-axis": name });
     const row = { name, box, slider, number, now, low, high, from: low, to: high, turn: NaN, dragging: false, asked: 0, waiting: 0 };
     function enter() {
         const text = number.value, value = parsed(text);
@@ -128,8 +114,7 @@ function axisRow(name, axis) {
         } }, wait);
     };
     slider.addEventListener("change", () => void slid());
-    box.append(el("div", { class: "top" }, el("span", { title: WHAT[name] ?? "" }, el("span", { class: "name" }, name), el("span", { class: "what" }, WHAT[name] ?? "")), el("span", {}, number, el("span", { class: "unit" }, axis.unit === "deg" ? "°" : "mm"))), el("div", { class: "line" }, jogButton(name, -1, "−"), el("div", { class: "track" }, slider, now), jogButton(name, 1, "+")));
-    box.dataset.axis = name;
+    box.append(el("div", { class: "top" }, el("span", { title: what }, el("span", { class: "name" }, name), el("span", { class: "what" }, what)), el("span", {}, number, el("span", { class: "unit" }, axis.unit === "deg" ? "°" : "mm"))), el("div", { class: "line" }, jogButton(name, -1, "−"), el("div", { class: "track" }, slider, now), jogButton(name, 1, "+")));
     rows.set(name, row);
     return box;
 }

@@ -48,12 +48,13 @@ export function words(i) {
 }
 // Dragging the curtain in the picture; `pixel` is a CSS pixel in its coordinates.
 let held = false;
-export function press(place, pixel) { const i = store.image, [c] = place; return marks.press(place) || (held = i?.virtual !== undefined && mode.value === "curtain" && Math.abs(c - column(i)) < REACH * pixel); }
-export function drag([c]) { if (held && store.image) {
+export function press(place, pixel) { const i = store.image, [c] = place; return marks.press(place, REACH * pixel) || (held = i?.virtual !== undefined && mode.value === "curtain" && Math.abs(c - column(i)) < REACH * pixel); }
+export function drag([c, r]) { if (marks.drag([c, r]))
+    return true; if (held && store.image) {
     curtain.value = String((1000 * c) / store.image.shape[1]);
     again();
 } return held; }
-export function release() { held = false; }
+export function release() { held = false; marks.release(); }
 const scanned = () => (store.recorded === null ? undefined : tracks.get(store.recorded));
 const shown = (i) => scanned()?.frames.find((f) => f.file === i?.recorded?.file);
 const px = (v) => (v === null || v === undefined ? "–" : `${fixed(v, v < 1 ? 3 : 2)} px`);

@@ -1,8 +1,9 @@
 // The Data tab: a browser of data sets; one that is open goes through its images, radiograph and machine together.
-import { $, $$, $button, $dialog, $select, download, el, fixed, putGrey, seconds, setText, within, words } from "./dom.js";
+import { $, $$, $button, $dialog, $select, el, fixed, putImage, seconds, setText, slid, within, words } from "./dom.js";
 import { call, command, emit, on, store } from "./link.js";
 import { asked, remember } from "./address.js";
 import { draw as drawTimeline } from "./timeline.js";
+import { offer } from "./share.js";
 import * as compare from "./compare.js";
 import * as marks from "./marks.js";
 const SEARCH_MS = 250, AGAIN_MS = 500, PLAYED = 300, LEAST_MS = 60;
@@ -15,17 +16,13 @@ const canvas = el("canvas", { id: "record-line", role: "img", "aria-label": "Mot
 const button = (id, text, title, f) => el("button", { id, class: "small", title, onclick: f }, text);
 const panel = el("div", { id: "record", hidden: true }, el("div", { class: "row head" }, el("b", { id: "record-name", class: "cut" }), el("span", { id: "record-state", class: "muted cut" }), el("span", { class: "spacer" }), button("record-fit", "Calibrate", "Calibrate from this data set: its sample is the phantom", () => { if (told)
     emit("calibrate", told.info.name, told.info.sample); }), button("record-align", "Align", "Find the axis of this scan without a phantom", () => { if (told)
-    emit("align", told.info.name); }), button("record-script", "Script", "Bring its script into the Scan tab", script), button("record-replay", "Replay file", "This scan as one HTML file that plays it", replay), button("record-close", "Close", "Back to what is live (Escape)", () => open(null, null, true))), el("div", { class: "row head" }, button("record-play", "▶", "Play", () => play(!playing)), button("record-back", "‹", "The image before", () => show(index - 1)), slider, button("record-next", "›", "The next image", () => show(index + 1)), el("span", { id: "record-at", class: "mono small-text cut" })), compare.row, marks.row((all) => { if (told)
+    emit("align", told.info.name); }), button("record-script", "Script", "Bring its script into the Scan tab", script), button("record-replay", "Replay file", "This scan as one HTML file that plays it", () => offer("viewer.export", { format: "html", replay: true }, "No replay")), button("record-close", "Close", "Back to what is live (Escape)", () => open(null, null, true))), el("div", { class: "row head" }, button("record-play", "▶", "Play", () => play(!playing)), button("record-back", "‹", "The image before", () => show(index - 1)), slider, button("record-next", "›", "The next image", () => show(index + 1)), el("span", { id: "record-at", class: "mono small-text cut" })), compare.row, marks.row((all) => { if (told)
     emit("calibrate", told.info.name, told.info.sample, all); }), el("div", { class: "lanes" }, canvas), el("div", { id: "record-note", class: "muted small-text cut" }));
 $("#stage").append(panel);
 // Thumbnails come as 8-bit grey.
 function thumbnail(small) {
     const c = el("canvas", { width: 1, height: 1 });
-    if (!small)
-        return c;
-    const raw = atob(small.data);
-    putGrey(c, small.shape, (k) => raw.charCodeAt(k));
-    return c;
+    return small ? putImage(c, small) : c;
 }
 const dated = (info) => (info.started ? info.started.slice(0, 16).replace("T", " ") : new Date(1000 * info.modified).toISOString().slice(0, 16).replace("T", " "));
 function settings(info) {
@@ -35,8 +32,7 @@ function settings(info) {
 }
 function row(info) {
     const why = info.problem || info.reason;
-    const node = el("button", { class: "data-set", title: why, onclick: () => open(info.name, null, true) }, thumbnail(info.thumbnail), el("span", {}, el("b", {}, info.name), el("span", { class: "muted" }, dated(info)), el("span", {}, settings(info)), el("span", { class: `state ${info.state}` }, info.state === "incomplete" && why ? `incomplete: ${why}` : info.state === "unknown" && why ? why : WORDS[info.state])));
-    node.dataset.name = info.name;
+    const node = el("button", { class: "data-set", "data-name": info.name, title: why, onclick: () => open(info.name, null, true) }, thumbnail(info.thumbnail), el("span", {}, el("b", {}, info.name), el("span", { class: "muted" }, dated(info)), el("span", {}, settings(info)), el("span", { class: `state ${info.state}` }, info.state === "incomplete" && why ? `incomplete: ${why}` : info.state === "unknown" && why ? why : WORDS[info.state])));
     node.setAttribute("aria-current", String(info.name === told?.info.name));
     return node;
 }
@@ -242,11 +238,6 @@ async function script() {
     if (answer?.script)
         emit("script", answer.script);
 }
-async function replay() {
-    const a = await command("viewer.export", { format: "html", replay: true }, "No replay");
-    if (a)
-        download(a.url, a.name);
-}
 // The virtual image goes with what the twin has in force.
 let force = "";
 const anew = () => { if (told) {
@@ -260,16 +251,14 @@ on("state", ({ sample, correction }) => {
         anew();
     force = now;
 });
-const seek = (e) => {
+slid(canvas, (part) => {
+    void play(false);
     if (!plan || !told)
         return;
-    const b = canvas.getBoundingClientRect(), { times, duration_s } = plan, t = Math.min(1, Math.max(0, (e.clientX - b.left) / b.width)) * duration_s;
+    const { times, duration_s } = plan, t = part * duration_s;
     const k = times.reduce((best, v, i) => (Math.abs(v - t) < Math.abs(times[best] - t) ? i : best), 0);
     void show(told.indices[k]);
-};
-canvas.addEventListener("pointerdown", (e) => { void play(false); canvas.setPointerCapture(e.pointerId); seek(e); });
-canvas.addEventListener("pointermove", (e) => { if (e.buttons)
-    seek(e); });
+});
 slider.addEventListener("pointerdown", () => void play(false));
 new ResizeObserver(redraw).observe(panel);
 new MutationObserver(redraw).observe(document.documentElement, { attributeFilter: ["data-theme"] });

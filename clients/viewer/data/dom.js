@@ -105,6 +105,39 @@ export function putGrey(canvas, [rows, cols], grey) {
         d[k] = 0xff000000 | (grey(k) * 0x010101);
     x.putImageData(out, 0, 0);
 }
+// One that the wire brought, with 8 bits a pixel.
+export function putImage(canvas, { shape, data }) {
+    const raw = atob(data);
+    putGrey(canvas, shape, (k) => raw.charCodeAt(k));
+    return canvas;
+}
+// A canvas with as many pixels as it takes on the screen, empty: what draws in it, width, height.
+export function cleared(canvas) {
+    canvas.width = canvas.clientWidth * devicePixelRatio;
+    canvas.height = canvas.clientHeight * devicePixelRatio;
+    return [context2d(canvas), canvas.width, canvas.height];
+}
+// How often each value occurs, as its logarithm, so that what is rare shows beside much air.
+export function bars([x, w, h], counts, style) {
+    const n = counts.length, most = Math.log1p(Math.max(...Array.from(counts)));
+    for (let k = 0; k < n; k++) {
+        const high = (h * Math.log1p(counts[k])) / most;
+        style(k);
+        x.fillRect((w * k) / n, h - high, Math.max(1, w / n - 1), high);
+    }
+}
+// Pressed or dragged: which part of its width the pointer is at.
+export function slid(canvas, to) {
+    const tell = (e) => { const b = canvas.getBoundingClientRect(); to(Math.min(1, Math.max(0, (e.clientX - b.left) / b.width))); };
+    canvas.addEventListener("pointerdown", (e) => { canvas.setPointerCapture(e.pointerId); tell(e); });
+    canvas.addEventListener("pointermove", (e) => { if (canvas.hasPointerCapture(e.pointerId))
+        tell(e); });
+}
+// A file that somebody chooses is taken once, and may be chosen again.
+export function chosen(input, take) {
+    input.addEventListener("change", () => { const file = input.files?.[0]; if (file)
+        void take(file); input.value = ""; });
+}
 // What went wrong, in words.
 export const words = (error) => (error instanceof Error ? error.message : String(error));
 // The element of a kind that an event happened within; elements of other frames are of other classes.

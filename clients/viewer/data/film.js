@@ -1,14 +1,16 @@
 // The radiograph: window and level, zoom, the value under the pointer, beads and flags drawn over it, and its
 // difference from a frame that was kept.
-import { $, $button, $canvas, $input, $select, context2d, fixed, setText } from "./dom.js";
+import { $, $button, $canvas, $input, $select, bars, cleared, context2d, fixed, setText, slid } from "./dom.js";
 import { call, emit, on, store } from "./link.js";
 import * as measure from "./measure.js";
 import * as compare from "./compare.js";
+import * as marks from "./marks.js";
 const canvas = $canvas("#film-canvas"), context = context2d(canvas), film = $("#film");
 const buffer = document.createElement("canvas"), pixels2d = context2d(buffer);
 // Zoom is relative to the whole image fitted in; x, y is the middle in pixels of the image.
 const view = { zoom: 1, x: 0, y: 0 };
 const SLIMMEST = 0.75, FLATTEST = 3; // of the film; a narrower image gets black edges
+const CLICK = 4; // pixels of the screen that a click may move
 const SATURATED = 0xff3040ff, STARVED = 0xff30b0ff; // drawn in red and orange
 let range = [0, 1], windowed = [0, 1], due = false, stamps = [], quiet, pointer = null;
 export const shown = { count: 0, at: 0 };
@@ -165,10 +167,9 @@ export function draw() {
     const alone = reference && $input("#difference").checked && !i.signed ? "  ·  no difference: the reference is of another kind or size" : "";
     setText($("#film-note"), `${i.full[1]} × ${i.full[0]}  ·  window ${low} – ${high}${zoom}${alone}`);
 }
-// How often each value occurs, drawn as the logarithm, so that a thin sample shows beside much air; what the
-// window leaves out is pale.
+// What the window leaves out is pale.
 const BINS = 128, EVERY = 7;
-const chart = $canvas("#histogram"), chart2d = context2d(chart);
+const chart = $canvas("#histogram");
 export function histogram(i, [low, high]) {
     const counts = new Float64Array(BINS), step = BINS / (high - low);
     for (let k = 0; k < i.pixels.length; k += EVERY) {
@@ -178,15 +179,13 @@ export function histogram(i, [low, high]) {
     return counts;
 }
 function drawHistogram(i) {
-    const counts = histogram(i, range), w = (chart.width = chart.clientWidth * devicePixelRatio), h = (chart.height = chart.clientHeight * devicePixelRatio);
-    const most = Math.log1p(Math.max(...counts)), at = (v) => (w * (v - range[0])) / (range[1] - range[0]);
+    const [chart2d, w, h] = cleared(chart), step = (range[1] - range[0]) / BINS, at = (v) => (w * (v - range[0])) / (range[1] - range[0]);
     const style = getComputedStyle(chart);
     chart2d.fillStyle = style.getPropertyValue("--accent");
-    for (let k = 0; k < BINS; k++) {
-        const middle = range[0] + ((k + 0.5) * (range[1] - range[0])) / BINS, high = (h * Math.log1p(counts[k])) / most;
+    bars([chart2d, w, h], histogram(i, range), (k) => {
+        const middle = range[0] + (k + 0.5) * step;
         chart2d.globalAlpha = middle < windowed[0] || middle > windowed[1] ? 0.3 : 1;
-        chart2d.fillRect((w * k) / BINS, h - high, Math.max(1, w / BINS - 1), high);
-    }
+    });
     chart2d.globalAlpha = 1;
     chart2d.fillStyle = style.getPropertyValue("--text");
     const wide = 6 * devicePixelRatio;
@@ -199,15 +198,12 @@ function drawHistogram(i) {
 }
 // The nearer end of the window follows the pointer.
 let pulled = null;
-function pull(e) {
-    const box = chart.getBoundingClientRect(), to = Math.min(1000, Math.max(0, (1000 * (e.clientX - box.left)) / box.width));
+slid(chart, (part) => {
+    const to = 1000 * part;
     pulled ??= Math.abs(to - lowEnd()) <= Math.abs(to - highEnd()) ? $input("#low") : $input("#high");
     pulled.value = String(to);
     pulled.dispatchEvent(new Event("input"));
-}
-chart.addEventListener("pointerdown", (e) => { chart.setPointerCapture(e.pointerId); pull(e); });
-chart.addEventListener("pointermove", (e) => { if (pulled)
-    pull(e); });
+});
 for (const end of ["pointerup", "pointercancel"])
     chart.addEventListener(end, () => { pulled?.dispatchEvent(new Event("change")); pulled = null; });
 on("state", (s) => {
@@ -296,25 +292,28 @@ canvas.addEventListener("wheel", (e) => {
     if (store.image)
         zoomTo(Math.min(40, Math.max(1, view.zoom * Math.exp(-e.deltaY / 400))), [e.clientX, e.clientY]);
 }, { passive: false });
-let drag = null;
+let drag = null, down = [0, 0];
 function place(e, { full: [rows, cols] }) {
     const [c, r] = at([e.clientX, e.clientY]), inside = (v, n) => Math.min(n - 1, Math.max(0, Math.floor(v)));
     return [inside(c, cols), inside(r, rows)];
 }
 canvas.addEventListener("pointerdown", (e) => {
     canvas.setPointerCapture(e.pointerId);
+    down = [e.clientX, e.clientY];
     const i = store.image;
     if (i && (measure.press(place(e, i)) || compare.press(at([e.clientX, e.clientY]), 1 / scale())))
         ask();
     else
         drag = [e.clientX, e.clientY, view.x, view.y];
 });
+canvas.addEventListener("pointerup", (e) => { if (Math.hypot(e.clientX - down[0], e.clientY - down[1]) < CLICK)
+    marks.click(at(down)); });
 for (const end of ["pointerup", "pointercancel"])
     canvas.addEventListener(end, () => { drag = null; measure.release(); compare.release(); });
 canvas.addEventListener("pointermove", (e) => {
     pointer = [e.clientX, e.clientY];
     const i = store.image;
-    if ((i && (measure.drag(place(e, i)) || compare.drag(place(e, i)))) || measure.follows())
+    if ((i && (measure.drag(place(e, i)) || compare.drag(at(pointer)))) || measure.follows())
         ask();
     if (drag) {
         view.x = drag[2] - (e.clientX - drag[0]) / scale();
@@ -330,11 +329,15 @@ const STEPS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowD
 const TIMES = { "+": 1.25, "=": 1.25, "-": 0.8 };
 canvas.addEventListener("keydown", (e) => {
     const step = STEPS[e.key], times = TIMES[e.key];
-    if (!store.image || e.ctrlKey || e.metaKey || e.altKey || (!step && !times && e.key !== "0"))
+    if (!store.image || e.ctrlKey || e.metaKey || e.altKey || (!step && !times && !["0", "Enter"].includes(e.key)))
         return;
     e.preventDefault();
     e.stopPropagation();
-    if (step) {
+    if (e.key === "Enter")
+        marks.click([view.x, view.y]);
+    else if (step && marks.shift(step, e.shiftKey))
+        return;
+    else if (step) {
         view.x += (40 * step[0]) / scale();
         view.y += (40 * step[1]) / scale();
         ask();

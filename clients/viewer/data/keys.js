@@ -90,9 +90,8 @@ export function toggleHelp() {
     }
     if (!dialog.childElementCount) {
         const grid = el("div", { class: "keys" });
-        for (const [code, [, , what]] of Object.entries(JOGS))
-            grid.append(el("kbd", {}, name(code)), el("span", {}, what));
-        for (const [key, what] of [["Space", "stop all axes"], ["Shift+Space", "emergency stop"], ["Alt+1…5", "views"], ["F1", "this help"]])
+        const jogs = Object.entries(JOGS).map(([code, [, , what]]) => [name(code), what]);
+        for (const [key, what] of [...jogs, ["Space", "stop all axes"], ["Shift+Space", "emergency stop"], ["Alt+1…5", "views"], ["F1", "this help"]])
             grid.append(el("kbd", {}, key), el("span", {}, what));
         dialog.append(el("h2", {}, "Keys"), grid, el("p", { class: "muted" }, HELP), el("div", { class: "row between" }, el("a", { href: "https://viser.studio", target: "_blank", class: "muted" }, "3-D by viser"), el("button", { class: "primary", onclick: () => dialog.close() }, "Close")));
     }

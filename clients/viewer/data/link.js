@@ -3,9 +3,10 @@
 import { words } from "./dom.js";
 export const pageId = [...crypto.getRandomValues(new Uint8Array(12))].map((b) => b.toString(16).padStart(2, "0")).join("");
 export const store = {
-    state: null, framing: null, near: null, hello: null, session: null, twin: false, viewer: false,
-    layers: {}, opacity: 1, image: null, recorded: null, hidden: false, received: { state: 0, image: 0 }, age: 0, fresh: null, imageAge: 0,
-    job: null, refused: null, problem: null,
+    state: null, framing: null, near: null, hello: null, session: null,
+    twin: false, viewer: false, layers: {}, opacity: 1, image: null, recorded: null, hidden: false,
+    received: { state: 0, image: 0 }, age: 0, fresh: null, imageAge: 0, job: null, refused: null,
+    problem: null, coneVec: null, cameras: null,
 };
 // Older than OLD_S, what is shown is said to be old; after SILENT_S nobody waits for answers any more.
 export const OLD_S = 1;

@@ -1,6 +1,6 @@
 // Measuring in the radiograph: a loupe, the profile along a line, the statistics of a region, the ray of a pixel. Places are
 // (column, row) of the full image; what was marked stays and is measured anew in every image.
-import { $, $canvas, $select, context2d, field, fixed, parsed, setText, words } from "./dom.js";
+import { $, $canvas, $select, cleared, field, fixed, parsed, setText, words } from "./dom.js";
 import { call } from "./link.js";
 const LOUPE = { radius: 72, times: 4 }, SAMPLES = 512;
 const HINTS = { pan: "", loupe: "", profile: "drag a line, or type its ends: column row column row", region: "drag a box, or type its corners: column row column row",
@@ -117,7 +117,7 @@ function ray(i) {
             redraw();
         } });
 }
-const plot = $canvas("#profile"), plot2d = context2d(plot);
+const plot = $canvas("#profile");
 // What was marked, measured in this image.
 export function tell(i, value) {
     const s = shapes[tool], marks = tool in shapes;
@@ -148,7 +148,7 @@ export function tell(i, value) {
         return;
     }
     setText($("#measured"), `${number(low)} to ${number(high)} · ${fixed(Math.hypot(s[2] - s[0], s[3] - s[1]), 1)} px`);
-    const w = (plot.width = plot.clientWidth * devicePixelRatio), h = (plot.height = plot.clientHeight * devicePixelRatio);
+    const [plot2d, w, h] = cleared(plot);
     plot2d.strokeStyle = getComputedStyle(plot).getPropertyValue("--accent");
     plot2d.lineWidth = 1.5 * devicePixelRatio;
     plot2d.beginPath();

@@ -1,5 +1,5 @@
 // The Scan tab: a script to write, check, scrub and run; the job's progress; thumbnails of its frames.
-import { $, $button, $canvas, $input, $select, bytes, el, fixed, isNumber, pressed, putGrey, seconds, words } from "./dom.js";
+import { $, $button, $canvas, $input, $select, bytes, chosen, el, fixed, isNumber, pressed, putGrey, seconds, slid, words } from "./dom.js";
 import { call, command, emit, Failure, on, store } from "./link.js";
 import { rememberedScript, rememberScript } from "./address.js";
 import { folder, open as openData } from "./data.js";
@@ -19,7 +19,7 @@ function jobButton(action) {
     const order = () => command(`job.${action}`, { job: store.job?.job }, `Cannot ${action}`);
     return el("button", { class: `small${action === "abort" ? " warn" : ""}`, id: `job-${action}`, onclick: order }, action.charAt(0).toUpperCase() + action.slice(1));
 }
-$("#tab-scan").append(el("div", { class: "card" }, el("h2", {}, "Script"), el("div", { class: "editor" }, gutter, el("div", { id: "paint", "aria-hidden": "true" }, ink), text), el("div", { id: "line-note", class: "small-text", "aria-live": "polite" }), el("div", { class: "row", style: "margin-top:7px" }, el("label", { class: "inline" }, el("input", { type: "file", id: "script-file", accept: ".txt,.acq", hidden: true }), el("button", { class: "small", onclick: () => $input("#script-file").click() }, "Open…")), el("button", { id: "check", class: "small", onclick: checkAndPlan }, "Check"), el("button", { id: "plan", class: "small", onclick: showPlan }, "Scrub"), el("span", { class: "spacer" }), el("span", { class: "inline" }, el("select", { id: "speed-up", title: "Speed-up", "aria-label": "Speed-up of the scan" }, ...SPEEDS.map(([v, t]) => el("option", { value: v }, t))), el("button", { id: "run", class: "small primary", onclick: run }, "Run"))), el("div", { class: "row", style: "margin-top:7px" }, el("select", { id: "wish-kind", "aria-label": "Kind of scan" }, ...["fly", "step", "tiled", "helical", "calibration"].map((k) => el("option", {}, k))), el("label", { class: "inline muted" }, "frames", el("input", { type: "number", id: "wish-frames", value: 73, min: 2, style: "width:58px" })), el("label", { class: "inline muted" }, "ms", el("input", { type: "number", id: "wish-exposure", value: 100, style: "width:54px" })), el("button", { id: "compose", class: "small", onclick: () => compose() }, "Write")), el("div", { class: "report", id: "report" })), el("div", { class: "card", id: "timeline-card", hidden: true }, el("h2", {}, "Timeline"), el("canvas", { id: "timeline", tabIndex: 0, role: "slider", "aria-label": "Moment of the plan", "aria-valuemin": 0 }), el("div", { class: "row between small-text mono" }, el("span", { id: "scrub-at", class: "cut" }), el("button", { class: "small", id: "unscrub", onclick: () => scrub(null) }, "Hide ghost"))), el("div", { class: "card", id: "thumb-card", hidden: true }, el("h2", {}, "Frames"), el("div", { class: "thumbs", id: "thumbs" })));
+$("#tab-scan").append(el("div", { class: "card" }, el("h2", {}, "Script"), el("div", { class: "editor" }, gutter, el("div", { id: "paint", "aria-hidden": "true" }, ink), text), el("div", { id: "line-note", class: "small-text", "aria-live": "polite" }), el("div", { class: "row", style: "margin-top:7px" }, el("label", { class: "inline" }, el("input", { type: "file", id: "script-file", accept: ".txt,.acq", hidden: true }), el("button", { class: "small", onclick: () => $input("#script-file").click() }, "Open…")), el("button", { id: "check", class: "small", onclick: checkAndPlan }, "Check"), el("button", { id: "plan", class: "small", onclick: showPlan }, "Scrub"), el("span", { class: "spacer" }), el("span", { class: "inline" }, el("select", { id: "speed-up", title: "Speed-up", "aria-label": "Speed-up of the scan" }, ...SPEEDS.map(([v, t]) => el("option", { value: v }, t))), el("button", { id: "run", class: "small primary", onclick: run }, "Run"))), el("div", { class: "row", style: "margin-top:7px" }, el("select", { id: "wish-kind", "aria-label": "Kind of scan" }, ...["fly", "step", "tiled", "helical", "calibration"].map((k) => el("option", {}, k))), el("label", { class: "inline muted" }, "frames", el("input", { type: "number", id: "wish-frames", value: 73, min: 2 })), el("label", { class: "inline muted" }, "ms", el("input", { type: "number", id: "wish-exposure", value: 100 })), el("button", { id: "compose", class: "small", onclick: () => compose() }, "Write")), el("div", { class: "report", id: "report" })), el("div", { class: "card", id: "timeline-card", hidden: true }, el("h2", {}, "Timeline"), el("canvas", { id: "timeline", tabIndex: 0, role: "slider", "aria-label": "Moment of the plan", "aria-valuemin": 0 }), el("div", { class: "row between small-text mono" }, el("span", { id: "scrub-at", class: "cut" }), el("button", { class: "small", id: "unscrub", onclick: () => scrub(null) }, "Hide ghost"))), el("div", { class: "card", id: "thumb-card", hidden: true }, el("h2", {}, "Frames"), el("div", { class: "thumbs", id: "thumbs" })));
 designer.place($("#tab-scan .card"));
 $("#job").append(el("div", { class: "row between" }, el("b", { id: "job-name" }), el("span", { id: "job-state", class: "muted" })), el("div", { class: "progress", id: "job-bar" }, el("i")), el("div", { class: "row between small-text mono" }, el("span", { id: "job-frames" }), el("span", { id: "job-left" })), el("div", { class: "muted small-text", id: "job-what" }), el("div", { class: "row", style: "margin-top:6px" }, ...["pause", "resume", "step", "abort"].map(jobButton), el("button", { id: "job-scrub", class: "small", title: "Go through this scan's plan on the timeline", onclick: recall }, "Go through it"), el("button", { id: "job-data", class: "small", title: "Its images, with the machine as it stood",
     onclick: () => { emit("show-tab", "data"); void openData(folder(store.job), null, true); } }, "Images")));
@@ -82,15 +82,7 @@ text.addEventListener("keydown", (e) => {
     leaving = e.key === "Escape";
 });
 text.addEventListener("blur", () => { leaving = false; });
-async function openScript() {
-    const input = $input("#script-file"), file = input.files?.[0];
-    if (file) {
-        setScript(await file.text());
-        sent = file.name.replace(/\.[^.]*$/, "");
-    }
-    input.value = "";
-}
-$input("#script-file").addEventListener("change", () => void openScript());
+chosen($input("#script-file"), async (file) => { setScript(await file.text()); sent = file.name.replace(/\.[^.]*$/, ""); });
 export function setScript(value) { text.value = value; sent = ""; outdated(); }
 export function goTo(line) {
     if (!line)
@@ -237,10 +229,7 @@ async function recall() {
         await showPlan();
     }
 }
-function bring(script) {
-    emit("show-tab", "scan");
-    setScript(script);
-}
+function bring(script) { emit("show-tab", "scan"); setScript(script); }
 on("script", bring);
 let asking = false, next = null, at = null;
 export async function scrub(time) {
@@ -269,11 +258,8 @@ function redraw() {
         canvas.setAttribute(name, String(value));
 }
 const canvas = $canvas("#timeline");
-const seek = (e) => { if (!plan)
-    return; const b = canvas.getBoundingClientRect(); void scrub(Math.min(1, Math.max(0, (e.clientX - b.left) / b.width)) * plan.duration_s); };
-canvas.addEventListener("pointerdown", (e) => { canvas.setPointerCapture(e.pointerId); seek(e); });
-canvas.addEventListener("pointermove", (e) => { if (e.buttons)
-    seek(e); });
+slid(canvas, (part) => { if (plan)
+    void scrub(part * plan.duration_s); });
 const STEPS = { ArrowLeft: -0.01, ArrowRight: 0.01, Home: -1, End: 1 };
 canvas.addEventListener("keydown", (e) => {
     const step = STEPS[e.key];

@@ -1,5 +1,5 @@
 // The Setup tab: tube, camera, sample on the stage (with upload), layers of the scene.
-import { $, $$, $button, $canvas, $input, $select, base64, context2d, el, field, fixed, parsed, words } from "./dom.js";
+import { $, $$, $button, $canvas, $input, $select, base64, cleared, el, field, fixed, parsed, words } from "./dom.js";
 import { call, command, emit, on, store } from "./link.js";
 const CHUNK = 3 << 20;
 const MODES = ["HW1SW1High", "HW2SW1High", "HW2SW2High", "HW1SW1Low", "HW2SW1Low", "HW2SW2Low"];
@@ -217,7 +217,7 @@ async function spectrum(kV) {
     const s = await call("viewer.spectrum", { kV }).catch(words);
     if (spectrumOf !== kV)
         return;
-    const canvas = $canvas("#spectrum"), x = context2d(canvas), w = (canvas.width = canvas.clientWidth * devicePixelRatio), h = (canvas.height = canvas.clientHeight * devicePixelRatio);
+    const canvas = $canvas("#spectrum"), [x, w, h] = cleared(canvas);
     if (typeof s === "string") {
         $("#filters").textContent = "–";
         $("#spectrum-note").textContent = s;

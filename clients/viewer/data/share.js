@@ -1,9 +1,9 @@
 // The Share tab: pictures, files that open anywhere, scenes to save and load.
-import { $, $input, $select, bytes, download, el, words } from "./dom.js";
+import { $, $input, $select, bytes, chosen, download, el, words } from "./dom.js";
 import { command, emit } from "./link.js";
 import { picture } from "./film.js";
 import { current } from "./views.js";
-async function offer(method, params, title) {
+export async function offer(method, params, title) {
     const a = await command(method, params, title);
     if (!a)
         return;
@@ -25,8 +25,7 @@ function film() {
     else
         emit("note", "error", "No picture", "no radiograph has come yet");
 }
-const scene = (format) => () => offer("viewer.export", { format }, "No export");
-const replay = (format) => () => offer("viewer.export", { format, replay: true }, "No replay");
+const exported = (format, replay = false) => () => offer("viewer.export", { format, replay }, replay ? "No replay" : "No export");
 async function save() {
     const a = await command("scene.save", {}, "Not saved");
     if (!a)
@@ -37,12 +36,8 @@ async function save() {
 }
 const button = (id, text, f) => el("button", { id, class: "small", onclick: f }, text);
 const row = (...nodes) => el("div", { class: "row", style: "flex-wrap:wrap" }, ...nodes);
-$("#tab-share").append(el("div", { class: "card" }, el("h2", {}, "Picture of a view"), row(el("select", { id: "shot-size", "aria-label": "Size of the picture" }, ...["1280x800", "1920x1080", "3840x2160"].map((s) => el("option", {}, s))), button("shot", "Save PNG", shot), button("shot-film", "Radiograph PNG", film))), el("div", { class: "card" }, el("h2", {}, "The scene as it stands"), row(button("export-html", "One HTML file", scene("html")), button("export-viser", ".viser", scene("viser"))), el("p", { class: "muted" }, "The HTML opens in any browser, without a server.")), el("div", { class: "card" }, el("h2", {}, "A scan as a replay"), row(button("replay-html", "One HTML file", replay("html")), button("replay-viser", ".viser", replay("viser"))), el("p", { class: "muted" }, "Of the script that was last scrubbed in the Scan tab.")), el("div", { class: "card" }, el("h2", {}, "Scenes"), row(button("scene-save", "Save", save), el("input", { type: "file", id: "scene-file", accept: ".json", hidden: true }), button("scene-load", "Load…", () => $input("#scene-file").click())), el("p", { class: "muted" }, "Positions, tube, camera, sample and correction. Loading moves the machine.")));
-async function load() {
-    const input = $input("#scene-file"), file = input.files?.[0];
-    input.value = "";
-    if (!file)
-        return;
+$("#tab-share").append(el("div", { class: "card" }, el("h2", {}, "Picture of a view"), row(el("select", { id: "shot-size", "aria-label": "Size of the picture" }, ...["1280x800", "1920x1080", "3840x2160"].map((s) => el("option", {}, s))), button("shot", "Save PNG", shot), button("shot-film", "Radiograph PNG", film))), el("div", { class: "card" }, el("h2", {}, "The scene as it stands"), row(button("export-html", "One HTML file", exported("html")), button("export-viser", ".viser", exported("viser"))), el("p", { class: "muted" }, "The HTML opens in any browser, without a server.")), el("div", { class: "card" }, el("h2", {}, "A scan as a replay"), row(button("replay-html", "One HTML file", exported("html", true)), button("replay-viser", ".viser", exported("viser", true))), el("p", { class: "muted" }, "Of the script that was last scrubbed in the Scan tab.")), el("div", { class: "card" }, el("h2", {}, "Scenes"), row(button("scene-save", "Save", save), el("input", { type: "file", id: "scene-file", accept: ".json", hidden: true }), button("scene-load", "Load…", () => $input("#scene-file").click())), el("p", { class: "muted" }, "Positions, tube, camera, sample and correction. Loading moves the machine.")));
+chosen($input("#scene-file"), async (file) => {
     try {
         if (await command("scene.load", { document: JSON.parse(await file.text()) }, "Not loaded"))
             emit("note", "good", "Scene", `${file.name} is loaded`);
@@ -50,5 +45,4 @@ async function load() {
     catch (error) {
         emit("note", "error", "Scene", `${file.name}: ${words(error)}`);
     }
-}
-$input("#scene-file").addEventListener("change", () => void load());
+});

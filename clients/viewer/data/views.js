@@ -5,6 +5,7 @@ import { remember } from "./address.js";
 const NAMES = { iso: "Isometric", beam: "Beam’s eye", side: "Side", free: "Free" };
 const WIDE = 1.35; // aspect for which the fixed cameras are made, as in clients.py
 const open = new Map();
+$("#view-switch").append(...Object.entries({ four: "Four views", ...NAMES }).map(([name, words]) => el("button", { "data-layout": name, onclick: () => layout(name, true) }, words)));
 export let current = null;
 // Without a graphics processor every picture costs processor time that the radiograph needs more.
 const query = new URLSearchParams(location.search);
@@ -34,8 +35,7 @@ function frame(view) {
     iframe.addEventListener("load", () => { if (iframe.contentWindow)
         emit("frame", iframe.contentWindow); }); // keys.js listens in it, too
     const tag = el("span", { class: "tag" }, NAMES[view]);
-    const box = el("div", { class: "view" });
-    box.dataset.view = view;
+    const box = el("div", { class: "view", "data-view": view });
     if (view === "beam") {
         const crop = el("div", { class: "crop" }, iframe, el("div", { class: "shield" }));
         box.append(crop, tag);
@@ -105,5 +105,3 @@ export function fit(force = false) {
 }
 on("state", () => fit());
 new ResizeObserver(() => fit()).observe($("#views"));
-for (const button of $$("#view-switch button"))
-    button.addEventListener("click", () => layout(button.dataset.layout ?? "iso", true));

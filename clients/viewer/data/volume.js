@@ -1,5 +1,5 @@
 // The volume that grows while a scan runs: its three middle slices, from the images so far.
-import { $, $canvas, el, fixed, keep, putGrey, setText, words } from "./dom.js";
+import { $, $canvas, el, fixed, keep, putImage, setText, words } from "./dom.js";
 import { call, on, store } from "./link.js";
 import { folder } from "./data.js";
 const KEY = "flexdt-volume", PLANES = { top: "from above", front: "from the source", side: "from the side" };
@@ -46,8 +46,6 @@ on("volume", (m) => {
     $(".slices").hidden = false;
     const other = m.side === Number(size.value) ? "" : `${m.side} voxels a side, as another page chose · `;
     setText(note, `${other}${m.views} of ${m.of} views · voxels of ${fixed(1000 * m.voxel_mm, 0)} µm · ${fixed(m.low, 4)} to ${fixed(m.high, 4)} per mm`);
-    for (const [name, { shape, data }] of Object.entries(m.slices)) {
-        const raw = atob(data);
-        putGrey($canvas(`#slice-${name}`), shape, (k) => raw.charCodeAt(k));
-    }
+    for (const [name, slice] of Object.entries(m.slices))
+        putImage($canvas(`#slice-${name}`), slice);
 });

@@ -1,20 +1,14 @@
 // The Move tab: a slider, a number and two hold-to-jog buttons for every axis, and the keys.
 import { $, $input, $select, el, field, fixed, parsed } from "./dom.js";
-import type { AxisState, State } from "./wire.js";
+import type { AxisState, State } from "./viewer.js";
 import { call, command, emit, Failure, on, store } from "./link.js";
 
 const LEASE_S = 0.5, MOST_S = 10, RENEW_MS = 180, SETTLE_MS = 400;
-type Group = [title: string, tint: string, names: string[]];
-const GROUPS: Group[] = [
-  ["Source", "#ffb020", ["ver_tube", "tra_tube"]],
-  ["Sample", "#3aa0ff", ["mag_obj", "tra_obj", "rot_obj", "ver_obj"]],
-  ["Detector", "#7a5cff", ["mag_det", "ver_det", "tra_det"]],
+const GROUPS: Array<[title: string, tint: string, axes: Record<string, string>]> = [
+  ["Source", "#ffb020", { ver_tube: "height", tra_tube: "sideways" }],
+  ["Sample", "#3aa0ff", { mag_obj: "to the detector", tra_obj: "sideways", rot_obj: "turn", ver_obj: "source and detector, up and down" }],
+  ["Detector", "#7a5cff", { mag_det: "distance", ver_det: "height", tra_det: "to the left" }],
 ];
-const WHAT: Record<string, string> = {
-  ver_tube: "height", tra_tube: "sideways",
-  mag_obj: "to the detector", tra_obj: "sideways", rot_obj: "turn", ver_obj: "source and detector, up and down",
-  mag_det: "distance", ver_det: "height", tra_det: "to the left",
-};
 const JOG_FALLBACK = { mm: 50, deg: 45 };
 interface Row {
   name: string; box: HTMLElement; slider: HTMLInputElement; number: HTMLInputElement; now: HTMLElement;
@@ -68,8 +62,7 @@ async function move(axis: string, value: number) {
 
 function jogButton(axis: string, direction: number, sign: string) {
   const token = `${axis}:${direction}`;
-  const button = el("button", { title: `Hold to jog ${axis} (or hold Enter)`, "aria-label": `jog ${axis} ${direction > 0 ? "up" : "down"}` }, sign);
-  button.dataset.jog = token;
+  const button = el("button", { "data-jog": token, title: `Hold to jog ${axis} (or hold Enter)`, "aria-label": `jog ${axis} ${direction > 0 ? "up" : "down"}` }, sign);
   const stop = () => { button.classList.remove("held"); jogStop(token); };
   const start = () => { button.classList.add("held"); jogStart(axis, direction, token); };
   button.addEventListener("pointerdown", (e) => { e.preventDefault(); button.setPointerCapture(e.pointerId); start(); });
@@ -80,25 +73,20 @@ function jogButton(axis: string, direction: number, sign: string) {
 }
 
 function build(state: State) {
-  const groups = GROUPS.map<Group>(([title, tint, names]) => [title, tint, names.filter((n) => n in state.axes)]);
-  const known = new Set(groups.flatMap((g) => g[2]));
-  const others = Object.keys(state.axes).filter((n) => !known.has(n));
-  if (others.length) groups.push(["Others", "#999", others]);
+  const others = Object.keys(state.axes).filter((name) => !GROUPS.some(([, , axes]) => name in axes));
   const box = $("#axes"); box.textContent = ""; rows.clear();
-  for (const [title, tint, names] of groups) {
-    if (!names.length) continue;
-    const group = el("div", { class: "group" }, el("h2", {}, title)); group.style.setProperty("--tint", tint);
-    for (const name of names) group.append(axisRow(name, state.axes[name]));
-    box.append(group);
+  for (const [title, tint, axes] of [...GROUPS, ["Others", "#999", Object.fromEntries(others.map((name) => [name, ""]))] as const]) {
+    const found = Object.entries(axes).filter(([name]) => name in state.axes).map(([name, what]) => axisRow(name, state.axes[name], what));
+    if (found.length) box.append(el("div", { class: "group", style: `--tint:${tint}` }, el("h2", {}, title), ...found));
   }
 }
 
-function axisRow(name: string, axis: AxisState) {
+function axisRow(name: string, axis: AxisState, what: string) {
   const [low, high] = axis.limits;
   const slider = el("input", { type: "range", min: low, max: high, step: 0.1, value: axis.target, "aria-label": `${name} slider` });
   const number = field({ "aria-label": `${name} value` }, enter, () => number.blur());
   const now = el("span", { class: "now" });
-  const box = el("div", { class: "axis" });
+  const box = el("div", { class: "axis", "data-axis": name });
   const row: Row = { name, box, slider, number, now, low, high, from: low, to: high, turn: NaN, dragging: false, asked: 0, waiting: 0 };
   function enter() {
     const text = number.value, value = parsed(text);
@@ -120,10 +108,9 @@ function axisRow(name: string, axis: AxisState) {
   slider.addEventListener("change", () => void slid());
   box.append(
     el("div", { class: "top" },
-      el("span", { title: WHAT[name] ?? "" }, el("span", { class: "name" }, name), el("span", { class: "what" }, WHAT[name] ?? "")),
+      el("span", { title: what }, el("span", { class: "name" }, name), el("span", { class: "what" }, what)),
       el("span", {}, number, el("span", { class: "unit" }, axis.unit === "deg" ? "°" : "mm"))),
     el("div", { class: "line" }, jogButton(name, -1, "−"), el("div", { class: "track" }, slider, now), jogButton(name, 1, "+")));
-  box.dataset.axis = name;
   rows.set(name, row);
   return box;
 }

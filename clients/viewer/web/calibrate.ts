@@ -1,8 +1,7 @@
 // The Calibrate tab: corrections there are, the one in force, applying and undoing, running a fit.
-import { $, $$, $button, $input, el, fixed, words } from "./dom.js";
+import { $, $$, $button, $input, chosen, el, fixed, words } from "./dom.js";
 import { call, command, emit, on } from "./link.js";
-import type { FitReport } from "./viewer.js";
-import type { CalibrationAlignResult, Correction, Estimated, Requests } from "./wire.js";
+import type { CalibrationAlignResult, Correction, Estimated, FitReport, Requests } from "./viewer.js";
 import { know } from "./compare.js";
 import { open } from "./data.js";
 
@@ -71,14 +70,10 @@ export async function refresh(): Promise<void> {
   }
 }
 const dated = (correction: Correction) => correction.date.slice(0, 16).replace("T", " ");
-async function applyFile() {
-  const input = $input("#correction-file"), file = input.files?.[0];
-  if (!file) return;
-  input.value = "";
+chosen($input("#correction-file"), async (file) => {
   try { await apply(parametersOf(JSON.parse(await file.text())), file.name); }
   catch (error) { emit("note", "error", "Not applied", `${file.name}: ${words(error)}`); }
-}
-$input("#correction-file").addEventListener("change", () => void applyFile());
+});
 
 async function datasets() {
   const answer = await call("viewer.datasets").catch(() => null);

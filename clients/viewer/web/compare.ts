@@ -52,9 +52,9 @@ export function words(i: Shown | null): string {
 }
 // Dragging the curtain in the picture; `pixel` is a CSS pixel in its coordinates.
 let held = false;
-export function press(place: Pair, pixel: number): boolean { const i = store.image, [c] = place; return marks.press(place) || (held = i?.virtual !== undefined && mode.value === "curtain" && Math.abs(c - column(i)) < REACH * pixel); }
-export function drag([c]: Pair): boolean { if (held && store.image) { curtain.value = String((1000 * c) / store.image.shape[1]); again(); } return held; }
-export function release(): void { held = false; }
+export function press(place: Pair, pixel: number): boolean { const i = store.image, [c] = place; return marks.press(place, REACH * pixel) || (held = i?.virtual !== undefined && mode.value === "curtain" && Math.abs(c - column(i)) < REACH * pixel); }
+export function drag([c, r]: Pair): boolean { if (marks.drag([c, r])) return true; if (held && store.image) { curtain.value = String((1000 * c) / store.image.shape[1]); again(); } return held; }
+export function release(): void { held = false; marks.release(); }
 
 const scanned = () => (store.recorded === null ? undefined : tracks.get(store.recorded));
 const shown = (i: Shown | null) => scanned()?.frames.find((f) => f.file === i?.recorded?.file);

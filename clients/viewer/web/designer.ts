@@ -1,7 +1,7 @@
 // The scan designer: bars for voxel, tube, exposure and images; what a scan with them will look like. A change of a bar
 // rewrites the script, unless somebody else's stands there.
-import { $input, bytes, context2d, el, fixed, seconds, setText, words } from "./dom.js";
-import type { ExposurePrediction, TransmissionShares } from "./wire.js";
+import { $input, bars, bytes, cleared, el, fixed, seconds, setText, words } from "./dom.js";
+import type { ExposurePrediction, TransmissionShares } from "./viewer.js";
 import { call, emit, on, store } from "./link.js";
 
 const SETTLE_MS = 400, LATEST = 1.02;
@@ -19,7 +19,7 @@ const row = ([name, words, unit, digits]: (typeof BARS)[number]) => {
 const word = (id: string, label: string, start: string, title: string) => [el("label", { class: "muted", htmlFor: id, title }, label), el("input", { type: "text", id, value: start, title, onchange: changed })];
 const facts = el("div", { id: "design-facts", class: "small-text", "aria-live": "polite" });
 const chart = el("canvas", { id: "design-chart", role: "img", "aria-label": "Predicted histogram of transmission" });
-const card = el("details", { class: "card", id: "designer", ontoggle: () => { if (card.open) void begin(); } }, el("summary", {}, "Design a scan"),
+const card = el("details", { id: "designer", ontoggle: () => { if (card.open) void begin(); } }, el("summary", {}, "Design a scan"),
   el("div", { class: "form" }, ...BARS.flatMap(row),
     ...word("design-filter", "filter", "", "MATERIAL:MM beside the machine’s own, put there by hand: aluminium:1"),
     ...word("design-detail", "detail", "void:0.5", "What is to be seen on the darkest ray: MATERIAL:MM or void:MM"),
@@ -36,8 +36,8 @@ function put(name: Bar, v: number) {
   inputs[name].value = String(1000 * Math.min(1, Math.max(0, t))); inputs[name].dispatchEvent(new Event("input"));
 }
 // What a script is to have; nothing while the designer is closed.
-const bars = () => Object.fromEntries(BARS.map(([name]) => [name, value(name)])) as Record<Bar, number>;
-export const wish = (): Partial<Record<Bar, number>> => (card.open && scales.kV ? bars() : {});
+const wished = () => Object.fromEntries(BARS.map(([name]) => [name, value(name)])) as Record<Bar, number>;
+export const wish = (): Partial<Record<Bar, number>> => (card.open && scales.kV ? wished() : {});
 
 async function begin() {
   if (scales.kV || !store.state) return;
@@ -57,7 +57,7 @@ function changed() {
 }
 async function predict() {
   if (!store.state) return;
-  const mine = ++number, { geometry: g, camera, sample } = store.state, w = bars();
+  const mine = ++number, { geometry: g, camera, sample } = store.state, w = wished();
   setText(facts, `predicting a scan of ${sample.name || "nothing"} …`);
   const asked = { kV: w.kV, power_W: w.power_W, exposure_ms: w.exposure_ms, frames: w.frames, filter: $input("#design-filter").value.trim(), detail: $input("#design-detail").value.trim(),
     sdd_mm: g.SDD_mm, sod_mm: (w.voxel_um / 1000 / camera.pixel_mm) * g.SDD_mm };
@@ -80,14 +80,8 @@ async function predict() {
 }
 function draw({ edges, shares }: TransmissionShares) {
   chart.hidden = false;
-  const w = (chart.width = chart.clientWidth * devicePixelRatio), h = (chart.height = chart.clientHeight * devicePixelRatio);
-  const x = context2d(chart), style = getComputedStyle(chart);
-  const most = Math.log1p(1000 * Math.max(...shares)), n = shares.length;
-  shares.forEach((share, k) => {
-    x.fillStyle = style.getPropertyValue(edges[k] < 0.02 ? "--warn" : "--accent");
-    const high = (h * Math.log1p(1000 * share)) / most;
-    x.fillRect((w * k) / n, h - high, Math.max(1, w / n - 1), high);
-  });
+  const room = cleared(chart), style = getComputedStyle(chart);
+  bars(room, shares.map((share) => 1000 * share), (k) => { room[0].fillStyle = style.getPropertyValue(edges[k] < 0.02 ? "--warn" : "--accent"); });
 }
 on("state", (s) => {
   const now = JSON.stringify([s.sample.name, s.sample.revision, s.camera.mode, s.geometry.SDD_mm.toFixed(1)]);

@@ -11,13 +11,7 @@ export const $button = (selector: string) => $<HTMLButtonElement>(selector);
 export const $canvas = (selector: string) => $<HTMLCanvasElement>(selector);
 export const $dialog = (selector: string) => $<HTMLDialogElement>(selector);
 
-interface Handlers {
-  onclick?: (e: MouseEvent) => unknown;
-  onkeydown?: (e: KeyboardEvent) => unknown;
-  oninput?: (e: Event) => unknown;
-  onchange?: (e: Event) => unknown;
-  ontoggle?: (e: Event) => unknown;
-}
+type Handlers = { [E in "click" | "keydown" | "input" | "change" | "toggle" as `on${E}`]?: (e: HTMLElementEventMap[E]) => unknown };
 export type Attributes = Handlers & { readonly [name: string]: string | number | boolean | null | undefined | Handlers[keyof Handlers] };
 export function el<T extends keyof HTMLElementTagNameMap>(tag: T, attributes: Attributes = {}, ...children: Array<Node | string | null | undefined>): HTMLElementTagNameMap[T] {
   const node = document.createElement(tag);
@@ -91,6 +85,35 @@ export function putGrey(canvas: HTMLCanvasElement, [rows, cols]: readonly number
   const x = context2d(canvas), out = x.createImageData(cols, rows), d = new Uint32Array(out.data.buffer);
   for (let k = 0; k < d.length; k++) d[k] = 0xff000000 | (grey(k) * 0x010101);
   x.putImageData(out, 0, 0);
+}
+// One that the wire brought, with 8 bits a pixel.
+export function putImage(canvas: HTMLCanvasElement, { shape, data }: { shape: readonly number[]; data: string }): HTMLCanvasElement {
+  const raw = atob(data);
+  putGrey(canvas, shape, (k) => raw.charCodeAt(k));
+  return canvas;
+}
+// A canvas with as many pixels as it takes on the screen, empty: what draws in it, width, height.
+export function cleared(canvas: HTMLCanvasElement): [context: CanvasRenderingContext2D, width: number, height: number] {
+  canvas.width = canvas.clientWidth * devicePixelRatio; canvas.height = canvas.clientHeight * devicePixelRatio;
+  return [context2d(canvas), canvas.width, canvas.height];
+}
+// How often each value occurs, as its logarithm, so that what is rare shows beside much air.
+export function bars([x, w, h]: ReturnType<typeof cleared>, counts: ArrayLike<number>, style: (k: number) => void): void {
+  const n = counts.length, most = Math.log1p(Math.max(...Array.from(counts)));
+  for (let k = 0; k < n; k++) {
+    const high = (h * Math.log1p(counts[k])) / most;
+    style(k); x.fillRect((w * k) / n, h - high, Math.max(1, w / n - 1), high);
+  }
+}
+// Pressed or dragged: which part of its width the pointer is at.
+export function slid(canvas: HTMLCanvasElement, to: (part: number) => unknown): void {
+  const tell = (e: PointerEvent) => { const b = canvas.getBoundingClientRect(); to(Math.min(1, Math.max(0, (e.clientX - b.left) / b.width))); };
+  canvas.addEventListener("pointerdown", (e) => { canvas.setPointerCapture(e.pointerId); tell(e); });
+  canvas.addEventListener("pointermove", (e) => { if (canvas.hasPointerCapture(e.pointerId)) tell(e); });
+}
+// A file that somebody chooses is taken once, and may be chosen again.
+export function chosen(input: HTMLInputElement, take: (file: File) => unknown): void {
+  input.addEventListener("change", () => { const file = input.files?.[0]; if (file) void take(file); input.value = ""; });
 }
 // What went wrong, in words.
 export const words = (error: unknown): string => (error instanceof Error ? error.message : String(error));

@@ -57,8 +57,8 @@ export function toggleHelp(): void {
   if (dialog.open) { dialog.close(); return; }
   if (!dialog.childElementCount) {
     const grid = el("div", { class: "keys" });
-    for (const [code, [, , what]] of Object.entries(JOGS)) grid.append(el("kbd", {}, name(code)), el("span", {}, what));
-    for (const [key, what] of [["Space", "stop all axes"], ["Shift+Space", "emergency stop"], ["Alt+1…5", "views"], ["F1", "this help"]]) grid.append(el("kbd", {}, key), el("span", {}, what));
+    const jogs = Object.entries(JOGS).map(([code, [, , what]]) => [name(code), what]);
+    for (const [key, what] of [...jogs, ["Space", "stop all axes"], ["Shift+Space", "emergency stop"], ["Alt+1…5", "views"], ["F1", "this help"]]) grid.append(el("kbd", {}, key), el("span", {}, what));
     dialog.append(
       el("h2", {}, "Keys"), grid,
       el("p", { class: "muted" }, HELP),

@@ -1,20 +1,14 @@
 // The page's connection to its viewer: requests with answers, newest states and images, how old they are,
 // reconnection.
 import { words } from "./dom.js";
-import type { Answers, Camera, Events, Framing, ImageHead, Messages, Near, Pair, Shown } from "./viewer.js";
-import type { HelloResult, JobStatus, Requests, State } from "./wire.js";
+import type { Answers, Camera, Events, Framing, HelloResult, ImageHead, JobStatus, Messages, Near, Pair, Requests, Shown, State } from "./viewer.js";
 
 export const pageId = [...crypto.getRandomValues(new Uint8Array(12))].map((b) => b.toString(16).padStart(2, "0")).join("");
-interface Store {
-  state: State | null; framing: Framing | null; near: Near | null; hello: HelloResult | null; session: string | null; twin: boolean; viewer: boolean;
-  layers: Record<string, boolean>; opacity: number; image: Shown | null; recorded: string | null; hidden: boolean; received: { state: number; image: number };
-  age: number; fresh: number | null; imageAge: number; job: JobStatus | null; refused: string | null; problem: string | null;
-  coneVec?: number[]; cameras?: Record<string, Camera>;
-}
-export const store: Store = {
-  state: null, framing: null, near: null, hello: null, session: null, twin: false, viewer: false,
-  layers: {}, opacity: 1, image: null, recorded: null, hidden: false, received: { state: 0, image: 0 }, age: 0, fresh: null, imageAge: 0,
-  job: null, refused: null, problem: null,
+export const store = {
+  state: null as State | null, framing: null as Framing | null, near: null as Near | null, hello: null as HelloResult | null, session: null as string | null,
+  twin: false, viewer: false, layers: {} as Record<string, boolean>, opacity: 1, image: null as Shown | null, recorded: null as string | null, hidden: false,
+  received: { state: 0, image: 0 }, age: 0, fresh: null as number | null, imageAge: 0, job: null as JobStatus | null, refused: null as string | null,
+  problem: null as string | null, coneVec: null as number[] | null, cameras: null as Record<string, Camera> | null,
 };
 // Older than OLD_S, what is shown is said to be old; after SILENT_S nobody waits for answers any more.
 export const OLD_S = 1;

@@ -1,17 +1,17 @@
-// Beads marked by hand in the recorded images of an open data set, to calibrate from.
-import { $input, el, setText } from "./dom.js";
-import type { Mark } from "./wire.js";
-import type { Pair } from "./viewer.js";
+// Beads marked by hand in the recorded images of an open data set, to calibrate from: clicked and dragged, or put into
+// the middle by Enter and moved by the arrows.
+import { $input, el, fixed, setText } from "./dom.js";
+import type { Mark, Pair } from "./viewer.js";
 import { emit, on, store } from "./link.js";
 
 const COLOUR = "#ff3ca0";
-let marks: Mark[] = [], of: string | null = null;
+let marks: Mark[] = [], last: Mark | null = null, held = false, of: string | null = null;
 const projection = () => store.image?.recorded?.projection ?? null;
 const here = () => marks.filter((m) => m.frame === projection());
 
 const tools = el("span", { class: "row", style: "flex-wrap:wrap", hidden: true });
-const toggle = el("button", { id: "mark", class: "small", "aria-pressed": "false", title: "Click beads in the images, to calibrate from them", onclick: () => { choose(Boolean(tools.hidden)); } }, "Mark beads");
-const said = el("span", { class: "muted small-text" }), list = el("span", { id: "marks", class: "row", style: "flex-wrap:wrap" });
+const toggle = el("button", { id: "mark", class: "small", "aria-pressed": "false", title: "Click beads in the images, to calibrate from them; in the radiograph Enter marks its middle, arrows move the last mark by 0.1 px, with Shift by 5", onclick: () => { choose(Boolean(tools.hidden)); } }, "Mark beads");
+const said = el("span", { class: "muted small-text", "aria-live": "polite" }), list = el("span", { id: "marks", class: "row", style: "flex-wrap:wrap" });
 function choose(wanted: boolean) { tools.hidden = !wanted; toggle.setAttribute("aria-pressed", String(wanted)); again(); }
 function again() { tell(); emit("image", store.image); }
 
@@ -26,18 +26,39 @@ function remove(mark: Mark) { marks = marks.filter((m) => m !== mark); again(); 
 function tell() {
   const frame = projection();
   list.replaceChildren(...here().map((m) => el("button", { class: "small", title: `Remove the mark of bead ${m.marker}`, onclick: () => { remove(m); } }, `${m.marker} ×`)));
-  setText(said, frame === null ? "no projection is shown" : `${several(marks.length, "mark")} in ${several(new Set(marks.map((m) => m.frame)).size, "image")}`);
+  const at = last && here().includes(last) ? ` · ${last.marker} at ${fixed(last.column, 1)}, ${fixed(last.row, 1)}` : "";
+  setText(said, frame === null ? "no projection is shown" : `${several(marks.length, "mark")} in ${several(new Set(marks.map((m) => m.frame)).size, "image")}${at}`);
 }
 on("recorded", (name) => { if (name !== of) { of = name; marks = []; choose(false); } });
 on("image", tell);
 
-// A click in the picture, in its coordinates: the middle of its first pixel is (0.5, 0.5) there. Whether it was a mark.
-export function press([column, line]: Pair): boolean {
+// Places are in the picture's coordinates: the middle of its first pixel is (0.5, 0.5) there.
+export function click([column, line]: Pair): void {
   const frame = projection(), bead = $input("#mark-bead"), number = Math.max(0, Math.round(bead.valueAsNumber || 0)), marker = String(number);
-  if (tools.hidden || frame === null) return false;
-  marks = [...marks.filter((m) => m.frame !== frame || m.marker !== marker), { frame, marker, column: column - 0.5, row: line - 0.5 }];
+  if (tools.hidden || frame === null) return;
+  last = { frame, marker, column: column - 0.5, row: line - 0.5 };
+  marks = [...marks.filter((m) => m.frame !== frame || m.marker !== marker), last];
   bead.value = String(number + 1);
-  tell();
+  again();
+}
+// Whether a press is on a mark, which a drag then moves; a click there is a bead that lies over it.
+export function press([column, line]: Pair, reach: number): boolean {
+  const near = tools.hidden ? undefined : here().find((m) => Math.hypot(m.column + 0.5 - column, m.row + 0.5 - line) < reach);
+  held = near !== undefined;
+  if (near) { last = near; start = [column, line]; slack = reach / 2; }
+  return held;
+}
+let start: Pair = [0, 0], slack = 0;
+export function drag([column, line]: Pair): boolean {
+  if (held && last && Math.hypot(column - start[0], line - start[1]) >= slack) { slack = 0; last.column = column - 0.5; last.row = line - 0.5; again(); }
+  return held;
+}
+export function release(): void { held = false; }
+// The arrows: whether there is a mark that they move.
+export function shift([x, y]: Pair, far: boolean): boolean {
+  if (tools.hidden || !last || !here().includes(last)) return false;
+  last.column += x * (far ? 5 : 0.1); last.row += y * (far ? 5 : 0.1);
+  again();
   return true;
 }
 export function draw(x: CanvasRenderingContext2D, unit: number): void {

@@ -1,8 +1,7 @@
 // The Scan tab: a script to write, check, scrub and run; the job's progress; thumbnails of its frames.
-import { $, $button, $canvas, $input, $select, bytes, el, fixed, isNumber, pressed, putGrey, seconds, words } from "./dom.js";
-import type { CheckResult, CheckStep, Compose, JobStatus, Problem, ScriptInput, State } from "./wire.js";
+import { $, $button, $canvas, $input, $select, bytes, chosen, el, fixed, isNumber, pressed, putGrey, seconds, slid, words } from "./dom.js";
+import type { CheckResult, CheckStep, Compose, JobStatus, Pair, PlanDocument, Problem, ScriptInput, State } from "./viewer.js";
 import { call, command, emit, Failure, on, store } from "./link.js";
-import type { Pair, PlanDocument } from "./viewer.js";
 import { rememberedScript, rememberScript } from "./address.js";
 import { folder, open as openData } from "./data.js";
 import { draw as drawTimeline, type Lanes } from "./timeline.js";
@@ -41,8 +40,8 @@ $("#tab-scan").append(
     el("div", { class: "row", style: "margin-top:7px" },
       el("select", { id: "wish-kind", "aria-label": "Kind of scan" },
         ...["fly", "step", "tiled", "helical", "calibration"].map((k) => el("option", {}, k))),
-      el("label", { class: "inline muted" }, "frames", el("input", { type: "number", id: "wish-frames", value: 73, min: 2, style: "width:58px" })),
-      el("label", { class: "inline muted" }, "ms", el("input", { type: "number", id: "wish-exposure", value: 100, style: "width:54px" })),
+      el("label", { class: "inline muted" }, "frames", el("input", { type: "number", id: "wish-frames", value: 73, min: 2 })),
+      el("label", { class: "inline muted" }, "ms", el("input", { type: "number", id: "wish-exposure", value: 100 })),
       el("button", { id: "compose", class: "small", onclick: () => compose() }, "Write")),
     el("div", { class: "report", id: "report" })),
   el("div", { class: "card", id: "timeline-card", hidden: true }, el("h2", {}, "Timeline"),
@@ -114,12 +113,7 @@ text.addEventListener("keydown", (e) => {
   leaving = e.key === "Escape";
 });
 text.addEventListener("blur", () => { leaving = false; });
-async function openScript() {
-  const input = $input("#script-file"), file = input.files?.[0];
-  if (file) { setScript(await file.text()); sent = file.name.replace(/\.[^.]*$/, ""); }
-  input.value = "";
-}
-$input("#script-file").addEventListener("change", () => void openScript());
+chosen($input("#script-file"), async (file) => { setScript(await file.text()); sent = file.name.replace(/\.[^.]*$/, ""); });
 
 export function setScript(value: string): void { text.value = value; sent = ""; outdated(); }
 export function goTo(line: number | null): void {
@@ -235,10 +229,7 @@ async function recall() {
   const answer = await command("dataset.get", { name: dataset, points: 2, script: true }, "Cannot scrub this scan");
   if (answer?.script) { bring(answer.script); await showPlan(); }
 }
-function bring(script: string) {
-  emit("show-tab", "scan");
-  setScript(script);
-}
+function bring(script: string) { emit("show-tab", "scan"); setScript(script); }
 on("script", bring);
 
 let asking = false, next: [number | null] | null = null, at: number | null = null;
@@ -260,9 +251,7 @@ function redraw() {
   for (const [name, value] of Object.entries(told)) canvas.setAttribute(name, String(value));
 }
 const canvas = $canvas("#timeline");
-const seek = (e: PointerEvent) => { if (!plan) return; const b = canvas.getBoundingClientRect(); void scrub(Math.min(1, Math.max(0, (e.clientX - b.left) / b.width)) * plan.duration_s); };
-canvas.addEventListener("pointerdown", (e) => { canvas.setPointerCapture(e.pointerId); seek(e); });
-canvas.addEventListener("pointermove", (e) => { if (e.buttons) seek(e); });
+slid(canvas, (part) => { if (plan) void scrub(part * plan.duration_s); });
 const STEPS: Record<string, number | undefined> = { ArrowLeft: -0.01, ArrowRight: 0.01, Home: -1, End: 1 };
 canvas.addEventListener("keydown", (e) => {
   const step = STEPS[e.key];

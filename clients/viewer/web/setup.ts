@@ -1,6 +1,6 @@
 // The Setup tab: tube, camera, sample on the stage (with upload), layers of the scene.
-import { $, $$, $button, $canvas, $input, $select, base64, context2d, el, field, fixed, parsed, words } from "./dom.js";
-import type { ExposurePrediction, Layers, Placement, PredictedSetting, Requests, SampleUpload, State, UploadResult } from "./wire.js";
+import { $, $$, $button, $canvas, $input, $select, base64, cleared, el, field, fixed, parsed, words } from "./dom.js";
+import type { ExposurePrediction, Layers, Placement, PredictedSetting, Requests, SampleUpload, State, UploadResult } from "./viewer.js";
 import { call, command, emit, on, store } from "./link.js";
 
 const CHUNK = 3 << 20;
@@ -200,7 +200,7 @@ async function spectrum(kV: number) {
   $("#physics-note").textContent = PHYSICS[kind] ?? "This twin does not say how it makes its images.";
   const s = await call("viewer.spectrum", { kV }).catch(words);
   if (spectrumOf !== kV) return;
-  const canvas = $canvas("#spectrum"), x = context2d(canvas), w = (canvas.width = canvas.clientWidth * devicePixelRatio), h = (canvas.height = canvas.clientHeight * devicePixelRatio);
+  const canvas = $canvas("#spectrum"), [x, w, h] = cleared(canvas);
   if (typeof s === "string") { $("#filters").textContent = "–"; $("#spectrum-note").textContent = s; return; }
   $("#filters").textContent = s.filters.map((f) => `${fixed(f.thickness_mm, 2)} mm ${f.material.split("@")[0]}`).join(", ") || "none";
   const used = kind === "ideal" ? " · not used by this physics" : "";

@@ -1,11 +1,11 @@
 // The Share tab: pictures, files that open anywhere, scenes to save and load.
-import { $, $input, $select, bytes, download, el, words } from "./dom.js";
+import { $, $input, $select, bytes, chosen, download, el, words } from "./dom.js";
 import { command, emit } from "./link.js";
 import { picture } from "./film.js";
 import { current } from "./views.js";
-import type { Export, Requests, Scene } from "./wire.js";
+import type { Export, Requests, Scene } from "./viewer.js";
 
-async function offer<M extends "viewer.screenshot" | "viewer.export">(method: M, params: Requests[M], title: string) {
+export async function offer<M extends "viewer.screenshot" | "viewer.export">(method: M, params: Requests[M], title: string): Promise<void> {
   const a = await command(method, params, title);
   if (!a) return;
   download(a.url, a.name);
@@ -21,8 +21,7 @@ function film() {
   if (png) download(png, "flexdt-radiograph.png");
   else emit("note", "error", "No picture", "no radiograph has come yet");
 }
-const scene = (format: Export["format"]) => () => offer("viewer.export", { format }, "No export");
-const replay = (format: Export["format"]) => () => offer("viewer.export", { format, replay: true }, "No replay");
+const exported = (format: Export["format"], replay = false) => () => offer("viewer.export", { format, replay }, replay ? "No replay" : "No export");
 async function save() {
   const a = await command("scene.save", {}, "Not saved");
   if (!a) return;
@@ -37,20 +36,16 @@ $("#tab-share").append(
     el("select", { id: "shot-size", "aria-label": "Size of the picture" }, ...["1280x800", "1920x1080", "3840x2160"].map((s) => el("option", {}, s))),
     button("shot", "Save PNG", shot), button("shot-film", "Radiograph PNG", film))),
   el("div", { class: "card" }, el("h2", {}, "The scene as it stands"), row(
-    button("export-html", "One HTML file", scene("html")), button("export-viser", ".viser", scene("viser"))),
+    button("export-html", "One HTML file", exported("html")), button("export-viser", ".viser", exported("viser"))),
     el("p", { class: "muted" }, "The HTML opens in any browser, without a server.")),
   el("div", { class: "card" }, el("h2", {}, "A scan as a replay"), row(
-    button("replay-html", "One HTML file", replay("html")), button("replay-viser", ".viser", replay("viser"))),
+    button("replay-html", "One HTML file", exported("html", true)), button("replay-viser", ".viser", exported("viser", true))),
     el("p", { class: "muted" }, "Of the script that was last scrubbed in the Scan tab.")),
   el("div", { class: "card" }, el("h2", {}, "Scenes"), row(
     button("scene-save", "Save", save), el("input", { type: "file", id: "scene-file", accept: ".json", hidden: true }),
     button("scene-load", "Load…", () => $input("#scene-file").click())),
     el("p", { class: "muted" }, "Positions, tube, camera, sample and correction. Loading moves the machine.")));
-async function load() {
-  const input = $input("#scene-file"), file = input.files?.[0];
-  input.value = "";
-  if (!file) return;
+chosen($input("#scene-file"), async (file) => {
   try { if (await command("scene.load", { document: JSON.parse(await file.text()) as Scene }, "Not loaded")) emit("note", "good", "Scene", `${file.name} is loaded`); }
   catch (error) { emit("note", "error", "Scene", `${file.name}: ${words(error)}`); }
-}
-$input("#scene-file").addEventListener("change", () => void load());
+});

@@ -1,6 +1,6 @@
 // Bar, readouts, warnings and notes: who holds control, how near things are, what went wrong.
 import { $, $$, $button, el, fixed, isNumber, setText } from "./dom.js";
-import type { State } from "./wire.js";
+import type { State } from "./viewer.js";
 import { command, OLD_S, on, store } from "./link.js";
 
 const ROWS: Array<[name: string, text: (s: State) => string]> = [
@@ -17,9 +17,8 @@ const cells = ROWS.map(([name]) => { const dd = el("dd"); $("#readouts").append(
 export function note(kind: string, title: string, body = "", life = kind === "error" ? 12000 : 6000) {
   const box = $("#notes");
   $$("#notes > *").find((n) => n.dataset.key === title + body)?.remove();
-  const node = el("div", { class: `note ${kind}` }, el("b", {}, title), el("span", {}, body));
-  node.dataset.key = title + body;
-  node.append(el("button", { "aria-label": "close", onclick: () => node.remove() }, "×"));
+  const node: HTMLElement = el("div", { class: `note ${kind}`, "data-key": title + body }, el("b", {}, title), el("span", {}, body),
+    el("button", { "aria-label": "close", onclick: () => node.remove() }, "×"));
   box.append(node);
   while (box.childElementCount > 5) box.firstChild?.remove();
   setTimeout(() => node.remove(), life);
@@ -38,12 +37,10 @@ export function truncated(s: State): string[] {
   if (radius >= g.SOD_mm) return ["the sample reaches the source"];
   const reach = (radius * g.SDD_mm) / Math.sqrt(g.SOD_mm ** 2 - radius ** 2) / c.pixel_mm;
   if (axis - reach < -0.5 || axis + reach > c.shape[1] - 0.5) out.push("truncated sideways over a full turn");
-  const near = g.SDD_mm / (g.SOD_mm - radius) / c.pixel_mm, middle = g.piercing_point_px[1] - ((o.z + aboveSource()) * g.magnification) / c.pixel_mm;
+  const near = g.SDD_mm / (g.SOD_mm - radius) / c.pixel_mm, middle = g.piercing_point_px[1] - ((o.z + (store.framing?.sample_height_mm ?? 0)) * g.magnification) / c.pixel_mm;
   if (middle - (height / 2) * near < -0.5 || middle + (height / 2) * near > c.shape[0] - 0.5) out.push("truncated at top or bottom");
   return out;
 }
-// Height of the sample's reference point above the focal spot [mm], from the frame's predicted geometry.
-function aboveSource() { const ref = store.framing?.sample_height_mm; return isNumber(ref) ? ref : 0; }
 
 // Axes that the page found at an end of their travel: a machine may well be at home there.
 let parked: Set<string> | null = null;
@@ -97,9 +94,8 @@ function near() {
 
 function holder() {
   const pill = $("#holder"), who = store.state?.controller ?? null, mine = who !== null && who === store.session;
-  pill.dataset.state = mine ? "mine" : who ? "other" : "none";
   // Without the twin nobody knows who may; with it the next state says.
-  if (!store.twin) pill.dataset.state = "none";
+  pill.dataset.state = !store.twin ? "none" : mine ? "mine" : who ? "other" : "none";
   setText(pill, !store.twin ? "control unknown" : mine ? "you control" : who ? `held by ${who}` : "nobody controls");
   setText($button("#take"), mine ? "Release" : who ? "Take over" : "Take control");
   $button("#take").disabled = !store.twin;

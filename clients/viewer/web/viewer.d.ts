@@ -1,6 +1,8 @@
 // What the viewer says beside the wire: its messages, its own methods' answers, and what the page makes of them.
 import type { CalibrationFitResult, CheckStep, DatasetListResult, DatasetResult, HelloResult, ImageFlags, JobStatus, Mark, State, WireAnswers } from "./wire.js";
 
+export type * from "./wire.js";
+
 export type Pair = [number, number];
 export type Four = [number, number, number, number];
 export type Vector = [number, number, number];
@@ -44,27 +46,21 @@ export interface Messages {
 
 export interface Offer { url: string; name: string; bytes: number }
 export interface PlanDocument { duration_s: number; frames: number; bytes: number; times: number[]; curves: Record<string, number[]>; images: Array<[number, string]>; steps: CheckStep[] }
-type Fitted = Pair | null;
-export interface TrackedFrame { file: string; measured: Fitted[]; before: Fitted[]; after: Fitted[] | null }
+export interface TrackedFrame { file: string; measured: Array<Pair | null>; before: Array<Pair | null>; after: Array<Pair | null> | null }
 export interface TrackedScan { dataset: string; folder: string; before: string; rms_before_px: number | null; rms_after_px: number | null; frames: TrackedFrame[] }
 // What `flexdt calibrate --json` writes beside what the wire names.
 export interface FitReport extends Omit<CalibrationFitResult, "tracks"> {
   frames: number; cost_reduction_pct: number | null; weak: string[]; tracks: { phantom: string; datasets: TrackedScan[] } | null;
 }
 
-export interface Answers extends Omit<WireAnswers, "calibration.fit"> {
+type Quiet = Record<`viewer.${"layers" | "theme" | "camera" | "feed" | "window" | "live"}`, object>;
+export interface Answers extends Omit<WireAnswers, "calibration.fit">, Quiet {
   "calibration.fit": FitReport;
-  "viewer.layers": object;
-  "viewer.theme": object;
-  "viewer.camera": object;
-  "viewer.feed": object;
-  "viewer.window": object;
   "viewer.ray": { paths_mm: Record<string, number>; length_mm: number };
   "viewer.spectrum": { energy_keV: number[]; photons: number[]; mean_keV: number; filters: Array<{ material: string; thickness_mm: number }>; limits: { kV: Pair; power_W: Pair; exposure_ms: Pair } };
   "viewer.plan": PlanDocument;
   "viewer.recorded": DatasetResult;
   "viewer.recorded_image": AboutImage;
-  "viewer.live": object;
   "viewer.compose": { text: string; moved: Record<string, Pair> };
   "viewer.datasets": DatasetListResult;
   "viewer.scrub": { positions: Record<string, number> | null };

@@ -9,6 +9,7 @@ const WIDE = 1.35; // aspect for which the fixed cameras are made, as in clients
 type Layout = View | "four" | "none";
 interface Frame { box: HTMLElement; iframe: HTMLIFrameElement; crop?: HTMLElement; tag: HTMLElement; src: string }
 const open = new Map<View, Frame>();
+$("#view-switch").append(...Object.entries({ four: "Four views", ...NAMES }).map(([name, words]) => el("button", { "data-layout": name, onclick: () => layout(name, true) }, words)));
 export let current: Layout | null = null;
 
 // Without a graphics processor every picture costs processor time that the radiograph needs more.
@@ -39,8 +40,7 @@ function frame(view: View): Frame {
   const iframe = el("iframe", { title: NAMES[view] });
   iframe.addEventListener("load", () => { if (iframe.contentWindow) emit("frame", iframe.contentWindow); }); // keys.js listens in it, too
   const tag = el("span", { class: "tag" }, NAMES[view]);
-  const box = el("div", { class: "view" });
-  box.dataset.view = view;
+  const box = el("div", { class: "view", "data-view": view });
   if (view === "beam") {
     const crop = el("div", { class: "crop" }, iframe, el("div", { class: "shield" }));
     box.append(crop, tag);
@@ -98,4 +98,3 @@ export function fit(force = false): void {
 
 on("state", () => fit());
 new ResizeObserver(() => fit()).observe($("#views"));
-for (const button of $$("#view-switch button")) button.addEventListener("click", () => layout(button.dataset.layout ?? "iso", true));
