@@ -228,7 +228,8 @@ def main(folder: str, side: str) -> None:
     os.nice(NICENESS)
 
     def say(document: dict[str, Any]) -> None:
-        print(json.dumps(document), flush=True)
+        # The surface is the viewer's, what comes after it goes to pages as it is.
+        print(json.dumps(document.pop("surface", None)), json.dumps(document), sep="\t", flush=True)
 
     try:
         grow(Path(folder), int(side), say, lambda: os.getppid() == parent)

@@ -365,11 +365,9 @@ class Viewer:
                 page.show("image", content)
 
     def _grown(self, line: str) -> None:
-        told = json.loads(line)
-        surface = told.pop("surface", None)
-        if surface is not None and self.lab is not None:
-            self.lab.scene.show_surface(points_of(surface), surface["size_mm"])
-        slices = json.dumps(told)
+        surface, slices = line.split("\t")
+        if (told := json.loads(surface)) is not None and self.lab is not None:
+            self.lab.scene.show_surface(points_of(told), told["size_mm"])
         for page in self.pages.values():
             if page.live:
                 page.show("volume", slices)

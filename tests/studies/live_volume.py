@@ -38,7 +38,7 @@ def measured(twin: fx.TwinClient, data: Path, side: int, frames: int) -> str:
     last = data / name / f"scan_{frames - 1:06d}.tif"
     steps, views, behind, voxel_mm, ended = [], [], 0.0, 0.0, 0.0
     for line in grower.stdout:
-        told, now = json.loads(line), time.monotonic()
+        told, now = json.loads(line.split("\t")[1]), time.monotonic()
         assert "problem" not in told, told
         steps.append(now)
         views.append(told["views"])

@@ -37,9 +37,11 @@ def own_looks(machine: Machine, folder: Path) -> dict[str, bytes]:
     looks = {}
     for part in machine.components:
         if part.mesh:
-            mesh = read_part(file := folder / part.mesh)
+            file = folder / part.mesh
             own = file.suffix.lower() == ".glb"  # with its colours
-            looks[part.name] = file.read_bytes() if own else s.glb([PaintedMesh(mesh, s.ALUMINIUM)])
+            looks[part.name] = (
+                file.read_bytes() if own else s.glb([PaintedMesh(read_part(file), s.ALUMINIUM)])
+            )
     return looks
 
 
