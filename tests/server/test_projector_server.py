@@ -32,6 +32,7 @@ from flexdt.twin.projection.analytic_solids import (
     Solid,
     Sphere,
 )
+from tests.support.device_simulator import run_simulated
 
 SHAPE = (30, 40)
 RNG = np.random.default_rng(5)
@@ -613,6 +614,57 @@ def test_health_names_what_computes(monkeypatch: pytest.MonkeyPatch) -> None:
         found = gpu.Availability(present, reason)
         monkeypatch.setattr(gpu, "availability", lambda found=found: found)
         assert kernels.backend() == expected
+
+
+DEVICES = """
+import numpy as np
+from flexdt.server.projector import compute
+from flexdt.twin.projection import Volume, gpu
+from flexdt.twin.projection.kernels import gpu_kernels
+from tests.support.device_simulator import two_devices
+from tests.twin.projection.conftest import _circle
+
+assert gpu.availability().present
+gpu_kernels.BLOCK = (4, 2)
+launches, shape = two_devices(), (4, 5)
+rng = np.random.default_rng(2)
+rows = _circle(37, 60.0, 100.0, 1.2, start=0.2, height=1.0).rows
+
+def projected(volume, block):
+    "Images, and the devices that computed each block."
+    images, used = [], []
+    for step in compute.projection_steps(volume, rows, shape, block):
+        launches.clear()
+        images.append(step())
+        used.append(set(launches))
+    return np.concatenate(images), used
+
+# A request's blocks are as long as all devices want them, however large an image is; a volume that
+# is worth no move for one block goes there once a few blocks would have paid for it.
+compute.BLOCK_BYTES = 4 * 20 * 4
+assert compute.views_a_block(shape) == 16
+gpu.CHUNK_BYTES = 9 * 20 * 4
+assert compute.views_a_block(shape) == 9
+gpu.CHUNK_BYTES = 2**28
+volumes = [Volume(rng.random((5, 5, 3), dtype=np.float32), 0.5) for _ in range(3)]
+with gpu.switched_off():
+    assert compute.views_a_block(shape) == 4
+    right, used = projected(volumes[0], 16)
+    assert used == [set()] * 3
+gpu.WORTH_BYTES, gpu.VIEWS_A_THREAD = 0, 20 / compute.numba.get_num_threads()
+here, two = [set()], [{0, 1}]
+for block, wanted in ((16, here + two + [{0}]), (4, here * 4 + [{0}] * 6), (37, two)):
+    images, used = projected(volumes.pop(), block)
+    if block == 37:
+        assert np.abs(images - right).max() < 3e-6 * right.max() and right.max() > 0
+    assert used == wanted, (block, used)
+gpu.WORTH_BYTES = 2**26
+assert projected(Volume(rng.random((5, 5, 3), dtype=np.float32), 0.5), 4)[1] == here * 10
+"""
+
+
+def test_a_scan_is_dealt_to_all_devices_block_by_block() -> None:
+    run_simulated(DEVICES)
 
 
 @pytest.mark.parametrize("kind", ["half a frame", "an answer nobody asked for"])

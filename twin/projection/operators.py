@@ -96,7 +96,9 @@ def _on_device(volume: Volume, geometry: ConeVec, shape: Shape2, out: Float32Arr
     layout = volume.layout
     views, box = voxel_rays(geometry, layout, shape), box_of(layout)
     to_move = 0 if layout.resident else layout.flat.nbytes
-    return gpu.usable(to_move, out, cpu.threads()) and gpu.attempt(
+    before = layout.views_here[0]
+    layout.views_here[0] += len(views)
+    return gpu.usable(to_move, out, cpu.threads(), before) and gpu.attempt(
         lambda: gpu.project(box, layout.on_devices(gpu.devices_for(len(views))), views, out)
     )
 

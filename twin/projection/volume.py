@@ -74,6 +74,11 @@ class Layout:
     def _there(self) -> list[Any]:
         return []
 
+    @cached_property
+    def views_here(self) -> list[int]:
+        """One number: views that the processor has projected though there is a device."""
+        return [0]
+
 
 def room_like(volume: Volume) -> Float32Array:
     """Zeros (nz, ny, nx) with z contiguous in memory: what `back` can write into.
