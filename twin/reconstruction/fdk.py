@@ -303,10 +303,12 @@ def filtered(rows: Float32Array, response: Float32Array) -> Float32Array:
     """Rows (..., cols), zero beyond their ends, convolved with the filter of `response`."""
     from scipy import fft
 
+    from flexdt.twin.reconstruction import fdk_kernels
+
     cols = rows.shape[-1]
     length = fft.next_fast_len(2 * cols, real=True)
     spectrum = fft.rfft(rows, length, axis=-1, workers=-1)
-    spectrum *= response
+    fdk_kernels.respond(spectrum.view(np.float32).reshape(-1, len(response), 2), response)
     back: Float32Array = fft.irfft(spectrum, length, axis=-1, workers=-1)[..., :cols]
     return back
 
@@ -408,7 +410,7 @@ def fdk_parts(
         return _fdk(parts(), cone_vec, shape, target, part, window, tell, truncation)
 
     if target is None and not circle_of(cone_vec).rise:
-        devices = gpu.devices_for(len(cone_vec)) if gpu.availability().present else 1
+        devices = gpu.devices_for(len(cone_vec))
         slabs = _slabs(like, shape, devices)
         with suppress(gpu.DeviceError):
             if len(slabs) == 1:

@@ -149,6 +149,15 @@ def weigh(images, first, factors, across, up, out):
             out[view, r, c] = images[view, first + r, c] * weight
 
 
+@parallel
+def respond(spectra, response):
+    """spectra *= response: float32 (n, frequencies, 2), real and imaginary part, (frequencies,)."""
+    for k in prange(len(spectra)):
+        for f in range(response.size):
+            spectra[k, f, 0] *= response[f]
+            spectra[k, f, 1] *= response[f]
+
+
 BLOCK = 32
 
 
