@@ -466,6 +466,125 @@ def test_a_device_that_fails_at_any_time_leaves_it_to_the_processor() -> None:
     run_simulated(FAILING)
 
 
+ATTACKED = """
+import contextlib, logging, sys
+import numpy as np
+from numba import cuda
+from numba.cuda.simulator.cudadrv.devicearray import FakeCUDAArray
+from numba.cuda.simulator.kernel import FakeCUDAKernel
+from flexdt.twin.errors import TwinError
+from flexdt.twin.projection import Volume, back, forward, gpu
+from flexdt.twin.projection.kernels import gpu_array_kernels, gpu_kernels
+from flexdt.twin.reconstruction import Grid, cgls, fdk, gpu_fdk_kernels
+from tests.twin.projection.conftest import _circle
+
+said = []
+class Keep(logging.Handler):
+    def emit(self, record):
+        said.append(record.getMessage())
+logging.getLogger("flexdt").addHandler(Keep())
+gpu.VIEWS_A_THREAD, gpu.LINEAR = 0.0, 16
+gpu_kernels.BLOCK = gpu_fdk_kernels.BLOCK = gpu_fdk_kernels.PLANE = (4, 2)
+gpu_array_kernels.FOLDING = (1, 4)
+scan, shape = _circle(3, 60.0, 100.0, 1.2, start=0.3), (3, 4)
+data = np.random.default_rng(0).random((2, 3, 4), dtype=np.float32)
+
+# Every call of the driver that a job makes has a number; from one on, or at one, it fails.
+calls, fails = [], lambda number: None
+
+def attacked(where, name, kind):
+    real = getattr(where, name)
+    def call(*arguments, **options):
+        calls.append(kind)
+        error = fails(len(calls))
+        if error is not None:
+            raise error
+        return real(*arguments, **options)
+    setattr(where, name, call)
+
+for where, name, kind in (
+    (cuda, "is_available", "init"), (cuda, "to_device", "copy"), (cuda, "device_array", "memory"),
+    (cuda, "pinned_array", "memory"), (cuda, "stream", "init"), (cuda, "event", "init"),
+    (FakeCUDAArray, "copy_to_host", "copy"),
+    (FakeCUDAArray, "copy_to_device", "copy"), (FakeCUDAKernel, "__getitem__", "compile"),
+    (FakeCUDAKernel, "__call__", "launch"), (type(cuda.gpus), "__len__", "init"),
+    (type(cuda.gpus), "__getitem__", "init"),
+):
+    attacked(where, name, kind)
+
+def job():
+    volume = Volume(data, 0.5)
+    images = forward(volume, scan, shape)
+    adjoint = back(images, scan, volume).data
+    slow = cgls(images, scan, volume, iterations=1).data
+    return [images, adjoint, fdk(images, scan, Grid((2, 2, 2), 0.5)).data, slow]
+
+def there():
+    "What is only on the device: lost with it, by an error of ours."
+    with contextlib.suppress(TwinError):
+        on_device = Volume(data, 0.5).to("cuda")
+        back(forward(on_device, scan, shape), scan, on_device).to("cpu")
+
+with gpu.switched_off():
+    exact = job()
+assert all(np.abs(e).max() > 0 for e in exact)
+
+def same(found):
+    return all(np.array_equal(a, b) for a, b in zip(found, exact, strict=True))
+
+def close(found):
+    return all(
+        np.abs(a - b).max() < 1e-5 * np.abs(b).max() for a, b in zip(found, exact, strict=True)
+    )
+
+assert not gpu._failed and close(job()) and not same(job()) and not said
+calls.clear(), gpu._probed.cache_clear()
+job(), there()
+kinds = list(calls)
+assert set(kinds) == {"init", "copy", "memory", "compile", "launch"}, set(kinds)
+errors = (
+    RuntimeError("[999] Call to cuLaunchKernel results in CUDA_ERROR_UNKNOWN"),
+    RuntimeError("[719] device lost"),
+    AttributeError("module 'numpy' has no attribute 'row_stack'"), OSError("no nvrtc"),
+    ImportError("no compiler"), ValueError("cc 3.0"), KeyError("sm_120"), MemoryError(),
+    NotImplementedError(),
+    RuntimeError("[2] Call to cuMemAlloc results in CUDA_ERROR_OUT_OF_MEMORY"),
+)
+rng = np.random.default_rng(int(sys.argv[1]))
+met = set()
+for case in range(int(sys.argv[2])):
+    kind = sorted(set(kinds))[case % len(set(kinds))]  # each kind as often as any other
+    places = [k for k, some in enumerate(kinds, 1) if some == kind]
+    at, error, once = int(rng.choice(places)), errors[rng.integers(len(errors))], rng.random() < 0.3
+    case = (case, at, kind, repr(error), once)
+    said.clear(), gpu._failed.clear(), gpu._probed.cache_clear(), calls.clear()
+    fails = lambda number: error if number == at or (number > at and not once) else None
+    found = job()
+    assert close(found), case
+    there()
+    memory = "OUT_OF_MEMORY" in str(error)
+    present = gpu.availability().present
+    if memory and present:  # it may be asked again, and a line says so each time
+        assert said and all("lacks memory" in line for line in said), (case, said)
+        if not once:
+            assert close(job()), case
+    elif said:  # given up for good: one line, its reason, and no call of the driver from then on
+        assert len(said) == 1 and not present, (case, said)
+        assert str(error) in gpu.availability().reason and str(error) in said[0], (case, said)
+        calls.clear()
+        assert same(job()) and not calls and len(said) == 1, (case, calls, said)
+    else:  # a driver that does not answer at first is no device
+        assert not present and kind == "init" and same(found), (case, gpu.availability())
+    met.add((kind, present))
+assert len(met) > 6, met
+"""
+
+
+@pytest.mark.slow
+def test_a_driver_that_fails_at_any_call_in_any_way_leaves_it_to_the_processor() -> None:
+    run_simulated(ATTACKED, "20261123", "20")
+
+
 def test_few_views_of_a_volume_of_the_host_stay_on_the_processor(monkeypatch) -> None:
     monkeypatch.setattr(gpu, "availability", lambda: gpu.Availability(True, "pretended"))
     monkeypatch.setattr(gpu, "free_bytes", lambda: None)
