@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from flexdt.server.bench.cases import BINNED, C1_SHAPE, circle, noise
-from flexdt.server.bench.measure import errors, exact_images
+from flexdt.server.bench.measure import errors, exact_images, interleaved
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Volume, back, forward, gpu, gpu_astra
 from flexdt.twin.projection.operators import box_of, voxel_rays
@@ -28,9 +28,12 @@ COUNTS = (1, 36, 360)
 PANEL = BINNED
 FDK_VIEWS = 1434
 ROUNDS = 5
+BESIDE_S = 2.0
+"""`back` and the processor's, each at least."""
 INSTRUCTIONS = 16
 """For a voxel that a ray passes, at best."""
-AGAINST_ASTRA = {"C1": (0.20, 0.15), "512^3": (0.45, 0.30), "1024^3": (0.40, 0.28)}
+AGAINST_ASTRA = {"C1": (2, 0.20, 0.15), "512^3": (2, 0.45, 0.30), "1024^3": (1, 0.40, 0.28)}
+"""Which of COUNTS, and the shares of ASTRA's time that are to be accepted and wanted."""
 OF_THE_BOUND = {"C1": (0.25, 0.45), "512^3": (0.30, 0.50), "1024^3": (0.80, 1.00)}
 Document = dict[str, Any]
 
@@ -79,9 +82,11 @@ def run_device_bench(tell: Callable[[str], None]) -> Document:
     most, some = COUNTS[-1], COUNTS[1]
     for name, seen in cases.items():
         top, middle = seen[most], seen[some]
-        astra = top["astra_ms"]
-        share = None if astra is None else top["kernel_ms"] / astra
-        line(f"{name}: forward kernel / ASTRA, {most} views", share, *AGAINST_ASTRA[name])
+        which, accepted, wanted = AGAINST_ASTRA[name]
+        views, beside = COUNTS[which], seen[COUNTS[which]]
+        astra = beside["astra_ms"]
+        share = None if astra is None else beside["kernel_ms"] / astra
+        line(f"{name}: forward kernel / ASTRA, {views} views", share, accepted, wanted)
         part = None if top["bound_ms"] is None else top["bound_ms"] / top["kernel_ms"]
         line(f"{name}: part of the bound, {most} views", part, *OF_THE_BOUND[name], sign=-1)
         copy, kernel = middle["image_bytes"] / 1e6, middle["kernel_ms"]
@@ -89,8 +94,9 @@ def run_device_bench(tell: Callable[[str], None]) -> Document:
         line(f"{name}: {some} views end to end [ms]", middle["call_ms"], *limits)
         line(f"{name}: adjoint / forward kernel", middle["adjoint_ms"] / kernel, 2.0, 1.5)
         alone = seen[COUNTS[0]]
-        ratio = alone["back_call_ms"] / alone["back_processor_ms"]
-        line(f"{name}: back of one view / the processor's", ratio, 1.0, 1.0)
+        for views, entry in ((COUNTS[0], alone), (some, middle)):
+            ratio = entry["back_call_ms"] / entry["back_processor_ms"]
+            line(f"{name}: back of {views} views / the processor's", ratio, 1.0, 1.0)
         ratio = middle["back_there_ms"] / middle["adjoint_ms"]
         line(f"{name}: back on the device / its kernel", ratio, 1.1, 1.1)
         line(f"{name}: mean error", alone["mean_error"], 3e-7, 2e-7)
@@ -121,15 +127,18 @@ def case(name: str, tell: Callable[[str], None]) -> dict[int, Document]:
             "adjoint_ms": by_events(behind),
             "call_ms": on_the_clock(partial(forward, volume, scan, PANEL, out)),
             "back_there_ms": on_the_clock(partial(back, images, scan, volume)),
-            "back_call_ms": on_the_clock(partial(back, out, scan, volume), 1),
             "image_bytes": out.nbytes,
             "bound_ms": bound(volume, scan),
             "astra_ms": astra_ms(volume, scan, "FP3D_CUDA"),
         }
+        if views < COUNTS[-1]:  # as the call chooses by itself, and on the processor, in turns
+            work = partial(back, out, scan, volume)
+            both = {"back_call_ms": work, "back_processor_ms": gpu.switched_off()(work)}
+            times = interleaved(both, budget_s=BESIDE_S)
+            entry |= {key: spent.best * 1e3 for key, spent in times.items()}
         if views == COUNTS[0]:
             with gpu.switched_off():
                 entry["processor_ms"] = on_the_clock(partial(forward, volume, scan, PANEL, out))
-                entry["back_processor_ms"] = on_the_clock(partial(back, out, scan, volume))
             exact = exact_images(volume, scan, PANEL)
             entry["mean_error"], entry["worst_error"] = errors(images.copy_to_host(), exact)
         seen[views] = entry

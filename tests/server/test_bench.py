@@ -288,6 +288,7 @@ from flexdt.twin.reconstruction import gpu_fdk_kernels
 gpu_kernels.BLOCK = gpu_fdk_kernels.BLOCK = gpu_fdk_kernels.PLANE = (4, 2)
 gpu_array_kernels.FOLDING = (1, 4)
 gpu.LINEAR, gpu.VIEWS_A_THREAD, device_page.ROUNDS = 64, 0.0, 1
+device_page.BESIDE_S = 0.0
 sizes = ((4, 3, 3), 12.0), ((3, 4, 3), 12.0), ((3, 3, 3), 9.0)
 device_page.SIZES = dict(zip(("C1", "512^3", "1024^3"), sizes))
 device_page.COUNTS, device_page.PANEL, device_page.FDK_VIEWS = (1, 2, 3), (3, 4), 6
@@ -307,13 +308,18 @@ def test_the_page_of_a_device_has_every_target(tmp_path) -> None:
     run_simulated(DEVICE, str(tmp_path))
     document = json.loads((tmp_path / "device.json").read_text("utf-8"))
     lines = {line["target"]: line for line in document["targets"]}
-    assert len(lines) == len(document["targets"]) == 3 * 8 + 4
+    assert len(lines) == len(document["targets"]) == 3 * 9 + 4
     for name in ("C1", "512^3", "1024^3"):
         assert lines[f"{name}: worst error"]["met"] == "wanted"
         assert lines[f"{name}: part of the bound, 3 views"]["met"] == "not measured"
-        seen = document["cases"][name]["3"]
-        share = lines[f"{name}: forward kernel / ASTRA, 3 views"]["measured"]
+        count = 2 if name == "1024^3" else 3
+        seen = document["cases"][name][str(count)]
+        share = lines[f"{name}: forward kernel / ASTRA, {count} views"]["measured"]
         assert share == seen["kernel_ms"] / seen["astra_ms"]
+        for count in (1, 2):
+            seen = document["cases"][name][str(count)]
+            ratio = lines[f"{name}: back of {count} views / the processor's"]["measured"]
+            assert ratio == seen["back_call_ms"] / seen["back_processor_ms"]
     assert lines["FDK: backprojection / ASTRA BP3D"]["measured"] is None
     assert lines["FDK of 6 views, host to host [s]"]["measured"] > 0
     text = (tmp_path / "device.md").read_text("utf-8")
