@@ -1,5 +1,5 @@
 """What `flexdt bench` leaves out: the adjoint, scenes and meshes, FDK, growth, cold start, memory,
-and the way through the projector server.
+what memory allows, and the way through the projector server.
 
     python examples/research/further_bench.py --out out/further [--only FDK growth] [--no-peers]
 
@@ -16,6 +16,8 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
+import importlib
 import json
 import os
 import subprocess
@@ -27,10 +29,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 from numba import njit, prange
 
+from flexdt.phantoms import load_phantom
 from flexdt.server.bench import rtk_peer as rtk
 from flexdt.server.bench.benchmark import Document, line_of, load, machine, to_stderr
 from flexdt.server.bench.cases import (
@@ -49,10 +53,13 @@ from flexdt.server.bench.peers import absent
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import (
+    Body,
     Volume,
     back,
+    cpu,
     forward,
     gpu,
+    project_body,
     project_mesh,
     project_scene,
     room_like,
@@ -60,7 +67,10 @@ from flexdt.twin.projection import (
 )
 from flexdt.twin.projection.analytic_solids import Box, Scene, Solid, Sphere
 from flexdt.twin.projection.cpu import threads
+from flexdt.twin.projection.kernels import fan_kernels
+from flexdt.twin.projection.kernels.fan_types import Box as VoxelBox
 from flexdt.twin.projection.mesh import TriangleMesh
+from flexdt.twin.projection.operators import box_of, voxel_rays
 
 ADJOINT = (
     "C1", "C1x36", "C1-tilt", "C2", "C3", "C2-tilt", "C3-tilt", "cone-60", "cone-60-tilt",
@@ -109,15 +119,19 @@ def adjoint(wanted: Callable[[str], bool]) -> list[Entry]:
     return entries
 
 
+def fdk_input() -> tuple[Float32Array, ConeVec, Volume]:
+    """360 views of 478 x 380 pixels of a ball, and a grid of 256^3."""
+    shape = (380, 478)
+    geometry = circle(360, shape, pitch=0.3)
+    scene = Scene((Solid(Sphere((5.0, -3.0, 4.0), 12.0), "abs", 0.02),))
+    return project_scene(scene, geometry, shape), geometry, Volume(np.zeros((256,) * 3), 0.2)
+
+
 def fdk_entry(part: frozenset[str]) -> Entry:
     """FDK of 360 views of 478 x 380 pixels into 256^3, against RTK's."""
     from flexdt.twin.reconstruction import fdk
 
-    shape, views, side = (380, 478), 360, 256
-    geometry = circle(views, shape, pitch=0.3)
-    scene = Scene((Solid(Sphere((5.0, -3.0, 4.0), 12.0), "abs", 0.02),))
-    images = project_scene(scene, geometry, shape)
-    grid = Volume(np.zeros((side,) * 3, np.float32), 0.2)
+    images, geometry, grid = fdk_input()
     made: dict[str, Volume] = {}
 
     def ours() -> None:
@@ -272,6 +286,120 @@ def bandwidth() -> Entry:
         best = min(timeit.repeat(partial(read_all, data, workers), number=1, repeat=5))
         entry[f"{name}_GB_s"] = data.nbytes / best / 1e9
     return entry
+
+
+BOUNDS = ("bound-C1", "bound-C2", "bound-C3", "bound-C1x36", "bound-C2x10", "bound-FDK")
+
+
+def bounds(wanted: Callable[[str], bool]) -> list[Entry]:
+    """What memory allows, and what threads cannot share; all for one view but FDK's.
+
+    least: bytes that any method reads once; asked: those that ours asks for, of caches or memory.
+    bound_ms: `least` at the speed at which all threads read. cached_ms: with every voxel column in
+    one place, where it stays in the cache. cpu_ms: of all threads, as loads disturb it less.
+    serial_ms: what one thread does beside the kernels, by its own clock.
+    """
+    rate = bandwidth()["all_threads_GB_s"]
+    entries = []
+    for case in peer_cases():
+        name, views = f"bound-{case.name}", len(case.geometry)
+        if name not in BOUNDS or not wanted(name):
+            continue
+        volume = case.volume()
+        box, rays = box_of(volume.layout), voxel_rays(case.geometry, volume.layout, case.shape)
+        out = np.empty((views, *case.shape), np.float32)
+        call = partial(forward, volume, case.geometry, case.shape, out)
+        same_place = partial(cpu.project, box._replace(hop_x=0, hop_y=0), rays, out)
+        asked = 4 * box.nz * np.mean([columns_passed(ray, box, case.shape[1]) for ray in rays])
+        entry = _bound(name, case.what, call, rate, volume.data.nbytes, float(asked), views)
+        entry["cached_ms"], entry["cached_cpu_ms"] = (x / views for x in _spent(same_place))
+        with mock.patch.object(fan_kernels, "project_fans"):
+            entry["serial_ms"] = _spent(call, time.thread_time)[1] / views
+        entries.append(entry)
+    if wanted(BOUNDS[-1]):
+        entries.append(_fdk_bound(rate))
+    return entries
+
+
+def columns_passed(ray: FloatArray, box: VoxelBox, cols: int) -> int:
+    """Voxel columns that the lines of a view's detector columns pass, seen along z.
+
+    Args:
+        ray: (12,) source, first pixel minus source, u, v in voxel units.
+    """
+    start, far = ray[:2], ray[3:5] + np.arange(cols)[:, None] * ray[6:8]
+    cuts = np.stack([-start / far, ((box.nx, box.ny) - start) / far])
+    enter, leave = cuts.min(axis=0).max(axis=1), cuts.max(axis=0).min(axis=1)
+    hit = enter < leave
+    ends = [np.floor(start + t[hit, None] * far[hit]) for t in (enter + 1e-9, leave - 1e-9)]
+    return int(hit.sum() + np.abs(ends[1] - ends[0]).sum())
+
+
+def _fdk_bound(rate: float) -> Entry:
+    """FDK of `fdk_entry`: images are read once, or by each tile of voxel columns that they meet."""
+    module = importlib.import_module("flexdt.twin.reconstruction.fdk")
+    kernels = importlib.import_module("flexdt.twin.reconstruction.fdk_kernels")
+    images, geometry, grid = fdk_input()
+    rows, cols = images.shape[1:]
+    x, y, _ = (np.sort(c)[[0, -1]] for c in grid.centers())
+    tile = kernels.TILE
+    places = [np.linspace(*ends, n + 1) for ends, n in zip((x, y), grid.shape[:0:-1], strict=True)]
+    px, py = np.meshgrid(places[0][::tile], places[1][::tile])
+    asked = 0.0
+    for g in module.view_table(geometry, (rows, cols)):
+        depth = (px - g[0]) * g[3] + (py - g[1]) * g[4]
+        c = g[8] + ((px - g[0]) * g[5] + (py - g[1]) * g[6]) / depth * g[7]
+        corners = np.stack([c[:-1, :-1], c[1:, :-1], c[:-1, 1:], c[1:, 1:]])
+        high = np.minimum(np.ptp(grid.centers()[2]) * g[9] / depth[:-1, :-1], rows)
+        asked += float((4 * (np.ptp(corners, axis=0) + 2) * high).sum())
+    call = partial(module.fdk, images, geometry, grid)
+    least = images.nbytes + grid.data.nbytes
+    what = "360 views of 478 x 380 into 256^3"
+    entry = _bound(BOUNDS[-1], what, call, rate, least, asked + grid.data.nbytes, 1)
+    with contextlib.ExitStack() as stack:
+        for name in ("weigh", "stand_up", "backproject"):
+            stack.enter_context(mock.patch.object(kernels, name))
+        stack.enter_context(mock.patch.object(module, "filtered"))
+        entry["serial_ms"] = _spent(call, time.thread_time)[1]
+    return entry
+
+
+def _bound(
+    name: str, what: str, call: Callable[[], object], rate: float, least: int, asked: float, n: int
+) -> Entry:
+    wall, cpu_ms = _spent(call)
+    entry = plain(name, wall / n, what)
+    entry |= {"views": n, "cpu_ms": cpu_ms / n, "least_MB": least / 1e6, "asked_MB": asked / 1e6}
+    entry["bound_ms"] = least / rate / 1e6
+    entry["share"] = entry["bound_ms"] / entry["ms_per_view"]
+    return entry
+
+
+def _spent(
+    call: Callable[[], object], clock: Callable[[], float] = time.process_time
+) -> tuple[float, float]:
+    """Least time [ms] of five calls, after a first one, by the clock on the wall and by another."""
+    found = []
+    for _ in range(6):
+        wall, own = time.perf_counter(), clock()
+        call()
+        found.append([time.perf_counter() - wall, clock() - own])
+    best = np.min(found[1:], axis=0) * 1e3
+    return float(best[0]), float(best[1])
+
+
+def bodies() -> list[Entry]:
+    """Solids and meshes of several sizes on both detectors: what a device would have to beat."""
+    things: dict[str, Body] = {
+        name: load_phantom(name).scene for name in ("normal", "shepp-logan", "lego")
+    }
+    things |= {f"ball-{20 * 4**n}": ball_mesh(n) for n in (3, 5, 7)}
+    entries = []
+    for name, thing in things.items():
+        for panel, shape in (("C1", BINNED), ("C3", FULL)):
+            wall, cpu_ms = _spent(partial(project_body, thing, circle(1, shape), shape))
+            entries.append(plain(f"body-{name}-{panel}", wall, "a view") | {"cpu_ms": cpu_ms})
+    return entries
 
 
 SERIES = (("level", NONE), ("tilted", TILT_DEG))
@@ -506,6 +634,8 @@ GROUPS: Mapping[tuple[str, ...], Callable[[Wanted, frozenset[str]], list[Entry]]
     ("FDK",): lambda wanted, part: [fdk_entry(part)],
     ("cold-cached", "cold-uncached"): lambda wanted, part: cold_start(),
     ("server-C1",): lambda wanted, part: through_server(),
+    BOUNDS: lambda wanted, part: bounds(wanted),
+    ("bodies",): lambda wanted, part: bodies(),
 }
 """Names of cases -> what measures them, given the names of peers taking part."""
 
@@ -516,7 +646,10 @@ CURVES: Mapping[str, Callable[[], list[Entry]]] = {
 }
 
 
-FURTHER = ("times_forward", "added_ms", "dot_product_error")
+FURTHER = (
+    "times_forward", "added_ms", "dot_product_error", "cpu_ms", "least_MB", "asked_MB", "bound_ms",
+    "share", "cached_ms", "cached_cpu_ms", "serial_ms",
+)  # fmt: skip
 """Figures of an entry that its line ends with."""
 
 

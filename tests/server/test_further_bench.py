@@ -76,6 +76,28 @@ def test_scenes_and_meshes_are_compared_with_a_second_way() -> None:
     assert errors(project_scene(ball, view, SHAPE)[0][tuple(pixels.T)], again)[1] > 0.01
 
 
+def test_what_memory_allows_is_counted_from_the_geometry(monkeypatch) -> None:
+    view = circle(2, SHAPE, pitch=0.5)
+    case = Case("C1x36", lambda: noise((16, 12, 10)), view, SHAPE, True, "small")
+    monkeypatch.setattr(further_bench, "peer_cases", lambda: [case])
+    monkeypatch.setattr(further_bench, "bandwidth", lambda: {"all_threads_GB_s": 1e-3})
+    (entry,) = further_bench.bounds(lambda name: name == "bound-C1x36")
+    assert entry["least_MB"] == pytest.approx(16 * 12 * 10 * 4e-6)
+    assert entry["bound_ms"] == pytest.approx(1e3 * entry["least_MB"] / 1e-3 / 1e3)
+    assert entry["share"] == pytest.approx(entry["bound_ms"] / entry["ms_per_view"])
+    assert all(entry[key] > 0 for key in ("cpu_ms", "cached_ms", "cached_cpu_ms", "serial_ms"))
+    # Points close together on the lines from the source to a detector column's place.
+    counted = 0
+    for one in view.rows:
+        for c in range(SHAPE[1]):
+            end = one[3:5] + (c - (SHAPE[1] - 1) / 2) * one[6:8]
+            points = one[:2] + np.linspace(0.4, 0.8, 200_000)[:, None] * (end - one[:2])
+            x, y = np.floor((points + (0.5, 0.6)) / 0.1).T.astype(int)
+            inside = (x >= 0) & (x < 10) & (y >= 0) & (y < 12)
+            counted += len(np.unique(100 * x[inside] + y[inside]))
+    assert entry["asked_MB"] == pytest.approx(counted / 2 * 16 * 4e-6)
+
+
 def test_no_peers_means_none(monkeypatch) -> None:
     def refuse(*arguments):
         raise AssertionError("a peer was prepared")
