@@ -343,6 +343,40 @@ assert "failed" in refused(lambda: volume.to("cuda"), NotBuiltError)
 """
 
 
+MATERIALS = """
+import numpy as np
+from numba import cuda
+from flexdt.phantoms import Phantom
+from flexdt.phantoms.channels import channels
+from flexdt.phantoms.pieces import Voxels
+from flexdt.twin.projection import gpu, project_body
+from flexdt.twin.projection.analytic_solids import Scene
+from flexdt.twin.projection.kernels import gpu_kernels
+from tests.twin.projection.conftest import _circle
+
+gpu_kernels.BLOCK, gpu.VIEWS_A_THREAD = (4, 2), 0.0
+assert gpu.availability().present
+rng = np.random.default_rng(7)
+labels = rng.integers(0, 3, (5, 4, 6)).astype(np.uint8)
+voxels = Voxels(np.ones(labels.shape, np.float32) * (labels > 0), (0.5,) * 3,
+                labels=labels, materials=("water", "steel"))
+parts = channels(Phantom("two", "two materials", Scene(()), (3.0, 2.0, 2.5), voxels=voxels))
+scan, uploads, upload = _circle(3, 60.0, 100.0, 1.2, start=0.3), [], gpu.upload
+gpu.upload = lambda flat, device=0: uploads.append(flat.nbytes) or upload(flat, device)
+paths = [[project_body(part.body, scan, (4, 5)) for part in parts] for _ in range(2)]
+assert [part.material.name for part in parts] == ["water", "steel"] and len(uploads) == 2
+with gpu.switched_off():
+    right = [project_body(part.body, scan, (4, 5)) for part in parts]
+for found in paths:
+    for a, b in zip(found, right, strict=True):
+        assert b.max() > 0 and np.abs(a - b).max() < 3e-6 * b.max()
+"""
+
+
+def test_each_material_of_voxels_goes_to_the_device_once() -> None:
+    run_simulated(MATERIALS)
+
+
 def test_volumes_on_a_device_stay_there_and_copies_are_counted() -> None:
     run_simulated(THERE)
 
