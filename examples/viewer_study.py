@@ -131,9 +131,10 @@ def browser(url: str, view: str, minutes: float, pid: int) -> dict[str, Any]:
         page.evaluate("flexdt.call('axes.move', {targets: {rot_obj: 2000}})")
         page.wait_for_timeout(2000)
         counts = "[flexdt.film.count, flexdt.store.received.image, flexdt.store.received.state]"
-        before, begun = page.evaluate(counts), time.monotonic()
+        before, begun, used = page.evaluate(counts), time.monotonic(), cpu_s(pid)
         page.wait_for_timeout(int(SECONDS * 1000))
         after, took = page.evaluate(counts), time.monotonic() - begun
+        used = cpu_s(pid) - used
         shown, images, states = ((b - a) / took for a, b in zip(before, after, strict=True))
         result: dict[str, Any] = {
             "view": view,
@@ -145,11 +146,18 @@ def browser(url: str, view: str, minutes: float, pid: int) -> dict[str, Any]:
             "displayed_images_per_s": round(shown, 1),
             "received_images_per_s": round(images, 1),
             "received_states_per_s": round(states, 1),
+            "viewer_share_of_a_core": round(used / took, 3),
         }
         if minutes > 0:
             result["memory"] = memory(page, minutes, pid)
         chromium.close()
     return result
+
+
+def cpu_s(pid: int) -> float:
+    """Processor time that a process has used so far [s]."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def memory(page: Any, minutes: float, pid: int) -> list[dict[str, float]]:

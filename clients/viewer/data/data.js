@@ -6,7 +6,7 @@ import { draw as drawTimeline } from "./timeline.js";
 import { offer } from "./share.js";
 import * as compare from "./compare.js";
 import * as marks from "./marks.js";
-const SEARCH_MS = 250, AGAIN_MS = 500, PLAYED = 300, LEAST_MS = 60;
+const SEARCH_MS = 250, AGAIN_MS = 500, PLAYED = 300, LEAST_MS = 60, LEAST_PX = 76;
 const WORDS = { complete: "complete", incomplete: "incomplete", running: "running", unknown: "cannot be read in full" };
 let listed = [], told = null, plan = null, index = 0, next = null, asking = false, playing = false, number = 0;
 const search = el("input", { type: "text", id: "data-search", placeholder: "Search: name, sample, date, 90kV, incomplete …", "aria-label": "Search data sets" });
@@ -160,7 +160,7 @@ function redraw() {
         return;
     drawTimeline(canvas, plan, moment, null);
     const rest = panel.offsetHeight - $(".lanes", panel).offsetHeight + 2;
-    $("#stage").style.setProperty("--record", `${Math.min(rest + canvas.offsetHeight, 0.45 * $("#stage").clientHeight)}px`);
+    $("#stage").style.setProperty("--record", `${Math.min(rest + canvas.offsetHeight, Math.max(rest + LEAST_PX, 0.45 * $("#stage").clientHeight))}px`);
 }
 // The newest image asked for wins; one that cannot be shown leaves no other in its place.
 const still = (name) => told?.info.name === name;

@@ -8,7 +8,7 @@ import { offer } from "./share.js";
 import * as compare from "./compare.js";
 import * as marks from "./marks.js";
 
-const SEARCH_MS = 250, AGAIN_MS = 500, PLAYED = 300, LEAST_MS = 60;
+const SEARCH_MS = 250, AGAIN_MS = 500, PLAYED = 300, LEAST_MS = 60, LEAST_PX = 76;
 const WORDS: Record<DatasetInfo["state"], string> = { complete: "complete", incomplete: "incomplete", running: "running", unknown: "cannot be read in full" };
 // What is open: as it was told first, and once more when it had been measured (at fewer places).
 type Opened = DatasetResult & { whole?: DatasetResult };
@@ -142,7 +142,7 @@ function redraw() {
   if (!plan || panel.hidden) return;
   drawTimeline(canvas, plan, moment, null);
   const rest = panel.offsetHeight - $(".lanes", panel).offsetHeight + 2;
-  $("#stage").style.setProperty("--record", `${Math.min(rest + canvas.offsetHeight, 0.45 * $("#stage").clientHeight)}px`);
+  $("#stage").style.setProperty("--record", `${Math.min(rest + canvas.offsetHeight, Math.max(rest + LEAST_PX, 0.45 * $("#stage").clientHeight))}px`);
 }
 
 // The newest image asked for wins; one that cannot be shown leaves no other in its place.

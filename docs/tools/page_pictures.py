@@ -1,0 +1,127 @@
+"""The pictures of the page in docs/images, from the page as it is: Chromium, software rendering.
+
+    python docs/tools/page_pictures.py [--out docs/images] [--url http://127.0.0.1:8080/]
+
+Starts a lab of its own, unless it is given the address of one whose machine stands at home. Writes
+viewer-four-views.png, viewer-scan.png, viewer-design.png and viewer-virtual.png. Needs Debian's
+chromium and playwright.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import Any
+
+CHROMIUM = "/usr/bin/chromium"
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic"]
+SIZE = {"width": 1440, "height": 810}
+FADED_MS = 6000
+"""A scene fades in once its parts have come."""
+PATIENCE_MS = 300_000
+WRONG = "flexdt.call('calibration.apply', {parameters: {dO_x: 0.3, dO_z: -0.4}, comment: 'wrong'})"
+"""A correction by which the beads stand beside where they are seen, until a fit puts it right."""
+
+
+@contextmanager
+def lab() -> Iterator[str]:
+    """`flexdt up` on free ports; the address of its page."""
+    with tempfile.TemporaryDirectory() as folder:
+        words = ["--port", "0", "--projector-port", "0", "--viewer-port", "0", "--data", folder]
+        process = subprocess.Popen(
+            [sys.executable, "-m", "flexdt.clients.launch.up", *words],
+            stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+        )  # fmt: skip
+        try:
+            assert process.stdout is not None
+            yield str(json.loads(process.stdout.readline())["viewer"]["url"])
+        finally:
+            process.send_signal(signal.SIGTERM)
+            process.wait(30)
+
+
+def opened(browser: Any, url: str, view: str, tab: str) -> Any:
+    page = browser.new_page(viewport=SIZE)
+    page.set_default_timeout(PATIENCE_MS)
+    page.goto(f"{url}?view={view}&tab={tab}&theme=light&patience=60")
+    page.wait_for_function("window.flexdt?.store.image && flexdt.store.session")
+    page.wait_for_timeout(FADED_MS)
+    return page
+
+
+def taken(page: Any, path: Path) -> None:
+    """A picture, once the scenes rest and nothing is said to be old."""
+    last = b""
+    while (now := page.locator("#views").screenshot()) != last:
+        page.wait_for_timeout(FADED_MS)
+        page.locator("#veil").wait_for(state="hidden")
+        last = now
+    page.screenshot(path=path)
+
+
+def four_views(browser: Any, url: str, to: Path) -> None:
+    page = opened(browser, url, "four", "move")
+    taken(page, to / "viewer-four-views.png")
+    page.close()
+
+
+def scan(browser: Any, url: str, to: Path) -> None:
+    """A plan on its timeline, then the same scan run, for `virtual`; and the scan designer."""
+    page = opened(browser, url, "iso", "scan")
+    page.select_option("#wish-kind", "step")
+    page.fill("#wish-frames", "13")
+    page.click("#compose")
+    page.locator("#report .verdict.ok").wait_for()
+    page.click("#plan")
+    page.locator("#timeline").click(position={"x": 150, "y": 20})
+    taken(page, to / "viewer-scan.png")
+    page.evaluate(WRONG)
+    page.select_option("#speed-up", "max")
+    page.click("#run")
+    page.locator("#job-state", has_text="done").wait_for()
+    page.get_by_text("Design a scan").click()
+    page.locator("#design-quality").wait_for()
+    page.locator("#design-best").scroll_into_view_if_needed()
+    taken(page, to / "viewer-design.png")
+    page.close()
+
+
+def virtual(browser: Any, url: str, to: Path) -> None:
+    """Recorded less virtual, with the beads of a fit, of the newest data set."""
+    page = opened(browser, url, "iso", "data")
+    page.locator(".data-set").first.click()
+    page.get_by_role("button", name="Calibrate", exact=True).click()
+    page.get_by_role("button", name="Compare over a radiograph").click()
+    page.locator("#compare-all-after", has_text="px").wait_for()
+    page.select_option("#compare-mode", "difference")
+    page.locator("#record-at", has_text="scan_").wait_for()
+    page.click("#tab-of-data")
+    taken(page, to / "viewer-virtual.png")
+    page.evaluate("flexdt.call('calibration.revert')")
+    page.close()
+
+
+def main() -> None:
+    from playwright.sync_api import sync_playwright
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("docs/images"))
+    parser.add_argument("--url", help="of a page that is served already")
+    chosen = parser.parse_args()
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    with nullcontext(chosen.url) if chosen.url else lab() as url, sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        for picture in (four_views, scan, virtual):
+            picture(browser, url, chosen.out)
+        browser.close()
+
+
+if __name__ == "__main__":
+    main()
