@@ -26,6 +26,8 @@ from flexdt.phantoms import Phantom
 from flexdt.server.files.dataset_folder import Frame, read_text
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections, SpotFinder
+from flexdt.twin.calibration.diagnose.finding import error
+from flexdt.twin.calibration.fit.fit import estimate_geometry
 from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.frame_source import Frames, FrameSpots, FrameState, SpotFrames
@@ -40,13 +42,20 @@ from flexdt.twin.calibration.unknown_markers import (
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection.analytic_solids import Scene
 
 ASSUMED_PX: Final = 0.5
 """Standard deviation of a marker's position where the file states none, assumed."""
+FAR_PX: Final = 1e5
+"""A coordinate of a marker is at most so large [px]."""
+WIDEST_PX: Final = 1e4
+"""And its standard deviation."""
 FREE_SCALE: Final = 0.05
 """Relative uncertainty of SOD where no distance of two markers is known, assumed."""
+LONGEST_MM: Final = 1e5
+"""A known distance is at most so long."""
 NAMES: Final = {
     "frame": ("frame", "view", "image", "projection"),
     "marker": ("marker", "bead", "point", "id"),
@@ -104,7 +113,8 @@ class Scale:
             found = cls(a.strip(), b.strip(), float(mm), float(sigma) if sigma else cls.sigma_mm)
         except ValueError:
             found = cls(a, b, math.nan)
-        if not (dash and found.a and found.b and found.mm > 0 and found.sigma_mm > 0):
+        sizes = (found.mm, found.sigma_mm)
+        if not (dash and found.a and found.b and all(0 < size <= LONGEST_MM for size in sizes)):
             raise TwinError(
                 f"scale {text!r}; allowed: A-B=MM or A-B=MM+-SIGMA, the distance of markers A and "
                 "B, such as 0-3=41.5+-0.02"
@@ -127,16 +137,23 @@ def read_markers(source: str | PathLike[str] | Sequence[Mark], views: int) -> Ma
     path = Path(source)
     if path.suffix.lower() == ".npy":
         try:
-            tracks = np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
-        except (OSError, ValueError) as error:
+            stored = np.load(path, allow_pickle=False)
+            tracks = stored.astype(np.float64, casting="same_kind")
+        except (AttributeError, OSError, TypeError, ValueError) as error:
             raise TwinError(f"cannot read {path}: {error}") from None
         if tracks.ndim != 3 or tracks.shape[0] != views or tracks.shape[2] != 2:
             raise TwinError(
                 f"{path}: array of shape {tracks.shape}; allowed: ({views} frames, markers, 2)"
             )
+        if (np.abs(tracks) > FAR_PX).any():
+            raise TwinError(f"{path}: pixels up to {np.nanmax(np.abs(tracks)):g}; allowed: "
+                            f"{FAR_PX:g}, nan where unseen")  # fmt: skip
         names = tuple(str(k) for k in range(tracks.shape[1]))
         return Markers(names, tracks, np.full(tracks.shape[:2], ASSUMED_PX))
-    rows = list(csv.reader(io.StringIO(read_text(path))))
+    try:
+        rows = list(csv.reader(io.StringIO(read_text(path))))
+    except csv.Error as error:
+        raise TwinError(f"cannot read {path}: {error}") from None
     head = [word.strip().lower() for word in rows[0]] if rows else []
     at = {n: next((head.index(w) for w in words if w in head), -1) for n, words in NAMES.items()}
     if -1 in at.values():
@@ -177,11 +194,13 @@ def _gathered(marks: Iterable[tuple[str, Mark]], views: int) -> Markers:
     seen: dict[tuple[int, str], tuple[float, float, float]] = {}
     for where, (frame, name, x, y, stated) in marks:
         sigma = ASSUMED_PX if stated is None else stated
-        if not 0 <= frame < views or (frame, name) in seen or not sigma > 0:
+        if not 0 <= frame < views or (frame, name) in seen or not 0 < sigma <= WIDEST_PX:
             raise TwinError(
-                f"{where}: marker {name!r} in frame {frame}, sigma {sigma:g} px; "
-                f"allowed: frames 0 to {views - 1}, each marker once in each, sigma above 0"
+                f"{where}: marker {name!r} in frame {frame}, sigma {sigma:g} px; allowed: frames "
+                f"0 to {views - 1}, each marker once in each, sigma above 0 to {WIDEST_PX:g}"
             )
+        if any(abs(v) > FAR_PX for v in (x, y)):
+            raise TwinError(f"{where}: pixel ({x:g}, {y:g}); allowed: up to {FAR_PX:g}")
         seen[frame, name] = x, y, sigma
     labels = {name for _, name in seen}
     names = tuple(sorted(labels, key=lambda n: (not n.isdecimal(), n.zfill(9))))
@@ -327,6 +346,7 @@ def calibrate_unknown(
         told = "estimated" if "dO_z" in request.free else "free"
         told = "from the prior on dO_z" if "dO_z" in request.priors else told
         found = _calibrated(data, looks, index, model, want, images)
+        found = _turning_back(found, data, markers)
         return found, {"markers": _described(found, names, index), "scale": told}
     pair = [_numbered(names, n) for n in (scale.a, scale.b)]
     if pair[0] == pair[1] or "dO_z" in request.free:
@@ -352,7 +372,38 @@ def calibrate_unknown(
             break
         radii, model = radii * last, replace(model, beads=beads)
     said = f"{scale.a}-{scale.b} = {scale.mm:g} +- {scale.sigma_mm:g} mm"
+    found = _turning_back(found, data, markers)
     return found, {"markers": _described(found, names, index), "scale": said}
+
+
+def _turning_back(found: Calibration, data: DataSet, markers: Markers | None) -> Calibration:
+    """Refused where markers stand still, or where they fit twice as well if the stage turns back.
+    (Without perspective both ways of turning would fit, with each marker as far behind as before
+    the axis.)
+    """
+    if markers is None or found.fit is None:
+        return found
+    moved = float(np.nanmax(np.nanmax(markers.tracks, axis=0) - np.nanmin(markers.tracks, axis=0)))
+    if moved < 6.0 * float(np.median(markers.sigma)):
+        off = error("not_turning", f"the markers move by {moved:.2g} px at most in all frames: the "
+                    "object does not turn although the angles say so")  # fmt: skip
+        return replace(found, findings=(off, *found.findings))
+    poses = replace(data.poses, angle=-data.poses.angle)
+    at = centred(markers.tracks, poses, data.shape, NOMINAL)
+    places = triangulate(markers.tracks, poses.cone_vec(at), data.shape)
+    fit = estimate_geometry(
+        markers.tracks, places, poses, ("dO_x", "det_roll"), shape=data.shape, start=at,
+        free_beads=True, bead_tolerance_mm=ANYWHERE_MM, priors={"det_roll": 1.0}, bound=math.inf,
+    )  # fmt: skip
+    if not fit.certificate.rms_px < 0.5 * found.fit.certificate.rms_px:
+        return found
+    off = error(
+        "angle_reversed",
+        f"the markers fit to {fit.certificate.rms_px:.2g} px instead of "
+        f"{found.fit.certificate.rms_px:.2g} if the stage turns the other way than the angles say, "
+        "or if the images are mirrored",
+    )
+    return replace(found, findings=(off, *found.findings))
 
 
 def _calibrated(

@@ -147,7 +147,14 @@ def _of_floats(
     flats: Sequence[str],
 ) -> DataSet:
     """The data set of float images, in memory."""
-    images = np.stack([read_values(folder / n) for n in names]).astype(np.float32)
+    values = [read_values(folder / n) for n in names]
+    for name, some in zip(names, values, strict=True):
+        if some.shape != values[0].shape:
+            raise DatasetFormatError(
+                f"{folder / name} has shape {some.shape}; allowed: that of {names[0]}, "
+                f"{values[0].shape}", {"path": name},
+            )  # fmt: skip
+    images = np.stack(values).astype(np.float32)
     if not np.isfinite(images).all():
         bad = names[int(np.flatnonzero(~np.isfinite(images).all(axis=(1, 2)))[0])]
         raise DatasetFormatError(
@@ -158,7 +165,7 @@ def _of_floats(
         flat = np.mean([read_values(folder / n) for n in flats], axis=0)
         images = (images - dark) / np.maximum(flat - dark, 1e-6 * flat.max())
     else:
-        images = np.exp(-images)
+        images = np.exp(-np.maximum(images, -80.0))
     top = np.iinfo(np.uint16).max
     # Brighter pixels than the open beam, as noise makes them, need room above it.
     opened = float(np.clip(np.floor(top / max(images.max(), 1e-9)), OPEN_COUNTS / 3, OPEN_COUNTS))

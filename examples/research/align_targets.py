@@ -260,7 +260,7 @@ def _angle(found: Any) -> float:
 
 SPOILT: Final = ("clean", "flat ramp 1 %", "flat ramp 3 %", "frame repeated", "3 frames missing",
                  "one in twelve missing", "first again at 360 deg", "200 deg", "350 deg",
-                 "drift 0.5 px")  # fmt: skip
+                 "drift 0.5 px", "slip 1 px")  # fmt: skip
 
 
 def spoilt(
@@ -278,6 +278,8 @@ def spoilt(
         keep[n // 3 + 1 :] -= 1
         lines = lines[keep]
         keep = np.arange(n)
+    elif kind == "slip 1 px":  # and it stays there
+        lines[n // 3 :] = np.roll(lines[n // 3 :], 1, axis=2)
     elif kind == "3 frames missing":
         keep = np.setdiff1d(keep, n // 4 + np.arange(3))
     elif kind == "one in twelve missing":

@@ -160,6 +160,15 @@ def test_a_ramp_of_the_flat_field_and_missing_frames_do_not_mislead(
         assert np.abs(pulls(lost, scanner)).max() < 4  # the stage missed a step
 
 
+def test_what_slips_aside_and_stays_is_told(scans: list[tuple[Scanner, np.ndarray]]) -> None:
+    for k, (scanner, lines) in enumerate(scans[:3]):
+        aside = (lines + np.roll(lines, 1, axis=2)) / 2
+        slipped = np.concatenate([lines[:20], aside[20:]])
+        found = data_set(slipped, DEGREES, 1e4, np.random.default_rng(k)).align()
+        assert "after frame 19 the images step" in " ".join(found.warnings)
+        assert np.abs(pulls(found, scanner)).max() < 4
+
+
 @pytest.mark.parametrize("rays", [1, 3])
 def test_flat_ends_along_the_rows_in_images_of_few_rays_a_pixel_do_not_mislead(
     rays: int, monkeypatch: pytest.MonkeyPatch

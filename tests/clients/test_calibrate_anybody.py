@@ -7,6 +7,7 @@ share nothing with the fit.
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,17 @@ import unknown_markers as study
 from prior_coverage import PIXEL, SDD, SHAPE, SOD, pixels, radiographs
 
 import flexdt as fx
-from flexdt.clients.calibration.markers import Scale, read_markers
+from flexdt.clients.calibration.markers import (
+    Scale,
+    calibrate_unknown,
+    markers_alone,
+    read_markers,
+)
 from flexdt.clients.cli.entry import run
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration import detect_beads
 from flexdt.twin.calibration.frame_source import nothing
+from flexdt.twin.calibration.pipeline import Request
 from flexdt.twin.calibration.unknown_markers import link, triangulate
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.offsets import NOMINAL
@@ -251,6 +258,9 @@ def test_float_images_are_counts_or_line_integrals(tmp_path: Path) -> None:
             tifffile.imwrite(folder / "di.tif", np.full((4, 5), dark, np.float32))
         data = fx.read_tiffs(folder, scan)
         assert data.line_integrals() == pytest.approx(integrals, abs=3e-4)
+    tifffile.imwrite(folder / "p1.tif", np.zeros((3, 5), np.float32))
+    with pytest.raises(TwinError, match=r"p1.tif has shape \(3, 5\); allowed: that of p0.tif"):
+        fx.read_tiffs(folder, scan)
     tifffile.imwrite(folder / "p1.tif", np.full((4, 5), np.nan, np.float32))
     with pytest.raises(TwinError, match=r"p1.tif has pixels that are no numbers"):
         fx.read_tiffs(folder, scan)
@@ -265,6 +275,10 @@ def test_float_images_are_counts_or_line_integrals(tmp_path: Path) -> None:
         ("frame,marker,x,y\n0,a,1,2\n0,a,1,2\n", "line 3: marker 'a' in frame 0"),
         ("view,point,u,v,sigma\n9,a,1,2,0.5\n", "allowed: frames 0 to 3"),
         ("view,point,u,v,sigma\n0,a,1,2,0\n", "sigma above 0"),
+        ("view,point,u,v,sigma\n0,a,1,2,inf\n", "sigma above 0 to 10000"),
+        ("frame,marker,x,y\n0,a,inf,2\n", "line 2: pixel (inf, 2); allowed: up to 100000"),
+        ("frame,marker,x,y\n0,a,1,-1e12\n", "allowed: up to 100000"),
+        ("frame,marker\r,x,y\n0,a,1,2\n", "cannot read"),
     ],
 )
 def test_files_of_markers_that_do_not_hold_say_where(tmp_path: Path, text: str, says: str) -> None:
@@ -287,11 +301,38 @@ def test_files_of_markers(tmp_path: Path) -> None:
     np.save(tmp_path / "flat.npy", np.zeros((2, 3)))
     with pytest.raises(TwinError, match=r"shape \(2, 3\); allowed: \(2 frames, markers, 2\)"):
         read_markers(tmp_path / "flat.npy", 2)
-    with pytest.raises(TwinError, match="cannot read"):
-        read_markers(tmp_path / "none.npy", 2)
+    np.save(tmp_path / "complex.npy", np.zeros((2, 3, 2), np.complex128))
+    np.save(tmp_path / "far.npy", np.full((2, 3, 2), np.inf))
+    with pytest.raises(TwinError, match="pixels up to inf; allowed: 100000"):
+        read_markers(tmp_path / "far.npy", 2)
+    for name in ("none.npy", "complex.npy"):
+        with pytest.raises(TwinError, match="cannot read"):
+            read_markers(tmp_path / name, 2)
 
 
-@pytest.mark.parametrize("text", ["0-1", "0=5", "0-1=x", "0-1=-3", "-1=3", "0-1=3+-0"])
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        (lambda tracks: tracks, None),
+        (lambda tracks: tracks[::-1], "angle_reversed"),
+        (lambda tracks: (SHAPE[1] - 1, 0) + (-1, 1) * tracks, "angle_reversed"),
+        (lambda tracks: np.repeat(tracks[:1], len(tracks), axis=0), "not_turning"),
+    ],
+)
+def test_what_is_wrong_with_unknown_markers_is_named(change: Any, code: str | None) -> None:
+    """And where nothing is, nothing is said: the markers' own frame is no value held exactly."""
+    _, angles, _, markers = study.marked(1, 12, 8, 0.1, 0.0)
+    data = markers_alone(study.geometry(angles), "marks")
+    marked = replace(markers, tracks=np.array(change(markers.tracks)))
+    found, _ = calibrate_unknown(data, None, marked, Request(free=("dO_x",)))
+    codes = [f.code for f in found.findings]
+    assert codes == [] if code is None else code in codes
+    assert found.identifiable == (code is None)
+
+
+@pytest.mark.parametrize(
+    "text", ["0-1", "0=5", "0-1=x", "0-1=inf", "0-1=3+-inf", "0-1=-3", "-1=3", "0-1=3+-0"]
+)
 def test_scales_of_another_form_are_refused(text: str) -> None:
     assert Scale.of("a-b=3.5+-0.1") == Scale("a", "b", 3.5, 0.1)
     with pytest.raises(TwinError, match="allowed: A-B=MM"):
@@ -316,11 +357,6 @@ def test_options_that_do_not_go_together(written: Path, capsys: pytest.CaptureFi
 def test_poses_do_not_matter() -> None:
     """The machine's own poses and those told from the vectors give the same marker positions."""
     truth, angles, _, markers = study.marked(1, 12, 6, 0.1, 0.0)
-    from dataclasses import replace
-
-    from flexdt.clients.calibration.markers import calibrate_unknown, markers_alone
-    from flexdt.twin.calibration.pipeline import Request
-
     told = markers_alone(study.geometry(angles), "vectors")
     u, v = [PIXEL, 0, 0], [0, 0, -PIXEL]
     own = Poses([0, 0, 0], [0, SOD, 0], [0, SDD, 0], u, v, np.radians(angles))

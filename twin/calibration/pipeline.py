@@ -94,6 +94,8 @@ FAR_PX = 0.5
 """The same for a draft."""
 ANYWHERE = 1e3
 """A prior [mm, deg] so wide that the images alone say where its parameter is."""
+OF_FRAME = ("dO_y", "alpha", "tau_x", "tau_z")
+"""With beads that may be anywhere, these only say in which frame of the object they are."""
 AS_GOOD = 1.2
 """A fit whose residuals are at most so many times as large explains the data as well."""
 
@@ -414,7 +416,10 @@ def _with_held(
             return fit, [*found, off]
     errors = {f.code for f in explained if f.forbids}
     stated = _stated(state.scans, asked)
-    widths = {n: w for n, w in {**FIXED, **ASSUMED}.items() if stated.get(n) == 0}
+    defined = OF_FRAME if (asked.bead_tolerance_mm or 0.0) >= ANYWHERE else ()
+    widths = {
+        n: w for n, w in {**FIXED, **ASSUMED}.items() if stated.get(n) == 0 and n not in defined
+    }
     exact = {n: at[n] for n in widths}
     usual = replace(asked, priors={**asked.priors, **widths})
     loose = _loose(state, usual, fit)

@@ -2,7 +2,7 @@
 
 Over a full turn the mean projection is that of a body of revolution. What would spoil it is looked
 for here: frames that are repeated, gaps between angles, and a step between neighbours, which after
-a drift is the one between the last frame and the first.
+a drift is the one between the last frame and the first; what slips during the scan leaves both.
 """
 
 from __future__ import annotations
@@ -34,6 +34,8 @@ CLEAR: Final = 1.5
 """And so many times the next largest elsewhere: faces that lie along the beam leave several."""
 FEWEST: Final = 24
 """Directions of which a mean is taken, at least."""
+BACK: Final = 0.3
+"""Two steps whose sum is smaller than so much of one are one to and fro (assumed)."""
 WIDEST_GAP: Final = 4.5
 """Largest gap between neighbouring angles, relative to the usual one: three frames missing."""
 GAP_IMAGES: Final = 6
@@ -103,7 +105,7 @@ def read_turn(
         if found:
             return read_turn(image, angle, present, tuple(sorted(found)))
     shape = np.shape(noise)
-    step = _step(views, gaps)
+    step = _step(views, gaps, int(index.argmin()))
     if step is not None:
         (right, down), after = step
         across, along = shape[1] / views.shape[2], shape[0] / views.shape[1]
@@ -175,8 +177,11 @@ def _repeated(views: Float32Array, gaps: FloatArray) -> list[int]:
     return [int(i) for i in np.flatnonzero(same)]
 
 
-def _step(views: Float32Array, gaps: FloatArray) -> tuple[tuple[float, float], int] | None:
-    """The largest step (columns, rows) between neighbours and the place before it.
+def _step(
+    views: Float32Array, gaps: FloatArray, first: int
+) -> tuple[tuple[float, float], int] | None:
+    """The largest step (columns, rows) between neighbours and the place before it; `first` is where
+    the frame stands that was taken first.
 
     Each frame is compared with the third-order interpolation of its four neighbours on the circle.
     A shift d between frame i - 1 and frame i leaves -d/2 in one of them and +d/2 in the other.
@@ -205,8 +210,18 @@ def _step(views: Float32Array, gaps: FloatArray) -> tuple[tuple[float, float], i
     spread = 1.4826 * np.median(np.abs(shifts[valid]), axis=0) + 1e-6
     score = np.where(valid, np.abs(shifts / spread).max(axis=1), 0.0)
     worst = int(score.argmax())
-    apart = np.abs(np.arange(n) - worst)
-    others = score[np.minimum(apart, n - apart) > 2].max()
-    if score[worst] < max(STEPS, CLEAR * others):
+    others = np.where(_far(n, worst), score, 0.0)
+    # What steps and stays has to step back between the last frame and the first.
+    back = int(others.argmax()) if worst == first else first
+    if np.linalg.norm(shifts[back] + shifts[worst]) < BACK * np.linalg.norm(shifts[worst]):
+        others = np.where(_far(n, back), others, 0.0)
+        worst = back if worst == first else worst
+    if score[worst] < max(STEPS, CLEAR * others.max()):
         return None
     return (float(shifts[worst, 0]), float(shifts[worst, 1])), (worst - 1) % n
+
+
+def _far(n: int, place: int) -> npt.NDArray[np.bool_]:
+    """(n,) places on the circle that are no near neighbours of one."""
+    apart = np.abs(np.arange(n) - place)
+    return np.asarray(np.minimum(apart, n - apart) > 2)
