@@ -5,14 +5,16 @@ an ellipse or a rectangle, or between three planes where neither is like it, is 
 views saw of it, row band by row band, and rows are continued by its path lengths. One shape for all
 views is what makes the continuations agree with each other: a row on its own says little of how far
 its object reaches. Other things in the object are deviations that count less and less (a Cauchy
-loss); an outline that no shape resembles is continued badly, and `Truncation.doubt` says so.
+loss). Where most rays meet some, they are found together with the prism: as few as explain the
+views, on a coarse grid over the field of view (`Things`). An outline that no shape resembles is
+continued badly, and `Truncation.doubt` says so.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from itertools import pairwise
 from typing import Any
 
@@ -22,6 +24,7 @@ import numpy.typing as npt
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.reconstruction.rectify import is_upright, on_its_side, rectified, swapped, upright
+from flexdt.twin.reconstruction.things_inside import Things
 from flexdt.twin.reconstruction.trajectory import circle_of, columns_beyond
 
 SAMPLES = 48
@@ -61,7 +64,7 @@ FEW = 15.0
 """Per cent of the rays that at least meet nothing denser, or less dense, than the outline's own
 material."""
 DOUBTFUL = 0.03
-"""Misfit above which an outline is unlike an ellipse or a rectangle."""
+"""Misfit above which an outline alone, without other things in the object, is not it."""
 EVEN_THERE = 6.0
 """The lower quartile of the deviations counts as so many times itself: other things in the object
 hide an outline from half of the rays, but not from three quarters of them."""
@@ -70,6 +73,17 @@ ROUGH = 0.01
 other things in the object and count less and less."""
 FINE = 0.003
 """The same in the last fit, which begins near: other things in the object then pull much less."""
+TOGETHER = 12
+"""Times that things and outline are found in turn, at most."""
+SETTLED = 1e-3
+"""Change of an outline's numbers at which that ends."""
+MOSTLY = 0.5
+"""Part of the field of view that may be other things before the outline's material is doubtful."""
+NOTICED = 0.1
+"""Attenuation of a thing, relative to the outline's, from which it counts in that."""
+STRAINED = 3e-4
+"""What it costs (`_Band.among`), for each ray and relative to large line integrals squared, before
+the outline is doubtful: where no outline is right, many things are needed to mend it."""
 HUGE = 50.0
 """Logarithm of an attenuation, or of its inverse, that no fit takes: what goes beyond counts as
 this."""
@@ -165,9 +179,8 @@ class Truncation:
     Attributes:
         rows: (b,) middle row of each band.
         prisms: one a band; None where the band's rows are whole.
-        misfit: of the worst band: median deviation of what was seen from the prism, or
-            `EVEN_THERE` times the lower quartile, relative to large line integrals; infinite where
-            none is fitted, which is so for a helix.
+        misfit: of the worst band, relative to what is tolerated; infinite where none is fitted,
+            which is so for a helix.
     """
 
     rows: FloatArray
@@ -177,7 +190,7 @@ class Truncation:
     @property
     def doubt(self) -> str | None:
         """What to tell the user where the outline is unlike the prism's; else None."""
-        if self.misfit <= DOUBTFUL:
+        if self.misfit <= 1.0:
             return None
         why = "its outline is unlike an ellipse, a rectangle or a triangle"
         if np.isinf(self.misfit):
@@ -297,12 +310,13 @@ def _fitted(
     prisms: list[Outline | None] = [None] * len(bands)
     known: Outline | None = None
     misfit = 0.0
+    things = cache(lambda: Things.of(source, rays, bands[0].field))
     for k in np.argsort([-band.seen.sum() for band in bands]).tolist():
         if (bands[k].cut_off(NOTICEABLE * most) & edges_that_count).any():
             if not fit:
                 return Truncation(middles, tuple(prisms), np.inf)
-            prisms[k] = known = bands[k].fitted(known)
-            misfit = max(misfit, bands[k].misfit(known))
+            prisms[k], off = bands[k].fitted(known, things)
+            known, misfit = prisms[k], max(misfit, off)
     return None if known is None else Truncation(middles, tuple(prisms), misfit)
 
 
@@ -365,7 +379,8 @@ class _Band:
         return np.log(np.clip(np.percentile(ratio, [FEW, 100.0 - FEW]), 0.5, 2.0))
 
     def misfit(self, prism: Outline) -> float:
-        """Deviations from a prism, relative to large line integrals; see `Truncation`."""
+        """Median deviation of what was seen from a prism, or `EVEN_THERE` times the lower quartile,
+        relative to large line integrals."""
         wrong = np.abs(prism.integrals(self.source, self.rays) - self.seen)
         few, half = np.percentile(wrong[self.seen > 0.1 * self.top], [25.0, 50.0])
         return float(max(EVEN_THERE * few, half) / self.top)
@@ -377,14 +392,32 @@ class _Band:
         aside = self.source[..., 0] * ends[..., 1] - self.source[..., 1] * ends[..., 0]
         return float(np.abs(aside / np.sqrt((ends**2).sum(axis=-1))).max())
 
-    def fitted(self, near: Outline | None) -> Outline:
-        """The prism that fits best; from `near` on, if a neighbour is known."""
+    def fitted(self, near: Outline | None, things: Callable[[], Things]) -> tuple[Outline, float]:
+        """The prism that fits best, from `near` on if a neighbour is known, and its misfit
+        (see `Truncation`)."""
         if isinstance(near, ThreeSided):
-            return self.three_sided([near])
-        prism = self.round_or_square(near)
-        if near is not None or self.misfit(prism) <= DOUBTFUL:
-            return prism
-        starts = [
+            found: list[Outline] = [self.three_sided([near])]
+        else:
+            found = self.round_or_square(near)
+            if near is None and self.misfit(found[0]) > DOUBTFUL:
+                other = self.three_sided(self.triangles())
+                found.insert(0 if self.misfit(other) < 0.5 * self.misfit(found[0]) else 2, other)
+        alone = self.misfit(found[0]) / DOUBTFUL
+        # Three planes are like many outlines, and must fit well.
+        if alone <= (FINE / DOUBTFUL if isinstance(found[0], ThreeSided) else 1.0):
+            return found[0], alone
+        rays, pixels = things().lengths.shape
+        if rays > 2 * pixels:
+            among = [self.among(things(), outline) for outline in found]
+            _, outline, misfit = min(among, key=lambda one: one[0])
+            if misfit <= 1.0:
+                return outline, misfit
+            return found[0], max(alone, misfit)
+        return found[0], alone
+
+    def triangles(self) -> list[ThreeSided]:
+        """Where the fit of a triangle starts."""
+        return [
             ThreeSided(
                 turn + np.array([0.0, 2.1, 4.2]), np.full(3, r * self.field),
                 self.top / (2.0 * r * self.field),
@@ -392,8 +425,36 @@ class _Band:
             for turn in (0.0, 0.5, 1.0, 1.5)
             for r in (0.7, 1.2)
         ]  # fmt: skip
-        other = self.three_sided(starts)
-        return other if self.misfit(other) < 0.5 * self.misfit(prism) else prism
+
+    def among(self, things: Things, near: Outline) -> tuple[float, Outline, float]:
+        """What it costs to explain the views by an outline and other things, from `near` on; the
+        outline; and its misfit.
+
+        Both are found in turn. The things are found for an outline that may still change, to first
+        order, so that few turns are enough.
+        """
+        outline, numbers = _by_numbers(near, self.field)
+        seen, x = self.seen.ravel(), numbers
+        bounds = {"bounds": (-LIMIT, LIMIT)} if isinstance(near, Prism) else {}
+        x = np.clip(x, -LIMIT, LIMIT) if bounds else x
+        weight, there = things.weight(seen), np.zeros(things.lengths.shape[1])
+
+        def integrals(x: FloatArray) -> FloatArray:
+            return outline(x).integrals(self.source, self.rays).ravel()
+
+        for _ in range(TOGETHER):
+            now = integrals(x)
+            slopes = np.stack([(integrals(x + d) - now) / 1e-4 for d in 1e-4 * np.eye(len(x))], 1)
+            there = things.found(seen - now, slopes, weight, there)
+            rest = replace(self, seen=self.seen - (things.lengths @ there).reshape(self.seen.shape))
+            before, (_, x) = x, rest.fit(outline, x, 8, FINE, **bounds)
+            if np.abs(x - before).max() < SETTLED:
+                break
+        left = seen - integrals(x) - things.lengths @ there
+        cost = float(0.5 * (left @ left) + weight * np.abs(there).sum())
+        filled = float((np.abs(there) > NOTICED * outline(x).attenuation).mean())
+        strain = cost / (self.top**2 * seen.size)
+        return cost, outline(x), max(filled / MOSTLY, strain / STRAINED)
 
     def fit(
         self,
@@ -414,40 +475,31 @@ class _Band:
 
     def three_sided(self, starts: Sequence[ThreeSided]) -> ThreeSided:
         """The best of the fits from some starts: all in short, then the best one to its end."""
-        field = self.field
-
-        def prism(x: FloatArray) -> ThreeSided:
-            return ThreeSided(x[:3], field * x[3:6], _attenuation(x[6]))
-
-        begun = [
-            np.array([*s.turns, *(s.distances / field), np.log(s.attenuation)]) for s in starts
-        ]
+        prism, _ = _by_numbers(starts[0], self.field)
+        begun = [_by_numbers(start, self.field)[1] for start in starts]
         short = [self.fit(prism, x, 12) for x in begun] if len(begun) > 1 else [(0.0, begun[0])]
         best = sorted(short, key=lambda f: f[0])[:2]
-        return prism(min((self.fit(prism, x, 60) for _, x in best), key=lambda f: f[0])[1])
+        found = prism(min((self.fit(prism, x, 60) for _, x in best), key=lambda f: f[0])[1])
+        assert isinstance(found, ThreeSided)
+        return found
 
-    def round_or_square(self, near: Prism | None) -> Prism:
-        """The ellipse or rectangle that fits best."""
+    def round_or_square(self, near: Prism | None) -> list[Outline]:
+        """The ellipse and the rectangle that fit best, the better one first; only one of them
+        from `near` on."""
         field, top = self.field, self.top
-        limit = np.array([2.0, 2.0, 1.5, 1.5, np.inf, np.inf])
-
-        def prism(round: bool, x: FloatArray) -> Prism:
-            half = field * np.exp(x[2:4])
-            centre, axes = (x[0] * field, x[1] * field), (float(half[0]), float(half[1]))
-            return Prism(round, centre, axes, float(x[4]), _attenuation(x[5]))
+        limit = LIMIT
 
         def fit(
             round: bool, start: npt.ArrayLike, rough: float = ROUGH
         ) -> tuple[float, bool, FloatArray]:
             begin = np.clip(start, -limit, limit)
-            cost, x = self.fit(partial(prism, round), begin, 60, rough, bounds=(-limit, limit))
+            shape = partial(_prism, round, field)
+            cost, x = self.fit(shape, begin, 60, rough, bounds=(-limit, limit))
             return cost, round, x
 
         if near is not None:
-            half, place = np.log(np.array(near.half) / field), np.array(near.centre) / field
-            start = [*place, *half, near.angle, np.log(near.attenuation)]
-            _, round, best = fit(near.round, start)
-            return prism(round, fit(round, best, FINE)[2])
+            _, round, best = fit(near.round, _by_numbers(near, field)[1])
+            return [_prism(round, field, fit(round, best, FINE)[2])]
         found = [
             fit(True, [0, 0, np.log(r), np.log(r), 0.3, np.log(top / (2 * r * field))])
             for r in STARTS
@@ -456,13 +508,43 @@ class _Band:
         for turn in TURNS:
             start = [*best[:2], *(best[2:4] - 0.12), best[4] + turn, best[5]]
             found.append(fit(False, start))
-        _, round, best = min(found, key=lambda f: f[0])
+        found.sort(key=lambda f: f[0])
+        _, round, best = found[0]
+        _, other, second = next(one for one in found if one[1] != round)
         # Dense things in an object may have made it denser, and shorter to make up for that.
-        nearby = [*NEARBY, *((0.0, 0.0, more) for more in self.excess(prism(round, best)))]
+        excess = self.excess(_prism(round, field, best))
+        nearby = [*NEARBY, *((0.0, 0.0, more) for more in excess)]
         steps = [np.array([0.0, 0.0, a, b, 0.0, c]) for a, b, c in nearby]
         found = [fit(round, best + step, FINE) for step in steps]
         _, round, best = min(found, key=lambda f: f[0])
-        return prism(round, best)
+        return [_prism(round, field, best), _prism(other, field, second)]
+
+
+def _prism(round: bool, field: float, x: FloatArray) -> Outline:
+    """A prism of numbers (6,): centre and logarithms of half axes, in units of the field of view's
+    radius, angle, logarithm of the attenuation."""
+    half = field * np.exp(x[2:4])
+    centre, axes = (x[0] * field, x[1] * field), (float(half[0]), float(half[1]))
+    return Prism(round, centre, axes, float(x[4]), _attenuation(x[5]))
+
+
+def _three_sided(field: float, x: FloatArray) -> Outline:
+    """As `_prism`, of turns, distances, and logarithm of the attenuation (7,)."""
+    return ThreeSided(x[:3], field * x[3:6], _attenuation(x[6]))
+
+
+def _by_numbers(one: Outline, field: float) -> tuple[Callable[[FloatArray], Outline], FloatArray]:
+    """How outlines like this one are made of numbers, and its own."""
+    if isinstance(one, ThreeSided):
+        turned = [*one.turns, *(one.distances / field), np.log(one.attenuation)]
+        return partial(_three_sided, field), np.array(turned)
+    half, place = np.log(np.array(one.half) / field), np.array(one.centre) / field
+    numbers = np.array([*place, *half, one.angle, np.log(one.attenuation)])
+    return partial(_prism, one.round, field), numbers
+
+
+LIMIT = np.array([2.0, 2.0, 1.5, 1.5, np.inf, np.inf])
+"""Largest numbers of a prism in a fit, and their least."""
 
 
 def _attenuation(logarithm: float) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import warnings
 from itertools import pairwise
 from pathlib import Path
 
@@ -247,6 +248,30 @@ def test_dense_things_do_not_pull_the_outline(seed):
     truth, even = layer_of(parts, at)
     middle = np.abs(np.hypot(at[:, None], at) / field - 0.5) < 0.1
     assert abs(float((found - truth)[even & middle].mean())) / 0.02 < 0.004
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_large_voids_do_not_pull_the_outline(seed):
+    """Five voids that most rays meet: up to 24 % off where they only count less in the fit."""
+    rng = np.random.default_rng(seed)
+    scan = circle(96, pixel=0.8, sod=300.0, sdd=600.0)
+    field = 300.0 * np.sin(np.arctan2(64.0, 600.0))
+    half = field * rng.uniform(1.05, 2.0), field * rng.uniform(0.8, 2.0)
+    place = field * rng.uniform(-0.2, 0.2, 2)
+    parts: list[Ellipse] = [(*place, *half, rng.uniform(0.0, 3.0), 0.02)]
+    while len(parts) < 6:
+        axes, at = field * rng.uniform(0.15, 0.4, 2), field * rng.uniform(-0.6, 0.6, 2)
+        if all(np.hypot(*(at - p[:2])) > max(axes) + max(p[2:4]) for p in parts[1:]):
+            parts.append((*at, *axes, 0.0, 0.02 * rng.uniform(-1.0, -0.6)))
+    data = ellipses(parts, scan, (1, 160))
+    places = np.linspace(-field, field, 61)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        grid = Grid((1, 61, 61), float(places[1] - places[0]))
+        found = fdk(data, scan, grid.blank()).data[0]
+    truth, even = layer_of(parts, places)
+    middle = np.abs(np.hypot(places[:, None], places) / field - 0.5) < 0.1
+    assert float((found - truth)[even & middle].mean()) / 0.02 == pytest.approx(0.0, abs=0.01)
 
 
 @pytest.mark.slow
