@@ -10,11 +10,14 @@ from __future__ import annotations
 import doctest
 from dataclasses import replace
 from importlib import import_module, resources
+from typing import Literal
 
 import numba
 import numpy as np
 import pytest
 import xraydb
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.interpolate import RectBivariateSpline
 
 from flexdt.twin.attenuation.scattering import cross_sections
@@ -33,7 +36,7 @@ from flexdt.twin.physics.scatter.simulation import (
     scatter_image,
 )
 from flexdt.twin.reconstruction import Grid, fdk, kernel_scatter, without_scatter
-from flexdt.twin.reconstruction.scatter_correction import scatterer_of
+from flexdt.twin.reconstruction.scatter_correction import scatterer_of, subtracted
 
 R2 = 0.0794078767e-22  # classical electron radius squared [mm2], 7.94e-30 m2
 AVOGADRO, MC2, HC = 6.02214076e23, 510.99895, 12.39841984
@@ -502,8 +505,8 @@ def test_kernels_of_one_object_correct_another_or_say_that_they_do_not() -> None
         return float(np.sqrt(np.mean((found - clean)[shadow] ** 2 / np.mean(clean[shadow] ** 2))))
 
     assert error(measured) > 0.03
-    for given in (amplitudes, None):
-        corrected, found = without_by_kernels(measured, pmma, given)
+    for known in (amplitudes, None):
+        corrected, found = without_by_kernels(measured, pmma, known)
         assert error(corrected) < 0.01
         assert not found.doubts
     corrected, found = without_by_kernels(measured, pmma, 3.0 * amplitudes)
@@ -517,6 +520,42 @@ def test_a_scatter_correction_needs_materials_that_differ() -> None:
     for substances, why in (((), "no material"), ((water, replace(water, name="w")), "alike")):
         with pytest.raises(LimitError, match=why):
             without_scatter(air, TURN, Chain(Panel(), substances=substances), 90.0)
+
+
+@given(st.floats(-10.0, 2.0**100, width=32), st.floats(0.0, 1e3, width=32))
+def test_any_scatter_is_subtracted_from_any_line_integral(integral: float, scatter: float) -> None:
+    """Black pixels, too, whose transmission has no inverse in float32."""
+    image = np.full((2, 3), integral, np.float32)
+    left = subtracted(image, np.full((2, 3), scatter, np.float32))
+    assert np.isfinite(left).all()
+    assert (left >= image).all()
+
+
+@pytest.mark.parametrize("kind", ["first", "mc"])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 30), (30, 1)])
+def test_panels_of_one_row_or_column(kind: Literal["first", "mc"], shape: tuple[int, int]) -> None:
+    beam, _ = mono(60.0)
+    thing = box(WATER, 1.0, (20, 30, 20))
+    view = [0, -300, 0, 0, 200, 0, 1, 0, 0, 0, 0, -1]
+    settings = ScatterSettings(kind=kind, error=0.2, nodes=16)
+    full = scatter_image(thing, view, (31, 31), beam, settings).full()
+    narrow = scatter_image(thing, view, shape, beam, settings).full()
+    assert narrow.shape == shape
+    assert narrow.mean() == pytest.approx(full[15, 15], rel=0.5)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_line_integrals_that_are_not_finite_are_refused(value: float) -> None:
+    """They were found to be air, by which nothing is scattered."""
+    scan = ConeVec.circular(sod=300, sdd=500, angles=24, shape=(10, 16), pixel=4)
+    chain = Chain(Panel(), substances=(Substance.of("water", "H2O", 1.0),))
+    images = np.zeros((24, 10, 16), np.float32)
+    images[3, 4, 5] = value
+    for correct in (without_scatter, kernel_scatter):
+        with pytest.raises(GeometryError, match="not finite"):
+            correct(images, scan, chain, 90.0)
+        with pytest.raises(GeometryError, match="projections"):
+            correct(np.zeros((5, 10, 16)), scan, chain, 90.0)
 
 
 def test_what_cannot_be_is_refused() -> None:

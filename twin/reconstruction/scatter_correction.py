@@ -31,7 +31,7 @@ from flexdt.twin.physics.panel import Panel
 from flexdt.twin.physics.scatter.simulation import Beam, Object, ScatterSettings, scan_scatter
 from flexdt.twin.physics.spectrum import TubeModel
 from flexdt.twin.projection import Grid, Volume
-from flexdt.twin.projection.operators import as_cone_vec
+from flexdt.twin.projection.operators import as_cone_vec, check_projections, require_finite
 from flexdt.twin.reconstruction.fdk import fdk_parts
 from flexdt.twin.reconstruction.rectify import field_of_view
 from flexdt.twin.reconstruction.truncation import truncation_of
@@ -144,6 +144,8 @@ what the object is; the scatter that is subtracted in the end is simulated as th
 MOST, OFTEN = 0.9, 0.001
 """Part of a pixel's signal that is taken for scatter at most, and part of the pixels that may reach
 it without a warning."""
+BLACK: Final = 80.0
+"""Line integral of a pixel that nothing reaches; its transmission still has a finite inverse."""
 FINER: Final = 4
 """Voxels of FDK's grid, the whole field of view, for each of the settings'."""
 AIR: Final = 0.15
@@ -202,7 +204,8 @@ def without_scatter(
         >>> bool(without_scatter(air, scan, chain, 90.0).any())
         False
     """
-    stack, cone = np.asarray(line_integrals, dtype=np.float32), as_cone_vec(cone_vec)
+    cone = as_cone_vec(cone_vec)
+    stack = as_stack(line_integrals, cone)
     found = scatterer_of(stack, cone, chain, kV, settings)
     beam = Beam.of(chain, kV)
     scatter = scan_scatter(found.thing, cone.rows, shape_of(stack), beam, settings)
@@ -216,7 +219,8 @@ def subtracted(line_integrals: Float32Array, scatter: Float32Array) -> Float32Ar
         line_integrals: (rows, cols) of the signal over the open beam's.
         scatter: (rows, cols), in units of the open beam; at most `MOST` of the signal is taken.
     """
-    part = np.minimum(scatter * np.exp(line_integrals), np.float32(MOST))
+    over = np.exp(np.minimum(line_integrals, np.float32(BLACK)))
+    part = np.minimum(scatter * over, np.float32(MOST))
     return np.asarray(line_integrals - np.log1p(-part), dtype=np.float32)
 
 
@@ -244,7 +248,8 @@ def scatterer_of(
         As `without_scatter`.
     """
     wanted = ScatterSettings() if settings is None else settings
-    stack, shape = line_integrals, shape_of(line_integrals)
+    stack = as_stack(line_integrals, cone_vec)
+    shape = shape_of(stack)
     grid = coarse_grid(cone_vec, shape, wanted)
     (mu, straighten), beam = attenuations(chain, kV), Beam.of(chain, kV)
     in_rounds = replace(
@@ -282,6 +287,17 @@ def volume_of(stack: Float32Array, cone_vec: ConeVec, grid: Grid) -> Volume:
     shape = shape_of(stack)
     truncation = truncation_of(stack.__getitem__, cone_vec, shape)
     return fdk_parts(lambda: [stack], cone_vec, shape, grid, "hann", None, truncation)
+
+
+def as_stack(line_integrals: npt.ArrayLike, cone_vec: ConeVec) -> Float32Array:
+    """Finite line integrals, one image for each view, float32 (n, rows, cols).
+
+    Raises:
+        GeometryError: they are not.
+    """
+    stack: Float32Array = check_projections(line_integrals, len(cone_vec))
+    require_finite(stack)
+    return stack
 
 
 def shape_of(stack: Float32Array) -> tuple[int, int]:
@@ -346,8 +362,10 @@ def doubts_about(dark: float, volume: Volume, chain: Chain, mu: FloatArray) -> l
     if dark > OFTEN:
         share = f"over {100 * MOST:g} % of the signal"
         out.append(f"scatter would be {share} in {100 * dark:.2g} % of the pixels")
-    filled = volume.data[volume.data > AIR * volume.data.max()]
-    ratio = float(np.percentile(filled, 99)) / float(mu.max()) if len(filled) else 0.0
+    filled = volume.data[volume.data > AIR * max(float(volume.data.max()), 0.0)]
+    if not len(filled):
+        return [*out, "nothing in the field of view attenuates, so no scatter was found"]
+    ratio = float(np.percentile(filled, 99)) / float(mu.max())
     if abs(ratio - 1.0) > UNLIKE:
         name, voxel = chain.substances[int(np.argmax(mu))].name, volume.voxel_xyz[0]
         out.append(

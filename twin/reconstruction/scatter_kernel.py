@@ -93,7 +93,8 @@ def kernel_scatter(
         0.0
     """
     wanted = ScatterSettings() if settings is None else settings
-    stack, shape = line_integrals, correction.shape_of(line_integrals)
+    stack = correction.as_stack(line_integrals, cone_vec)
+    shape = correction.shape_of(stack)
     every, whole = (cone_vec, shape) if panels is None else panels
     known = np.arange(0, len(every), -(-len(every) // len(stack)))
     beam, (mu, straighten) = simulation.Beam.of(chain, kV), correction.attenuations(chain, kV)

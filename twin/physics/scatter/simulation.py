@@ -169,7 +169,9 @@ def spread_out(values: FloatArray, shape: tuple[int, int]) -> Float32Array:
     from scipy.interpolate import RectBivariateSpline
 
     rows, cols = shape
-    v, u = np.linspace(0, rows - 1, values.shape[0]), np.linspace(0, cols - 1, values.shape[1])
+    # A single row or column has all its nodes at one place: the first one's value is taken.
+    v = np.linspace(0, max(rows - 1, 1), values.shape[0])
+    u = np.linspace(0, max(cols - 1, 1), values.shape[1])
     orders = {"kx": min(3, len(v) - 1), "ky": min(3, len(u) - 1)}
     spline = RectBivariateSpline(v, u, values, s=0, **orders)
     return np.asarray(spline(np.arange(rows), np.arange(cols)), dtype=np.float32)
