@@ -1,7 +1,7 @@
 """FDK beside itk-rtk's on the same data: a ball and a box, exact projections, one machine.
 
-Needs `pip install itk-rtk`. Prints both times, the error of each against the truth well inside the
-bodies, and the root mean square difference of the two volumes.
+Needs `pip install itk-rtk`. Prints both times, the mean of each inside the ball over the truth, and
+the largest and the root mean square difference of the two volumes [1/mm].
 
     python examples/compare_fdk.py --views 360 --voxels 256
 """
@@ -31,13 +31,13 @@ def circle(views: int) -> ConeVec:
 
 
 def by_rtk(data: np.ndarray, views: int, voxels: int, size: float) -> tuple[np.ndarray, float]:
-    """RTK's y is up, its detector rows grow upwards; the array it returns is [y, z, x] of ours."""
+    """RTK's (x, y, z) is our (x, z, -y), and its detector rows grow upwards."""
     import itk  # here, so that --help needs no peer
     from itk import RTK as rtk
 
     geometry = rtk.ThreeDCircularProjectionGeometry.New()
     for i in range(views):
-        geometry.AddProjection(SOD, SDD, -360.0 * i / views)
+        geometry.AddProjection(SOD, SDD, 360.0 * i / views)
     stack = itk.image_from_array(np.ascontiguousarray(data[:, ::-1]))
     stack.SetSpacing([PIXEL, PIXEL, 1.0])
     rows, cols = data.shape[1:]
@@ -55,7 +55,7 @@ def by_rtk(data: np.ndarray, views: int, voxels: int, size: float) -> tuple[np.n
     begun = time.perf_counter()
     filters.Update()
     seconds = time.perf_counter() - begun
-    return itk.array_from_image(filters.GetOutput()), seconds
+    return itk.array_from_image(filters.GetOutput())[::-1].transpose(1, 0, 2), seconds
 
 
 def main() -> None:
@@ -80,10 +80,8 @@ def main() -> None:
         begun = time.perf_counter()
         volume = fdk(data, scan, like).data
         ours.append(time.perf_counter() - begun)
-        other, seconds = by_rtk(data, options.views, n, size)
+        theirs_volume, seconds = by_rtk(data, options.views, n, size)
         theirs.append(seconds)
-    theirs_volume = other.transpose(1, 0, 2)
-    rest = (volume - theirs_volume)[_away_from_edges(n, size)]
     inside = _well_inside_the_ball(n, size)
     print(
         json.dumps(
@@ -91,8 +89,8 @@ def main() -> None:
                 "flexdt_s": np.round(ours, 2).tolist(),
                 "itk-rtk_s": np.round(theirs, 2).tolist(),
                 "ratio": round(min(theirs) / min(ours), 2),
+                "largest_difference": float(np.abs(volume - theirs_volume).max()),
                 "rms_difference": float(np.sqrt(np.mean((volume - theirs_volume) ** 2))),
-                "rms_difference_off_edges": float(np.sqrt(np.mean(rest**2))),
                 "flexdt_ball": round(float(volume[inside].mean()) / 0.05, 5),
                 "itk-rtk_ball": round(float(theirs_volume[inside].mean()) / 0.05, 5),
             },
@@ -101,22 +99,10 @@ def main() -> None:
     )
 
 
-def _axes(n: int, size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _well_inside_the_ball(n: int, size: float) -> np.ndarray:
     at = (np.arange(n) - (n - 1) / 2) * size
     z, y, x = np.meshgrid(at, at, at, indexing="ij")
-    return x, y, z
-
-
-def _well_inside_the_ball(n: int, size: float) -> np.ndarray:
-    x, y, z = _axes(n, size)
     return (x - 9) ** 2 + (y + 6) ** 2 + (z - 5) ** 2 < 6.5**2
-
-
-def _away_from_edges(n: int, size: float) -> np.ndarray:
-    x, y, z = _axes(n, size)
-    ball = np.abs(np.sqrt((x - 9) ** 2 + (y + 6) ** 2 + (z - 5) ** 2) - 8.0)
-    inner = np.max([np.abs(x + 8) - 5, np.abs(y - 5) - 6, np.abs(z + 6) - 7], axis=0)
-    return (ball > 4 * size) & (np.abs(inner) > 4 * size)
 
 
 if __name__ == "__main__":
