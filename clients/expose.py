@@ -10,6 +10,7 @@ import numpy as np
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.phantoms.exposure_forecast import VIEWS, Forecast, Transmission, expose
+from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.physics.exposure import FEW_COUNTS
 
 __all__ = ["Forecast", "Measured", "Transmission", "expose", "exposure_of"]
@@ -33,11 +34,19 @@ def exposure_of(data: DataSet | str | PathLike[str]) -> Measured:
 
     Args:
         data: a data set or its folder.
+
+    Raises:
+        DatasetFormatError: no pixel of its flat image is brighter than the dark one.
     """
     scan = data if isinstance(data, DataSet) else load_dataset(data)
     wanted = np.unique(np.linspace(0, len(scan) - 1, VIEWS).astype(int))
     counts = np.stack([scan.counts(int(i)) for i in wanted])
     alive = scan.flat > scan.dark
+    if not alive.any():
+        raise DatasetFormatError(
+            "no pixel of the flat images is brighter than the dark ones: was the tube off?",
+            {"asked": 0, "allowed": "> 0 pixels"},
+        )
     signal = (counts - scan.dark)[:, alive]
     return Measured(
         Transmission.of(signal / (scan.flat - scan.dark)[alive]),

@@ -92,6 +92,10 @@ def test_saturation_is_known_of_a_saved_scan_and_else_unknown(
     plain.save(tmp_path / "plain")
     assert run(["expose", str(tmp_path / "plain")]) == 0
     assert "saturated unknown" in capsys.readouterr().out
+    dull = fx.DataSet.from_arrays(scan.counts(), geometry, dark=scan.flat, flat=scan.dark)
+    dull.save(tmp_path / "dull")
+    assert run(["expose", str(tmp_path / "dull")]) == 1
+    assert "was the tube off?" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
