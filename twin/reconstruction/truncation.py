@@ -63,6 +63,9 @@ NEARBY = (
 FEW = 15.0
 """Per cent of the rays that at least meet nothing denser, or less dense, than the outline's own
 material."""
+UNDERSTOOD = 0.003
+"""Misfit up to which an outline alone explains the views: what fits less well is looked at together
+with other things in the object, as many outlines are nearly like one of three planes."""
 DOUBTFUL = 0.03
 """Misfit above which an outline alone, without other things in the object, is not it."""
 EVEN_THERE = 6.0
@@ -403,8 +406,7 @@ class _Band:
                 other = self.three_sided(self.triangles())
                 found.insert(0 if self.misfit(other) < 0.5 * self.misfit(found[0]) else 2, other)
         alone = self.misfit(found[0]) / DOUBTFUL
-        # Three planes are like many outlines, and must fit well.
-        if alone <= (FINE / DOUBTFUL if isinstance(found[0], ThreeSided) else 1.0):
+        if alone <= UNDERSTOOD / DOUBTFUL:
             return found[0], alone
         rays, pixels = things().lengths.shape
         if rays > 2 * pixels:
