@@ -122,6 +122,13 @@ def distance() -> FloatArray:
     return np.asarray(np.hypot(at[:, None], at))
 
 
+def layer() -> tuple[FloatArray, FloatArray]:
+    """x and y of the pixels of a layer of the whole field of view, (CELLS, CELLS) [mm]."""
+    at = (np.arange(CELLS) - (CELLS - 1) / 2) * 2.0 * FIELD / CELLS
+    x, y = np.meshgrid(at, at)
+    return x, y
+
+
 def moved_aside(views: int, rtk: bool) -> None:
     print("detector moved aside by a part of its half width; object out to 0.95 of the field")
     print(
@@ -162,6 +169,36 @@ def prism(corners: int, radius: float) -> Shape:
     )
 
 
+OUTLINES = ("ellipse", "box", "polygon")
+INSIDE = {
+    "nothing": (0, (0.0, 0.0), (0.0, 0.0)),
+    "three of any density": (3, (0.05, 0.25), (-0.8, 2.0)),
+    "four dense": (4, (0.05, 0.25), (0.6, 2.0)),
+    "five voids": (5, (0.15, 0.35), (-1.0, -0.6)),
+    "five large voids": (5, (0.2, 0.5), (-1.0, -0.8)),
+}
+"""How many ellipses, their half axes over the field of view's radius, and their attenuation over
+the object's own; where voids overlap, a voxel may have less than none."""
+
+
+def put_in(
+    solids: list[Solid],
+    count: int,
+    sizes: tuple[float, float],
+    densities: tuple[float, float],
+    rng: np.random.Generator,
+) -> npt.NDArray[np.bool_]:
+    """Append drawn ellipses (see `INSIDE`); where a layer has none of them."""
+    x, y = layer()
+    outside = np.ones_like(x, dtype=bool)
+    for _ in range(count):
+        axes, spot = FIELD * rng.uniform(*sizes, 2), FIELD * rng.uniform(-0.6, 0.6, 2)
+        thing = Ellipsoid((*spot.tolist(), 0.0), (*axes.tolist(), 1e5))
+        solids.append(Solid(thing, "b", MU * float(rng.uniform(*densities))))
+        outside &= ((x - spot[0]) / axes[0]) ** 2 + ((y - spot[1]) / axes[1]) ** 2 > 1.3
+    return outside
+
+
 def wider(views: int, rtk: bool) -> None:
     print("\nobjects wider than the panel, error of the attenuation at r / field of view")
     print(f"{'':34}   0.0      0.5      0.9" + "        RTK: 0.0      0.5      0.9" * rtk)
@@ -191,8 +228,7 @@ def wider(views: int, rtk: bool) -> None:
         for name, shape in shapes.items():
             row(f"{name}, {wide} of the field", [Solid(shape, "a", MU)], everywhere)
     rng = np.random.default_rng(1)
-    at = (np.arange(CELLS) - (CELLS - 1) / 2) * 2.0 * FIELD / CELLS
-    x, y = np.meshgrid(at, at)
+    x, y = layer()
     worst = []
     for _ in range(20):
         half = FIELD * rng.uniform(1.05, 2.0), FIELD * rng.uniform(0.8, 2.0)
@@ -200,36 +236,17 @@ def wider(views: int, rtk: bool) -> None:
         solids = [Solid(Ellipsoid((*place.tolist(), 0.0), (*half, 1e5)), "a", MU)]
         outer = ((x - place[0]) / half[0]) ** 2 + ((y - place[1]) / half[1]) ** 2
         even = outer < 0.95
-        for _ in range(rng.integers(0, 5)):
-            axes, spot = FIELD * rng.uniform(0.05, 0.25, 2), FIELD * rng.uniform(-0.6, 0.6, 2)
-            tall = (float(axes[0]), float(axes[1]), 1e5)
-            solids.append(Solid(Ellipsoid((*spot.tolist(), 0.0), tall), "b",
-                                MU * float(rng.uniform(-0.8, 2.0))))  # fmt: skip
-            inner = ((x - spot[0]) / axes[0]) ** 2 + ((y - spot[1]) / axes[1]) ** 2
-            even &= inner > 1.3
+        even &= put_in(solids, int(rng.integers(0, 5)), *INSIDE["three of any density"][1:], rng)
         worst.append(np.abs(row("", solids, even)))
     print(f"{'20 random ones, median':34}{figures(np.median(worst, 0))}")
     print(f"{'20 random ones, worst':34}{figures(np.max(worst, 0))}")
-
-
-OUTLINES = ("ellipse", "box", "polygon")
-INSIDE = {
-    "nothing": (0, (0.0, 0.0), (0.0, 0.0)),
-    "three of any density": (3, (0.05, 0.25), (-0.8, 2.0)),
-    "four dense": (4, (0.05, 0.25), (0.6, 2.0)),
-    "five voids": (5, (0.15, 0.35), (-1.0, -0.6)),
-    "five large voids": (5, (0.2, 0.5), (-1.0, -0.8)),
-}
-"""How many ellipses, their half axes over the field of view's radius, and their attenuation over
-the object's own; where voids overlap, a voxel may have less than none."""
 
 
 def drawn(
     outline: str, inside: str, rng: np.random.Generator
 ) -> tuple[list[Solid], npt.NDArray[np.bool_]]:
     """An object wider than the field of view, and where a layer of it is of its own material."""
-    at = (np.arange(CELLS) - (CELLS - 1) / 2) * 2.0 * FIELD / CELLS
-    x, y = np.meshgrid(at, at)
+    x, y = layer()
     turn, place = rng.uniform(0.0, np.pi), FIELD * rng.uniform(-0.2, 0.2, 2)
     if outline == "polygon":
         corners = int(rng.integers(4, 9))
@@ -256,13 +273,7 @@ def drawn(
         )
         even = np.all([a * x + b * y < d - 1 for a, b, d in zip(c, s, far, strict=True)], axis=0)
     solids = [Solid(body, "a", MU)]
-    count, sizes, densities = INSIDE[inside]
-    for _ in range(count):
-        axes_xy, spot = FIELD * rng.uniform(*sizes, 2), FIELD * rng.uniform(-0.6, 0.6, 2)
-        thing = Ellipsoid((*spot.tolist(), 0.0), (*axes_xy.tolist(), 1e5))
-        solids.append(Solid(thing, "b", MU * float(rng.uniform(*densities))))
-        even &= ((x - spot[0]) / axes_xy[0]) ** 2 + ((y - spot[1]) / axes_xy[1]) ** 2 > 1.3
-    return solids, even
+    return solids, even & put_in(solids, *INSIDE[inside], rng)
 
 
 def told(views: int, count: int) -> None:

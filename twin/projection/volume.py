@@ -76,7 +76,7 @@ class Layout:
 
     @cached_property
     def views_here(self) -> list[int]:
-        """One number: views that the processor has projected though there is a device."""
+        """One number: the views asked for so far, before the volume was moved to a device."""
         return [0]
 
 

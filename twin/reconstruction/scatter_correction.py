@@ -205,8 +205,8 @@ def without_scatter(
         False
     """
     cone = as_cone_vec(cone_vec)
-    stack = as_stack(line_integrals, cone)
-    found = scatterer_of(stack, cone, chain, kV, settings)
+    found = scatterer_of(line_integrals, cone, chain, kV, settings)
+    stack = np.asarray(line_integrals, dtype=np.float32)
     beam = Beam.of(chain, kV)
     scatter = scan_scatter(found.thing, cone.rows, shape_of(stack), beam, settings)
     return np.stack([subtracted(image, scatter.signal(i)) for i, image in enumerate(stack)])
@@ -225,7 +225,7 @@ def subtracted(line_integrals: Float32Array, scatter: Float32Array) -> Float32Ar
 
 
 def scatterer_of(
-    line_integrals: Float32Array,
+    line_integrals: npt.ArrayLike,
     cone_vec: ConeVec,
     chain: Chain,
     kV: float,

@@ -87,6 +87,8 @@ NOTICED = 0.1
 STRAINED = 3e-4
 """What it costs (`_Band.among`), for each ray and relative to large line integrals squared, before
 the outline is doubtful: where no outline is right, many things are needed to mend it."""
+LIMIT = np.array([2.0, 2.0, 1.5, 1.5, np.inf, np.inf])
+"""Largest numbers of a prism in a fit, and, negative, their least; see `_prism`."""
 HUGE = 50.0
 """Logarithm of an attenuation, or of its inverse, that no fit takes: what goes beyond counts as
 this."""
@@ -399,7 +401,7 @@ class _Band:
         """The prism that fits best, from `near` on if a neighbour is known, and its misfit
         (see `Truncation`)."""
         if isinstance(near, ThreeSided):
-            found: list[Outline] = [self.three_sided([near])]
+            found = [self.three_sided([near])]
         else:
             found = self.round_or_square(near)
             if near is None and self.misfit(found[0]) > DOUBTFUL:
@@ -475,28 +477,25 @@ class _Band:
         )  # fmt: skip
         return float(found.cost), np.asarray(found.x)
 
-    def three_sided(self, starts: Sequence[ThreeSided]) -> ThreeSided:
+    def three_sided(self, starts: Sequence[ThreeSided]) -> Outline:
         """The best of the fits from some starts: all in short, then the best one to its end."""
         prism, _ = _by_numbers(starts[0], self.field)
         begun = [_by_numbers(start, self.field)[1] for start in starts]
         short = [self.fit(prism, x, 12) for x in begun] if len(begun) > 1 else [(0.0, begun[0])]
         best = sorted(short, key=lambda f: f[0])[:2]
-        found = prism(min((self.fit(prism, x, 60) for _, x in best), key=lambda f: f[0])[1])
-        assert isinstance(found, ThreeSided)
-        return found
+        return prism(min((self.fit(prism, x, 60) for _, x in best), key=lambda f: f[0])[1])
 
     def round_or_square(self, near: Prism | None) -> list[Outline]:
         """The ellipse and the rectangle that fit best, the better one first; only one of them
         from `near` on."""
         field, top = self.field, self.top
-        limit = LIMIT
 
         def fit(
             round: bool, start: npt.ArrayLike, rough: float = ROUGH
         ) -> tuple[float, bool, FloatArray]:
-            begin = np.clip(start, -limit, limit)
+            begin = np.clip(start, -LIMIT, LIMIT)
             shape = partial(_prism, round, field)
-            cost, x = self.fit(shape, begin, 60, rough, bounds=(-limit, limit))
+            cost, x = self.fit(shape, begin, 60, rough, bounds=(-LIMIT, LIMIT))
             return cost, round, x
 
         if near is not None:
@@ -543,10 +542,6 @@ def _by_numbers(one: Outline, field: float) -> tuple[Callable[[FloatArray], Outl
     half, place = np.log(np.array(one.half) / field), np.array(one.centre) / field
     numbers = np.array([*place, *half, one.angle, np.log(one.attenuation)])
     return partial(_prism, one.round, field), numbers
-
-
-LIMIT = np.array([2.0, 2.0, 1.5, 1.5, np.inf, np.inf])
-"""Largest numbers of a prism in a fit, and their least."""
 
 
 def _attenuation(logarithm: float) -> float:
