@@ -18,7 +18,7 @@ import numpy as np
 from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model, spot_radii
 from flexdt.twin.calibration.detect.detection import SpotFinder
 from flexdt.twin.calibration.detect.refine import FEW_WINDOWS, Refined, contrast_of, measure_beads
-from flexdt.twin.calibration.detect.windows import plan_windows
+from flexdt.twin.calibration.detect.windows import mended, plan_windows
 from flexdt.twin.calibration.diagnose.data import (
     WIDE_GATE_PX,
     explain_identification,
@@ -562,6 +562,7 @@ def _second_look(
             contrast = contrast_of([look.detections.contrast for look in state.looks[g]])
             images = scan.frames.windows(plan)
             images[[look.state is not FrameState.USABLE for look in state.looks[g]]] = np.nan
+            images = mended(images, plan)
             measured.append(measure_beads(images, plan, cone, model, contrast, solids, draft=draft))
             plans.append(plan)
         state = replace(state, measured=tuple(measured))

@@ -10,7 +10,7 @@ from flexdt.phantoms import Phantom, bead_phantom, lego_phantom, load_phantom
 from flexdt.twin.calibration.bead_model import bead_model
 from flexdt.twin.calibration.detect.detection import Detections, detect_beads
 from flexdt.twin.calibration.detect.refine import measure_beads
-from flexdt.twin.calibration.detect.windows import crop, plan_windows
+from flexdt.twin.calibration.detect.windows import crop, mended, plan_windows
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
@@ -197,3 +197,26 @@ def test_second_look_separates_touching_beads_and_fits_cut_ones() -> None:
     assert (~whole).sum() == 24  # two of three beads cut in every frame
     assert np.isfinite(error).all()
     assert np.sqrt(np.mean(error[~whole] ** 2)) < 0.1
+
+
+def test_only_pixels_that_never_change_are_filled() -> None:
+    model = bead_model(load_phantom("lego"))
+    cone = lego_cone(24)
+    plan = plan_windows(model, cone, SHAPE)
+    rng = np.random.default_rng(5)
+    clean = radiographs(lego_phantom(), cone, counts=None)
+    noisy = [np.float32(im + rng.normal(0.0, 0.02, SHAPE)) for im in clean]
+    seen = np.stack([crop(im, plan, f) for f, im in enumerate(noisy)])
+    there = np.isfinite(seen)
+    assert (mended(seen, plan) == seen)[there].mean() > 0.9999  # noise repeats by chance
+    still = np.stack([crop(im, plan, f) for f, im in enumerate(clean)])
+    assert mended(still, plan) is still
+    column = int(plan.predicted[..., 0].mean())
+    for im in noisy:
+        im[:, column] = 9.0
+    broken = np.stack([crop(im, plan, f) for f, im in enumerate(noisy)])
+    filled = mended(broken, plan)
+    hit = broken == 9.0
+    assert hit.sum() > 200
+    assert np.median(np.abs(filled - seen)[hit]) < 0.03
+    assert (filled == seen)[~hit & there].mean() > 0.9999

@@ -60,7 +60,7 @@ def survey(flat: Float32Array, alone: Float32Array) -> Background:
     enough = valid.sum(axis=1) >= 24
     straight, _ = _fitted(off, valid, shapes[:, :3], enough)
     curved, coefficients = _fitted(off, valid, shapes, enough)
-    variance = _noise(flat, edge, count * BLOCK) ** 2 / BLOCK**2
+    variance = pixel_noise(flat, edge, count * BLOCK) ** 2 / BLOCK**2
     gain = (straight - curved) / np.maximum(variance, 1e-12)
     bent = bool(enough.any()) and _bends(gain[enough], curved[enough], variance[enough], valid)
     free = valid.sum(axis=1) - (shapes.shape[1] if bent else 3)
@@ -121,7 +121,7 @@ def _fitted(
     return np.asarray(np.maximum(left, 0.0)), np.asarray(coefficients, dtype=np.float64)
 
 
-def _noise(flat: Float32Array, edge: int, width: int) -> FloatArray:
+def pixel_noise(flat: Float32Array, edge: int, width: int) -> FloatArray:
     """Noise of each window's pixels from neighbours in a few rows at its top and bottom, (m,)."""
     rows = [edge, edge + 3, edge + 6, edge + width - 7, edge + width - 4, edge + width - 1]
     strips = flat[:, rows, edge : edge + width]

@@ -16,12 +16,21 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.detect.background import pixel_noise
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.analytic import project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 
 Part = tuple[slice, slice]
+LEAST_SEEN = 4
+"""Frames in which a pixel must be seen before it can be called dead."""
+STILL = 0.1
+"""Spread of a dead pixel's values over the frames, by the noise."""
+STANDS_OUT = 5.0
+"""What a dead pixel differs by from its neighbours in some frame, by the noise."""
+WIDEST_DEAD = 4
+"""Pixels along the shorter side of a gap that is filled."""
 BATCH = 12_000_000
 """Rays rendered at a time, about."""
 
@@ -139,6 +148,57 @@ def overlap(windows: Windows, frame: int, bead: int) -> tuple[Part, Part]:
         (slice(top - y, bottom - y), slice(left - x, right - x)),
         (slice(top, bottom), slice(left, right)),
     )
+
+
+def mended(images: Float32Array, windows: Windows) -> Float32Array:
+    """The windows (n, k, side, side) with dead pixels filled from their neighbours.
+
+    A dead pixel shows the same in all frames, which noise allows no other pixel, and not what its
+    neighbours show. Parts of more than `WIDEST_DEAD` pixels are left: they may be starved.
+    """
+    side = windows.side
+    noise = float(np.median(pixel_noise(images.reshape(-1, side, side), 0, side)))
+    low = np.full(windows.shape, np.inf, dtype=np.float32)
+    high, seen = -low, np.zeros(windows.shape, dtype=np.uint16)
+    places = [
+        (f, k, *overlap(windows, f, k))
+        for f, k in np.ndindex(*images.shape[:2])
+        if np.isfinite(images[f, k]).any()
+    ]
+    for f, k, inside, there in places:
+        part = images[f, k][inside]
+        np.fmin(low[there], part, out=low[there])
+        np.fmax(high[there], part, out=high[there])
+        seen[there] += 1
+    still = np.zeros(windows.shape, dtype=np.uint8)
+    known = seen >= LEAST_SEEN
+    still[known] = high[known] - low[known] < STILL * noise
+    wide = np.ones((WIDEST_DEAD + 1, WIDEST_DEAD + 1), dtype=np.uint8)
+    still[cv2.morphologyEx(still, cv2.MORPH_OPEN, wide) > 0] = 0
+    dead = np.zeros(windows.shape, dtype=np.bool_)
+    suspects = [place for place in places if still[place[3]].any()]
+    filled = [_filled(images[f, k][i], still[t] > 0) for f, k, i, t in suspects]
+    for (f, k, inside, there), fill in zip(suspects, filled, strict=True):
+        dead[there] |= np.abs(fill - images[f, k][inside]) > STANDS_OUT * noise
+    if not dead.any():
+        return images
+    out = images.copy()
+    for (f, k, inside, there), fill in zip(suspects, filled, strict=True):
+        out[f, k][inside] = np.where(dead[there], fill, images[f, k][inside])
+    return out
+
+
+def _filled(image: Float32Array, dead: npt.NDArray[np.bool_]) -> Float32Array:
+    """An image whose dead pixels are means of those beside, above and below them, from the gaps'
+    edges inwards."""
+    sides = np.pad(np.where(dead, np.float32(np.nan), image), 1, constant_values=np.nan)
+    inner = sides[1:-1, 1:-1]
+    for _ in range((WIDEST_DEAD + 1) // 2):
+        around = np.stack([sides[:-2, 1:-1], sides[2:, 1:-1], sides[1:-1, :-2], sides[1:-1, 2:]])
+        there = np.isfinite(around)
+        fill = dead & np.isnan(inner) & there.any(axis=0)
+        inner[fill] = np.where(there, around, 0.0).sum(axis=0)[fill] / there.sum(axis=0)[fill]
+    return np.ascontiguousarray(inner)
 
 
 def without_beads(scene: Scene, model: BeadModel) -> Scene:
