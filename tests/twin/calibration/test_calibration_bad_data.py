@@ -69,7 +69,7 @@ def test_dead_columns_and_pixels_are_no_shadows() -> None:
     """They were taken for a body and for beads elsewhere: the magnification was 5 sigmas off."""
     _, found = run_case(("dead_pixels", 325, "normal-5"))
     assert not found.refused
-    assert found.findings == ()
+    assert not {"body_differs", "bead_displaced"} & set(found.findings)
     assert found.worst < 4.0
 
 
