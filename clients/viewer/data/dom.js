@@ -91,7 +91,7 @@ export function base64(buffer) {
 }
 // A canvas's pixels in two dimensions, and one that was not refused.
 export function context2d(canvas) {
-    const context = canvas.getContext("2d");
+    const context = canvas.getContext("2d", { willReadFrequently: true }); // images are made, and read back, by the processor
     if (!context)
         throw new Error("this browser draws nothing");
     return context;
