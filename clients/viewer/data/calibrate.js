@@ -3,7 +3,7 @@ import { $, $$, $button, $input, chosen, el, fixed, words } from "./dom.js";
 import { call, command, emit, on } from "./link.js";
 import { know } from "./compare.js";
 import { open } from "./data.js";
-$("#tab-calibrate").append(el("div", { class: "card" }, el("h2", {}, "In force"), el("div", { id: "in-force" }), el("div", { class: "row", style: "margin-top:7px" }, el("button", { id: "revert", class: "small", onclick: revert }, "Undo"))), el("div", { class: "card", id: "fit-card" }, el("h2", {}, "Calibrate from data sets"), el("div", { class: "list", id: "datasets" }), el("div", { class: "form", style: "margin-top:7px" }, el("label", { class: "muted" }, "phantom"), el("input", { type: "text", id: "fit-phantom", value: "lego", "aria-label": "Phantom" }), el("button", { id: "fit", class: "small primary", onclick: fit }, "Calibrate"), el("span", { id: "fit-note", class: "muted" })), el("div", { class: "report", id: "fit-report" })), el("div", { class: "card" }, el("h2", {}, "Apply a report"), el("div", { class: "muted" }, "The JSON of “flexdt calibrate --json”, or parameter: value pairs."), el("div", { class: "row", style: "margin-top:7px" }, el("input", { type: "file", id: "correction-file", accept: ".json", "aria-label": "A calibration's report" }))), el("div", { class: "card" }, el("h2", {}, "History"), el("div", { class: "list", id: "corrections" })));
+$("#tab-calibrate").append(el("div", { class: "card" }, el("h2", {}, "In force"), el("div", { id: "in-force" }), el("div", { class: "row", style: "margin-top:7px" }, el("button", { id: "revert", class: "small", onclick: revert }, "Undo"))), el("div", { class: "card", id: "fit-card" }, el("h2", {}, "Calibrate from data sets"), el("div", { class: "list", id: "datasets" }), el("div", { class: "form", style: "margin-top:7px" }, el("label", { class: "muted" }, "phantom"), el("input", { type: "text", id: "fit-phantom", value: "lego", "aria-label": "Phantom", title: "unknown: markers of which nobody knows where they are", oninput: named }), el("input", { type: "text", id: "fit-scale", placeholder: "0-1=25 (mm)", hidden: true, "aria-label": "Distance of two markers" }), el("button", { id: "fit", class: "small primary", onclick: fit }, "Calibrate"), el("span", { id: "fit-note", class: "muted" })), el("div", { class: "report", id: "fit-report" })), el("div", { class: "card" }, el("h2", {}, "Apply a report"), el("div", { class: "muted" }, "The JSON of “flexdt calibrate --json”, or parameter: value pairs."), el("div", { class: "row", style: "margin-top:7px" }, el("input", { type: "file", id: "correction-file", accept: ".json", "aria-label": "A calibration's report" }))), el("div", { class: "card" }, el("h2", {}, "History"), el("div", { class: "list", id: "corrections" })));
 const values = (parameters) => Object.fromEntries(Object.entries(parameters).map(([k, v]) => [k, typeof v === "number" ? v : v?.value]));
 // The parameters of a report, or of a plain list of them: all of them numbers, or none is taken.
 export function parametersOf(report) {
@@ -78,6 +78,8 @@ async function datasets() {
         box.append(el("div", {}, el("label", {}, tick, d.name), el("span", { class: "muted small-text" }, `${d.present} frames`)));
     }
 }
+function named() { $("#fit-scale").hidden = $input("#fit-phantom").value !== "unknown"; }
+const wanted = () => ({ phantom: $input("#fit-phantom").value, tracks: true, scale: $("#fit-scale").hidden ? null : $input("#fit-scale").value || null });
 const ticked = () => $$("#datasets input:checked").map((i) => i.value);
 function fit() {
     const names = ticked();
@@ -85,7 +87,7 @@ function fit() {
         emit("note", "warning-note", "Calibrate", "choose a data set");
         return;
     }
-    void estimate("calibration.fit", { datasets: names, phantom: $input("#fit-phantom").value, tracks: true }, names, "No calibration");
+    void estimate("calibration.fit", { datasets: names, ...wanted() }, names, "No calibration");
 }
 async function estimate(method, params, names, title) {
     $button("#fit").disabled = true;
@@ -110,9 +112,11 @@ on("calibrate", async (dataset, sample, markers) => {
     await datasets();
     for (const tick of $$("#datasets input"))
         tick.checked = tick.value === dataset;
-    if (sample)
+    if (sample && !(markers && wanted().phantom === "unknown")) {
         $input("#fit-phantom").value = sample;
-    void estimate("calibration.fit", { datasets: [dataset], phantom: $input("#fit-phantom").value, tracks: true, markers: markers ?? null }, [dataset], "No calibration");
+        named();
+    }
+    void estimate("calibration.fit", { datasets: [dataset], ...wanted(), markers: markers ?? null }, [dataset], "No calibration");
 });
 on("align", (dataset) => { emit("show-tab", "calibrate"); void estimate("calibration.align", { name: dataset }, [dataset], "Not aligned"); });
 let name;
@@ -122,12 +126,8 @@ on("state", (state) => {
     if (name === (c?.name ?? null))
         return;
     name = c?.name ?? null;
-    const box = $("#in-force");
-    box.textContent = "";
-    if (c)
-        box.append(el("div", {}, el("b", {}, c.name), el("span", { class: "muted" }, `  ${dated(c)}`)), table(c.parameters));
-    else
-        box.append(el("span", { class: "muted" }, "none: nominal geometry"));
+    $("#in-force").replaceChildren(...c ? [el("div", {}, el("b", {}, c.name), el("span", { class: "muted" }, `  ${dated(c)}`)), table(c.parameters)]
+        : [el("span", { class: "muted" }, "none: nominal geometry")]);
     void refresh();
 });
 on("session", () => { void refresh(); void datasets(); });

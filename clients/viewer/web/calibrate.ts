@@ -11,7 +11,8 @@ $("#tab-calibrate").append(
   el("div", { class: "card", id: "fit-card" }, el("h2", {}, "Calibrate from data sets"),
     el("div", { class: "list", id: "datasets" }),
     el("div", { class: "form", style: "margin-top:7px" },
-      el("label", { class: "muted" }, "phantom"), el("input", { type: "text", id: "fit-phantom", value: "lego", "aria-label": "Phantom" }),
+      el("label", { class: "muted" }, "phantom"), el("input", { type: "text", id: "fit-phantom", value: "lego", "aria-label": "Phantom", title: "unknown: markers of which nobody knows where they are", oninput: named }),
+      el("input", { type: "text", id: "fit-scale", placeholder: "0-1=25 (mm)", hidden: true, "aria-label": "Distance of two markers" }),
       el("button", { id: "fit", class: "small primary", onclick: fit }, "Calibrate"), el("span", { id: "fit-note", class: "muted" })),
     el("div", { class: "report", id: "fit-report" })),
   el("div", { class: "card" }, el("h2", {}, "Apply a report"),
@@ -86,11 +87,13 @@ async function datasets() {
     box.append(el("div", {}, el("label", {}, tick, d.name), el("span", { class: "muted small-text" }, `${d.present} frames`)));
   }
 }
+function named() { $("#fit-scale").hidden = $input("#fit-phantom").value !== "unknown"; }
+const wanted = () => ({ phantom: $input("#fit-phantom").value, tracks: true, scale: $("#fit-scale").hidden ? null : $input("#fit-scale").value || null });
 const ticked = () => $$<HTMLInputElement>("#datasets input:checked").map((i) => i.value);
 function fit() {
   const names = ticked();
   if (!names.length) { emit("note", "warning-note", "Calibrate", "choose a data set"); return; }
-  void estimate("calibration.fit", { datasets: names, phantom: $input("#fit-phantom").value, tracks: true }, names, "No calibration");
+  void estimate("calibration.fit", { datasets: names, ...wanted() }, names, "No calibration");
 }
 async function estimate<M extends "calibration.fit" | "calibration.align">(method: M, params: Requests[M], names: string[], title: string) {
   $button("#fit").disabled = true; $("#fit-note").textContent = `${names.join(", ")}: running…`; $("#fit-report").textContent = "";
@@ -116,8 +119,8 @@ on("calibrate", async (dataset, sample, markers) => {
   emit("show-tab", "calibrate");
   await datasets();
   for (const tick of $$<HTMLInputElement>("#datasets input")) tick.checked = tick.value === dataset;
-  if (sample) $input("#fit-phantom").value = sample;
-  void estimate("calibration.fit", { datasets: [dataset], phantom: $input("#fit-phantom").value, tracks: true, markers: markers ?? null }, [dataset], "No calibration");
+  if (sample && !(markers && wanted().phantom === "unknown")) { $input("#fit-phantom").value = sample; named(); }
+  void estimate("calibration.fit", { datasets: [dataset], ...wanted(), markers: markers ?? null }, [dataset], "No calibration");
 });
 on("align", (dataset) => { emit("show-tab", "calibrate"); void estimate("calibration.align", { name: dataset }, [dataset], "Not aligned"); });
 let name: string | null | undefined;
@@ -126,10 +129,8 @@ on("state", (state) => {
   $button("#revert").disabled = !c;
   if (name === (c?.name ?? null)) return;
   name = c?.name ?? null;
-  const box = $("#in-force");
-  box.textContent = "";
-  if (c) box.append(el("div", {}, el("b", {}, c.name), el("span", { class: "muted" }, `  ${dated(c)}`)), table(c.parameters));
-  else box.append(el("span", { class: "muted" }, "none: nominal geometry"));
+  $("#in-force").replaceChildren(...c ? [el("div", {}, el("b", {}, c.name), el("span", { class: "muted" }, `  ${dated(c)}`)), table(c.parameters)]
+    : [el("span", { class: "muted" }, "none: nominal geometry")]);
   void refresh();
 });
 on("session", () => { void refresh(); void datasets(); });
