@@ -63,7 +63,7 @@ NEARBY = (
 FEW = 15.0
 """Per cent of the rays that at least meet nothing denser, or less dense, than the outline's own
 material."""
-UNDERSTOOD = 0.003
+UNDERSTOOD = 0.001
 """Misfit up to which an outline alone explains the views: what fits less well is looked at together
 with other things in the object, as many outlines are nearly like one of three planes."""
 DOUBTFUL = 0.03
