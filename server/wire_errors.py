@@ -6,7 +6,9 @@ else.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from flexdt.protocol.rpc_errors import Code, RpcError, internal
 from flexdt.twin import errors as e
@@ -29,8 +31,13 @@ CODES: Sequence[tuple[type[e.TwinError], Code]] = (
 )
 
 
-def explain(error: Exception) -> RpcError:
-    """The wire's error for `error`."""
+def explain(error: Exception, root: Path | None = None) -> RpcError:
+    """The wire's error for `error`; of files below `root`, the data directory, it says where they
+    are in it."""
+    if root is not None:
+        known = explain(error)
+        message, data = from_root(known.message, root), from_root(known.data, root)
+        return RpcError(known.code, str(message), data)
     match error:
         case RpcError():
             return error
@@ -50,3 +57,16 @@ def explain(error: Exception) -> RpcError:
 def is_user_error(error: Exception) -> bool:
     """Whether `explain` has more to say than "internal error"."""
     return isinstance(error, RpcError | e.TwinError | ProjectorUnavailable)
+
+
+def from_root(said: object, root: Path) -> object:
+    """What is said, with paths below the folder `root` told from there: no client needs more."""
+    match said:
+        case str():
+            here = str(root)
+            return said.replace(here + os.sep, "").replace(here, "the data directory")
+        case Mapping():
+            return {name: from_root(value, root) for name, value in said.items()}
+        case list() | tuple():
+            return [from_root(value, root) for value in said]
+    return said

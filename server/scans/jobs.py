@@ -41,6 +41,7 @@ class Jobs:
         changed: called with a job whenever its status has changed.
         max_waiting: jobs in the queue at a time.
         projectors: that make frames at the same time.
+        root: the data directory, from which errors tell where files are.
     """
 
     def __init__(
@@ -51,7 +52,9 @@ class Jobs:
         *,
         max_waiting: int = 1000,
         projectors: int = 1,
+        root: Path | None = None,
     ) -> None:
+        self._root = root
         self._projectors = projectors
         self._scanner, self._clock, self._notify = scanner, clock, changed
         self._all: dict[str, Job] = {}
@@ -382,7 +385,7 @@ class Jobs:
         return "failed"
 
     def _error(self, error: Exception) -> dict[str, object]:
-        e = explain(error)
+        e = explain(error, self._root)
         return {"code": e.code, "message": e.message, "data": e.data}
 
     def _runner(self, job: Job, what: str, phases: tuple[JobPhase, ...]) -> ScanRunner:

@@ -15,6 +15,7 @@ from flexdt.phantoms import is_shipped, load_phantom, load_phantom_file
 from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol.method_table import FIT_LIMITS
+from flexdt.server.wire_errors import from_root
 from flexdt.twin.calibration.fit.covariance_steps import covariance_by_step
 from flexdt.twin.calibration.unknown_markers import UNKNOWN
 from flexdt.twin.dataset.dataset_errors import DatasetMissingError
@@ -59,13 +60,13 @@ def fit(root: Path, asked: p.CalibrationFit, *_: object) -> r.CalibrationFitResu
         ]
     if asked.tracks:
         told["tracks"] = import_module("flexdt.clients.calibration.tracks").tracks_document(found)
-    return r.CalibrationFitResult.model_validate(told)
+    return r.CalibrationFitResult.model_validate(from_root(told, root))
 
 
 def align(root: Path, asked: p.CalibrationAlign, *_: object) -> r.CalibrationAlignResult:
     """Align; blocks. Raises as `fit`."""
     found = _face().align(_there(root, asked.name, "data set"))
-    return r.CalibrationAlignResult.model_validate(dict(found.document))
+    return r.CalibrationAlignResult.model_validate(from_root(found.document, root))
 
 
 def _there(root: Path, name: str, what: str) -> Path:

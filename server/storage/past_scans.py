@@ -37,6 +37,7 @@ from flexdt.server.files.dataset_folder import (
 )
 from flexdt.server.runtime.workers import Workers
 from flexdt.server.storage import dataset_fits
+from flexdt.server.wire_errors import from_root
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetMissingError, DatasetNameError
 from flexdt.twin.dataset.file_names import DOCUMENT, SCRIPT, plain_name
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, FrameEntry, parse_document
@@ -369,7 +370,8 @@ def _listed(path: Path, modified: float) -> r.DatasetInfo | str:
     try:
         scan = _scan(folder, LISTED_DOCUMENT)
     except (TwinError, MemoryError) as error:
-        scan = _Scan(folder, problem=str(error) or "it takes too much memory")
+        problem = str(from_root(str(error), path.parent))
+        scan = _Scan(folder, problem=problem or "it takes too much memory")
     return _info(path, modified, scan)
 
 

@@ -45,7 +45,7 @@ class TwinSession:
                 return await result if inspect.isawaitable(result) else result
         except Exception as error:
             if is_user_error(error):
-                raise explain(error) from None
+                raise explain(error, twin.root) from None
             raise
 
     def close(self) -> None:

@@ -126,7 +126,7 @@ class TwinServer:
         )
         self.jobs = Jobs(
             self.scanner, self.clock, self._job_changed, max_waiting=self.limits.max_jobs,
-            projectors=projectors,
+            projectors=projectors, root=root,
         )  # fmt: skip
         self.radiography = Radiography.of(
             self.imaging, detector_model(machine), machine, physics, scatter

@@ -195,6 +195,36 @@ def lost(folder: Path, rng: random.Random) -> None:
     rng.choice(sorted(f for f in folder.iterdir() if f.is_file())).unlink()
 
 
+@pytest.mark.parametrize("file", ["flexdt.json", "io000000.tif", "scan_000001.tif", "none of all"])
+def test_replies_do_not_say_where_the_data_lie(server: Process, data: Path, file: str) -> None:
+    """Errors and warnings about damaged files name them below the data directory."""
+    folder = data / "spoilt"
+    shutil.copytree(data / "first scan", folder)
+    try:
+        if (folder / file).exists():
+            (folder / file).write_bytes((folder / file).read_bytes()[:400])
+        else:
+            (folder / "scan settings.txt").write_text("SOD : x\n")
+        told: list[str] = []
+        with TwinClient(port=server.port) as client:
+            for ask in (
+                lambda: client.dataset("spoilt", measure=True),
+                lambda: client.dataset_frame("spoilt", 3, "line_integral"),
+                lambda: client.fit_calibration(["spoilt"], "lego", tracks=True),
+                lambda: client.align_dataset("spoilt"),
+                lambda: client.submit_script(fly_script(frames=FRAMES), "spoilt"),
+            ):
+                try:
+                    told.append(repr(ask()))
+                except RpcError as error:
+                    told.append(f"{error.message} {error.data}")
+        assert f"spoilt/{file}" in " ".join(told) or file == "none of all"
+        for part in (data, data.parent):
+            assert str(part) not in " ".join(told)
+    finally:
+        shutil.rmtree(folder)
+
+
 def strange(folder: Path, rng: random.Random) -> None:
     """A file is a folder, a link to elsewhere, a pipe, or of another kind."""
     file = rng.choice(sorted(f for f in folder.iterdir() if f.is_file()))
