@@ -157,7 +157,13 @@ class ScenarioImages:
 
     @cached_property
     def _open(self) -> tuple[Float32Array, Float32Array]:
-        return self._collected(0, samples=False)
+        energy, variance = self._collected(0, samples=False)
+        if not min(energy.max(), variance.max()) > 0.0:
+            raise ExchangeError(
+                f"{self.path}: nothing of the open beam reaches and stays in the detector; "
+                "allowed: thinner windows, filters and environment, a thicker scintillator"
+            )
+        return energy, variance
 
     @property
     def brightest(self) -> float:

@@ -333,6 +333,8 @@ BAD: tuple[tuple[str, Any, str], ...] = (
     ("source.spectrum.file", {"value": "no.csv"}, "names 'no.csv'"),
     ("source.spot", {"intensity_map": {"file": {"value": "x.tif"}}}, "intensity_map.file"),
     ("source.filters", [{"material_id": "Xy"}], r"filters\[0\].material_id is \"Xy\"; .* Al, PMMA"),
+    ("source.window", 2 * [{"material_id": "Al", "thickness": {"value": 1000, "unit": "mm"}}],
+     "nothing of the open beam reaches"),
     ("environment.material_id", "Air", "environment.material_id is \"Air\""),
     ("materials", [{"id": "Al", "density": {"value": 2.7},
                     "composition": [{"formula": {"value": "Qq"}}]}], "no element 'Qq'"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import inspect
 import textwrap
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,13 +13,16 @@ import pytest
 from image_quality import edge_mtf, photon_transfer, region
 
 from flexdt.twin.attenuation.substances import Substance
-from flexdt.twin.errors import TwinError
+from flexdt.twin.errors import LimitError, TwinError
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.physics.chain import (
     Chain,
+    Expected,
     blurred,
     expected_signal,
+    flux_of,
     kernel,
+    noise_kernel,
     read_out,
     spot_blur_px,
     weights_of,
@@ -26,6 +30,7 @@ from flexdt.twin.physics.chain import (
 from flexdt.twin.physics.effective import effective_beam
 from flexdt.twin.physics.exposure import ExposureSettings, frame_rng
 from flexdt.twin.physics.panel import Panel, pattern
+from flexdt.twin.physics.radiograph import radiographs
 from flexdt.twin.physics.spectrum import tube_spectrum
 
 ABS = Substance.of("abs", "C15H17N", 1.05)
@@ -312,6 +317,56 @@ def test_neighbours_share_the_noise_of_light_that_reaches_both(blur_mm: float) -
     for n, share in enumerate(shares):
         both = (image[:, : image.shape[1] - n] * image[:, n:]).mean() / variance
         assert both == pytest.approx(share * shares[0], abs=0.012)
+
+
+@pytest.mark.parametrize("sigma", [0.5, 20.0, 80.0, 900.0])
+def test_noise_is_spread_as_wide_as_light_is(sigma: float) -> None:
+    """White noise that a Gaussian spreads keeps 1 / (2 sqrt(pi) sigma) of its variance an axis, the
+    pixels' own width (variance 1/12, twice) included; blurs beyond reason are refused."""
+    weights = noise_kernel(sigma).astype(np.float64)
+    narrow = sigma if sigma > 10.0 else np.sqrt(sigma**2 + 1.0 / 12.0)
+    assert (weights**2).sum() == pytest.approx(0.5 / np.sqrt(np.pi) / narrow, rel=0.01)
+    assert abs(weights).argmax() == len(weights) // 2
+    with pytest.raises(LimitError, match="a blur of 2e\\+03 pixels"):
+        blurred(np.ones((3, 4), np.float32), 0.0, 2000.0)
+
+
+def test_hardly_a_photon_is_none_and_not_a_black_pixel() -> None:
+    """Below about 1e-19 electrons their square is no float32."""
+    dim = np.geomspace(1e-38, 1e-3, 64, dtype=np.float32).reshape(8, 8)
+    panel = Panel(read_noise_e=(0.0, 0.0), dead_fraction=0.0)
+    counts = [
+        read_out(panel, Expected(signal, 400.0 * signal), camera(8, 8), LISTING_1, frame_rng(3, 1))
+        for signal in (dim, 0.0 * dim)
+    ]
+    assert (counts[0] == counts[1]).mean() > 0.9
+    assert counts[0].min() > 50
+
+
+def test_small_pixels_have_their_own_area() -> None:
+    view = np.array([0, -600, 0, 0, 459, 0, 1.4e-6, 0, 0, 0, 0, -2.7e-6], dtype=np.float64)
+    assert flux_of(view, (1, 1))[0, 0] == pytest.approx(
+        1.4e-8 * 2.7e-6 * (1000 / 1059) ** 2, rel=1e-5, abs=0.0
+    )
+
+
+def test_a_beam_of_next_to_nothing_has_no_line_integrals_below_0() -> None:
+    chain = Chain(Panel(), substances=(STEEL,), thickest_mm=(10.0,))
+    paths = np.full((1, 1, 4, 5), 10.0, np.float32)
+    faint = ExposureSettings(90.0, 1e-9, 1e-6)
+    [image] = radiographs(chain, paths, VIEW[None], [faint])
+    assert np.isfinite(image.integrals).all()
+    assert image.integrals.min() >= 0.0
+    weak = Panel(scintillator="H@1e-30", scintillator_mm=1e-6)
+    with pytest.raises(LimitError, match="no photon leaves anything in the detector"):
+        radiographs(replace(chain, panel=weak), paths, VIEW[None], [LISTING_1])
+
+
+def test_a_source_on_the_axis_is_a_blur_that_is_refused() -> None:
+    row = np.concatenate([np.zeros(3), VIEW[3:]])
+    assert spot_blur_px(row, 0.0) == 0.0
+    with pytest.raises(LimitError, match="less magnification"):
+        blurred(np.ones((3, 4), np.float32), spot_blur_px(row, 0.01))
 
 
 def test_edge_gives_the_modulation_of_its_blur():

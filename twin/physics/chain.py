@@ -37,8 +37,10 @@ SAMPLED = 0.7
 """Standard deviation from which samples of a Gaussian have its variance [pixels]."""
 NARROWEST = 0.02
 """Standard deviation below which nothing is done [pixels]."""
+WIDEST = 1000.0
+"""Standard deviation of a blur at most [pixels]."""
 FREQUENCIES, FOLDS = 512, 20
-"""Samples of a noise spectrum, and spectra on either side that are folded into it."""
+"""Samples of a noise spectrum at least, and spectra on either side that are folded into it."""
 
 
 def kernel(sigma_px: float) -> Float32Array:
@@ -56,10 +58,10 @@ def kernel(sigma_px: float) -> Float32Array:
 def noise_kernel(sigma_px: float) -> Float32Array:
     """Weights that give white noise of the pixels' photons the spectrum it has where light spreads
     with `sigma_px` before pixels collect it, (2 r + 1,); see `noise_spectrum`."""
-    frequency = np.fft.fftfreq(FREQUENCIES).astype(np.float64)
+    reach = int(np.ceil(4.0 * sigma_px + 3.0))
+    frequency = np.fft.fftfreq(max(FREQUENCIES, 4 * reach)).astype(np.float64)
     modulation = np.sqrt(noise_spectrum(frequency, sigma_px))
     weights = np.fft.ifft(modulation).real
-    reach = int(np.ceil(4.0 * sigma_px + 3.0))
     return np.asarray(weights[np.arange(-reach, reach + 1)], dtype=np.float32)
 
 
@@ -80,6 +82,12 @@ def blurred(
     """`image` (rows, cols) blurred along its rows and, by default alike, across them; edges go on
     as their last pixel."""
     across = sigma_px if across_px is None else across_px
+    if not max(sigma_px, across) <= WIDEST:
+        raise LimitError(
+            f"a blur of {max(sigma_px, across):.3g} pixels (standard deviation); allowed: "
+            f"{WIDEST:g}, by a smaller focal spot, less power, less magnification or larger pixels",
+            {"asked": max(sigma_px, across), "allowed": WIDEST},
+        )
     if max(sigma_px, across) < NARROWEST:
         return image
     import cv2
@@ -292,9 +300,9 @@ def _quantum_noise(
     """
     out = rng.standard_normal(mean.shape, dtype=np.float32)
     out *= np.sqrt(variance * np.float32(1.0 / averages))
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         quanta = mean * mean * np.float32(averages) / variance
-    few = np.flatnonzero((quanta < FEW).ravel() & (mean > 0.0).ravel())
+    few = np.flatnonzero((quanta < FEW).ravel() & (quanta > 0.0).ravel())
     if len(few):
         each = mean.ravel()[few] / quanta.ravel()[few]
         out.ravel()[few] = (rng.poisson(quanta.ravel()[few]) - quanta.ravel()[few]) * each
@@ -307,9 +315,8 @@ def spot_blur_px(view: FloatArray, spot_mm: float, towards_mm: float = 0.0) -> f
     source, centre, u, v = view[0:3], view[3:6], view[6:9], view[9:12]
     normal = np.cross(u, v)
     to_axis, to_panel = float(-source @ normal), float((centre - source) @ normal)
-    magnification = to_panel / max(
-        to_axis - towards_mm * float(np.linalg.norm(normal)), 1e-3 * to_axis
-    )
+    near = to_axis - towards_mm * float(np.linalg.norm(normal))
+    magnification = to_panel / (max(near, 1e-3 * to_axis) or 1e-300)
     return max(0.0, magnification - 1.0) * spot_mm / FWHM / float(np.linalg.norm(u))
 
 
@@ -348,8 +355,8 @@ def flux_of(view: npt.ArrayLike, shape: tuple[int, int]) -> Float32Array:
     normal = np.cross(u, v) / (pixel_u * pixel_v)
     feet = float(away @ u) / pixel_u, float(away @ v) / pixel_v
     # Rounded, so that equal views share a map.
-    key = (round(x, 6) for x in (abs(float(away @ normal)), *feet, pixel_u, pixel_v))
-    return flux_map(*key, shape)
+    key = (round(x, 6) for x in (abs(float(away @ normal)), *feet))
+    return flux_map(*key, round(pixel_u, 12), round(pixel_v, 12), shape)
 
 
 @lru_cache(maxsize=16)

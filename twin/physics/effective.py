@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexdt.twin.attenuation.substances import Substance
-from flexdt.twin.errors import TwinError
+from flexdt.twin.errors import LimitError, TwinError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 TOLERANCE = 1e-3
@@ -106,8 +106,15 @@ def effective_beam(
         tolerance: largest relative error of the signal.
 
     Raises:
+        LimitError: no energy has a signal.
         TwinError: not reached with `MOST` energies.
     """
+    if not signal.max() > 0.0:
+        raise LimitError(
+            "no photon leaves anything in the detector; allowed: one that absorbs some of the "
+            "spectrum",
+            {"asked": 0.0, "allowed": "> 0"},
+        )
     used = np.flatnonzero(signal > signal.max() * 1e-9)
     mu = np.array([s.attenuation()[used] for s in substances]).reshape(len(substances), len(used))
     paths = sample_paths(mu, signal[used], thickest_mm)

@@ -78,7 +78,7 @@ def _as_line_integrals(
 ) -> Float32Array:
     """-log of the signal over the open beam's."""
     area = open_electrons(chain, exposure, 100.0)  # electrons for a cm2 at 1 m
-    with np.errstate(divide="ignore"):
-        lines = np.log(np.float32(area) * flux_of(view, expected.mean_e.shape))
-        lines -= np.log(np.maximum(expected.mean_e, np.float32(1e-6)))
+    least = np.float32(1e-6)
+    lines = np.log(np.maximum(np.float32(area) * flux_of(view, expected.mean_e.shape), least))
+    lines -= np.log(np.maximum(expected.mean_e, least))
     return np.asarray(lines, dtype=np.float32)

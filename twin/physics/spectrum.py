@@ -19,6 +19,8 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import TubeSpec
 
 ALUMINIUM = Substance.parse("Al@2.70")
+NOTHING = 1e-20
+"""Photons per cm2 and mAs at 1 m, below which no exposure sees one."""
 
 
 _FILTER = "tube_filter_"
@@ -153,7 +155,7 @@ def tube_spectrum(kV: float, tube: TubeModel | None = None) -> Spectrum:
     bare = (1.0 - part) * stored.fluence[before] + part * stored.fluence[after]
     layers = (TubeModel() if tube is None else tube).filters
     behind = Spectrum(bare).behind(*layers)
-    if not behind.photons > 0.0:
+    if not behind.photons > NOTHING:
         names = ", ".join(f"{one.thickness_mm:g} mm of {one.substance.name}" for one in layers)
         raise LimitError(
             f"at {kV:g} kV nothing comes through the tube's filters ({names})",
@@ -171,11 +173,11 @@ def monochromatic(energy_keV: float) -> Spectrum:
     energy = tables().energy_keV
     step = float(energy[1] - energy[0])
     low, high = float(energy[0]) - step / 2, float(energy[-1]) + step / 2
-    if not low <= energy_keV < high:
+    if not low <= energy_keV <= high:
         raise LimitError(
             f"no bin for {energy_keV:g} keV; the tables reach from {low:g} to {high:g} keV",
             {"asked": energy_keV, "allowed": [low, high], "unit": "keV"},
         )
     fluence = np.zeros_like(energy)
-    fluence[int((energy_keV - low) / step)] = 1.0
+    fluence[min(int((energy_keV - low) / step), len(fluence) - 1)] = 1.0
     return Spectrum(fluence)
