@@ -2,6 +2,10 @@
 
     python examples/research/align_targets.py [--views 180] [--binning 2] [--geometries 10] [--json]
     python examples/research/align_targets.py --spoilt
+    python examples/research/align_targets.py --edge
+
+`--edge` reconstructs a ball (FDK) as the data set says it was scanned, as aligned and as it really
+was, and tells how wide its edge is (10 to 90 %).
 
 Objects are sums of ellipsoids and boxes, whose line integrals are closed forms, written out here
 with kinematics of their own: nothing is shared with what is tested. Geometries are drawn by a seed.
@@ -22,6 +26,8 @@ from typing import Any, Final
 
 import numba
 import numpy as np
+from scipy.optimize import curve_fit
+from scipy.special import ndtr
 
 import flexdt as fx
 
@@ -258,6 +264,43 @@ def _angle(found: Any) -> float:
     return math.degrees(math.atan2(c1 - c0, r0 - r1))
 
 
+RADIUS: Final = 14.0
+"""Of the ball whose edge is looked at [mm]."""
+
+
+def edges(plain: Hidden, rng: np.random.Generator) -> list[float]:
+    """Widths of a ball's edge in voxels: nominal geometry, aligned, true."""
+    hidden = drawn(rng, plain)
+    ball = Solids(np.array([[2.0, -1.0, 0.0, *3 * [RADIUS], 0.02]]), np.zeros((0, 7)))
+    data = measured(project(hidden, ball), hidden, 10_000.0, rng)
+    aligned = data.with_correction(data.align().correction)
+    u, v = hidden.steps()
+    turns = np.radians(np.arange(hidden.views) * hidden.span / hidden.views)
+    rows = []
+    for phi in turns:
+        c, s = math.cos(phi), math.sin(phi)
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        pivot = np.array([hidden.axis_x, SOD, 0.0])
+        centre = np.array([hidden.panel[0], SDD, hidden.panel[1]])
+        rows.append([*(turn @ -pivot), *(turn @ (centre - pivot)), *(turn @ u), *(turn @ v)])
+    true = fx.ConeVec(np.array(rows))
+    voxel = hidden.pixel * SOD / SDD
+    across = int(2.4 * RADIUS / voxel)
+    like = fx.Grid((3, across, across), voxel).blank()
+    at = (np.arange(across) - (across - 1) / 2) * voxel
+    away = (np.hypot(at - 2.0, at[:, None] + 1.0) - RADIUS) / voxel
+    near = np.abs(away) < 20
+    widths = []
+    for geometry in (data.geometry, aligned.geometry, true):
+        image = fx.fdk(data.line_integrals(), geometry, like).data[1]
+        found, _ = curve_fit(
+            lambda at, low, high, sigma, shift: low + (high - low) * ndtr((shift - at) / sigma),
+            away[near], image[near], p0=(0.0, 0.02, 2.0, 0.0),
+        )  # fmt: skip
+        widths.append(float(2.563 * abs(found[2])))  # 10 to 90 %
+    return widths
+
+
 SPOILT: Final = ("clean", "flat ramp 1 %", "flat ramp 3 %", "frame repeated", "3 frames missing",
                  "one in twelve missing", "first again at 360 deg", "200 deg", "350 deg",
                  "drift 0.5 px", "slip 1 px")  # fmt: skip
@@ -299,10 +342,17 @@ def main() -> None:
     parser.add_argument("--photons", default="10000,100")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--spoilt", action="store_true", help="data sets with something wrong")
+    parser.add_argument("--edge", action="store_true", help="edges of a reconstructed ball")
     parser.add_argument("--json", action="store_true", help="one line for each scan instead")
     o = parser.parse_args()
     shape = (760 // o.binning, 956 // o.binning)
     plain = Hidden(o.views, shape, PIXEL * o.binning)
+    if o.edge:
+        print("width of a ball's edge, voxels: as the data set says, aligned, as it really was")
+        for k in range(o.geometries):
+            widths = edges(plain, np.random.default_rng([o.seed, k]))
+            print("  ".join(f"{w:6.1f}" for w in widths), flush=True)
+        return
     if not o.json:
         print(f"{o.views} views of {shape[0]} x {shape[1]} px; errors in px of 0.1496 mm and deg")
         print(
