@@ -190,10 +190,11 @@ def views_of(
         LimitError: nothing would be left.
     """
     rows, cols = dataset.shape
-    if not 1 <= binning <= min(rows, cols) // 2:
+    most = max(1, min(rows, cols) // 2)
+    if not 1 <= binning <= most:
         raise LimitError(
-            f"binning {binning} of {cols} x {rows} pixels; allowed: 1 to {min(rows, cols) // 2}",
-            {"asked": binning, "allowed": [1, min(rows, cols) // 2]},
+            f"binning {binning} of {cols} x {rows} pixels; allowed: 1 to {most}",
+            {"asked": binning, "allowed": [1, most]},
         )
     indices = dataset.present[:: max(1, every)]
     if not indices:

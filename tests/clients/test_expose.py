@@ -106,6 +106,10 @@ def test_numbers_that_no_scan_has_are_refused(words: dict[str, float]) -> None:
         fx.expose(rod(5.0), **words)
 
 
+def test_no_voltage_is_the_machines() -> None:
+    assert fx.expose(rod(5.0), kV=[]).asked == fx.expose(rod(5.0)).asked
+
+
 def test_a_voltage_may_be_numpys() -> None:
     assert fx.expose(rod(5.0), kV=np.int64(60), power_W=np.float32(20)).asked.kV == 60.0
 

@@ -178,6 +178,14 @@ def test_without_a_flat_image_there_are_counts_alone() -> None:
         data[0]
 
 
+def test_a_panel_of_one_row_reconstructs() -> None:
+    """With pixels as they are, which was refused as a binning of 1 out of "1 to 0"."""
+    scan = fx.ConeVec.circular(sod=300, sdd=450, angles=24, shape=(1, 30), pixel=1.0)
+    ball = {"kind": "sphere", "center": [0, 0, 0], "radius": 6, "material": "pmma"}
+    volume = fx.simulate(ball, scan, tube=fx.Tube(mono_keV=60, power_W=0.2)).reconstruct()
+    assert volume.data[0, 12:18, 12:18].mean() == pytest.approx(0.0229, rel=0.05)
+
+
 def test_a_data_set_reconstructs_in_memory(data: fx.DataSet) -> None:
     volume = data.reconstruct("fdk", voxel=0.8, shape=(11, 22, 22))
     x, y, z = volume.centers()

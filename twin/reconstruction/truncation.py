@@ -25,7 +25,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.reconstruction.rectify import is_upright, on_its_side, rectified, swapped, upright
 from flexdt.twin.reconstruction.things_inside import Things
-from flexdt.twin.reconstruction.trajectory import circle_of, columns_beyond
+from flexdt.twin.reconstruction.trajectory import circle_of, columns_beyond, fan_angles, reach
 
 SAMPLES = 48
 """Views that the shape is fitted to, at most."""
@@ -49,6 +49,8 @@ FADING = 0.5
 """Length of a row over which what no prism explains fades out, beyond an edge."""
 FARTHEST = 4.0
 """Times the way from source to panel: there rays end between planes that do not close."""
+LOPSIDED = 0.95
+"""Reach of a panel's near side over that of its far one, below which it is moved to one side."""
 WIDEST = 2.0
 """Rows are continued by at most so many times their length on either side."""
 STARTS = (1.1, 1.5, 2.2)
@@ -186,20 +188,25 @@ class Truncation:
         prisms: one a band; None where the band's rows are whole.
         misfit: of the worst band, relative to what is tolerated; infinite where none is fitted,
             which is so for a helix.
+        one_sided: whether less than a turn was seen by a panel moved to one side: nothing says
+            what lies beyond its near edge.
     """
 
     rows: FloatArray
     prisms: tuple[Outline | None, ...]
     misfit: float = 0.0
+    one_sided: bool = False
 
     @property
     def doubt(self) -> str | None:
         """What to tell the user where the outline is unlike the prism's; else None."""
-        if self.misfit <= 1.0:
+        if self.misfit <= 1.0 and not self.one_sided:
             return None
         why = "its outline is unlike an ellipse, a rectangle or a triangle"
         if np.isinf(self.misfit):
             why = "a helix does not tell how far it goes on"
+        if self.one_sided:
+            why = "less than a turn does not tell what a panel moved to one side misses"
         wide = "the object is wider than the panel"
         return f"{wide}, and {why}: densities may be off by tens of per cent"
 
@@ -268,6 +275,7 @@ def truncation_of(
         For `fdk_parts`; None where the panel saw the whole object.
     """
     views = len(cone_vec)
+    circle = circle_of(cone_vec)  # of all: fewer may seem to close a turn that is open
     chosen = np.unique(np.linspace(0, views - 1, min(views, SAMPLES)).round().astype(np.intp))
     images = [np.asarray(image(i), dtype=np.float32) for i in chosen.tolist()]
     cone_vec = cone_vec[chosen]
@@ -281,12 +289,16 @@ def truncation_of(
             for i, image in enumerate(images)
         ]
     # Beyond the near edge of a panel moved to one side the opposite views say what is there.
-    circle = circle_of(cone_vec)
     if shape[1] < 2:
         return None
     before, after = columns_beyond(circle, panels, shape[1])
     # A helix sees other layers in the same rows at each turn, which no prism stands for.
-    return _fitted(images, panels, shape, np.array([before <= 1, after <= 1]), not circle.rise)
+    edges = np.array([before <= 1, after <= 1])
+    found = _fitted(images, panels, shape, edges, not circle.rise)
+    near, far = sorted(reach(fan_angles(circle, panels, shape[1])))
+    if found is None or circle.full or near > LOPSIDED * far:
+        return found
+    return replace(found, one_sided=True)
 
 
 def _fitted(

@@ -632,3 +632,29 @@ def test_a_panel_that_goes_sideways_between_the_views_is_refused(seed: int) -> N
     tiled = ConeVec(np.concatenate([scan(np.full(90, k * aside)).rows for k in (-0.5, 0.5)]))
     with pytest.raises(GeometryError, match="columns sideways between the views"):
         fdk(np.zeros((180, *shape), np.float32), tiled, like)
+
+
+@pytest.mark.parametrize(("degrees", "told"), [(352.0, True), (220.0, True), (360.0, False)])
+def test_less_than_a_turn_does_not_tell_what_lies_beyond_a_near_edge(
+    degrees: float, told: bool
+) -> None:
+    """A ball that the panel, moved to one side, cuts off in some views. Opposite ones make up for
+    it if there is a whole turn, otherwise a warning says so, however few views are looked at."""
+    angles = np.arange(0.0, degrees, 1.0)
+    scan = ConeVec.circular(sod=300.0, sdd=450.0, angles=angles, shape=(12, 90), pixel=1.0)
+    rows = scan.rows.copy()
+    rows[:, 3:6] += 18.0 * rows[:, 6:9]
+    middle, radius = np.array([12.0, -9.0, 0.0]), 10.0
+    u, v = np.arange(90) - 44.5, np.arange(12) - 5.5
+    rays = rows[:, None, None, 3:6] - rows[:, None, None, 0:3]
+    rays = rays + u[:, None] * rows[:, None, None, 6:9]
+    rays = rays + v[:, None, None] * rows[:, None, None, 9:12]
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    source = rows[:, None, None, 0:3] - middle
+    along = (rays * source).sum(axis=-1)
+    chords = 2.0 * np.sqrt(np.maximum(along**2 - (source**2).sum(axis=-1) + radius**2, 0.0))
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        made = fdk((0.02 * chords).astype(np.float32), ConeVec(rows), Grid((1, 9, 9), 1.0, middle))
+    assert any("less than a turn" in str(one.message) for one in found) == told
+    assert told or made.data.mean() == pytest.approx(0.02, rel=0.005)
