@@ -12,7 +12,7 @@ $("#tab-calibrate").append(
     el("div", { class: "list", id: "datasets" }),
     el("div", { class: "form", style: "margin-top:7px" },
       el("label", { class: "muted" }, "phantom"), el("input", { type: "text", id: "fit-phantom", value: "lego", "aria-label": "Phantom", title: "unknown: markers of which nobody knows where they are", oninput: named }),
-      el("input", { type: "text", id: "fit-scale", placeholder: "0-1=25 (mm)", hidden: true, "aria-label": "Distance of two markers" }),
+      el("label", { class: "muted", id: "fit-scale-label", hidden: true }, "distance, mm"), el("input", { type: "text", id: "fit-scale", placeholder: "0-1=25", hidden: true, "aria-label": "Distance of two markers", title: "Of markers 0 and 1, say; empty: the scale is not known" }),
       el("button", { id: "fit", class: "small primary", onclick: fit }, "Calibrate"), el("span", { id: "fit-note", class: "muted" })),
     el("div", { class: "report", id: "fit-report" })),
   el("div", { class: "card" }, el("h2", {}, "Apply a report"),
@@ -87,7 +87,7 @@ async function datasets() {
     box.append(el("div", {}, el("label", {}, tick, d.name), el("span", { class: "muted small-text" }, `${d.present} frames`)));
   }
 }
-function named() { $("#fit-scale").hidden = $input("#fit-phantom").value !== "unknown"; }
+function named() { $("#fit-scale").hidden = $("#fit-scale-label").hidden = $input("#fit-phantom").value !== "unknown"; }
 const wanted = () => ({ phantom: $input("#fit-phantom").value, tracks: true, scale: $("#fit-scale").hidden ? null : $input("#fit-scale").value || null });
 const ticked = () => $$<HTMLInputElement>("#datasets input:checked").map((i) => i.value);
 function fit() {
