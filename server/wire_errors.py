@@ -7,6 +7,7 @@ else.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -63,8 +64,8 @@ def from_root(said: object, root: Path) -> object:
     """What is said, with paths below the folder `root` told from there: no client needs more."""
     match said:
         case str():
-            here = str(root)
-            return said.replace(here + os.sep, "").replace(here, "the data directory")
+            below = said.replace(str(root) + os.sep, "")
+            return re.sub(rf"{re.escape(str(root))}(?![\w-]|\.\w)", "the data directory", below)
         case Mapping():
             return {name: from_root(value, root) for name, value in said.items()}
         case list() | tuple():

@@ -77,6 +77,19 @@ class Hidden:
         swing = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         return swing @ lean @ u * self.pixel, swing @ lean @ v * self.pixel
 
+    def placed(self, k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Source, panel's centre, u and v of view `k`, (3,) each, as the object sees them [mm]."""
+        part = k / self.views
+        phi = math.radians(part * self.span)
+        c, s = math.cos(phi), math.sin(phi)
+        # The object turns clockwise seen from above; seen from it, everything else the other way.
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        pivot = np.array([self.axis_x, SOD, 0.0])
+        source = turn @ (np.array([self.drift * (part - 0.5), 0.0, 0.0]) - pivot)
+        centre = turn @ (np.array([self.panel[0], SDD, self.panel[1]]) - pivot)
+        u, v = self.steps()
+        return source, centre, turn @ u, turn @ v
+
     def axis_in_image(self) -> tuple[float, float]:
         """Column where the axis crosses the middle row [px], its angle [deg]: its upper end leans
         to the right for positive ones."""
@@ -200,21 +213,12 @@ def _chords(source, centre, u, v, ellipsoids, boxes, out):  # type: ignore[no-un
 
 def project(hidden: Hidden, solids: Solids) -> np.ndarray:
     """Line integrals (views, rows, cols) with 2 x 2 rays a pixel."""
-    u, v = hidden.steps()
     rows, cols = hidden.shape
     out = np.empty((hidden.views, rows, cols), dtype=np.float32)
     fine = np.empty((2 * rows, 2 * cols))
     for k in range(hidden.views):
-        part = k / hidden.views
-        phi = math.radians(part * hidden.span)
-        # The object turns clockwise seen from above; seen from it, everything else the other way.
-        turn = np.array(
-            [[math.cos(phi), -math.sin(phi), 0], [math.sin(phi), math.cos(phi), 0], [0, 0, 1.0]]
-        )
-        pivot = np.array([hidden.axis_x, SOD, 0.0])
-        source = turn @ (np.array([hidden.drift * (part - 0.5), 0.0, 0.0]) - pivot)
-        centre = turn @ (np.array([hidden.panel[0], SDD, hidden.panel[1]]) - pivot)
-        _chords(source, centre, turn @ u / 2, turn @ v / 2, solids.ellipsoids, solids.boxes, fine)
+        source, centre, u, v = hidden.placed(k)
+        _chords(source, centre, u / 2, v / 2, solids.ellipsoids, solids.boxes, fine)
         out[k] = fine.reshape(rows, 2, cols, 2).mean(axis=(1, 3))
     return out
 
@@ -274,16 +278,7 @@ def edges(plain: Hidden, rng: np.random.Generator) -> list[float]:
     ball = Solids(np.array([[2.0, -1.0, 0.0, *3 * [RADIUS], 0.02]]), np.zeros((0, 7)))
     data = measured(project(hidden, ball), hidden, 10_000.0, rng)
     aligned = data.with_correction(data.align().correction)
-    u, v = hidden.steps()
-    turns = np.radians(np.arange(hidden.views) * hidden.span / hidden.views)
-    rows = []
-    for phi in turns:
-        c, s = math.cos(phi), math.sin(phi)
-        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        pivot = np.array([hidden.axis_x, SOD, 0.0])
-        centre = np.array([hidden.panel[0], SDD, hidden.panel[1]])
-        rows.append([*(turn @ -pivot), *(turn @ (centre - pivot)), *(turn @ u), *(turn @ v)])
-    true = fx.ConeVec(np.array(rows))
+    true = fx.ConeVec(np.array([np.concatenate(hidden.placed(k)) for k in range(hidden.views)]))
     voxel = hidden.pixel * SOD / SDD
     across = int(2.4 * RADIUS / voxel)
     like = fx.Grid((3, across, across), voxel).blank()

@@ -23,7 +23,7 @@ from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.server.storage import past_scans
 from flexdt.server.storage.past_scans import PastScans, work
-from flexdt.server.wire_errors import explain, is_user_error
+from flexdt.server.wire_errors import explain, from_root, is_user_error
 from flexdt.twin.machine.description import builtin_machine, profile_of
 
 FRAMES = 7
@@ -223,6 +223,20 @@ def test_replies_do_not_say_where_the_data_lie(server: Process, data: Path, file
             assert str(part) not in " ".join(told)
     finally:
         shutil.rmtree(folder)
+
+
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        ("/d/a/x/y.tif is bad", "x/y.tif is bad"),
+        ("nothing in /d/a.", "nothing in the data directory."),
+        ("/d/a: full", "the data directory: full"),
+        ("/d/a2/x, /d/a.old/x", "/d/a2/x, /d/a.old/x"),
+        ({"asked": ["/d/a/x", 3]}, {"asked": ["x", 3]}),
+    ],
+)
+def test_paths_are_told_from_the_data_directory(said: object, told: object) -> None:
+    assert from_root(said, Path("/d/a")) == told
 
 
 def strange(folder: Path, rng: random.Random) -> None:

@@ -1,4 +1,4 @@
-"""Windows around the positions where the geometry predicts the beads: planned, cut out, rendered.
+"""Windows around the positions where the beads are predicted: planned, cut out, mended, rendered.
 
 With them the second measurement can subtract the phantom's body and the neighbouring beads without
 processing whole images.
