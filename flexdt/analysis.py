@@ -159,16 +159,18 @@ def reconstruct(
     return reconstruct_volume(_opened(data), request, parameters=parameters)
 
 
-def align(data: Data) -> Aligned:
-    """Find the axis of an ordinary full-turn scan by the symmetry of its mean projection.
+def align(data: Data, *, per_frame: bool = False) -> Aligned:
+    """Find axis and source plane of an ordinary full-turn scan without a phantom.
 
     Args:
         data: a data set or its folder.
+        per_frame: look for shifts of single frames (jitter) too; `.dataset` then has them.
 
     Returns:
-        Axis column, roll and, if the object tells it, yaw of the panel, each with its sigma, what
-        is refused and why, and the correction; `document` is the JSON of `flexdt align`. Where
-        the scan cannot tell column and roll, `identifiable` is False.
+        Axis column, roll and, if the object tells them, yaw of the panel and row of the plane in
+        which the source turns, each with its sigma, what is refused and why, and the correction;
+        `document` is the JSON of `flexdt align`. Where the scan cannot tell column and roll,
+        `identifiable` is False.
 
     Raises:
         TwinError: the folder is no data set, or a frame cannot be read.
@@ -179,7 +181,7 @@ def align(data: Data) -> Aligned:
         >>> found = fx.align(data)  # doctest: +SKIP
         >>> volume = data.with_correction(found.correction).reconstruct("fdk")  # doctest: +SKIP
     """
-    return align_dataset(_opened(data))
+    return align_dataset(_opened(data), per_frame)
 
 
 def _posed(data: Data, geometry: ConeVec) -> DataSet:

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
+import numpy as np
+
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.without_phantom.align import Alignment, align_turn
@@ -22,7 +24,7 @@ class Aligned:
     Attributes:
         alignment: everything about it.
         document: the JSON of `flexdt align`.
-        dataset: of what.
+        dataset: of what, with the motion that was found.
     """
 
     alignment: Alignment
@@ -48,14 +50,15 @@ class Aligned:
 
     @property
     def parameters(self) -> Mapping[str, Mapping[str, object]]:
-        """Name -> {value, sigma, unit}: axis_column_px [px], det_roll and perhaps det_yaw [deg]."""
+        """Name -> {value, sigma, unit}: axis_column_px [px], det_roll [deg] and, if the images tell
+        them, det_yaw [deg] and source_row_px [px]."""
         found: Mapping[str, Mapping[str, object]] = self.document["parameters"]  # type: ignore[assignment]
         return found
 
     @property
     def correction(self) -> Correction:
         """The correction, for `DataSet.with_correction` and `calibration.apply`: the one that was
-        in force, with dO_x, det_roll and det_yaw replaced.
+        in force, with dO_x, det_roll, det_yaw and dD_y replaced.
 
         Raises:
             NotIdentifiableError: there is none; says why.
@@ -69,11 +72,12 @@ class Aligned:
         return Correction(name, now.isoformat(timespec="seconds"), offsets, note)
 
 
-def align_dataset(data: DataSet) -> Aligned:
-    """Estimate the geometry of a scan by the symmetry of its mean projection.
+def align_dataset(data: DataSet, per_frame: bool = False) -> Aligned:
+    """Estimate the geometry of a scan without a phantom.
 
     Args:
         data: a data set with a flat image; frames may be missing.
+        per_frame: whether shifts of single frames are looked for too.
 
     Raises:
         DatasetError: a frame cannot be read, or there is no flat image.
@@ -82,7 +86,7 @@ def align_dataset(data: DataSet) -> Aligned:
     base = NOMINAL if data.correction is None else data.correction.parameters
     found = align_turn(
         data.line_integrals, data.poses, data.present, data.shape, base,
-        prior_widths(data.machine, data.profile),
+        prior_widths(data.machine, data.profile), np.random.default_rng(0), per_frame,
     )  # fmt: skip
     document: dict[str, object] = {
         "identifiable": found.identifiable,
@@ -95,4 +99,8 @@ def align_dataset(data: DataSet) -> Aligned:
     }
     if found.offsets is not None:
         document["correction"] = found.offsets.to_edge()
+    if found.motion is not None:
+        document["motion"] = [found.motion.to_dict()]
+        document["datasets"] = [data.where]
+        data = data.with_motion(found.motion)
     return Aligned(found, document, data)

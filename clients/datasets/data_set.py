@@ -423,12 +423,12 @@ class DataSet:
         found: Outcome = outward("analysis").calibrate(self, phantom, **options)
         return found
 
-    def align(self) -> Aligned:
+    def align(self, *, per_frame: bool = False) -> Aligned:
         """Estimate the geometry without a phantom; see `flexdt.align`.
 
         `data.with_correction(data.align().correction)` is the corrected data set.
         """
-        found: Aligned = outward("analysis").align(self)
+        found: Aligned = outward("analysis").align(self, per_frame=per_frame)
         return found
 
     def reconstruct(self, algorithm: str = "fdk", **options: Any) -> Volume:

@@ -2,10 +2,12 @@
 
     python examples/research/align_targets.py [--views 180] [--binning 2] [--geometries 10] [--json]
     python examples/research/align_targets.py --spoilt
+    python examples/research/align_targets.py --jitter 1
     python examples/research/align_targets.py --edge
 
-`--edge` reconstructs a ball (FDK) as the data set says it was scanned, as aligned and as it really
-was, and tells how wide its edge is (10 to 90 %).
+`--jitter` shifts every frame at random and tells what is left of the shifts after
+`align(per_frame=True)`. `--edge` reconstructs a ball (FDK) as the data set says it was scanned, as
+aligned and as it really was, and tells how wide its edge is (10 to 90 %).
 
 Objects are sums of ellipsoids and boxes, whose line integrals are closed forms, written out here
 with kinematics of their own: nothing is shared with what is tested. Geometries are drawn by a seed.
@@ -48,6 +50,7 @@ class Hidden:
             directions that conventions.md names [deg].
         span: of the turn [deg].
         drift: of the source in x over the scan [mm].
+        jitter: (views, 2) columns and rows by which frames show the object aside; None: not.
     """
 
     views: int
@@ -58,6 +61,7 @@ class Hidden:
     tilts: tuple[float, float, float] = (0.0, 0.0, 0.0)
     span: float = 360.0
     drift: float = 0.0
+    jitter: np.ndarray | None = None
 
     def nominal(self) -> fx.ConeVec:
         """What the data set says."""
@@ -88,7 +92,10 @@ class Hidden:
         source = turn @ (np.array([self.drift * (part - 0.5), 0.0, 0.0]) - pivot)
         centre = turn @ (np.array([self.panel[0], SDD, self.panel[1]]) - pivot)
         u, v = self.steps()
-        return source, centre, turn @ u, turn @ v
+        u, v = turn @ u, turn @ v
+        if self.jitter is not None:
+            centre = centre - self.jitter[k, 0] * u - self.jitter[k, 1] * v
+        return source, centre, u, v
 
     def axis_in_image(self) -> tuple[float, float]:
         """Column where the axis crosses the middle row [px], its angle [deg]: its upper end leans
@@ -102,6 +109,14 @@ class Hidden:
         (c0, r0), (c1, r1) = seen
         column = c0 - r0 * (c1 - c0) / (r1 - r0)
         return column + (self.shape[1] - 1) / 2, math.degrees(math.atan2(c1 - c0, r0 - r1))
+
+    def source_row(self) -> float:
+        """Row of the ray from the source, level, to the axis [px]."""
+        u, v = self.steps()
+        centre = np.array([self.panel[0], SDD, self.panel[1]])
+        ray = np.array([self.axis_x, SOD, 0.0])
+        seen = np.linalg.solve(np.column_stack([u, v, -ray]), -centre)
+        return float(seen[1] + (self.shape[0] - 1) / 2)
 
 
 def drawn(rng: np.random.Generator, plain: Hidden) -> Hidden:
@@ -250,7 +265,7 @@ def measured(
 
 
 def errors(found: Any, hidden: Hidden) -> dict[str, tuple[float, float]]:
-    """Error and sigma of the column [px], the axis's angle and the yaw [deg]."""
+    """Error and sigma of the column [px], the axis's angle, the yaw [deg] and the row [px]."""
     column, angle = hidden.axis_in_image()
     p = found.parameters
     out = {"column": (p["axis_column_px"]["value"] - column, p["axis_column_px"]["sigma"])}
@@ -258,6 +273,9 @@ def errors(found: Any, hidden: Hidden) -> dict[str, tuple[float, float]]:
     if "det_yaw" in p:
         aside = math.degrees(math.atan(hidden.panel[0] / SDD))
         out["yaw"] = (p["det_yaw"]["value"] - hidden.tilts[2] + aside, p["det_yaw"]["sigma"])
+    if "source_row_px" in p:
+        row = p["source_row_px"]
+        out["row"] = (row["value"] - hidden.source_row(), row["sigma"])
     return out
 
 
@@ -266,6 +284,30 @@ def _angle(found: Any) -> float:
     cone = found.dataset.with_correction(found.correction).geometry
     (c0, r0), (c1, r1) = cone.project_points([[0, 0, -10], [0, 0, 10]])[0]
     return math.degrees(math.atan2(c1 - c0, r0 - r1))
+
+
+def shifted(name: str, plain: Hidden, size: float, photons: float, seed: tuple[int, ...]) -> str:
+    """What is left of shifts of `size` pixels (0.1496 mm, rms) in every frame, in words."""
+    rng = np.random.default_rng([*seed, sorted(OBJECTS).index(name)])
+    hidden, solids = drawn(rng, plain), OBJECTS[name](rng)
+    factor = hidden.pixel / PIXEL
+    true = rng.normal(0, size / factor, (hidden.views, 2))
+    data = measured(project(replace(hidden, jitter=true), solids), hidden, photons, rng)
+    begun = time.perf_counter()
+    found = data.align(per_frame=True)
+    took = time.perf_counter() - begun
+    motion = found.alignment.motion
+    if motion is None:
+        return str(found.document["refused"].get("motion", found.document["refused"]))
+    angle = np.radians(np.arange(hidden.views) * hidden.span / hidden.views)
+    modes = np.column_stack([np.ones(hidden.views), np.cos(angle), np.sin(angle)])
+    left = motion.values * np.array([1.0, -1.0]) * SDD / SOD / hidden.pixel - true
+    left -= modes @ np.linalg.lstsq(modes, left, rcond=None)[0]
+    sigma = np.nan_to_num(motion.sigma).mean(axis=0) * SDD / SOD / hidden.pixel
+    cells = [f"{name} {photons:g}", "left"]
+    cells += [f"{a * factor:.3f}" for a in left.std(axis=0)]
+    cells += ["+-", *(f"{a * factor:.3f}" for a in sigma), f"{took:.1f} s"]
+    return "  ".join(cells)
 
 
 RADIUS: Final = 14.0
@@ -337,6 +379,7 @@ def main() -> None:
     parser.add_argument("--photons", default="10000,100")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--spoilt", action="store_true", help="data sets with something wrong")
+    parser.add_argument("--jitter", type=float, help="rms shift of every frame [px of 0.1496 mm]")
     parser.add_argument("--edge", action="store_true", help="edges of a reconstructed ball")
     parser.add_argument("--json", action="store_true", help="one line for each scan instead")
     o = parser.parse_args()
@@ -348,10 +391,18 @@ def main() -> None:
             widths = edges(plain, np.random.default_rng([o.seed, k]))
             print("  ".join(f"{w:6.1f}" for w in widths), flush=True)
         return
+    if o.jitter is not None:
+        print(f"shifts of {o.jitter:g} px in every frame, rms: left in columns and rows, px")
+        for name in o.objects.split(","):
+            for photons in map(float, o.photons.split(",")):
+                for k in range(o.geometries):
+                    print(shifted(name, plain, o.jitter, photons, (o.seed, k)), flush=True)
+        return
     if not o.json:
         print(f"{o.views} views of {shape[0]} x {shape[1]} px; errors in px of 0.1496 mm and deg")
         print(
-            f"{'scan':40s}  told  column rms  max  roll rms  max  yaw rms  pulls c/r/y  >4 sigma  s"
+            f"{'scan':40s}  told  column rms  max  roll rms  max  yaw rms  row rms  max  rows"
+            "  pulls c/r/y/row  >4 sigma  s"
         )
     for name in o.objects.split(","):
         for kind in SPOILT if o.spoilt else ("",):
@@ -382,7 +433,7 @@ def _line(label: str, runs: list[tuple[dict[str, tuple[float, float]], float]], 
     told = [r for r, _ in runs if r]
     cells = [f"{label:40s}  {len(told)}/{len(runs)}"]
     pulls, wild = [], 0
-    for name, unit in (("column", factor), ("roll", 1), ("yaw", 1)):
+    for name, unit in (("column", factor), ("roll", 1), ("yaw", 1), ("row", factor)):
         values = np.array([r[name] for r in told if name in r]).reshape(-1, 2)
         if len(values) == 0:
             cells.append("-")
@@ -390,6 +441,8 @@ def _line(label: str, runs: list[tuple[dict[str, tuple[float, float]], float]], 
             continue
         rms, most = math.sqrt(np.mean(values[:, 0] ** 2)), np.abs(values[:, 0]).max()
         cells.append(f"{rms * unit:.4f}" + ("" if name == "yaw" else f" {most * unit:.4f}"))
+        if name == "row":
+            cells[-1] += f" {len(values)}"
         pull = values[:, 0] / values[:, 1]
         wild += int((np.abs(pull) > 4).sum())
         pulls.append(f"{math.sqrt(np.mean(pull**2)):.2f}")

@@ -57,14 +57,25 @@ class Scanner:
         slope = (c1 - c0) / (r1 - r0)
         return c0 - r0 * slope + (SHAPE[1] - 1) / 2, slope
 
-    def lines(self, bodies: np.ndarray, angles: np.ndarray) -> np.ndarray:
-        """Line integrals (n, rows, cols) of ellipsoids (k, 7): centre, half axes, 1/mm."""
+    def row(self) -> float:
+        """The row in which the source sees the point of the axis at its own height."""
         centre, u, v = self.panel()
-        c, r = np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in SHAPE[::-1]))
-        rays = centre + c[..., None] * u + r[..., None] * v
-        rays = (rays / np.linalg.norm(rays, axis=-1)[..., None]).astype(np.float32)
+        ray = np.array([self.axis_x, SOD, 0.0])
+        return float(np.linalg.solve(np.array([u, v, -ray]).T, -centre)[1] + (SHAPE[0] - 1) / 2)
+
+    def lines(
+        self, bodies: np.ndarray, angles: np.ndarray, aside: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Line integrals (n, rows, cols) of ellipsoids (k, 7): centre, half axes, 1/mm; frame k
+        shows them `aside[k]` columns to the right and rows further down."""
         out = np.zeros((len(angles), *SHAPE), dtype=np.float32)
         for k, angle in enumerate(angles):
+            centre, u, v = self.panel()
+            c, r = np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in SHAPE[::-1]))
+            if aside is not None:
+                c, r = c - aside[k, 0], r - aside[k, 1]
+            rays = centre + c[..., None] * u + r[..., None] * v
+            rays = (rays / np.linalg.norm(rays, axis=-1)[..., None]).astype(np.float32)
             for x, y, z, *half, density in bodies:
                 # Clockwise seen from above: x turns to -y.
                 at = np.array([x * math.cos(angle) + y * math.sin(angle) + self.axis_x,
@@ -135,15 +146,81 @@ def pulls(found: object, scanner: Scanner) -> tuple[float, float]:
 def test_column_and_roll_are_where_they_are_within_their_sigmas(
     scans: list[tuple[Scanner, np.ndarray]], photons: float, column: float, roll: float
 ) -> None:
-    off = []
+    off, rows = [], []
     for k, (scanner, lines) in enumerate(scans):
         found = data_set(lines, DEGREES, photons, np.random.default_rng(k)).align()
         assert found.identifiable
+        if "source_row_px" in found.parameters:
+            rows.append(row_pull(found, scanner))
         assert found.parameters["axis_column_px"]["sigma"] < column
         assert found.parameters["det_roll"]["sigma"] < roll
         off.append(pulls(found, scanner))
     assert np.abs(off).max() < 4
     assert (np.sqrt(np.mean(np.square(off), axis=0)) < 1.7).all()
+    if photons < 1000:  # the row cannot be told, and nothing is told of it
+        assert not rows
+    else:
+        error, pull = np.array(rows).T
+        assert len(rows) >= 6
+        assert np.abs(pull).max() < 4
+        assert np.sqrt(np.mean(error**2)) < 0.7
+        assert np.sqrt(np.mean(pull**2)) < 1.7
+
+
+def row_pull(found: object, scanner: Scanner) -> tuple[float, float]:
+    """Error [px] and error over sigma of the row of the source's plane."""
+    told = found.parameters["source_row_px"]  # type: ignore[attr-defined]
+    data = found.dataset.with_correction(found.correction)  # type: ignore[attr-defined]
+    geometry = data.geometry
+    seen = geometry.project_points([[0, 0, geometry.source[0, 2]]])[0, 0, 1]
+    assert told["value"] == pytest.approx(seen, abs=1e-6)  # the correction says the same
+    error = told["value"] - scanner.row()
+    return error, error / told["sigma"]
+
+
+def test_the_row_is_right_above_and_below_the_panel_and_refused_beside_it(
+    scans: list[tuple[Scanner, np.ndarray]],
+) -> None:
+    scanner = scans[0][0]
+    for high, wide in ((60.0, 14.0), (14.0, 45.0)):
+        body = bodies(np.random.default_rng(3))
+        body[0] = [0, 0, 0, wide, wide, high, 0.01]
+        lines = scanner.lines(body, np.radians(DEGREES))
+        found = data_set(lines, DEGREES, 1e4, np.random.default_rng(1)).align()
+        if wide > high:
+            assert "source_row_px" in found.document["refused"]
+        elif "source_row_px" in found.parameters:
+            assert abs(row_pull(found, scanner)[1]) < 4
+
+
+@pytest.mark.parametrize(("size", "photons"), [(0.3, 1e4), (0.0, 1e4), (0.3, 300)])
+def test_shifts_of_single_frames_are_found_with_their_sigmas(size: float, photons: float) -> None:
+    rng, degrees = np.random.default_rng(7), np.arange(120) * 3.0
+    scanner = Scanner.drawn(rng)
+    aside = rng.normal(0, size, (120, 2))
+    lines = scanner.lines(bodies(rng), np.radians(degrees), aside)
+    data = data_set(lines, degrees, photons, rng)
+    found = data.align(per_frame=True)
+    place = [[0.0, 0.0, 0.0]]
+    seen = found.dataset.geometry.project_points(place) - data.geometry.project_points(place)
+    turn = np.radians(degrees)
+    # The geometry takes up what all frames have in common, the object what turns with it.
+    modes = np.column_stack([np.ones(120), np.cos(turn), np.sin(turn)])
+    left = seen[:, 0] - aside
+    left -= modes @ np.linalg.lstsq(modes, left, rcond=None)[0]
+    motion = found.alignment.motion
+    assert motion is not None
+    sigma = motion.sigma.mean(axis=0) * SDD / SOD / PITCH
+    moves = [bool(m["moves"]) for m in motion.to_dict().values()]
+    if size == 0.0:
+        assert moves == [False, False]
+        assert np.abs(seen).max() < 1e-9
+        return
+    assert moves == [True, True]
+    known = np.array([0.06, 0.02] if photons > 1000 else [0.25, 0.1])
+    assert (left.std(axis=0) < known).all()
+    assert (left.std(axis=0) / sigma > 0.5).all()
+    assert (left.std(axis=0) / sigma < 1.7).all()
 
 
 def test_a_ramp_of_the_flat_field_and_missing_frames_do_not_mislead(
@@ -169,7 +246,7 @@ def test_what_slips_aside_and_stays_is_told(scans: list[tuple[Scanner, np.ndarra
         assert np.abs(pulls(found, scanner)).max() < 4
 
 
-@pytest.mark.parametrize("rays", [1, 3])
+@pytest.mark.parametrize("rays", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_flat_ends_along_the_rows_in_images_of_few_rays_a_pixel_do_not_mislead(
     rays: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -240,7 +317,8 @@ def test_what_a_scan_cannot_tell_is_refused_with_the_reason(
     rng = np.random.default_rng(1)
     good = data_set(lines, DEGREES, 1e4, rng)
     refused = good.align().document["refused"]
-    assert {"source_row_px", "SOD", "magnification", "SDD", "det_pitch"} <= set(refused)
+    assert {"SOD", "magnification", "SDD", "det_pitch"} <= set(refused)
+    assert "source_row_px" not in refused
     assert all(len(why) > 30 for why in refused.values())
     short = good[:30].align()
     assert not short.identifiable
@@ -283,8 +361,10 @@ def test_the_command_writes_a_correction_that_reconstruct_takes(
     )
     np.testing.assert_allclose(given, ours.data, atol=1e-5)
     capsys.readouterr()
-    assert run(["align", folder]) == 0
-    assert "not told: SOD" in capsys.readouterr().out
+    assert run(["align", folder, "--per-frame"]) == 0
+    said = capsys.readouterr().out
+    assert "not told: SOD" in said
+    assert "no motion of dO_x was found" in said
     assert run(["align", folder, "--out", str(tmp_path / "axis.txt")]) == 2
     own[:24].save(tmp_path / "half")
     assert run(["align", str(tmp_path / "half"), "--json"]) == 5

@@ -1,9 +1,11 @@
 """Geometry of an ordinary circular scan from its own projections: what it tells, and what not.
 
 Mirror symmetry (`mirror_symmetry.py`) tells where the image of the axis lies and, less well, the
-panel's yaw. They are given as offsets: dO_x for the column, det_roll for the panel against the
-axis, det_yaw. A panel shifted sideways looks as an axis shifted the other way does, but for a yaw
-of shift / SDD, so that the geometry as a whole is right whichever of the two it was.
+panel's yaw; planes through two sources tell the row in which the source turns (`source_row.py`)
+and shifts of single frames (`frame_shifts.py`). They are given as offsets: dO_x for the column,
+det_roll for the panel against the axis, det_yaw, dD_y for the row. A panel shifted sideways looks
+as an axis shifted the other way does, but for a yaw of shift / SDD, and one shifted upwards as an
+axis that leans, but for a pitch: the geometry as a whole is right whichever of the two it was.
 """
 
 from __future__ import annotations
@@ -14,29 +16,33 @@ from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from flexdt.twin.calibration.fit.image_quantities import axis_in_image
+from flexdt.twin.calibration.without_phantom.frame_shifts import Shifts, find_shifts
 from flexdt.twin.calibration.without_phantom.mirror_symmetry import (
     REACH,
     Symmetry,
     find_symmetry,
     first_column,
 )
+from flexdt.twin.calibration.without_phantom.plane_pairs import PlanePairs
+from flexdt.twin.calibration.without_phantom.source_row import find_height
 from flexdt.twin.calibration.without_phantom.turn import Image, Turn, read_turn
+from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import NotIdentifiableError
+from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.motion import Motion
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
 
 FREE: Final = ("dO_x", "det_roll", "det_yaw")
 UNTOLD: Final[Mapping[str, str]] = {
-    "source_row_px": "the row of the source plane lies in the plane of symmetry, which is the same "
-    "for every row; a phantom tells it (flexdt calibrate: det_pitch, dD_y)",
     "SOD": "an object twice as large at twice the distance gives the same images; a phantom of "
     "known size tells it",
     "magnification": "it is SDD / SOD; a phantom of known size tells it",
-    "SDD": "in a circular scan it trades against the object's size and the row of the source "
-    "plane; a phantom tells it (dD_z)",
+    "SDD": "in a circular scan it trades against the object's size; a phantom tells it (dD_z)",
     "det_pitch": "its axis is perpendicular to the plane of symmetry, which stays as it is; a "
     "phantom tells it",
     "dO_y": "a shift along the axis moves the object alone; a phantom tells it",
@@ -59,6 +65,16 @@ FLOOR_DEG: Final = 0.001
 """The same for the roll [deg]."""
 STEP_TOLD: Final = 0.2
 """From here on a step of the images is a warning [px]."""
+COLUMNS: Final = 256
+"""Frames are binned to about so many columns where planes are looked at."""
+MOST_FRAMES: Final = 360
+"""For the row, of more frames than this every second, third and so on is used."""
+MOST_SHIFTS: Final = 2000
+"""Frames whose shifts can be asked for."""
+FLOOR_OF_ROW: Final = 0.1
+"""The row's sigma is this at least: what sampling does (assumed) [px of the binned frames]."""
+STEP_OF_ROW: Final = 10.0
+"""A step of the images may move the row so many times as far (assumed)."""
 
 
 class Told(NamedTuple):
@@ -75,10 +91,12 @@ class Alignment:
 
     Attributes:
         offsets: the correction, all of it: what was in force with what was found; None: refused.
-        parameters: axis_column_px, det_roll and, if the images tell it, det_yaw [px, deg].
+        parameters: axis_column_px, det_roll and, if the images tell them, det_yaw and
+            source_row_px [px, deg].
         refused: name -> why it is not given.
         warnings: what is doubtful about the scan.
         frames: number of those that were used.
+        motion: shifts of single frames, as shifts of the sample; None: not asked for, or refused.
     """
 
     offsets: Offsets | None
@@ -86,6 +104,7 @@ class Alignment:
     refused: Mapping[str, str]
     warnings: tuple[str, ...]
     frames: int
+    motion: Motion | None = None
 
     @property
     def identifiable(self) -> bool:
@@ -100,45 +119,50 @@ def align_turn(
     shape: tuple[int, int],
     base: Offsets,
     priors: Mapping[str, float],
+    random: np.random.Generator,
+    per_frame: bool = False,
 ) -> Alignment:
-    """Estimate axis column, roll and yaw from the frames of a turn.
+    """Estimate axis column, roll, yaw and the source's row from the frames of a turn.
 
     Args:
         image: line integrals of a frame, (rows, cols).
         poses: nominal poses of all frames.
         present: indices of the frames that are there.
         shape: (rows, cols) of every image.
-        base: offsets in force; dO_x, det_roll and det_yaw are replaced.
-        priors: standard deviation of each offset [mm, deg]; those of det_yaw and dD_x count.
+        base: offsets in force; dO_x, det_roll, det_yaw and dD_y are replaced.
+        priors: standard deviation of each offset [mm, deg]; those of the panel and of axis_tilt_x
+            count.
+        random: for images of noise, which tell what noise does.
+        per_frame: whether shifts of single frames are looked for.
 
     Returns:
         The alignment; what the scan cannot tell is in `refused`.
     """
     try:
-        return _align(image, poses, present, shape, base, priors)
+        return _align(image, poses, present, shape, base, priors, random, per_frame)
     except NotIdentifiableError as error:
-        why = dict.fromkeys(("axis_column_px", "det_roll", "det_yaw"), error.message)
+        why = dict.fromkeys(
+            ("axis_column_px", "det_roll", "det_yaw", "source_row_px"), error.message
+        )
         return Alignment(None, {}, {**why, **UNTOLD}, (), 0)
 
 
 def _align(
     image: Image, poses: Poses, present: tuple[int, ...], shape: tuple[int, int],
-    base: Offsets, priors: Mapping[str, float],
+    base: Offsets, priors: Mapping[str, float], random: np.random.Generator,
+    per_frame: bool,
 ) -> Alignment:  # fmt: skip
     _refuse_if(len(present) == 0, "no frame is there")
     pose = _standing(poses, present)
     turn = read_turn(image, base.angle_scale * poses.angle, present)
     rows, cols = shape
     middle = np.array([(cols - 1) / 2, (rows - 1) / 2])
-    foot = np.array([base.tau_x, base.tau_z, 0.0])
 
     def offsets(values: FloatArray) -> Offsets:
         return replace(base, **dict(zip(FREE, values.tolist(), strict=True)))
 
     def view(values: FloatArray) -> FloatArray:
-        parts: FloatArray = pose.cone_vec(offsets(values)).rows[0].reshape(4, 3).copy()
-        parts[:2] -= foot
-        return parts.ravel()
+        return np.asarray(_about_axis(pose, offsets(values)).rows[0])
 
     def seen(values: FloatArray) -> float:
         return float(axis_in_image(pose, offsets(values), middle)[0])
@@ -198,8 +222,135 @@ def _align(
             f"the images tell it to +- {math.degrees(found.images[2]):.2g} deg, its prior to +- "
             f"{math.degrees(yaw):.2g} deg: that is what the correction contains"
         )
+    planes = _Planes(image, poses, turn, offsets, found.values, covariance, priors)
+    corrected, motion = offsets(found.values), None
+    try:
+        corrected, parameters["source_row_px"] = planes.row(random)
+    except NotIdentifiableError as error:
+        refused["source_row_px"] = error.message
+    if per_frame:
+        try:
+            motion = planes.motion(corrected, random)
+        except NotIdentifiableError as error:
+            refused["motion"] = error.message
     warnings = _warnings(turn, found, len(poses) - len(present))
-    return Alignment(offsets(found.values), parameters, refused, warnings, len(turn.used))
+    return Alignment(corrected, parameters, refused, warnings, len(turn.used), motion)
+
+
+class _Planes:
+    """What planes through two sources tell once the plane of symmetry is known.
+
+    Args:
+        image, poses: as of `align_turn`.
+        turn: the frames' mean.
+        offsets: of dO_x, det_roll and det_yaw to all.
+        values: of those three.
+        covariance: of those three.
+        priors: as of `align_turn`.
+    """
+
+    def __init__(
+        self, image: Image, poses: Poses, turn: Turn,
+        offsets: Callable[[FloatArray], Offsets], values: FloatArray, covariance: FloatArray,
+        priors: Mapping[str, float],
+    ) -> None:  # fmt: skip
+        self.image, self.poses, self.turn, self.offsets = image, poses, turn, offsets
+        self.values, self.priors = values, priors
+        self.doubts = np.linalg.cholesky(covariance)
+        self.pitch = float(np.linalg.norm(poses.v[turn.used[0]]))
+        self.factor = max(1, round(turn.mean.shape[1] / COLUMNS))
+        scale = offsets(values).angle_scale
+        around = scale * poses.angle[list(turn.used)] % (2 * np.pi)
+        self.sorted = np.array(turn.used)[np.argsort(around)]
+
+    def _of(self, at: FloatArray) -> Offsets:
+        """Offsets for the panel's height above what is said [px], three doubts of the plane of
+        symmetry and those of SDD and pitch [sigma]."""
+        given = self.offsets(self.values + self.doubts @ at[1:4])
+        return replace(
+            given,
+            dD_y=given.dD_y + float(at[0]) * self.pitch,
+            dD_z=given.dD_z + float(at[4]) * self.priors.get("dD_z", 0.0),
+            det_pitch=given.det_pitch
+            + math.radians(float(at[5]) * self.priors.get("det_pitch", 0.0)),
+        )
+
+    def _pairs(self, frames: npt.NDArray[np.intp], factors: tuple[int, ...]) -> list[PlanePairs]:
+        stack = np.stack([binned_mean(self.image(i), self.factor) for i in frames.tolist()])
+        poses = self.poses[frames]
+
+        def views(at: FloatArray) -> ConeVec:
+            return _about_axis(poses, self._of(at))
+
+        mean, start = self.turn.mean, np.zeros(6)
+        return [
+            PlanePairs(binned_mean(stack, f), mean, f * self.factor, views, start) for f in factors
+        ]
+
+    def row(self, random: np.random.Generator) -> tuple[Offsets, Told]:
+        """Offsets with the panel's height, and the row of the source's plane.
+
+        Raises:
+            NotIdentifiableError: the images do not tell it.
+        """
+        stride = -(-len(self.sorted) // MOST_FRAMES)
+        fine, coarse = self._pairs(self.sorted[::stride], (1, 2))
+        found = find_height(fine, coarse, REACH * self.turn.mean.shape[0], random)
+        step = (0.0, 0.0) if self.turn.step_px is None else self.turn.step_px[0]
+        floor = FLOOR_OF_ROW * self.factor
+        sigma = math.hypot(found.sigma, floor, STEP_OF_ROW * math.hypot(*step))
+        sdd = float(self.poses.sdd[self.sorted[0]])
+        lean = sdd * math.tan(math.radians(self.priors.get("axis_tilt_x", 0.0)))
+        known = math.hypot(self.priors.get("dD_y", 0.0), lean) / self.pitch
+        _refuse_if(
+            sigma > known / 2,
+            f"the images tell it to +- {sigma:.2g} px, the priors of dD_y and axis_tilt_x to +- "
+            f"{known:.2g} px",
+        )
+        at = np.array([found.value, *(5 * [0.0])])
+        parts = _about_axis(self.poses[self.sorted[:1]], self._of(at)).rows[0].reshape(4, 3)
+        source, centre, u, v = parts
+        level = np.array([-source[0], -source[1], 0.0])
+        seen = np.linalg.solve(np.column_stack([u, v, -level]), source - centre)
+        middle = (self.turn.mean.shape[0] - 1) / 2
+        return self._of(at), Told(float(seen[1]) + middle, sigma, "px")
+
+    def motion(self, corrected: Offsets, random: np.random.Generator) -> Motion:
+        """Shifts of single frames as shifts of the sample, dO_x and dO_y.
+
+        Raises:
+            NotIdentifiableError: the images do not tell them, or there are too many frames.
+        """
+        n = len(self.sorted)
+        _refuse_if(n > MOST_SHIFTS, f"{n} frames; shifts are looked for in up to {MOST_SHIFTS}")
+        (pairs,) = self._pairs(self.sorted, (1,))
+        at = np.zeros(6)
+        at[0] = (corrected.dD_y - self._of(at).dD_y) / self.pitch
+        angle = corrected.angle_scale * self.poses.angle[self.sorted]
+        return self._as_motion(find_shifts(pairs, at, angle, random))
+
+    def _as_motion(self, shifts: Shifts) -> Motion:
+        pose = self.poses[self.sorted[:1]]
+        scale = self.factor * float(pose.sod[0] / pose.sdd[0])
+        values, sigmas = np.zeros((2, len(self.poses), 2))
+        sigmas[:] = np.sqrt(np.square(shifts.values).mean(axis=0))  # of frames that are not used
+        across, upwards = scale * float(pose.u[0, 0]), scale * float(pose.v[0, 2])
+        values[self.sorted] = shifts.values * [across, upwards]
+        sigmas[self.sorted] = shifts.sigmas
+        return Motion(("dO_x", "dO_y"), values, sigmas * np.abs([across, upwards]), shifts.evidence)
+
+
+def _about_axis(poses: Poses, offsets: Offsets) -> ConeVec:
+    """The views, the rotation axis at the origin."""
+    rows = poses.cone_vec(offsets).rows.copy()
+    for first in (0, 3):
+        rows[:, first : first + 2] -= _foot(poses, offsets)
+    return ConeVec(rows)
+
+
+def _foot(poses: Poses, offsets: Offsets) -> FloatArray:
+    """Where the axis stands in the sample's frame, (n, 2) [mm]."""
+    return np.array([offsets.tau_x, offsets.tau_z]) - poses.mount[:, :2]
 
 
 def _standing(poses: Poses, present: tuple[int, ...]) -> Poses:

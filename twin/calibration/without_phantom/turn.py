@@ -168,7 +168,13 @@ def _thumb(image: Float32Array) -> Float32Array:
 def _repeated(views: Float32Array, gaps: FloatArray) -> list[int]:
     """Places of frames that show what the one before shows although the stage turned."""
     soft = gaussian_filter(views, (0, 2, 2))  # less noise: a copy may have been exposed anew
-    change = np.square(soft - np.roll(soft, 1, axis=0)).mean(axis=(1, 2), dtype=np.float64)
+    rest = soft - np.roll(soft, 1, axis=0)
+    change = np.empty(len(views))
+    for i, (down, right) in enumerate(zip(*np.gradient(soft, axis=(1, 2)), strict=True)):
+        # Frames that are shifted against each other change more than a turn makes them.
+        slopes = np.stack([right.ravel(), down.ravel()], axis=1)
+        left = rest[i].ravel() - slopes @ np.linalg.lstsq(slopes, rest[i].ravel(), rcond=None)[0]
+        change[i] = np.square(left).mean(dtype=np.float64)
     # Usual for that part of the turn: a round body hardly changes where it turns back.
     usual = median_filter(change, 5, mode="wrap")
     same = (change <= ALIKE * usual) & (np.roll(gaps, 1) > 1e-6)

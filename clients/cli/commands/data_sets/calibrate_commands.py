@@ -110,9 +110,7 @@ def calibrate(
     if not document["identifiable"]:
         raise CommandError("not identifiable: these numbers must not be used", NOT_IDENTIFIABLE)
     if push:
-        _push(twin, outcome.correction, outcome.sources)
-        if "motion" in document:
-            note("warning: a twin's correction is the same in all frames, without the motion")
+        _push(twin, outcome.correction, outcome.sources, document)
 
 
 def _request(
@@ -201,14 +199,16 @@ def align(
     twin: Twin,
     dataset: Path = argument(..., "DATASET"),
     out: Path | None = option(None, "For flexdt reconstruct --correction.", metavar="FILE.json"),
+    per_frame: bool = option(False, "Find shifts of single frames (jitter) too."),
     push: options.Push = False,
     geometry: options.Geometry = None,
     json: options.Json = False,
 ) -> None:
-    """Find the axis of an ordinary full-turn scan, without a phantom.
+    """Find axis and source plane of an ordinary full-turn scan, without a phantom.
 
-    Axis column, roll and, if the object tells it, yaw of the panel. Exit code 5 when the scan
-    cannot tell column and roll; then there is no correction.
+    Axis column, roll and, if the object tells them, yaw of the panel and row of the plane in which
+    the source turns. Exit code 5 when the scan cannot tell column and roll; then there is no
+    correction.
     """
     if out is not None and out.suffix.lower() != ".json":
         raise typer.BadParameter(f"--out: {out.name}: the ending must be .json")
@@ -216,7 +216,8 @@ def align(
 
     if push:
         _require_answer(twin)
-    found = align_dataset(_opened([dataset], None if geometry is None else [geometry])[0])
+    data = _opened([dataset], None if geometry is None else [geometry])[0]
+    found = align_dataset(data, per_frame)
     document: dict[str, Any] = found.document
     if out is not None:
         write_json(out, document)
@@ -229,6 +230,8 @@ def align(
         ]
         say(table(rows, ("parameter", "value", "sigma", "unit")))
         say(f"{document['frames']} frames, {_number(document['seconds'], 2)} s")
+        for text in motions(document):
+            say(text)
         for name, why in found.alignment.refused.items():
             say(f"not told: {name}: {why}")
         warn(found.warnings)
@@ -236,7 +239,7 @@ def align(
         why = found.alignment.refused["axis_column_px"]
         raise CommandError(f"not identifiable: {why}", NOT_IDENTIFIABLE)
     if push:
-        _push(twin, found.correction, found.dataset.name)
+        _push(twin, found.correction, found.dataset.name, document)
 
 
 def compare(
@@ -280,10 +283,12 @@ def _require_answer(twin: Twin) -> None:
         pass
 
 
-def _push(twin: Twin, correction: Correction, source: str) -> None:
+def _push(twin: Twin, correction: Correction, source: str, document: Mapping[str, object]) -> None:
     with twin() as client:
         push_correction(client, correction, source)
     note(f"in force on the twin: {correction.name}")
+    if "motion" in document:
+        note("warning: a twin's correction is the same in all frames, without the motion")
 
 
 def push_correction(client: TwinClient, correction: Correction, source: str) -> None:

@@ -1,0 +1,304 @@
+"""How well pairs of views agree on an object's integrals over planes through both their sources.
+
+The integrals are those of `plane_kernels.py`. Nothing is assumed of their errors but that those of
+frames, distances between views, and heights far apart are their own: what a sum of squares is
+known to follows from how much its parts scatter.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import gaussian_filter
+
+from flexdt.twin.calibration.without_phantom.plane_kernels import sum_planes
+from flexdt.twin.dataset.normalise import binned_mean
+from flexdt.twin.errors import NotIdentifiableError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+
+Views = Callable[[FloatArray], ConeVec]
+"""The panel's height [px], and doubtful parameters, to all views; the axis at the origin."""
+
+APART: Final = (0.2, 0.3, 0.38, 0.43, 0.455, 0.47, 0.48)
+"""Distances of the two views of a pair, in turns."""
+CLEAR: Final = 1.05
+"""The line through two sources keeps so far from the axis, relative to the object's radius."""
+AIR: Final = 0.005
+"""Of the mean's largest value, what is taken for air (assumed)."""
+NOISE: Final = 7.0
+"""And so many standard deviations of the mean's noise."""
+LEVELS: Final = ((1, 0), (2, 0), (4, 0), (1, 8), (2, 8), (4, 8), (2, 20), (4, 20))
+"""Bins of planes, and pairs within so many degrees, whose differences are added before they are
+squared."""
+ROWS: Final = 2
+"""Rows to a bin."""
+FEWEST_BINS: Final = 4
+"""In which a pair must be seen whole to count."""
+FEWEST_PAIRS: Final = 0.25
+"""Share of the pairs that count, at least (assumed)."""
+DARKEST: Final = 8.0
+"""Line integral above which the noise is taken for that of this one."""
+MEDIAN_OF_CHI_SQUARE: Final = 0.4549
+"""Of one degree of freedom."""
+SECTORS: Final = 18
+"""Of the turn, whose sums are compared."""
+BLOCKS: Final = 12
+"""Of heights, whose sums are compared."""
+
+
+class PlanePairs:
+    """Pairs of views, and the planes that both see as far as the object reaches.
+
+    Args:
+        frames: line integrals (n, rows, cols), sorted by angle, binned by `factor`.
+        mean: over the turn, not binned.
+        factor: of the binning.
+        views: to the geometry of the frames as they were before.
+        start: the arguments of `views` about which the others lie.
+
+    Raises:
+        NotIdentifiableError: no two views have sources whose connection is clear of the object.
+    """
+
+    def __init__(
+        self, frames: Float32Array, mean: FloatArray, factor: int, views: Views, start: FloatArray
+    ) -> None:
+        self.shape, self.factor, self.views, self.start = mean.shape, factor, views, start
+        n, rows, cols = frames.shape
+        self.sums = np.zeros((n, cols, rows + 1), dtype=np.float32)
+        np.cumsum(frames.transpose(0, 2, 1), axis=2, out=self.sums[:, :, 1:])
+        here = self.rows(start)
+        radius, border = _support(binned_mean(mean, factor), here[0])
+        table = np.array([(i, (i + round(part * n)) % n) for part in APART for i in range(n)])
+        kind = np.repeat(np.arange(len(APART)), n)
+        sources = here[:, :2]
+        along = sources[table[:, 1]] - sources[table[:, 0]]
+        along /= np.linalg.norm(along, axis=1)[:, None]
+        inwards = np.column_stack([-along[:, 1], along[:, 0]])
+        away = -(inwards * sources[table[:, 0]]).sum(axis=1)
+        clear = np.abs(away) > CLEAR * radius
+        if clear.sum() < n:
+            raise NotIdentifiableError(
+                f"the object reaches {radius:.4g} mm from the axis, the source is "
+                f"{np.hypot(*sources[0]):.4g} mm away: hardly two views have sources whose "
+                "connection is clear of it"
+            )
+        self.pairs, kind, self.away = table[clear], kind[clear], np.abs(away[clear])
+        self.inwards = inwards[clear] * np.sign(away[clear])[:, None]
+        # First pair of each distance, and every pair's place behind it.
+        self.starts = np.flatnonzero(np.diff(kind, prepend=-1))
+        self.sizes = np.diff(self.starts, append=len(kind))
+        self.place = np.arange(len(kind)) - np.repeat(self.starts, self.sizes)
+        at = np.arange(0, rows + 1, ROWS) - rows / 2
+        to = here[0, 3:6] - here[0, :3] + at[:, None] * here[0, 9:12]
+        flat = here[0, :2]
+        self.heights = np.sort(-to[:, 2] / (to[:, :2] @ flat) * (flat @ flat))
+        self.columns = _columns(here, cols, radius)
+        self.valid = self._valid(here, border)
+        whole = float((self.valid.sum(axis=1) >= FEWEST_BINS).mean())
+        if whole < FEWEST_PAIRS:
+            raise NotIdentifiableError(
+                f"the object reaches beyond the panel: {100 * whole:.0f} % of pairs of views have "
+                f"planes through both sources that they see whole (at least "
+                f"{100 * FEWEST_PAIRS:.0f} %)"
+            )
+        ends = [self.rows(start + s * np.eye(len(start))[0])[0] for s in (1, -1)]
+        magnified = np.hypot(*(here[0, 3:5] - flat)) / np.hypot(*flat)
+        # What a row sees at the axis rises so far with the panel's height [mm/px].
+        self.rise = float(ends[0][5] - ends[1][5]) / 2 / float(magnified)
+
+    def rows(self, at: FloatArray) -> FloatArray:
+        """Views of the binned frames, (n, 12)."""
+        return np.ascontiguousarray(self.views(at).binned(self.factor, self.shape).rows)
+
+    def integrals(
+        self, at: FloatArray, rows: FloatArray | None = None, sums: Float32Array | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Integrals of both views of each pair, (q, 2, k), and what 1 comes to, (q, k).
+
+        Args:
+            at: arguments of `views`; the planes rise with the panel's height.
+            rows: views to use instead, (n, 12).
+            sums: of other images, laid out as `self.sums`.
+        """
+        edges = (self.heights + self.rise * (at[0] - self.start[0])) / self.away[:, None]
+        found, ones = np.zeros((2, len(self.pairs), 2, edges.shape[1] - 1))
+        given = self.rows(at) if rows is None else np.ascontiguousarray(rows)
+        images = self.sums if sums is None else sums
+        sum_planes(images, given, self.pairs, self.inwards, edges, self.columns, found, ones)
+        return found, ones.mean(axis=1)
+
+    def costs(self, at: FloatArray, sums: Float32Array | None = None) -> FloatArray:
+        """Sums of squared differences, without what is alike in all bins (air that is not 0).
+
+        Args:
+            at: arguments of `views`.
+            sums: of other images, laid out as `self.sums`.
+
+        Returns:
+            For each of `LEVELS`, of each pair and then of each distance and block of heights,
+            (levels, q + distances * BLOCKS).
+        """
+        found, ones = self.integrals(at, sums=sums)
+        rest = found[:, 0] - found[:, 1]
+        pairs = np.zeros((len(LEVELS), len(rest)))
+        blocks = np.zeros((len(LEVELS), len(self.starts), BLOCKS))
+        for i, (bins, degrees) in enumerate(LEVELS):
+            near = max(1, round(degrees / 360 * len(self.sums)))
+            first = np.flatnonzero(self.place % near == 0)
+            size = np.diff(first, append=len(rest))
+            k = rest.shape[1] // bins
+            wide = (
+                a[:, : k * bins].reshape(len(a), k, bins).sum(axis=2)
+                for a in (rest, ones, ~self.valid)
+            )
+            r, c, unseen = (np.add.reduceat(a, first, axis=0) for a in wide)
+            square = np.square(without(c, r * (unseen == 0), unseen == 0))
+            pairs[i] = np.repeat(square.sum(axis=1) / size, size)
+            of_kind = np.add.reduceat(square, np.searchsorted(first, self.starts), axis=0)
+            blocks[i] = np.add.reduceat(of_kind, np.arange(BLOCKS) * k // BLOCKS, axis=1)
+        return np.hstack([pairs, blocks.reshape(len(LEVELS), -1)])
+
+    def scales(self, costs: FloatArray) -> FloatArray:
+        """1 / usual cost of pairs as far apart as each one, laid out as `costs`."""
+        pairs = costs[:, : len(self.pairs)]
+        usual = np.add.reduceat(pairs, self.starts, axis=1) / self.sizes
+        scale = np.where(usual > 0, 1.0 / np.maximum(usual, 1e-300), 0.0)
+        return np.hstack([np.repeat(scale, self.sizes, axis=1), np.repeat(scale, BLOCKS, axis=1)])
+
+    def total(self, parts: FloatArray) -> FloatArray:
+        """Sums over the pairs of what is laid out as `costs`."""
+        return np.asarray(parts[..., : len(self.pairs)].sum(axis=-1))
+
+    def spread(self, parts: FloatArray, blocks: bool = False) -> FloatArray:
+        """Standard deviations of `total`.
+
+        Pairs that share a frame, or one of a sector, are not independent: of squares of the sums
+        over all that do, those that count pairs twice are taken away. The largest of three counts.
+
+        Args:
+            parts: (..., q + distances * BLOCKS).
+            blocks: whether sums over heights and over distances count too.
+        """
+        n, q = len(self.sums), len(self.pairs)
+        own = parts[..., :q] - parts[..., :q].mean(axis=-1, keepdims=True)
+        worst = np.square(own).sum(axis=-1)
+        for count in (SECTORS, n):
+            low, high = np.sort(self.pairs * count // n, axis=1).T
+            both = np.zeros((*own.shape[:-1], count, count))
+            np.add.at(both, (..., low, high), own)  # type: ignore[arg-type]
+            touched = both.sum(axis=-1) + both.sum(axis=-2)
+            touched -= np.diagonal(both, axis1=-2, axis2=-1)
+            twice = np.square(np.triu(both, 1)).sum(axis=(-1, -2))
+            worst = np.maximum(worst, np.square(touched).sum(axis=-1) - twice)
+        if blocks:
+            table = parts[..., q:].reshape(*parts.shape[:-1], -1, BLOCKS)
+            for axis in (-2, -1):
+                squares = np.square(table.sum(axis=axis))
+                total = squares.sum(axis=-1)
+                # Where one or two blocks have it all, their scatter is hardly known.
+                count = total**2 / np.maximum(np.square(squares).sum(axis=-1), 1e-300)
+                worst = np.maximum(worst, total * count / np.maximum(count - 1.0, 0.25))
+        return np.asarray(np.sqrt(worst))
+
+    def noise(self, random: np.random.Generator) -> Float32Array:
+        """Images that are noise as large as that of the frames, laid out as `sums`.
+
+        Its variance grows as 1 / exp(-g), as that of counted photons; how large it is is the
+        median over all pixels of second differences along rows, so mostly of air.
+        """
+        images = np.diff(self.sums, axis=2)
+        power = np.exp(np.minimum(images, DARKEST))
+        change = np.square(np.diff(images, 2, axis=1)) / 6
+        size = math.sqrt(float(np.median(change / power[:, 1:-1])) / MEDIAN_OF_CHI_SQUARE)
+        white = random.standard_normal(images.shape, dtype=np.float32)
+        out = np.zeros_like(self.sums)
+        np.cumsum(size * np.sqrt(power) * white, axis=2, out=out[:, :, 1:])
+        return out
+
+    def _valid(
+        self, here: FloatArray, border: tuple[FloatArray, FloatArray, FloatArray]
+    ) -> npt.NDArray[np.bool_]:
+        """(q, k) bins of planes that leave the panel of neither view where it sees the object."""
+        edges, step = self.heights, float(np.diff(self.heights).mean())
+        valid = np.ones((len(self.pairs), len(edges) - 1), dtype=bool)
+        upper, lower, sides = border
+        upwards = -float(np.sign(here[0, 11]))
+        for v in (here[self.pairs[:, 0]], here[self.pairs[:, 1]]):
+
+            def heights(at: FloatArray, v: FloatArray = v) -> FloatArray:
+                to = v[:, None, 3:6] - v[:, None, :3] + at[:, :1] * v[:, None, 6:9]
+                to = to + at[:, 1:] * v[:, None, 9:12]
+                inward = (to[..., :2] * self.inwards[:, None]).sum(axis=2)
+                return np.asarray(to[..., 2] / inward * self.away[:, None])
+
+            for places, up in ((upper, upwards), (lower, -upwards)):
+                if len(places):
+                    limit = (up * heights(places)).min(axis=1) - 2 * step
+                    valid &= up * (edges[1:] if up > 0 else edges[:-1]) < limit[:, None]
+            if len(sides):
+                k = np.floor((heights(sides) - edges[0]) / step).astype(np.intp)
+                q = np.broadcast_to(np.arange(len(k))[:, None], k.shape)
+                for by in range(-2, 3):
+                    inside = (k + by >= 0) & (k + by < valid.shape[1])
+                    valid[q[inside], (k + by)[inside]] = False
+        return valid
+
+
+def without(
+    part: FloatArray, whole: FloatArray, used: npt.NDArray[np.bool_] | None = None
+) -> FloatArray:
+    """`whole` (..., k) where it is used, less what is like `part`; 0 where hardly any is."""
+    if used is not None:
+        used = used & (used.sum(axis=-1) >= FEWEST_BINS)[..., None]
+        part, whole = part * used, whole * used
+    share = (whole * part).sum(axis=-1) / np.maximum((part * part).sum(axis=-1), 1e-300)
+    return np.asarray(whole - share[..., None] * part)
+
+
+def _columns(here: FloatArray, cols: int, radius: float) -> npt.NDArray[np.intp]:
+    """First column of each view that the object can reach and the one after the last, (n, 2)."""
+    i = np.arange(cols) - (cols - 1) / 2
+    x, y = (here[:, 3 + a, None] - here[:, a, None] + i * here[:, 6 + a, None] for a in (0, 1))
+    passing = np.abs(here[:, 0, None] * y - here[:, 1, None] * x) / np.hypot(x, y)
+    reached = passing <= radius
+    return np.stack([reached.argmax(axis=1), cols - reached[:, ::-1].argmax(axis=1)], axis=1)
+
+
+def _support(
+    mean: FloatArray, view: FloatArray
+) -> tuple[float, tuple[FloatArray, FloatArray, FloatArray]]:
+    """How far the object reaches from the axis [mm], and places (column, row) about the panel's
+    centre at its upper end, its lower end and its sides where it does not see air."""
+    rows, cols = mean.shape
+    soft = gaussian_filter(mean, 2.0, mode="nearest")
+    rim = np.concatenate([soft[0], soft[-1], soft[:, 0], soft[:, -1]])
+    air = float(np.percentile(rim, 25))
+    white = np.square(np.diff(mean, 2, axis=1)).mean() / 6 / (16 * math.pi)
+    full = soft > air + max(AIR * (float(soft.max()) - air), NOISE * math.sqrt(white))
+    seen = np.flatnonzero(full.any(axis=0))
+    if len(seen) == 0:
+        raise NotIdentifiableError("the mean shows nothing but air")
+    i = np.array([seen[0] - 0.5, seen[-1] + 0.5]) - (cols - 1) / 2
+    x, y = (view[3 + a] - view[a] + i * view[6 + a] for a in (0, 1))
+    radius = float((np.abs(view[0] * y - view[1] * x) / np.hypot(x, y)).max())
+
+    def ends(line: npt.NDArray[np.bool_], size: int) -> FloatArray:
+        at = np.flatnonzero(line) - (size - 1) / 2
+        return np.concatenate([at - 0.5, at + 0.5])
+
+    def across(line: npt.NDArray[np.bool_], row: float) -> FloatArray:
+        at = ends(line, cols)
+        return np.column_stack([at, np.full(len(at), row)])
+
+    def along(line: npt.NDArray[np.bool_], column: float) -> FloatArray:
+        at = ends(line, rows)
+        return np.column_stack([np.full(len(at), column), at])
+
+    sides = np.vstack([along(full[:, 0], -cols / 2), along(full[:, -1], cols / 2)])
+    return radius, (across(full[0], -rows / 2), across(full[-1], rows / 2), sides)
