@@ -216,11 +216,10 @@ def test_shifts_of_single_frames_are_found_with_their_sigmas(size: float, photon
         assert moves == [False, False]
         assert np.abs(seen).max() < 1e-9
         return
-    assert moves == [True, True]
-    known = np.array([0.06, 0.02] if photons > 1000 else [0.25, 0.1])
-    assert (left.std(axis=0) < known).all()
-    assert (left.std(axis=0) / sigma > 0.5).all()
-    assert (left.std(axis=0) / sigma < 1.7).all()
+    assert moves == [photons > 1000, True]  # with little light only up and down
+    for i, known in ((0, 0.06), (1, 0.02)) if photons > 1000 else ((1, 0.1),):
+        assert left[:, i].std() < known
+        assert 0.4 < left[:, i].std() / sigma[i] < 1.3
 
 
 def test_a_ramp_of_the_flat_field_and_missing_frames_do_not_mislead(

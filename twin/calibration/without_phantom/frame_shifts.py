@@ -25,6 +25,10 @@ PULLED: Final = 1e-6
 """Weight that keeps shifts near 0 in directions of which the images say nothing."""
 EVIDENCE: Final = 6.0
 """Gain in log likelihood from which on frames are said to move, as in `fitted_motion`."""
+WIDER: Final = 1.5
+"""Errors are taken to be so many times what disagreements and noise make of them (assumed)."""
+LARGER: Final = 5.0
+"""Squares of shifts must be so many times those of their errors (assumed)."""
 LEAST_TOLD: Final = 0.1
 """Share of the slopes' squares that is the object's is taken to be this at least."""
 
@@ -62,13 +66,14 @@ def find_shifts(
     told = np.maximum(1.0 - system.share(image), LEAST_TOLD)
     scatter = (free @ system.solve(noise)).var(axis=0) / np.square(told)
     # What planes disagree by beyond noise (sampling, beam hardening) is in the shifts as well.
-    scatter *= max(1.0, system.power(system.rest) / system.power(noise))
+    # A face along the beam is sampled alike in all pairs of a frame: more than they tell.
+    scatter *= WIDER**2 * max(1.0, system.power(system.rest) / system.power(noise))
     found = values.var(axis=0)
     sigmas, evidence = np.zeros((n, 2)), []
     for i, (s, v) in enumerate(zip(scatter.tolist(), found.tolist(), strict=True)):
         gain = n / 2 * (v / s - 1.0 - math.log(v / s)) if v > s else 0.0
         evidence.append(gain)
-        share = 1.0 - s / v if gain > EVIDENCE else 0.0
+        share = 1.0 - s / v if gain > EVIDENCE and v > LARGER * s else 0.0
         values[:, i] *= share
         sigmas[:, i] = math.sqrt(share * s) if share else math.nan
     return Shifts(values, sigmas, (evidence[0], evidence[1]))
@@ -88,11 +93,11 @@ class _System:
         usual = np.add.reduceat(np.square(self.rest).sum(axis=1), pairs.starts) / pairs.sizes
         self.weight = np.repeat(1.0 / np.maximum(usual, 1e-300), pairs.sizes)
         self.places = (2 * pairs.pairs[:, :, None] + [0, 1]).reshape(-1, 4)
-        normal = np.zeros(2 * (2 * len(shifts),))
+        n = 2 * len(shifts)
+        self.normal = np.zeros((n, n))
         blocks = np.einsum("qak,qbk,q->qab", self.slopes, self.slopes, self.weight, optimize=True)
-        np.add.at(normal, (self.places[:, :, None], self.places[:, None]), blocks)
-        normal[np.diag_indices(len(normal))] += PULLED * np.trace(normal) / len(normal) + 1e-300
-        self.normal = normal
+        np.add.at(self.normal, (self.places[:, :, None], self.places[:, None]), blocks)
+        self.normal[np.diag_indices(n)] += PULLED * np.trace(self.normal) / n + 1e-300
 
     def _difference(self, found: FloatArray) -> FloatArray:
         return without(self.ones, found[:, 0] - found[:, 1], self.pairs.valid)

@@ -175,6 +175,11 @@ class PlanePairs:
         """Sums over the pairs of what is laid out as `costs`."""
         return np.asarray(parts[..., : len(self.pairs)].sum(axis=-1))
 
+    def by_height(self, parts: FloatArray) -> FloatArray:
+        """Sums over blocks of heights of what is laid out as `costs`, (..., BLOCKS)."""
+        blocks = parts[..., len(self.pairs) :]
+        return np.asarray(blocks.reshape(*parts.shape[:-1], -1, BLOCKS).sum(axis=-2))
+
     def spread(self, parts: FloatArray, blocks: bool = False) -> FloatArray:
         """Standard deviations of `total`.
 

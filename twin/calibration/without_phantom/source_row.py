@@ -24,6 +24,8 @@ SURE: Final = 2.0
 """Standard deviations by which the best of them must be better than any that is not beside it."""
 BENT: Final = 2.5
 """Standard deviations of its own by which the minimum must be one."""
+LEFT: Final = 0.05
+"""Share of the curvature that is left without any two neighbouring blocks of heights, at least."""
 ROUNDS: Final = 8
 FREE_ROUNDS: Final = 3
 """In which the level may change."""
@@ -129,8 +131,12 @@ def _first(
     alone = np.stack([pairs.total(pairs.costs(pairs.start + y * up, noise) * scale) for y in grid])
     found: list[tuple[float, float]] = []
     for of_level, wiggle in zip((costs * scale).swapaxes(0, 1), alone.std(axis=0), strict=True):
-        best = int(pairs.total(of_level).argmin())
-        if 0 < best < len(grid) - 1:
+        total = pairs.total(of_level)
+        best = int(total.argmin())
+        # Planes that lie in a flat face of the object agree in a spike, not in a bowl.
+        beside = np.abs(np.arange(len(grid)) - best) == 1
+        spike = total[beside].min() > np.delete(total, best).min()
+        if 0 < best < len(grid) - 1 and not spike:
             more = of_level[np.abs(np.arange(len(grid)) - best) > 1] - of_level[best]
             spread = np.maximum(pairs.spread(more), math.sqrt(2.0) * wiggle)
             better = pairs.total(more) / np.maximum(spread, 1e-300)
@@ -154,4 +160,11 @@ def _bowl(pairs: PlanePairs, at: float, h: float, up: FloatArray) -> _Bowl:
     # Of several levels the one that happens to bend most would be chosen, its sigma too small.
     wider = np.hypot(1.0, BENT / np.maximum(sure, BENT))
     sigmas = np.where(sure > BENT, wider * left / np.where(sure > BENT, bend, 1.0), np.inf)
+    # No two neighbouring blocks of heights may have the answer to themselves: a flat face would.
+    parts = np.stack([pairs.by_height(slopes), pairs.by_height(bends)])
+    rest_slope, rest_bend = np.stack([slope, bend])[..., None] - parts[..., 1:] - parts[..., :-1]
+    alone = ~(rest_bend > np.maximum(LEFT * bend[:, None], 0.0))
+    without = rest_slope / np.where(alone, 1.0, rest_bend) - steps[:, None]
+    doubt = np.where(alone, np.inf, np.abs(without) / 2).max(axis=1)
+    sigmas = np.maximum(sigmas, doubt)
     return _Bowl(at - steps, sigmas, bend, scale)
