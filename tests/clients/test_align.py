@@ -263,6 +263,8 @@ def test_flat_ends_along_the_rows_in_images_of_few_rays_a_pixel_do_not_mislead(
         found = data_set(lines, DEGREES, 1.5e4, rng).align()
         if found.identifiable:
             off.append(pulls(found, scanner))
+        if "source_row_px" in found.parameters:
+            assert abs(row_pull(found, scanner)[1]) < 4
     assert len(off) >= 6
     assert np.abs(off).max() < 4
     assert (np.sqrt(np.mean(np.square(off), axis=0)) < 1.7).all()
