@@ -32,7 +32,7 @@ from flexdt.twin.calibration.without_phantom.turn import Image, Turn, read_turn
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.conventions import FloatArray, from_unity
 from flexdt.twin.geometry.motion import Motion
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
@@ -270,9 +270,8 @@ class _Planes:
         return replace(
             given,
             dD_y=given.dD_y + float(at[0]) * self.pitch,
-            dD_z=given.dD_z + float(at[4]) * self.priors.get("dD_z", 0.0),
-            det_pitch=given.det_pitch
-            + math.radians(float(at[5]) * self.priors.get("det_pitch", 0.0)),
+            dD_z=given.dD_z + float(at[4]) * self.priors["dD_z"],
+            det_pitch=given.det_pitch + math.radians(float(at[5]) * self.priors["det_pitch"]),
         )
 
     def _pairs(self, frames: npt.NDArray[np.intp], factors: tuple[int, ...]) -> list[PlanePairs]:
@@ -300,20 +299,18 @@ class _Planes:
         floor = FLOOR_OF_ROW * self.factor
         sigma = math.hypot(found.sigma, floor, STEP_OF_ROW * math.hypot(*step))
         sdd = float(self.poses.sdd[self.sorted[0]])
-        lean = sdd * math.tan(math.radians(self.priors.get("axis_tilt_x", 0.0)))
-        known = math.hypot(self.priors.get("dD_y", 0.0), lean) / self.pitch
+        lean = sdd * math.tan(math.radians(self.priors["axis_tilt_x"]))
+        known = math.hypot(self.priors["dD_y"], lean) / self.pitch
         _refuse_if(
             sigma > known / 2,
             f"the images tell it to +- {sigma:.2g} px, the priors of dD_y and axis_tilt_x to +- "
             f"{known:.2g} px",
         )
         at = np.array([found.value, *(5 * [0.0])])
-        parts = _about_axis(self.poses[self.sorted[:1]], self._of(at)).rows[0].reshape(4, 3)
-        source, centre, u, v = parts
-        level = np.array([-source[0], -source[1], 0.0])
-        seen = np.linalg.solve(np.column_stack([u, v, -level]), source - centre)
-        middle = (self.turn.mean.shape[0] - 1) / 2
-        return self._of(at), Told(float(seen[1]) + middle, sigma, "px")
+        cone_vec = _about_axis(self.poses[self.sorted[:1]], self._of(at))
+        level = [[0.0, 0.0, float(cone_vec.source[0, 2])]]
+        row = cone_vec.project_points(level, self.turn.mean.shape)[0, 0, 1]
+        return self._of(at), Told(float(row), sigma, "px")
 
     def motion(self, corrected: Offsets, random: np.random.Generator) -> Motion:
         """Shifts of single frames as shifts of the sample, dO_x and dO_y.
@@ -342,15 +339,8 @@ class _Planes:
 
 def _about_axis(poses: Poses, offsets: Offsets) -> ConeVec:
     """The views, the rotation axis at the origin."""
-    rows = poses.cone_vec(offsets).rows.copy()
-    for first in (0, 3):
-        rows[:, first : first + 2] -= _foot(poses, offsets)
-    return ConeVec(rows)
-
-
-def _foot(poses: Poses, offsets: Offsets) -> FloatArray:
-    """Where the axis stands in the sample's frame, (n, 2) [mm]."""
-    return np.array([offsets.tau_x, offsets.tau_z]) - poses.mount[:, :2]
+    foot = from_unity([offsets.tau_x, 0.0, offsets.tau_z]) - poses.mount
+    return poses.cone_vec(offsets).moved(np.eye(3), -foot)
 
 
 def _standing(poses: Poses, present: tuple[int, ...]) -> Poses:

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 
 from flexdt.twin.calibration.without_phantom.plane_kernels import sum_planes
+from flexdt.twin.calibration.without_phantom.turn import DARKEST
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -41,8 +42,6 @@ FEWEST_BINS: Final = 4
 """In which a pair must be seen whole to count."""
 FEWEST_PAIRS: Final = 0.25
 """Share of the pairs that count, at least (assumed)."""
-DARKEST: Final = 8.0
-"""Line integral above which the noise is taken for that of this one."""
 MEDIAN_OF_CHI_SQUARE: Final = 0.4549
 """Of one degree of freedom."""
 SECTORS: Final = 18
@@ -175,10 +174,9 @@ class PlanePairs:
         """Sums over the pairs of what is laid out as `costs`."""
         return np.asarray(parts[..., : len(self.pairs)].sum(axis=-1))
 
-    def by_height(self, parts: FloatArray) -> FloatArray:
-        """Sums over blocks of heights of what is laid out as `costs`, (..., BLOCKS)."""
-        blocks = parts[..., len(self.pairs) :]
-        return np.asarray(blocks.reshape(*parts.shape[:-1], -1, BLOCKS).sum(axis=-2))
+    def blocks(self, parts: FloatArray) -> FloatArray:
+        """What `costs` has behind the pairs, (..., distances, BLOCKS)."""
+        return parts[..., len(self.pairs) :].reshape(*parts.shape[:-1], -1, BLOCKS)
 
     def spread(self, parts: FloatArray, blocks: bool = False) -> FloatArray:
         """Standard deviations of `total`.
@@ -202,9 +200,8 @@ class PlanePairs:
             twice = np.square(np.triu(both, 1)).sum(axis=(-1, -2))
             worst = np.maximum(worst, np.square(touched).sum(axis=-1) - twice)
         if blocks:
-            table = parts[..., q:].reshape(*parts.shape[:-1], -1, BLOCKS)
             for axis in (-2, -1):
-                squares = np.square(table.sum(axis=axis))
+                squares = np.square(self.blocks(parts).sum(axis=axis))
                 total = squares.sum(axis=-1)
                 # Where one or two blocks have it all, their scatter is hardly known.
                 count = total**2 / np.maximum(np.square(squares).sum(axis=-1), 1e-300)

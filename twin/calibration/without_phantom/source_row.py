@@ -161,7 +161,7 @@ def _bowl(pairs: PlanePairs, at: float, h: float, up: FloatArray) -> _Bowl:
     wider = np.hypot(1.0, BENT / np.maximum(sure, BENT))
     sigmas = np.where(sure > BENT, wider * left / np.where(sure > BENT, bend, 1.0), np.inf)
     # No two neighbouring blocks of heights may have the answer to themselves: a flat face would.
-    parts = np.stack([pairs.by_height(slopes), pairs.by_height(bends)])
+    parts = pairs.blocks(np.stack([slopes, bends])).sum(axis=-2)
     rest_slope, rest_bend = np.stack([slope, bend])[..., None] - parts[..., 1:] - parts[..., :-1]
     alone = ~(rest_bend > np.maximum(LEFT * bend[:, None], 0.0))
     without = rest_slope / np.where(alone, 1.0, rest_bend) - steps[:, None]
