@@ -430,6 +430,7 @@ class CalibrationAlign(Params):
     """A scan of anything over a full turn."""
 
     name: DataSetName = Field(description="of its folder")
+    per_frame: bool = Field(default=False, description="look for shifts of single frames too")
 
 
 class SceneSave(Params):

@@ -365,6 +365,9 @@ class CalibrationAlignResult(Result):
     refused: dict[str, str] = Field(description="what such a scan cannot tell, and why")
     warnings: list[str]
     correction: dict[str, float] | None = Field(default=None, description="for calibration.apply")
+    motion: list[dict[str, JsonValue]] | None = Field(
+        default=None, description="shifts of single frames, as `flexdt align --json` tells them"
+    )
 
 
 class CorrectionListResult(Result):

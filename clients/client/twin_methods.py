@@ -885,8 +885,12 @@ def fit_calibration(
     return ask("calibration.fit", params, r.CalibrationFitResult, patience_s=None)
 
 
-def align_dataset(name: str) -> Flow[r.CalibrationAlignResult]:
+def align_dataset(name: str, *, per_frame: bool = False) -> Flow[r.CalibrationAlignResult]:
     """Find the axis of a full-turn scan of anything by symmetry; nothing is applied.
+
+    Args:
+        name: of the data set.
+        per_frame: look for shifts of single frames too; they are `motion` in the result.
 
     Raises:
         RpcError: as `fit_calibration`.
@@ -897,7 +901,8 @@ def align_dataset(name: str) -> Flow[r.CalibrationAlignResult]:
         ...
         flexdt.protocol.rpc_errors.RpcError: no data set 'gone' in the data directory
     """
-    return ask("calibration.align", {"name": name}, r.CalibrationAlignResult, patience_s=None)
+    params = {"name": name, "per_frame": per_frame}
+    return ask("calibration.align", params, r.CalibrationAlignResult, patience_s=None)
 
 
 def save_scene(name: str | None = None) -> Flow[dict[str, Any]]:

@@ -51,6 +51,7 @@ class Hidden:
         span: of the turn [deg].
         drift: of the source in x over the scan [mm].
         jitter: (views, 2) columns and rows by which frames show the object aside; None: not.
+        sod, sdd: distances of axis and panel from the source [mm].
     """
 
     views: int
@@ -62,12 +63,17 @@ class Hidden:
     span: float = 360.0
     drift: float = 0.0
     jitter: np.ndarray | None = None
+    sod: float = SOD
+    sdd: float = SDD
+
+    def degrees(self) -> np.ndarray:
+        """Of the stage in every view, (views,)."""
+        return np.arange(self.views) * self.span / self.views
 
     def nominal(self) -> fx.ConeVec:
         """What the data set says."""
-        angles = np.arange(self.views) * self.span / self.views
         return fx.ConeVec.circular(
-            sod=SOD, sdd=SDD, angles=angles, shape=self.shape, pixel=self.pixel
+            sod=self.sod, sdd=self.sdd, angles=self.degrees(), shape=self.shape, pixel=self.pixel
         )
 
     def steps(self) -> tuple[np.ndarray, np.ndarray]:
@@ -81,30 +87,31 @@ class Hidden:
         swing = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         return swing @ lean @ u * self.pixel, swing @ lean @ v * self.pixel
 
-    def placed(self, k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Source, panel's centre, u and v of view `k`, (3,) each, as the object sees them [mm]."""
+    def placed(self, k: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Source, panel's centre, u and v of view `k`, or one between two,
+        (3,) each, as the object sees them [mm]."""
         part = k / self.views
         phi = math.radians(part * self.span)
         c, s = math.cos(phi), math.sin(phi)
         # The object turns clockwise seen from above; seen from it, everything else the other way.
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        pivot = np.array([self.axis_x, SOD, 0.0])
+        pivot = np.array([self.axis_x, self.sod, 0.0])
         source = turn @ (np.array([self.drift * (part - 0.5), 0.0, 0.0]) - pivot)
-        centre = turn @ (np.array([self.panel[0], SDD, self.panel[1]]) - pivot)
+        centre = turn @ (np.array([self.panel[0], self.sdd, self.panel[1]]) - pivot)
         u, v = self.steps()
         u, v = turn @ u, turn @ v
         if self.jitter is not None:
-            centre = centre - self.jitter[k, 0] * u - self.jitter[k, 1] * v
+            centre = centre - self.jitter[int(k), 0] * u - self.jitter[int(k), 1] * v
         return source, centre, u, v
 
     def axis_in_image(self) -> tuple[float, float]:
         """Column where the axis crosses the middle row [px], its angle [deg]: its upper end leans
         to the right for positive ones."""
         u, v = self.steps()
-        centre = np.array([self.panel[0], SDD, self.panel[1]])
+        centre = np.array([self.panel[0], self.sdd, self.panel[1]])
         seen = []
         for z in (-10.0, 10.0):
-            ray = np.array([self.axis_x, SOD, z])
+            ray = np.array([self.axis_x, self.sod, z])
             seen.append(np.linalg.solve(np.column_stack([u, v, -ray]), -centre)[:2])
         (c0, r0), (c1, r1) = seen
         column = c0 - r0 * (c1 - c0) / (r1 - r0)
@@ -113,8 +120,8 @@ class Hidden:
     def source_row(self) -> float:
         """Row of the ray from the source, level, to the axis [px]."""
         u, v = self.steps()
-        centre = np.array([self.panel[0], SDD, self.panel[1]])
-        ray = np.array([self.axis_x, SOD, 0.0])
+        centre = np.array([self.panel[0], self.sdd, self.panel[1]])
+        ray = np.array([self.axis_x, self.sod, 0.0])
         seen = np.linalg.solve(np.column_stack([u, v, -ray]), -centre)
         return float(seen[1] + (self.shape[0] - 1) / 2)
 
@@ -189,52 +196,71 @@ OBJECTS: Final[Mapping[str, Callable[[np.random.Generator], Solids]]] = {
 
 
 @numba.njit(cache=True, fastmath=True)
-def _chords(source, centre, u, v, ellipsoids, boxes, out):  # type: ignore[no-untyped-def]
+def _window(solid, source, centre, u, v, shape):  # type: ignore[no-untyped-def]
+    """First row and column of the pixels that may see the solid's bounding box, and those after the
+    last."""
+    normal, to = np.cross(u, v), centre - source
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for corner in range(8):
+        sign = np.array([corner & 1, corner >> 1 & 1, corner >> 2 & 1]) * 2.0 - 1.0
+        way = solid[:3] + sign * solid[3:6] - source
+        ahead = np.dot(way, normal) / np.dot(to, normal)
+        if ahead <= 1e-6:
+            return 0, shape[0], 0, shape[1]
+        at = way / ahead - to
+        place = np.array([np.dot(at, v) / np.dot(v, v), np.dot(at, u) / np.dot(u, u)])
+        low, high = np.minimum(low, place), np.maximum(high, place)
+    size = np.array([shape[0], shape[1]])
+    first = np.minimum(np.maximum(np.floor(low + (size - 1) / 2), 0), size)
+    last = np.minimum(np.maximum(np.ceil(high + (size - 1) / 2) + 1, 0), size)
+    return int(first[0]), int(last[0]), int(first[1]), int(last[1])
+
+
+@numba.njit(cache=True, fastmath=True)
+def add_chords(source, centre, u, v, solids, round_, out):  # type: ignore[no-untyped-def]
+    """Adds the line integrals of ellipsoids (`round_`) or boxes (k, 7); u is perpendicular to v."""
     rows, cols = out.shape
-    for r in range(rows):
-        for c in range(cols):
-            i, j = c - (cols - 1) / 2, r - (rows - 1) / 2
-            dx = centre[0] + i * u[0] + j * v[0] - source[0]
-            dy = centre[1] + i * u[1] + j * v[1] - source[1]
-            dz = centre[2] + i * u[2] + j * v[2] - source[2]
-            length = math.sqrt(dx * dx + dy * dy + dz * dz)
-            total = 0.0
-            for k in range(len(ellipsoids)):
-                e = ellipsoids[k]
-                ax, ay, az = dx / e[3], dy / e[4], dz / e[5]
-                bx, by = (source[0] - e[0]) / e[3], (source[1] - e[1]) / e[4]
-                bz = (source[2] - e[2]) / e[5]
-                a = ax * ax + ay * ay + az * az
-                b = ax * bx + ay * by + az * bz
-                root = b * b - a * (bx * bx + by * by + bz * bz - 1.0)
-                if root > 0.0:
-                    total += e[6] * 2.0 * math.sqrt(root) / a
-            for k in range(len(boxes)):
+    for k in range(len(solids)):
+        e = solids[k]
+        top, bottom, left, right = _window(e, source, centre, u, v, out.shape)
+        start = (source - e[:3]) / e[3:6]
+        for r in range(top, bottom):
+            for c in range(left, right):
+                i, j = c - (cols - 1) / 2, r - (rows - 1) / 2
+                dx = centre[0] + i * u[0] + j * v[0] - source[0]
+                dy = centre[1] + i * u[1] + j * v[1] - source[1]
+                dz = centre[2] + i * u[2] + j * v[2] - source[2]
+                length = math.sqrt(dx * dx + dy * dy + dz * dz)
+                wx, wy, wz = dx / e[3], dy / e[4], dz / e[5]
+                if round_:
+                    a = wx * wx + wy * wy + wz * wz
+                    b = wx * start[0] + wy * start[1] + wz * start[2]
+                    root = b * b - a * (start @ start - 1.0)
+                    if root > 0.0:
+                        out[r, c] += e[6] * 2.0 * math.sqrt(root) / a * length
+                    continue
                 low, high = 0.0, 1.0
-                for axis in range(3):
-                    d = dx if axis == 0 else (dy if axis == 1 else dz)
-                    s = source[axis] - boxes[k, axis]
-                    half = boxes[k, 3 + axis]
-                    if abs(d) < 1e-12:
-                        if abs(s) > half:
+                for w, s in ((wx, start[0]), (wy, start[1]), (wz, start[2])):
+                    if abs(w) < 1e-12:
+                        if abs(s) > 1.0:
                             high = -1.0
                         continue
-                    t0, t1 = (-half - s) / d, (half - s) / d
+                    t0, t1 = (-1.0 - s) / w, (1.0 - s) / w
                     low, high = max(low, min(t0, t1)), min(high, max(t0, t1))
                 if high > low:
-                    total += boxes[k, 6] * (high - low)
-            out[r, c] = total * length
+                    out[r, c] += e[6] * (high - low) * length
 
 
-def project(hidden: Hidden, solids: Solids) -> np.ndarray:
-    """Line integrals (views, rows, cols) with 2 x 2 rays a pixel."""
+def project(hidden: Hidden, solids: Solids, rays: int = 3) -> np.ndarray:
+    """Line integrals (views, rows, cols), the mean over `rays` x `rays` of each pixel."""
     rows, cols = hidden.shape
     out = np.empty((hidden.views, rows, cols), dtype=np.float32)
-    fine = np.empty((2 * rows, 2 * cols))
     for k in range(hidden.views):
         source, centre, u, v = hidden.placed(k)
-        _chords(source, centre, u / 2, v / 2, solids.ellipsoids, solids.boxes, fine)
-        out[k] = fine.reshape(rows, 2, cols, 2).mean(axis=(1, 3))
+        fine = np.zeros((rays * rows, rays * cols))
+        add_chords(source, centre, u / rays, v / rays, solids.ellipsoids, True, fine)
+        add_chords(source, centre, u / rays, v / rays, solids.boxes, False, fine)
+        out[k] = fine.reshape(rows, rays, cols, rays).mean(axis=(1, 3))
     return out
 
 
@@ -296,7 +322,7 @@ def shifted(name: str, plain: Hidden, size: float, photons: float, seed: tuple[i
     begun = time.perf_counter()
     found = data.align(per_frame=True)
     took = time.perf_counter() - begun
-    motion = found.alignment.motion
+    motion, row = found.alignment.motion, errors(found, hidden).get("row")
     if motion is None:
         return str(found.document["refused"].get("motion", found.document["refused"]))
     angle = np.radians(np.arange(hidden.views) * hidden.span / hidden.views)
@@ -306,7 +332,9 @@ def shifted(name: str, plain: Hidden, size: float, photons: float, seed: tuple[i
     sigma = np.nan_to_num(motion.sigma).mean(axis=0) * SDD / SOD / hidden.pixel
     cells = [f"{name} {photons:g}", "left"]
     cells += [f"{a * factor:.3f}" for a in left.std(axis=0)]
-    cells += ["+-", *(f"{a * factor:.3f}" for a in sigma), f"{took:.1f} s"]
+    cells += ["+-", *(f"{a * factor:.3f}" for a in sigma)]
+    cells += ["row", "-" if row is None else f"{row[0] * factor:.2f} +- {row[1] * factor:.2f}"]
+    cells += [f"{took:.1f} s"]
     return "  ".join(cells)
 
 

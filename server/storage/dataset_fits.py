@@ -65,7 +65,7 @@ def fit(root: Path, asked: p.CalibrationFit, *_: object) -> r.CalibrationFitResu
 
 def align(root: Path, asked: p.CalibrationAlign, *_: object) -> r.CalibrationAlignResult:
     """Align; blocks. Raises as `fit`."""
-    found = _face().align(_there(root, asked.name, "data set"))
+    found = _face().align(_there(root, asked.name, "data set"), per_frame=asked.per_frame)
     return r.CalibrationAlignResult.model_validate(from_root(found.document, root))
 
 

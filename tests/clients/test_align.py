@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
+import align_faults
 import numpy as np
 import pytest
 
@@ -286,6 +288,12 @@ def box_lines(scanner: Scanner, low: np.ndarray, high: np.ndarray, rays: int) ->
         chord = np.maximum(inside, 0) * np.linalg.norm(ray, axis=-1)
         out.append(0.02 * chord.reshape(SHAPE[0], rays, SHAPE[1], rays).mean(axis=(1, 3)))
     return np.array(out)
+
+
+@pytest.mark.slow
+def test_what_spoils_scans_misleads_nobody(capsys: pytest.CaptureFixture[str]) -> None:
+    assert align_faults.main(["--count", "14", "--seed", "4"]) == 0, capsys.readouterr().out
+    assert re.search(r"^all +14 +1[0-4] ", capsys.readouterr().out, re.MULTILINE)
 
 
 def test_a_round_body_that_turns_back_is_no_repeated_frame(

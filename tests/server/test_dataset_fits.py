@@ -191,9 +191,10 @@ def test_marks_that_do_not_hold_are_refused(data: Path) -> None:
 
 
 def test_an_alignment_over_the_wire_is_that_of_the_package(data: Path) -> None:
-    own = fx.align(data / "lego")
-    told = called(data, "calibration.align", name="lego")
+    own = fx.align(data / "lego", per_frame=True)
+    told = called(data, "calibration.align", name="lego", per_frame=True)
     assert told["identifiable"] == own.identifiable
+    assert told["motion"] == own.document.get("motion")
     assert told["refused"] == own.document["refused"]
     assert set(told["parameters"]) == set(own.parameters)
 

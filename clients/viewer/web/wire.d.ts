@@ -23,6 +23,7 @@ export type AxisState = {
 };
 export type CalibrationAlign = {
   name: string;
+  per_frame?: boolean;
 };
 export type CalibrationAlignResult = {
   identifiable: boolean;
@@ -30,6 +31,7 @@ export type CalibrationAlignResult = {
   refused: Record<string, string>;
   warnings: Array<string>;
   correction: Record<string, number> | null;
+  motion: Array<Record<string, JsonValue>> | null;
 };
 export type CalibrationFit = {
   datasets: Array<string>;

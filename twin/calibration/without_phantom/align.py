@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from flexdt.twin.calibration.fit.image_quantities import axis_in_image
 from flexdt.twin.calibration.without_phantom.frame_shifts import Shifts, find_shifts
@@ -25,6 +24,7 @@ from flexdt.twin.calibration.without_phantom.mirror_symmetry import (
     Symmetry,
     find_symmetry,
     first_column,
+    sharpness,
 )
 from flexdt.twin.calibration.without_phantom.plane_pairs import PlanePairs
 from flexdt.twin.calibration.without_phantom.source_row import find_height
@@ -32,7 +32,7 @@ from flexdt.twin.calibration.without_phantom.turn import Image, Turn, read_turn
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.geometry.conventions import FloatArray, from_unity
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray, from_unity
 from flexdt.twin.geometry.motion import Motion
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
@@ -73,6 +73,8 @@ MOST_SHIFTS: Final = 2000
 """Frames whose shifts can be asked for."""
 FLOOR_OF_ROW: Final = 0.1
 """The row's sigma is this at least: what sampling does (assumed) [px of the binned frames]."""
+SHARP_ROWS: Final = 2.0
+"""What sampling does to edges along rows as sharp as those of points (assumed) [px]."""
 STEP_OF_ROW: Final = 10.0
 """A step of the images may move the row so many times as far (assumed)."""
 
@@ -262,6 +264,7 @@ class _Planes:
         scale = offsets(values).angle_scale
         around = scale * poses.angle[list(turn.used)] % (2 * np.pi)
         self.sorted = np.array(turn.used)[np.argsort(around)]
+        self.stack: Float32Array | None = None
 
     def _of(self, at: FloatArray) -> Offsets:
         """Offsets for the panel's height above what is said [px], three doubts of the plane of
@@ -274,17 +277,18 @@ class _Planes:
             det_pitch=given.det_pitch + math.radians(float(at[5]) * self.priors["det_pitch"]),
         )
 
-    def _pairs(self, frames: npt.NDArray[np.intp], factors: tuple[int, ...]) -> list[PlanePairs]:
-        stack = np.stack([binned_mean(self.image(i), self.factor) for i in frames.tolist()])
-        poses = self.poses[frames]
+    def _pairs(self, stride: int, coarser: int = 1) -> PlanePairs:
+        """Pairs of every frame, or of every second, third and so on."""
+        frames = self.sorted[::stride]
+        if self.stack is None or len(self.stack) != len(frames):
+            images = [binned_mean(self.image(i), self.factor) for i in frames.tolist()]
+            self.stack = np.stack(images)
+        poses, stack = self.poses[frames], binned_mean(self.stack, coarser)
 
         def views(at: FloatArray) -> ConeVec:
             return _about_axis(poses, self._of(at))
 
-        mean, start = self.turn.mean, np.zeros(6)
-        return [
-            PlanePairs(binned_mean(stack, f), mean, f * self.factor, views, start) for f in factors
-        ]
+        return PlanePairs(stack, self.turn.mean, coarser * self.factor, views, np.zeros(6))
 
     def row(self, random: np.random.Generator) -> tuple[Offsets, Told]:
         """Offsets with the panel's height, and the row of the source's plane.
@@ -293,11 +297,11 @@ class _Planes:
             NotIdentifiableError: the images do not tell it.
         """
         stride = -(-len(self.sorted) // MOST_FRAMES)
-        fine, coarse = self._pairs(self.sorted[::stride], (1, 2))
+        fine, coarse = (self._pairs(stride, coarser) for coarser in (1, 2))
         found = find_height(fine, coarse, REACH * self.turn.mean.shape[0], random)
         step = (0.0, 0.0) if self.turn.step_px is None else self.turn.step_px[0]
-        floor = FLOOR_OF_ROW * self.factor
-        sigma = math.hypot(found.sigma, floor, STEP_OF_ROW * math.hypot(*step))
+        sampled = FLOOR_OF_ROW * self.factor, SHARP_ROWS * sharpness(self.turn.mean) ** 2
+        sigma = math.hypot(found.sigma, *sampled, STEP_OF_ROW * math.hypot(*step))
         sdd = float(self.poses.sdd[self.sorted[0]])
         lean = sdd * math.tan(math.radians(self.priors["axis_tilt_x"]))
         known = math.hypot(self.priors["dD_y"], lean) / self.pitch
@@ -320,11 +324,10 @@ class _Planes:
         """
         n = len(self.sorted)
         _refuse_if(n > MOST_SHIFTS, f"{n} frames; shifts are looked for in up to {MOST_SHIFTS}")
-        (pairs,) = self._pairs(self.sorted, (1,))
         at = np.zeros(6)
         at[0] = (corrected.dD_y - self._of(at).dD_y) / self.pitch
         angle = corrected.angle_scale * self.poses.angle[self.sorted]
-        return self._as_motion(find_shifts(pairs, at, angle, random))
+        return self._as_motion(find_shifts(self._pairs(1), at, angle, random))
 
     def _as_motion(self, shifts: Shifts) -> Motion:
         pose = self.poses[self.sorted[:1]]
@@ -357,7 +360,7 @@ def _standing(poses: Poses, present: tuple[int, ...]) -> Poses:
     _refuse_if(
         moved > STANDS,
         f"source or panel move by {moved:.4g} px between frames; allowed: {STANDS:g} px (one "
-        "circle about the rotation axis)",
+        "circle about z, the rotation axis)",
     )
     return poses[chosen[:1]]
 

@@ -151,9 +151,7 @@ class _Level:
         self.soft = [spline_filter(i) for i in images]
         self.softer = spline_filter(gaussian_filter(images[0], sigma, mode="nearest"))
         self.relative = turn.noise
-        # Second differences along rows: photons, flat field and rings, little of the object.
-        change = np.diff(np.pad(turn.mean, ((0, 0), (1, 1)), mode="reflect"), 2, axis=1)
-        self.pixel = np.square(change) / 6
+        self.pixel = _noise(turn.mean)
         self.white = gaussian_filter(self.pixel, 2.0 * sigma, mode="nearest")
         noise = gaussian_filter(self.pixel, NEAR_PX, mode="nearest")
         steps = (_steps(turn.mean, noise), _steps(turn.mean.T, noise.T).T)
@@ -332,6 +330,23 @@ class _Pairs:
         )
 
 
+def sharpness(mean: FloatArray) -> float:
+    """How sharp edges along the rows are: what is left at half the sampling's frequency, relative
+    to a quarter. 1 is that of pixels that are points, 0.4 that of square ones without blur.
+
+    Args:
+        mean: line integrals, (rows, cols).
+    """
+    return _edges(mean, gaussian_filter(_noise(mean), NEAR_PX, mode="nearest"))[1]
+
+
+def _noise(mean: FloatArray) -> FloatArray:
+    """Squares of second differences along rows, of which the noise's variance is the mean: photons,
+    flat field and rings, little of the object."""
+    change = np.diff(np.pad(mean, ((0, 0), (1, 1)), mode="reflect"), 2, axis=1)
+    return np.asarray(np.square(change) / 6)
+
+
 def _steps(mean: FloatArray, noise: FloatArray) -> FloatArray:
     """Standard deviation of what sampling does to edges along the rows, (rows, cols).
 
@@ -339,6 +354,13 @@ def _steps(mean: FloatArray, noise: FloatArray) -> FloatArray:
     spread it over several. An edge without blur has all frequencies alike, so what is left of
     them at half the sampling's, relative to a quarter, tells what is left at the sampling's own.
     """
+    edges, left = _edges(mean, noise)
+    return np.asarray(edges * left**2 / math.sqrt(6.0))
+
+
+def _edges(mean: FloatArray, noise: FloatArray) -> tuple[FloatArray, float]:
+    """How much of a quarter of the sampling's frequency edges along the rows have, (rows, cols),
+    and how much there is of half of it, relative to that."""
     change = np.diff(mean, axis=0, append=mean[-1:])
 
     def at(turn: float) -> FloatArray:
@@ -348,7 +370,7 @@ def _steps(mean: FloatArray, noise: FloatArray) -> FloatArray:
     half, quarter = at(np.pi), at(np.pi / 2)
     seen = np.square(quarter) > SEEN**2 * noise / (2.0 * math.pi * NEAR_PX**2)
     left = min(1.0, half[seen].sum() / max(quarter[seen].sum(), 1e-30))
-    return np.asarray(np.where(seen, quarter, 0.0) * left**2 / math.sqrt(6.0))
+    return np.where(seen, quarter, 0.0), left
 
 
 def _read(coefficients: FloatArray, at: FloatArray) -> FloatArray:

@@ -72,7 +72,7 @@ class PlanePairs:
         self.sums = np.zeros((n, cols, rows + 1), dtype=np.float32)
         np.cumsum(frames.transpose(0, 2, 1), axis=2, out=self.sums[:, :, 1:])
         here = self.rows(start)
-        radius, border = _support(binned_mean(mean, factor), here[0])
+        radius, border = _support(frames, binned_mean(mean, factor), here[0])
         table = np.array([(i, (i + round(part * n)) % n) for part in APART for i in range(n)])
         kind = np.repeat(np.arange(len(APART)), n)
         sources = here[:, :2]
@@ -273,16 +273,20 @@ def _columns(here: FloatArray, cols: int, radius: float) -> npt.NDArray[np.intp]
 
 
 def _support(
-    mean: FloatArray, view: FloatArray
+    frames: Float32Array, mean: FloatArray, view: FloatArray
 ) -> tuple[float, tuple[FloatArray, FloatArray, FloatArray]]:
     """How far the object reaches from the axis [mm], and places (column, row) about the panel's
     centre at its upper end, its lower end and its sides where it does not see air."""
     rows, cols = mean.shape
-    soft = gaussian_filter(mean, 2.0, mode="nearest")
-    rim = np.concatenate([soft[0], soft[-1], soft[:, 0], soft[:, -1]])
-    air = float(np.percentile(rim, 25))
-    white = np.square(np.diff(mean, 2, axis=1)).mean() / 6 / (16 * math.pi)
-    full = soft > air + max(AIR * (float(soft.max()) - air), NOISE * math.sqrt(white))
+    full = np.zeros((rows, cols), dtype=bool)
+    # What is thin and far from the axis hardly shows in the mean.
+    for images in (mean[None], frames):
+        soft = gaussian_filter(images, (0.0, 2.0, 2.0), mode="nearest").max(axis=0)
+        rim = np.concatenate([soft[0], soft[-1], soft[:, 0], soft[:, -1]])
+        air = float(np.percentile(rim, 25))
+        change = np.square(np.diff(images, 2, axis=2)) / 6
+        white = float(np.median(change)) / MEDIAN_OF_CHI_SQUARE / (16 * math.pi)
+        full |= soft > air + max(AIR * (float(soft.max()) - air), NOISE * math.sqrt(white))
     seen = np.flatnonzero(full.any(axis=0))
     if len(seen) == 0:
         raise NotIdentifiableError("the mean shows nothing but air")
