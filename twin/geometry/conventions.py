@@ -86,15 +86,15 @@ def rotation_z(angle: float | FloatArray) -> FloatArray:
 
 
 def rotation_about(axis: npt.ArrayLike, angle: float) -> FloatArray:
-    """Right-handed rotation by `angle` [rad] about the direction `axis` (3,) (Rodrigues).
+    """Right-handed rotations (..., 3, 3) by `angle` [rad] about directions (..., 3) (Rodrigues).
 
     Example:
         >>> bool(np.allclose(rotation_about([0, 0, 2], 0.3), rotation_z(0.3)))
         True
     """
     k = np.asarray(axis, dtype=np.float64)
-    k = k / np.linalg.norm(k)
-    cross = np.array([[0.0, -k[2], k[1]], [k[2], 0.0, -k[0]], [-k[1], k[0], 0.0]])
+    k = k / np.linalg.norm(k, axis=-1, keepdims=True)
+    cross = np.swapaxes(np.cross(k[..., None, :], np.eye(3)), -1, -2)
     turned: FloatArray = (
         np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
     )
@@ -128,8 +128,8 @@ def turn_detector(
     """Turn pixel steps by yaw about v, pitch about the turned u, roll about the turned normal.
 
     Args:
-        u: step to the next column, (3,) [mm].
-        v: step to the next row, (3,) [mm].
+        u: steps to the next column, (..., 3) [mm].
+        v: steps to the next row, (..., 3) [mm].
         yaw: [rad], right-handed like the other two.
         pitch: [rad].
         roll: [rad], about u x v.
@@ -139,8 +139,8 @@ def turn_detector(
         >>> u.round(9).tolist()  # seen from the source, columns now grow downwards
         [0.0, 0.0, -1.0]
     """
-    u1 = rotation_about(v, yaw) @ np.asarray(u, dtype=np.float64)
-    v1 = np.asarray(v, dtype=np.float64)
-    v2 = rotation_about(u1, pitch) @ v1
-    r = rotation_about(np.cross(u1, v2), roll)
-    return r @ u1, r @ v2
+    u1, v1 = (np.asarray(step, dtype=np.float64)[..., None] for step in (u, v))
+    u1 = rotation_about(v, yaw) @ u1
+    v1 = rotation_about(u1[..., 0], pitch) @ v1
+    r = rotation_about(np.cross(u1[..., 0], v1[..., 0]), roll)
+    return (r @ u1)[..., 0], (r @ v1)[..., 0]

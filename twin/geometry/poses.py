@@ -174,7 +174,4 @@ class Poses:
     def _turned_detector(self, p: Offsets) -> tuple[FloatArray, FloatArray]:
         if p.det_yaw == 0.0 and p.det_pitch == 0.0 and p.det_roll == 0.0:
             return self.u, self.v
-        u, v = np.empty_like(self.u), np.empty_like(self.v)
-        for i in range(len(self)):
-            u[i], v[i] = turn_detector(self.u[i], self.v[i], p.det_yaw, p.det_pitch, p.det_roll)
-        return u, v
+        return turn_detector(self.u, self.v, p.det_yaw, p.det_pitch, p.det_roll)

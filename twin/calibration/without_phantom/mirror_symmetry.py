@@ -23,7 +23,7 @@ from typing import Final
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
-from flexdt.twin.calibration.without_phantom.turn import Turn
+from flexdt.twin.calibration.without_phantom.turn import MEDIAN_OF_CHI_SQUARE, Turn
 from flexdt.twin.geometry.conventions import FloatArray
 
 View = Callable[[FloatArray], FloatArray]
@@ -331,13 +331,16 @@ class _Pairs:
 
 
 def sharpness(mean: FloatArray) -> float:
-    """How sharp edges along the rows are: what is left at half the sampling's frequency, relative
-    to a quarter. 1 is that of pixels that are points, 0.4 that of square ones without blur.
+    """How sharp edges along the rows are, times the root of their share in what changes from row to
+    row. 1 is that of pixels that are points, 0.4 of square ones without blur, 0 without edges.
 
     Args:
         mean: line integrals, (rows, cols).
     """
-    return _edges(mean, gaussian_filter(_noise(mean), NEAR_PX, mode="nearest"))[1]
+    noise = np.full(mean.shape, np.median(_noise(mean)) / MEDIAN_OF_CHI_SQUARE)
+    edges, left = _edges(mean, noise)
+    change = np.square(gaussian_filter(np.diff(mean, axis=0, append=mean[-1:]), NEAR_PX))
+    return left * math.sqrt(change[edges > 0.0].sum() / max(float(change.sum()), 1e-30))
 
 
 def _noise(mean: FloatArray) -> FloatArray:

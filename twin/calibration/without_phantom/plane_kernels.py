@@ -18,7 +18,7 @@ from numba import njit, prange
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=True, error_model="numpy", fastmath=True)
 def sum_planes(
     sums: Float32Array, views: FloatArray, pairs: npt.NDArray[np.intp], inwards: FloatArray,
     edges: FloatArray, columns: npt.NDArray[np.intp], integrals: FloatArray, ones: FloatArray,
@@ -38,9 +38,10 @@ def sum_planes(
         integrals: (q, 2, k) what g integrates to, written.
         ones: the same of 1 instead of g, written.
     """
-    cols, rows = sums.shape[1], sums.shape[2] - 1
+    cols, rows, planes = sums.shape[1], sums.shape[2] - 1, edges.shape[1]
     for q in prange(len(pairs)):
         mx, my = inwards[q]
+        cut, above = np.empty(planes), np.empty(planes)
         for side in range(2):
             f = pairs[q, side]
             v = views[f]
@@ -59,24 +60,22 @@ def sum_planes(
                 m, z = m0 + i * mu, dz + i * v[8]
                 if m <= 0.0:
                     continue
-                last, last_sum = 0.0, 0.0
-                for k in range(edges.shape[1]):
+                # Three loops, of which the compiler does the first and the last four at a time.
+                for k in range(planes):
                     # Row at which the plane cuts this column, from the upper end of the panel.
                     at = (z - edges[q, k] * m) / (edges[q, k] * mv - v[11]) + rows / 2.0
-                    at = min(max(at, 0.0), float(rows))
-                    whole = min(int(at), rows - 1)
+                    cut[k] = min(max(at, 0.0), float(rows))
+                for k in range(planes):
+                    whole = min(int(cut[k]), rows - 1)
                     low = sums[f, c, whole]
-                    total = low + (at - whole) * (sums[f, c, whole + 1] - low)
-                    if k > 0 and at != last:
-                        j = (at + last) / 2.0 - rows / 2.0
-                        px = dx + i * v[6] + j * v[9]
-                        py = dy + i * v[7] + j * v[10]
-                        pz = z + j * v[11]
-                        inward = m + j * mv
-                        length = math.sqrt(px * px + py * py + pz * pz)
-                        weight = volume / (length * inward * inward)
-                        integrals[q, side, k - 1] += (
-                            weight * (total - last_sum) * (1.0 if at > last else -1.0)
-                        )
-                        ones[q, side, k - 1] += weight * abs(at - last)
-                    last, last_sum = at, total
+                    above[k] = low + (cut[k] - whole) * (sums[f, c, whole + 1] - low)
+                x, y = dx + i * v[6], dy + i * v[7]
+                for k in range(planes - 1):
+                    j = (cut[k] + cut[k + 1]) / 2.0 - rows / 2.0
+                    px, py, pz = x + j * v[9], y + j * v[10], z + j * v[11]
+                    inward = m + j * mv
+                    weight = volume / (math.sqrt(px * px + py * py + pz * pz) * inward * inward)
+                    height = cut[k + 1] - cut[k]
+                    within = math.copysign(1.0, height) * (above[k + 1] - above[k])
+                    integrals[q, side, k] += weight * within
+                    ones[q, side, k] += weight * abs(height)

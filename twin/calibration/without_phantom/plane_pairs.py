@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 
 from flexdt.twin.calibration.without_phantom.plane_kernels import sum_planes
-from flexdt.twin.calibration.without_phantom.turn import DARKEST
+from flexdt.twin.calibration.without_phantom.turn import DARKEST, MEDIAN_OF_CHI_SQUARE
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -42,8 +42,6 @@ FEWEST_BINS: Final = 4
 """In which a pair must be seen whole to count."""
 FEWEST_PAIRS: Final = 0.25
 """Share of the pairs that count, at least (assumed)."""
-MEDIAN_OF_CHI_SQUARE: Final = 0.4549
-"""Of one degree of freedom."""
 SECTORS: Final = 18
 """Of the turn, whose sums are compared."""
 BLOCKS: Final = 12

@@ -26,6 +26,8 @@ THUMB_COLUMNS: Final = 64
 """Columns of the small copies in which frames are compared, at least where there are as many."""
 DARKEST: Final = 8.0
 """Line integral above which the noise is taken for that of this one."""
+MEDIAN_OF_CHI_SQUARE: Final = 0.4549
+"""Of one degree of freedom."""
 ALIKE: Final = 0.03
 """Squared difference of neighbours, relative to the usual one, below which a frame is repeated."""
 STEPS: Final = 5.0
