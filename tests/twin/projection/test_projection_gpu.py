@@ -244,6 +244,7 @@ def test_compiled_kernels_keep_their_budget() -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_kernels_are_exact_in_the_simulator() -> None:
     run_simulated(DRAWN)
 

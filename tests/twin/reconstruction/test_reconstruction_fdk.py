@@ -250,7 +250,7 @@ def test_dense_things_do_not_pull_the_outline(seed):
     assert abs(float((found - truth)[even & middle].mean())) / 0.02 < 0.004
 
 
-@pytest.mark.parametrize("seed", [1, 3])
+@pytest.mark.parametrize("seed", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_large_voids_do_not_pull_the_outline(seed):
     """Five voids that most rays meet: up to 24 % off where they only count less in the fit."""
     rng = np.random.default_rng(seed)
@@ -303,7 +303,7 @@ def test_triangles_wider_than_the_panel_come_out_even(seed):
     assert np.abs(found[even & inside] - 1.0).mean() < 0.03
 
 
-@pytest.mark.parametrize("wide", [1.1, 1.5])
+@pytest.mark.parametrize("wide", [pytest.param(1.1, marks=pytest.mark.slow), 1.5])
 def test_boxes_and_balls_wider_than_the_panel(wide):
     scan = circle(120, pixel=1.6, sod=300.0, sdd=600.0)
     field = 300.0 * np.sin(np.arctan2(64.0, 600.0))
@@ -339,6 +339,7 @@ def test_noise_at_the_edges_is_no_truncation(blur):
             assert (found is not None) == cut_off, (views, rows, cols, photons, wide)
 
 
+@pytest.mark.slow
 def test_an_outline_that_is_not_understood_is_said():
     scan = circle(60, pixel=3.2, sod=300.0, sdd=600.0)
     arms = Box((0, -25, 0), (160.0, 30.0, 99.0)), Box((-25, 50, 0), (30.0, 120.0, 99.0))
@@ -634,7 +635,9 @@ def test_a_panel_that_goes_sideways_between_the_views_is_refused(seed: int) -> N
         fdk(np.zeros((180, *shape), np.float32), tiled, like)
 
 
-@pytest.mark.parametrize(("degrees", "told"), [(352.0, True), (220.0, True), (360.0, False)])
+@pytest.mark.parametrize(("degrees", "told"), [
+    (352.0, True), pytest.param(220.0, True, marks=pytest.mark.slow), (360.0, False),
+])  # fmt: skip
 def test_less_than_a_turn_does_not_tell_what_lies_beyond_a_near_edge(
     degrees: float, told: bool
 ) -> None:

@@ -168,7 +168,7 @@ assert not gpu.availability().present and "lost" in gpu.availability().reason
     "program",
     [
         pytest.param(SIMULATED, id="fdk", marks=pytest.mark.slow),
-        pytest.param(TWO_DEVICES, id="two"),
+        pytest.param(TWO_DEVICES, id="two", marks=pytest.mark.slow),
         pytest.param(ITERATED, id="iterative", marks=pytest.mark.slow),
     ],
 )
