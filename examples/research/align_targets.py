@@ -312,6 +312,18 @@ def _angle(found: Any) -> float:
     return math.degrees(math.atan2(c1 - c0, r0 - r1))
 
 
+def left_of(
+    true: np.ndarray, motion: Any, hidden: Hidden, degrees: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """What a motion leaves of shifts, without what all frames share or turns once with the stage,
+    and its sigmas, both (n, 2) as columns and rows [px]."""
+    to_px = hidden.sdd / hidden.sod / hidden.pixel
+    angle = np.radians(degrees)
+    modes = np.column_stack([np.ones(len(angle)), np.cos(angle), np.sin(angle)])
+    left = motion.values * [to_px, -to_px] - true
+    return left - modes @ np.linalg.lstsq(modes, left, rcond=None)[0], motion.sigma * to_px
+
+
 def shifted(name: str, plain: Hidden, size: float, photons: float, seed: tuple[int, ...]) -> str:
     """What is left of shifts of `size` pixels (0.1496 mm, rms) in every frame, in words."""
     rng = np.random.default_rng([*seed, sorted(OBJECTS).index(name)])
@@ -325,11 +337,8 @@ def shifted(name: str, plain: Hidden, size: float, photons: float, seed: tuple[i
     motion, row = found.alignment.motion, errors(found, hidden).get("row")
     if motion is None:
         return str(found.document["refused"].get("motion", found.document["refused"]))
-    angle = np.radians(np.arange(hidden.views) * hidden.span / hidden.views)
-    modes = np.column_stack([np.ones(hidden.views), np.cos(angle), np.sin(angle)])
-    left = motion.values * np.array([1.0, -1.0]) * SDD / SOD / hidden.pixel - true
-    left -= modes @ np.linalg.lstsq(modes, left, rcond=None)[0]
-    sigma = np.nan_to_num(motion.sigma).mean(axis=0) * SDD / SOD / hidden.pixel
+    left, sigma = left_of(true, motion, hidden, hidden.degrees())
+    sigma = np.nan_to_num(sigma).mean(axis=0)
     cells = [f"{name} {photons:g}", "left"]
     cells += [f"{a * factor:.3f}" for a in left.std(axis=0)]
     cells += ["+-", *(f"{a * factor:.3f}" for a in sigma)]

@@ -29,7 +29,18 @@ from scipy.ndimage import gaussian_filter
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "research"))
 
-from align_targets import OBJECTS, PIXEL, SDD, SOD, Hidden, Solids, add_chords, drawn, truncated
+from align_targets import (
+    OBJECTS,
+    PIXEL,
+    SDD,
+    SOD,
+    Hidden,
+    Solids,
+    add_chords,
+    drawn,
+    left_of,
+    truncated,
+)
 
 import flexdt as fx
 
@@ -581,14 +592,10 @@ def tried(kinds: list[str], seed: int, per_frame: bool) -> dict[str, Any]:
             told["pulls"][name] = float(errors[np.abs(errors).argmin()]) / p["sigma"]
     motion = found.alignment.motion
     if motion is not None:
-        to_px = hidden.sdd / hidden.sod / hidden.pixel
-        angle = np.radians(hidden.degrees()[there])
-        modes = np.column_stack([np.ones(len(there)), np.cos(angle), np.sin(angle)])
-        left = motion.values * [to_px, -to_px] - shift
-        left -= modes @ np.linalg.lstsq(modes, left, rcond=None)[0]
+        left, sigma = left_of(shift, motion, hidden, hidden.degrees()[there])
         for i, name in enumerate(("shifts aside", "shifts down")):
             if motion.values[:, i].any():
-                pulls = left[:, i] / (motion.sigma[:, i] * to_px)
+                pulls = left[:, i] / sigma[:, i]
                 told["pulls"][name] = float(np.sqrt(np.mean(np.square(pulls))))
     return told
 
