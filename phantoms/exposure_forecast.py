@@ -184,8 +184,13 @@ def expose(
     scanner = machine if isinstance(machine, Machine) else builtin_machine(machine)
     spec = scanner.detector
     low, high = max(scanner.tube.min_kV, voltages()[0]), min(scanner.tube.max_kV, voltages()[1])
-    given = scanner.tube.kV if kV is None or not np.size(kV) else kV
-    tried = np.atleast_1d(given).astype(float).tolist()
+    tried = np.atleast_1d(scanner.tube.kV if kV is None else kV).astype(float).tolist()
+    if not tried:
+        raise LimitError(
+            f"kV is {kV}, no voltage; allowed with {scanner.name}: one or more of {low:g} to "
+            f"{high:g}, or None",
+            {"asked": [], "allowed": [low, high]},
+        )
     power = scanner.tube.power_W if power_W is None else power_W
     time_ms = spec.exposure_ms if exposure_ms is None else exposure_ms
     for what, values, least, most in (

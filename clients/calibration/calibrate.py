@@ -133,6 +133,8 @@ def calibrate_datasets(
             markers does not hold.
     """
     start = time.perf_counter()
+    if not datasets:
+        raise TwinError("no data sets; allowed: one or more", {"asked": 0, "allowed": 1})
     unknown = phantom == UNKNOWN
     want = request or Request(free=("dO_x",) if unknown else SIX)
     frames = [DatasetFrames(d) for d in datasets]

@@ -196,7 +196,11 @@ def views_of(
             f"binning {binning} of {cols} x {rows} pixels; allowed: 1 to {most}",
             {"asked": binning, "allowed": [1, most]},
         )
-    indices = dataset.present[:: max(1, every)]
+    if not isinstance(every, int | np.integer) or every < 1:
+        raise LimitError(
+            f"every {every} frames; allowed: a whole number from 1", {"asked": every, "allowed": 1}
+        )
+    indices = dataset.present[::every]
     if not indices:
         raise LimitError(f"{dataset.where}: no projections to reconstruct from", {"asked": every})
     cone_vec = dataset.corrected(parameters)[np.array(indices)]

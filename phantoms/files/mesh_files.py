@@ -215,10 +215,10 @@ def voxel_phantom(
         >>> voxel_phantom(np.full((4, 6, 8), 0.02, np.float32), 0.5).size_mm
         (4.0, 3.0, 2.0)
     """
-    edges = np.broadcast_to(np.asarray(voxel_mm, dtype=np.float64), (3,))
-    if not (np.isfinite(edges).all() and (edges > 0).all()):
-        raise PhantomError(f"voxel size is {voxel_mm} mm; allowed: above 0")
-    dx, dy, dz = edges.tolist()
+    edges = np.asarray(voxel_mm, dtype=np.float64)
+    if edges.shape not in ((), (3,)) or not (np.isfinite(edges).all() and (edges > 0).all()):
+        raise PhantomError(f"voxel size is {voxel_mm} mm; allowed: one or three above 0")
+    dx, dy, dz = np.broadcast_to(edges, 3).tolist()
     voxels = Voxels(data, (dx, dy, dz), center_mm, material)
     nz, ny, nx = voxels.data.shape
     cx, cy, cz = (2.0 * abs(c) for c in center_mm)

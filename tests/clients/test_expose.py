@@ -89,6 +89,9 @@ def test_saturation_is_known_of_a_saved_scan_and_else_unknown(
     assert set(back.warnings) == set(scan.warnings)
     plain = fx.DataSet.from_arrays(scan.counts(), geometry, dark=scan.dark, flat=scan.flat)
     assert exposure_of(plain).saturated is None
+    assert run(["expose", str(tmp_path / "whole")]) == 0
+    told = capsys.readouterr().err
+    assert all(f"{tmp_path / 'whole'}: warning: {one}\n" in told for one in scan.warnings)
     plain.save(tmp_path / "plain")
     assert run(["expose", str(tmp_path / "plain")]) == 0
     assert "saturated unknown" in capsys.readouterr().out
@@ -106,8 +109,10 @@ def test_numbers_that_no_scan_has_are_refused(words: dict[str, float]) -> None:
         fx.expose(rod(5.0), **words)
 
 
-def test_no_voltage_is_the_machines() -> None:
-    assert fx.expose(rod(5.0), kV=[]).asked == fx.expose(rod(5.0)).asked
+@pytest.mark.parametrize("none", [[], (), np.zeros(0)])
+def test_no_voltage_at_all_is_refused(none: Any) -> None:
+    with pytest.raises(fx.TwinError, match=r"kV is .*, no voltage; allowed with .*: one or more"):
+        fx.expose(rod(5.0), kV=none)
 
 
 def test_a_voltage_may_be_numpys() -> None:

@@ -17,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
+from flexdt.twin.dataset.flexdt_json import DatasetDocument
 from flexdt.twin.dataset.rebuild import angles_deg, rebuild
 from flexdt.twin.dataset.record import SampleRecord, ScanRecord
 from flexdt.twin.dataset.scan_settings import (
@@ -203,6 +204,17 @@ def test_names_cannot_smuggle_lines_into_the_texts(record: Callable[..., ScanRec
     x = parse_xre(format_xre(r))
     assert x.number("motor positions", "tra_obj") == 2.5
     assert x.text("Sample info", "Sample name") == evil.replace("\r\n", " ")
+
+
+def test_the_document_ignores_nothing_that_is_said_of_an_image(
+    record: Callable[..., ScanRecord],
+) -> None:
+    scan = record()
+    document = DatasetDocument.of(scan)
+    cameras = [scan.camera, *(block.camera for block in scan.blocks for _ in range(len(block)))]
+    for entry, camera in zip((document.detector, *document.frames), cameras, strict=True):
+        said = camera.of_image
+        assert {name: getattr(entry, name) for name in said} == said
 
 
 def test_both_texts_of_a_scan_agree(record: Callable[..., ScanRecord]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,27 @@ def test_fdk_and_iterative_algorithms_take_a_grid() -> None:
     for algorithm, options in ((fx.fdk, {}), (fx.back, {}), (fx.sirt, {"iterations": 2})):
         one, two = (algorithm(images, SCAN, like, **options) for like in (grid, volume))
         assert np.array_equal(one.data, two.data)
+
+
+BALL = {"kind": "sphere", "center": [0, 0, 0], "radius": 5, "material": "pmma"}
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        *((lambda size=size, f=f: f(np.ones((4, 4, 4)), voxel_mm=size), "one or three above 0")
+          for size in ((), (1, 1), (1, 1, 1, 1))
+          for f in (lambda *a, **b: fx.simulate(*a, SCAN, **b), fx.expose)),
+        (lambda: fx.calibrate([], "lego"), "no data sets; allowed: one or more"),
+        *((lambda f=f: f(np.zeros((0, 4, 4)), np.zeros((0, 12)), fx.Grid((4, 4, 4), 1)), "views")
+          for f in (fx.fdk, fx.sirt, fx.cgls, fx.tv)),
+        *((lambda n=n: fx.reconstruct(fx.simulate(BALL, SCAN), every=n), f"every {n} frames; all")
+          for n in (0, -2, 1.5)),
+    ],
+)  # fmt: skip
+def test_nothing_at_all_is_refused(call: Callable[[], object], told: str) -> None:
+    with pytest.raises(fx.TwinError, match=told):
+        call()
 
 
 def test_positions_outside_the_travel_are_not_a_pose() -> None:

@@ -75,15 +75,19 @@ class CameraSettings:
         return (r.bottom - r.top + 1) // b, (r.right - r.left + 1) // b
 
     @property
-    def stated(self) -> dict[str, Any]:
-        """What is set, by name; the ROI as its edges."""
+    def of_image(self) -> dict[str, Any]:
+        """What each image is taken with, by name; the ROI as its edges."""
         return {
             "mode": self.mode,
             "exposure_ms": self.exposure_ms,
             "roi": self.roi.edges,
             "averages": self.averages,
-            "frames": self.frames,
         }
+
+    @property
+    def stated(self) -> dict[str, Any]:
+        """What is set, by name: `of_image` and the number of images."""
+        return {**self.of_image, "frames": self.frames}
 
     def facts(self, sensor: Sensor) -> dict[str, Any]:
         """What is set and the image's `shape` and `pixel_mm`: the wire's camera."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import operator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
@@ -57,27 +57,33 @@ class Layout:
         """True when no voxel differs from zero."""
         return min(self.counts) == 0
 
-    @property
-    def resident(self) -> bool:
-        """Whether the storage is on the CUDA device."""
-        return bool(self._there)
+    @cached_property
+    def copies(self) -> DeviceCopies:
+        """The storage on CUDA devices."""
+        return DeviceCopies(self.flat)
 
-    def on_devices(self, count: int = 1) -> list[Any]:
-        """The storage on each of the first devices; uploaded once and cached with the layout."""
+
+@dataclass(eq=False)
+class DeviceCopies:
+    """What of a storage is on CUDA devices, and how much it would have been used there.
+
+    Attributes:
+        flat: the storage.
+        there: on each of the first devices.
+        views: asked for so far.
+    """
+
+    flat: Float32Array
+    there: list[Any] = field(default_factory=list)
+    views: int = 0
+
+    def first(self, count: int = 1) -> list[Any]:
+        """Those on the first devices, uploaded once."""
         from flexdt.twin.projection import gpu
 
-        for device in range(len(self._there), count):
-            self._there.append(gpu.upload(self.flat, device))
-        return self._there[:count]
-
-    @cached_property
-    def _there(self) -> list[Any]:
-        return []
-
-    @cached_property
-    def views_here(self) -> list[int]:
-        """One number: the views asked for so far, before the volume was moved to a device."""
-        return [0]
+        for device in range(len(self.there), count):
+            self.there.append(gpu.upload(self.flat, device))
+        return self.there[:count]
 
 
 def room_like(volume: Volume) -> Float32Array:
@@ -220,7 +226,7 @@ class Volume:
                 {"asked": device, "allowed": ["cpu", "cuda"]},
             )
         layout = self.layout
-        there = replace(layout, flat=gpu.demand(lambda: layout.on_devices()[0]))
+        there = replace(layout, flat=gpu.demand(lambda: layout.copies.first()[0]))
         return DeviceVolume(there, self.shape, self.voxel_xyz, self.center_mm)
 
     def save(self, file: File) -> None:

@@ -76,7 +76,7 @@ class Problem:
         """From checked arguments.
 
         Raises:
-            GeometryError: shapes that do not fit.
+            GeometryError: no views, or shapes that do not fit.
             LimitError: no iterations.
         """
         if iterations < 1:
@@ -84,6 +84,8 @@ class Problem:
                 f"{iterations} iterations; allowed: at least 1", {"asked": iterations, "allowed": 1}
             )
         geometry = as_cone_vec(cone_vec)
+        if not len(geometry):
+            raise GeometryError("no views; allowed: one or more", {"asked": 0, "allowed": 1})
         values = check_projections(projections, len(geometry))
         require_finite(values)
         geometry.of_shape((values.shape[1], values.shape[2]))

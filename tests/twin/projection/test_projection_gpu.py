@@ -55,11 +55,11 @@ gpu.free_bytes = lambda: gpu.SPARE_BYTES + volume.layout.flat.nbytes + 7 * 8 * 4
 assert np.array_equal(forward(volume, geometry, (7, 8)), images)
 fits = back(y, geometry, volume).data
 gpu.free_bytes = lambda: gpu.SPARE_BYTES + 4
-assert volume.layout.resident  # but there is no room for images
+assert volume.layout.copies.there  # but there is no room for images
 assert np.array_equal(forward(volume, geometry, (7, 8)), exact)
 stays = Volume(data, (0.1, 0.2, 0.15), (0.01, 0.02, 0.03))
 assert np.array_equal(forward(stays, geometry, (7, 8)), exact)
-assert not stays.layout.resident
+assert not stays.layout.copies.there
 out = room_like(volume)
 out[...] = 7
 layout = blank_layout(volume)

@@ -38,9 +38,12 @@ def expose(
 ) -> None:
     """Predict transmission, contrast to noise, dose and the best voltage and filter."""
     from flexdt.clients import expose as of
+    from flexdt.clients.datasets.dataset import load_dataset
 
     if dataset is not None:
-        measured = of.exposure_of(dataset)
+        data = load_dataset(dataset)
+        warn(data.warnings, dataset)
+        measured = of.exposure_of(data)
         emit(asdict(measured)) if json else _seen(measured)
         return
     forecast = of.expose(
