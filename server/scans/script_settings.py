@@ -20,30 +20,16 @@ def apply_command(scanner: ScannerTwin, command: c.Command, now: float) -> None:
             scanner.set_tube(on=True, now=now, warm=True)
         case c.XrayOff():
             scanner.set_tube(on=False, now=now)
-        case c.SetVoltage(kV=kV):
-            scanner.set_tube(kV=kV)
-        case c.SetPower(power_W=power):
-            scanner.set_tube(power_W=power)
-        case c.SetMode(mode=mode):
-            scanner.set_camera(mode=mode)
-        case c.SetExposure(exposure_ms=exposure):
-            scanner.set_camera(exposure_ms=exposure)
-        case c.SetFrames(frames=frames):
-            scanner.set_camera(frames=frames)
-        case c.SetAverages(averages=averages):
-            scanner.set_camera(averages=averages)
-        case c.SetRoi(roi=roi):
-            scanner.set_camera(roi=roi)
-        case c.SetSpeed(component=axis, speed=speed) if _known(scanner, axis):
+        case c.TubeSetting():
+            scanner.set_tube(**command.arguments)
+        case c.CameraSetting():
+            scanner.set_camera(**command.arguments)
+        case c.MotorCommand(component=axis) if not scanner.machine.has(axis):
+            pass  # a component of somebody else's
+        case c.SetSpeed(component=axis, speed=speed):
             scanner.set_axis(axis, speed=_allowed(scanner, axis, speed, "max_speed"))
-        case c.SetAcceleration(component=axis, acceleration=rate) if _known(scanner, axis):
+        case c.SetAcceleration(component=axis, acceleration=rate):
             scanner.set_axis(axis, acceleration=_allowed(scanner, axis, rate, "max_acceleration"))
-        case _:
-            pass
-
-
-def _known(scanner: ScannerTwin, axis: str) -> bool:
-    return scanner.machine.has(axis)
 
 
 def _allowed(scanner: ScannerTwin, axis: str, value: float, limit: str) -> float:

@@ -9,10 +9,10 @@ that is slow a growing one, whatever the machine's overhead.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Final
+from typing import Final
 
 from flexdt.twin.following.mirror import MOST_WAITING, Alarm, Heard, Mirror, Waiting
 from flexdt.twin.machine.description import Machine, Profile, unknown_axis
@@ -308,12 +308,7 @@ class Follower:
             return self._arrived(mirror, waiting, heard, now)
         if waiting.heard.asks:
             return self._read(mirror, replace(heard, asks=waiting.heard.asks), now)
-        if waiting.heard.command is not None:
-            effect = _EFFECTS.get(type(waiting.heard.command))
-            if effect is not None:
-                changes = effect(waiting.heard.command, mirror, self.machine, now)
-                mirror = replace(mirror, **changes)
-        return mirror
+        return _after(mirror, waiting.heard.command, self.machine, now)
 
     def _arrived(self, mirror: Mirror, waiting: Waiting, heard: Heard, now: float) -> Mirror:
         """A move has ended: where, and with which limits, as its reply says."""
@@ -470,39 +465,23 @@ def _number(text: str) -> float | None:
         return None
 
 
-Changes = dict[str, Any]
-
-
-def _rate(command: Any, mirror: Mirror, machine: Machine, now: float) -> Changes:
-    if not machine.has(command.component):
-        return {}
-    speed = isinstance(command, c.SetSpeed)
-    for motor, share in machine.moves(command.component).items():
-        value = (command.speed if speed else command.acceleration) * abs(share)
-        mirror = mirror.with_axis(motor, **{"speed" if speed else "acceleration": value})
-    return {"axes": mirror.axes}
-
-
-def _camera(name: str) -> Callable[[Any, Mirror, Machine, float], Changes]:
-    return lambda k, m, machine, now: {"camera": replace(m.camera, **{name: getattr(k, name)})}
-
-
-_EFFECTS: Final[Mapping[type[c.Command], Callable[[Any, Mirror, Machine, float], Changes]]] = {
-    c.SetMode: _camera("mode"),
-    c.SetExposure: _camera("exposure_ms"),
-    c.SetFrames: _camera("frames"),
-    c.SetAverages: _camera("averages"),
-    c.SetRoi: _camera("roi"),
-    c.TakeImage: lambda k, m, machine, now: {"taken": m.taken + 1},
-    c.TakeSequence: lambda k, m, machine, now: {"taken": m.taken + 1},
-    c.SetVoltage: lambda k, m, machine, now: {"kV": k.kV},
-    c.SetPower: lambda k, m, machine, now: {"power_W": k.power_W},
-    c.XrayOn: lambda k, m, machine, now: {
-        "xrays_on": True, "ready_s": now + machine.timing.xray_ready_s
-    },
-    c.XrayOff: lambda k, m, machine, now: {"xrays_on": False},
-    c.WaitXrayReady: lambda k, m, machine, now: {"xrays_on": True, "ready_s": now},
-    c.SetSpeed: _rate,
-    c.SetAcceleration: _rate,
-}  # fmt: skip
-"""What the end of a command changes in the mirror."""
+def _after(mirror: Mirror, command: c.Command | None, machine: Machine, now: float) -> Mirror:
+    """The mirror as the end of a command changes it."""
+    match command:
+        case c.CameraSetting():
+            return replace(mirror, camera=replace(mirror.camera, **command.arguments))
+        case c.TubeSetting():
+            return replace(mirror, **command.arguments)
+        case c.TakeImage() | c.TakeSequence():
+            return replace(mirror, taken=mirror.taken + 1)
+        case c.XrayOn():
+            return replace(mirror, xrays_on=True, ready_s=now + machine.timing.xray_ready_s)
+        case c.XrayOff():
+            return replace(mirror, xrays_on=False)
+        case c.WaitXrayReady():
+            return replace(mirror, xrays_on=True, ready_s=now)
+        case c.SetSpeed() | c.SetAcceleration() if machine.has(command.component):
+            rates = command.arguments
+            for motor, share in machine.moves(rates.pop("component")).items():
+                mirror = mirror.with_axis(motor, **{n: x * abs(share) for n, x in rates.items()})
+    return mirror

@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import Enum
 from typing import Annotated, Any, dataclass_transform
 
@@ -58,6 +58,11 @@ class Command:
     def __init_subclass__(cls) -> None:
         dataclass(frozen=True, kw_only=True)(cls)
 
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """The fields of its own type, which not all commands have."""
+        return {f.name: getattr(self, f.name) for f in fields(self)[len(fields(Command)) :]}
+
 
 class Pause(Command):
     """`scanner pause`."""
@@ -95,13 +100,17 @@ class XrayOff(Command):
     """`tube xrayoff`."""
 
 
-class SetVoltage(Command):
+class TubeSetting(Command):
+    """A setting of the tube, by the name it has everywhere."""
+
+
+class SetVoltage(TubeSetting):
     """`tube set kV`."""
 
     kV: float
 
 
-class SetPower(Command):
+class SetPower(TubeSetting):
     """`tube set power`."""
 
     power_W: float
@@ -111,31 +120,35 @@ class WaitXrayReady(Command):
     """`tube REPEAT UNTIL TRUE status_XReady_get`."""
 
 
-class SetMode(Command):
+class CameraSetting(Command):
+    """A setting of the camera, by the name it has everywhere."""
+
+
+class SetMode(CameraSetting):
     """`camera set mode`."""
 
     mode: str
 
 
-class SetExposure(Command):
+class SetExposure(CameraSetting):
     """`camera set exposure`."""
 
     exposure_ms: float
 
 
-class SetFrames(Command):
+class SetFrames(CameraSetting):
     """`camera set number of frames`."""
 
     frames: int
 
 
-class SetAverages(Command):
+class SetAverages(CameraSetting):
     """`camera set number of averages`."""
 
     averages: int
 
 
-class SetRoi(Command):
+class SetRoi(CameraSetting):
     """`camera set ROI`: left, top, right, bottom, inclusive, unbinned."""
 
     roi: Roi

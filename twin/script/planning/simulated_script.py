@@ -327,16 +327,7 @@ class Simulation:
         return time
 
 
-_CAMERA: Final = (
-    c.SetMode,
-    c.SetExposure,
-    c.SetFrames,
-    c.SetAverages,
-    c.SetRoi,
-    c.TakeImage,
-    c.SaveImage,
-    c.TakeSequence,
-)
+_CAMERA: Final = (c.CameraSetting, c.TakeImage, c.SaveImage, c.TakeSequence)
 _Effect = Callable[[Simulation, Any], Span]
 
 _EFFECTS: Final[Mapping[type[c.Command], _Effect]] = {
