@@ -12,9 +12,9 @@ import os
 import time
 import warnings
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -22,8 +22,7 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 Work = tuple[Callable[[], None], Callable[[], Float32Array]]
 """What is timed, and what gives its last result."""
-PATIENCE_S = 60.0
-"""How long the process may take to end."""
+_T = TypeVar("_T")
 
 
 class Rtk:
@@ -38,61 +37,48 @@ class Rtk:
     """
 
     def __init__(self, build: Callable[..., Work], *arguments: object) -> None:
-        context = get_context("spawn")
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, build, arguments), daemon=True)
-        self._process.start()
-        theirs.close()
-        self._answer()
+        self._pool = ProcessPoolExecutor(1, get_context("spawn"))
+        self._ask(_prepare, build, arguments)
 
     def run(self) -> float:
         """Do the work; the seconds it took."""
-        return float(self._ask("run"))
+        return self._ask(_timed)
 
     def images(self) -> Float32Array:
         """The last result."""
-        return np.asarray(self._ask("images"), dtype=np.float32)
+        return self._ask(_result)
 
     def close(self) -> None:
         """End the process."""
-        self._pipe.close()
-        self._process.join(PATIENCE_S)
-        if self._process.is_alive():
-            self._process.kill()
+        self._pool.shutdown()
 
-    def _ask(self, word: str) -> Any:
-        self._pipe.send(word)
-        return self._answer()
-
-    def _answer(self) -> Any:
+    def _ask(self, do: Callable[..., _T], *arguments: object) -> _T:
         try:
-            answer = self._pipe.recv()
-        except EOFError:
-            raise RuntimeError("RTK's process has ended") from None
-        if isinstance(answer, Exception):
-            raise RuntimeError(f"RTK: {answer}")
-        return answer
+            return self._pool.submit(do, *arguments).result()
+        except Exception as error:
+            self.close()
+            raise RuntimeError(f"RTK: {error}") from None
 
 
-def _serve(pipe: Connection, build: Callable[..., Work], arguments: tuple[object, ...]) -> None:
-    """The process: prepares, then does as it is told until nobody is there any more."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # ITK's wrappers warn while they load
-            run, images = build(*arguments)
-        pipe.send(None)
-        while True:
-            if pipe.recv() == "run":
-                begun = time.perf_counter()
-                run()
-                pipe.send(time.perf_counter() - begun)
-            else:
-                pipe.send(images())
-    except EOFError:
-        pass
-    except Exception as error:
-        pipe.send(RuntimeError(str(error)))
+_PREPARED: list[Work] = []
+"""In the process: its piece of work."""
+
+
+def _prepare(build: Callable[..., Work], arguments: tuple[object, ...]) -> None:
     atexit.register(os._exit, 0)  # past the wrappers' own end
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # ITK's wrappers warn while they load
+        _PREPARED.append(build(*arguments))
+
+
+def _timed() -> float:
+    begun = time.perf_counter()
+    _PREPARED[0][0]()
+    return time.perf_counter() - begun
+
+
+def _result() -> Float32Array:
+    return np.asarray(_PREPARED[0][1](), dtype=np.float32)
 
 
 # RTK turns about y, with the source on +z: its (x, y, z) is our (x, z, -y).
