@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import pickle
 from dataclasses import asdict
 from typing import Any, Final
 
@@ -42,15 +40,13 @@ async def predicted(
     Raises:
         RpcError: an argument that the machine does not allow, or -32008.
     """
-    matter = await asyncio.to_thread(pickle.dumps, (phantom, machine, settings))
-    return Encoded(tuple(await workers.ask(work, [codec.value.encode(), matter])))
+    return Encoded(tuple(await workers.ask(work, phantom, machine, settings, codec)))
 
 
-def work(parts: list[bytes]) -> list[bytes]:
-    """In the worker: codec, and what is to be scanned; answers with the encoded result."""
-    phantom, machine, settings = pickle.loads(parts[1])
+def work(phantom: Phantom, machine: Machine, settings: dict[str, Any], codec: Codec) -> list[bytes]:
+    """In the worker: the encoded result."""
     told = asdict(expose(phantom, machine=machine, **settings))
     told["transmission"]["edges"] = told["transmission"]["edges"][:-1]  # no infinity in JSON
     told |= {"sample": phantom.name, "best": told["best"][:BEST], "frames": told.pop("images")}
     result = r.ExposurePrediction.model_validate(told, strict=False)
-    return list(encoded(result, Codec(parts[0].decode())).pieces)
+    return list(encoded(result, codec).pieces)

@@ -2,13 +2,14 @@
 
 Requests and answers are lists of byte strings over a socket that the parent handed down. The
 process has a limit on memory, one on processor time for each request, a low priority, and ends when
-its parent does. A request names a module-level function; `Workers.ask` takes the function itself.
+its parent does. A request is a pickled call of a module-level function, and what it takes as it is.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import pickle
 import select
 import socket
 import struct
@@ -17,18 +18,12 @@ import threading
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from importlib import import_module
 
 Parts = Sequence[bytes | bytearray | memoryview]
 
-Work = Callable[[list[bytes]], list[bytes]]
-"""A piece of work: a function of a module, from parts to parts."""
+Work = Callable[..., list[bytes]]
+"""A piece of work: a function of a module."""
 NICENESS = 5
-
-
-def name_of(work: Work) -> str:
-    """How a request names its function: `module:function`."""
-    return f"{work.__module__}:{work.__name__}"
 
 
 def send_parts(channel: socket.socket, parts: Parts) -> None:
@@ -92,12 +87,10 @@ def peak_bytes() -> int:
 
 def answer(request: Sequence[bytes]) -> list[bytes]:
     """Do one piece of work; the first part says how it went."""
-    name, seconds, *parts = request
-    limit("RLIMIT_CPU", int(sum(os.times()[:2]) + float(seconds) + 2.0))
     try:
-        module, function = name.decode().split(":")
-        work: Work = getattr(import_module(module), function)
-        return [b"done", *work(parts)]
+        work, seconds, arguments = pickle.loads(request[0])
+        limit("RLIMIT_CPU", int(sum(os.times()[:2]) + seconds + 2.0))
+        return [b"done", *work(*arguments, *request[1:])]
     except MemoryError:
         return [b"memory"]
     except Exception as error:

@@ -10,15 +10,17 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import pickle
 import socket
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 from flexdt.protocol.rpc_errors import Code, RpcError, busy, too_large
-from flexdt.server.runtime.worker import Parts, Work, name_of, receive_parts, send_parts
+from flexdt.server.runtime.worker import Parts, Work, receive_parts, send_parts
 
 KEPT_BYTES = 400 << 20
 """A process that has taken more is replaced, so that the memory is given back."""
@@ -61,8 +63,16 @@ class Worker:
         """The process."""
         return self._process.pid
 
-    def ask(self, work: Work, parts: Parts, seconds: float) -> list[bytes]:
+    def ask(
+        self, work: Work, arguments: Sequence[object], raw: Parts, seconds: float
+    ) -> list[bytes]:
         """Have one piece of work done; after any error but -32602 and the like, `kill` it.
+
+        Args:
+            work: called there.
+            arguments: that it takes first, pickled.
+            raw: that it takes after them, sent as they are.
+            seconds: that it may take.
 
         Raises:
             RpcError: the work's own refusal; -32008 where it takes too long, too much memory, or
@@ -72,7 +82,7 @@ class Worker:
         try:
             self._channel.settimeout(seconds)
             until = time.monotonic() + seconds
-            send_parts(self._channel, [name_of(work).encode(), f"{seconds}".encode(), *parts])
+            send_parts(self._channel, [pickle.dumps((work, seconds, arguments)), *raw])
             self._channel.settimeout(max(0.001, until - time.monotonic()))
             how, peak, *answer = receive_parts(self._channel)
         except TimeoutError:
@@ -133,7 +143,7 @@ class Workers:
         """Whether an idle process is available."""
         return bool(self._idle)
 
-    async def ask(self, work: Work, parts: Parts) -> list[bytes]:
+    async def ask(self, work: Work, *arguments: object, raw: Parts = ()) -> list[bytes]:
         """Have one piece of work done; it is stopped if this is cancelled.
 
         Raises:
@@ -144,7 +154,7 @@ class Workers:
             worker = self._idle.pop() if self._idle else None
             if worker is None:
                 worker = await loop.run_in_executor(self._threads, self._new)
-            asked = loop.run_in_executor(self._threads, self._ask, worker, work, parts)
+            asked = loop.run_in_executor(self._threads, self._ask, worker, work, arguments, raw)
             try:
                 answer = await asyncio.shield(asked)
             except asyncio.CancelledError:
@@ -164,11 +174,13 @@ class Workers:
             data = {"allowed": "try again later"}
             raise busy(f"no process could be started: {error.strerror}", data) from None
 
-    def _ask(self, worker: Worker, work: Work, parts: Parts) -> list[bytes]:
+    def _ask(
+        self, worker: Worker, work: Work, arguments: Sequence[object], raw: Parts
+    ) -> list[bytes]:
         """In a thread: ask, and end a process that is not to be kept."""
         sound = False
         try:
-            answer = worker.ask(work, parts, self.seconds)
+            answer = worker.ask(work, arguments, raw, self.seconds)
             sound = True
             return answer
         except RpcError as error:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, replace
 from itertools import chain
-from typing import Any, Final, Literal, TypeVar
+from typing import Any, Final, TypeVar
 
 from flexdt.protocol import Codec
 from flexdt.protocol.codec import write_json, write_msgpack
@@ -152,13 +152,13 @@ class Checks:
         """
         if self._here(matter):
             return await self._threaded(lambda: _encoded(matter, codec))
-        return await self._workers.ask(work, _asked("report", matter, codec))
+        return await self._workers.ask(_encoded, _bare(matter), codec)
 
     async def verdict(self, matter: Matter) -> ScanVerdict:
         """Whether it may run, and what it comes to; raises as `ScanVerdict.of`."""
         if self._here(matter):
             return await self._threaded(lambda: ScanVerdict.of(matter.report()))
-        [answer] = await self._workers.ask(work, _asked("verdict", matter))
+        [answer] = await self._workers.ask(verdict_of, _bare(matter))
         return ScanVerdict(**json.loads(answer))
 
     async def plan(self, matter: Matter) -> ScanPlan:
@@ -167,7 +167,7 @@ class Checks:
             report = await self._threaded(matter.report)
             require_sound(report)
             return report.plan
-        parts = await self._workers.ask(work, _asked("plan", matter))
+        parts = await self._workers.ask(_planned, _bare(matter))
         plan = await asyncio.to_thread(_joined, parts, matter.machine, matter.profile)
         if isinstance(asyncio.get_running_loop(), ServerLoop):  # a process that serves one twin
             gc.freeze()  # a million objects that are no garbage, see `announce`
@@ -187,7 +187,7 @@ class Checks:
 
     async def _start(self, matter: Matter) -> None:
         with suppress(RpcError):
-            await self._workers.ask(work, _asked("verdict", matter))
+            await self._workers.ask(verdict_of, _bare(matter))
         self._starting = None
 
     async def _threaded(self, do: Callable[[], _T]) -> _T:
@@ -201,38 +201,23 @@ class Checks:
         self._workers.close()
 
 
-def work(parts: list[bytes]) -> list[bytes]:
-    """In the worker: what is wanted, a codec, what is checked."""
-    wanted, codec, matter = parts[0].decode(), Codec(parts[1].decode()), _matter(parts[2:])
-    match wanted:
-        case "report":
-            return _encoded(matter, codec)
-        case "verdict":
-            return [json.dumps(ScanVerdict.of(matter.report()).__dict__).encode()]
+def verdict_of(matter: Matter) -> list[bytes]:
+    """In the worker: the verdict as JSON."""
+    return [json.dumps(vars(ScanVerdict.of(matter.report()))).encode()]
+
+
+def _planned(matter: Matter) -> list[bytes]:
     report = matter.report()
     require_sound(report)
     return _pieces_of(report.plan)
 
 
-Wanted = Literal["report", "verdict", "plan"]
-
-
-def _asked(wanted: Wanted, matter: Matter, codec: Codec = Codec.JSON) -> list[bytes]:
-    """A request; the wish's long strings travel as they are."""
+def _bare(matter: Matter) -> Matter:
+    """Without the listing of poses, which only people read."""
     wish = matter.wish
-    bare = replace(matter, wish=replace(wish, script=b"", poses=None))
-    text = wish.script if wish.poses is None else wish.poses.text
-    kind = b"script" if wish.poses is None else b"poses"
-    return [wanted.encode(), codec.value.encode(), pickle.dumps(bare), kind, text]
-
-
-def _matter(parts: list[bytes]) -> Matter:
-    bare: Matter = pickle.loads(parts[0])
-    _, kind, text = parts
-    wish = bare.wish
-    if kind == b"script":
-        return replace(bare, wish=replace(wish, script=text))
-    return replace(bare, wish=replace(wish, poses=PoseList(text, b"")))
+    if wish.poses is None:
+        return matter
+    return replace(matter, wish=replace(wish, script=b"", poses=PoseList(wish.poses.text, b"")))
 
 
 def _encoded(matter: Matter, codec: Codec) -> list[bytes]:

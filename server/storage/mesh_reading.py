@@ -13,7 +13,7 @@ from collections.abc import Callable
 from flexdt.phantoms import Phantom, PhantomError, mesh_phantom
 from flexdt.phantoms.files.phantom_files import sent_scene
 from flexdt.protocol.rpc_errors import RpcError
-from flexdt.server.runtime.worker import Work, limit
+from flexdt.server.runtime.worker import limit
 from flexdt.server.runtime.workers import Worker
 from flexdt.twin.errors import TwinError, UnknownNameError
 
@@ -31,7 +31,7 @@ def mesh_apart(
         UnknownNameError: unknown material.
     """
     how = {"unit": unit, "material": material, "file_type": file_type, "name": name}
-    return _apart(read_mesh, how, raw, timeout_s)
+    return _apart(mesh_phantom, how, raw, timeout_s)
 
 
 def scene_apart(raw: bytes, *, name: str, timeout_s: float = TIMEOUT_S) -> Phantom:
@@ -41,14 +41,16 @@ def scene_apart(raw: bytes, *, name: str, timeout_s: float = TIMEOUT_S) -> Phant
         PhantomError: its content does not hold, it is larger than is allowed, names files or an
             unknown material, or reading it takes too much time or memory.
     """
-    return _apart(read_scene, {"name": name}, raw, timeout_s)
+    return _apart(sent_scene, {"name": name}, raw, timeout_s)
 
 
-def _apart(work: Work, how: dict[str, str], raw: bytes, timeout_s: float) -> Phantom:
+def _apart(
+    read: Callable[..., Phantom], how: dict[str, str], raw: bytes, timeout_s: float
+) -> Phantom:
     name = how["name"]
     worker = Worker(MEMORY_BYTES)
     try:
-        [answer] = worker.ask(work, [json.dumps(how).encode(), raw], timeout_s)
+        [answer] = worker.ask(_answered, (read, how), [raw], timeout_s)
     except RpcError as error:
         data = error.data if isinstance(error.data, dict) else None
         raise PhantomError(f"{name!r} cannot be read: {error.message}", data) from None
@@ -61,21 +63,10 @@ def _apart(work: Work, how: dict[str, str], raw: bytes, timeout_s: float) -> Pha
     return Phantom.from_dict(document)
 
 
-def read_mesh(parts: list[bytes]) -> list[bytes]:
-    """Read a mesh in the worker process: options and bytes in, a phantom or an error out."""
-    return _answered(parts, mesh_phantom)
-
-
-def read_scene(parts: list[bytes]) -> list[bytes]:
-    """Read a scene in the worker process: options and text in, a phantom or an error out."""
-    return _answered(parts, sent_scene)
-
-
-def _answered(parts: list[bytes], read: Callable[..., Phantom]) -> list[bytes]:
+def _answered(read: Callable[..., Phantom], how: dict[str, str], raw: bytes) -> list[bytes]:
     limit("RLIMIT_FSIZE", 0)
-    how = json.loads(parts[0])
     try:
-        document: dict[str, object] = read(parts[1], **how).to_dict()
+        document: dict[str, object] = read(raw, **how).to_dict()
     except TwinError as error:
         document = {"error": type(error).__name__, "message": error.message, "data": error.data}
     return [json.dumps(document, default=repr).encode()]

@@ -7,7 +7,6 @@ kept until its folder changes.
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import stat
@@ -85,7 +84,7 @@ class PastScans:
     """
 
     def __init__(self, root: Path, machine: Machine, profile: Profile) -> None:
-        self._root = os.fsencode(root)
+        self._root = root
         self._machine = machine.model_dump(mode="json", by_alias=True)
         self._profile = profile.model_dump(mode="json")
         self._workers = Workers(AT_ONCE, MEMORY_BYTES, SECONDS)
@@ -104,11 +103,9 @@ class PastScans:
                 larger, or takes longer to read, than is allowed.
         """
         around = Around(running, self._machine, self._profile)
-        asked = json.dumps([type(params).__name__, params.model_dump(), vars(around)])
-        parts = [codec.value.encode(), self._root, asked.encode()]
         slow = isinstance(params, p.CalibrationFit | p.CalibrationAlign)
         workers = self._fitters if slow else self._workers
-        return Encoded(tuple(await workers.ask(work, parts)))
+        return Encoded(tuple(await workers.ask(work, self._root, params, around, codec)))
 
     def close(self) -> None:
         """End the processes."""
@@ -116,15 +113,12 @@ class PastScans:
         self._fitters.close()
 
 
-def work(parts: list[bytes]) -> list[bytes]:
-    """In the worker: codec, data directory, what is asked; answers with the encoded result."""
-    codec, root = Codec(parts[0].decode()), Path(os.fsdecode(parts[1]))
-    asked, given, around = json.loads(parts[2])
-    model, answer = _ANSWERS[asked]
+def work(root: Path, asked: Params, around: Around, codec: Codec) -> list[bytes]:
+    """In the worker: the encoded answer."""
     try:
-        result = answer(root, model.model_validate(given), Around(**around), codec)
+        result = _ANSWERS[type(asked)](root, asked, around, codec)
     except OSError as error:  # it has gone meanwhile, or the disk fails
-        name = given.get("name", "the data directory")
+        name = getattr(asked, "name", "the data directory")
         raise DatasetMissingError(f"{name} cannot be read: {error.strerror}") from None
     return list(encoded(result, codec).pieces)
 
@@ -572,10 +566,10 @@ def _normal(
     return made
 
 
-_ANSWERS: Final[Mapping[str, tuple[type[Params], Callable[..., object]]]] = {
-    "DatasetList": (p.DatasetList, _list),
-    "DatasetGet": (p.DatasetGet, _get),
-    "DatasetFrame": (p.DatasetFrame, _frame),
-    "CalibrationFit": (p.CalibrationFit, dataset_fits.fit),
-    "CalibrationAlign": (p.CalibrationAlign, dataset_fits.align),
+_ANSWERS: Final[Mapping[type[Params], Callable[..., object]]] = {
+    p.DatasetList: _list,
+    p.DatasetGet: _get,
+    p.DatasetFrame: _frame,
+    p.CalibrationFit: dataset_fits.fit,
+    p.CalibrationAlign: dataset_fits.align,
 }

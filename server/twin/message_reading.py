@@ -42,10 +42,8 @@ class Reader:
         Raises:
             RpcError: -32008, it cannot be read within the limits.
         """
-        codec = (wire.codec or Codec.JSON).value.encode()
         pieces = (raw,) if isinstance(raw, bytes) else raw
-        asked = [codec, str(wire.max_batch).encode(), *pieces]
-        kind, *items = await self._workers.ask(work, asked)
+        kind, *items = await self._workers.ask(work, wire.codec, wire.max_batch, raw=pieces)
         pairs = zip(items[::2], items[1::2], strict=True)
         frozen = tuple(Frozen(item, method.decode()) for method, item in pairs)
         return frozen if kind == b"batch" else frozen[0]
@@ -55,11 +53,9 @@ class Reader:
         self._workers.close()
 
 
-def work(parts: list[bytes]) -> list[bytes]:
-    """In the worker: codec, largest batch, message; answers with its items: method, pickle."""
-    codec, most, *pieces = parts
-    wire = Connection(Codec(codec.decode()), max_batch=int(most))
-    message = wire.decode(tuple(pieces))
+def work(codec: Codec | None, most: int, *pieces: bytes) -> list[bytes]:
+    """In the worker: the items of a message, of a batch of at most so many: method, pickle."""
+    message = Connection(codec, max_batch=most).decode(pieces)
     batch = isinstance(message, Batch)
     items = message.items if isinstance(message, Batch) else (message,)
     parts = [b"batch" if batch else b"single"]

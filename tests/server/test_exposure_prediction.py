@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 
 import flexdt as fx
 from flexdt.phantoms.samples import as_phantom
-from flexdt.protocol import METHODS, RpcError
+from flexdt.protocol import METHODS, Codec, RpcError
 from flexdt.protocol import results as r
 from flexdt.server.imaging.exposure_prediction import BEST, work
 from flexdt.twin.errors import LimitError
@@ -22,8 +21,7 @@ ROD = {"kind": "cylinder", "center": [0, 0, 0], "radius": 12.0, "height": 60, "m
 def predicted(**settings: Any) -> r.ExposurePrediction:
     """As in the worker; through JSON, as on the wire."""
     given = {"kV": 70.0, "images": 100, "sod": 600.0, "sdd": 1059.0, **settings}
-    matter = pickle.dumps((as_phantom(ROD), fx.machine("flexray"), given))
-    told = b"".join(work([b"json", matter]))
+    told = b"".join(work(as_phantom(ROD), fx.machine("flexray"), given, Codec.JSON))
     return r.ExposurePrediction.model_validate(json.loads(told))
 
 

@@ -22,7 +22,7 @@ from flexdt.protocol import Codec, RpcError
 from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.server.storage import past_scans
-from flexdt.server.storage.past_scans import PastScans, work
+from flexdt.server.storage.past_scans import Around, PastScans, work
 from flexdt.server.wire_errors import explain, from_root, is_user_error
 from flexdt.twin.machine.description import builtin_machine, profile_of
 
@@ -50,11 +50,10 @@ def server(data: Path) -> Iterator[Process]:
 
 def asked(root: Path, params: p.Params, running: str = "") -> Any:
     """In this process, what a worker does; the wire's error where it is one for a user."""
-    around = {"running": running, "machine": MACHINE.model_dump(mode="json", by_alias=True),
-              "profile": PROFILE.model_dump(mode="json")}  # fmt: skip
-    given = json.dumps([type(params).__name__, params.model_dump(), around]).encode()
+    machine = MACHINE.model_dump(mode="json", by_alias=True)
+    around = Around(running, machine, PROFILE.model_dump(mode="json"))
     try:
-        return json.loads(b"".join(work([b"json", os.fsencode(root), given])))
+        return json.loads(b"".join(work(root, params, around, Codec.JSON)))
     except Exception as error:
         if not is_user_error(error):
             raise

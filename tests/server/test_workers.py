@@ -122,25 +122,25 @@ def worked(body: Callable[[Workers], Awaitable[None]], **limits: Any) -> None:
     asyncio.run(main())
 
 
-def heavy() -> list[bytes]:
+def heavy() -> Matter:
     """A check of some seconds."""
-    return checking._asked("verdict", matter(Wish(long_script(60_000))))
+    return matter(Wish(long_script(60_000)))
 
 
-def light() -> list[bytes]:
-    return checking._asked("verdict", matter(Wish(long_script(1))))
+def light() -> Matter:
+    return matter(Wish(long_script(1)))
 
 
 def test_work_beyond_its_time_is_ended_and_says_what_is_allowed() -> None:
     async def body(workers: Workers) -> None:
-        await workers.ask(checking.work, light())
+        await workers.ask(checking.verdict_of, light())
         workers.seconds = 0.5
         with pytest.raises(RpcError) as refused:
-            await workers.ask(checking.work, heavy())
+            await workers.ask(checking.verdict_of, heavy())
         assert refused.value.code == Code.TOO_LARGE
         assert refused.value.data["allowed"] == 0.5  # type: ignore[index, call-overload]
         workers.seconds = 60.0
-        await workers.ask(checking.work, light())  # another process
+        await workers.ask(checking.verdict_of, light())  # another process
 
     worked(body)
 
@@ -150,26 +150,26 @@ def test_work_beyond_its_memory_says_what_is_allowed() -> None:
     async def body(workers: Workers) -> None:
         with pytest.raises(RpcError) as refused:
             await workers.ask(
-                message_reading.work, [b"json", b"10", b"[" + b"{}," * 10_000_000 + b"{}]"]
+                message_reading.work, Codec.JSON, 10, b"[" + b"{}," * 10_000_000 + b"{}]"
             )
         assert refused.value.code == Code.TOO_LARGE
-        await workers.ask(message_reading.work, [b"json", b"10", b"{}"])
+        await workers.ask(message_reading.work, Codec.JSON, 10, b"{}")
 
     worked(body, memory_bytes=600 << 20)
 
 
 def test_a_process_that_is_killed_costs_who_asked_an_error_and_nobody_else() -> None:
     async def body(workers: Workers) -> None:
-        await workers.ask(checking.work, light())
+        await workers.ask(checking.verdict_of, light())
         [worker] = workers._idle
-        asked = asyncio.create_task(workers.ask(checking.work, heavy()))
+        asked = asyncio.create_task(workers.ask(checking.verdict_of, heavy()))
         await asyncio.sleep(0.3)
         os.kill(worker.pid, signal.SIGKILL)
         with pytest.raises(RpcError) as refused:
             await asked
         assert refused.value.code == Code.TOO_LARGE
         assert "ended" in refused.value.message
-        await workers.ask(checking.work, light())
+        await workers.ask(checking.verdict_of, light())
 
     worked(body)
 
@@ -177,9 +177,9 @@ def test_a_process_that_is_killed_costs_who_asked_an_error_and_nobody_else() -> 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="looks for the process in /proc")
 def test_work_that_nobody_waits_for_any_more_is_stopped() -> None:
     async def body(workers: Workers) -> None:
-        await workers.ask(checking.work, light())
+        await workers.ask(checking.verdict_of, light())
         [worker] = workers._idle
-        asked = asyncio.create_task(workers.ask(checking.work, heavy()))
+        asked = asyncio.create_task(workers.ask(checking.verdict_of, heavy()))
         await asyncio.sleep(0.3)
         asked.cancel()
         with pytest.raises(asyncio.CancelledError):
