@@ -37,8 +37,6 @@ from flexdt.protocol.rpc_errors import Code, ProtocolError, RpcError, clip
 
 _W = TypeVar("_W")
 
-HELLO = "session.hello"
-
 
 class Role(Enum):
     """Which end of a connection this is."""
@@ -75,7 +73,6 @@ class Correlation(Generic[_W]):
         role: of this end.
 
     Attributes:
-        greeted: whether `session.hello` has been answered with a result.
         reason: an error that the peer reported about the connection as a whole.
         violation: what the peer did that the protocol forbids; the connection must be closed.
 
@@ -89,7 +86,6 @@ class Correlation(Generic[_W]):
 
     def __init__(self, role: Role) -> None:
         self.role = role
-        self.greeted = False
         self.reason: RpcError | None = None
         self.violation: ProtocolError | None = None
         self._ids = itertools.count(1)
@@ -98,7 +94,6 @@ class Correlation(Generic[_W]):
         self._asked: dict[Id, _W | None] = {}
         # Requests received and not answered; a client may use an id twice at the same time.
         self._owed: Counter[Id] = Counter()
-        self._hello: Id = None
 
     # -- the client's side -------------------------------------------------------------------
 
@@ -120,8 +115,6 @@ class Correlation(Generic[_W]):
         number = next(self._ids)
         id: Id = f"{trace}/{number}" if trace else number
         self._asked[id] = waiter
-        if method == HELLO:
-            self._hello = id
         return Request(id, method, dict(params))
 
     def abandon(self, request: Request, *, sent: bool = True) -> None:
@@ -164,7 +157,6 @@ class Correlation(Generic[_W]):
             self._owed[answer.id] -= 1
             if not self._owed[answer.id]:
                 del self._owed[answer.id]  # a long connection has many ids
-            self._greet(answer)
         return answer
 
     @property
@@ -219,15 +211,12 @@ class Correlation(Generic[_W]):
                 f"an answer to a request that is not open (id {clip(answer.id, 40)})"
             )
         waiter = self._asked.pop(answer.id)
-        self._greet(answer)
         return [] if waiter is None else [Answered(waiter, answer)]
 
     def _receive_call(self, message: Message) -> list[Answered[_W] | Request | Notification]:
         match message:
-            case Request(id, method):
+            case Request(id):
                 self._owed[id] += 1
-                if method == HELLO:
-                    self._hello = id
                 return [message]
             case Notification():
                 return [message]
@@ -235,10 +224,6 @@ class Correlation(Generic[_W]):
                 self._owed[id] += id is not None
                 return []
         raise self._violated("an answer to a server, which asks nothing")
-
-    def _greet(self, answer: Response | Failure) -> None:
-        if isinstance(answer, Response) and answer.id == self._hello:
-            self.greeted = True
 
     def _violated(self, what: str) -> ProtocolError:
         self.violation = ProtocolError(what)

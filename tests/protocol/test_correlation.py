@@ -170,20 +170,10 @@ def test_ids_say_what_caused_the_request() -> None:
     assert calls.open == 2
 
 
-def test_hello_is_noticed_on_both_sides() -> None:
-    asked = Correlation[None](Role.CLIENT)
-    answered = Correlation[None](Role.SERVER)
-    hello = asked.request("session.hello", hello_params("a test", "secret"), None)
-    assert hello.params == {"protocol": PROTOCOL, "client": "a test", "token": "secret"}
-    [request] = answered.receive(hello)
-    assert isinstance(request, Request)
-    asked.receive(answered.answer(Failure(request.id, BUSY)))
-    assert (asked.greeted, answered.greeted) == (False, False)
-    hello = asked.request("session.hello", hello_params("a test", None), None)
-    assert "token" not in hello.params  # type: ignore[operator]
-    answered.receive(hello)
-    asked.receive(answered.answer(Response(hello.id, {})))
-    assert (asked.greeted, answered.greeted) == (True, True)
+def test_hello_brings_the_token_if_there_is_one() -> None:
+    said = {"protocol": PROTOCOL, "client": "a test"}
+    assert hello_params("a test", "secret") == {**said, "token": "secret"}
+    assert hello_params("a test", None) == said
 
 
 def test_a_server_answers_each_request_once_and_takes_no_answers() -> None:
