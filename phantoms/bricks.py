@@ -24,9 +24,9 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.phantoms.checked_reading import PhantomError
 from flexdt.phantoms.materials import Material, material
 from flexdt.phantoms.phantom import Phantom
-from flexdt.phantoms.pieces import PhantomError
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import FloatArray, stage_rotation
 from flexdt.twin.projection.analytic_solids import (

@@ -1,21 +1,23 @@
 """Validated reading of JSON-able documents: each reader takes a value and its key path.
 
 Documents come from outside, so every reader either returns the right type or raises PhantomError
-with the path, the value and what is allowed.
+with the path, the value and what is allowed. `Text`, `Number`, `Lengths`, `Place` and `Packed` make
+pydantic read the fields of a dataclass so.
 """
 
 from __future__ import annotations
 
 import base64
-import binascii
 import math
 from collections.abc import Callable, Mapping
-from typing import Final, TypeVar
+from functools import partial
+from typing import Annotated, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import BeforeValidator, PlainSerializer, PlainValidator
 
-from flexdt.phantoms.pieces import PhantomError
+from flexdt.twin.errors import TwinError
 from flexdt.twin.projection.analytic_solids import Matrix, Vector
 
 MAX_ARRAY_BYTES: Final = 4 << 30
@@ -24,6 +26,12 @@ LARGEST: Final = 1e9
 SMALLEST: Final = 1e-9
 """Of lengths [mm]."""
 _T = TypeVar("_T")
+IT: Final = "it"
+"""The key path of a field that pydantic has named already."""
+
+
+class PhantomError(TwinError):
+    """A phantom that cannot be built: what was asked, what is allowed, where."""
 
 
 def wrong(value: object, where: str, allowed: str) -> PhantomError:
@@ -106,30 +114,41 @@ def axes(value: object, where: str) -> Matrix:
     return (rows[0], rows[1], rows[2])
 
 
-def pack(array: npt.NDArray[np.generic]) -> dict[str, object]:
-    """An array as `{dtype, shape, data}`, base64 in C order; give it little-endian."""
-    data = base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
-    return {"dtype": array.dtype.str, "shape": list(array.shape), "data": data}
+Text = Annotated[str, BeforeValidator(partial(string, where=IT))]
+Number = Annotated[float, BeforeValidator(partial(number, where=IT))]
+Place = Annotated[Vector, BeforeValidator(partial(vector, where=IT))]
+Lengths = Annotated[Vector, BeforeValidator(partial(lengths, where=IT))]
 
 
-def unpack(document: object, dtype: str, where: str) -> npt.NDArray[np.generic]:
-    """The array of a document that `pack` made; only `dtype` is accepted, nothing is executed."""
-    if get(document, "dtype", where) != dtype:
-        raise wrong(get(document, "dtype", where), f"{where}.dtype", dtype)
-    shape = each(get(document, "shape", where), f"{where}.shape", _count)
-    text = get(document, "data", where)
-    if not isinstance(text, str):
-        raise wrong(text, f"{where}.data", "base64 text")
-    size = math.prod(shape) * np.dtype(dtype).itemsize
-    if size > MAX_ARRAY_BYTES:
-        raise wrong(shape, f"{where}.shape", f"at most {MAX_ARRAY_BYTES} bytes")
-    try:
-        raw = base64.b64decode(text, validate=True)
-    except (binascii.Error, ValueError) as error:
-        raise PhantomError(f"{where}.data is not base64: {error}", {"path": where}) from None
-    if len(raw) != size:
-        raise wrong(f"{len(raw)} bytes", f"{where}.data", f"{size} bytes, for shape {shape}")
-    return np.frombuffer(raw, dtype=dtype).reshape(shape)
+def packed(dtype: str) -> PlainValidator:
+    """How pydantic reads an array of `dtype` that `PACK` wrote; nothing is executed."""
+
+    def read(value: object) -> npt.NDArray[np.generic]:
+        if get(value, "dtype", IT) != dtype:
+            raise wrong(get(value, "dtype", IT), "dtype", dtype)
+        shape = each(get(value, "shape", IT), "shape", _count)
+        size = math.prod(shape) * np.dtype(dtype).itemsize
+        if size > MAX_ARRAY_BYTES:
+            raise wrong(shape, "shape", f"at most {MAX_ARRAY_BYTES} bytes")
+        try:
+            raw = base64.b64decode(str(get(value, "data", IT)), validate=True)
+        except ValueError as error:
+            raise PhantomError(f"data is not base64: {error}") from None
+        if len(raw) != size:
+            raise wrong(f"{len(raw)} bytes", "data", f"{size} bytes, for shape {shape}")
+        return np.frombuffer(raw, dtype=dtype).reshape(shape)
+
+    return PlainValidator(read)
+
+
+def _pack(array: npt.NDArray[np.generic]) -> dict[str, object]:
+    little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
+    data = base64.b64encode(little.tobytes()).decode("ascii")
+    return {"dtype": little.dtype.str, "shape": list(array.shape), "data": data}
+
+
+PACK: Final = PlainSerializer(_pack, when_used="json")
+"""An array as `{dtype, shape, data}`, base64 in C order, little-endian."""
 
 
 def _count(value: object, where: str) -> int:

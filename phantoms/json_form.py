@@ -1,6 +1,6 @@
-"""Scenes, meshes and grids as JSON-able documents and back, for the wire and for files.
+"""Scenes as JSON-able documents and back, for the wire and for files.
 
-Shapes are tagged by kind; arrays are base64. Every field is validated by `checked_reading`.
+Shapes are tagged by kind. Every field is validated by `checked_reading`.
 """
 
 from __future__ import annotations
@@ -9,11 +9,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any, Final
 
-import numpy as np
-
 from flexdt.phantoms import checked_reading as reading
-from flexdt.phantoms.checked_reading import each, get, number, pack, unpack, wrong
-from flexdt.phantoms.pieces import PhantomError, Surface, Voxels
+from flexdt.phantoms.checked_reading import PhantomError, each, get, number, wrong
 from flexdt.twin.projection.analytic_solids import (
     Box,
     ConvexPolyhedron,
@@ -92,55 +89,6 @@ def scene_from_dict(document: object, where: str = "scene") -> Scene:
     if isinstance(solids, list | tuple) and len(solids) > MAX_SOLIDS:
         raise wrong(f"{len(solids)} solids", f"{where}.solids", f"at most {MAX_SOLIDS}")
     return Scene(each(solids, f"{where}.solids", _solid))
-
-
-def surface_to_dict(surface: Surface) -> dict[str, object]:
-    """JSON-able document of a triangle mesh."""
-    return {
-        "vertices": pack(surface.vertices.astype("<f8")),
-        "faces": pack(surface.faces.astype("<i4")),
-        "material": surface.material,
-        "mu_per_mm": surface.mu_per_mm,
-    }
-
-
-def surface_from_dict(document: object, where: str = "surface") -> Surface:
-    """The mesh of a document that `surface_to_dict` made; raises PhantomError."""
-    return Surface(
-        unpack(get(document, "vertices", where), "<f8", f"{where}.vertices").astype(np.float64),
-        unpack(get(document, "faces", where), "<i4", f"{where}.faces").astype(np.int32),
-        reading.string(get(document, "material", where), f"{where}.material"),
-        number(get(document, "mu_per_mm", where), f"{where}.mu_per_mm"),
-    )
-
-
-def voxels_to_dict(voxels: Voxels) -> dict[str, object]:
-    """JSON-able document of a grid."""
-    return {
-        "data": pack(voxels.data.astype("<f4")),
-        "voxel_mm": list(voxels.voxel_mm),
-        "center_mm": list(voxels.center_mm),
-        **({} if voxels.material is None else {"material": voxels.material}),
-        **(
-            {}
-            if voxels.labels is None
-            else {"labels": pack(voxels.labels), "materials": list(voxels.materials)}
-        ),
-    }
-
-
-def voxels_from_dict(document: object, where: str = "voxels") -> Voxels:
-    """The grid of a document that `voxels_to_dict` made; raises PhantomError."""
-    given = reading.mapping(document, where)
-    made_of, labels = given.get("material"), given.get("labels")
-    return Voxels(
-        unpack(get(document, "data", where), "<f4", f"{where}.data").astype(np.float32),
-        reading.lengths(get(document, "voxel_mm", where), f"{where}.voxel_mm"),
-        reading.vector(get(document, "center_mm", where), f"{where}.center_mm"),
-        None if made_of is None else reading.string(made_of, f"{where}.material"),
-        None if labels is None else unpack(labels, "|u1", f"{where}.labels").astype(np.uint8),
-        reading.each(given.get("materials", []), f"{where}.materials", reading.string),
-    )
 
 
 def _solid(document: object, where: str) -> Solid:

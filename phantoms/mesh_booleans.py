@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.phantoms.pieces import PhantomError, Surface, bounds
+from flexdt.phantoms.checked_reading import PhantomError
+from flexdt.phantoms.pieces import Surface, bounds
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection import TriangleMesh
 from flexdt.twin.projection.analytic_solids import Box, ConvexPolyhedron, Scene, Solid

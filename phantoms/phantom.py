@@ -12,17 +12,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+from pydantic import PlainSerializer, PlainValidator, ValidationError
 
 from flexdt.phantoms import checked_reading as reading
-from flexdt.phantoms import json_form as serial
+from flexdt.phantoms.checked_reading import PhantomError
+from flexdt.phantoms.json_form import scene_from_dict, scene_to_dict
 from flexdt.phantoms.mesh_booleans import cut
-from flexdt.phantoms.pieces import PhantomError, Surface, Voxels, freeze
+from flexdt.phantoms.pieces import Surface, Voxels, freeze
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.projection.analytic_solids import Scene, Vector
-from flexdt.twin.values import ArrayValue
+from flexdt.twin.projection.analytic_solids import Scene
+from flexdt.twin.values import ArrayValue, adapter_of, told
 
 if TYPE_CHECKING:
     import trimesh
@@ -35,6 +38,18 @@ SCHEMA = 1
 
 VOXELS_ALONG_LONGEST = 256
 """Resolution of `volume()` when no voxel size is asked for."""
+
+
+_Scene = Annotated[
+    Scene,
+    PlainValidator(partial(scene_from_dict, where="phantom.scene")),
+    PlainSerializer(scene_to_dict, when_used="json"),
+]
+_LIST = PlainSerializer(np.ndarray.tolist, when_used="json")
+_PLACES = PlainValidator(partial(reading.each, where="phantom.beads", read=reading.vector))
+_RADII = PlainValidator(
+    partial(reading.each, where="phantom.bead_radius_mm", read=reading.positive)
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,13 +68,15 @@ class Phantom(ArrayValue):
         voxels: ready grid, for a phantom that came as one.
     """
 
-    name: str
-    description: str
-    scene: Scene
-    size_mm: Vector
-    beads: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    bead_radius_mm: FloatArray = field(default_factory=lambda: np.zeros(0))
-    assumed: tuple[str, ...] = ()
+    name: reading.Text
+    description: reading.Text
+    scene: _Scene
+    size_mm: reading.Lengths
+    beads: Annotated[FloatArray, _PLACES, _LIST] = field(default_factory=lambda: np.zeros((0, 3)))
+    bead_radius_mm: Annotated[FloatArray, _RADII, _LIST] = field(
+        default_factory=lambda: np.zeros(0)
+    )
+    assumed: tuple[reading.Text, ...] = ()
     surfaces: tuple[Surface, ...] = ()
     voxels: Voxels | None = None
 
@@ -138,19 +155,11 @@ class Phantom(ArrayValue):
 
     def to_dict(self) -> dict[str, object]:
         """JSON-able document; `from_dict` gives an equal phantom."""
-        surfaces = [serial.surface_to_dict(one) for one in self.surfaces]
-        return {
-            "schema": SCHEMA,
-            "name": self.name,
-            "description": self.description,
-            "size_mm": list(self.size_mm),
-            "beads": self.beads.tolist(),
-            "bead_radius_mm": self.bead_radius_mm.tolist(),
-            "assumed": list(self.assumed),
-            "scene": serial.scene_to_dict(self.scene),
-            **({"surfaces": surfaces} if surfaces else {}),
-            **({} if self.voxels is None else {"voxels": serial.voxels_to_dict(self.voxels)}),
-        }
+        document = adapter_of(Phantom).dump_python(self, mode="json", exclude_none=True)
+        for place, name in ((document, "surfaces"), (document.get("voxels", {}), "materials")):
+            if not place.get(name):  # left out where there are none
+                place.pop(name, None)
+        return {"schema": SCHEMA, **document}
 
     @classmethod
     def from_dict(cls, document: object) -> Phantom:
@@ -159,29 +168,16 @@ class Phantom(ArrayValue):
         Raises:
             PhantomError: names the key path, the value and what is allowed.
         """
-        doc = reading.mapping(document, "phantom")
+        doc = {"description": "", **reading.mapping(document, "phantom")}
         if reading.get(doc, "schema", "phantom") != SCHEMA:
             raise reading.wrong(doc["schema"], "phantom.schema", str(SCHEMA))
-        voxels, only = doc.get("voxels"), doc.get("surface")  # one surface: as 0.2.0 wrote it
-        surfaces = doc.get("surfaces", [] if only is None else [only])
-        return cls(
-            reading.string(reading.get(doc, "name", "phantom"), "phantom.name"),
-            reading.string(doc.get("description", ""), "phantom.description"),
-            serial.scene_from_dict(reading.get(doc, "scene", "phantom"), "phantom.scene"),
-            reading.lengths(reading.get(doc, "size_mm", "phantom"), "phantom.size_mm"),
-            np.array(
-                reading.each(doc.get("beads", []), "phantom.beads", reading.vector),
-                dtype=np.float64,
-            ).reshape(-1, 3),
-            np.array(
-                reading.each(
-                    doc.get("bead_radius_mm", []), "phantom.bead_radius_mm", reading.positive
-                )
-            ),
-            reading.each(doc.get("assumed", []), "phantom.assumed", reading.string),
-            reading.each(surfaces, "phantom.surfaces", serial.surface_from_dict),
-            None if voxels is None else serial.voxels_from_dict(voxels, "phantom.voxels"),
-        )
+        if "surface" in doc:  # one: as 0.2.0 wrote it
+            doc["surfaces"] = [doc["surface"]]
+        try:
+            made: Phantom = adapter_of(Phantom).validate_python(doc)
+        except ValidationError as error:
+            raise PhantomError(*told("phantom", error)) from None
+        return made
 
 
 def assemble(

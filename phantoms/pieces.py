@@ -8,19 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.errors import TwinError
+from flexdt.phantoms.checked_reading import PACK, Lengths, Number, PhantomError, Place, Text, packed
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection.analytic_solids import Cylinder, Scene, Shape, Vector
 from flexdt.twin.projection.convex import as_convex
 from flexdt.twin.values import ArrayValue
-
-
-class PhantomError(TwinError):
-    """A phantom that cannot be built: what was asked, what is allowed, where."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +31,10 @@ class Surface(ArrayValue):
         mu_per_mm: attenuation inside [1/mm].
     """
 
-    vertices: FloatArray
-    faces: npt.NDArray[np.int32]
-    material: str
-    mu_per_mm: float
+    vertices: Annotated[FloatArray, packed("<f8"), PACK]
+    faces: Annotated[npt.NDArray[np.int32], packed("<i4"), PACK]
+    material: Text
+    mu_per_mm: Number
 
     def __post_init__(self) -> None:
         vertices = np.array(self.vertices, dtype=np.float64).reshape(-1, 3)
@@ -61,12 +58,12 @@ class Voxels(ArrayValue):
         materials: their names.
     """
 
-    data: npt.NDArray[np.float32]
-    voxel_mm: Vector
-    center_mm: Vector = (0.0, 0.0, 0.0)
-    material: str | None = None
-    labels: npt.NDArray[np.uint8] | None = None
-    materials: tuple[str, ...] = ()
+    data: Annotated[npt.NDArray[np.float32], packed("<f4"), PACK]
+    voxel_mm: Lengths
+    center_mm: Place = (0.0, 0.0, 0.0)
+    material: Text | None = None
+    labels: Annotated[npt.NDArray[np.uint8], packed("|u1"), PACK] | None = None
+    materials: tuple[Text, ...] = ()
 
     def __post_init__(self) -> None:
         data = np.array(self.data, dtype=np.float32)

@@ -14,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from flexdt.phantoms.catalog import is_shipped, load_phantom, phantom_names
+from flexdt.phantoms.checked_reading import PhantomError
 from flexdt.phantoms.files.mesh_files import FORMATS, filled_mesh, mesh_phantom, voxel_phantom
 from flexdt.phantoms.files.phantom_files import (
     phantom_of,
@@ -23,7 +24,7 @@ from flexdt.phantoms.files.phantom_files import (
 )
 from flexdt.phantoms.materials import material as material_of
 from flexdt.phantoms.phantom import Phantom, assemble
-from flexdt.phantoms.pieces import PhantomError, size_about_origin
+from flexdt.phantoms.pieces import size_about_origin
 from flexdt.twin.errors import UnknownNameError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection import Volume

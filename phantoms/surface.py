@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import trimesh
 
-from flexdt.phantoms.pieces import PhantomError
+from flexdt.phantoms.checked_reading import PhantomError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection.analytic_solids import (
     Box,

@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.phantoms import voxelise_kernels as kernels
-from flexdt.phantoms.pieces import PhantomError, Surface, Voxels, bounds
+from flexdt.phantoms.checked_reading import PhantomError
+from flexdt.phantoms.pieces import Surface, Voxels, bounds
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection import Volume
 from flexdt.twin.projection.analytic_solids import Scene, Shape, Vector

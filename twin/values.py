@@ -65,12 +65,17 @@ class JsonValue:
         try:
             value: Self = adapter_of(cls).validate_json(json.dumps(document))
         except ValidationError as error:
-            lines = [
-                f"{cls.__name__}: {'.'.join(map(str, e['loc'])) or 'document'}: {message_of(e)}"
-                for e in error.errors(include_url=False, include_context=False)[:10]
-            ]
-            raise TwinError("\n".join(lines), {"problems": lines}) from None
+            raise TwinError(*told(cls.__name__, error)) from None
         return value
+
+
+def told(name: str, error: ValidationError) -> tuple[str, dict[str, object]]:
+    """What does not hold in a document, place by place: an error's message and data."""
+    lines = [
+        f"{name}: {'.'.join(map(str, e['loc'])) or 'document'}: {message_of(e)}"
+        for e in error.errors(include_url=False, include_context=False)[:10]
+    ]
+    return "\n".join(lines), {"problems": lines}
 
 
 def message_of(problem: Mapping[str, Any]) -> str:

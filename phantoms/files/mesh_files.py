@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.phantoms.checked_reading import PhantomError
 from flexdt.phantoms.files.gltf import read_glb
 from flexdt.phantoms.materials import material as material_of
 from flexdt.phantoms.phantom import Phantom
-from flexdt.phantoms.pieces import PhantomError, Surface, Voxels
+from flexdt.phantoms.pieces import Surface, Voxels
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection.analytic_solids import ConvexPolyhedron, Scene, Solid, Vector
 

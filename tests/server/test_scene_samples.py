@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,6 @@ from stored_upload import completed
 from flexdt.clients.client.uploads import scene as to_upload
 from flexdt.phantoms import Phantom, PhantomError, Surface, bead_phantom, load_phantom
 from flexdt.phantoms.files import phantom_files
-from flexdt.phantoms.json_form import surface_to_dict
 from flexdt.phantoms.samples import as_phantom
 from flexdt.server.scans.stage import Stage
 from flexdt.server.storage import mesh_reading
@@ -88,11 +88,11 @@ def test_what_does_not_hold_is_refused_with_its_place(document: object, message:
 def test_an_open_mesh_inside_a_document_is_refused() -> None:
     ball = trimesh.creation.icosphere(subdivisions=1, radius=5)
     whole = Surface(ball.vertices, ball.faces, "abs", 0.02)
-    document = Phantom("m", "", Scene(()), (10.0, 10.0, 10.0), surfaces=(whole, whole)).to_dict()
-    assert len(sent(document).surfaces) == 2
+    made = Phantom("m", "", Scene(()), (10.0, 10.0, 10.0), surfaces=(whole, whole))
+    assert len(sent(made.to_dict()).surfaces) == 2
     holed = Surface(ball.vertices, ball.faces[1:], "abs", 0.02)
     with pytest.raises(PhantomError, match="not closed"):
-        sent({**document, "surfaces": [surface_to_dict(holed)]})
+        sent(replace(made, surfaces=(holed,)).to_dict())
 
 
 def test_a_size_that_is_said_too_small_does_not_hide_the_solids() -> None:
