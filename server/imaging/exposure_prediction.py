@@ -10,7 +10,6 @@ from flexdt.phantoms.exposure_forecast import expose
 from flexdt.protocol import Codec
 from flexdt.protocol import results as r
 from flexdt.protocol.connection import encoded
-from flexdt.protocol.messages import Encoded
 from flexdt.protocol.method_table import PREDICTION_LIMITS
 from flexdt.server.runtime.workers import Workers
 from flexdt.twin.machine.description import Machine
@@ -25,26 +24,14 @@ def predictors() -> Workers:
     return Workers(1, int(limits["memory_bytes"]), float(limits["seconds"]))
 
 
-async def predicted(
-    workers: Workers, phantom: Phantom, machine: Machine, settings: dict[str, Any], codec: Codec
-) -> Encoded:
-    """The answer to `exposure.predict`, encoded.
-
-    Args:
-        workers: made by `predictors`.
-        phantom: the sample.
-        machine: the scanner.
-        settings: further arguments of `expose`.
-        codec: of the answer.
+def predict(
+    phantom: Phantom, machine: Machine, settings: dict[str, Any], codec: Codec
+) -> list[bytes]:
+    """In the worker: the answer to `exposure.predict`, encoded; `settings` are `expose`'s.
 
     Raises:
-        RpcError: an argument that the machine does not allow, or -32008.
+        RpcError: an argument that the machine does not allow.
     """
-    return Encoded(tuple(await workers.ask(work, phantom, machine, settings, codec)))
-
-
-def work(phantom: Phantom, machine: Machine, settings: dict[str, Any], codec: Codec) -> list[bytes]:
-    """In the worker: the encoded result."""
     told = asdict(expose(phantom, machine=machine, **settings))
     told["transmission"]["edges"] = told["transmission"]["edges"][:-1]  # no infinity in JSON
     told |= {"sample": phantom.name, "best": told["best"][:BEST], "frames": told.pop("images")}

@@ -29,13 +29,13 @@ from flexdt.twin.collision.convex_solids import Polytope
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import Machine, Profile
-from flexdt.twin.script import Problem, ScanPlan, StartState
+from flexdt.twin.script import Problem, ScanPlan, StartState, plan_poses
 from flexdt.twin.script.lexer import LIGHT_BYTES, is_light
 from flexdt.twin.script.planning.dry_run import (
     CheckReport,
     Clearance,
     CollisionCheck,
-    check_poses,
+    check_plan,
     check_script,
 )
 from flexdt.twin.script.planning.plan import SampleSize
@@ -99,10 +99,11 @@ class Matter:
                 wish.script, self.machine, self.profile,
                 start=self.start, sample=self.size, collision=sweep,
             )  # fmt: skip
-        return check_poses(
+        plan = plan_poses(
             wish.poses.decoded(), self.machine, self.profile, wish.exposure_ms,
-            start=self.start, sample=self.size, collision=sweep,
+            start=self.start, sample=self.size,
         )  # fmt: skip
+        return check_plan(plan, (), sweep)
 
 
 @dataclass(frozen=True)

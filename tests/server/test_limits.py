@@ -35,8 +35,9 @@ from flexdt.twin.dataset.dataset_errors import DiskFullError
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.scanner.scanner import ScannerTwin
-from flexdt.twin.script.planning.dry_run import check_poses, check_script
+from flexdt.twin.script.planning.dry_run import check_plan, check_script
 from flexdt.twin.script.planning.plan import StartState
+from flexdt.twin.script.planning.planner import plan_poses
 
 M = builtin_machine("flexray")
 P = builtin_profile(M.default_profile)
@@ -251,11 +252,11 @@ def test_a_component_alone_is_a_syntax_error(text: bytes) -> None:
 
 
 def test_absurd_settings_leave_a_finite_plan() -> None:
-    report = check_poses([{"rot_obj": 1.0}], M, P, 1e308)
+    report = check_plan(plan_poses([{"rot_obj": 1.0}], M, P, 1e308))
     assert not report.ok
     assert math.isfinite(report.plan.duration_s)
     start = replace(StartState.of(M), kV=1e-320, xrays_on=True)
-    report = check_poses([{"rot_obj": 1.0}], M, P, 50.0, start=start)
+    report = check_plan(plan_poses([{"rot_obj": 1.0}], M, P, 50.0, start=start))
     json.dumps(report.to_dict(), allow_nan=False)
     scanner = ScannerTwin(M, P)
     for rate in (1e-320, 1e-9, 0.0, -1.0, math.nan):

@@ -6,7 +6,7 @@ from flexdt.twin.script.planning.dry_run import (
     CheckReport,
     Clearance,
     Collision,
-    check_poses,
+    check_plan,
     check_script,
 )
 from flexdt.twin.script.planning.dry_run_report import html_report
@@ -33,7 +33,7 @@ __all__ = [
     "StartState",
     "Step",
     "Wait",
-    "check_poses",
+    "check_plan",
     "check_script",
     "html_report",
     "parse_script",

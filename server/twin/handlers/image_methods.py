@@ -16,7 +16,7 @@ from flexdt.protocol.fields import Empty, ImageValue
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.rpc_errors import invalid_params, too_large
 from flexdt.server.imaging.exposure_flags import marks_of
-from flexdt.server.imaging.exposure_prediction import predicted
+from flexdt.server.imaging.exposure_prediction import predict as forecast
 from flexdt.server.storage.stored_samples import EMPTY
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client
@@ -133,4 +133,5 @@ async def predict(twin: TwinServer, client: Client, params: p.ExposurePredict) -
     async with twin.samples.turn:
         phantom = await asyncio.to_thread(twin.samples.load, name, material)
     codec = client.peer.codec
-    return await predicted(twin.predictors, phantom, twin.machine, settings, codec)
+    pieces = await twin.predictors.ask(forecast, phantom, twin.machine, settings, codec)
+    return Encoded(tuple(pieces))

@@ -21,9 +21,10 @@ from flexdt.twin.script import (
     SampleSize,
     ScanPlan,
     StartState,
-    check_poses,
+    check_plan,
     check_script,
     html_report,
+    plan_poses,
 )
 from flexdt.twin.script.planning.dry_run_report import clearance_plot, summary
 from tests.twin.script.conftest import Planner, blob, tabbed
@@ -402,7 +403,7 @@ def test_start_and_stage_are_told_in_every_form(
 
 def test_poses_are_checked_alike(flexray: Machine, profile: Profile) -> None:
     poses, start = [{"rot_obj": 0.0}, {"mag_obj": 1500.0}], StartState.of(flexray)
-    made = check_poses(poses, flexray, profile, 50.0, start=start)
+    made = check_plan(plan_poses(poses, flexray, profile, 50.0, start=start))
     assert [(p.line, p.code) for p in made.problems] == [(2, "limit_clamped")]
     assert made.plan.frames == 2
 

@@ -24,7 +24,7 @@ from flexdt.twin.script.planning.plan import (
     step_range,
     total_range,
 )
-from flexdt.twin.script.planning.planner import plan_poses, plan_script
+from flexdt.twin.script.planning.planner import plan_script
 from flexdt.twin.script.planning.sample_in_beam import View, views
 from flexdt.twin.script.problems import Problem, WithProblems, in_order
 
@@ -253,32 +253,6 @@ def check_script(
     bare = c.Script(script.commands, (), script.lines)
     plan = plan_script(bare, machine, profile, start=start, sample=sample)
     return check_plan(plan, problems, collision, shown, start is not None)
-
-
-def check_poses(
-    poses: Sequence[Mapping[str, float]],
-    machine: Machine,
-    profile: Profile,
-    exposure_ms: float | None = None,
-    *,
-    start: StartState | None = None,
-    sample: SampleSize | None = None,
-    collision: CollisionCheck | None = None,
-) -> CheckReport:
-    """The same for streamed poses; line i + 1 is pose i.
-
-    Raises:
-        UnknownNameError: a pose names an axis that the machine does not have.
-
-    Example:
-        >>> from flexdt.twin.machine.description import builtin_machine, builtin_profile
-        >>> machine = builtin_machine("flexray")
-        >>> profile = builtin_profile(machine.default_profile)
-        >>> check_poses([{"rot_obj": 0.0}, {"rot_obj": 9999.0}], machine, profile, 100.0).ok
-        True
-    """
-    plan = plan_poses(poses, machine, profile, exposure_ms, start=start, sample=sample)
-    return check_plan(plan, (), collision, "", start is not None)
 
 
 def check_plan(
