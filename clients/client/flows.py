@@ -9,7 +9,7 @@ import asyncio
 import inspect
 from collections.abc import Awaitable, Callable, Generator, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, Final, TypeAlias, TypeVar
 
 from pydantic import BaseModel
 
@@ -17,6 +17,9 @@ from flexdt.protocol import parse_result
 
 _R = TypeVar("_R")
 _M = TypeVar("_M", bound=BaseModel)
+
+OWN_PATIENCE: Final = -1.0
+"""As a timeout: the client's own."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,7 @@ class Ask:
 
     method: str
     params: Mapping[str, object]
-    patience_s: float | None = -1.0
+    patience_s: float | None = OWN_PATIENCE
 
 
 @dataclass(frozen=True)
@@ -54,9 +57,15 @@ Flow: TypeAlias = Generator[Effect, Any, _R]
 
 
 def ask(
-    method: str, params: Mapping[str, object], model: type[_M], patience_s: float | None = -1.0
+    method: str, model: type[_M], patience_s: float | None = OWN_PATIENCE, /, **params: object
 ) -> Flow[_M]:
     """Call `method` and validate its result as `model`; params that are None are not sent.
+
+    Args:
+        method: of the wire.
+        model: of its result.
+        patience_s: see `Ask`.
+        params: of the method, by name.
 
     Raises:
         RpcError: the server's answer is an error, or does not fit `model`.

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from flexdt.clients.client import uploads
 from flexdt.clients.client.events import Projection
-from flexdt.clients.client.flows import Flow, Sleep, Tell, ask
+from flexdt.clients.client.flows import OWN_PATIENCE, Flow, Sleep, Tell, ask
 from flexdt.protocol import image as wire_image
 from flexdt.protocol import results as r
 from flexdt.protocol import state_model as s
@@ -45,7 +45,7 @@ def control(action: Literal["acquire", "release", "force"]) -> Flow[r.ControlRes
         >>> twin.control("acquire").yours
         True
     """
-    return ask("session.control", {"action": action}, r.ControlResult)
+    return ask("session.control", r.ControlResult, action=action)
 
 
 def ping() -> Flow[float]:
@@ -55,7 +55,7 @@ def ping() -> Flow[float]:
         >>> twin.ping() <= twin.ping()  # the twin's clock [s]
         True
     """
-    return (yield from ask("session.ping", {}, r.Pong)).time
+    return (yield from ask("session.ping", r.Pong)).time
 
 
 def discover() -> Flow[dict[str, Any]]:
@@ -65,7 +65,7 @@ def discover() -> Flow[dict[str, Any]]:
         >>> "axes.move" in [method["name"] for method in twin.discover()["methods"]]
         True
     """
-    return (yield from ask("rpc.discover", {}, Result)).model_dump(mode="python")
+    return (yield from ask("rpc.discover", Result)).model_dump(mode="python")
 
 
 # -- state and motion --------------------------------------------------------------------
@@ -78,7 +78,7 @@ def state() -> Flow[s.State]:
         >>> twin.state().axes["rot_obj"].unit
         'deg'
     """
-    return ask("state.get", {}, s.State)
+    return ask("state.get", s.State)
 
 
 def move(
@@ -106,12 +106,10 @@ def move(
         >>> round(twin.state().axes["rot_obj"].position, 6)
         30.0
     """
-    params = {
-        "targets": dict(targets), "relative": relative, "wait": wait, "plan": plan,
-        "shortest": shortest,
-    }  # fmt: skip
-    patience = None if wait else -1.0
-    return ask("axes.move", params, r.MoveResult, patience)
+    return ask(
+        "axes.move", r.MoveResult, None if wait else OWN_PATIENCE, targets=dict(targets),
+        relative=relative, wait=wait, plan=plan, shortest=shortest,
+    )  # fmt: skip
 
 
 def jog(axis: str, velocity: float, lease_s: float = 0.5) -> Flow[r.MoveResult]:
@@ -121,8 +119,7 @@ def jog(axis: str, velocity: float, lease_s: float = 0.5) -> Flow[r.MoveResult]:
         >>> twin.jog("rot_obj", 5.0, lease_s=0.2).warnings
         []
     """
-    params = {"axis": axis, "velocity": velocity, "lease_s": lease_s}
-    return ask("axes.jog", params, r.MoveResult)
+    return ask("axes.jog", r.MoveResult, axis=axis, velocity=velocity, lease_s=lease_s)
 
 
 def set_axis(
@@ -134,8 +131,7 @@ def set_axis(
         >>> twin.set_axis("rot_obj", speed=10.0).speed
         10.0
     """
-    params = {"axis": axis, "speed": speed, "acceleration": acceleration}
-    return ask("axes.set", params, r.AxisSetResult)
+    return ask("axes.set", r.AxisSetResult, axis=axis, speed=speed, acceleration=acceleration)
 
 
 def stop() -> Flow[s.Stopped]:
@@ -145,7 +141,7 @@ def stop() -> Flow[s.Stopped]:
         >>> twin.stop().safety.estop
         False
     """
-    return ask("axes.stop", {}, s.Stopped)
+    return ask("axes.stop", s.Stopped)
 
 
 def estop() -> Flow[s.Stopped]:
@@ -155,7 +151,7 @@ def estop() -> Flow[s.Stopped]:
         >>> twin.estop().safety.estop, twin.reset().safety.estop
         (True, False)
     """
-    return ask("safety.estop", {}, s.Stopped)
+    return ask("safety.estop", s.Stopped)
 
 
 def reset() -> Flow[s.State]:
@@ -165,7 +161,7 @@ def reset() -> Flow[s.State]:
         >>> twin.reset().safety.state
         'ok'
     """
-    return ask("safety.reset", {}, s.State)
+    return ask("safety.reset", s.State)
 
 
 # -- settings ----------------------------------------------------------------------------
@@ -178,7 +174,7 @@ def set_clock(speed_up: SpeedUp) -> Flow[s.ClockState]:
         >>> twin.set_clock("max").speed_up
         'max'
     """
-    return ask("clock.set", {"speed_up": speed_up}, s.ClockState)
+    return ask("clock.set", s.ClockState, speed_up=speed_up)
 
 
 def set_tube(
@@ -191,7 +187,7 @@ def set_tube(
         >>> tube.kV, tube.power_W
         (80.0, 20.0)
     """
-    return ask("tube.set", {"kV": kV, "power_W": power_W, "on": on}, s.TubeState)
+    return ask("tube.set", s.TubeState, kV=kV, power_W=power_W, on=on)
 
 
 def set_camera(
@@ -208,11 +204,10 @@ def set_camera(
         >>> twin.set_camera(exposure_ms=200.0).exposure_ms
         200.0
     """
-    params = {
-        "exposure_ms": exposure_ms, "mode": mode, "roi": None if roi is None else list(roi),
-        "averages": averages, "frames": frames,
-    }  # fmt: skip
-    return ask("camera.set", params, s.CameraState)
+    return ask(
+        "camera.set", s.CameraState, exposure_ms=exposure_ms, mode=mode,
+        roi=None if roi is None else list(roi), averages=averages, frames=frames,
+    )  # fmt: skip
 
 
 # -- samples -----------------------------------------------------------------------------
@@ -225,7 +220,7 @@ def samples() -> Flow[r.SampleListResult]:
         >>> "lego" in [sample.name for sample in twin.samples().samples]
         True
     """
-    return ask("sample.list", {}, r.SampleListResult)
+    return ask("sample.list", r.SampleListResult)
 
 
 def set_sample(
@@ -247,11 +242,8 @@ def set_sample(
         >>> twin.set_sample("lego").sample.name
         'lego'
     """
-    params = {
-        "name": name, "file": file, "material": material,
-        "offset": None if offset is None else dict(offset),
-    }  # fmt: skip
-    return ask("sample.set", params, r.SampleResult)
+    place = None if offset is None else dict(offset)
+    return ask("sample.set", r.SampleResult, name=name, file=file, material=material, offset=place)
 
 
 def sample_mesh() -> Flow[bytes]:
@@ -269,7 +261,7 @@ def sample_mesh() -> Flow[bytes]:
     while True:
         content, first = b"", None
         while first is None or len(content) < first.total:
-            part = yield from ask("sample.mesh", {"start": len(content)}, r.SampleMeshResult)
+            part = yield from ask("sample.mesh", r.SampleMeshResult, start=len(content))
             first = part if first is None else first
             if (part.name, part.revision, part.total) != (first.name, first.revision, first.total):
                 break  # another sample is on the stage by now: start again
@@ -366,7 +358,7 @@ def _upload(
 ) -> Flow[r.UploadResult]:
     done = None
     for chunk in upload.chunks():
-        done = yield from ask("sample.upload", chunk, r.UploadResult)
+        done = yield from ask("sample.upload", r.UploadResult, **chunk)
         if progress is not None:
             yield Tell(progress, (done.received, len(upload.data)))
     assert done is not None
@@ -403,11 +395,10 @@ def projection(
         >>> projection.image.shape, projection.kind
         ((95, 119), 'line_integral')
     """
-    params = {
-        "kind": kind, "binning": binning, "marks": marks or None, "positions": positions,
-        "tube": tube, "camera": camera,
-    }  # fmt: skip
-    answer = yield from ask("projection.get", params, WireProjection)
+    answer = yield from ask(
+        "projection.get", WireProjection, kind=kind, binning=binning, marks=marks or None,
+        positions=positions, tube=tube, camera=camera,
+    )  # fmt: skip
     return Projection.from_wire(answer)
 
 
@@ -427,7 +418,7 @@ def ray(column: float, row: float) -> Flow[dict[str, float]]:
         >>> all(mm >= 0.0 for mm in twin.ray(477.5, 379.5).values())
         True
     """
-    told = yield from ask("projection.ray", {"pixel": [column, row]}, r.RayResult)
+    told = yield from ask("projection.ray", r.RayResult, pixel=[column, row])
     return dict(told.paths_mm)
 
 
@@ -438,7 +429,7 @@ def geometry() -> Flow[s.GeometryResult]:
         >>> len(twin.geometry().cone_vec)
         12
     """
-    return ask("geometry.get", {}, s.GeometryResult)
+    return ask("geometry.get", s.GeometryResult)
 
 
 # -- scripts and jobs --------------------------------------------------------------------
@@ -475,12 +466,11 @@ def predict_exposure(
         >>> 0.0 < told.transmission.least < told.transmission.median <= 1.1, told.asked.kV
         (True, 60.0)
     """
-    params = {
-        "sample": sample, "kV": kV, "power_W": power_W, "filter": filter,
-        "exposure_ms": exposure_ms, "averages": averages, "frames": frames, "detail": detail,
-        "sod_mm": sod_mm, "sdd_mm": sdd_mm,
-    }  # fmt: skip
-    return ask("exposure.predict", params, r.ExposurePrediction)
+    return ask(
+        "exposure.predict", r.ExposurePrediction, sample=sample, kV=kV, power_W=power_W,
+        filter=filter, exposure_ms=exposure_ms, averages=averages, frames=frames, detail=detail,
+        sod_mm=sod_mm, sdd_mm=sdd_mm,
+    )  # fmt: skip
 
 
 def check_script(script: str | bytes, name: str | None = None) -> Flow[r.CheckResult]:
@@ -491,8 +481,7 @@ def check_script(script: str | bytes, name: str | None = None) -> Flow[r.CheckRe
         >>> twin.check_script(script).ok
         True
     """
-    params = {**_script(script), "name": name}
-    return ask("script.check", params, r.CheckResult, None)
+    return ask("script.check", r.CheckResult, None, **_script(script), name=name)
 
 
 def submit_script(
@@ -521,11 +510,10 @@ def submit_script(
         >>> twin.wait_job(job).state
         'done'
     """
-    params = {
-        **_script(script), "name": name, "speed_up": speed_up, "seed": seed,
-        "motion_samples": motion_samples,
-    }  # fmt: skip
-    return ask("script.submit", params, r.SubmitResult, None)
+    return ask(
+        "script.submit", r.SubmitResult, None, **_script(script), name=name, speed_up=speed_up,
+        seed=seed, motion_samples=motion_samples,
+    )  # fmt: skip
 
 
 def check_trajectory(
@@ -538,8 +526,8 @@ def check_trajectory(
         >>> twin.check_trajectory(poses, 100.0).frames
         2
     """
-    params = {"poses": [dict(p) for p in poses], "exposure_ms": exposure_ms}
-    return ask("trajectory.check", params, r.CheckResult, None)
+    places = [dict(p) for p in poses]
+    return ask("trajectory.check", r.CheckResult, None, poses=places, exposure_ms=exposure_ms)
 
 
 def submit_trajectory(
@@ -558,11 +546,10 @@ def submit_trajectory(
         >>> twin.wait_job(job).frames_done
         2
     """
-    params = {
-        "poses": [dict(p) for p in poses], "exposure_ms": exposure_ms, "name": name,
-        "speed_up": speed_up, "seed": seed,
-    }  # fmt: skip
-    return ask("trajectory.submit", params, r.SubmitResult, None)
+    return ask(
+        "trajectory.submit", r.SubmitResult, None, poses=[dict(p) for p in poses],
+        exposure_ms=exposure_ms, name=name, speed_up=speed_up, seed=seed,
+    )  # fmt: skip
 
 
 def jobs() -> Flow[r.JobListResult]:
@@ -572,7 +559,7 @@ def jobs() -> Flow[r.JobListResult]:
         >>> all(job.frames_done <= job.frames_total for job in twin.jobs().jobs)
         True
     """
-    return ask("job.list", {}, r.JobListResult)
+    return ask("job.list", r.JobListResult)
 
 
 def job_status(job: str | None = None) -> Flow[s.JobStatus]:
@@ -585,7 +572,7 @@ def job_status(job: str | None = None) -> Flow[s.JobStatus]:
         >>> twin.wait_job(twin.abort_job(job).job).state in FINAL_STATES
         True
     """
-    return _job("status", job)
+    return ask("job.status", s.JobStatus, job=job)
 
 
 def pause_job(job: str | None = None) -> Flow[s.JobStatus]:
@@ -600,7 +587,7 @@ def pause_job(job: str | None = None) -> Flow[s.JobStatus]:
         >>> twin.wait_job(twin.abort_job(job).job).state in FINAL_STATES
         True
     """
-    return _job("pause", job)
+    return ask("job.pause", s.JobStatus, job=job)
 
 
 def resume_job(job: str | None = None) -> Flow[s.JobStatus]:
@@ -615,7 +602,7 @@ def resume_job(job: str | None = None) -> Flow[s.JobStatus]:
         >>> twin.wait_job(twin.abort_job(job).job).state in FINAL_STATES
         True
     """
-    return _job("resume", job)
+    return ask("job.resume", s.JobStatus, job=job)
 
 
 def step_job(job: str | None = None) -> Flow[s.JobStatus]:
@@ -634,7 +621,7 @@ def step_job(job: str | None = None) -> Flow[s.JobStatus]:
         >>> twin.wait_job(twin.abort_job(job).job).state in FINAL_STATES
         True
     """
-    return _job("step", job)
+    return ask("job.step", s.JobStatus, job=job)
 
 
 def abort_job(job: str | None = None) -> Flow[s.JobStatus]:
@@ -645,11 +632,7 @@ def abort_job(job: str | None = None) -> Flow[s.JobStatus]:
         >>> twin.wait_job(twin.abort_job(job).job).state
         'aborted'
     """
-    return _job("abort", job)
-
-
-def _job(action: str, job: str | None) -> Flow[s.JobStatus]:
-    return ask(f"job.{action}", {"job": job}, s.JobStatus)
+    return ask("job.abort", s.JobStatus, job=job)
 
 
 def wait_job(
@@ -709,9 +692,7 @@ def datasets(search: str = "", *, start: int = 0, count: int = 50) -> Flow[r.Dat
         >>> [found.name for found in twin.datasets("listed").datasets]
         ['listed']
     """
-    return ask(
-        "dataset.list", {"search": search, "start": start, "count": count}, r.DatasetListResult
-    )
+    return ask("dataset.list", r.DatasetListResult, search=search, start=start, count=count)
 
 
 def dataset(
@@ -736,8 +717,9 @@ def dataset(
         >>> twin.dataset("looked-at").positions["rot_obj"]
         [90.0, 0.0, 90.0]
     """
-    params = {"name": name, "points": points, "measure": measure, "script": script}
-    return ask("dataset.get", params, r.DatasetResult)
+    return ask(
+        "dataset.get", r.DatasetResult, name=name, points=points, measure=measure, script=script
+    )
 
 
 def dataset_frame(
@@ -766,8 +748,9 @@ def dataset_frame(
         >>> counts.dtype == np.uint16, what.image
         (True, 'dark')
     """
-    params = {"name": name, "index": index, "kind": kind, "binning": binning}
-    told = yield from ask("dataset.frame", params, r.DatasetFrameResult)
+    told = yield from ask(
+        "dataset.frame", r.DatasetFrameResult, name=name, index=index, kind=kind, binning=binning
+    )
     return wire_image.from_bytes(told.data, told.dtype, told.shape), told
 
 
@@ -789,10 +772,10 @@ def apply_calibration(
         >>> twin.revert_calibration().correction is None
         True
     """
-    params = {
-        "parameters": dict(parameters), "name": name, "comment": comment, "source": source,
-    }  # fmt: skip
-    return ask("calibration.apply", params, r.CorrectionResult)
+    return ask(
+        "calibration.apply", r.CorrectionResult, parameters=dict(parameters), name=name,
+        comment=comment, source=source,
+    )  # fmt: skip
 
 
 def calibration(name: str | None = None) -> Flow[s.Correction | None]:
@@ -802,8 +785,7 @@ def calibration(name: str | None = None) -> Flow[s.Correction | None]:
         >>> twin.calibration() is None  # none is in force
         True
     """
-    answer = yield from ask("calibration.get", {"name": name}, r.CorrectionResult)
-    return answer.correction
+    return (yield from ask("calibration.get", r.CorrectionResult, name=name)).correction
 
 
 def calibrations() -> Flow[r.CorrectionListResult]:
@@ -813,7 +795,7 @@ def calibrations() -> Flow[r.CorrectionListResult]:
         >>> twin.calibrations().current is None
         True
     """
-    return ask("calibration.list", {}, r.CorrectionListResult)
+    return ask("calibration.list", r.CorrectionListResult)
 
 
 def revert_calibration() -> Flow[r.CorrectionResult]:
@@ -825,7 +807,7 @@ def revert_calibration() -> Flow[r.CorrectionResult]:
         >>> twin.revert_calibration().correction is None
         True
     """
-    return ask("calibration.revert", {}, r.CorrectionResult)
+    return ask("calibration.revert", r.CorrectionResult)
 
 
 def fit_calibration(
@@ -876,13 +858,11 @@ def fit_calibration(
     marks = None if markers is None else [
         dict(zip(Mark.model_fields, row, strict=True)) for row in markers
     ]  # fmt: skip
-    params = {
-        "datasets": list(datasets), "phantom": phantom, "free": free and list(free),
-        "priors": dict(priors or {}), "per_frame": list(per_frame), "steps": steps,
-        "residuals": residuals, "tracks": tracks,
-        "markers": marks, "scale": scale,
-    }  # fmt: skip
-    return ask("calibration.fit", params, r.CalibrationFitResult, patience_s=None)
+    return ask(
+        "calibration.fit", r.CalibrationFitResult, None, datasets=list(datasets), phantom=phantom,
+        free=free and list(free), priors=dict(priors or {}), per_frame=list(per_frame),
+        steps=steps, residuals=residuals, tracks=tracks, markers=marks, scale=scale,
+    )  # fmt: skip
 
 
 def align_dataset(name: str, *, per_frame: bool = False) -> Flow[r.CalibrationAlignResult]:
@@ -901,8 +881,7 @@ def align_dataset(name: str, *, per_frame: bool = False) -> Flow[r.CalibrationAl
         ...
         flexdt.protocol.rpc_errors.RpcError: no data set 'gone' in the data directory
     """
-    params = {"name": name, "per_frame": per_frame}
-    return ask("calibration.align", params, r.CalibrationAlignResult, patience_s=None)
+    return ask("calibration.align", r.CalibrationAlignResult, None, name=name, per_frame=per_frame)
 
 
 def save_scene(name: str | None = None) -> Flow[dict[str, Any]]:
@@ -912,7 +891,7 @@ def save_scene(name: str | None = None) -> Flow[dict[str, Any]]:
         >>> sorted(twin.save_scene("mine"))[:3]
         ['accelerations', 'camera', 'correction']
     """
-    return dict((yield from ask("scene.save", {"name": name}, r.SceneResult)).document)
+    return dict((yield from ask("scene.save", r.SceneResult, name=name)).document)
 
 
 def load_scene(document: Mapping[str, Any]) -> Flow[s.State]:
@@ -922,7 +901,7 @@ def load_scene(document: Mapping[str, Any]) -> Flow[s.State]:
         >>> twin.load_scene(twin.save_scene()).safety.state
         'ok'
     """
-    return ask("scene.load", {"document": dict(document)}, s.State)
+    return ask("scene.load", s.State, document=dict(document))
 
 
 def _script(script: str | bytes) -> dict[str, object]:
