@@ -3,7 +3,7 @@
 Each builder fills the component's box; what it adds outside (carriages, motors, a tube housing) is
 decoration that is fixed to its own stage and never checked for collisions. Components with unknown
 names become bevelled boxes, so another machine file still draws; a part with a mesh of its own is
-drawn as that. Coordinates are those of the component's own frame [mm].
+drawn as that. Lengths are in mm.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ from flexdt.clients.viewer.scenes.sample import PaintedMesh
 from flexdt.phantoms.files.mesh_files import read_part
 from flexdt.twin.machine.description import Component, Machine
 
-Builder = Callable[[Component], list[PaintedMesh]]
+Builder = Callable[[float, float, float], list[PaintedMesh]]
+"""Pieces of a part of some size along x, y and z [mm], about its middle."""
+MIDDLE = (0.0, 0.0, 0.0)
 
 
 def own_looks(machine: Machine, folder: Path) -> dict[str, bytes]:
@@ -49,135 +51,121 @@ def pieces_of(part: Component) -> list[PaintedMesh]:
     """The part's painted meshes, in its own frame [mm]."""
     if part.points_mm:
         return [PaintedMesh(trimesh.convex.convex_hull(np.array(part.points_mm)), s.ALUMINIUM)]
-    builder = BUILDERS.get(part.name)
-    if builder is None:
-        builder = ROLES.get(part.role, _generic)
-    return builder(part)
-
-
-def _generic(part: Component) -> list[PaintedMesh]:
-    if part.shape == "cylinder":
-        return [s.cylinder(part.size_mm[0], part.size_mm[2], part.center_mm, s.ALUMINIUM)]
-    return [s.bevelled(part.size_mm, part.center_mm, s.ALUMINIUM)]
-
-
-def _platform(part: Component) -> list[PaintedMesh]:
-    (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
-    top = cz + z / 2
-    pieces = [
-        s.bevelled((x, y, z), part.center_mm, s.GRANITE, 8.0),
-        s.bevelled((x * 0.96, 14.0, 1.0), (cx, cy - y * 0.47, top), s.BRAND, 0.2),
-    ]
-    for dx, dy in product((-0.42 * x, 0.42 * x), (-0.42 * y, 0.42 * y)):
-        foot = (cx + dx, cy + dy, cz - z / 2 - 45)
-        pieces.append(s.cylinder(150.0, 90.0, foot, s.RUBBER))
+    usual = _drum if part.shape == "cylinder" else _block
+    pieces = (BUILDERS.get(part.name) or ROLES.get(part.role) or usual)(*part.size_mm)
+    for piece in pieces:
+        piece.mesh.apply_translation(part.center_mm)
     return pieces
 
 
-def _rail(part: Component) -> list[PaintedMesh]:
-    (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
+def _drum(x: float, y: float, z: float) -> list[PaintedMesh]:
+    return [s.cylinder(x, z, MIDDLE, s.ALUMINIUM)]
+
+
+def _block(x: float, y: float, z: float) -> list[PaintedMesh]:
+    return [s.bevelled((x, y, z), MIDDLE, s.ALUMINIUM)]
+
+
+def _platform(x: float, y: float, z: float) -> list[PaintedMesh]:
+    feet = product((-0.42 * x, 0.42 * x), (-0.42 * y, 0.42 * y))
     return [
-        s.bevelled((x * 1.9, y, z * 0.55), (cx, cy, cz - z * 0.225), s.ANODISED, 2.0),
-        s.bevelled((x * 0.62, y, z * 0.5), (cx, cy, cz + z * 0.25), s.STEEL, 2.0),
+        s.bevelled((x, y, z), MIDDLE, s.GRANITE, 8.0),
+        s.bevelled((x * 0.96, 14.0, 1.0), (0, -y * 0.47, z / 2), s.BRAND, 0.2),
+        *(s.cylinder(150.0, 90.0, (dx, dy, -z / 2 - 45), s.RUBBER) for dx, dy in feet),
     ]
 
 
-def _plate(part: Component) -> list[PaintedMesh]:
-    (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
-    pieces = [
-        s.bevelled((x, y, z * 0.55), (cx, cy, cz + z * 0.225), s.ALUMINIUM, 4.0),
-        s.bevelled((x * 0.92, y * 0.92, z * 0.45), (cx, cy, cz - z * 0.275), s.ANODISED, 2.0),
-    ]
-    for dx, dy in product((-0.45 * x, 0.45 * x), (-0.45 * y, 0.45 * y)):
-        at = (cx + dx, cy + dy, cz + z / 2)
-        pieces.append(s.cylinder(9.0, 1.6, at, s.RUBBER, sections=18))
-    return pieces
-
-
-def _tower(part: Component) -> list[PaintedMesh]:
-    (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
-    top = cz + z / 2
+def _rail(x: float, y: float, z: float) -> list[PaintedMesh]:
     return [
-        *s.column(part.size_mm, part.center_mm, s.ALUMINIUM),
-        s.bevelled((x * 1.15, y * 1.15, 24.0), (cx, cy, top + 12.0), s.ANODISED, 4.0),
-        s.cylinder(x * 0.62, 70.0, (cx, cy, top + 58.0), s.RUBBER),
-        s.cylinder(x * 0.5, 8.0, (cx, cy, top + 96.0), s.BRAND),
+        s.bevelled((x * 1.9, y, z * 0.55), (0, 0, -z * 0.225), s.ANODISED, 2.0),
+        s.bevelled((x * 0.62, y, z * 0.5), (0, 0, z * 0.25), s.STEEL, 2.0),
     ]
 
 
-def _tube(part: Component) -> list[PaintedMesh]:
+def _plate(x: float, y: float, z: float) -> list[PaintedMesh]:
+    screws = product((-0.45 * x, 0.45 * x), (-0.45 * y, 0.45 * y))
+    return [
+        s.bevelled((x, y, z * 0.55), (0, 0, z * 0.225), s.ALUMINIUM, 4.0),
+        s.bevelled((x * 0.92, y * 0.92, z * 0.45), (0, 0, -z * 0.275), s.ANODISED, 2.0),
+        *(s.cylinder(9.0, 1.6, (dx, dy, z / 2), s.RUBBER, sections=18) for dx, dy in screws),
+    ]
+
+
+def _tower(x: float, y: float, z: float) -> list[PaintedMesh]:
+    top = z / 2
+    return [
+        *s.column((x, y, z), s.ALUMINIUM),
+        s.bevelled((x * 1.15, y * 1.15, 24.0), (0, 0, top + 12.0), s.ANODISED, 4.0),
+        s.cylinder(x * 0.62, 70.0, (0, 0, top + 58.0), s.RUBBER),
+        s.cylinder(x * 0.5, 8.0, (0, 0, top + 96.0), s.BRAND),
+    ]
+
+
+def _tube(x: float, y: float, z: float) -> list[PaintedMesh]:
     """A microfocus tube: housing beside the tower, a nose that ends in the focal spot."""
-    (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
-    back, front = cy - y / 2, cy + y / 2
+    back, front = -y / 2, y / 2
     nose = [
         (0.0, 0.0), (46.0, 0.0), (46.0, 0.30 * y), (30.0, 0.52 * y), (13.0, 0.80 * y),
         (max(x, z) * 0.75, 0.9 * y), (max(x, z) / 2, y - 0.4), (0.0, y - 0.4),
     ]  # fmt: skip
     return [
-        s.lathe(nose, (cx, back, cz), s.ENAMEL, axis="y"),
-        s.cylinder(7.0, 0.8, (cx, front - 0.4, cz), s.BRASS, axis="y"),
-        s.cylinder(97.0, 7.0, (cx, back + 0.17 * y, cz), s.BRAND, axis="y"),
-        s.bevelled((132.0, 26.0, 118.0), (cx, back - 8.0, cz), s.ANODISED, 4.0),
-        s.bevelled((16.0, 118.0, 96.0), (cx - 60.0, back - 55.0, cz), s.ANODISED, 3.0),
-        s.bevelled((16.0, 118.0, 96.0), (cx + 60.0, back - 55.0, cz), s.ANODISED, 3.0),
-        s.bevelled((136.0, 22.0, 96.0), (cx, back - 114.0, cz), s.ANODISED, 3.0),
-        s.cylinder(88.0, 210.0, (cx, back - 215.0, cz), s.ENAMEL, axis="y"),
-        s.cylinder(92.0, 10.0, (cx, back - 150.0, cz), s.BRAND, axis="y"),
-        s.cylinder(40.0, 26.0, (cx, back - 332.0, cz), s.RUBBER, axis="y"),
+        s.lathe(nose, (0, back, 0), s.ENAMEL, axis="y"),
+        s.cylinder(7.0, 0.8, (0, front - 0.4, 0), s.BRASS, axis="y"),
+        s.cylinder(97.0, 7.0, (0, back + 0.17 * y, 0), s.BRAND, axis="y"),
+        s.bevelled((132.0, 26.0, 118.0), (0, back - 8.0, 0), s.ANODISED, 4.0),
+        s.bevelled((16.0, 118.0, 96.0), (-60.0, back - 55.0, 0), s.ANODISED, 3.0),
+        s.bevelled((16.0, 118.0, 96.0), (60.0, back - 55.0, 0), s.ANODISED, 3.0),
+        s.bevelled((136.0, 22.0, 96.0), (0, back - 114.0, 0), s.ANODISED, 3.0),
+        s.cylinder(88.0, 210.0, (0, back - 215.0, 0), s.ENAMEL, axis="y"),
+        s.cylinder(92.0, 10.0, (0, back - 150.0, 0), s.BRAND, axis="y"),
+        s.cylinder(40.0, 26.0, (0, back - 332.0, 0), s.RUBBER, axis="y"),
     ]
 
 
-def _base(part: Component) -> list[PaintedMesh]:
-    (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
+def _base(x: float, y: float, z: float) -> list[PaintedMesh]:
     return [
-        s.bevelled((x, y, z), part.center_mm, s.ANODISED, 5.0),
-        s.bevelled((x * 1.002, y * 0.5, z * 0.16), (cx, cy, cz), s.BRAND, 0.4),
-        s.cylinder(x * 0.86, 3.0, (cx, cy, cz + z / 2 - 0.5), s.STEEL, sections=72),
+        s.bevelled((x, y, z), MIDDLE, s.ANODISED, 5.0),
+        s.bevelled((x * 1.002, y * 0.5, z * 0.16), MIDDLE, s.BRAND, 0.4),
+        s.cylinder(x * 0.86, 3.0, (0, 0, z / 2 - 0.5), s.STEEL, sections=72),
     ]
 
 
-def _holder(part: Component) -> list[PaintedMesh]:
+def _holder(x: float, y: float, z: float) -> list[PaintedMesh]:
     """The turntable, with ticks on its rim so that one sees it turn."""
-    (d, _, z), (cx, cy, cz) = part.size_mm, part.center_mm
-    pieces = [s.cylinder(d, z, part.center_mm, s.ALUMINIUM, sections=96)]
+    pieces = [s.cylinder(x, z, MIDDLE, s.ALUMINIUM, sections=96)]
     for k in range(24):
-        a = 2.0 * math.pi * k / 24
         long = k % 6 == 0
-        size = (3.0 if long else 1.6, d * (0.1 if long else 0.06), 0.8)
-        r = d / 2 - size[1] / 2 - 2.0
-        piece = s.bevelled(size, (0.0, 0.0, 0.0), s.SIGNAL if k == 0 else s.RUBBER, 0.1)
-        piece.mesh.apply_transform(s.turn_matrix((0, 0, 1), a))
-        piece.mesh.apply_translation((cx - r * math.sin(a), cy + r * math.cos(a), cz + z / 2))
+        size = (3.0 if long else 1.6, x * (0.1 if long else 0.06), 0.8)
+        place = (0, x / 2 - size[1] / 2 - 2.0, z / 2)
+        piece = s.bevelled(size, place, s.SIGNAL if k == 0 else s.RUBBER, 0.1)
+        piece.mesh.apply_transform(s.turn_matrix((0, 0, 1), 2.0 * math.pi * k / 24))
         pieces.append(piece)
     return pieces
 
 
-def _mount(part: Component) -> list[PaintedMesh]:
-    (d, _, z), (cx, cy, cz) = part.size_mm, part.center_mm
+def _mount(x: float, y: float, z: float) -> list[PaintedMesh]:
     return [
-        s.cylinder(d * 0.7, z, part.center_mm, s.BRASS),
-        s.cylinder(d, z * 0.12, (cx, cy, cz - z * 0.44), s.STEEL),
-        s.cylinder(d, z * 0.1, (cx, cy, cz + z * 0.45), s.STEEL),
+        s.cylinder(x * 0.7, z, MIDDLE, s.BRASS),
+        s.cylinder(x, z * 0.12, (0, 0, -z * 0.44), s.STEEL),
+        s.cylinder(x, z * 0.1, (0, 0, z * 0.45), s.STEEL),
     ]
 
 
-def _carriage(part: Component) -> list[PaintedMesh]:
+def _carriage(x: float, y: float, z: float) -> list[PaintedMesh]:
     """What runs along the detector's tower, and the cross slide that it carries."""
-    (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
     return [
-        s.bevelled((x, y, z), part.center_mm, s.ANODISED, 2.0),
-        s.bevelled((14.0, 116.0, z * 0.8), (cx - 58.0, cy + 56.0, cz), s.ANODISED, 3.0),
-        s.bevelled((14.0, 116.0, z * 0.8), (cx + 58.0, cy + 56.0, cz), s.ANODISED, 3.0),
-        s.bevelled((130.0, 14.0, z * 0.8), (cx, cy + 114.0, cz), s.ANODISED, 3.0),
+        s.bevelled((x, y, z), MIDDLE, s.ANODISED, 2.0),
+        s.bevelled((14.0, 116.0, z * 0.8), (-58.0, 56.0, 0), s.ANODISED, 3.0),
+        s.bevelled((14.0, 116.0, z * 0.8), (58.0, 56.0, 0), s.ANODISED, 3.0),
+        s.bevelled((130.0, 14.0, z * 0.8), (0, 114.0, 0), s.ANODISED, 3.0),
     ]
 
 
-def _panel(part: Component) -> list[PaintedMesh]:
+def _panel(x: float, y: float, z: float) -> list[PaintedMesh]:
     """The flat panel: its front face is where the image is drawn."""
-    (x, y, z), (cx, cy, cz) = part.size_mm, part.center_mm
     return [
-        s.bevelled((x, y * 0.92, z), (cx, cy + y * 0.04, cz), s.RUBBER, 1.0),
-        s.bevelled((x + 7.0, y * 0.7, z + 7.0), (cx, cy + y * 0.15, cz), s.ENAMEL, 2.0),
+        s.bevelled((x, y * 0.92, z), (0, y * 0.04, 0), s.RUBBER, 1.0),
+        s.bevelled((x + 7.0, y * 0.7, z + 7.0), (0, y * 0.15, 0), s.ENAMEL, 2.0),
     ]
 
 
@@ -200,6 +188,5 @@ ROLES: Mapping[str, Builder] = {
     "sample_holder": _holder,
     "sample_mount": _mount,
     "panel": _panel,
-    "": _generic,
 }
 """Component role -> its builder, where the name says nothing."""

@@ -109,18 +109,16 @@ def _standing(mesh: trimesh.Trimesh, center: Vector, paint: Paint, axis: str) ->
     return PaintedMesh(mesh, paint)
 
 
-def column(size: Vector, center: Vector, paint: Paint) -> list[PaintedMesh]:
+def column(size: Vector, paint: Paint) -> list[PaintedMesh]:
     """An upright aluminium profile [mm] with two T-slots in each of its four faces."""
     x, y, z = size
-    cx, cy, cz = center
     width = 0.045 * (x + y)
-    pieces = [bevelled(size, center, paint, 3.0)]
+    pieces = [bevelled(size, (0, 0, 0), paint, 3.0)]
     for at, side in product((-1 / 6, 1 / 6), (-0.5, 0.5)):
-        for slot, dx, dy in (
-            ((width, 1.2, z * 0.985), at * x, side * y),
-            ((1.2, width, z * 0.985), side * x, at * y),
-        ):
-            pieces.append(bevelled(slot, (cx + dx, cy + dy, cz), RUBBER, 0.2))
+        pieces += [
+            bevelled((width, 1.2, z * 0.985), (at * x, side * y, 0), RUBBER, 0.2),
+            bevelled((1.2, width, z * 0.985), (side * x, at * y, 0), RUBBER, 0.2),
+        ]
     return pieces
 
 
