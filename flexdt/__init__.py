@@ -3,8 +3,8 @@
     import flexdt as fx
 
 Every public name is here, and each is found on first use: `import flexdt` itself loads none of the
-heavy libraries. To add a name, write it in `_HOMES`, in `__all__` and among the imports for type
-checkers; a test compares the three and asks each name for a docstring with an example.
+heavy libraries. To add a name, write it in `_HOMES` and among the imports for type checkers; a test
+compares the two and asks each name for a docstring with an example.
 """
 
 from __future__ import annotations
@@ -13,29 +13,38 @@ import os
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
-    from flexdt import phantoms
-    from flexdt.analysis import align, calibrate, reconstruct
-    from flexdt.clients import AsyncTwinClient, TwinClient
-    from flexdt.clients.datasets.data_set import DataSet
-    from flexdt.clients.datasets.dataset import load_dataset as open
-    from flexdt.clients.datasets.dataset import read_tiffs
-    from flexdt.clients.expose import expose
-    from flexdt.clients.launch.local_twin import LocalTwin
-    from flexdt.clients.simulate import simulate
-    from flexdt.machines import machine
-    from flexdt.projecting import project
-    from flexdt.scripts import plan
-    from flexdt.twin.errors import NotBuiltError, TwinError
-    from flexdt.twin.geometry.cone_vec import ConeVec
-    from flexdt.twin.geometry.rigid import Rigid
-    from flexdt.twin.physics.apparatus import Detector, Tube
-    from flexdt.twin.projection.linear_operator import Operator
-    from flexdt.twin.projection.operators import back, forward
-    from flexdt.twin.projection.volume import Grid, Volume
-    from flexdt.twin.reconstruction.fdk import fdk
-    from flexdt.twin.reconstruction.iterative import cgls, sirt
-    from flexdt.twin.reconstruction.tv import tv
+    from flexdt import phantoms as phantoms
+    from flexdt.analysis import align as align
+    from flexdt.analysis import calibrate as calibrate
+    from flexdt.analysis import reconstruct as reconstruct
+    from flexdt.clients import AsyncTwinClient as AsyncTwinClient
+    from flexdt.clients import TwinClient as TwinClient
+    from flexdt.clients.datasets.data_set import DataSet as DataSet
+    from flexdt.clients.datasets.dataset import load_dataset
+    from flexdt.clients.datasets.dataset import read_tiffs as read_tiffs
+    from flexdt.clients.expose import expose as expose
+    from flexdt.clients.launch.local_twin import LocalTwin as LocalTwin
+    from flexdt.clients.simulate import simulate as simulate
+    from flexdt.machines import machine as machine
+    from flexdt.projecting import project as project
+    from flexdt.scripts import plan as plan
+    from flexdt.twin.errors import NotBuiltError as NotBuiltError
+    from flexdt.twin.errors import TwinError as TwinError
+    from flexdt.twin.geometry.cone_vec import ConeVec as ConeVec
+    from flexdt.twin.geometry.rigid import Rigid as Rigid
+    from flexdt.twin.physics.apparatus import Detector as Detector
+    from flexdt.twin.physics.apparatus import Tube as Tube
+    from flexdt.twin.projection.linear_operator import Operator as Operator
+    from flexdt.twin.projection.operators import back as back
+    from flexdt.twin.projection.operators import forward as forward
+    from flexdt.twin.projection.volume import Grid as Grid
+    from flexdt.twin.projection.volume import Volume as Volume
+    from flexdt.twin.reconstruction.fdk import fdk as fdk
+    from flexdt.twin.reconstruction.iterative import cgls as cgls
+    from flexdt.twin.reconstruction.iterative import sirt as sirt
+    from flexdt.twin.reconstruction.tv import tv as tv
 
+    open = load_dataset
     __version__: str
 
 if not os.path.isdir(os.path.join(__path__[0], "twin")):
@@ -77,39 +86,7 @@ _HOMES: Final = {
 }
 """Name -> module, or MODULE:ATTRIBUTE where the names differ; a module itself ends with a colon."""
 
-__all__ = [
-    "AsyncTwinClient",
-    "ConeVec",
-    "DataSet",
-    "Detector",
-    "Grid",
-    "LocalTwin",
-    "NotBuiltError",
-    "Operator",
-    "Rigid",
-    "Tube",
-    "TwinClient",
-    "TwinError",
-    "Volume",
-    "__version__",
-    "align",
-    "back",
-    "calibrate",
-    "cgls",
-    "expose",
-    "fdk",
-    "forward",
-    "machine",
-    "open",
-    "phantoms",
-    "plan",
-    "project",
-    "read_tiffs",
-    "reconstruct",
-    "simulate",
-    "sirt",
-    "tv",
-]
+__all__ = sorted(["__version__", *_HOMES])
 
 
 if not TYPE_CHECKING:  # with a `__getattr__`, type checkers would take any name for one of ours

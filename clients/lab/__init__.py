@@ -12,11 +12,14 @@ from typing import TYPE_CHECKING, Any
 from flexdt.twin.errors import TwinError
 
 if TYPE_CHECKING:
-    from flexdt.clients.lab.axes import LimitsExceeded, TwinAxis
-    from flexdt.clients.lab.camera_device import TwinCamera
-    from flexdt.clients.lab.devices import TwinLab, TwinTube
-    from flexdt.clients.lab.flyer import FlyScan, TwinFlyer
-    from flexdt.clients.lab.lab_connection import LabConnection
+    from flexdt.clients.lab.axes import LimitsExceeded as LimitsExceeded
+    from flexdt.clients.lab.axes import TwinAxis as TwinAxis
+    from flexdt.clients.lab.camera_device import TwinCamera as TwinCamera
+    from flexdt.clients.lab.devices import TwinLab as TwinLab
+    from flexdt.clients.lab.devices import TwinTube as TwinTube
+    from flexdt.clients.lab.flyer import FlyScan as FlyScan
+    from flexdt.clients.lab.flyer import TwinFlyer as TwinFlyer
+    from flexdt.clients.lab.lab_connection import LabConnection as LabConnection
 
 _HOMES = {
     "FlyScan": "flexdt.clients.lab.flyer",
@@ -29,16 +32,7 @@ _HOMES = {
     "TwinTube": "flexdt.clients.lab.devices",
 }
 
-__all__ = [
-    "FlyScan",
-    "LabConnection",
-    "LimitsExceeded",
-    "TwinAxis",
-    "TwinCamera",
-    "TwinFlyer",
-    "TwinLab",
-    "TwinTube",
-]
+__all__ = list(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
