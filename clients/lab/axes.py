@@ -14,13 +14,14 @@ from functools import cached_property
 from ophyd_async.core import (
     MovableLogic,
     SignalR,
+    SignalRW,
     StandardMovable,
     StandardReadable,
     StandardReadableFormat,
     TimeoutCalculator,
 )
 
-from flexdt.clients.lab.lab_connection import LabConnection, TwinBackend, settable
+from flexdt.clients.lab.lab_connection import LabConnection, Put, TwinBackend, settable
 from flexdt.protocol.state_model import AxisState, State
 
 ARRIVED = 1e-6
@@ -134,28 +135,21 @@ class TwinAxis(StandardReadable, StandardMovable[float]):
         self._link, self._axis, self._collisions = link, axis, collisions
         client = link.client
 
-        def of(state: State) -> AxisState:
-            return state.axes[axis]
+        def member(name: str, put: Put[float], units: str) -> SignalRW[float]:
+            return settable(link, f"axes.{axis}.{name}", float, put, units)
 
         with self.add_children_as_readables(StandardReadableFormat.HINTED_SIGNAL):
             position = TwinBackend(
-                link, f"axes.{axis}.position", float, lambda s: of(s).position,
-                units=unit, limits=lambda s: of(s).limits,
+                link, f"axes.{axis}.position", float, units=unit,
+                limits=lambda state: state.axes[axis].limits,
             )  # fmt: skip
             self.readback = SignalR(position)
         with self.add_children_as_readables(StandardReadableFormat.CONFIG_SIGNAL):
-            self.speed = settable(
-                link, f"axes.{axis}.speed", float, lambda s: of(s).speed or 0.0,
-                lambda value: client.set_axis(axis, speed=value), f"{unit}/s",
-            )  # fmt: skip
-            self.acceleration = settable(
-                link, f"axes.{axis}.acceleration", float, lambda s: of(s).acceleration or 0.0,
-                lambda value: client.set_axis(axis, acceleration=value), f"{unit}/s^2",
-            )  # fmt: skip
-        self.setpoint = settable(
-            link, f"axes.{axis}.target", float, lambda s: of(s).target,
-            lambda value: client.move({axis: value}), unit,
-        )  # fmt: skip
+            self.speed = member("speed", lambda v: client.set_axis(axis, speed=v), f"{unit}/s")
+            self.acceleration = member(
+                "acceleration", lambda v: client.set_axis(axis, acceleration=v), f"{unit}/s^2"
+            )
+        self.setpoint = member("target", lambda v: client.move({axis: v}), unit)
         super().__init__(name=name)
 
     @cached_property

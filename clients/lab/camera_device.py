@@ -189,20 +189,15 @@ class TwinCamera(StandardDetector):
     def __init__(self, link: LabConnection, where: PathProvider, name: str = "") -> None:
         client = link.client
         self.exposure_ms = settable(
-            link, "camera.exposure_ms", float, lambda s: s.camera.exposure_ms,
-            lambda v: client.set_camera(exposure_ms=v), "ms",
-        )  # fmt: skip
+            link, "camera.exposure_ms", float, lambda v: client.set_camera(exposure_ms=v), "ms"
+        )
         self.averages = settable(
-            link, "camera.averages", int, lambda s: s.camera.averages,
-            lambda v: client.set_camera(averages=v),
-        )  # fmt: skip
-        self.mode = settable(
-            link, "camera.mode", str, lambda s: s.camera.mode,
-            lambda v: client.set_camera(mode=v),
-        )  # fmt: skip
+            link, "camera.averages", int, lambda v: client.set_camera(averages=v)
+        )
+        self.mode = settable(link, "camera.mode", str, lambda v: client.set_camera(mode=v))
         self.roi = settable(
-            link, "camera.roi", str, lambda s: " ".join(map(str, s.camera.roi)),
-            lambda v: client.set_camera(roi=_edges(v)),
+            link, "camera.roi", str, lambda v: client.set_camera(roi=_edges(v)),
+            get=lambda state: " ".join(map(str, state.camera.roi)),
         )  # fmt: skip
         super().__init__(name=name)
         roll = Roll()

@@ -45,14 +45,11 @@ class TwinTube(StandardReadable):
                     return
 
         with self.add_children_as_readables(StandardReadableFormat.CONFIG_SIGNAL):
-            self.kV = settable(
-                link, "tube.kV", float, lambda s: s.tube.kV, lambda v: client.set_tube(kV=v), "kV"
-            )
+            self.kV = settable(link, "tube.kV", float, lambda v: client.set_tube(kV=v), "kV")
             self.power_W = settable(
-                link, "tube.power_W", float, lambda s: s.tube.power_W,
-                lambda v: client.set_tube(power_W=v), "W",
-            )  # fmt: skip
-            self.on = settable(link, "tube.on", bool, lambda s: s.tube.on, switch)
+                link, "tube.power_W", float, lambda v: client.set_tube(power_W=v), "W"
+            )
+            self.on = settable(link, "tube.on", bool, switch)
         super().__init__(name=name)
 
 

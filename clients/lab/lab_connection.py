@@ -148,10 +148,10 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
 
     Args:
         link: to the twin.
-        path: the value's place in the state, for sources and errors: `axes.rot_obj.position`.
+        path: the value's place in the state: `axes.rot_obj.position`.
         datatype: of the value.
-        get: the value, from a state.
         put: request another value.
+        get: the value, from a state, where it is not what is at `path`.
         units: of the value.
         limits: lowest and highest value, from a state.
     """
@@ -161,16 +161,22 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
         link: LabConnection,
         path: str,
         datatype: type[_T],
-        get: Get[_T],
-        *,
         put: Put[_T] | None = None,
         units: str | None = None,
+        get: Get[_T] | None = None,
         limits: Callable[[State], tuple[float, float]] | None = None,
     ) -> None:
         super().__init__(datatype)
-        self._link, self._path, self._get = link, path, get
+        self._link, self._path, self._get = link, path, get or self._member
         self._put, self._units, self._limits = put, units, limits
         self._end: Callable[[], None] | None = None
+
+    def _member(self, state: State) -> _T:
+        """What is at `path`; zero where that is not known."""
+        value: Any = state
+        for name in self._path.split("."):
+            value = value[name] if isinstance(value, Mapping) else getattr(value, name)
+        return cast(_T, cast(type[Any], self.datatype)() if value is None else value)
 
     def source(self, name: str, read: bool) -> str:
         """Where the value comes from."""
@@ -250,9 +256,9 @@ def settable(
     link: LabConnection,
     path: str,
     datatype: type[_T],
-    get: Get[_T],
     put: Put[_T],
     units: str | None = None,
+    get: Get[_T] | None = None,
 ) -> SignalRW[_T]:
     """A signal to read and set; arguments as those of `TwinBackend`."""
-    return SignalRW(TwinBackend(link, path, datatype, get, put=put, units=units))
+    return SignalRW(TwinBackend(link, path, datatype, put, units, get))
