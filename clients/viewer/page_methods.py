@@ -27,8 +27,9 @@ from flexdt.clients.viewer.export import picture, replay_file, scene_file
 from flexdt.clients.viewer.feed import ShownImage, packed
 from flexdt.clients.viewer.front import Download
 from flexdt.clients.viewer.page import Page, without_bytes
+from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.world import motors
-from flexdt.clients.viewer.viewer import PageMethod, ShownMachine, Viewer
+from flexdt.clients.viewer.viewer import PageMethod, Viewer
 from flexdt.protocol import Code, Method, RpcError, parse_params
 from flexdt.protocol import image as wire_image
 from flexdt.protocol.fields import Nothing, Params
@@ -50,7 +51,7 @@ MAX_SHARED: Final = 2
 
 async def layers(viewer: Viewer, page: Page, params: p.Layers) -> object:
     """Show or hide layers on all pages; maps a layer's name to whether it is shown."""
-    scene = _lab(viewer).scene
+    scene = _lab(viewer)
     for name, visible in params.model_dump(exclude_none=True, exclude={"opacity"}).items():
         scene.show(name, visible)
     if params.opacity is not None:
@@ -100,11 +101,11 @@ async def ray(viewer: Viewer, page: Page, params: p.Ray) -> object:
     lab, world = _lab(viewer), viewer.world
     clients = viewer.clients.of(page.id)
     if params.pixel is None or world is None:
-        lab.scene.plan.ray(clients, None)
+        lab.plan.ray(clients, None)
         return {}
     told: Any = await page.link.request("projection.ray", {"pixel": list(params.pixel)})
     ends = np.array([world.source, world.pixel(*params.pixel)])
-    lab.scene.plan.ray(clients, ends)
+    lab.plan.ray(clients, ends)
     return {**told, "length_mm": float(np.linalg.norm(ends[1] - ends[0]))}
 
 
@@ -136,14 +137,14 @@ async def plan(viewer: Viewer, page: Page, params: p.Plan) -> object:
     if text is None:
         page.plan = page.orbit = None
         clients = viewer.clients.of(page.id)
-        lab.scene.plan.unghost(clients)
-        lab.scene.plan.orbit(clients, None)
+        lab.plan.unghost(clients)
+        lab.plan.orbit(clients, None)
         return {}
     made = await plans.make(viewer.planners, text, lab.machine, lab.profile, viewer.state)
     page.plan = made.plan
     if made.path is not None:
         page.orbit = made.path
-        lab.scene.plan.orbit(viewer.clients.of(page.id), page.orbit)
+        lab.plan.orbit(viewer.clients.of(page.id), page.orbit)
     return made.document
 
 
@@ -156,7 +157,7 @@ async def recorded(viewer: Viewer, page: Page, params: p.Recorded) -> object:
         told = await page.link.request("dataset.get", {"name": name, "points": 1000})
     page.recorded = name
     page.plan = page.orbit = None
-    lab.scene.plan.unghost(clients)
+    lab.plan.unghost(clients)
     if name is None:
         for feed in viewer.feeds.values():
             feed.again()
@@ -165,7 +166,7 @@ async def recorded(viewer: Viewer, page: Page, params: p.Recorded) -> object:
         taken = np.array(told["kinds"], dtype=str) == "projection"
         at = {n: np.array(v, dtype=float)[taken] for n, v in told["positions"].items()}
         page.orbit = plans.source_path(at, lab.machine, lab.profile, viewer.state)
-    lab.scene.plan.orbit(clients, page.orbit)
+    lab.plan.orbit(clients, page.orbit)
     return told or {}
 
 
@@ -201,7 +202,7 @@ async def recorded_image(viewer: Viewer, page: Page, params: p.RecordedImage) ->
         page.show("image", content)
     clients = viewer.clients.of(page.id)
     if page.plan is not None and about["positions"]:
-        lab.scene.plan.ghost(clients, about["positions"])
+        lab.plan.ghost(clients, about["positions"])
     return about
 
 
@@ -254,7 +255,7 @@ async def compose(viewer: Viewer, page: Page, params: p.Compose) -> object:
     return {"text": text, "moved": moved}
 
 
-def _moved(text: str, lab: ShownMachine, state: State) -> dict[str, tuple[float, float]]:
+def _moved(text: str, lab: LabScene, state: State) -> dict[str, tuple[float, float]]:
     """Axis -> (where it stands, where a script's projections have it), for axes that stand neither
     there nor at home; axes that the script moves between projections are its own."""
     plan = plans.plan_text(text, lab.machine, lab.profile, state)
@@ -301,12 +302,12 @@ async def scrub(viewer: Viewer, page: Page, params: p.Scrub) -> object:
     """Draw, for this page, where the plan has the machine at `time_s`; none: no longer."""
     lab, time_s = _lab(viewer), params.time_s
     if time_s is None:
-        lab.scene.plan.unghost(viewer.clients.of(page.id))
+        lab.plan.unghost(viewer.clients.of(page.id))
         return {"positions": None}
     if page.plan is None:
         raise RpcError(Code.INVALID_PARAMS, "plan a script first: there is nothing to scrub")
     positions = plans.positions_at(page.plan, time_s)
-    lab.scene.plan.ghost(viewer.clients.of(page.id), positions)
+    lab.plan.ghost(viewer.clients.of(page.id), positions)
     return {"positions": positions}
 
 
@@ -351,7 +352,7 @@ def _room(viewer: Viewer) -> Iterator[None]:
         viewer.sharing -= 1
 
 
-def _lab(viewer: Viewer) -> ShownMachine:
+def _lab(viewer: Viewer) -> LabScene:
     if viewer.lab is None:
         raise RpcError(Code.INTERNAL, "the twin has not been seen yet")
     return viewer.lab

@@ -12,7 +12,7 @@ import json
 import logging
 import time
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -67,15 +67,6 @@ def nearest(safety: SafetyState) -> dict[str, Any]:
     return {"mm": mm, "pair": safety.pair or [], "close": mm is not None and mm < CLOSE_MM}
 
 
-@dataclass
-class ShownMachine:
-    """The machine that the twin names, and its scene."""
-
-    machine: Machine
-    profile: Profile
-    scene: LabScene
-
-
 class Viewer:
     """A viewer: its link to the twin, scenes, pages and exports.
 
@@ -111,7 +102,7 @@ class Viewer:
         self.opened = self.drawn = self.sharing = 0
         self.pages: dict[str, Page] = {}
         self.downloads: dict[str, Download] = {}
-        self.lab: ShownMachine | None = None
+        self.lab: LabScene | None = None
         self.state: State | None = None
         self.world: World | None = None
         self.look: SampleLook = NOTHING
@@ -283,18 +274,18 @@ class Viewer:
             for feed in self.feeds.values():
                 feed.again()
         near = nearest(state.safety)
-        lab.scene.update(state, world)
-        lab.scene.highlight(near["pair"] if near["close"] else ())
-        if lab.scene.shown["ranges"] and time.monotonic() - self._ranges_at > RANGES_S:
+        lab.update(state, world)
+        lab.highlight(near["pair"] if near["close"] else ())
+        if lab.shown["ranges"] and time.monotonic() - self._ranges_at > RANGES_S:
             self._ranges_at = time.monotonic()
-            lab.scene.draw_ranges(state)
+            lab.draw_ranges(state)
         camera, framing = views.beam_view(world)
         self.clients.follow("beam", camera)
         text = json.dumps(
             {
                 "type": "state",
                 "state": without_bytes(raw),
-                "framing": views.document(framing, world),
+                "framing": framing,
                 "cone_vec": world.cone_vec.rows[0].tolist(),
                 "near": near,
                 "at": time.time(),
@@ -303,7 +294,7 @@ class Viewer:
         for page in self.pages.values():
             page.show("state", text)
 
-    async def _ready_lab(self) -> ShownMachine:
+    async def _ready_lab(self) -> LabScene:
         hello = self.link.hello
         machine = self._machine or builtin_machine("flexray" if hello is None else hello.machine)
         named = None if hello is None else hello.profile
@@ -313,22 +304,22 @@ class Viewer:
                 LabScene, self.viser, machine, profile, self._dragged, self.looks
             )
             if self.lab is not None:  # what was shown stays shown
-                for what, visible in self.lab.scene.shown.items():
+                for what, visible in self.lab.shown.items():
                     scene.show(what, visible)
-                scene.fade(self.lab.scene.opacity)
-            self.lab = ShownMachine(machine, profile, scene)
+                scene.fade(self.lab.opacity)
+            self.lab = scene
             self.clients.cameras.update(views.FIXED)
             for page in self.pages.values():
-                page.say("layers", shown=scene.shown, opacity=scene.opacity)
+                page.say("layers", **scene.layers)
         return self.lab
 
-    async def _dress(self, lab: ShownMachine, state: State) -> None:
+    async def _dress(self, lab: LabScene, state: State) -> None:
         self.look = await asyncio.to_thread(self.wardrobe.look, state.sample)
-        lab.scene.wear(self.look)
+        lab.wear(self.look)
         if self.wardrobe.lacks(state.sample):
             self._fetching = watched(self._fetch(lab, state.sample), "fetching a shape")
 
-    async def _fetch(self, lab: ShownMachine, sample: SampleState) -> None:
+    async def _fetch(self, lab: LabScene, sample: SampleState) -> None:
         """Fetch the mesh of an upload; a box is drawn until it has arrived."""
         try:
             stl = await shapes.fetch(self.link.request, sample)
@@ -355,7 +346,7 @@ class Viewer:
             window = self.window or window_of(image)
             small = image.pixels[::2, ::2] if coarse else image.pixels
             shown = ShownImage(small, image.kind, image.cone_vec, image.time, image.seq)
-            lab.scene.show_image(grey(shown, window), small, world)
+            lab.show_image(grey(shown, window), small, world)
         assert self._loop is not None
         self._loop.call_soon_threadsafe(self._send_image, image.kind, content)
 
@@ -367,7 +358,7 @@ class Viewer:
     def _grown(self, line: str) -> None:
         surface, slices = line.split("\t")
         if (told := json.loads(surface)) is not None and self.lab is not None:
-            self.lab.scene.show_surface(points_of(told), told["size_mm"])
+            self.lab.show_surface(points_of(told), told["size_mm"])
         for page in self.pages.values():
             if page.live:
                 page.show("volume", slices)
@@ -377,7 +368,7 @@ class Viewer:
         if not any(page.live for page in self.pages.values()):
             self.grower.stop()
             if self.lab is not None:
-                self.lab.scene.show_surface(None)
+                self.lab.show_surface(None)
 
     # -- pages -------------------------------------------------------------------------------
 
@@ -393,7 +384,7 @@ class Viewer:
         self.pages[id] = page
         self._tell_link(page)
         if self.lab is not None:
-            page.say("layers", shown=self.lab.scene.shown, opacity=self.lab.scene.opacity)
+            page.say("layers", **self.lab.layers)
         self.refresh_feeds()
         self._due.set()
         try:
@@ -422,7 +413,7 @@ class Viewer:
         """In one of viser's threads: a page opens a view, which shows its plan's path, too."""
         page, lab = self.pages.get(id), self.lab
         if page is not None and page.orbit is not None and lab is not None:
-            lab.scene.plan.orbit([client], page.orbit)
+            lab.plan.orbit([client], page.orbit)
 
     def _dragged(self, client: int | None, targets: Mapping[str, float]) -> None:
         """Pass a drag of a stage on to its page; called in one of viser's threads."""

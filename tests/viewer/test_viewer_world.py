@@ -124,23 +124,25 @@ def test_beams_eye_frames_exactly_the_image(tra_det: float) -> None:
     """A symmetric camera and the page's crop together show the image's corners at the corners."""
     world = placed(MACHINE, PROFILE, CAMERA, {**AT, "tra_det": tra_det, "tra_tube": 0.0})
     camera, frame = beam_view(world)
-    assert frame.exact
+    assert frame["exact"]
     eye, aim = np.array(camera.position), np.array(camera.look_at)
     forward = (aim - eye) / np.linalg.norm(aim - eye)
     up = np.array(camera.up)
     right = np.cross(forward, up)
     for corner, (x, y) in zip(
-        world.corners * 0.001, ((0, 0), (1, 0), (1, frame.aspect), (0, frame.aspect)), strict=True
+        world.corners * 0.001,
+        ((0, 0), (1, 0), (1, frame["aspect"]), (0, frame["aspect"])),
+        strict=True,
     ):
         d = corner - eye
         half = math.tan(camera.fov / 2.0) * (d @ forward)
-        px = frame.width / 2 + (d @ right) / half * frame.height / 2
-        py = frame.height / 2 - (d @ up) / half * frame.height / 2
-        assert (px - frame.left, py - frame.top) == pytest.approx((x, y), abs=1e-9)
+        px = frame["width"] / 2 + (d @ right) / half * frame["height"] / 2
+        py = frame["height"] / 2 - (d @ up) / half * frame["height"] / 2
+        assert (px - frame["left"], py - frame["top"]) == pytest.approx((x, y), abs=1e-9)
 
 
 def test_far_off_axis_the_beams_eye_says_that_it_is_not_exact() -> None:
-    assert not beam_view(placed(MACHINE, PROFILE, CAMERA, {**AT, "tra_det": 404.0}))[1].exact
+    assert not beam_view(placed(MACHINE, PROFILE, CAMERA, {**AT, "tra_det": 404.0}))[1]["exact"]
 
 
 @pytest.mark.parametrize("name", builtin_machines())

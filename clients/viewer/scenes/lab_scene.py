@@ -18,7 +18,7 @@ from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.beam_shade import BeamShade
 from flexdt.clients.viewer.scenes.gizmos import Drag, Gizmos
 from flexdt.clients.viewer.scenes.sample import MM, SampleLook
-from flexdt.clients.viewer.scenes.world import PlanDrawing, World, motors, quaternion
+from flexdt.clients.viewer.scenes.world import SCREEN, PlanDrawing, World, motors, quaternion
 from flexdt.protocol.state_model import State
 from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.geometry.conventions import FloatArray
@@ -31,8 +31,6 @@ LIGHTS = (
 """Name, intensity, where it comes from [m]."""
 FLOOR_MM = -405.0
 BEAM_ON = (255, 176, 32)
-SCREEN: Any = {"thickness_units": "screen"}
-"""Lines have a width in pixels."""
 BEAM_OFF = (120, 140, 165)
 SURFACE = (70, 190, 255)
 FLOOR = (140, 150, 165)
@@ -64,7 +62,8 @@ class LabScene:
         drag: Drag = lambda client, targets: None,
         looks: Mapping[str, bytes] | None = None,
     ) -> None:
-        self._server, self._machine, self._own = server, machine, looks or {}
+        self._server, self.machine, self.profile = server, machine, profile
+        self._own = looks or {}
         self._collision = build_scene(machine, profile)
         self._bodies = {b.name: b for b in self._collision.bodies}
         self._frames: dict[str, viser.FrameHandle] = {}
@@ -121,7 +120,7 @@ class LabScene:
             section_thickness=0.9, fade_distance=5.0, fade_strength=2.0,
             position=(0.0, 0.55, FLOOR_MM * MM),
         )  # fmt: skip
-        for part in self._machine.components:
+        for part in self.machine.components:
             frame = scene.add_frame(f"/machine/{part.name}", show_axes=False)
             self._frames[part.name] = frame
             own = self._own.get(part.name)
@@ -142,11 +141,7 @@ class LabScene:
         )  # fmt: skip
         self._shade = BeamShade(scene)
         self._edges = scene.add_line_segments(
-            "/beam/edges",
-            np.zeros((8, 2, 3), dtype=np.float32),
-            BEAM_OFF,
-            thickness=1.6,
-            **SCREEN,
+            "/beam/edges", np.zeros((8, 2, 3), np.float32), BEAM_OFF, thickness=1.6, **SCREEN
         )
         self._spot = scene.add_icosphere(
             "/beam/spot", radius=0.004, color=BEAM_ON, cast_shadow=False, receive_shadow=False
@@ -163,7 +158,7 @@ class LabScene:
         )  # fmt: skip
 
     def _build_bodies(self) -> None:
-        margin = self._machine.safety_margin_mm
+        margin = self.machine.safety_margin_mm
         for name, body in self._bodies.items():
             hull = bodies.bare(body.solid)
             self._hulls[name] = self._hull(f"/machine/{name}/body", hull, RED, 0.35)
@@ -174,7 +169,7 @@ class LabScene:
     def _build_labels(self) -> None:
         """Names of parts, the world's axes, and a scale on the floor; hidden at first."""
         scene = self._server.scene
-        (x, y, z), name = _scale_mm(self._machine), f"{SCALE_MM:g} mm"
+        (x, y, z), name = _scale_mm(self.machine), f"{SCALE_MM:g} mm"
         ends = np.array([[[x, y, z], [x, y + SCALE_MM, z]]]) * MM
         bar = scene.add_line_segments("/scale", ends, RANGE, thickness=5.0, **SCREEN, visible=False)
         axes = scene.add_frame(
@@ -185,7 +180,7 @@ class LabScene:
         for k, words in enumerate(("x traversal", "y source to detector", "z up")):
             place = np.eye(3)[k] * 1.15 * AXES_MM * MM
             self._labels.append(scene.add_label(f"/axes/{words[0]}", words, position=place))
-        for part in self._machine.components:
+        for part in self.machine.components:
             if part.axis is None and not part.role:
                 continue
             (x, _, z), words = part.size_mm, part.name.replace("_", " ")
@@ -206,9 +201,9 @@ class LabScene:
 
     def update(self, state: State, world: World) -> None:
         """Move everything to a state."""
-        q = self._collision.vector(motors(self._machine, state))
+        q = self._collision.vector(motors(self.machine, state))
         with self._server.atomic():
-            for part in self._machine.components:
+            for part in self.machine.components:
                 body = self._bodies[part.name]
                 at = body.origin + q @ body.slides
                 turn = body.rotation(float(q @ body.turns))
@@ -318,13 +313,13 @@ class LabScene:
     def _stand(self, look: SampleLook) -> None:
         """A thin rod from the mount to the sample: drawn only, X-rays do not see it."""
         name = f"{STAND}/rod"
-        mount = next((p for p in self._machine.components if p.role == "sample_mount"), None)
+        mount = next((p for p in self.machine.components if p.role == "sample_mount"), None)
         known = self._server.scene.get_handle_by_name(name)
         if known is not None:
             known.remove()
         if mount is None or not look.skins:
             return
-        low = mount.center_mm[2] + mount.size_mm[2] / 2 - self._machine.sample_height_mm
+        low = mount.center_mm[2] + mount.size_mm[2] / 2 - self.machine.sample_height_mm
         high = min(float(skin.vertices[:, 2].min()) for skin in look.skins) / MM
         if high > low:
             rod = solids.cylinder(5.0, high - low, (0.0, 0.0, 0.5 * (low + high)), solids.RUBBER)
@@ -338,6 +333,11 @@ class LabScene:
         if look is not None:
             self._look = None
             self.wear(look)
+
+    @property
+    def layers(self) -> dict[str, object]:
+        """What is shown, for pages."""
+        return {"shown": self.shown, "opacity": self.opacity}
 
     def show(self, what: str, visible: bool) -> None:
         """Switch a layer, one of `shown`."""
@@ -363,11 +363,11 @@ class LabScene:
 
     def draw_ranges(self, state: State) -> None:
         """Draw the remaining travel of each stage as a line through its position."""
-        q = self._collision.vector(motors(self._machine, state))
+        q = self._collision.vector(motors(self.machine, state))
         lines = []
-        for part in self._machine.components:
+        for part in self.machine.components:
             body = self._bodies[part.name]
-            axis = self._machine.axes.get(part.axis or "")
+            axis = self.machine.axes.get(part.axis or "")
             if part.axis is None or axis is None or axis.kind != "linear":
                 continue
             k = self._collision.axes.index(part.axis)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import viser
@@ -44,6 +45,8 @@ class World:
 
     Attributes:
         view: geometry of an image of this moment, one row that knows its shape.
+        source, detector: focal spot and centre of the image (3,) [mm].
+        u, v: step to the next column and to the next row (3,) [mm].
         axis: point of the rotation axis at the sample's reference height (3,) [mm].
         stage: from the object's frame to the world.
         sample: from the sample's own frame to the world.
@@ -51,31 +54,15 @@ class World:
     """
 
     view: ConeVec
+    source: FloatArray
+    detector: FloatArray
+    u: FloatArray
+    v: FloatArray
     axis: FloatArray
     stage: Rigid
     sample: Rigid
     tube_shift: FloatArray
     panel_shift: FloatArray
-
-    @property
-    def source(self) -> FloatArray:
-        """Focal spot (3,) [mm]."""
-        return self.view.source.reshape(3)
-
-    @property
-    def detector(self) -> FloatArray:
-        """Centre of the image (3,) [mm]."""
-        return self.view.detector.reshape(3)
-
-    @property
-    def u(self) -> FloatArray:
-        """Step to the next column (3,) [mm]."""
-        return self.view.u.reshape(3)
-
-    @property
-    def v(self) -> FloatArray:
-        """Step to the next row (3,) [mm]."""
-        return self.view.v.reshape(3)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -179,14 +166,9 @@ def placed(
     view = stage @ pose.cone_vec(p).with_shape(camera.shape)
     at = Placement() if offset is None else offset
     on_stage = Rigid(at.rotation, np.array([at.x, at.y, at.z]))
-    return World(
-        view,
-        pivot,
-        stage,
-        stage @ on_stage,
-        view.source[0] - pose.source[0],
-        view.detector[0] - pose.detector[0],
-    )
+    source, detector, u, v = view.rows.reshape(4, 3)
+    shifts = source - pose.source[0], detector - pose.detector[0]
+    return World(view, source, detector, u, v, pivot, stage, stage @ on_stage, *shifts)
 
 
 def quaternion(rotation: FloatArray) -> tuple[float, float, float, float]:
@@ -216,6 +198,8 @@ def beads_on(
     return [[float(c), float(r)] for c, r in pixels[inside]]
 
 
+SCREEN: Any = {"thickness_units": "screen"}
+"""Lines have a width in pixels."""
 GHOST = (60, 130, 255)
 PATH = (90, 120, 255)
 HOME = "/object/plan"
@@ -270,25 +254,23 @@ class PlanDrawing:
             clients: that see it.
             points: (n, 3) [mm], object frame.
         """
-        _remove(clients, ORBIT)
-        if points is None or len(points) < 2:
-            return
-        segments = (np.stack([points[:-1], points[1:]], axis=1) * MM).astype(np.float32)
-        for client in clients:
-            client.scene.add_line_segments(
-                ORBIT, segments, PATH, thickness=1.5, thickness_units="screen"
-            )
+        steps = None if points is None else np.stack([points[:-1], points[1:]], axis=1)
+        _draw_lines(clients, ORBIT, steps, PATH, 1.5)
 
     def ray(self, clients: Sequence[viser.ClientHandle], ends: FloatArray | None) -> None:
         """Show some clients a ray, (2, 3) [mm, world]; None: no longer."""
-        _remove(clients, RAY)
-        if ends is None:
-            return
+        _draw_lines(clients, RAY, None if ends is None else ends[None], RAY_COLOR, 3.0)
+
+
+def _draw_lines(
+    clients: Sequence[viser.ClientHandle], name: str, lines: FloatArray | None,
+    color: tuple[int, int, int], px: float,
+) -> None:  # fmt: skip
+    """Lines (n, 2, 3) [mm] in place of those that clients had under this name; None for none."""
+    _remove(clients, name)
+    if lines is not None and len(lines):
         for client in clients:
-            client.scene.add_line_segments(
-                RAY, (ends[None] * MM).astype(np.float32), RAY_COLOR,
-                thickness=3.0, thickness_units="screen",
-            )  # fmt: skip
+            client.scene.add_line_segments(name, lines * MM, color, thickness=px, **SCREEN)
 
 
 def _remove(clients: Iterable[viser.ClientHandle], name: str) -> None:
