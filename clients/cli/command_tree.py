@@ -5,8 +5,9 @@ Command modules import what they need inside their functions, so building the tr
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping
-from typing import Final
+from typing import Any, Final
 
 import typer
 
@@ -37,7 +38,7 @@ from flexdt.clients.cli.commands.scanner import (
     snap_command,
     state_commands,
 )
-from flexdt.clients.cli.options import option
+from flexdt.clients.cli.options import answering, option
 
 COMMANDS: Final[Mapping[str, Callable[..., object]]] = {
     "demo": demo_command.demo,
@@ -123,13 +124,18 @@ def build() -> typer.Typer:
 
     for name, command in COMMANDS.items():
         context = {"ignore_unknown_options": name in NUMBERS_WITH_SIGN}
-        app.command(name, context_settings=context)(command)
+        app.command(name, context_settings=context)(_complete(command))
     for name, (about, commands) in GROUPS.items():
         group = typer.Typer(help=about, no_args_is_help=True, add_completion=False)
         for one, command in commands.items():
-            group.command(one)(command)
+            group.command(one)(_complete(command))
         app.add_typer(group, name=name)
     return app
+
+
+def _complete(command: Callable[..., Any]) -> Callable[..., object]:
+    """A command as typer takes it: with --json, if it yields its answer."""
+    return answering(command) if inspect.isgeneratorfunction(inspect.unwrap(command)) else command
 
 
 def _version(asked: bool) -> None:

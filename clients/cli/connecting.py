@@ -19,17 +19,20 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import partial, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
 import typer
 
 from flexdt.clients.cli import option_values
+from flexdt.clients.cli.options import has_parameters
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
     import ssl
 
     from flexdt.clients.client.client import TwinClient
+
+_R = TypeVar("_R")
 
 PREFIX: Final = "FLEXDT_"
 PATHS: Final = ("token_file", "tls_ca", "data")
@@ -135,7 +138,7 @@ CONNECTION: Final = tuple(
 """Arguments of `connect` as options."""
 
 
-def on_twin(command: Callable[..., None]) -> Callable[..., None]:
+def on_twin(command: Callable[..., _R]) -> Callable[..., _R]:
     """Give a command the connection options in place of its first parameter, a `Twin`.
 
     Typer builds the command line from the signature of what this returns. The command itself
@@ -143,14 +146,12 @@ def on_twin(command: Callable[..., None]) -> Callable[..., None]:
     """
 
     @wraps(command)
-    def with_connection(**given: Any) -> None:
+    def with_connection(**given: Any) -> _R:
         address = {p.name: given.pop(p.name) for p in CONNECTION}
-        command(partial(connect, **address), **given)
+        return command(partial(connect, **address), **given)
 
     _, *own = inspect.signature(command, eval_str=True).parameters.values()
-    shown = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own] + list(CONNECTION)
-    with_connection.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
-    with_connection.__annotations__ = {p.name: p.annotation for p in shown}
+    has_parameters(with_connection, [*own, *CONNECTION])
     return with_connection
 
 

@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable, Iterable, Iterator
+from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+
+from flexdt.clients.cli.console import emit, say
+
+Answer = Iterator[object]
+"""What most commands yield: texts, which are lines for people, and one thing that is no text, which
+is the document of `--json`."""
 
 
 def option(default: object, help: str = "", *flags: str, **details: Any) -> Any:
@@ -29,6 +38,33 @@ def argument(default: object, metavar: str, help: str = "") -> Any:
 Json = Annotated[
     bool, typer.Option("--json", help="One JSON document on standard output, nothing else.")
 ]
+
+
+def has_parameters(command: Callable[..., Any], parameters: Iterable[inspect.Parameter]) -> None:
+    """Have typer see these parameters as those of a command, by name alone."""
+    shown = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in parameters]
+    command.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
+    command.__annotations__ = {p.name: p.annotation for p in shown}
+
+
+def answering(command: Callable[..., Answer]) -> Callable[..., None]:
+    """A command that yields its answer, with the option that prints its document instead."""
+
+    @wraps(command)
+    def answered(json: bool, **given: Any) -> None:
+        for part in command(**given):
+            if isinstance(part, str) and not json:
+                say(part)
+            elif json and not isinstance(part, str):
+                emit(part)
+
+    own = inspect.signature(command, eval_str=True).parameters.values()
+    asked = inspect.Parameter("json", inspect.Parameter.KEYWORD_ONLY, default=False,
+                              annotation=Json)  # fmt: skip
+    has_parameters(answered, [*own, asked])
+    return answered
+
+
 MachineName = Annotated[
     str | None,
     typer.Option("--machine", metavar="FILE or NAME", help="Machine description (TOML)."),

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import typer
 
 from flexdt.clients.cli import options
-from flexdt.clients.cli.console import emit, note, say, size, table
-from flexdt.clients.cli.options import argument, option
+from flexdt.clients.cli.console import note, size, table
+from flexdt.clients.cli.options import Answer, argument, option
 from flexdt.clients.failure import CommandError
 from flexdt.clients.whole_files import free_bytes
 
@@ -40,8 +40,7 @@ def batch(
     setup: list[str] | None = option(
         None, "Before workers start; repeat.", "--slurm-setup", metavar="COMMAND"
     ),
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Make a batch of scans or calibrations; run again to take up an interrupted one.
 
     Results are Zarr arrays and a manifest with every item's seed, parameters and checksums; they
@@ -63,7 +62,7 @@ def batch(
         slurm or 1, cores, memory, walltime, queue, account, tuple(extra or ()), tuple(setup or ())
     )
     if slurm_script:
-        say(job_script(queued).rstrip())
+        yield job_script(queued).rstrip()
         return
     if scheduler is not None and slurm is not None:
         raise typer.BadParameter("give --scheduler or --slurm, not both")
@@ -88,21 +87,19 @@ def batch(
             note(f"{done}/{items} items, {rate:.2f} a second, {left:.0f} s left")
 
     summary = run_batch(wanted, folder, workers, tell=tell)
-    if json:
-        emit(summary)
-        return
+    yield summary
     rate = summary["items_per_s"]
     pace = "" if rate is None else f", {rate:g} a second"
-    say(
+    yield (
         f"{summary['done']} of {summary['items']} items done, {summary['failed']} failed, "
         f"{summary['resumed']} taken up{pace}"
     )
     found = summary["figures"]
     if found:
-        say(f"{found['identifiable']} of {found['judged']} calibrations are identifiable")
+        yield f"{found['identifiable']} of {found['judged']} calibrations are identifiable"
         rows = [
             (name, f"{f['mae']:.4g}", f"{f['rms_pull']:.3g}", f"{100 * f['within_95']:.1f} %")
             for name, f in found["parameters"].items()
         ]
-        say(table(rows, ("parameter", "MAE", "error/sigma", "within 1.96 sigma")))
-    say(f"{folder / 'manifest.json'}: items {summary['items_sha256'][:16]}")
+        yield table(rows, ("parameter", "MAE", "error/sigma", "within 1.96 sigma"))
+    yield f"{folder / 'manifest.json'}: items {summary['items_sha256'][:16]}"

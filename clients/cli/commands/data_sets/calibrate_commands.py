@@ -17,8 +17,8 @@ from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
 from flexdt.clients.cli.commands.data_sets.exchange_commands import said
 from flexdt.clients.cli.connecting import Twin, on_twin
-from flexdt.clients.cli.console import as_json, emit, note, say, table, warn
-from flexdt.clients.cli.options import argument, option
+from flexdt.clients.cli.console import as_json, note, table, warn
+from flexdt.clients.cli.options import Answer, argument, option
 from flexdt.clients.failure import CommandError
 from flexdt.clients.whole_files import write_whole
 
@@ -67,8 +67,7 @@ def calibrate(
     radius: float | None = option(None, "Of the beads' spots.", metavar="PX"),
     start: list[str] | None = option(None, "Offsets to begin with (mm, deg).", metavar="P=V,..."),
     push: options.Push = False,
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Calibrate the geometry from scans of a bead phantom or of unknown markers.
 
     A data set may be a folder of TIFFs with the two settings texts alone; --frames and --geometry
@@ -104,7 +103,8 @@ def calibrate(
         from flexdt.clients.calibration.tracks import write_tracks
 
         write_tracks(outcome, tracks)
-    emit(document) if json else show(document)
+    yield document
+    yield from show(document)
     for problem in document["problems"]:
         note(f"{problem['severity']}: {problem['text']} [{problem['code']}]")
     if not document["identifiable"]:
@@ -202,8 +202,7 @@ def align(
     per_frame: bool = option(False, "Find shifts of single frames (jitter) too."),
     push: options.Push = False,
     geometry: options.Geometry = None,
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Find axis and source plane of an ordinary full-turn scan, without a phantom.
 
     Axis column, roll and, if the object tells them, yaw of the panel and row of the plane in which
@@ -221,20 +220,17 @@ def align(
     document: dict[str, Any] = found.document
     if out is not None:
         write_json(out, document)
-    if json:
-        emit(document)
-    else:
-        rows = [
-            (name, _number(p["value"], 5), _number(p["sigma"], 5), p["unit"])
-            for name, p in document["parameters"].items()
-        ]
-        say(table(rows, ("parameter", "value", "sigma", "unit")))
-        say(f"{document['frames']} frames, {_number(document['seconds'], 2)} s")
-        for text in motions(document):
-            say(text)
-        for name, why in found.alignment.refused.items():
-            say(f"not told: {name}: {why}")
-        warn(found.warnings)
+    warn(found.warnings)
+    yield document
+    rows = [
+        (name, _number(p["value"], 5), _number(p["sigma"], 5), p["unit"])
+        for name, p in document["parameters"].items()
+    ]
+    yield table(rows, ("parameter", "value", "sigma", "unit"))
+    yield f"{document['frames']} frames, {_number(document['seconds'], 2)} s"
+    yield from motions(document)
+    for name, why in found.alignment.refused.items():
+        yield f"not told: {name}: {why}"
     if not found.identifiable:
         why = found.alignment.refused["axis_column_px"]
         raise CommandError(f"not identifiable: {why}", NOT_IDENTIFIABLE)
@@ -247,8 +243,7 @@ def compare(
     phantom: str | None = option(None, "What was scanned.", metavar="NAME or FILE"),
     tolerance: float = option(0.5, "Largest rms of the beads.", metavar="PX", min=0.0),
     out: Path | None = option(None, "Report and difference images.", metavar="DIR"),
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Lay virtual projections beside a data set's radiographs.
 
     The twin is posed from the data set's texts; residuals and difference images are given before
@@ -263,15 +258,13 @@ def compare(
     if out is not None:
         write_comparison(found, out)
     document: dict[str, Any] = found.document
-    if json:
-        emit(document)
-    else:
-        rows = [
-            (name, *(_number(document[name][k], 4) for k in ("rms_px", "max_px", "image_rms")))
-            for name in ("before", "after", "in_force")
-            if name in document
-        ]
-        say(table(rows, ("correction", "rms [px]", "worst bead [px]", "difference rms")))
+    yield document
+    rows = [
+        (name, *(_number(document[name][k], 4) for k in ("rms_px", "max_px", "image_rms")))
+        for name in ("before", "after", "in_force")
+        if name in document
+    ]
+    yield table(rows, ("correction", "rms [px]", "worst bead [px]", "difference rms"))
     if not found.within:
         rms = _number(document["after"]["rms_px"], 4)
         raise CommandError(f"{dataset}: rms {rms} px after correction, allowed {tolerance:g} px")
@@ -300,32 +293,32 @@ def push_correction(client: TwinClient, correction: Correction, source: str) -> 
     client.apply_calibration(parameters, correction.name, comment=correction.note, source=source)
 
 
-def show(document: Mapping[str, Any]) -> None:
+def show(document: Mapping[str, Any]) -> Iterator[str]:
     """A calibration's document for people."""
-    say(table(parameter_rows(document), ("parameter", "value", "sigma", "of images", "unit")))
+    yield table(parameter_rows(document), ("parameter", "value", "sigma", "of images", "unit"))
     seen = f"{document['frames']} frames, {document['detections']} beads seen"
     if document["rms_px"] is None:
-        say(f"{seen}: no fit, {_number(document['seconds'], 2)} s")
+        yield f"{seen}: no fit, {_number(document['seconds'], 2)} s"
         return
-    say(
+    yield (
         f"{seen}, {document['outliers']} outliers, rms {_number(document['rms_px'], 4)} px, "
         f"cost down {_number(document['cost_reduction_pct'], 4)} %, "
         f"{document['iterations']} iterations, rank {document['rank']}, "
         f"condition {_number(document['condition'], 1)}, "
         f"{_number(document['seconds'], 2)} s"
     )
-    for text in (*limits(document), *motions(document)):
-        say(text)
+    yield from limits(document)
+    yield from motions(document)
     if "scale" in document:
         rows = [
             (m["name"], m["position_mm"], m["frames"], _number(m["rms_px"], 3))
             for m in document["markers"]
         ]
-        say(table(rows, ("marker", "x, y, z [mm]", "frames", "rms [px]")))
+        yield table(rows, ("marker", "x, y, z [mm]", "frames", "rms [px]"))
         free = "; give the distance of two: --scale A-B=MM" if document["scale"] == "free" else ""
-        say(f"scale: {document['scale']}{free}")
+        yield f"scale: {document['scale']}{free}"
     for text in document["weak"]:
-        say(f"weak: {text}")
+        yield f"weak: {text}"
 
 
 def motions(document: Mapping[str, Any]) -> Iterator[str]:

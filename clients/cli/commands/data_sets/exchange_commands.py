@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Literal
 import typer
 
 from flexdt.clients.cli import option_values, options
-from flexdt.clients.cli.console import emit, note, say, warn
-from flexdt.clients.cli.options import argument, option
+from flexdt.clients.cli.console import note, warn
+from flexdt.clients.cli.options import Answer, argument, option
 
 if TYPE_CHECKING:
     from flexdt.clients.datasets.exchange import Given
@@ -43,8 +43,7 @@ def export(
         min=0.0,
     ),
     texts: options.Texts = False,
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Write a data set's geometry in another program's format; nxtomo holds its images, too.
 
     What the format cannot carry is an error, and nothing is written: docs/exchange.md.
@@ -71,15 +70,12 @@ def export(
         tolerance_mm=tolerance,
     )
     height, width = written.shape or (0, 0)
-    document = {
+    yield {
         "format": format, "file": str(out), "views": len(written), "shape": [height, width],
         "corrected": corrected, "rows": "up" if format == "flexdata" else rows,
     }  # fmt: skip
-    if json:
-        emit(document)
-    else:
-        what = "corrected" if corrected else "nominal"
-        say(f"{out}: {len(written)} views of {width} x {height} pixels, {what}, {format}")
+    what = "corrected" if corrected else "nominal"
+    yield f"{out}: {len(written)} views of {width} x {height} pixels, {what}, {format}"
 
 
 def import_(
@@ -94,8 +90,7 @@ def import_(
     real: bool = option(
         False, "CTSimU: what is so, or what reconstruction knows.", "--real/--known"
     ),
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Read a geometry in another program's format and write it as a geometry file.
 
     `flexdt reconstruct` and `calibrate` take it with --geometry, Python with `load_geometry`.
@@ -111,18 +106,15 @@ def import_(
     save_geometry(geometry, out)
     for text in geometry.notes:
         note(f"{file}: {text}")
-    document = {
+    yield {
         "format": format, "file": str(file), "out": str(out), "views": len(geometry),
         "shape": None if geometry.shape is None else list(geometry.shape),
         "pixel_mm": list(geometry.pitch_mm), "notes": list(geometry.notes),
     }  # fmt: skip
-    if json:
-        emit(document)
-        return
     height, width = geometry.shape or (None, None)
     size = "unknown size" if width is None else f"{width} x {height} pixels"
     u, v = geometry.pitch_mm
-    say(f"{out}: {len(geometry)} views of {size}, pixel {u:.6g} x {v:.6g} mm")
+    yield f"{out}: {len(geometry)} views of {size}, pixel {u:.6g} x {v:.6g} mm"
 
 
 def said(

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from flexdt import machines
 from flexdt.clients.cli import options
-from flexdt.clients.cli.console import duration, emit, say, size, table, warn
-from flexdt.clients.cli.options import argument, option
+from flexdt.clients.cli.console import duration, size, table, warn
+from flexdt.clients.cli.options import Answer, argument, option
 
 if TYPE_CHECKING:
     from flexdt.clients.expose import Forecast, Measured, Transmission
@@ -34,8 +34,7 @@ def expose(
     sdd: float = option(1059.0, metavar="MM"),
     detail: str = option("void:0.5", "What is to be seen; void:MM.", metavar="MATERIAL:MM"),
     machine: options.MachineName = None,
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Predict transmission, contrast to noise, dose and the best voltage and filter."""
     from flexdt.clients import expose as of
     from flexdt.clients.datasets.dataset import load_dataset
@@ -44,7 +43,8 @@ def expose(
         data = load_dataset(dataset)
         warn(data.warnings, dataset)
         measured = of.exposure_of(data)
-        emit(asdict(measured)) if json else _seen(measured)
+        yield asdict(measured)
+        yield from _seen(measured)
         return
     forecast = of.expose(
         sample,
@@ -61,27 +61,28 @@ def expose(
         material=material,
     )
     warn(forecast.assumed)
-    emit(asdict(forecast)) if json else _told(forecast)
+    yield asdict(forecast)
+    yield from _told(forecast)
 
 
-def _seen(found: Forecast | Measured) -> None:
+def _seen(found: Forecast | Measured) -> Answer:
     seen: Transmission = found.transmission
-    say(f"transmission: least {seen.least:.3g}, 1 % below {seen.p1:.3g}, 5 % below {seen.p5:.3g}, "
-        f"half below {seen.median:.3g}")  # fmt: skip
+    yield (f"transmission: least {seen.least:.3g}, 1 % below {seen.p1:.3g}, "
+           f"5 % below {seen.p5:.3g}, half below {seen.median:.3g}")  # fmt: skip
     full = "unknown" if found.saturated is None else f"{100 * found.saturated:.3g} % of the pixels"
-    say(f"saturated {full}, starved {100 * found.starved:.3g} %")
+    yield f"saturated {full}, starved {100 * found.starved:.3g} %"
 
 
-def _told(forecast: Forecast) -> None:
-    _seen(forecast)
+def _told(forecast: Forecast) -> Answer:
+    yield from _seen(forecast)
     asked = forecast.asked
-    say(f"{forecast.detail} on the darkest ray: contrast {asked.cnr:.3g} times the noise")
-    say(f"air kerma on the axis {asked.kerma_mGy:.3g} mGy; {forecast.images} images, at least "
-        f"{duration(forecast.seconds)}, {size(forecast.bytes)}")  # fmt: skip
+    yield f"{forecast.detail} on the darkest ray: contrast {asked.cnr:.3g} times the noise"
+    yield (f"air kerma on the axis {asked.kerma_mGy:.3g} mGy; {forecast.images} images, at least "
+           f"{duration(forecast.seconds)}, {size(forecast.bytes)}")  # fmt: skip
     rows = [
         (f"{s.kV:g}", s.filter or "-", f"{s.averages} x {s.exposure_ms:.4g}", f"{s.cnr:.3g}",
          f"{s.kerma_mGy:.3g}")
         for s in forecast.best[:BEST]
     ]  # fmt: skip
-    say(f"best of {len(forecast.best)} settings of the same power and time:")
-    say(table(rows, ("kV", "filter", "ms", "contrast/noise", "mGy")))
+    yield f"best of {len(forecast.best)} settings of the same power and time:"
+    yield table(rows, ("kV", "filter", "ms", "contrast/noise", "mGy"))

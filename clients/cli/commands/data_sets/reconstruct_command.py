@@ -13,8 +13,8 @@ import typer
 
 from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.connecting import Twin, on_twin
-from flexdt.clients.cli.console import ProgressBar, duration, emit, note, say, size, warn
-from flexdt.clients.cli.options import argument, option
+from flexdt.clients.cli.console import ProgressBar, duration, note, size, warn
+from flexdt.clients.cli.options import Answer, argument, option
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -64,8 +64,7 @@ def reconstruct(
     geometry: options.Geometry = None,
     scheduler: options.Scheduler = None,
     slurm: Path | None = option(None, "Submit workers to SLURM: a TOML file.", metavar="FILE"),
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Reconstruct a volume from a data set.
 
     Layers go from the lowest up, rows along +y, columns along +x; values are attenuation in 1/mm.
@@ -110,16 +109,13 @@ def reconstruct(
                 data, out, request, parameters=parameters, progress=bar.update, workers=workers
             )
     warn(document["warnings"], dataset)
-    if json:
-        emit(document)
-        return
+    yield document
     z, y, x = document["shape"]
-    say(
+    yield (
         f"{out}: {x} x {y} x {z} voxels of {document['voxel_mm']:g} mm from {document['frames']} "
         f"frames, {size(out.stat().st_size)}, {duration(document['seconds'])}"
     )
-    for file in document["slices"]:
-        say(f"  {file}")
+    yield from (f"  {file}" for file in document["slices"])
 
 
 def _check_together(chosen: Mapping[str, object], out: Path, kept_out: Iterable[str]) -> None:

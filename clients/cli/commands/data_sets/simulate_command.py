@@ -7,9 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from flexdt.clients.cli import options
-from flexdt.clients.cli.console import emit, say, warn
-from flexdt.clients.cli.options import argument, option
+from flexdt.clients.cli.console import warn
+from flexdt.clients.cli.options import Answer, argument, option
 
 
 def simulate(
@@ -17,8 +16,7 @@ def simulate(
     out: Path | None = option(None, "A new folder; default: the scenario's name.", metavar="DIR"),
     seed: int = option(0, "Of the noise.", min=0),
     rays: int = option(3, "Along each side of a pixel.", min=1, max=16),
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Simulate a CTSimU scenario: projections, dark and flat images as TIFF, and metadata.
 
     What the scenario asks and cannot be done is an error; what is left out is a warning.
@@ -30,13 +28,12 @@ def simulate(
     metadata = images.write(scenario.stem if out is None else out)
     scan = images.scan
     rows, cols = scan.geometry.shape or (0, 0)
-    document = {
+    yield {
         "scenario": str(scenario), "out": str(metadata.parent), "metadata": str(metadata),
         "projections": len(images), "darks": scan.dark.number, "flats": scan.flat.number,
         "shape": [rows, cols], "max_intensity": images.brightest, "warnings": list(scan.notes),
     }  # fmt: skip
-    if json:
-        emit(document)
-        return
-    say(f"{metadata.parent}: {len(images)} projections, {scan.dark.number} dark and "
-        f"{scan.flat.number} flat images of {cols} x {rows} pixels; {metadata.name}")  # fmt: skip
+    yield (
+        f"{metadata.parent}: {len(images)} projections, {scan.dark.number} dark and "
+        f"{scan.flat.number} flat images of {cols} x {rows} pixels; {metadata.name}"
+    )

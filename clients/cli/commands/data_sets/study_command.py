@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Final, Literal
 
 from flexdt.clients.cli import options
-from flexdt.clients.cli.console import emit, note, say, table
-from flexdt.clients.cli.options import argument, option
+from flexdt.clients.cli.console import note, table
+from flexdt.clients.cli.options import Answer, argument, option
 
 Experiment = Literal["beads", "phantoms", "damping", "detector", "real", "basin"]
 Fidelity = Literal["points", "noisy", "clean", "images"]
@@ -32,8 +32,7 @@ def study(
     jobs: options.Jobs = None,
     scheduler: options.Scheduler = None,
     seed: int = option(1, "Of all noise.", min=0),
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Repeat an experiment of the thesis.
 
     EXPERIMENT: beads, phantoms, damping, detector (6.6), real (experiment 4: the 242 fits of real
@@ -46,20 +45,17 @@ def study(
         experiment, fidelity, out=out, jobs=jobs, scheduler=scheduler, seed=seed, variant=variant,
         tell=note,
     )  # fmt: skip
-    if json:
-        emit(document)
-        return
+    yield document
     rows = [[_text(row.get(key)) for key in COLUMNS] for row in document["rows"]]
     head = [*COLUMNS.values()]
     weak = open_directions(document["rows"])
     if weak is not None:
         rows = [[*row, *more] for row, more in zip(rows, weak, strict=True)]
         head += ["weak", "largest sigma"]
-    say(table(rows, head))
-    for line in real_lines(document):
-        say(line)
+    yield table(rows, head)
+    yield from real_lines(document)
     if out is not None:
-        say(f"report: {out}")
+        yield f"report: {out}"
 
 
 def _text(value: object) -> str:

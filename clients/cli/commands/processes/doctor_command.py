@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from flexdt.clients.cli import options
-from flexdt.clients.cli.console import emit, say
-from flexdt.clients.cli.options import option
+import typer
+
+from flexdt.clients.cli.options import Answer, option
 
 MARKS = {"ok": "ok     ", "warning": "warning", "error": "ERROR  "}
 
@@ -16,8 +16,7 @@ def doctor(
     port: int = option(55000, "The twin's."),
     projector_port: int = option(55001),
     viewer_port: int = option(8080),
-    json: options.Json = False,
-) -> int:
+) -> Answer:
     """Check this installation: Python, packages, compiled kernels, threads, GPU, ports, disk.
 
     Ends with exit code 1 when something is wrong; warnings alone are fine.
@@ -28,12 +27,10 @@ def doctor(
     findings = []
     for finding in examine(data, ports):
         findings.append(finding)
-        if not json:
-            advice = f" -> {finding.advice}" if finding.advice else ""
-            say(f"{MARKS[finding.verdict]}  {finding.what}: {finding.found}{advice}")
+        advice = f" -> {finding.advice}" if finding.advice else ""
+        yield f"{MARKS[finding.verdict]}  {finding.what}: {finding.found}{advice}"
     sound = all(finding.verdict != "error" for finding in findings)
-    if json:
-        emit({"ok": sound, "findings": [vars(finding) for finding in findings]})
-    elif sound:
-        say("This installation is sound.")
-    return 0 if sound else 1
+    yield {"ok": sound, "findings": [vars(finding) for finding in findings]}
+    if not sound:
+        raise typer.Exit(1)
+    yield "This installation is sound."

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from flexdt.clients.cli import options
 from flexdt.clients.cli.connecting import Twin, on_twin
-from flexdt.clients.cli.console import duration, emit, say, table, warn
+from flexdt.clients.cli.console import duration, table, warn
+from flexdt.clients.cli.options import Answer
 
 if TYPE_CHECKING:
     from flexdt.clients.client.client import TwinClient
@@ -21,29 +21,26 @@ Job = Annotated[
 
 
 @on_twin
-def list_jobs(twin: Twin, json: options.Json = False) -> None:
+def list_jobs(twin: Twin) -> Answer:
     """List all jobs, oldest first."""
     with twin() as client:
         found = client.jobs()
-    if json:
-        emit(found)
-    elif not found.jobs:
-        say("no jobs yet")
-    else:
-        rows = [(j.job, j.state, f"{j.frames_done}/{j.frames_total}", j.dataset or j.name)
-                for j in found.jobs]  # fmt: skip
-        say(table(rows, ("job", "state", "frames", "data set")))
+    yield found
+    rows = [(j.job, j.state, f"{j.frames_done}/{j.frames_total}", j.dataset or j.name)
+            for j in found.jobs]  # fmt: skip
+    yield table(rows, ("job", "state", "frames", "data set")) if rows else "no jobs yet"
 
 
-def _on_job(does: str, act: Callable[[TwinClient, str | None], JobStatus]) -> Callable[..., None]:
+def _on_job(does: str, act: Callable[[TwinClient, str | None], JobStatus]) -> Callable[..., Answer]:
     """A command that does something with one job and shows how the job is then."""
 
     @on_twin
-    def command(twin: Twin, job: Job = None, json: options.Json = False) -> None:
+    def command(twin: Twin, job: Job = None) -> Answer:
         with twin() as client:
             status = act(client, job)
         warn(status.warnings)
-        emit(status) if json else say(describe(status))
+        yield status
+        yield describe(status)
 
     command.__doc__ = does
     return command

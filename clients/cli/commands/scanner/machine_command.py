@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import typer
 
 from flexdt import machines
-from flexdt.clients.cli import option_values, options
+from flexdt.clients.cli import option_values
 from flexdt.clients.cli.commands.scanner.script_commands import read_log_file, tell
-from flexdt.clients.cli.console import emit, say, table
-from flexdt.clients.cli.options import argument, option
+from flexdt.clients.cli.console import say, table
+from flexdt.clients.cli.options import Answer, argument, option
 
 if TYPE_CHECKING:
     from flexdt.twin.machine.description import Axis, Machine
@@ -22,33 +22,29 @@ _COMMENTS = "as the file's comments say"
 NameOrFile = Annotated[str, typer.Argument(metavar="NAME or FILE", help="Shipped, or TOML.")]
 
 
-def list_machines(json: options.Json = False) -> None:
+def list_machines() -> Answer:
     """List the machines that ship."""
     from flexdt.twin.machine.description import builtin_machine, builtin_machines
 
     found = [builtin_machine(name) for name in builtin_machines()]
-    if json:
-        emit({"machines": [{"name": m.name, "description": m.description} for m in found]})
-        return
-    say(table([(m.name, m.description) for m in found], ("name", "what it is")))
+    yield {"machines": [{"name": m.name, "description": m.description} for m in found]}
+    yield table([(m.name, m.description) for m in found], ("name", "what it is"))
 
 
-def show(name: NameOrFile, json: options.Json = False) -> None:
+def show(name: NameOrFile) -> Answer:
     """Print a machine's axes, distances, bodies and times, and where each value comes from."""
     found = machines.machine(name)
-    if json:
-        emit(found.model_dump(mode="json", by_alias=True))
-        return
-    say(f"{found.name}: {found.description}\n")
-    say(_axes({n: (a, a.source or _COMMENTS) for n, a in found.axes.items()}))
-    say("\n" + _places(found))
+    yield found.model_dump(mode="json", by_alias=True)
+    yield f"{found.name}: {found.description}\n"
+    yield _axes({n: (a, a.source or _COMMENTS) for n, a in found.axes.items()})
+    yield "\n" + _places(found)
     panel, tube = found.detector, found.tube
-    say(f"\npanel: {panel.model}, {panel.columns} x {panel.rows} of {panel.pitch_mm:g} mm, "
-        f"{panel.bits} bits, mode {panel.mode}")  # fmt: skip
-    say(f"tube: {tube.min_kV:g} to {tube.max_kV:g} kV, at most {tube.max_W:g} W; at start "
-        f"{tube.kV:g} kV, {tube.power_W:g} W\n")  # fmt: skip
-    say(_bodies(found))
-    say("\n" + _times(found))
+    yield (f"\npanel: {panel.model}, {panel.columns} x {panel.rows} of {panel.pitch_mm:g} mm, "
+           f"{panel.bits} bits, mode {panel.mode}")  # fmt: skip
+    yield (f"tube: {tube.min_kV:g} to {tube.max_kV:g} kV, at most {tube.max_W:g} W; at start "
+           f"{tube.kV:g} kV, {tube.power_W:g} W\n")  # fmt: skip
+    yield _bodies(found)
+    yield "\n" + _times(found)
 
 
 def check(name: NameOrFile) -> None:
@@ -143,8 +139,7 @@ def fit(
     base: str = option(
         machines.DEFAULT_MACHINE, "What the logs do not tell.", metavar="FILE or NAME"
     ),
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Fit a machine to executed scripts: limits, rates and the times of its commands."""
     from flexdt.twin.machine.description import builtin_machine_text
     from flexdt.twin.machine.fitted_file import fitted_text
@@ -162,20 +157,18 @@ def fit(
         text, found.machine, found.axes, lambda text, _: machines.parsed(text, str(out))
     )
     out.write_text(made, encoding="utf-8")
-    if json:
-        emit(found.to_dict())
-        return
-    say(_axes({n: (found.machine.axes[n], found.machine.axes[n].source) for n in found.axes}))
-    say("\n" + _times(found.machine))
+    yield found.to_dict()
+    yield _axes({n: (found.machine.axes[n], found.machine.axes[n].source) for n in found.axes})
+    yield "\n" + _times(found.machine)
     lines = found.lines
-    say(
+    yield (
         f"\n{len(lines.rows)} lines, {lines.total_real_s:.2f} s; absolute errors sum to "
         f"{lines.sum_abs_error_s:.2f} s, {found.cross_validated_s:.2f} s with each time predicted "
         "from the others of its kind"
     )
     if len(logs) == 1:
-        say("one log does not show how a scan differs from the next: ranges may be too narrow")
-    say(f"{out}: written, everything else as in {base}")
+        yield ("one log does not show how a scan differs from the next: ranges may be too narrow")
+    yield (f"{out}: written, everything else as in {base}")
 
 
 def _axes(axes: dict[str, tuple[Axis, str]]) -> str:

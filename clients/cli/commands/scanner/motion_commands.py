@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flexdt.clients.cli import option_values, options
+from flexdt.clients.cli import option_values
 from flexdt.clients.cli.boundary import REFUSED
 from flexdt.clients.cli.connecting import Twin, on_twin
-from flexdt.clients.cli.console import duration, emit, note, say, warn
-from flexdt.clients.cli.options import argument, option
+from flexdt.clients.cli.console import duration, note, say, warn
+from flexdt.clients.cli.options import Answer, argument, option
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -39,8 +39,7 @@ def move(
     plan: bool = option(False, "Go around obstacles.", "--plan"),
     shortest: bool = option(False, "rot_obj by the shortest way.", "--shortest"),
     no_wait: bool = option(False, "Do not wait for arrival.", "--no-wait"),
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Move axes; several start together."""
     wanted = option_values.assignments(targets)
     with twin() as client:
@@ -52,13 +51,11 @@ def move(
             note("flexdt: the axes keep moving; `flexdt stop` brakes them")
             raise
     warn(done.warnings)
-    if json:
-        emit(done)
+    yield done
     if done.arrived is False:
         raise CommandError("the move did not end at its target; see `flexdt state`", REFUSED)
-    if not json:
-        verb = "moving, arrives in" if no_wait else "arrived after"
-        say(f"{verb} {duration(done.duration_s)} of the twin's clock")
+    verb = "moving, arrives in" if no_wait else "arrived after"
+    yield f"{verb} {duration(done.duration_s)} of the twin's clock"
 
 
 @on_twin
@@ -114,19 +111,21 @@ def _lease(client: TwinClient, axis: str, speed: float, seconds: float) -> None:
 
 
 @on_twin
-def stop(twin: Twin, json: options.Json = False) -> None:
+def stop(twin: Twin) -> Answer:
     """Bring all motors to rest (pauses a running job)."""
     with twin() as client:
         current = client.stop()
-    emit(current) if json else say(f"{_rest(current)}; a running job is paused")
+    yield current
+    yield f"{_rest(current)}; a running job is paused"
 
 
 @on_twin
-def estop(twin: Twin, json: options.Json = False) -> None:
+def estop(twin: Twin) -> Answer:
     """Emergency stop: everything halts, X-rays off."""
     with twin() as client:
         current = client.estop()
-    emit(current) if json else say(f"emergency stop, {_rest(current)}; `flexdt reset` leaves it")
+    yield current
+    yield f"emergency stop, {_rest(current)}; `flexdt reset` leaves it"
 
 
 def _rest(state: Stopped) -> str:
@@ -140,9 +139,10 @@ def _rest(state: Stopped) -> str:
 
 
 @on_twin
-def reset(twin: Twin, json: options.Json = False) -> None:
+def reset(twin: Twin) -> Answer:
     """Leave the emergency stop."""
     with twin() as client:
         current = client.reset()
     why = f": {current.safety.message}" if current.safety.message else ""
-    emit(current) if json else say(f"safety: {current.safety.state}{why}")
+    yield current
+    yield f"safety: {current.safety.state}{why}"

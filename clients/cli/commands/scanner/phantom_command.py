@@ -13,28 +13,26 @@ import typer
 
 from flexdt import machines
 from flexdt.clients.cli import option_values, options
-from flexdt.clients.cli.console import emit, note, say, table
-from flexdt.clients.cli.options import argument, option
+from flexdt.clients.cli.console import note, table
+from flexdt.clients.cli.options import Answer, argument, option
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
     from flexdt.phantoms import Phantom
 
 
-def list_phantoms(json: options.Json = False) -> None:
+def list_phantoms() -> Answer:
     """List the phantoms that ship."""
     from flexdt.phantoms import load_phantom, phantom_names
 
     found = {name: load_phantom(name) for name in phantom_names()}
-    if json:
-        emit({"phantoms": [_summary(name, p) for name, p in found.items()]})
-        return
+    yield {"phantoms": [_summary(name, p) for name, p in found.items()]}
     rows = [
         (name, " x ".join(f"{s:g}" for s in p.size_mm), len(p.beads), p.description)
         for name, p in found.items()
     ]
-    say(table(rows, ("name", "size [mm]", "beads", "what it is")))
-    say("\nCuboids take a number of beads: normal-7 has seven.")
+    yield table(rows, ("name", "size [mm]", "beads", "what it is"))
+    yield "\nCuboids take a number of beads: normal-7 has seven."
 
 
 def make(
@@ -48,8 +46,7 @@ def make(
     mesh: Path | None = option(None, "STL, OBJ, PLY, GLB or OFF.", metavar="FILE"),
     unit: str | None = option(None, "Of the mesh's coordinates; default: mm, for GLB m."),
     stl: Path | None = option(None, "Its surfaces, to print it.", metavar="FILE.stl"),
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Write a new phantom: a bead cuboid of your own size, or a mesh."""
     if sum(given is not None for given in (like, size, mesh)) != 1:
         raise typer.BadParameter("give one of --like NAME, --size W,B,H or --mesh FILE")
@@ -73,10 +70,8 @@ def make(
         made.mesh().export(stl, file_type="stl")
     for line in made.assumed:
         note(f"assumed: {line}")
-    if json:
-        emit({"file": str(file), "stl": stl, **_summary(made.name, made)})
-    else:
-        say(f"{file}: {made.description}")
+    yield {"file": str(file), "stl": stl, **_summary(made.name, made)}
+    yield f"{file}: {made.description}"
 
 
 def design(
@@ -102,8 +97,7 @@ def design(
     out: Path | None = option(None, "Instruction, STL, phantom file.", metavar="DIR"),
     machine: options.MachineName = None,
     profile: options.ProfileName = None,
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Choose bead places that determine the geometry best, and say how to build it."""
     from flexdt.clients.calibration import phantom_design as work
     from flexdt.phantoms.bricks import Brickwork
@@ -131,13 +125,11 @@ def design(
     else:
         holder = work.BeadHolder(None, _size(size), body)
     document = work.run_design(holder, scans, request, out=out, tell=note)
-    if json:
-        emit(document)
-        return
-    say(table(work.table_rows(document), work.HEADER))
-    say(f"\n{work.verdict(document)}")
+    yield document
+    yield table(work.table_rows(document), work.HEADER)
+    yield f"\n{work.verdict(document)}"
     if out is not None:
-        say(f"building instruction: {out / 'build.html'}; phantom: {out / 'phantom.json'}")
+        yield (f"building instruction: {out / 'build.html'}; phantom: {out / 'phantom.json'}")
 
 
 def _studs(text: str) -> tuple[int, int]:

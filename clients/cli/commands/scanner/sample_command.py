@@ -7,10 +7,9 @@ from typing import Literal
 
 import typer
 
-from flexdt.clients.cli import options
 from flexdt.clients.cli.connecting import Twin, on_twin
-from flexdt.clients.cli.console import emit, say, warn
-from flexdt.clients.cli.options import argument, option
+from flexdt.clients.cli.console import warn
+from flexdt.clients.cli.options import Answer, argument, option
 
 
 @on_twin
@@ -25,8 +24,7 @@ def sample(
         None, "Of a mesh's coordinates; default: mm, for GLB m."
     ),
     material: str | None = option(None, "A mesh is made of; default: abs."),
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Put a sample on the stage, or list what there is."""
     from flexdt.clients.client.uploads import MESH_FORMATS, SCENE_FORMATS
 
@@ -39,11 +37,8 @@ def sample(
     with twin() as client:
         if name is None:
             found = client.samples()
-            if json:
-                emit(found)
-            else:
-                for one in found.samples:
-                    say(f"{one.name:20} {one.description}")
+            yield found
+            yield from (f"{one.name:20} {one.description}" for one in found.samples)
             return
         if file is not None:
             if kind in SCENE_FORMATS:
@@ -54,4 +49,5 @@ def sample(
         else:
             now = client.set_sample(name)
     warn(now.warnings)
-    emit(now) if json else say(f"on the stage: {now.sample.name or 'nothing'}")
+    yield now
+    yield f"on the stage: {now.sample.name or 'nothing'}"

@@ -26,7 +26,7 @@ from flexdt.clients.cli.commands.scanner.job_command import describe
 from flexdt.clients.cli.commands.scanner.snap_command import warn_of_exposure
 from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import ProgressBar, duration, emit, note, say, size, table, warn
-from flexdt.clients.cli.options import option
+from flexdt.clients.cli.options import Answer, option
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -174,8 +174,7 @@ def run(
     sample: str | None = option(None, "Put this on the stage first.", metavar="NAME"),
     speed_up: str | None = option(None, "Twin seconds per second of yours.", metavar="X or max"),
     detach: bool = option(False, "Submit and leave.", "--detach"),
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Run a script on the twin and wait for the data set.
 
     Ctrl-C leaves the scan running; `flexdt job` steers it.
@@ -201,13 +200,15 @@ def run(
             ) from None
         warn(made.warnings, script)
         if detach:
-            emit(made) if json else say(f"{made.job} submitted; `flexdt job status {made.job}`")
+            yield made
+            yield f"{made.job} submitted; `flexdt job status {made.job}`"
             return
         last = follow(client, made.job)
         seen = client.state().image
     if seen is not None and (seen.time or 0.0) >= began:
         warn_of_exposure(seen)
-    emit(last) if json else say(describe(last))
+    yield last
+    yield describe(last)
     if last.state != "done":
         message = (last.error or {}).get("message", "the data set is incomplete")
         raise CommandError(f"{last.job} {last.state}: {message}", failure_code(last))
@@ -279,8 +280,7 @@ def new(
     roi: options.Roi = None,
     machine: options.MachineName = None,
     profile: options.ProfileName = None,
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Write a valid scan script; one that `flexdt check` would reject is not written."""
     from flexdt.scripts import collisions
     from flexdt.twin.machine.camera import Roi
@@ -315,13 +315,12 @@ def new(
         )
     if file is not None:
         file.write_bytes(text.encode("utf-8"))
-    if json:
-        emit({"file": file, "text": text, "frames": plan.frames, "bytes": plan.bytes,
-              "duration_s": plan.duration_s})  # fmt: skip
-    elif file is None:
-        say(text, end="")
+    yield {"file": file, "text": text, "frames": plan.frames, "bytes": plan.bytes,
+           "duration_s": plan.duration_s}  # fmt: skip
+    if file is None:
+        yield text.removesuffix("\n")
     else:
-        say(f"{file}: {plan.frames} frames, {size(plan.bytes)}, {duration(plan.duration_s)}")
+        yield f"{file}: {plan.frames} frames, {size(plan.bytes)}, {duration(plan.duration_s)}"
 
 
 def _own(kind: Kind, **given: Any) -> dict[str, Any]:

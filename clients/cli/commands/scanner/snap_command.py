@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
-from flexdt.clients.cli import options
 from flexdt.clients.cli.connecting import Twin, on_twin
-from flexdt.clients.cli.console import emit, note, say
-from flexdt.clients.cli.options import argument, option
+from flexdt.clients.cli.console import note
+from flexdt.clients.cli.options import Answer, argument, option
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -32,8 +31,7 @@ def snap(
     marks: bool = option(
         True, "Saturated and starved pixels and edges that cut off, in a PNG's colour."
     ),
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Take a projection at the current pose.
 
     A TIFF holds the values as they come: uint16 counts unless said. A PNG is windowed to 8 bit,
@@ -60,19 +58,15 @@ def snap(
         note(f"warning: X-rays warm up (ready in {tube.ready_in_s:.1f} s): this is a dark image")
     elif taken.flags is not None:
         warn_of_exposure(taken.flags)
-    if json:
-        flags = None if dark or taken.flags is None else taken.flags.model_dump()
-        emit({"file": str(file), "dtype": str(image.dtype), "shape": image.shape,
-              "cone_vec": taken.cone_vec, "kind": wanted,
-              "flags": flags})  # fmt: skip
-    else:
-        rows, cols = image.shape
-        say(f"{file}: {cols} x {rows} {image.dtype}")
-        if taken.marks is not None:
-            from flexdt.clients.datasets.pictures import legend
+    flags = None if dark or taken.flags is None else taken.flags.model_dump()
+    yield {"file": str(file), "dtype": str(image.dtype), "shape": image.shape,
+           "cone_vec": taken.cone_vec, "kind": wanted, "flags": flags}  # fmt: skip
+    rows, cols = image.shape
+    yield f"{file}: {cols} x {rows} {image.dtype}"
+    if taken.marks is not None:
+        from flexdt.clients.datasets.pictures import legend
 
-            for line in legend(taken.marks):
-                say(line)
+        yield from legend(taken.marks)
 
 
 def warn_of_exposure(flags: ImageFlags) -> None:

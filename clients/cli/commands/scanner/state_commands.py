@@ -9,28 +9,24 @@ from typing import TYPE_CHECKING
 
 from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.connecting import Twin, on_twin
-from flexdt.clients.cli.console import emit, say, table
-from flexdt.clients.cli.options import argument, option
+from flexdt.clients.cli.console import table
+from flexdt.clients.cli.options import Answer, argument, option
 
 if TYPE_CHECKING:
     from flexdt.protocol.state_model import AxisState, State, TubeState
 
 
 @on_twin
-def state(twin: Twin, json: options.Json = False) -> None:
+def state(twin: Twin) -> Answer:
     """Show axes, geometry, tube, camera, sample, safety, job."""
     with twin() as client:
         current = client.state()
-    emit(current) if json else show(current)
-
-
-def show(state: State) -> None:
-    """The state as text for people, to standard output."""
-    say(table([_axis(n, a) for n, a in state.axes.items()],
-              ("axis", "position", "target", "velocity", "limits", "unit", "")))  # fmt: skip
-    say()
-    for name, text in _facts(state):
-        say(f"{name:12} {text}")
+    yield current
+    yield table([_axis(n, a) for n, a in current.axes.items()],
+                ("axis", "position", "target", "velocity", "limits", "unit", ""))  # fmt: skip
+    yield ""
+    for name, text in _facts(current):
+        yield f"{name:12} {text}"
 
 
 def _axis(name: str, axis: AxisState) -> tuple[str, ...]:
@@ -74,15 +70,15 @@ def tube(
     kV: float | None = option(None, "Voltage.", "--kv"),
     power_W: float | None = option(None, "Power.", "--power", metavar="W"),
     on: bool | None = option(None, "X-rays.", "--on/--off"),
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Set the X-ray tube, or show it; what is left out stays."""
     with twin() as client:
         if kV is None and power_W is None and on is None:
             t = client.state().tube
         else:
             t = client.set_tube(kV=kV, power_W=power_W, on=on)
-    emit(t) if json else say(f"X-rays {xrays(t)}, {t.kV:g} kV, {t.power_W:g} W")
+    yield t
+    yield f"X-rays {xrays(t)}, {t.kV:g} kV, {t.power_W:g} W"
 
 
 def xrays(tube: TubeState) -> str:
@@ -99,30 +95,24 @@ def camera(
     mode: str | None = option(None, "HWaSWbHigh or HWaSWbLow."),
     roi: options.Roi = None,
     averages: int | None = option(None),
-    json: options.Json = False,
-) -> None:
+) -> Answer:
     """Set the camera, or show it; what is left out stays."""
     with twin() as client:
         if exposure_ms is None and mode is None and roi is None and averages is None:
             c = client.state().camera
         else:
             c = client.set_camera(exposure_ms=exposure_ms, mode=mode, roi=roi, averages=averages)
-    if json:
-        emit(c)
-    else:
-        rows, cols = c.shape
-        say(f"{c.mode}, {cols} x {rows} pixels of {c.pixel_mm:g} mm, {c.exposure_ms:g} ms, "
-            f"averages {c.averages}, ROI {' '.join(map(str, c.roi))}")  # fmt: skip
+    yield c
+    rows, cols = c.shape
+    yield (f"{c.mode}, {cols} x {rows} pixels of {c.pixel_mm:g} mm, {c.exposure_ms:g} ms, "
+           f"averages {c.averages}, ROI {' '.join(map(str, c.roi))}")  # fmt: skip
 
 
 @on_twin
-def clock(
-    twin: Twin,
-    speed_up: str = argument(..., "X or max"),
-    json: options.Json = False,
-) -> None:
+def clock(twin: Twin, speed_up: str = argument(..., "X or max")) -> Answer:
     """Set how fast the twin's time runs."""
     wanted = option_values.speed_up(speed_up)
     with twin() as client:
         now = client.set_clock(wanted)
-    emit(now) if json else say(f"speed-up {now.speed_up}, {now.time_s:.2f} s on the twin's clock")
+    yield now
+    yield f"speed-up {now.speed_up}, {now.time_s:.2f} s on the twin's clock"
