@@ -8,7 +8,6 @@ beads in pixels and as difference images. A correction that is not identifiable 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -142,12 +141,8 @@ def _figures(residual: FloatArray, images: Float32Array | None) -> dict[str, flo
     }
 
 
-def write_comparison(comparison: Comparison, out: Path) -> Mapping[str, Path]:
-    """Write report.html, compare.json and the difference images (float32 TIFF) into a folder.
-
-    Returns:
-        What was written, by name.
-    """
+def write_comparison(comparison: Comparison, out: Path) -> None:
+    """Write report.html, compare.json and the difference images (float32 TIFF) into a folder."""
     import json
 
     import tifffile
@@ -155,16 +150,11 @@ def write_comparison(comparison: Comparison, out: Path) -> Mapping[str, Path]:
     from flexdt.clients.studies.figures import Series, image_under, page, plot, table
 
     out.mkdir(parents=True, exist_ok=True)
-    written: dict[str, Path] = {}
     for k, frame in enumerate(comparison.frames):
         for name, stack in (("before", comparison.before), ("after", comparison.after)):
-            path = out / f"difference_{frame:06d}_{name}.tif"
-            tifffile.imwrite(path, stack[k])
-            written[path.name] = path
+            tifffile.imwrite(out / f"difference_{frame:06d}_{name}.tif", stack[k])
     document = comparison.document
-    path = out / "compare.json"
-    path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    written[path.name] = path
+    (out / "compare.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     rows = [
         [name, *(document[name][k] for k in ("rms_px", "max_px", "image_rms"))]
         for name in ("before", "after", "in_force")
@@ -194,7 +184,4 @@ def write_comparison(comparison: Comparison, out: Path) -> Mapping[str, Path]:
         for name, stack in shown.items():
             picture = image_under(stack[k], [], title=f"{name}, frame {frame}", width=300)
             body.append(f"<figure>{picture}</figure>")
-    path = out / "report.html"
-    path.write_text(page("flexdt compare", body), encoding="utf-8")
-    written[path.name] = path
-    return written
+    (out / "report.html").write_text(page("flexdt compare", body), encoding="utf-8")

@@ -144,10 +144,7 @@ class DataSet:
         """
         values = np.asarray(counts)
         if values.ndim != 3 or 0 in values.shape:
-            raise DatasetFormatError(
-                f"counts of shape {values.shape}; allowed: (n, rows, cols)",
-                {"asked": list(values.shape), "allowed": ["n", "rows", "cols"]},
-            )
+            raise DatasetFormatError.of_shape("counts", values.shape, ("n", "rows", "cols"))
         if values.dtype != np.uint16:
             whole_numbers = values.astype(np.uint16)
             if not np.array_equal(whole_numbers, values):

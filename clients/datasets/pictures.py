@@ -25,9 +25,11 @@ BAND: Final = 100
 """Marks on the edge are drawn 1 / BAND of the picture wide, so that they can be seen."""
 
 
-def windowed(image: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
-    """8-bit view of an image: percentiles to black and white, clipped beyond."""
-    low, high = np.percentile(image, PERCENTILES)
+def windowed(
+    image: npt.NDArray[Any], like: npt.NDArray[Any] | None = None
+) -> npt.NDArray[np.uint8]:
+    """8-bit view of an image: percentiles, of `like` if given, to black and white."""
+    low, high = np.percentile(image if like is None else like, PERCENTILES)
     if high <= low:
         return np.zeros(image.shape, dtype=np.uint8)
     scaled = (image.astype(np.float64) - low) * (255.0 / (high - low))
@@ -73,8 +75,9 @@ def png(
     *,
     dark_is_dense: bool = False,
     marks: npt.NDArray[np.generic] | None = None,
+    like: npt.NDArray[Any] | None = None,
 ) -> bytes:
-    """Encode an image, windowed, as PNG; optionally as its negative.
+    """Encode an image, windowed as `like` is or by itself, as PNG; optionally as its negative.
 
     With marks (see `MARKS`) that are not all zero it is a colour picture.
 
@@ -85,7 +88,7 @@ def png(
 
     if image.ndim != 2 or image.size == 0:
         raise ValueError(f"an image has rows and columns, got shape {image.shape}")
-    shown = windowed(image)
+    shown = windowed(image, like)
     if dark_is_dense:
         shown = 255 - shown
     if marks is not None and np.any(marks):

@@ -378,12 +378,12 @@ def _task(
 ) -> tuple[VolumeRequest, ScanFrames, Grid]:
     """A request that can be met, its views, not yet corrected, and its grid."""
     wanted = VolumeRequest() if request is None else request
-    if wanted.algorithm not in ALGORITHMS:
-        what = f"unknown algorithm {wanted.algorithm!r}; allowed"
-        raise UnknownNameError.among(what, wanted.algorithm, ALGORITHMS)
-    if wanted.scatter_method not in SCATTER_METHODS:
-        what = f"unknown scatter method {wanted.scatter_method!r}; allowed"
-        raise UnknownNameError.among(what, wanted.scatter_method, SCATTER_METHODS)
+    for what, name, allowed in (
+        ("algorithm", wanted.algorithm, ALGORITHMS),
+        ("scatter method", wanted.scatter_method, SCATTER_METHODS),
+    ):
+        if name not in allowed:
+            raise UnknownNameError.among(f"unknown {what} {name!r}; allowed", name, allowed)
     views = views_of(dataset, parameters, binning=wanted.binning, every=wanted.every)
     return wanted, views, grid_of(views, wanted)
 

@@ -19,6 +19,7 @@ from typing import IO, TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.clients.datasets.pictures import png
 from flexdt.clients.extras import package
 from flexdt.clients.reconstruction import zarr_volume
 from flexdt.twin.errors import LimitError
@@ -106,11 +107,6 @@ def save_volume(volume: Volume, file: File) -> None:
         )
     with volume_writer(Path(file), Grid(volume.shape, voxel[0], volume.center_mm)) as write:
         write(volume.data)
-
-
-def load_volume(file: File) -> Volume:
-    """See `Volume.load`."""
-    return read_volume(Path(file))
 
 
 def _raw(file: IO[bytes] | gzip.GzipFile) -> Sink:
@@ -285,13 +281,14 @@ def read_values(path: Path) -> npt.NDArray[np.float32]:
     return read_volume(path).data
 
 
-def read_volume(path: Path) -> Volume:
+def read_volume(file: File) -> Volume:
     """A volume with its place, from a file that `volume_writer` made.
 
     Raises:
         OSError: it cannot be read.
         LimitError: it is not such a file (NumPy's format has no room for the place).
     """
+    path = Path(file)
     try:
         values, voxel, place, first = READERS[ending(path)](path)
         if first:  # the place is that of the first voxel
@@ -382,19 +379,12 @@ def write_slices(path: Path, volume: npt.NDArray[np.float32]) -> list[Path]:
 
     All three share one grey scale: the 0.5th and 99.5th percentile of their values.
     """
-    import cv2
-
     slices = middle_slices(volume)
-    low, high = np.percentile(np.concatenate([s.ravel() for s in slices.values()]), [0.5, 99.5])
+    every = np.concatenate([s.ravel() for s in slices.values()])
     written = []
     for name, image in slices.items():
-        scaled = (image - low) * (255.0 / max(float(high - low), 1e-30))
-        file = path.with_name(f"{path.name}_{name}.png")
-        ok, encoded = cv2.imencode(".png", np.clip(np.rint(scaled), 0, 255).astype(np.uint8))
-        if not ok:
-            raise OSError(f"{file}: the image could not be encoded as PNG")
-        file.write_bytes(encoded.tobytes())
-        written.append(file)
+        written.append(path.with_name(f"{path.name}_{name}.png"))
+        written[-1].write_bytes(png(image, like=every))
     return written
 
 

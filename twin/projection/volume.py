@@ -263,7 +263,7 @@ class Volume:
             ...     Volume.load(f"{folder}/volume.tif").voxel_mm
             0.5
         """
-        volume: Volume = outward("clients.reconstruction.volume_files").load_volume(file)
+        volume: Volume = outward("clients.reconstruction.volume_files").read_volume(file)
         return volume
 
     @property
