@@ -1,9 +1,8 @@
 """The options of each server process, declared once.
 
-Each process has a frozen dataclass of settings. The argument parser of `python -m flexdt....main`,
-the options of `flexdt twin` and its like, and the words that `flexdt up` starts its processes with
-are all derived from it. Command line and servers both import this module, so it stands above their
-two packages and imports nothing but the standard library.
+Each process has a frozen dataclass of settings. The options of `python -m flexdt....main`, those of
+`flexdt twin` and its like, and the words that `flexdt up` starts its processes with are all derived
+from it. Command line and servers both import this module, so it stands above their two packages.
 """
 
 # ruff: noqa: RUF009  (the calls make fields; they are not values shared by all instances)
@@ -11,12 +10,16 @@ two packages and imports nothing but the standard library.
 from __future__ import annotations
 
 import argparse
+import inspect
 import re
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, ClassVar, Literal, NoReturn, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeVar, get_type_hints
+
+import typer
+from typer.main import get_command
 
 LOOPBACK = "127.0.0.1"
 LARGEST_PORT = 65535
@@ -41,11 +44,13 @@ def address(text: str) -> Address:
     """Read HOST:PORT or [IPv6]:PORT.
 
     Raises:
-        argparse.ArgumentTypeError: the text has another form.
+        typer.BadParameter: the text has another form, or the port is none.
     """
-    host, _, port = text.rpartition(":")
+    host, _, port = text.strip().rpartition(":")
     if not host or not port.isdigit():
-        raise argparse.ArgumentTypeError(f"{text!r} is not HOST:PORT")
+        raise typer.BadParameter(f"{text!r} is not HOST:PORT, such as {LOOPBACK}:55000")
+    if not 1 <= int(port) <= LARGEST_PORT:
+        raise typer.BadParameter(f"{text!r}: the port must be a number from 1 to {LARGEST_PORT}")
     return Address(host.strip("[]"), int(port))
 
 
@@ -53,9 +58,9 @@ def addresses(text: str | None) -> tuple[Address, ...]:
     """Read HOST:PORT,HOST:PORT...; none of None.
 
     Raises:
-        argparse.ArgumentTypeError: as `address`.
+        typer.BadParameter: as `address`.
     """
-    return () if text is None else tuple(address(word.strip()) for word in text.split(","))
+    return () if text is None else tuple(address(word) for word in text.split(","))
 
 
 def several(text: str) -> str:
@@ -68,69 +73,32 @@ def memory_size(text: str) -> int:
     """Bytes of "4GiB", "512M" or "1000000".
 
     Raises:
-        ValueError: not a size.
+        typer.BadParameter: not a size.
     """
     match = re.fullmatch(r"(\d+\.?\d*)\s*([kmgt]?)i?b?", text.strip().lower())
     size = 0 if match is None else int(float(match[1]) * UNITS[match[2]])
     if size <= 0:
-        raise ValueError(f"{text!r} is not a size such as 512M or 4GiB")
+        raise typer.BadParameter(f"{text!r} is not a size such as 512M or 4GiB")
     return size
 
 
-@dataclass(frozen=True)
-class Option:
-    """One option of a process.
+def option(default: object, help: str, *flags: str, public: bool = True, **details: Any) -> Any:
+    """A field of settings that is an option.
 
-    Attributes:
-        name: of the field in the settings.
-        flags: as typed, e.g. `--http-port`; the first is the usual one.
-        kind: type of the value, or of one value where the option may be given several times.
+    Args:
         default: where the option is left out.
         help: one line.
-        metavar: stands for the value in the help.
-        read: turns the word into the value.
-        least, most: range of a whole number, both included; None where there is no bound.
-        repeated: whether it may be given several times.
+        flags: as typed; they follow from the field's name.
         public: whether the `flexdt` command offers it too.
+        details: of `typer.Option`, such as metavar, min, max and parser.
     """
-
-    name: str
-    flags: tuple[str, ...]
-    kind: Any
-    default: Any
-    help: str
-    metavar: str | None
-    read: Callable[[str], object]
-    least: int | None
-    most: int | None
-    repeated: bool
-    public: bool
-
-    @property
-    def choices(self) -> tuple[str, ...] | None:
-        """The values allowed, where they can be listed."""
-        return get_args(self.kind) if get_origin(self.kind) is Literal else None
-
-
-def option(
-    default: object,
-    help: str,
-    *flags: str,
-    metavar: str | None = None,
-    read: Callable[[str], object] | None = None,
-    least: int | None = None,
-    most: int | None = None,
-    public: bool = True,
-) -> Any:
-    """A field of settings with what `Option` says about it; flags follow from the field's name."""
-    details = {"help": help, "flags": flags, "metavar": metavar, "read": read, "least": least,
-               "most": most, "public": public}  # fmt: skip
-    return field(default=default, metadata=details)
+    return field(default=default, metadata={"public": public, "flags": flags,
+                                            "details": {"help": help, **details}})  # fmt: skip
 
 
 def tcp_port(default: int | None, help: str, *flags: str, most: int = LARGEST_PORT) -> Any:
     """A field for a TCP port."""
-    return option(default, help, *flags, least=0, most=most)
+    return option(default, help, *flags, min=0, max=most)
 
 
 def some_file(help: str) -> Any:
@@ -141,8 +109,14 @@ def some_file(help: str) -> Any:
 def further_projectors() -> Any:
     """A field for projectors beside the first."""
     return option(
-        None, "Further ones; views are dealt among all.", metavar="HOST:PORT,...", read=several
+        None, "Further ones; views are dealt among all.", metavar="HOST:PORT,...", parser=several
     )
+
+
+def where_the_twin_is() -> Any:
+    """A field for the twin's address."""
+    twin = Address(LOOPBACK, 55000)
+    return option(twin, "Where the twin listens.", metavar="HOST:PORT", parser=address)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,9 +151,9 @@ class ProjectorSettings(ServerSettings):
 
     command = "projector"
     port: int = tcp_port(55001, "0 is any free.", "--port", "--projector-port")
-    threads: int | None = option(None, "Of the kernels; all cores if left out.", least=1)
+    threads: int | None = option(None, "Of the kernels; all cores if left out.", min=1)
     memory_limit: int | None = option(
-        None, "E.g. 4GiB; half of the memory if left out.", metavar="SIZE", read=memory_size
+        None, "E.g. 4GiB; half of the memory if left out.", metavar="SIZE", parser=memory_size
     )
 
 
@@ -207,7 +181,10 @@ class TwinSettings(ScannerSettings):
     data: Path = option(Path("data"), "Data directory: all that is written.", metavar="DIR")
     machine: str = option("flexray", "Machine description (TOML).", metavar="FILE or NAME")
     projector: Address = option(
-        Address(LOOPBACK, 55001), "Where the projector listens.", metavar="HOST:PORT"
+        Address(LOOPBACK, 55001),
+        "Where the projector listens.",
+        metavar="HOST:PORT",
+        parser=address,
     )
     projectors: str | None = further_projectors()
     projector_token_file: Path | None = some_file("Shown to the projectors.")
@@ -232,7 +209,7 @@ class ViewerSettings(TwinClientSettings, ServerSettings):
 
     command = "viewer"
     port: int = tcp_port(8080, "0 is any free.", "--port", "--viewer-port")
-    twin: Address = option(Address(LOOPBACK, 55000), "Where the twin listens.", metavar="HOST:PORT")
+    twin: Address = where_the_twin_is()
     token_file: Path | None = some_file("Shown to the twin; browsers must show its token.")
 
 
@@ -246,9 +223,7 @@ class GatewaySettings(TwinClientSettings):
     )
     port: int = tcp_port(50000, "Events go out there; 0 is any free.")
     inbound_port: int | None = tcp_port(None, "Events come in; default: the next.")
-    server: Address = option(
-        Address(LOOPBACK, 55000), "Where the twin listens.", metavar="HOST:PORT"
-    )
+    server: Address = where_the_twin_is()
     data: Path = option(Path("data"), "Images are saved there.", metavar="DIR")
 
 
@@ -273,32 +248,26 @@ class UpSettings(ScannerSettings):
 S = TypeVar("S", bound=ProcessSettings)
 
 
-def options(settings: type[ProcessSettings]) -> tuple[Option, ...]:
-    """The options of a process, in the order of its settings."""
-    hints = get_type_hints(settings)
-    return tuple(_option(f.name, hints[f.name], f.default, **f.metadata) for f in fields(settings))
+def parameters(settings: type[ProcessSettings]) -> dict[str, inspect.Parameter]:
+    """The options of a process, as parameters of a function that typer reads."""
+    hints, found = get_type_hints(settings), {}
+    for f in fields(settings):
+        flags = f.metadata["flags"] or (f"--{f.name.replace('_', '-')}",)
+        default = str(f.default) if isinstance(f.default, Address) else f.default
+        kind: Any = list[str] if isinstance(default, tuple) else hints[f.name]
+        found[f.name] = inspect.Parameter(
+            f.name, inspect.Parameter.KEYWORD_ONLY,
+            default=[*default] if isinstance(default, tuple) else default,
+            annotation=Annotated[kind, typer.Option(*flags, **f.metadata["details"])],
+        )  # fmt: skip
+    return found
 
 
-def _option(
-    name: str, hint: Any, default: object, *, flags: tuple[str, ...], read: Any, **details: Any
-) -> Option:
-    kind = hint
-    if get_origin(hint) is UnionType or NoneType in get_args(hint):
-        (kind,) = (each for each in get_args(hint) if each is not NoneType)
-    repeated = get_origin(kind) is tuple
-    kind = get_args(kind)[0] if repeated else kind
-    if read is None:
-        read = address if kind is Address else str if get_origin(kind) is Literal else kind
-    flags = flags or (f"--{name.replace('_', '-')}",)
-    return Option(name, flags, kind, default, read=read, repeated=repeated, **details)
-
-
-class OneLine(argparse.ArgumentParser):
-    """Reports a wrong option in one line, without the page of all options."""
-
-    def error(self, message: str) -> NoReturn:
-        """Exit with code 2."""
-        self.exit(2, f"{self.prog}: {message}\n")
+def has_parameters(command: Callable[..., Any], shown: Iterable[inspect.Parameter]) -> None:
+    """Have typer see these parameters as those of a command, by name alone."""
+    named = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in shown]
+    command.__signature__ = inspect.Signature(named)  # type: ignore[attr-defined]
+    command.__annotations__ = {p.name: p.annotation for p in named}
 
 
 def parse(settings: type[S], words: Sequence[str] | None = None) -> S:
@@ -308,27 +277,24 @@ def parse(settings: type[S], words: Sequence[str] | None = None) -> S:
         settings: class of the process.
         words: of the command line, `sys.argv`'s where left out.
     """
-    parser = OneLine(prog=f"flexdt {settings.command}")
-    for o in options(settings):
-        common: dict[str, Any] = {"dest": o.name, "help": o.help, "default": o.default}
-        if o.kind is bool:
-            parser.add_argument(*o.flags, action="store_true", **common)
-            continue
-        action = "append" if o.repeated else "store"
-        if o.repeated:
-            common["default"] = list(o.default)
-        parser.add_argument(*o.flags, action=action, type=o.read, choices=o.choices,
-                            metavar=o.metavar, **common)  # fmt: skip
-    found = vars(parser.parse_args(words))
-    for o in options(settings):
-        value = found[o.name]
-        low, high = o.least, o.most
-        if isinstance(value, int) and (
-            (low is not None and value < low) or (high is not None and value > high)
-        ):
-            parser.error(f"argument {o.flags[0]}: {value} is not in {low}..{high or ''}")
-        if o.repeated:
-            found[o.name] = tuple(value)
+    found: dict[str, Any] = {}
+
+    def take(**given: Any) -> None:
+        found.update({n: tuple(v) if isinstance(v, list) else v for n, v in given.items()})
+
+    has_parameters(take, parameters(settings).values())
+    app = typer.Typer(add_completion=False, rich_markup_mode=None)
+    app.command()(take)
+    prog = f"flexdt {settings.command}"
+    try:
+        get_command(app).main(words, prog, standalone_mode=False)
+    except Exception as error:
+        if not hasattr(error, "format_message"):  # that of typer's usage errors, any version
+            raise
+        print(f"{prog}: {error.format_message()}", file=sys.stderr)
+        sys.exit(2)
+    if not found:  # the help was shown
+        sys.exit(0)
     return settings(**found)
 
 
@@ -354,3 +320,11 @@ def shared(settings: ProcessSettings, other: type[ProcessSettings]) -> dict[str,
     """The values of `settings` that a process with settings `other` takes too, by name."""
     mine = {f.name for f in fields(settings)}
     return {f.name: getattr(settings, f.name) for f in fields(other) if f.name in mine}
+
+
+class OneLine(argparse.ArgumentParser):
+    """Reports a wrong option in one line, without the page of all options."""
+
+    def error(self, message: str) -> NoReturn:
+        """Exit with code 2."""
+        self.exit(2, f"{self.prog}: {message}\n")

@@ -24,8 +24,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 import typer
 
 from flexdt.clients.cli import option_values
-from flexdt.clients.cli.options import has_parameters
 from flexdt.clients.failure import CommandError
+from flexdt.process_settings import has_parameters
 
 if TYPE_CHECKING:
     import ssl

@@ -84,23 +84,6 @@ def server(word: str) -> tuple[str, int]:
     return host or "127.0.0.1", int(port)
 
 
-def address(word: str) -> str:
-    """HOST:PORT or [IPV6]:PORT with a port, as processes take it.
-
-    Raises:
-        typer.BadParameter: another form, or a port outside 1 to 65535.
-    """
-    from argparse import ArgumentTypeError
-
-    from flexdt.process_settings import address as read
-
-    server(word)
-    try:
-        return str(read(word.strip()))
-    except ArgumentTypeError as error:
-        raise typer.BadParameter(f"{error}, such as {DEFAULT_SERVER}") from None
-
-
 def speed_up(word: str) -> float | Literal["max"]:
     """A positive factor, or "max".
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from flexdt.clients.cli.console import emit, say
+from flexdt.process_settings import has_parameters
 
 Answer = Iterator[object]
 """What most commands yield: texts, which are lines for people, and one thing that is no text, which
@@ -38,13 +39,6 @@ def argument(default: object, metavar: str, help: str = "") -> Any:
 Json = Annotated[
     bool, typer.Option("--json", help="One JSON document on standard output, nothing else.")
 ]
-
-
-def has_parameters(command: Callable[..., Any], parameters: Iterable[inspect.Parameter]) -> None:
-    """Have typer see these parameters as those of a command, by name alone."""
-    shown = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in parameters]
-    command.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
-    command.__annotations__ = {p.name: p.annotation for p in shown}
 
 
 def answering(command: Callable[..., Answer]) -> Callable[..., None]:

@@ -78,6 +78,7 @@ def test_positions_of_script_errors_are_printed() -> None:
         ["twin", "--projector", "host:1", "--projector-port", "2"],
         ["study", "real", "--seed", "-1"],
         ["twin", "--projector", "nowhere:port"],
+        ["projector", "--memory-limit", "much"],
     ],
 )
 def test_usage_errors_leave_with_2(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
@@ -204,7 +205,6 @@ def test_each_process_takes_its_port_by_the_name_that_up_has(
     ("argv", "code", "says"),
     [
         (["bench", "--only", "foo"], 2, "no case foo; there are: C1, "),
-        (["projector", "--memory-limit", "much"], 2, "--memory-limit"),
         (["projector", "--port", "0", "--token-file", "nope"], 1, "token file nope: No such file"),
     ],
 )

@@ -70,7 +70,7 @@ def test_a_wrong_option_is_reported_in_one_line(
         parse(ProjectorSettings, given)
     assert left.value.code == 2
     err = capsys.readouterr().err
-    assert err.startswith("flexdt projector: argument ")
+    assert err.startswith("flexdt projector: Invalid value for ")
     assert says in err
     assert err.count("\n") == 1
 

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+import typer
 
 from flexdt.process_settings import memory_size
 from flexdt.server.imaging.projector_client import ProjectorClient
@@ -95,7 +96,7 @@ def test_memory_sizes(text: str, size: int) -> None:
 
 @pytest.mark.parametrize("text", ["", "GiB", "12X", "-1G", "0", "nan"])
 def test_memory_sizes_that_are_none(text: str) -> None:
-    with pytest.raises(ValueError, match="not a size"):
+    with pytest.raises(typer.BadParameter, match="not a size"):
         memory_size(text)
 
 

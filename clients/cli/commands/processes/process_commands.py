@@ -10,6 +10,7 @@ import inspect
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
 from typing import Annotated, Any
 
 import typer
@@ -20,13 +21,15 @@ from flexdt.process_settings import (
     LARGEST_PORT,
     Address,
     GatewaySettings,
-    Option,
     ProcessSettings,
     ProjectorSettings,
     TwinSettings,
     UpSettings,
     ViewerSettings,
-    options,
+    address,
+    addresses,
+    has_parameters,
+    parameters,
     words,
 )
 
@@ -41,31 +44,18 @@ def with_options(settings: type[ProcessSettings], **other: Any) -> Callable[[Com
         other: name -> annotation of options of the command alone; one that the process has too
             replaces it. Their default is None.
     """
-    found = {o.name: _parameter(o) for o in options(settings) if o.public}
+    hidden = {f.name for f in fields(settings) if not f.metadata["public"]}
+    own = {name: p for name, p in parameters(settings).items() if name not in hidden}
     for name, annotation in other.items():
-        found[name] = inspect.Parameter(
+        own[name] = inspect.Parameter(
             name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation
         )
 
     def decorate(command: Command) -> Command:
-        command.__signature__ = inspect.Signature(list(found.values()))  # type: ignore[attr-defined]
+        has_parameters(command, own.values())
         return command
 
     return decorate
-
-
-def _parameter(o: Option) -> inspect.Parameter:
-    """One option for typer; the process reads the words, so most values stay text here."""
-    kind = o.kind if o.read in (int, bool) or o.choices else str
-    if o.repeated:
-        kind = list[kind]  # type: ignore[valid-type]
-    plain = isinstance(o.default, int | None)
-    default = None if o.repeated else o.default if plain else str(o.default)
-    offered = typer.Option(*o.flags, help=o.help, metavar=o.metavar, min=o.least, max=o.most)
-    return inspect.Parameter(
-        o.name, inspect.Parameter.KEYWORD_ONLY, default=default,
-        annotation=Annotated[kind | None if default is None else kind, offered],
-    )  # fmt: skip
 
 
 Data = Annotated[
@@ -98,10 +88,11 @@ def up(data: str | None, **given: object) -> None:
     TwinSettings,
     data=Data,
     projector=Annotated[
-        str | None,
+        Address | None,
         typer.Option(
             "--projector",
             metavar="HOST:PORT",
+            parser=address,
             help="Where the projector listens; 127.0.0.1:55001 if left out.",
         ),
     ],
@@ -111,7 +102,7 @@ def up(data: str | None, **given: object) -> None:
     ],
 )
 def twin(
-    projector: str | None,
+    projector: Address | None,
     projector_port: int | None,
     projectors: str | None,
     data: str | None,
@@ -120,15 +111,15 @@ def twin(
     """Run the twin server alone."""
     if projector is not None and projector_port is not None:
         raise typer.BadParameter("give --projector or --projector-port, not both")
-    further = [option_values.address(word) for word in option_values.names(projectors or "")]
+    further = list(addresses(projectors))
     if projector is not None:
-        first = option_values.address(projector)
+        first = projector
     elif projector_port is None and further:
         first = further.pop(0)
     else:
         default = TwinSettings().projector
-        first = str(Address(default.host, projector_port or default.port))
-    given |= {"projector": first, "projectors": ",".join(further) or None}
+        first = Address(default.host, projector_port or default.port)
+    given |= {"projector": first, "projectors": ",".join(map(str, further)) or None}
     _check(given)
     become("flexdt.server.twin.main", {**given, "data": _data(data)})
 
@@ -143,7 +134,6 @@ def projector(**given: object) -> None:
 @with_options(ViewerSettings)
 def viewer(**given: Any) -> None:
     """Run the viewer, the lab in the browser, alone."""
-    option_values.address(given["twin"])
     _check(given)
     become("flexdt.clients.viewer.main", given)
 
@@ -154,7 +144,6 @@ def gateway(**given: Any) -> None:
 
     Programs written for the scanner connect to it as they do to the scanner.
     """
-    option_values.address(given["server"])
     become("flexdt.clients.gateway.main", given)
 
 
