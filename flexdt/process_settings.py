@@ -47,7 +47,8 @@ def address(text: str) -> Address:
         typer.BadParameter: the text has another form, or the port is none.
     """
     host, _, port = text.strip().rpartition(":")
-    if not host or not port.isdigit():
+    closed = host.startswith("[") == host.endswith("]")
+    if not host or not closed or not (port.isascii() and port.isdigit()):
         raise typer.BadParameter(f"{text!r} is not HOST:PORT, such as {LOOPBACK}:55000")
     if not 1 <= int(port) <= LARGEST_PORT:
         raise typer.BadParameter(f"{text!r}: the port must be a number from 1 to {LARGEST_PORT}")

@@ -12,6 +12,8 @@ from typing import Literal
 
 import typer
 
+from flexdt.process_settings import LOOPBACK, address
+
 DEFAULT_SERVER = "127.0.0.1:55000"
 DEFAULT_PORT = 55000
 
@@ -68,20 +70,12 @@ def server(word: str) -> tuple[str, int]:
         typer.BadParameter: no such form, or a port outside 1 to 65535.
     """
     text = word.strip()
-    if text.startswith("["):
-        host, bracket, rest = text[1:].partition("]")
-        if not bracket or (rest and not rest.startswith(":")):
-            raise typer.BadParameter(f"server {word!r} is not of the form [ADDRESS]:PORT")
-        port = rest[1:]
-    elif text.count(":") > 1:
-        host, port = text, ""
-    else:
-        host, _, port = text.partition(":")
-    if not port:
-        return host or "127.0.0.1", DEFAULT_PORT
-    if not port.isascii() or not port.isdigit() or not 1 <= int(port) <= 65535:
-        raise typer.BadParameter(f"server {word!r}: the port must be a number from 1 to 65535")
-    return host or "127.0.0.1", int(port)
+    if text.count(":") > 1 and "[" not in text:  # an IPv6 address by itself
+        text = f"[{text}]"
+    if ":" not in text.rpartition("]")[2]:
+        text += f":{DEFAULT_PORT}"
+    found = address(f"{LOOPBACK}{text}" if text.startswith(":") else text)
+    return found.host, found.port
 
 
 def speed_up(word: str) -> float | Literal["max"]:
