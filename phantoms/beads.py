@@ -60,16 +60,10 @@ def spiral_positions(size_mm: Sequence[float], beads: int, radius_mm: float) -> 
     """
     width, breadth, height = (float(s) for s in size_mm)
     if not 1 <= beads <= MAX_BEADS:
-        raise LimitError(
-            f"{beads} beads asked; allowed: 1 to {MAX_BEADS}",
-            {"asked": beads, "allowed": [1, MAX_BEADS]},
-        )
+        raise LimitError.instead(f"{beads} beads asked", beads, f"1 to {MAX_BEADS}")
     if not 0.0 < min(width, breadth, height) <= max(width, breadth, height) < math.inf:
-        raise LimitError(
-            f"a cuboid of {width:g} x {breadth:g} x {height:g} mm cannot be; allowed: sides of "
-            "more than 0 mm",
-            {"asked": [width, breadth, height], "allowed": "sides of more than 0 mm"},
-        )
+        said = f"a cuboid of {width:g} x {breadth:g} x {height:g} mm cannot be"
+        raise LimitError.instead(said, [width, breadth, height], "sides of more than 0 mm")
     if not 0.0 < 2.0 * radius_mm <= min(width, breadth, height):
         raise LimitError(
             f"a bead of radius {radius_mm:g} mm does not fit into {width:g} x {breadth:g} x "

@@ -159,10 +159,7 @@ class Brickwork:
             ("bricks", self.bricks, 1, MOST_BRICKS),
         ):
             if not low <= value <= high:
-                raise LimitError(
-                    f"{value} {what}; allowed: {low} to {high}",
-                    {"asked": value, "allowed": [low, high]},
-                )
+                raise LimitError.instead(f"{value} {what}", value, f"{low} to {high}")
 
     @cached_property
     def measures(self) -> dict[str, float]:

@@ -38,10 +38,7 @@ def wrong(value: object, where: str, allowed: str) -> PhantomError:
     """The error for a value that is not what is `allowed` at key path `where`."""
     shown = repr(value)
     shown = shown if len(shown) <= 80 else shown[:77] + "..."
-    return PhantomError(
-        f"{where} is {shown}; allowed: {allowed}",
-        {"path": where, "asked": shown, "allowed": allowed},
-    )
+    return PhantomError.instead(f"{where} is {shown}", shown, allowed, path=where)
 
 
 def mapping(value: object, where: str) -> Mapping[str, object]:

@@ -108,10 +108,8 @@ def shape_from_dict(document: object, where: str) -> Shape:
     names = [f.name for f in fields(_KINDS[kind])]
     unknown = sorted(str(key) for key in given if key not in (*names, "kind"))
     if unknown:
-        raise PhantomError(
-            f"{where}: a {kind} has no {', '.join(unknown)}; allowed: {', '.join(names)}",
-            {"path": where, "asked": unknown, "allowed": names},
-        )
+        said = f"{where}: a {kind} has no {', '.join(unknown)}"
+        raise PhantomError.instead(said, unknown, names, path=where)
     values: dict[str, Any] = {
         name: _READERS[name](get(given, name, where), f"{where}.{name}")
         for name in names

@@ -111,10 +111,7 @@ def _one(
     if isinstance(sample, Sequence) and sample:
         parts = [_one(each, None, voxel_mm, keep=True) for each in sample]
         return assemble("scene", parts, priority=priority)
-    raise PhantomError(
-        f"a sample cannot be {_shown(sample)}; allowed: {FORMS}",
-        {"asked": _shown(sample), "allowed": FORMS},
-    )
+    raise PhantomError.instead(f"a sample cannot be {_shown(sample)}", _shown(sample), FORMS)
 
 
 def _named(word: str, material: str | None, keep: bool) -> Phantom:
@@ -148,10 +145,8 @@ def _array(
             {"asked": None, "allowed": "voxel_mm > 0"},
         )
     if values.dtype.kind not in "buif":
-        raise PhantomError(
-            f"an array of {values.dtype} is no sample; allowed: numbers",
-            {"asked": str(values.dtype)},
-        )
+        kind = str(values.dtype)
+        raise PhantomError.instead(f"an array of {kind} is no sample", kind, "numbers")
     data = values.astype(np.float32)
     if material is not None:
         low, high = float(data.min()), float(data.max())

@@ -53,11 +53,9 @@ def voxelise(
         raise PhantomError(f"oversample is {oversample}; allowed: 1 to 16")
     counts = [max(math.ceil(s / voxel_mm - 1e-9), 1) for s in size_mm]
     if math.prod(counts) > MAX_VOXELS:
-        raise PhantomError(
-            f"{counts[0]} x {counts[1]} x {counts[2]} voxels of {voxel_mm:g} mm are too many; "
-            f"allowed: {MAX_VOXELS}",
-            {"asked": math.prod(counts), "allowed": MAX_VOXELS},
-        )
+        grid = " x ".join(map(str, counts))
+        said = f"{grid} voxels of {voxel_mm:g} mm are too many"
+        raise PhantomError.instead(said, math.prod(counts), MAX_VOXELS)
     data = np.zeros(counts[::-1], dtype=np.float32)
     for solid in scene.solids:
         _add_solid(data, solid.shape, solid.mu_per_mm, voxel_mm, oversample)

@@ -28,6 +28,20 @@ class TwinError(ValueError):
         self.data: dict[str, object] = dict(data or {})
 
     @classmethod
+    def instead(cls, said: str, asked: object, allowed: object, **where: object) -> Self:
+        """The error whose message is `said` and what is allowed; `where` goes into its data.
+
+        Example:
+            >>> error = TwinError.instead("no unit 'mile'", "mile", ("mm", "m"))
+            >>> print(error, error.data)
+            no unit 'mile'; allowed: mm, m {'asked': 'mile', 'allowed': ['mm', 'm']}
+        """
+        several = list(map(str, allowed)) if isinstance(allowed, list | tuple | dict) else None
+        words = allowed if several is None else ", ".join(several)
+        data = {**where, "asked": asked, "allowed": allowed if several is None else several}
+        return cls(f"{said}; allowed: {words}", data)
+
+    @classmethod
     def of_shape(
         cls, what: str, got: Sequence[int], allowed: Sequence[int | str], more: str = ""
     ) -> Self:

@@ -88,10 +88,7 @@ def mesh_phantom(
         (5.0, 6.0, 7.0)
     """
     if unit is not None and unit not in UNITS_MM:
-        raise PhantomError(
-            f"unknown unit {unit!r}; allowed: {', '.join(UNITS_MM)}",
-            {"asked": unit, "allowed": list(UNITS_MM)},
-        )
+        raise PhantomError.instead(f"unknown unit {unit!r}", unit, list(UNITS_MM))
     raw, kind, label = _read(source, file_type)
     unit = default_unit(kind) if unit is None else unit
     return filled_mesh(
@@ -247,21 +244,15 @@ def _read(source: bytes | str | os.PathLike[str], file_type: str | None) -> tupl
             ) from None
         _check_size(size, label)
     if kind.lower() not in FORMATS:
-        raise PhantomError(
-            f"{label}: {kind or 'no format'!r} is not a mesh format we read; allowed: "
-            f"{', '.join(FORMATS)}",
-            {"asked": kind, "allowed": list(FORMATS)},
-        )
+        what = f"{label}: {kind or 'no format'!r} is not a mesh format we read"
+        raise PhantomError.instead(what, kind, FORMATS)
     _check_size(len(raw), label)
     return raw, kind.lower(), label
 
 
 def _check_size(size: int, label: str) -> None:
     if not 0 < size <= MAX_BYTES:
-        raise PhantomError(
-            f"{label} has {size} bytes; allowed: 1 to {MAX_BYTES}",
-            {"asked": size, "allowed": MAX_BYTES},
-        )
+        raise PhantomError.instead(f"{label} has {size} bytes", size, f"1 to {MAX_BYTES}")
 
 
 def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
@@ -284,10 +275,8 @@ def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise PhantomError(f"the {kind.upper()} file holds no triangles")
     if len(mesh.faces) > MAX_FACES:
-        raise PhantomError(
-            f"the mesh has {len(mesh.faces)} triangles; allowed: {MAX_FACES}",
-            {"asked": len(mesh.faces), "allowed": MAX_FACES},
-        )
+        count = len(mesh.faces)
+        raise PhantomError.instead(f"the mesh has {count} triangles", count, MAX_FACES)
     if len(mesh.vertices) == 0 or not np.isfinite(mesh.vertices).all():
         raise PhantomError("the mesh has vertices that are not finite numbers")
     return mesh

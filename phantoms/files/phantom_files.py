@@ -231,10 +231,8 @@ def _bead(value: object, where: str) -> tuple[tuple[float, float, float], float,
 def _known(value: object, allowed: tuple[str, ...], where: str) -> None:
     for key in reading.mapping(value, where):
         if key not in allowed:
-            raise PhantomError(
-                f"{where}: unknown key {key!r}; allowed: {', '.join(allowed)}",
-                {"path": f"{where}.{key}", "asked": key, "allowed": list(allowed)},
-            )
+            said = f"{where}: unknown key {key!r}"
+            raise PhantomError.instead(said, key, allowed, path=f"{where}.{key}")
 
 
 def _default(value: object, key: str, default: object) -> object:
@@ -266,9 +264,7 @@ def sent_scene(text: bytes, *, name: str) -> Phantom:
         ("triangles", faces, MAX_FACES),
     ):
         if count > most:
-            raise PhantomError(
-                f"{name} has {count} {what}; allowed: {most}", {"asked": count, "allowed": most}
-            )
+            raise PhantomError.instead(f"{name} has {count} {what}", count, most)
     if phantom.voxels is not None and not phantom.is_voxels:
         raise PhantomError(f"{name}: voxels cannot be put together with other parts")
     for surface in phantom.surfaces:
@@ -281,8 +277,6 @@ def sent_scene(text: bytes, *, name: str) -> Phantom:
         own = size_about_origin(phantom.scene, phantom.surfaces)
         size = (max(size[0], own[0]), max(size[1], own[1]), max(size[2], own[2]))
     if max(size) > MAX_EXTENT_MM:
-        raise PhantomError(
-            f"{name} measures {max(size):g} mm about its axis; allowed: {MAX_EXTENT_MM:g} mm",
-            {"asked": max(size), "allowed": MAX_EXTENT_MM},
-        )
+        said = f"{name} measures {max(size):g} mm about its axis"
+        raise PhantomError.instead(said, max(size), f"{MAX_EXTENT_MM:g} mm")
     return replace(phantom, name=name, size_mm=size)

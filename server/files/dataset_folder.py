@@ -137,9 +137,7 @@ def read_text(path: Path, most: int = MAX_TEXT_BYTES) -> str:
     try:
         size = path.stat().st_size
         if size > most:
-            raise DatasetFormatError(
-                f"{path} has {size} bytes; allowed: {most}", {"path": str(path)}
-            )
+            raise DatasetFormatError.instead(f"{path} has {size} bytes", size, most, path=str(path))
         raw = path.read_bytes()
     except OSError as error:
         raise DatasetFormatError(
@@ -206,10 +204,8 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
             )
         size = kind.itemsize * math.prod(shape)
         if size > MAX_IMAGE_BYTES:
-            raise DatasetFormatError(
-                f"{path} claims {shape[1]} x {shape[0]} pixels; allowed: {MAX_IMAGE_BYTES} bytes",
-                {"path": str(path), "asked": size, "allowed": MAX_IMAGE_BYTES},
-            )
+            said, most = f"{path} claims {shape[1]} x {shape[0]} pixels", f"{MAX_IMAGE_BYTES} bytes"
+            raise DatasetFormatError.instead(said, size, most, path=str(path))
         wanted = np.uint16 if kind.kind == "u" else np.float32
         packing = tifffile.COMPRESSION
         if page.compression in (packing.ADOBE_DEFLATE, packing.DEFLATE):

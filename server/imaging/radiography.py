@@ -57,11 +57,8 @@ def with_spectra(machine: Machine, physics: Physics) -> Machine:
     tube, (least, most) = machine.tube, voltages()
     low, high = max(least, tube.min_kV), min(most, tube.max_kV)
     if not low <= tube.kV <= high:
-        raise LimitError(
-            f"physics {physics} has no spectrum for the tube's {tube.kV:g} kV; allowed: {low:g} to "
-            f"{high:g} kV",
-            {"asked": tube.kV, "allowed": [low, high], "unit": "kV"},
-        )
+        said = f"physics {physics} has no spectrum for the tube's {tube.kV:g} kV"
+        raise LimitError.instead(said, tube.kV, f"{low:g} to {high:g} kV")
     held = tube.model_copy(update={"min_kV": low, "max_kV": high})
     return machine.model_copy(update={"tube": held})
 

@@ -114,10 +114,9 @@ class DatasetWriter:
                 f"{name} is no image of scan {self.record.name}", {"asked": name}
             )
         if image.shape != expected or image.dtype != np.uint16:
-            raise DatasetWriteError(
-                f"{name}: image is {image.dtype} of shape {image.shape}; allowed: uint16 of shape "
-                f"{expected}",
-                {"asked": [str(image.dtype), list(image.shape)], "allowed": list(expected)},
+            found = f"{image.dtype} of shape {image.shape}"
+            raise DatasetWriteError.instead(
+                f"{name}: image is {found}", found, f"uint16 of shape {expected}"
             )
         self._files.put(name, tiff_bytes(image))
         with self._lock:

@@ -49,10 +49,8 @@ def require_size(text: str, file: str) -> None:
         DatasetFormatError: it has too many characters.
     """
     if len(text) > MAX_CHARS:
-        raise DatasetFormatError(
-            f"{file}: {len(text)} characters is no settings file; allowed: {MAX_CHARS}",
-            {"path": file, "asked": len(text), "allowed": MAX_CHARS},
-        )
+        said = f"{file}: {len(text)} characters is no settings file"
+        raise DatasetFormatError.instead(said, len(text), MAX_CHARS, path=file)
 
 
 def parse_number(text: str) -> float:

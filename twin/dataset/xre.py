@@ -42,10 +42,7 @@ class XreSettings:
         try:
             return parse_number(text)
         except ValueError:
-            raise DatasetFormatError(
-                f"{XRE_SETTINGS}: [{section}] {key} is {text[:80]!r}; allowed: a number",
-                {"path": XRE_SETTINGS, "section": section, "key": key, "asked": text[:200]},
-            ) from None
+            raise _wrong(section, key, text, "a number") from None
 
     @property
     def settings(self) -> ScanSettings:
@@ -73,10 +70,7 @@ class XreSettings:
         try:
             values["roi"] = None if roi is None else parse_roi(roi)
         except ValueError:
-            raise DatasetFormatError(
-                f"{XRE_SETTINGS}: [Camera settings] ROI is {roi!r}; allowed: four whole numbers",
-                {"path": XRE_SETTINGS, "key": "ROI", "asked": roi},
-            ) from None
+            raise _wrong("Camera settings", "ROI", str(roi), "four whole numbers") from None
         return ScanSettings(
             **values,
             motors=motors,
@@ -97,6 +91,12 @@ class XreSettings:
             if name.lower() == section.lower()
             for entry in entries.items()
         ]
+
+
+def _wrong(section: str, key: str, text: str, allowed: str) -> DatasetFormatError:
+    said = f"{XRE_SETTINGS}: [{section}] {key} is {text[:80]!r}"
+    where = {"path": XRE_SETTINGS, "section": section, "key": key}
+    return DatasetFormatError.instead(said, text[:200], allowed, **where)
 
 
 def format_xre(record: ScanRecord) -> str:

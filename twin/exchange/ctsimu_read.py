@@ -325,17 +325,14 @@ class ScenarioReader:
         major, minor = said.get("major"), said.get("minor")
         fits = major == 1 and isinstance(minor, int) and minor <= MAX_MINOR
         if about.get("file_type") != "CTSimU Scenario" or not fits:
-            raise ExchangeError(
-                f"{self._file}: file_type {about.get('file_type')!r}, format {major}.{minor}; "
-                f"allowed: CTSimU Scenario, 1.0 to 1.{MAX_MINOR}",
-                {"path": "file", "allowed": ["1.0", f"1.{MAX_MINOR}"]},
-            )
+            asked = f"file_type {about.get('file_type')!r}, format {major}.{minor}"
+            allowed = f"CTSimU Scenario, 1.0 to 1.{MAX_MINOR}"
+            raise ExchangeError.instead(f"{self._file}: {asked}", asked, allowed, path="file")
 
     def _error(self, where: str, allowed: str) -> ExchangeError:
         asked = self._asked(where)
-        return ExchangeError(
-            f"{self._file}: {where} is {asked}; allowed: {allowed}",
-            {"path": where, "asked": asked, "allowed": allowed},
+        return ExchangeError.instead(
+            f"{self._file}: {where} is {asked}", asked, allowed, path=where
         )
 
     def _asked(self, where: str) -> str:

@@ -8,6 +8,7 @@ angles, more than one circle and panels with skew pixels are errors.
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import tomllib
@@ -83,15 +84,7 @@ def flexdata_text(geometry: ScanGeometry, tolerance_mm: float = SAME_MM) -> str:
     }
     if geometry.shape is not None:
         values["det_rows"], values["det_cols"] = geometry.shape
-    return "".join(f"{name} = {_toml(value)}\n" for name, value in values.items())
-
-
-def _toml(value: object) -> str:
-    if isinstance(value, str):
-        return f'"{value}"'
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_toml, value)) + "]"
-    return repr(value)
+    return "".join(f"{name} = {json.dumps(value)}\n" for name, value in values.items())
 
 
 def _equal_steps(circle: CircularScan, tolerance_mm: float) -> tuple[float, float]:
@@ -219,10 +212,8 @@ class _Getter:
         count = _LISTS[name]
         if value is None and name != "ang_range":
             return [default] * count
-        if not isinstance(value, list) or len(value) != count:
-            raise ExchangeError(
-                f"{self._file}: {name} must be {count} numbers", {"path": name, "allowed": count}
-            )
-        if not all(isinstance(v, int | float) and math.isfinite(v) for v in value):
+        given = value if isinstance(value, list) else []
+        sound = all(isinstance(v, int | float) and math.isfinite(v) for v in given)
+        if not sound or len(given) != count:
             raise ExchangeError(f"{self._file}: {name} must be {count} numbers", {"path": name})
-        return [float(v) for v in value]
+        return [float(v) for v in given]

@@ -114,10 +114,8 @@ def read_rtk(
     except ElementTree.ParseError as error:
         raise ExchangeError(f"{file} is not valid XML: {error}", {"path": file}) from None
     if root.tag != _ROOT or root.get("version") != VERSION:
-        raise ExchangeError(
-            f"{file}: {root.tag} version {root.get('version')}; allowed: {_ROOT} version {VERSION}",
-            {"asked": root.tag, "allowed": _ROOT},
-        )
+        said = f"{file}: {root.tag} version {root.get('version')}"
+        raise ExchangeError.instead(said, root.tag, f"{_ROOT} version {VERSION}")
     common = dict.fromkeys(NAMES, 0.0)  # what RTK writes before the views holds for all
     rows: list[FloatArray] = []
     for element in root:
@@ -161,7 +159,5 @@ def _take(entry: ElementTree.Element, values: dict[str, float], file: str) -> No
     if entry.tag in values:
         values[entry.tag] = value
     elif value != 0.0:  # RadiusCylindricalDetector and whatever else bends the geometry
-        raise ExchangeError(
-            f"{file}: {entry.tag} = {value:g} is not understood; allowed: {', '.join(NAMES)}",
-            {"path": entry.tag, "allowed": list(NAMES)},
-        )
+        said = f"{file}: {entry.tag} = {value:g} is not understood"
+        raise ExchangeError.instead(said, value, NAMES, path=entry.tag)
