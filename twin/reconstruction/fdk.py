@@ -117,11 +117,12 @@ class OnProcessor:
         ready = np.empty((n, rows, wide), np.float32)
         images = np.ascontiguousarray(views.images)
         fdk_kernels.weigh(images, views.top, views.factors, views.across, views.up, ready)
-        columns = np.empty((n, cols, rows), np.float32)
+        columns = fdk_kernels.room(n, cols, rows)
         fdk_kernels.stand_up(filtered(ready, views.response), views.kept.start, columns)
         fdk_kernels.backproject(
-            columns, views.shares, views.table, *self._first, *self._size, self._data, threads()
-        )
+            columns, rows, views.shares, views.table, *self._first, *self._size, self._data,
+            threads(),
+        )  # fmt: skip
 
     def volume(self) -> Float32Array:
         """What has been added up, (ny, nx, nz)."""

@@ -13,17 +13,11 @@ from numba import njit, prange
 
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection.kernels.compiling import fetch_next, fused, kernel, parallel, sources
+from flexdt.twin.projection.volume import aligned_zeros
 from flexdt.twin.reconstruction import resample_kernels
-from flexdt.twin.reconstruction.resample_kernels import LANES, MARGIN, add_column
+from flexdt.twin.reconstruction.resample_kernels import LANES, MARGIN, add_column, mix_columns
 
 TILE = 8
-
-
-@fused
-def _mix(out, left, right, part):
-    """out = left + part * (right - left)."""
-    for r in range(out.size):
-        out[r] = left[r] + part * (right[r] - left[r])
 
 
 @fused
@@ -34,9 +28,9 @@ def _times(line, left, right, part):
 
 
 @kernel
-def _add_view(acc, image, shares, g, x, y, z0, dz, line):
+def _add_view(acc, image, rows, shares, g, x, y, z0, dz, line):
     """Add one view to the voxels above one another at (x, y); see `backproject`."""
-    cols, rows = image.shape
+    cols = len(image)
     # Along the panel's normal; the same for all voxels above one another, as is the column c.
     x -= g[0]
     y -= g[1]
@@ -58,15 +52,13 @@ def _add_view(acc, image, shares, g, x, y, z0, dz, line):
     highest = min(acc.size - 1, math.floor(-start * every - 1e-3))
     if highest < lowest:
         return
-    # The column between image columns i and i + 1, only over the rows that are needed.
-    top = int(start + highest * step)
+    # The column between image columns i and i + 1, only over the rows that are needed, from a whole
+    # register on, times the weight.
+    top = int(start + highest * step) // LANES * LANES
     bottom = min(rows - 1, int(start + lowest * step) + 1)
-    _mix(
-        line[: bottom - top + 1],
-        image[i, top : bottom + 1],
-        image[i + 1, top : bottom + 1],
-        np.float32(c - i),
-    )
+    weight, part = inverse * inverse, c - i
+    one, other = np.float32(weight * (1.0 - part)), np.float32(weight * part)
+    mix_columns(line, image[i], image[i + 1], top, bottom - top + 1, one, other)
     if g.size > 11:
         at = max((depth - g[11]) * g[12], 0.0)
         j = min(int(at), len(shares) - 2)
@@ -79,12 +71,11 @@ def _add_view(acc, image, shares, g, x, y, z0, dz, line):
     # The look-up at the last row reads one sample more.
     line[bottom - top + 1] = line[bottom - top]
     first = start + lowest * step - top
-    weight = np.float32(inverse * inverse)
-    add_column(acc, line, lowest, highest - lowest + 1, first, step, weight)
+    add_column(acc, line, lowest, highest - lowest + 1, first, step)
 
 
 @kernel
-def _add_tile(images, shares, views, first_x, first_y, x0, y0, z0, dx, dy, dz, line, volume):
+def _add_tile(images, rows, shares, views, first_x, first_y, x0, y0, z0, dx, dy, dz, line, volume):
     """Add all views to one tile of voxel columns."""
     ny, nx = volume.shape[:2]
     for view in range(len(images)):
@@ -93,15 +84,16 @@ def _add_tile(images, shares, views, first_x, first_y, x0, y0, z0, dx, dy, dz, l
             y = y0 + iy * dy
             for ix in range(first_x, min(nx, first_x + TILE)):
                 x = x0 + ix * dx
-                _add_view(volume[iy, ix], images[view], share, g, x, y, z0, dz, line)
+                _add_view(volume[iy, ix], images[view], rows, share, g, x, y, z0, dz, line)
 
 
 def _entry_point(key: int, lanes: int):  # type: ignore[no-untyped-def]
     @parallel
-    def backproject(images, shares, views, x0, y0, z0, dx, dy, dz, volume, workers):
+    def backproject(images, rows, shares, views, x0, y0, z0, dx, dy, dz, volume, workers):
         """Add views to a volume.
 
-        images: float32 (n, cols, rows), rows contiguous.
+        images: float32 (n, cols, rows and as many more as `room` says), rows contiguous.
+        rows: of the images.
         shares: float32 (n, depths, rows), what rows count in a helix; else (n, 0, 0).
         views: float64 (n, 11): source x, y, z; unit normal x, y; unit u x, y; distance in pitches
             of columns; column of the foot point; distance in pitches of rows; row of the foot
@@ -116,12 +108,12 @@ def _entry_point(key: int, lanes: int):  # type: ignore[no-untyped-def]
         tiles = tiles_x * ((ny + TILE - 1) // TILE)
         counter = np.zeros(1, np.int64)
         for _ in prange(workers):
-            line = np.zeros(images.shape[2] + 2 + MARGIN, np.float32)
+            line = np.zeros(rows + 2 + MARGIN, np.float32)
             tile = fetch_next(counter)
             while tile < tiles:
                 across, along = tile % tiles_x * TILE, tile // tiles_x * TILE
                 _add_tile(
-                    images, shares, views, across, along, x0, y0, z0, dx, dy, dz, line, volume
+                    images, rows, shares, views, across, along, x0, y0, z0, dx, dy, dz, line, volume
                 )
                 tile = fetch_next(counter)
 
@@ -129,6 +121,12 @@ def _entry_point(key: int, lanes: int):  # type: ignore[no-untyped-def]
 
 
 backproject = _entry_point(sources(resample_kernels), LANES)
+
+
+def room(n: int, cols: int, rows: int) -> Float32Array:
+    """Memory for images, (n, cols, rows and more): columns of whole registers, aligned to them."""
+    shape = (n, cols, -(-rows // LANES) * LANES)
+    return aligned_zeros(math.prod(shape)).reshape(shape)
 
 
 @parallel
@@ -164,7 +162,8 @@ BLOCK = 32
 @parallel
 def stand_up(rows_first, start, out):
     """out[n, c, r] = rows_first[n, r, start + c], in blocks, so that both stay in the cache."""
-    n, cols, rows = out.shape
+    n, cols = out.shape[:2]
+    rows = rows_first.shape[1]
     blocks = (cols + BLOCK - 1) // BLOCK
     for job in prange(n * blocks):
         view = job // blocks

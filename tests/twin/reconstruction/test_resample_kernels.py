@@ -1,4 +1,4 @@
-"""Columns resampled by registers of 16, of 8 and voxel by voxel, each beside NumPy and the others.
+"""Columns mixed and resampled by registers of 16, of 8 and one by one, beside NumPy and each other.
 
 Each way is compiled in a process of its own, for a processor that has no other.
 """
@@ -21,16 +21,18 @@ PROGRAM = """
 import sys
 import numpy as np
 from numba import njit
-from flexdt.twin.reconstruction.resample_kernels import LANES, add_column
+from flexdt.twin.reconstruction.resample_kernels import LANES, add_column, mix_columns
 
 @njit
-def work(acc, line, cases, weights):
+def work(acc, left, right, shares, cases):
+    line = np.empty_like(left[0])
     for n in range(len(cases)):
-        first, count = int(cases[n, 0]), int(cases[n, 1])
-        add_column(acc[n], line[n], first, count, cases[n, 2], cases[n, 3], weights[n])
+        first, count, samples = int(cases[n, 0]), int(cases[n, 1]), int(cases[n, 4])
+        mix_columns(line, left[n], right[n], 0, samples + 1, shares[n, 0], shares[n, 1])
+        add_column(acc[n], line, first, count, cases[n, 2], cases[n, 3])
 
 given = dict(np.load(sys.argv[1]))
-work(given["acc"], given["line"], given["cases"], given["weights"])
+work(given["acc"], given["left"], given["right"], given["shares"], given["cases"])
 np.savez(sys.argv[2], acc=given["acc"], lanes=LANES)
 """
 
@@ -41,8 +43,8 @@ def draw(seed: int, cases: int = 300) -> dict[str, np.ndarray]:
     Places are multiples of 2^-16, so that a column cut in two has the very same ones.
     """
     rng = np.random.default_rng(seed)
-    table = np.empty((cases, 4))
-    line = np.zeros((cases, 512 + MARGIN), np.float32)
+    table = np.empty((cases, 5))
+    line = np.zeros((2, cases, 512 + MARGIN), np.float32)
     for n in range(cases):
         count = int(rng.integers(1, 150))
         samples = int(rng.integers(2, 480))
@@ -52,22 +54,28 @@ def draw(seed: int, cases: int = 300) -> dict[str, np.ndarray]:
         start = np.floor(rng.uniform(0.0, max(spare, 0.0)) * 2**16) / 2**16
         if step < 0:
             start += abs(step) * (count - 1)
-        table[n] = rng.integers(0, 40), count, min(start, samples - 1.0), step
-        line[n, :samples] = rng.normal(size=samples)
-        line[n, samples] = line[n, samples - 1]
+        table[n] = rng.integers(0, 40), count, min(start, samples - 1.0), step, samples
+        line[:, n, :samples] = rng.normal(size=(2, samples))
+        line[:, n, samples] = line[:, n, samples - 1]
     acc = rng.normal(size=(cases, 200)).astype(np.float32)
     return {
-        "acc": acc, "line": line, "cases": table, "weights": rng.random(cases).astype(np.float32)
+        "acc": acc, "left": line[0], "right": line[1], "cases": table,
+        "shares": rng.random((cases, 2)).astype(np.float32),
     }  # fmt: skip
 
 
 def cut(given: dict[str, np.ndarray], at: int) -> tuple[dict[str, np.ndarray], ...]:
     """The same columns, up to voxel `at` and from there on."""
-    first, count, start, step = given["cases"].T
+    first, count, start, step, samples = given["cases"].T
     below = np.clip(at - first, 0, count)
     return (
-        {**given, "cases": np.stack([first, below, start, step], 1)},
-        {**given, "cases": np.stack([first + below, count - below, start + below * step, step], 1)},
+        {**given, "cases": np.stack([first, below, start, step, samples], 1)},
+        {
+            **given,
+            "cases": np.stack(
+                [first + below, count - below, start + below * step, step, samples], 1
+            ),
+        },
     )
 
 
@@ -93,12 +101,13 @@ def ways() -> list[int]:
 def test_every_way_is_numpys_and_the_others(ways: list[int], tmp_path: Path) -> None:
     given = draw(3)
     wanted = given["acc"].astype(np.float64)
-    for row, line, (first, count, start, step), weight in zip(
-        wanted, given["line"], given["cases"], given["weights"], strict=True
+    one, other = given["shares"].T[:, :, None].astype(np.float64)
+    lines = one * given["left"] + other * given["right"]
+    for row, line, (first, count, start, step, _) in zip(
+        wanted, lines, given["cases"], strict=True
     ):
         places = start + np.arange(int(count)) * step
-        found = np.interp(places, np.arange(line.size), line.astype(np.float64))
-        row[int(first) : int(first + count)] += weight * found
+        row[int(first) : int(first + count)] += np.interp(places, np.arange(line.size), line)
     # Beside the whole columns the same in two parts, that registers of any length end at.
     parts = cut(given, 48)
     both = {k: np.concatenate([given[k], parts[0][k]]) for k in given}
