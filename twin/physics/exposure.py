@@ -130,59 +130,33 @@ def expose(
     flat = moments.reshape(len(moments), -1)
     out = np.empty(flat.shape[1], dtype=np.uint16)
     open_counts = np.float32(open_beam(model, settings))
-    signal = np.empty(min(BLOCK, flat.shape[1]), dtype=np.float32)
-    scratch = np.empty_like(signal)
     for start in range(0, flat.shape[1], BLOCK):
-        stop = min(start + BLOCK, flat.shape[1])
-        s, t = signal[: stop - start], scratch[: stop - start]
+        part = slice(start, start + BLOCK)
         if open_counts > 0.0:
-            _transmission(flat[:, start:stop], s, t)
-            s *= open_counts
+            signal = np.exp(-flat[:, part]).sum(axis=0) * np.float32(1.0 / len(moments))
+            signal *= open_counts
         else:
-            s[:] = 0.0
+            signal = np.zeros_like(flat[0, part])
         if rng is not None:
-            _add_noise(model, settings, rng, s, t)
-        s += np.float32(model.dark_counts + 0.5)
-        np.clip(s, 0.0, model.full_scale, out=s)
-        out[start:stop] = s  # truncates; the half above makes it rounding
+            signal = _noisy(model, settings, rng, signal)
+        signal += np.float32(model.dark_counts + 0.5)
+        # Truncated; the half above makes it rounding.
+        out[part] = np.clip(signal, 0.0, model.full_scale)
     return out.reshape(shape)
 
 
-def _transmission(moments: Float32Array, out: Float32Array, scratch: Float32Array) -> None:
-    """exp(-L), averaged over the moments, into `out`."""
-    np.negative(moments[0], out=out)
-    np.exp(out, out=out)
-    for later in moments[1:]:
-        np.negative(later, out=scratch)
-        np.exp(scratch, out=scratch)
-        out += scratch
-    if len(moments) > 1:
-        out *= np.float32(1.0 / len(moments))
-
-
-def _add_noise(
+def _noisy(
     model: DetectorModel,
     settings: ExposureSettings,
     rng: np.random.Generator,
     signal: Float32Array,
-    scratch: Float32Array,
-) -> None:
-    """Poisson and read noise of `averages` read-outs, added to `signal` [counts] in place."""
+) -> Float32Array:
+    """`signal` [counts] with the Poisson and read noise of `averages` read-outs."""
     photons = np.float32(model.photons_per_count * settings.averages)
-    read_variance = np.float32(model.read_noise_counts**2 / settings.averages)
-    few = None
-    if settings.xrays_on:
-        dimmest = float(signal.min()) * float(photons)
-        if dimmest < FEW:
-            few = np.flatnonzero(signal * photons < FEW)
-            expected = signal[few] * photons
-            signal[few] = rng.poisson(expected) / photons
-        np.divide(signal, photons, out=scratch)
-        if few is not None:
-            scratch[few] = 0.0
-        scratch += read_variance
-    else:
-        scratch[:] = read_variance
-    np.sqrt(scratch, out=scratch)
-    scratch *= rng.standard_normal(len(signal), dtype=np.float32)
-    signal += scratch
+    variance = signal / photons
+    if settings.xrays_on and signal.min() * photons < FEW:
+        few = np.flatnonzero(signal * photons < FEW)
+        signal[few] = rng.poisson(signal[few] * photons) / photons
+        variance[few] = 0.0
+    variance += np.float32(model.read_noise_counts**2 / settings.averages)
+    return signal + np.sqrt(variance) * rng.standard_normal(len(signal), dtype=np.float32)
