@@ -19,7 +19,7 @@ from swept import sweep
 from flexdt.twin.collision.collision_scene import Scene, build_scene, scene_of
 from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid, box, hull
 from flexdt.twin.collision.guard import SceneGuard, _Overlap
-from flexdt.twin.collision.nearest import _farthest, separation_of
+from flexdt.twin.collision.nearest import separation_of
 from flexdt.twin.collision.paths import Path, path_of
 from flexdt.twin.collision.relative import Moment, RelativeMotion, _Bound
 from flexdt.twin.collision.scene_search import (
@@ -33,8 +33,7 @@ from flexdt.twin.collision.sweep import Limits, refine_pair, sweep_pair
 from flexdt.twin.geometry.conventions import FloatArray, rotation_about
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.motion import profiles as motion
-from flexdt.twin.motion.axis_path import AxisPath
-from flexdt.twin.motion.profiles import Piece, Trajectory
+from flexdt.twin.motion.profiles import AxisPath, Piece, Trajectory
 
 AXES = ("x", "y", "turn")
 MARGIN, TOLERANCE = 1.0, 0.01
@@ -761,7 +760,7 @@ def test_the_farthest_point_along_a_direction_is_one_of_the_solid(seed: int) -> 
     round_one = Cylinder(tuple(rng.uniform(-9, 9, 3)), 5.0, 8.0)
     for direction in (np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]), rng.normal(size=3)):
         for solid in (random_solid(rng), round_one):
-            point = _farthest(solid, direction)
+            point = solid.farthest(direction)
             assert point @ direction >= (solid_points(solid) @ direction).max() - 1e-9
             if isinstance(solid, Cylinder):
                 across, along = (point - solid.center)[:2], (point - solid.center)[2]

@@ -18,7 +18,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.machine.kinematics import poses
-from flexdt.twin.motion.axis_path import AxisPath
+from flexdt.twin.motion.profiles import AxisPath
 from flexdt.twin.script import SampleSize, ScanPlan, StartState, parse_script, plan_script
 
 finite = st.floats(-1e6, 1e6)

@@ -25,8 +25,7 @@ from flexdt.twin.collision.sweep import Limits
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import Machine, Profile
-from flexdt.twin.motion.axis_path import AxisPath
-from flexdt.twin.motion.profiles import Trajectory
+from flexdt.twin.motion.profiles import AxisPath, Trajectory
 
 REACH_SLACK = 10.0
 """Poses this far outside the travel limits [mm] are still checked against the short list of pairs

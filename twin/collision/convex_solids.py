@@ -33,8 +33,12 @@ _BOX_FACES = np.array(
 class Solid(Protocol):
     """What the sweep asks of a convex solid, in the frame of the body that carries it."""
 
-    def support(self, direction: FloatArray) -> float:
-        """Largest p . direction over the solid's points p [mm, for a unit direction]."""
+    def farthest(self, directions: FloatArray) -> FloatArray:
+        """A point of the solid that lies farthest along each of directions, (..., 3) both."""
+
+    def support(self, directions: FloatArray) -> FloatArray:
+        """Largest p . direction over the solid's points p, (...) [mm, for unit directions]."""
+        return np.asarray((directions * self.farthest(directions)).sum(axis=-1))
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Lower and upper corner of the axis-aligned box around it, (3,) each [mm]."""
@@ -47,7 +51,7 @@ class Solid(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Polytope:
+class Polytope(Solid):
     """The convex hull of `vertices` (k, 3) [mm]; `faces` (m, 3) are its outward triangles."""
 
     vertices: FloatArray
@@ -60,9 +64,10 @@ class Polytope:
         vertices.setflags(write=False)
         object.__setattr__(self, "vertices", vertices)
 
-    def support(self, direction: FloatArray) -> float:
+    def farthest(self, directions: FloatArray) -> FloatArray:
         """See `Solid`."""
-        return float((self.vertices @ direction).max())
+        corner: FloatArray = self.vertices[np.argmax(directions @ self.vertices.T, axis=-1)]
+        return corner
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """See `Solid`."""
@@ -80,19 +85,19 @@ class Polytope:
 
 
 @dataclass(frozen=True)
-class Cylinder:
+class Cylinder(Solid):
     """An upright cylinder, its axis along z: `center`, `radius` and full `height` [mm]."""
 
     center: Vector3
     radius: float
     height: float
 
-    def support(self, direction: FloatArray) -> float:
+    def farthest(self, directions: FloatArray) -> FloatArray:
         """See `Solid`."""
-        x, y, z = direction.tolist()
-        cx, cy, cz = self.center
-        across = self.radius * math.hypot(x, y) + 0.5 * self.height * abs(z)
-        return float(across + cx * x + cy * y + cz * z)
+        across = np.hypot(directions[..., 0], directions[..., 1])
+        out = directions * (self.radius / np.where(across > 0.0, across, 1.0))[..., None]
+        out[..., 2] = np.copysign(0.5 * self.height, directions[..., 2])
+        return np.asarray(out + self.center)
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """See `Solid`."""

@@ -129,7 +129,7 @@ class _Overlap:
         self, i: int, directions: FloatArray, turned: tuple[FloatArray, FloatArray]
     ) -> FloatArray:
         towards = directions if i else -directions
-        return _supports(self.bodies[i].solid, towards @ turned[i])
+        return self.bodies[i].solid.support(towards @ turned[i])
 
     def separation(self, q: FloatArray) -> float:
         """Width of the widest slab between them [mm]; negative for an overlap, never too large.
@@ -180,29 +180,12 @@ def _many(solid: Solid) -> bool:
 
 def _corners(solid: Solid) -> FloatArray:
     """(k, 3): corners of a body, of one with very many only some."""
-    match solid:
-        case Polytope():
-            if not _many(solid):
-                return solid.vertices
-            ways = np.random.default_rng(0).normal(size=(MANY, 3))
-            some: FloatArray = solid.vertices[np.unique((ways @ solid.vertices.T).argmax(axis=1))]
-            return some
-        case Cylinder():
-            return solid.prism().vertices
-    raise TypeError(f"no corners of a {type(solid).__name__}")
-
-
-def _supports(solid: Solid, directions: FloatArray) -> FloatArray:
-    """`solid.support` of many directions (k, 3)."""
-    match solid:
-        case Polytope():
-            reach: FloatArray = (directions @ solid.vertices.T).max(axis=1)
-            return reach
-        case Cylinder(center, radius, height):
-            across = radius * np.hypot(directions[:, 0], directions[:, 1])
-            along = 0.5 * height * np.abs(directions[:, 2])
-            return np.asarray(across + along + directions @ np.array(center))
-    raise TypeError(f"no support of a {type(solid).__name__}")
+    if _many(solid):
+        ways = np.random.default_rng(0).normal(size=(MANY, 3))
+        return np.unique(solid.farthest(ways), axis=0)
+    upright = solid.prism() if isinstance(solid, Cylinder) else solid
+    assert isinstance(upright, Polytope)
+    return upright.vertices
 
 
 HORIZON = 3600.0

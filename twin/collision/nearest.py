@@ -65,7 +65,7 @@ def separation_of(
             return _NOWHERE
         normal = apart / length
         # The empty slab across the normal: no two points are nearer than it is wide.
-        gap = float(normal @ offset) - a.support(-normal @ ra) - b.support(normal @ rb)
+        gap = float(normal @ offset - a.support(-normal @ ra) - b.support(normal @ rb))
         if gap < distance - DOUBT:
             gap, normal = _improved(a, b, (gap, normal), offset, ra, rb)
         return (gap, normal) if gap > 0.0 else _NOWHERE
@@ -84,7 +84,7 @@ def _improved(
 
     normal, corners = found[1], []
     for _ in range(ROUNDS):
-        corners.append(offset + ra @ _farthest(a, -normal @ ra) - rb @ _farthest(b, normal @ rb))
+        corners.append(offset + ra @ a.farthest(-normal @ ra) - rb @ b.farthest(normal @ rb))
         found = max(found, (float(normal @ corners[-1]), normal), key=lambda f: f[0])
         # The hull's point nearest to the origin: least squares with weights that add up to one.
         points = np.array(corners).T
@@ -99,18 +99,6 @@ def _improved(
             break
         normal = nearest / length
     return found
-
-
-def _farthest(solid: Solid, direction: FloatArray) -> FloatArray:
-    """A point of the solid that lies farthest along a direction, (3,)."""
-    if isinstance(solid, Polytope):
-        corner: FloatArray = solid.vertices[np.argmax(solid.vertices @ direction)]
-        return corner
-    assert isinstance(solid, Cylinder)  # what fcl has a shape for
-    across = solid.radius / (math.hypot(direction[0], direction[1]) or 1.0)
-    up = math.copysign(0.5 * solid.height, direction[2])
-    rim: FloatArray = np.array([across * direction[0], across * direction[1], up])
-    return rim + solid.center
 
 
 def _as_fcl(solid: Solid) -> tuple[Any, FloatArray]:

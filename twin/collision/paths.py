@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.motion.axis_path import AxisPath
+from flexdt.twin.motion.profiles import AxisPath
 
 CONTINUITY = 1e-6
 """Largest jump of a motor between two pieces that counts as rounding [mm, deg]."""
@@ -146,21 +146,14 @@ def coarseness(times: FloatArray) -> FloatArray:
 
 
 def _stands(table: AxisPath) -> bool:
-    if len(table.times) == 1:
-        return not (table.v[0] or table.a[0])
     return not (table.v.any() or table.a.any() or (table.x != table.x[0]).any())
 
 
 def _state(table: AxisPath, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Position, velocity, acceleration in force from each of `times` (in order) on."""
     i = table.times.searchsorted(times, side="right") - 1
-    v, a = table.v, table.a
-    if i[0] < 0:  # before its first piece it stands
-        before, i = i < 0, np.maximum(i, 0)
-        dt = np.where(before, 0.0, times - table.times[i])
-        v0, a0 = np.where(before, 0.0, v[i]), np.where(before, 0.0, a[i])
-    else:
-        dt, v0, a0 = times - table.times[i], v[i], a[i]
+    before, i = i < 0, np.maximum(i, 0)  # there it stands
+    dt, v0, a0 = np.where(before, 0.0, (times - table.times[i], table.v[i], table.a[i]))
     gained = a0 * dt
     return table.x[i] + dt * (v0 + 0.5 * gained), v0 + gained, a0
 

@@ -25,9 +25,6 @@ from flexdt.twin.geometry.conventions import FloatArray
 Separate = Callable[[FloatArray, FloatArray | None, FloatArray | None], Separation]
 """The certified clearance of two solids: from b's origin to a's, orientations of a and b."""
 
-ONE_BY_ONE = 4
-"""Segments that are gone through singly before the rest is searched at once."""
-
 
 @dataclass(frozen=True, slots=True)
 class Moment:
@@ -66,31 +63,23 @@ class _Bound:
         self, at: Moment, lengths: FloatArray, value: float, level: float
     ) -> Moment | None:
         """The first moment from `at` on at which it, being `value` there, reaches `level`."""
-        near = min(at.segment + ONE_BY_ONE, len(lengths))
-        dt = at.dt
-        for j in range(at.segment, near):
-            growth = float(self.growth[j])
-            rate, length = float(self.rate[j]) + growth * dt, float(lengths[j]) - dt
-            fall = _fall_time(value - level, rate, growth, length)
-            if fall is not None:
-                return Moment(j, dt + fall)
-            value += length * (rate + 0.5 * growth * length)
-            dt = 0.0
-        if near == len(lengths):
-            return None
-        rate_, growth_, length_ = self.rate[near:], self.growth[near:], lengths[near:]
-        change = length_ * (rate_ + 0.5 * growth_ * length_)
+        lengths = lengths[at.segment :].copy()
+        lengths[0] -= at.dt
+        rate, growth = self.rate[at.segment :].copy(), self.growth[at.segment :]
+        rate[0] += growth[0] * at.dt
+        change = lengths * (rate + 0.5 * growth * lengths)
         ends = value + np.cumsum(change)
-        dips = (rate_ < 0.0) & (rate_ + growth_ * length_ > 0.0)
+        dips = (rate < 0.0) & (rate + growth * lengths > 0.0)
         # Where it turns round within a segment, its least value lies there.
-        depth = 0.5 * rate_ * rate_ / np.where(dips, growth_, 1.0)
+        depth = 0.5 * rate * rate / np.where(dips, growth, 1.0)
         reached = np.flatnonzero(np.where(dips, ends - change - depth, ends) <= level)
         if len(reached) == 0:
             return None
         j = int(reached[0])
-        above = float(ends[j] - change[j]) - level
-        fall = _fall_time(above, float(rate_[j]), float(growth_[j]), float(length_[j]))
-        return Moment(near + j, float(length_[j]) if fall is None else fall)
+        above = (float(ends[j - 1]) if j else value) - level
+        fall = _fall_time(above, float(rate[j]), float(growth[j]), float(lengths[j]))
+        dt = float(lengths[j]) if fall is None else fall
+        return Moment(at.segment + j, dt + (at.dt if j == 0 else 0.0))
 
 
 def _fall_time(above: float, rate: float, growth: float, length: float) -> float | None:

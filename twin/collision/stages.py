@@ -85,7 +85,7 @@ class Body:
         if not self.spins:
             return lower, upper
         k = self.spin_axis
-        along = sorted((-self.solid.support(-k), self.solid.support(k)))
+        along = sorted((-float(self.solid.support(-k)), float(self.solid.support(k))))
         # A disc of radius `reach` across the axis, swept along it.
         across = self.reach * np.sqrt(np.maximum(0.0, 1.0 - k * k))
         ends = np.outer(along, k)

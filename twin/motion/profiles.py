@@ -3,7 +3,8 @@
 A `Trajectory` gives position and velocity at any time; nothing is stepped. Builders make the
 trapezoidal profile of thesis 4.5.1 (triangular when short) from any state of motion, the stop with
 deceleration, and the jog. Arrival is exact: after the end the position is the target (the thesis's
-1 mm arrival threshold is a simulation artefact). Limits are checked by the callers.
+1 mm arrival threshold is a simulation artefact). Limits are checked by the callers. An `AxisPath`
+is the same as arrays: what sweeps and plans ask for many moments at once.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.values import ArrayValue
 
 LEAST_RATE = 1e-6
 """Least speed and acceleration that can be set: a move may be slow, but it ends."""
@@ -97,14 +99,7 @@ class Trajectory:
 
     def positions(self, times: npt.ArrayLike) -> FloatArray:
         """Positions at many times [s], same shape as `times`."""
-        t = np.asarray(times, dtype=np.float64)
-        starts = np.array([p.start for p in self.pieces])
-        index = np.clip(np.searchsorted(starts, t, side="right") - 1, 0, len(starts) - 1)
-        x0 = np.array([p.position for p in self.pieces])[index]
-        v0 = np.array([p.velocity for p in self.pieces])[index]
-        a = np.array([p.acceleration for p in self.pieces])[index]
-        dt = np.maximum(t - starts[index], 0.0)
-        return np.where(t >= self.end, self.target, x0 + dt * (v0 + 0.5 * a * dt))
+        return AxisPath.along(self).positions(times)
 
     def law(self, time: float) -> tuple[float, float, float]:
         """Velocity, acceleration, and the time until which the motor obeys them [s].
@@ -162,6 +157,57 @@ class Trajectory:
                 return min(piece.start + dt, stop)
         # A position that rounding puts a hair past the target is the target.
         return self.end if abs(position - self.target) <= 1e-9 else None
+
+
+@dataclass(frozen=True, eq=False)
+class AxisPath(ArrayValue):
+    """One axis over time: constant acceleration from each of `times` on, (k,) arrays.
+
+    Attributes:
+        times: starts of the pieces [s], in order; before the first it stands at `x[0]`.
+        x: positions then [mm, deg].
+        v: velocities then, per s.
+        a: accelerations from then on, per s^2.
+    """
+
+    times: FloatArray
+    x: FloatArray
+    v: FloatArray
+    a: FloatArray
+
+    @classmethod
+    def of(cls, start: float, trajectories: Sequence[tuple[float, Trajectory]]) -> AxisPath:
+        """Join trajectories, each in force from its time until the next one's."""
+        return cls.along(joined([at_rest(start), *(later for _, later in trajectories)]))
+
+    @classmethod
+    def along(cls, trajectory: Trajectory) -> AxisPath:
+        """One trajectory, with the rest after it."""
+        rows = [(p.start, p.position, p.velocity, p.acceleration) for p in trajectory.pieces]
+        if math.isfinite(trajectory.end):
+            rows.append((trajectory.end, trajectory.target, 0.0, 0.0))
+        return cls(*np.array(rows).T)
+
+    @classmethod
+    def standing(cls, position: float) -> AxisPath:
+        """A motor that does not move."""
+        zero = np.zeros(1)
+        return cls(zero, np.array([position]), zero, zero)
+
+    def _at(self, times: npt.ArrayLike) -> tuple[npt.NDArray[np.intp], FloatArray]:
+        t = np.asarray(times, dtype=np.float64)
+        index = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, None)
+        return index, np.maximum(t - self.times[index], 0.0)
+
+    def positions(self, times: npt.ArrayLike) -> FloatArray:
+        """Positions at `times` [s], same shape."""
+        i, dt = self._at(times)
+        return np.asarray(self.x[i] + dt * (self.v[i] + 0.5 * self.a[i] * dt))
+
+    def velocities(self, times: npt.ArrayLike) -> FloatArray:
+        """Velocities at `times` [s], same shape."""
+        i, dt = self._at(times)
+        return np.asarray(self.v[i] + self.a[i] * dt)
 
 
 def at_rest(position: float, time: float = 0.0) -> Trajectory:

@@ -159,4 +159,5 @@ def _noisy(
         signal[few] = rng.poisson(signal[few] * photons) / photons
         variance[few] = 0.0
     variance += np.float32(model.read_noise_counts**2 / settings.averages)
-    return signal + np.sqrt(variance) * rng.standard_normal(len(signal), dtype=np.float32)
+    signal += np.sqrt(variance) * rng.standard_normal(len(signal), dtype=np.float32)
+    return signal

@@ -26,8 +26,7 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine, Profile, Timing
 from flexdt.twin.machine.kinematics import motor_poses
-from flexdt.twin.motion.axis_path import AxisPath
-from flexdt.twin.motion.profiles import Trajectory
+from flexdt.twin.motion.profiles import AxisPath, Trajectory
 from flexdt.twin.outward import outward
 from flexdt.twin.scanner.state import Placement
 from flexdt.twin.script.commands import AnyCommand
