@@ -21,9 +21,8 @@ from scipy.optimize import linear_sum_assignment
 from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model, spot_radii
 from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.fit.identifiability import visible_beads
-from flexdt.twin.calibration.fit.nominal import as_poses
 from flexdt.twin.calibration.fit.priors import ASSUMED
-from flexdt.twin.calibration.fit.problem import SIX, Problem, build_problem
+from flexdt.twin.calibration.fit.problem import SIX, Problem, as_poses, build_problem
 from flexdt.twin.calibration.fit.solver import RAYLEIGH_MEDIAN, Solver, solve
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec

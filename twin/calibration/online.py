@@ -20,7 +20,6 @@ from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.fit.certificate import Certificate
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
 from flexdt.twin.calibration.fit.identifiability import visible_beads
-from flexdt.twin.calibration.fit.nominal import frame_shapes
 from flexdt.twin.calibration.fit.priors import require_widths
 from flexdt.twin.calibration.fit.problem import SIX, build_problem, edge_factor, require_names
 from flexdt.twin.calibration.identify import assign, attempt, identified
@@ -247,7 +246,7 @@ def next_angle(
     k = len(state.model)
     trial = replace(pose[np.zeros(len(angles), dtype=np.intp)], angle=angles)
     rows = _rows(state, trial).reshape(len(angles), 2 * k, len(names))
-    sizes = frame_shapes(state.detections[-1].shape, len(angles))
+    sizes = np.array([state.detections[-1].shape] * len(angles), dtype=np.float64)
     visible = visible_beads(state.model, trial, sizes, fit.parameters)
     rows = rows * np.repeat(visible, 2, axis=1)[..., None]
     # A new position is worth as much as those already in the fit turned out to be.

@@ -165,8 +165,7 @@ def check(kernels: object, want: Reference) -> None:
         jac = np.zeros((2 * FRAMES * BEADS, columns))
         hess, grad = np.zeros((columns, columns)), np.zeros(columns)
         data = fit_kernels.Data(
-            geometry, np.zeros(FRAMES, np.int64), np.zeros((1, len(NAMES))), case.pivot,
-            case.beads, case.radius, np.full((FRAMES, BEADS), BIAS), case.measured, case.whiten,
+            geometry, np.zeros(FRAMES, np.int64), case.pivot, case.radius, np.full((FRAMES, BEADS), BIAS), case.measured, case.whiten,
             np.arange(len(NAMES)), np.arange(len(NAMES))[None], len(NAMES),
         )  # fmt: skip
         cost = kernels.evaluate(  # type: ignore[attr-defined]

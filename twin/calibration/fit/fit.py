@@ -16,13 +16,13 @@ import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
 from flexdt.twin.calibration.fit.certificate import Certificate, certify, spread_of_residuals
-from flexdt.twin.calibration.fit.nominal import Shape
 from flexdt.twin.calibration.fit.priors import require_widths
 from flexdt.twin.calibration.fit.problem import (
     SIX,
     Centre,
     Problem,
     Reading,
+    Shape,
     build_problem,
     from_printed_reading,
     values_in,

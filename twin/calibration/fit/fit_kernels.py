@@ -1,4 +1,4 @@
-"""Compiled kernels of the fit: residuals, analytic Jacobian, normal equations, the LM loop.
+"""Compiled kernels of the fit: residuals, analytic Jacobian, normal equations and their solution.
 
 For any subset of the seventeen parameters, and for the beads themselves, they compute what
 `Poses.cone_vec(parameters).project_points(beads)` computes. That makes this the second place where
@@ -95,9 +95,7 @@ class Data(NamedTuple):
         geometry: (n, 18) nominal source, axis, detector, u, v [mm], angle [rad] and the mount's x
             and y [mm]; see `SOURCE`.
         group: (n,) index of each frame's parameter set.
-        base: (groups, 17) values [mm, rad] of what is not free, in the order of `offsets.NAMES`.
         pivot: 1.0 or 0.0, see the module.
-        beads: (k, 3) centres in the object's frame [mm], where they are not free.
         radius: (k,) [mm].
         bias: (n, k) factor of the sphere-centre bias.
         measured: (n, k, 2) pixels from the detector's centre.
@@ -109,9 +107,7 @@ class Data(NamedTuple):
 
     geometry: FloatArray
     group: npt.NDArray[np.int64]
-    base: FloatArray
     pivot: float
-    beads: FloatArray
     radius: FloatArray
     bias: FloatArray
     measured: FloatArray
@@ -142,7 +138,7 @@ def evaluate(  # type: ignore[no-untyped-def]
     Returns:
         The cost; inf if a bead is not in front of the source.
     """
-    geometry, group, _, pivot, _, radius, bias, measured, whiten, active, colmap, bead_col = data
+    geometry, group, pivot, radius, bias, measured, whiten, active, colmap, bead_col = data
     n_frames, n_beads = use.shape
     na = active.shape[0]
     kind = np.empty(na, np.int64)
@@ -413,7 +409,7 @@ def evaluate(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _solve(hess, grad, damping, step):  # type: ignore[no-untyped-def]
+def solve(hess, grad, damping, step):  # type: ignore[no-untyped-def]
     """Cholesky of the column-scaled, Marquardt-damped normal equations; False if not possible."""
     n = grad.shape[0]
     scale = np.empty(n)
@@ -447,132 +443,3 @@ def _solve(hess, grad, damping, step):  # type: ignore[no-untyped-def]
             t -= low[k, i] * step[k] / scale[k]
         step[i] = t / low[i, i] * scale[i]
     return True
-
-
-@njit(cache=True, nogil=True)
-def apply(data, x, params, beads):  # type: ignore[no-untyped-def]
-    """Spread the free values `x` over parameter sets and beads; the rest comes from the data."""
-    for g in range(data.base.shape[0]):
-        for i in range(PARAMETERS):
-            column = data.colmap[g, i]
-            params[g, i] = data.base[g, i] if column < 0 else x[column]
-    for k in range(data.beads.shape[0]):
-        for i in range(3):
-            beads[k, i] = data.beads[k, i] if data.bead_col < 0 else x[data.bead_col + 3 * k + i]
-
-
-@njit(cache=True, nogil=True)
-def _median_norm(norms):  # type: ignore[no-untyped-def]
-    flat = norms.ravel()
-    used = flat[flat >= 0.0]
-    if used.shape[0] == 0:
-        return 0.0
-    return np.median(used)
-
-
-@njit(cache=True, nogil=True)
-def _prior_cost(x, prior_mean, prior_weight):  # type: ignore[no-untyped-def]
-    total = 0.0
-    for i in range(x.shape[0]):
-        d = x[i] - prior_mean[i]
-        total += 0.5 * prior_weight[i] * d * d
-    return total
-
-
-@njit(cache=True, nogil=True)
-def levenberg(  # type: ignore[no-untyped-def]
-    data, use, huber_factor, floor, prior_mean, prior_weight, x, max_iterations, tolerance
-):
-    """Levenberg-Marquardt with Marquardt's diagonal from `x`, in place.
-
-    The first step is tried almost undamped; damping appears only when a step fails. The Huber
-    threshold follows the residuals: huber_factor times their robust spread, never below
-    `floor`; factor inf is plain least squares. Stops when a step is predicted to change the
-    residuals' rms by less than `tolerance` (whitened units) plus a millionth of it.
-
-    Returns:
-        (iterations, huber threshold, converged).
-    """
-    n = x.shape[0]
-    params = np.empty_like(data.base)
-    beads = np.empty_like(data.beads)
-    predicted = np.empty((use.shape[0], use.shape[1], 2))
-    norms = np.empty(use.shape)
-    trial_norms = np.empty(use.shape)
-    hess = np.zeros((n, n))
-    grad = np.zeros(n)
-    trial_hess = np.zeros((n, n))
-    trial_grad = np.zeros(n)
-    # Variables, not literals: each literal would be a type of its own, compiled anew.
-    none, full = np.int64(0), np.int64(1)
-    dummy = np.empty((0, 0))
-    step = np.zeros(n)
-    trial = np.empty(n)
-    rows = max(1, 2 * int(np.count_nonzero(use)))
-
-    huber = np.inf
-    apply(data, x, params, beads)
-    if huber_factor < np.inf:
-        evaluate(data, params, beads, use, huber, none, predicted, norms, dummy, hess, grad)
-        # The length of a 2-vector with unit-variance parts has median 1.1774.
-        huber = max(floor, huber_factor * _median_norm(norms) / 1.1774)
-    cost = evaluate(data, params, beads, use, huber, full, predicted, norms, dummy, hess, grad)
-    cost += _prior_cost(x, prior_mean, prior_weight)
-    if not cost < np.inf:
-        return 0, huber, False
-    damping = 1e-9
-    iterations = 0
-    converged = n == 0
-    while iterations < max_iterations and not converged:
-        iterations += 1
-        for i in range(n):
-            hess[i, i] += prior_weight[i]
-            grad[i] += prior_weight[i] * (x[i] - prior_mean[i])
-        accepted = False
-        for _ in range(40):
-            if not _solve(hess, grad, damping, step):
-                damping = max(damping * 10.0, 1e-12)
-                continue
-            change = 0.0  # step' H step: squared change of the residuals the step stands for
-            damped = 0.0
-            for i in range(n):
-                damped += damping * hess[i, i] * step[i] * step[i]
-                change -= step[i] * grad[i]
-                trial[i] = x[i] + step[i]
-            change -= damped
-            small = math.sqrt(abs(change) / rows) < tolerance + 1e-6 * math.sqrt(2.0 * cost / rows)
-            apply(data, trial, params, beads)
-            new = evaluate(data, params, beads, use, huber, full, predicted, trial_norms, dummy,
-                           trial_hess, trial_grad)  # fmt: skip
-            new += _prior_cost(trial, prior_mean, prior_weight)
-            if new < cost or (small and new <= cost * (1.0 + 1e-9) + 1e-24):
-                accepted = True
-                break
-            if small:
-                break
-            damping = max(damping * 10.0, 1e-4)
-        if not accepted:
-            converged = small
-            break
-        gain = cost - new
-        promised = 0.5 * change + damped
-        if gain > 0.5 * promised:
-            damping = max(damping * 0.02, 1e-14)
-        elif gain < 0.1 * promised:
-            damping = max(damping * 4.0, 1e-6)
-        x[:] = trial
-        cost = new
-        norms, trial_norms = trial_norms, norms
-        hess, trial_hess = trial_hess, hess
-        grad, trial_grad = trial_grad, grad
-        converged = small
-        if huber_factor < np.inf and not converged:
-            fresh = max(floor, huber_factor * _median_norm(norms) / 1.1774)
-            if abs(fresh - huber) > 0.02 * huber:
-                changed = np.any(norms > min(fresh, huber))
-                huber = fresh
-                if changed:
-                    cost = evaluate(data, params, beads, use, huber, full, predicted, norms, dummy,
-                                    hess, grad)  # fmt: skip
-                    cost += _prior_cost(x, prior_mean, prior_weight)
-    return iterations, huber, converged

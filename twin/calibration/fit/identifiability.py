@@ -14,9 +14,15 @@ import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model, spot_radii
 from flexdt.twin.calibration.fit.certificate import Conditioning, spectrum
-from flexdt.twin.calibration.fit.nominal import Shape, as_poses, frame_shapes
 from flexdt.twin.calibration.fit.priors import require_widths
-from flexdt.twin.calibration.fit.problem import SIX, build_problem, require_tolerance
+from flexdt.twin.calibration.fit.problem import (
+    SIX,
+    Shape,
+    as_poses,
+    build_problem,
+    frame_shapes,
+    require_tolerance,
+)
 from flexdt.twin.calibration.fit.weak_directions import BOUND, Direction, tolerance_of
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray

@@ -17,12 +17,15 @@ import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.fit import fit_kernels as kernels
-from flexdt.twin.calibration.fit.nominal import Shape, as_poses, frame_shapes
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets, to_edge, to_internal
 from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.machine.description import builtin_machine
+
+Shape = tuple[int, int] | FloatArray | None
+"""Detector (rows, cols) of all frames, or (n, 2) of each; None is the default machine's camera."""
 
 SIX = ("dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z")
 """The thesis's active vector, eq. 5.6."""
@@ -226,16 +229,16 @@ class Problem:
     def data(self) -> kernels.Data:
         """What the kernels want of it."""
         return kernels.Data(
-            self.geometry, self.group, self.base, self.reading.pivot, self.model.beads,
-            self.model.bead_radius_mm, self.bias, self.measured, self.whiten, self.layout.active,
-            self.layout.colmap, self.layout.bead_column,
+            self.geometry, self.group, self.reading.pivot, self.model.bead_radius_mm, self.bias,
+            self.measured, self.whiten, self.layout.active, self.layout.colmap,
+            self.layout.bead_column,
         )  # fmt: skip
 
     def spread(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Parameter sets (groups, 17) and beads (k, 3) for column values `x`."""
-        params, beads = np.empty_like(self.base), np.empty_like(self.model.beads)
-        kernels.apply(self.data, x, params, beads)
-        return params, beads
+        columns, own = self.layout.colmap, self.layout.bead_column
+        params = np.where(columns < 0, self.base, np.append(x, 0.0)[columns])
+        return params, np.array(self.model.beads if own < 0 else x[own:].reshape(-1, 3))
 
     def parameters(self, x: FloatArray) -> tuple[Offsets, ...]:
         """The geometry of each group for column values `x`, in the reading corrections use."""
@@ -265,18 +268,27 @@ class Problem:
     def _evaluate(
         self, x: FloatArray, use: npt.NDArray[np.bool_], want: int
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        params, beads = self.spread(np.asarray(x, dtype=np.float64))
-        predicted = np.zeros((*use.shape, 2))
-        norms = np.zeros(use.shape)
-        size = len(self.layout.names)
-        jac = np.zeros((2 * use.size if want == 2 else 0, size))
-        hess, grad = np.zeros((size, size)), np.zeros(size)
-        cost = kernels.evaluate(
-            self.data, params, beads, use, np.inf, want, predicted, norms, jac, hess, grad
-        )
+        cost, predicted, norms, jac, _, _ = self.evaluate(x, use, want)
         if not np.isfinite(cost):
             raise TwinError("a bead lies at or behind the source in this geometry")
         return predicted, norms, jac
+
+    def evaluate(
+        self, x: FloatArray, use: npt.NDArray[np.bool_], want: int, huber: float = math.inf
+    ) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """The cost of column values, and what `fit_kernels.evaluate` writes: predicted, norms, jac,
+        hess, grad; arguments as there."""
+        params, beads = self.spread(np.asarray(x, dtype=np.float64))
+        size = len(self.layout.names)
+        written = (
+            np.zeros((*use.shape, 2)),
+            np.zeros(use.shape),
+            np.zeros((2 * use.size if want == 2 else 0, size)),
+            np.zeros((size, size)),
+            np.zeros(size),
+        )
+        cost = kernels.evaluate(self.data, params, beads, use, huber, want, *written)
+        return float(cost), *written
 
     @property
     def pixels(self) -> FloatArray:
@@ -376,6 +388,31 @@ def build_problem(
             [[widths.get(n, math.inf) for n in bases], np.full(beads, bead_tolerance_mm)]
         ),
     )
+
+
+def frame_shapes(shape: Shape, frames: int) -> FloatArray:
+    """Detector (rows, cols) of each frame, (n, 2).
+
+    Raises:
+        TwinError: `shape` is neither (2,) nor (n, 2).
+    """
+    value = builtin_machine().detector.camera.shape if shape is None else shape
+    try:
+        return np.array(np.broadcast_to(np.asarray(value, dtype=np.float64), (frames, 2)))
+    except ValueError:
+        raise TwinError(
+            f"shape {np.shape(value)} is neither (rows, cols) nor one pair for each of "
+            f"{frames} frames"
+        ) from None
+
+
+def as_poses(geometry: Poses | ConeVec) -> Poses:
+    """Poses of a nominal geometry.
+
+    Raises:
+        GeometryError: `Poses.from_cone_vec` cannot read the stage angles from the rows.
+    """
+    return geometry if isinstance(geometry, Poses) else Poses.from_cone_vec(geometry)
 
 
 def bias_factors(centre: Centre | npt.ArrayLike, shape: tuple[int, int]) -> FloatArray:

@@ -83,10 +83,9 @@ def solve(
     """
     how = Solver() if solver is None else solver
     value = np.array(problem.start if x is None else x, dtype=np.float64)
-    mean, weight = problem.prior_mean, problem.prior_weight(prior_noise)
     use = problem.seen
-    first = value.copy()
-    iterations, huber, converged = _levenberg(problem, value, use, how, mean, weight)
+    first = value
+    value, iterations, huber, converged = _levenberg(problem, value, use, how, prior_noise)
     for _ in range(4):
         norms = problem.residuals(value)[1]
         limit = how.trim * _spread(norms[use], len(value), how.floor_px)
@@ -96,7 +95,7 @@ def solve(
             break
         use = keep
         plain = replace(how, huber=math.inf)
-        more, huber, converged = _levenberg(problem, value, use, plain, mean, weight)
+        value, more, huber, converged = _levenberg(problem, value, use, plain, prior_noise)
         iterations += more
         if math.isinf(how.trim):
             break
@@ -121,18 +120,74 @@ def _spread(norms: FloatArray, columns: int, floor: float) -> float:
 
 
 def _levenberg(
-    p: Problem,
-    x: FloatArray,
-    use: npt.NDArray[np.bool_],
-    how: Solver,
-    mean: FloatArray,
-    weight: FloatArray,
-) -> tuple[int, float, bool]:
-    floor = how.floor_px * how.huber if math.isfinite(how.huber) else 0.0
-    iterations, huber, converged = kernels.levenberg(
-        p.data, use, how.huber, floor, mean, weight, x, how.max_iterations, how.tolerance
-    )
-    return int(iterations), float(huber), bool(converged)
+    p: Problem, x: FloatArray, use: npt.NDArray[np.bool_], how: Solver, prior_noise: float
+) -> tuple[FloatArray, int, float, bool]:
+    """Levenberg-Marquardt with Marquardt's diagonal from `x`.
+
+    The first step is tried almost undamped; damping appears only when a step fails. The Huber
+    threshold follows the residuals: `how.huber` times their robust spread. Stops when a step is
+    predicted to change the residuals' rms by less than the tolerance plus a millionth of it.
+
+    Returns:
+        (values, iterations, Huber threshold, converged).
+    """
+    weight = p.prior_weight(prior_noise)
+    rows = max(1, 2 * int(np.count_nonzero(use)))
+    huber = math.inf
+
+    def at(x: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+        """Cost, norms and normal equations, priors included."""
+        cost, _, norms, _, hess, grad = p.evaluate(x, use, 1, huber)
+        off = x - p.prior_mean
+        hess.flat[:: len(x) + 1] += weight
+        return cost + 0.5 * float(weight @ off**2), norms, hess, grad + weight * off
+
+    def threshold(norms: FloatArray) -> float:
+        spread = float(np.median(norms[use])) / RAYLEIGH_MEDIAN if use.any() else 0.0
+        return how.huber * max(how.floor_px, spread)
+
+    robust = math.isfinite(how.huber)
+    if robust:
+        huber = threshold(p.evaluate(x, use, 0)[2])
+    cost, norms, hess, grad = at(x)
+    if not cost < math.inf:
+        return x, 0, huber, False
+    damping, iterations, converged, small = 1e-9, 0, len(x) == 0, False
+    step = np.zeros_like(x)
+    while iterations < how.max_iterations and not converged:
+        iterations += 1
+        accepted = False
+        for _ in range(40):
+            if not kernels.solve(hess, grad, damping, step):
+                damping = max(damping * 10.0, 1e-12)
+                continue
+            damped = damping * float(np.diag(hess) @ step**2)
+            change = -float(step @ grad) - damped  # step' H step
+            least = how.tolerance + 1e-6 * math.sqrt(2.0 * cost / rows)
+            small = math.sqrt(abs(change) / rows) < least
+            trial = at(x + step)
+            accepted = trial[0] < cost or (small and trial[0] <= cost * (1.0 + 1e-9) + 1e-24)
+            if accepted or small:
+                break
+            damping = max(damping * 10.0, 1e-4)
+        converged = small
+        if not accepted:
+            break
+        gain, promised = cost - trial[0], 0.5 * change + damped
+        if gain > 0.5 * promised:
+            damping = max(damping * 0.02, 1e-14)
+        elif gain < 0.1 * promised:
+            damping = max(damping * 4.0, 1e-6)
+        x = x + step
+        cost, norms, hess, grad = trial
+        if robust and not converged:
+            fresh = threshold(norms)
+            if abs(fresh - huber) > 0.02 * huber:
+                changed = (norms > min(fresh, huber)).any()
+                huber = fresh
+                if changed:
+                    cost, norms, hess, grad = at(x)
+    return x, iterations, huber, converged
 
 
 def cost_at(problem: Problem, x: FloatArray, use: npt.NDArray[np.bool_]) -> float:
