@@ -43,11 +43,10 @@ def centroids(
 ) -> FloatArray:
     """`measure` in some windows; zeros elsewhere. least: (m,) noise to weigh pixels for."""
     results = np.zeros((len(patches.flat), kernels.RESULTS))
-    least = np.zeros(len(patches.flat)) if least is None else np.ascontiguousarray(least)
-    index = np.ascontiguousarray(index)  # one compiled kernel, not one for slices too
-    kernels.measure_windows(
-        patches.flat, index, patches.offsets, patches.radii, CAP, least, results
-    )
+    least = np.zeros(len(results)) if least is None else least
+    for i in index:
+        x, y = patches.offsets[i]
+        kernels.measure(patches.flat[i], x, y, patches.radii[i], CAP, least[i], results[i])
     return results
 
 
@@ -60,10 +59,12 @@ def fits(
 ) -> FloatArray:
     """`fit_ball` in some windows; zeros elsewhere. masks: usable pixels of those windows."""
     results = np.zeros((len(patches.flat), kernels.RESULTS))
-    kernels.fit_windows(
-        patches.flat, np.ascontiguousarray(index), masks, patches.offsets, patches.radii,
-        patches.stretch, patches.peaks, blur, patches.windows.whole.ravel(), free_radius, results,
-    )  # fmt: skip
+    whole = patches.windows.whole.ravel()
+    for i, mask in zip(index, masks, strict=True):
+        kernels.fit_ball(
+            patches.flat[i], mask, *patches.offsets[i], patches.radii[i], patches.stretch[i],
+            patches.peaks[i], blur, whole[i], free_radius, results[i],
+        )  # fmt: skip
     return results
 
 

@@ -466,23 +466,3 @@ def fit_ball(  # type: ignore[no-untyped-def]
     result[BIAS] = 0.93  # the rim decides: between full chords (0.8) and the outline (1)
     result[SCORE] = share
     result[OK] = 1.0
-
-
-@njit(cache=True, nogil=True)
-def measure_windows(windows, index, offsets, radii, cap, least, results):  # type: ignore[no-untyped-def]
-    """`measure` in windows[i] at offsets[i] for every i of index; least: (m,) of each window."""
-    for i in index:
-        measure(windows[i], offsets[i, 0], offsets[i, 1], radii[i], cap, least[i], results[i])
-
-
-@njit(cache=True, nogil=True)
-def fit_windows(  # type: ignore[no-untyped-def]
-    windows, index, masks, offsets, radii, stretch, peaks, blur, whole, free_radius, results
-):
-    """`fit_ball` in windows[index[i]] with masks[i] for every i; the rest by window."""
-    for n in range(index.shape[0]):
-        i = index[n]
-        fit_ball(
-            windows[i], masks[n], offsets[i, 0], offsets[i, 1], radii[i], stretch[i], peaks[i],
-            blur, whole[i], free_radius, results[i],
-        )  # fmt: skip
