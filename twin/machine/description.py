@@ -98,17 +98,15 @@ class Axis(_Frozen):
 
     @model_validator(mode="after")
     def _ordered(self) -> Axis:
-        if self.lower > self.upper:
-            raise _refused("upper", self.upper, f"at least lower, {self.lower}")
-        if not self.lower <= self.home <= self.upper:
-            raise _refused(
-                "home", self.home, f"within lower and upper, [{self.lower}, {self.upper}]"
-            )
-        if self.speed > self.max_speed:
-            raise _refused("speed", self.speed, f"at most max_speed, {self.max_speed}")
-        if self.acceleration > self.max_acceleration:
-            most = f"at most max_acceleration, {self.max_acceleration}"
-            raise _refused("acceleration", self.acceleration, most)
+        _refuse_if(self.lower > self.upper, "upper", self.upper, f"at least lower, {self.lower}")
+        most = f"within lower and upper, [{self.lower}, {self.upper}]"
+        _refuse_if(not self.lower <= self.home <= self.upper, "home", self.home, most)
+        most = f"at most max_speed, {self.max_speed}"
+        _refuse_if(self.speed > self.max_speed, "speed", self.speed, most)
+        most = f"at most max_acceleration, {self.max_acceleration}"
+        _refuse_if(
+            self.acceleration > self.max_acceleration, "acceleration", self.acceleration, most
+        )
         return self
 
 
@@ -124,19 +122,14 @@ class VirtualAxis(_Frozen):
 
     @model_validator(mode="after")
     def _reads_what_it_moves(self) -> VirtualAxis:
-        if self.factor == 0.0:
-            raise _refused("factor", self.factor, "a number other than 0")
-        if self.of not in self.moves:
-            raise _refused(
-                "moves", self.moves, f"shares of motors, {self.of!r} (the `of`) among them"
-            )
+        _refuse_if(self.factor == 0.0, "factor", self.factor, "a number other than 0")
+        most = f"shares of motors, {self.of!r} (the `of`) among them"
+        _refuse_if(self.of not in self.moves, "moves", self.moves, most)
         for motor, share in self.moves.items():
-            if share == 0.0:
-                raise _refused(f"moves.{motor}", share, "a number other than 0, or left out")
+            _refuse_if(share == 0.0, f"moves.{motor}", share, "a number other than 0, or left out")
         share = self.moves[self.of]
-        if abs(self.factor * share - 1.0) > 1e-6:
-            most = f"1 / factor, {1.0 / self.factor:g}, so that the axis gets where it is sent"
-            raise _refused(f"moves.{self.of}", share, most)
+        most = f"1 / factor, {1.0 / self.factor:g}, so that the axis gets where it is sent"
+        _refuse_if(abs(self.factor * share - 1.0) > 1e-6, f"moves.{self.of}", share, most)
         return self
 
 
@@ -196,12 +189,11 @@ class DetectorSpec(_Frozen):
         except LimitError as error:
             raise _refused("roi", self.roi, error.message) from None
         for i, (energy, left) in enumerate(self.response):
-            if left > energy:
-                most = f"at most the photon's energy, {energy:g} keV"
-                raise _refused(f"response.{i}", [energy, left], most)
-            if i and energy <= self.response[i - 1][0]:
-                most = f"at a higher energy than the point before, {self.response[i - 1][0]:g} keV"
-                raise _refused(f"response.{i}", [energy, left], most)
+            most = f"at most the photon's energy, {energy:g} keV"
+            _refuse_if(left > energy, f"response.{i}", [energy, left], most)
+            before = self.response[i - 1][0] if i else 0.0
+            most = f"at a higher energy than the point before, {before:g} keV"
+            _refuse_if(energy <= before, f"response.{i}", [energy, left], most)
         return self
 
 
@@ -248,13 +240,11 @@ class TubeSpec(_Frozen):
 
     @model_validator(mode="after")
     def _starts_within(self) -> TubeSpec:
-        if not self.min_kV <= self.kV <= self.max_kV:
-            most = f"from min_kV to max_kV, [{self.min_kV:g}, {self.max_kV:g}]"
-            raise _refused("kV", self.kV, most)
-        if self.power_W > self.max_W:
-            raise _refused("power_W", self.power_W, f"at most max_W, {self.max_W:g}")
-        if self.spot_points == 2:
-            raise _refused("spot_points", 2, "1, or 3 to 1024")
+        most = f"from min_kV to max_kV, [{self.min_kV:g}, {self.max_kV:g}]"
+        _refuse_if(not self.min_kV <= self.kV <= self.max_kV, "kV", self.kV, most)
+        most = f"at most max_W, {self.max_W:g}"
+        _refuse_if(self.power_W > self.max_W, "power_W", self.power_W, most)
+        _refuse_if(self.spot_points == 2, "spot_points", 2, "1, or 3 to 1024")
         return self
 
 
@@ -384,9 +374,8 @@ class Timing(_Frozen):
         _require(self.spread, self.kinds, "spread", "kind of command")
         for kind, found in self.spread.items():
             middle = self.seconds(kind)
-            if not found.p5_s <= middle <= found.p95_s:
-                most = f"from p5_s to p95_s, [{found.p5_s:g}, {found.p95_s:g}]"
-                raise _refused(f"{kind}_s", middle, most)
+            most = f"from p5_s to p95_s, [{found.p5_s:g}, {found.p95_s:g}]"
+            _refuse_if(not found.p5_s <= middle <= found.p95_s, f"{kind}_s", middle, most)
         return self
 
 
@@ -493,12 +482,10 @@ class Machine(_Frozen):
             _require(factors, self.axes, f"geometry.{quantity}", "axis")
             kind = "rotation" if quantity == "angle" else "linear"
             for name, factor in factors.items():
-                if factor == 0.0:
-                    most = "a number other than 0, or left out"
-                    raise _refused(f"geometry.{quantity}.{name}", factor, most)
-                if self.axes[name].kind != kind:
-                    most = f"driven by {kind} axes alone; {OUTSIDE}"
-                    raise _refused(f"geometry.{quantity}", name, most)
+                most = "a number other than 0, or left out"
+                _refuse_if(factor == 0.0, f"geometry.{quantity}.{name}", factor, most)
+                most = f"driven by {kind} axes alone; {OUTSIDE}"
+                _refuse_if(self.axes[name].kind != kind, f"geometry.{quantity}", name, most)
         for quantity in ("mount_x", "mount_y"):
             if quantity in self.fixed and not self.geometry.get(quantity):
                 most = "left out where no stage on the turntable moves along it"
@@ -509,9 +496,8 @@ class Machine(_Frozen):
             raise _refused("detector.response", response[-1], most)
         taken = [*_COMPONENTS_OF_SCRIPTS, self.tube.name.lower()]
         for name in (*self.axes, *self.virtual_axes):
-            if name.lower() in taken:
-                most = "another name: scripts, which tell no case apart, say it of other things"
-                raise _refused(f"axes.{name}", name, most)
+            most = "another name: scripts, which tell no case apart, say it of other things"
+            _refuse_if(name.lower() in taken, f"axes.{name}", name, most)
             taken.append(name.lower())
         for name, virtual in self.virtual_axes.items():
             _require([virtual.of], self.axes, f"virtual_axes.{name}.of", "axis")
@@ -563,9 +549,8 @@ class Machine(_Frozen):
                 most = f"carried by the turntable ({', '.join(turns)}), as mount_x and mount_y are"
                 raise _refused(f"components.{component.name}.axis", component.axis, most)
             twice = next((motor for motor in chain if chain.count(motor) > 1), None)
-            if twice is not None:
-                most = "a motor that no part which carries this one has already"
-                raise _refused(f"components.{component.name}.axis", twice, most)
+            most = "a motor that no part which carries this one has already"
+            _refuse_if(twice is not None, f"components.{component.name}.axis", twice, most)
 
     def _check_roles(self) -> None:
         """What stands for focal spot, active area and holder is where the X-ray geometry has them.
@@ -656,6 +641,11 @@ def _refused(at: str, value: object, allowed: str) -> PydanticCustomError:
     """An error of several keys together, reported at one of them; `at` is relative to the model."""
     context = {"at": at, "value": value, "allowed": allowed}
     return PydanticCustomError("refused", "must be {allowed}", context)
+
+
+def _refuse_if(wrong: bool, at: str, value: object, allowed: str) -> None:
+    if wrong:
+        raise _refused(at, value, allowed)
 
 
 def unknown_axis(name: str, machine: Machine) -> UnknownNameError:
