@@ -17,7 +17,7 @@ chord-weighted centroid, 0 for points (calibration.md, "Images").
 
 Derivatives: a = w.P / w.n, so da = (dw.P + w.dP - a (dw.n + w.dn)) / w.n, and the same with Q for
 the row. A parameter moves the bead (dw), the source and with it w and g, or the detector (dP, dQ,
-dn); the four kinds below say which, so that the inner loop computes only what is not zero.
+dn); what it does not move has zeros.
 """
 
 from __future__ import annotations
@@ -38,11 +38,6 @@ DO_X, DO_Y, DO_Z, ALPHA, TAU_X, TAU_Z, DD_X, DD_Y, DD_Z, DS_X, DS_Y = range(11)
 ROLL, PITCH, YAW, TILT_X, TILT_Z, ANGLE_SCALE = range(11, PARAMETERS)
 # First columns of a row of `geometry`.
 SOURCE, AXIS, DETECTOR, U, V, ANGLE, MOUNT = 0, 3, 6, 9, 12, 15, 16
-# How a parameter acts on w and on P, Q, n (see `evaluate`).
-_CONSTANT = 0  # adds the same vector to w for every bead
-_LINEAR = 1  # adds a matrix times (b - tau) to w
-_DETECTOR = 2  # changes P, Q and n alone
-_SOURCE = 3  # adds a constant to w and changes P, Q and n
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -141,20 +136,6 @@ def evaluate(  # type: ignore[no-untyped-def]
     geometry, group, pivot, radius, bias, measured, whiten, active, colmap, bead_col = data
     n_frames, n_beads = use.shape
     na = active.shape[0]
-    kind = np.empty(na, np.int64)
-    turning = False
-    for j in range(na):
-        i = active[j]
-        if i in (DS_X, DS_Y):
-            kind[j] = _SOURCE
-        elif DD_X <= i <= DD_Z or ROLL <= i <= YAW:
-            kind[j] = _DETECTOR
-            # The axes of turning are needed for a derivative even where all turns are zero.
-            turning = turning or (want > 0 and i >= ROLL)
-        elif i <= DO_Z or i in (TAU_X, TAU_Z):
-            kind[j] = _CONSTANT
-        else:
-            kind[j] = _LINEAR
     const = np.zeros((na, 3))
     linear = np.zeros((na, 3, 3))
     dp = np.zeros((na, 3))
@@ -172,6 +153,7 @@ def evaluate(  # type: ignore[no-untyped-def]
     v = np.empty(3)
     axes = np.zeros((3, 3))
     w = np.empty(3)
+    dw = np.empty(3)
     b = np.empty(3)
     da = np.empty(na + 3)
     db = np.empty(na + 3)
@@ -197,12 +179,7 @@ def evaluate(  # type: ignore[no-untyped-def]
         g[0] = geo[DETECTOR] + p[DD_X] - s[0]
         g[1] = geo[DETECTOR + 1] + p[DD_Z] - s[1]
         g[2] = geo[DETECTOR + 2] + p[DD_Y] - s[2]
-        for i in range(3):
-            u[i] = geo[U + i]
-            v[i] = geo[V + i]
-        tilted = p[ROLL] != 0.0 or p[PITCH] != 0.0 or p[YAW] != 0.0
-        if tilted or turning:
-            _turned(geo[U : U + 3], geo[V : V + 3], p, u, v, axes)
+        _turned(geo[U : U + 3], geo[V : V + 3], p, u, v, axes)
         px, py, pz = _cross(v[0], v[1], v[2], g[0], g[1], g[2])
         qx, qy, qz = _cross(g[0], g[1], g[2], u[0], u[1], u[2])
         nx, ny, nz = _cross(u[0], u[1], u[2], v[0], v[1], v[2])
@@ -257,7 +234,8 @@ def evaluate(  # type: ignore[no-untyped-def]
                     ex = sign if i in (DD_X, DS_X) else 0.0
                     ey = sign if i == DD_Z else 0.0
                     ez = sign if i in (DD_Y, DS_Y) else 0.0
-                    const[j, 0], const[j, 1], const[j, 2] = ex, ey, ez
+                    if i >= DS_X:
+                        const[j, 0], const[j, 1], const[j, 2] = ex, ey, ez
                     dp[j, 0], dp[j, 1], dp[j, 2] = _cross(v[0], v[1], v[2], ex, ey, ez)
                     dq[j, 0], dq[j, 1], dq[j, 2] = _cross(ex, ey, ez, u[0], u[1], u[2])
                     dn[j, :] = 0.0
@@ -331,23 +309,17 @@ def evaluate(  # type: ignore[no-untyped-def]
             pax, pay, paz = (px - a * nx) * inv, (py - a * ny) * inv, (pz - a * nz) * inv
             qbx, qby, qbz = (qx - e * nx) * inv, (qy - e * ny) * inv, (qz - e * nz) * inv
             for j in range(na):
-                t = kind[j]
-                dwx, dwy, dwz = 0.0, 0.0, 0.0
-                if t == _LINEAR:
-                    dwx = linear[j, 0, 0] * b[0] + linear[j, 0, 1] * b[1] + linear[j, 0, 2] * b[2]
-                    dwy = linear[j, 1, 0] * b[0] + linear[j, 1, 1] * b[1] + linear[j, 1, 2] * b[2]
-                    dwz = linear[j, 2, 0] * b[0] + linear[j, 2, 1] * b[1] + linear[j, 2, 2] * b[2]
-                elif t != _DETECTOR:
-                    dwx, dwy, dwz = const[j, 0], const[j, 1], const[j, 2]
-                va = dwx * pax + dwy * pay + dwz * paz
-                vb = dwx * qbx + dwy * qby + dwz * qbz
-                wn = 0.0
-                if t >= _DETECTOR:
-                    wn = w[0] * dn[j, 0] + w[1] * dn[j, 1] + w[2] * dn[j, 2]
-                    va += inv * (w[0] * dp[j, 0] + w[1] * dp[j, 1] + w[2] * dp[j, 2] - a * wn)
-                    vb += inv * (w[0] * dq[j, 0] + w[1] * dq[j, 1] + w[2] * dq[j, 2] - e * wn)
+                for i in range(3):
+                    dw[i] = const[j, i]
+                    for m in range(3):
+                        dw[i] += linear[j, i, m] * b[m]
+                wn = w[0] * dn[j, 0] + w[1] * dn[j, 1] + w[2] * dn[j, 2]
+                va = dw[0] * pax + dw[1] * pay + dw[2] * paz
+                va += inv * (w[0] * dp[j, 0] + w[1] * dp[j, 1] + w[2] * dp[j, 2] - a * wn)
+                vb = dw[0] * qbx + dw[1] * qby + dw[2] * qbz
+                vb += inv * (w[0] * dq[j, 0] + w[1] * dq[j, 1] + w[2] * dq[j, 2] - e * wn)
                 if stretch > 0.0:
-                    grow = -2.0 * stretch * inv * (dwx * nx + dwy * ny + dwz * nz + wn)
+                    grow = -2.0 * stretch * inv * (dw[0] * nx + dw[1] * ny + dw[2] * nz + wn)
                     va += stretch * (va - dfoot[j, 0]) + grow * (a - foot_a)
                     vb += stretch * (vb - dfoot[j, 1]) + grow * (e - foot_b)
                 da[j] = va
