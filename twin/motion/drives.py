@@ -184,21 +184,25 @@ def plan_jog(
             f"jog of {axis} at {velocity:g} {unit}/s: {name} allows {limit:g} {unit}/s",
             {"axis": axis, "asked": str(velocity), "allowed": limit, "unit": f"{unit}/s"},
         )
-    runs = {}
-    for name, factor in moves.items():
-        current = drives[name].at(now)
-        _, acceleration = pace[name]
-        runs[name] = _Run(
-            machine.axes[name],
-            current.position(now),
-            current.velocity(now),
-            velocity * factor,
-            max(acceleration, current.acceleration(now)),
-            now,
-        )
+
+    def run(name: str, lease: float) -> Trajectory:
+        """A motor's share: it runs for `lease` [s], or as far as its limit."""
+        axis, current = machine.axes[name], drives[name].at(now)
+        begin, wanted = (current.position(now), current.velocity(now)), velocity * moves[name]
+        acceleration = max(pace[name][1], current.acceleration(now))
+        free = motion.jog(*begin, wanted, lease, acceleration, now)
+        if axis.lower <= free.target <= axis.upper:
+            return free
+        limit = axis.upper if free.target > axis.upper else axis.lower
+        return motion.move(*begin, limit, max(abs(wanted), 1e-9), acceleration, now)
+
     # Coupled motors brake together, when the first of them has to brake for its limit.
-    lease = min(run.lease(lease_s) for run in runs.values())
-    return {name: run.trajectory(lease) for name, run in runs.items()}
+    lease = lease_s
+    for name in moves:
+        planned, axis_of = run(name, lease_s), machine.axes[name]
+        if planned.target in (axis_of.lower, axis_of.upper):
+            lease = max(0.0, min(lease, planned.pieces[-1].start - now))
+    return {name: run(name, lease) for name in moves}
 
 
 def with_settings(
@@ -234,36 +238,6 @@ def with_settings(
             acceleration=drive.acceleration if acceleration is None else acceleration * share,
         )
     return out
-
-
-@dataclass(frozen=True)
-class _Run:
-    """One motor's share of a jog."""
-
-    axis: Axis
-    position: float
-    speed: float
-    wanted: float
-    acceleration: float
-    now: float
-
-    def trajectory(self, lease: float) -> Trajectory:
-        """Run for `lease` [s], or as far as the limit."""
-        free = motion.jog(
-            self.position, self.speed, self.wanted, lease, self.acceleration, self.now
-        )
-        if self.axis.lower <= free.target <= self.axis.upper:
-            return free
-        limit = self.axis.upper if free.target > self.axis.upper else self.axis.lower
-        pace = max(abs(self.wanted), 1e-9)
-        return motion.move(self.position, self.speed, limit, pace, self.acceleration, self.now)
-
-    def lease(self, lease: float) -> float:
-        """How long it may run before it must brake for its limit, at most `lease` [s]."""
-        planned = self.trajectory(lease)
-        if planned.target not in (self.axis.lower, self.axis.upper):
-            return lease
-        return max(0.0, min(lease, planned.pieces[-1].start - self.now))
 
 
 def _refuse_double(machine: Machine, targets: Mapping[str, float]) -> None:

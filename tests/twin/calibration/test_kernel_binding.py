@@ -165,7 +165,8 @@ def check(kernels: object, want: Reference) -> None:
         jac = np.zeros((2 * FRAMES * BEADS, columns))
         hess, grad = np.zeros((columns, columns)), np.zeros(columns)
         data = fit_kernels.Data(
-            geometry, np.zeros(FRAMES, np.int64), case.pivot, case.radius, np.full((FRAMES, BEADS), BIAS), case.measured, case.whiten,
+            geometry, np.zeros(FRAMES, np.int64), case.pivot, case.radius,
+            np.full((FRAMES, BEADS), BIAS), case.measured, case.whiten,
             np.arange(len(NAMES)), np.arange(len(NAMES))[None], len(NAMES),
         )  # fmt: skip
         cost = kernels.evaluate(  # type: ignore[attr-defined]
@@ -256,7 +257,7 @@ def test_every_flipped_sign_is_caught() -> None:
     for want in wanted:
         check(module_of(ast.parse(source)), want)  # as it stands it agrees
     total = sum(1 for _ in flips(ast.parse(source)))
-    assert total > 180
+    assert total > 170
     survivors = []
     for i in range(total):
         tree = ast.parse(source)

@@ -128,7 +128,7 @@ def evaluate(  # type: ignore[no-untyped-def]
         predicted: (n, k, 2) out.
         norms: (n, k) out: length of the whitened residual; -1 where not used.
         jac: (2 n k, columns) out when want = 2 (rows of unused observations stay zero).
-        hess: (columns, columns), grad: (columns,): out when want = 1, upper triangle.
+        hess: (columns, columns), grad: (columns,): added to when want = 1, upper triangle.
 
     Returns:
         The cost; inf if a bead is not in front of the source.
@@ -158,13 +158,8 @@ def evaluate(  # type: ignore[no-untyped-def]
     da = np.empty(na + 3)
     db = np.empty(na + 3)
     cols = np.empty(na + 3, np.int64)
-    local = np.zeros((na, na))
-    local_grad = np.zeros(na)
     rot[2, 2] = 1.0
     total = 0.0
-    if want == 1:
-        hess[:] = 0.0
-        grad[:] = 0.0
 
     for f in range(n_frames):
         p = params[group[f]]
@@ -335,48 +330,20 @@ def evaluate(  # type: ignore[no-untyped-def]
                     da[na + i] = (1.0 + stretch) * va + grow * (a - foot_a)
                     db[na + i] = (1.0 + stretch) * vb + grow * (e - foot_b)
                 m = na + 3
-            if want == 1:
-                # Parameter by parameter into `local`, spread when the group changes; the few
-                # entries with a bead's coordinates go into `hess` directly.
-                for j in range(m):
-                    da[j] = w0 * da[j] + w1 * db[j]
-                    db[j] = w2 * db[j]
-                for j in range(na):
-                    va = weight * da[j]
-                    vb = weight * db[j]
-                    local_grad[j] += va * r0 + vb * r1
-                    for i in range(j, na):
-                        local[j, i] += va * da[i] + vb * db[i]
-                for j in range(na, m):
-                    va = weight * da[j]
-                    vb = weight * db[j]
-                    cj = cols[j]
-                    grad[cj] += va * r0 + vb * r1
-                    for i in range(na):
-                        if cols[i] >= 0:  # parameters come before beads
-                            hess[cols[i], cj] += va * da[i] + vb * db[i]
-                    for i in range(j, m):
-                        hess[cj, cols[i]] += va * da[i] + vb * db[i]
-            else:
-                row_index = 2 * (f * n_beads + k)
-                for j in range(m):
-                    if cols[j] >= 0:
-                        jac[row_index, cols[j]] = w0 * da[j] + w1 * db[j]
-                        jac[row_index + 1, cols[j]] = w2 * db[j]
-
-        # Frames of a group share their columns: add up until the group changes.
-        last = f == n_frames - 1 or group[f + 1] != group[f]
-        if want == 1 and last:
-            for j in range(na):
-                cj = colmap[group[f], active[j]]
-                if cj >= 0:
-                    grad[cj] += local_grad[j]
-                    for i in range(j, na):
-                        ci = colmap[group[f], active[i]]
-                        if ci >= 0:
-                            hess[min(ci, cj), max(ci, cj)] += local[j, i]
-            local[:] = 0.0
-            local_grad[:] = 0.0
+            for j in range(m):
+                da[j] = w0 * da[j] + w1 * db[j]
+                db[j] = w2 * db[j]
+            row_index = 2 * (f * n_beads + k)
+            for j in range(m):
+                if want == 2:
+                    jac[row_index, cols[j]] = da[j]
+                    jac[row_index + 1, cols[j]] = db[j]
+                    continue
+                va = weight * da[j]
+                vb = weight * db[j]
+                grad[cols[j]] += va * r0 + vb * r1
+                for i in range(j, m):  # columns grow with the parameters, and beads come last
+                    hess[cols[j], cols[i]] += va * da[i] + vb * db[i]
     return total
 
 
