@@ -1,4 +1,4 @@
-"""Compiled kernels of the fit: residuals, analytic Jacobian, normal equations and their solution.
+"""Compiled kernels of the fit: residuals, analytic Jacobian, normal equations.
 
 For any subset of the seventeen parameters, and for the beads themselves, they compute what
 `Poses.cone_vec(parameters).project_points(beads)` computes. That makes this the second place where
@@ -345,40 +345,3 @@ def evaluate(  # type: ignore[no-untyped-def]
                 for i in range(j, m):  # columns grow with the parameters, and beads come last
                     hess[cols[j], cols[i]] += va * da[i] + vb * db[i]
     return total
-
-
-@njit(cache=True, nogil=True)
-def solve(hess, grad, damping, step):  # type: ignore[no-untyped-def]
-    """Cholesky of the column-scaled, Marquardt-damped normal equations; False if not possible."""
-    n = grad.shape[0]
-    scale = np.empty(n)
-    low = np.zeros((n, n))
-    for i in range(n):
-        scale[i] = 1.0 / math.sqrt(hess[i, i]) if hess[i, i] > 0.0 else 1.0
-    for i in range(n):
-        for j in range(i + 1):
-            low[i, j] = hess[j, i] * scale[i] * scale[j]
-        low[i, i] += damping
-    for i in range(n):
-        for j in range(i + 1):
-            t = low[i, j]
-            for k in range(j):
-                t -= low[i, k] * low[j, k]
-            if i == j:
-                if t <= 1e-15:
-                    return False
-                low[i, i] = math.sqrt(t)
-            else:
-                low[i, j] = t / low[j, j]
-    y = np.empty(n)
-    for i in range(n):
-        t = -grad[i] * scale[i]
-        for k in range(i):
-            t -= low[i, k] * y[k]
-        y[i] = t / low[i, i]
-    for i in range(n - 1, -1, -1):
-        t = y[i]
-        for k in range(i + 1, n):
-            t -= low[k, i] * step[k] / scale[k]
-        step[i] = t / low[i, i] * scale[i]
-    return True

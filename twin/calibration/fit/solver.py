@@ -12,14 +12,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import lapack
 
-from flexdt.twin.calibration.fit import fit_kernels as kernels
 from flexdt.twin.calibration.fit.problem import Problem
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 
 RAYLEIGH_MEDIAN = 1.1774100225154747
 """Median length of a 2-vector with independent unit normal parts."""
+LEAST_PIVOT = 1e-15
+"""Of the scaled normal equations: what is less is rounding."""
 
 
 @dataclass(frozen=True)
@@ -153,19 +155,20 @@ def _levenberg(
     if not cost < math.inf:
         return x, 0, huber, False
     damping, iterations, converged, small = 1e-9, 0, len(x) == 0, False
-    step = np.zeros_like(x)
     while iterations < how.max_iterations and not converged:
         iterations += 1
         accepted = False
         for _ in range(40):
-            if not kernels.solve(hess, grad, damping, step):
+            step = _step(hess, grad, damping)
+            if step is None:
                 damping = max(damping * 10.0, 1e-12)
                 continue
             damped = damping * float(np.diag(hess) @ step**2)
             change = -float(step @ grad) - damped  # step' H step
             least = how.tolerance + 1e-6 * math.sqrt(2.0 * cost / rows)
             small = math.sqrt(abs(change) / rows) < least
-            trial = at(x + step)
+            there = x + step
+            trial = at(there)
             accepted = trial[0] < cost or (small and trial[0] <= cost * (1.0 + 1e-9) + 1e-24)
             if accepted or small:
                 break
@@ -178,7 +181,7 @@ def _levenberg(
             damping = max(damping * 0.02, 1e-14)
         elif gain < 0.1 * promised:
             damping = max(damping * 4.0, 1e-6)
-        x = x + step
+        x = there
         cost, norms, hess, grad = trial
         if robust and not converged:
             fresh = threshold(norms)
@@ -188,6 +191,19 @@ def _levenberg(
                 if changed:
                     cost, norms, hess, grad = at(x)
     return x, iterations, huber, converged
+
+
+def _step(hess: FloatArray, grad: FloatArray, damping: float) -> FloatArray | None:
+    """The solution of the column-scaled, damped normal equations, of which `hess` is the upper
+    triangle; None where they are not positive definite."""
+    diagonal = np.diag(hess)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    scaled = hess * np.outer(scale, scale)
+    scaled.flat[:: len(grad) + 1] += damping
+    factor, solved, failed = lapack.dposv(scaled, grad * scale)
+    if failed or (np.diag(factor) ** 2 <= LEAST_PIVOT).any():
+        return None
+    return np.asarray(-scale * solved)
 
 
 def cost_at(problem: Problem, x: FloatArray, use: npt.NDArray[np.bool_]) -> float:
