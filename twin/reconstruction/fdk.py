@@ -499,7 +499,8 @@ def _fdk(
         shape = (shape[0], round(FINER * shape[1]))
     level = panels = upright(cone_vec, shape[1] / seen[1]) if tilted else cone_vec
     _check_steady(circle, level, shape)
-    weights = redundancy(circle, level, shape[1])
+    beyond = truncation is not None and truncation.beyond
+    weights = redundancy(circle, level, shape[1], beyond=beyond)
     # Columns off the panel whose filtered values are needed, and those that go into the filter.
     near = columns_beyond(circle, level, shape[1])
     far = (0, 0) if truncation is None else truncation.columns(level, shape[1])

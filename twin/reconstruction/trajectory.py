@@ -19,6 +19,8 @@ FLATNESS = 0.03
 """Largest deviation of the sources from a horizontal circle, relative to its radius."""
 TAPER = 4.0
 """Width of the weights' transition, over how much further the detector reaches to one side."""
+UNSEEN = 3e-3
+"""Parker's weight of an opposite ray below which it counts as not seen; see `redundancy`."""
 NARROWEST = 24
 """Least width of that transition [columns]."""
 MOST_COLUMNS = 8
@@ -148,13 +150,13 @@ def _closing_gap(span: float, turns: int, usual: float) -> float | None:
     return None
 
 
-def redundancy(circle: Circle, cone_vec: ConeVec, cols: int) -> FloatArray:
+def redundancy(circle: Circle, cone_vec: ConeVec, cols: int, *, beyond: bool = False) -> FloatArray:
     """Weights (n, cols) of rays so that every line counts once, with its opposite or alone.
 
     Over whole turns every ray and its opposite share (1/2 each); with a detector moved to one
     side the rays near its near edge hand over smoothly to their opposites, and those beyond count
     alone. Turns beyond the first divide it further. Short scans get Parker's weights, widened to
-    the span there is.
+    the span there is, and the handing over where an object lies `beyond` the near edge.
 
     Raises:
         GeometryError: less than half a turn plus the fan's opening.
@@ -166,19 +168,11 @@ def redundancy(circle: Circle, cone_vec: ConeVec, cols: int) -> FloatArray:
             "the shadow of the rotation axis does not fall on the detector; FDK needs it to",
             {"fan_deg": np.rad2deg([-low, high]).tolist()},
         )
+    turns, shared, widest = 1.0, np.full_like(fan, 0.5), float(np.abs(fan).max())
     if circle.full:
         # The turns of a helix share each voxel in the backprojection.
         turns = 1.0 if circle.rise else circle.span / (2 * np.pi)
-        column = (low + high) / cols
-        if abs(high - low) <= column:
-            return np.full_like(fan, 0.5 / turns)
-        overlap = min(low, high)
-        taper = min(overlap, max(TAPER * abs(high - low), NARROWEST * column))
-        side = fan if high > low else -fan
-        part = np.clip((np.abs(side) - (overlap - taper)) / taper, 0.0, 1.0)
-        return np.asarray((0.5 + 0.5 * np.sign(side) * np.sin(np.pi / 2 * part) ** 2) / turns)
-    widest = float(np.abs(fan).max())
-    if circle.span < np.pi + 2 * widest - 1e-6 or circle.span > 2 * np.pi:
+    elif circle.span < np.pi + 2 * widest - 1e-6 or circle.span > 2 * np.pi:
         raise GeometryError(
             f"the views span {np.rad2deg(circle.span):.4g} deg; FDK needs whole turns, or between "
             f"{np.rad2deg(np.pi + 2 * widest):.4g} (half a turn and the fan) and 360 deg",
@@ -187,7 +181,20 @@ def redundancy(circle: Circle, cone_vec: ConeVec, cols: int) -> FloatArray:
                 "allowed": [float(np.rad2deg(np.pi + 2 * widest)), 360.0],
             },
         )
-    return parker(circle.progress[:, None], circle.sense * fan, circle.span)
+    else:
+        shared = parker(circle.progress[:, None], circle.sense * fan, circle.span)
+    column = (low + high) / cols
+    if abs(high - low) <= column or not (circle.full or beyond):
+        return shared / turns
+    overlap = min(low, high)
+    taper = min(overlap, max(TAPER * abs(high - low), NARROWEST * column))
+    side = fan if high > low else -fan
+    alone = np.sin(np.pi / 2 * np.clip((np.abs(side) - (overlap - taper)) / taper, 0.0, 1.0)) ** 2
+    # Off the near edge a ray counts, as what continues the panel, where its opposite was not seen.
+    opposite = np.where(side > 0, shared, 1.0 - shared)
+    seen = np.clip(opposite / UNSEEN, 0.0, 1.0)
+    weight = np.where(side > 0, seen, 1.0 - seen)
+    return np.asarray(((1.0 - alone) * shared + alone * weight) / turns)
 
 
 def reach(fan: FloatArray) -> tuple[float, float]:
@@ -201,8 +208,6 @@ def columns_beyond(circle: Circle, cone_vec: ConeVec, cols: int) -> tuple[int, i
     The filter's response to what the panel saw goes on beyond its near edge. Voxels whose shadow
     falls there need it, out to where the panel ends on the other side.
     """
-    if not circle.full:
-        return 0, 0
     widest = max(reach(fan_angles(circle, cone_vec, cols)))
     source = cone_vec.source[:, :2]
     inward, panel = circle.centre - source, cone_vec.detector[:, :2] - source

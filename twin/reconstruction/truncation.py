@@ -89,6 +89,9 @@ NOTICED = 0.1
 STRAINED = 3e-4
 """What it costs (`_Band.among`), for each ray and relative to large line integrals squared, before
 the outline is doubtful: where no outline is right, many things are needed to mend it."""
+EVEN = 0.01
+"""Change of line integrals across a panel and from view to view, relative to large ones, below
+which there is no outline: that of the largest cylinder that `LIMIT` allows is 0.025."""
 LIMIT = np.array([2.0, 2.0, 1.5, 1.5, np.inf, np.inf])
 """Largest numbers of a prism in a fit, and, negative, their least; see `_prism`."""
 HUGE = 50.0
@@ -187,9 +190,9 @@ class Truncation:
         rows: (b,) middle row of each band.
         prisms: one a band; None where the band's rows are whole.
         misfit: of the worst band, relative to what is tolerated; infinite where none is fitted,
-            which is so for a helix.
-        one_sided: whether less than a turn was seen by a panel moved to one side: nothing says
-            what lies beyond its near edge.
+            which is so for a helix and for images without an edge.
+        one_sided: whether the object reaches beyond the near edge of a panel moved to one side,
+            in less than a turn: opposite views do not say all of what is there.
     """
 
     rows: FloatArray
@@ -198,16 +201,22 @@ class Truncation:
     one_sided: bool = False
 
     @property
+    def beyond(self) -> bool:
+        """Whether no prism stands for what a panel moved to one side misses."""
+        return self.one_sided and (self.misfit > 1.0 or not any(self.prisms))
+
+    @property
     def doubt(self) -> str | None:
         """What to tell the user where the outline is unlike the prism's; else None."""
         if self.misfit <= 1.0 and not self.one_sided:
             return None
+        wide = "the object is wider than the panel"
         why = "its outline is unlike an ellipse, a rectangle or a triangle"
         if np.isinf(self.misfit):
-            why = "a helix does not tell how far it goes on"
+            why = "a helix, or images without an edge, do not tell how far it goes on"
         if self.one_sided:
-            why = "less than a turn does not tell what a panel moved to one side misses"
-        wide = "the object is wider than the panel"
+            wide = "the object reaches beyond the near edge of a panel moved to one side"
+            why = "less than a turn does not tell all of what is there"
         return f"{wide}, and {why}: densities may be off by tens of per cent"
 
     def columns(self, cone_vec: ConeVec, cols: int) -> tuple[int, int]:
@@ -293,12 +302,31 @@ def truncation_of(
         return None
     before, after = columns_beyond(circle, panels, shape[1])
     # A helix sees other layers in the same rows at each turn, which no prism stands for.
-    edges = np.array([before <= 1, after <= 1])
+    edges = np.array([before <= 1, after <= 1]) | (not circle.full)
     found = _fitted(images, panels, shape, edges, not circle.rise)
-    near, far = sorted(reach(fan_angles(circle, panels, shape[1])))
-    if found is None or circle.full or near > LOPSIDED * far:
+    fan = fan_angles(circle, panels, shape[1])
+    near, far = sorted(reach(fan))
+    if circle.full or near > LOPSIDED * far:
         return found
-    return replace(found, one_sided=True)
+    if found is None and not _seen_beyond(images, np.abs(fan) > near):
+        return None
+    return replace(found or Truncation(np.zeros(1), (None,)), one_sided=True)
+
+
+def _seen_beyond(images: Sequence[Float32Array], there: npt.NDArray[np.bool_]) -> bool:
+    """Whether something that is no noise is seen in some columns of each view (n, cols)."""
+    from scipy.ndimage import uniform_filter
+
+    rows, cols = images[0].shape
+    smooth = [uniform_filter(image, (-(-rows // BANDS), _edge(cols))) for image in images]
+    least = NOTICEABLE * max(float(np.abs(image).max()) for image in smooth)
+    apart = _edge(cols) + APART
+    for image, columns in zip(smooth, there, strict=True):
+        bend = image[:, 2 * apart :] - 2.0 * image[:, apart:-apart] + image[:, : -2 * apart]
+        noise = float(np.median(np.abs(bend))) / 1.65 if bend.size else 0.0
+        if columns.any() and image[:, columns].max() > max(least, 2.0 * SIGNIFICANT * noise):
+            return True
+    return False
 
 
 def _fitted(
@@ -330,11 +358,13 @@ def _fitted(
     things = cache(lambda: Things.of(source, rays, bands[0].field))
     for k in np.argsort([-band.seen.sum() for band in bands]).tolist():
         if (bands[k].cut_off(NOTICEABLE * most) & edges_that_count).any():
-            if not fit:
-                return Truncation(middles, tuple(prisms), np.inf)
+            if not fit or bands[k].even:
+                misfit = np.inf
+                continue
             prisms[k], off = bands[k].fitted(known, things)
             known, misfit = prisms[k], max(misfit, off)
-    return None if known is None else Truncation(middles, tuple(prisms), misfit)
+    cut_off = known is not None or misfit > 0.0
+    return Truncation(middles, tuple(prisms), misfit) if cut_off else None
 
 
 def _at_edges(band: Float32Array) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -386,6 +416,12 @@ class _Band:
     def top(self) -> float:
         """A large line integral."""
         return float(np.percentile(self.seen, 99.0))
+
+    @property
+    def even(self) -> bool:
+        """Whether columns and views differ less than those of any prism: black images, say."""
+        changes = [float(np.ptp(self.seen.mean(axis=axis))) for axis in (0, 1)]
+        return max(changes) < EVEN * self.top
 
     def excess(self, prism: Outline) -> FloatArray:
         """Logarithms (2,) of what was seen over the prism's integrals where that is little, and
