@@ -87,10 +87,12 @@ def peak_bytes() -> int:
 
 def answer(request: Sequence[bytes]) -> list[bytes]:
     """Do one piece of work; the first part says how it went."""
+    seconds, call, *raw = request
+    # Before the call is read, which imports what it needs.
+    limit("RLIMIT_CPU", int(sum(os.times()[:2]) + float(seconds) + 2.0))
     try:
-        work, seconds, arguments = pickle.loads(request[0])
-        limit("RLIMIT_CPU", int(sum(os.times()[:2]) + seconds + 2.0))
-        return [b"done", *work(*arguments, *request[1:])]
+        work, arguments = pickle.loads(call)
+        return [b"done", *work(*arguments, *raw)]
     except MemoryError:
         return [b"memory"]
     except Exception as error:

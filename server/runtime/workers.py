@@ -82,7 +82,8 @@ class Worker:
         try:
             self._channel.settimeout(seconds)
             until = time.monotonic() + seconds
-            send_parts(self._channel, [pickle.dumps((work, seconds, arguments)), *raw])
+            call = pickle.dumps((work, arguments))
+            send_parts(self._channel, [f"{seconds}".encode(), call, *raw])
             self._channel.settimeout(max(0.001, until - time.monotonic()))
             how, peak, *answer = receive_parts(self._channel)
         except TimeoutError:

@@ -314,7 +314,8 @@ def _pieces_of(plan: ScanPlan) -> list[bytes]:
     }
     out = [pickle.dumps(short)]
     for name, values in long.items():
-        pieces = [values[i : i + A_PIECE] for i in range(0, len(values), A_PIECE)]
+        size = 1 if name == "files" else A_PIECE  # one of them has thousands of names
+        pieces = [values[i : i + size] for i in range(0, len(values), size)]
         out += [name.encode(), str(len(pieces)).encode(), *map(pickle.dumps, pieces)]
     return out
 

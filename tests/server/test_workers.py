@@ -252,3 +252,13 @@ def test_poses_of_a_beginning_come_back(tmp_path: Path) -> None:
     document["wish"]["poses"] = json.loads(document["wish"]["poses"])  # as it was before
     file.write_text(json.dumps(document))
     assert Sidecar.read(tmp_path, "a").wish.poses == wish.poses
+
+
+def test_a_plan_comes_in_pieces_that_are_read_at_once() -> None:
+    plan = matter(Wish(script(60_000))).report().plan
+    pieces = checking._pieces_of(plan)
+    assert max(map(len, pieces[1:])) < 200_000  # the first has arrays, which are read as they are
+    assert same(checking._joined(pieces, M, P), plan)
+    assert [g.files for g in checking._joined(pieces, M, P).groups] == [
+        g.files for g in plan.groups
+    ]
