@@ -17,7 +17,7 @@ chord-weighted centroid, 0 for points (calibration.md, "Images").
 
 Derivatives: a = w.P / w.n, so da = (dw.P + w.dP - a (dw.n + w.dn)) / w.n, and the same with Q for
 the row. A parameter moves the bead (dw), the source and with it w and g, or the detector (dP, dQ,
-dn); what it does not move has zeros.
+dn); the four kinds below say which, so that the inner loop computes only what is not zero.
 """
 
 from __future__ import annotations
@@ -38,6 +38,11 @@ DO_X, DO_Y, DO_Z, ALPHA, TAU_X, TAU_Z, DD_X, DD_Y, DD_Z, DS_X, DS_Y = range(11)
 ROLL, PITCH, YAW, TILT_X, TILT_Z, ANGLE_SCALE = range(11, PARAMETERS)
 # First columns of a row of `geometry`.
 SOURCE, AXIS, DETECTOR, U, V, ANGLE, MOUNT = 0, 3, 6, 9, 12, 15, 16
+# How a parameter acts on w and on P, Q, n (see `evaluate`).
+_CONSTANT = 0  # adds the same vector to w for every bead
+_LINEAR = 1  # adds a matrix times (b - tau) to w
+_DETECTOR = 2  # changes P, Q and n alone
+_SOURCE = 3  # adds a constant to w and changes P, Q and n
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -128,7 +133,7 @@ def evaluate(  # type: ignore[no-untyped-def]
         predicted: (n, k, 2) out.
         norms: (n, k) out: length of the whitened residual; -1 where not used.
         jac: (2 n k, columns) out when want = 2 (rows of unused observations stay zero).
-        hess: (columns, columns), grad: (columns,): added to when want = 1, upper triangle.
+        hess: (columns, columns), grad: (columns,): out when want = 1, upper triangle.
 
     Returns:
         The cost; inf if a bead is not in front of the source.
@@ -136,6 +141,20 @@ def evaluate(  # type: ignore[no-untyped-def]
     geometry, group, pivot, radius, bias, measured, whiten, active, colmap, bead_col = data
     n_frames, n_beads = use.shape
     na = active.shape[0]
+    kind = np.empty(na, np.int64)
+    turning = False
+    for j in range(na):
+        i = active[j]
+        if i in (DS_X, DS_Y):
+            kind[j] = _SOURCE
+        elif DD_X <= i <= DD_Z or ROLL <= i <= YAW:
+            kind[j] = _DETECTOR
+            # The axes of turning are needed for a derivative even where all turns are zero.
+            turning = turning or (want > 0 and i >= ROLL)
+        elif i <= DO_Z or i in (TAU_X, TAU_Z):
+            kind[j] = _CONSTANT
+        else:
+            kind[j] = _LINEAR
     const = np.zeros((na, 3))
     linear = np.zeros((na, 3, 3))
     dp = np.zeros((na, 3))
@@ -153,13 +172,17 @@ def evaluate(  # type: ignore[no-untyped-def]
     v = np.empty(3)
     axes = np.zeros((3, 3))
     w = np.empty(3)
-    dw = np.empty(3)
     b = np.empty(3)
     da = np.empty(na + 3)
     db = np.empty(na + 3)
     cols = np.empty(na + 3, np.int64)
+    local = np.zeros((na, na))
+    local_grad = np.zeros(na)
     rot[2, 2] = 1.0
     total = 0.0
+    if want == 1:
+        hess[:] = 0.0
+        grad[:] = 0.0
 
     for f in range(n_frames):
         p = params[group[f]]
@@ -174,7 +197,12 @@ def evaluate(  # type: ignore[no-untyped-def]
         g[0] = geo[DETECTOR] + p[DD_X] - s[0]
         g[1] = geo[DETECTOR + 1] + p[DD_Z] - s[1]
         g[2] = geo[DETECTOR + 2] + p[DD_Y] - s[2]
-        _turned(geo[U : U + 3], geo[V : V + 3], p, u, v, axes)
+        for i in range(3):
+            u[i] = geo[U + i]
+            v[i] = geo[V + i]
+        tilted = p[ROLL] != 0.0 or p[PITCH] != 0.0 or p[YAW] != 0.0
+        if tilted or turning:
+            _turned(geo[U : U + 3], geo[V : V + 3], p, u, v, axes)
         px, py, pz = _cross(v[0], v[1], v[2], g[0], g[1], g[2])
         qx, qy, qz = _cross(g[0], g[1], g[2], u[0], u[1], u[2])
         nx, ny, nz = _cross(u[0], u[1], u[2], v[0], v[1], v[2])
@@ -229,8 +257,7 @@ def evaluate(  # type: ignore[no-untyped-def]
                     ex = sign if i in (DD_X, DS_X) else 0.0
                     ey = sign if i == DD_Z else 0.0
                     ez = sign if i in (DD_Y, DS_Y) else 0.0
-                    if i >= DS_X:
-                        const[j, 0], const[j, 1], const[j, 2] = ex, ey, ez
+                    const[j, 0], const[j, 1], const[j, 2] = ex, ey, ez
                     dp[j, 0], dp[j, 1], dp[j, 2] = _cross(v[0], v[1], v[2], ex, ey, ez)
                     dq[j, 0], dq[j, 1], dq[j, 2] = _cross(ex, ey, ez, u[0], u[1], u[2])
                     dn[j, :] = 0.0
@@ -304,17 +331,23 @@ def evaluate(  # type: ignore[no-untyped-def]
             pax, pay, paz = (px - a * nx) * inv, (py - a * ny) * inv, (pz - a * nz) * inv
             qbx, qby, qbz = (qx - e * nx) * inv, (qy - e * ny) * inv, (qz - e * nz) * inv
             for j in range(na):
-                for i in range(3):
-                    dw[i] = const[j, i]
-                    for m in range(3):
-                        dw[i] += linear[j, i, m] * b[m]
-                wn = w[0] * dn[j, 0] + w[1] * dn[j, 1] + w[2] * dn[j, 2]
-                va = dw[0] * pax + dw[1] * pay + dw[2] * paz
-                va += inv * (w[0] * dp[j, 0] + w[1] * dp[j, 1] + w[2] * dp[j, 2] - a * wn)
-                vb = dw[0] * qbx + dw[1] * qby + dw[2] * qbz
-                vb += inv * (w[0] * dq[j, 0] + w[1] * dq[j, 1] + w[2] * dq[j, 2] - e * wn)
+                t = kind[j]
+                dwx, dwy, dwz = 0.0, 0.0, 0.0
+                if t == _LINEAR:
+                    dwx = linear[j, 0, 0] * b[0] + linear[j, 0, 1] * b[1] + linear[j, 0, 2] * b[2]
+                    dwy = linear[j, 1, 0] * b[0] + linear[j, 1, 1] * b[1] + linear[j, 1, 2] * b[2]
+                    dwz = linear[j, 2, 0] * b[0] + linear[j, 2, 1] * b[1] + linear[j, 2, 2] * b[2]
+                elif t != _DETECTOR:
+                    dwx, dwy, dwz = const[j, 0], const[j, 1], const[j, 2]
+                va = dwx * pax + dwy * pay + dwz * paz
+                vb = dwx * qbx + dwy * qby + dwz * qbz
+                wn = 0.0
+                if t >= _DETECTOR:
+                    wn = w[0] * dn[j, 0] + w[1] * dn[j, 1] + w[2] * dn[j, 2]
+                    va += inv * (w[0] * dp[j, 0] + w[1] * dp[j, 1] + w[2] * dp[j, 2] - a * wn)
+                    vb += inv * (w[0] * dq[j, 0] + w[1] * dq[j, 1] + w[2] * dq[j, 2] - e * wn)
                 if stretch > 0.0:
-                    grow = -2.0 * stretch * inv * (dw[0] * nx + dw[1] * ny + dw[2] * nz + wn)
+                    grow = -2.0 * stretch * inv * (dwx * nx + dwy * ny + dwz * nz + wn)
                     va += stretch * (va - dfoot[j, 0]) + grow * (a - foot_a)
                     vb += stretch * (vb - dfoot[j, 1]) + grow * (e - foot_b)
                 da[j] = va
@@ -330,18 +363,46 @@ def evaluate(  # type: ignore[no-untyped-def]
                     da[na + i] = (1.0 + stretch) * va + grow * (a - foot_a)
                     db[na + i] = (1.0 + stretch) * vb + grow * (e - foot_b)
                 m = na + 3
-            for j in range(m):
-                da[j] = w0 * da[j] + w1 * db[j]
-                db[j] = w2 * db[j]
-            row_index = 2 * (f * n_beads + k)
-            for j in range(m):
-                if want == 2:
-                    jac[row_index, cols[j]] = da[j]
-                    jac[row_index + 1, cols[j]] = db[j]
-                    continue
-                va = weight * da[j]
-                vb = weight * db[j]
-                grad[cols[j]] += va * r0 + vb * r1
-                for i in range(j, m):  # columns grow with the parameters, and beads come last
-                    hess[cols[j], cols[i]] += va * da[i] + vb * db[i]
+            if want == 1:
+                # Parameter by parameter into `local`, spread when the group changes; the few
+                # entries with a bead's coordinates go into `hess` directly.
+                for j in range(m):
+                    da[j] = w0 * da[j] + w1 * db[j]
+                    db[j] = w2 * db[j]
+                for j in range(na):
+                    va = weight * da[j]
+                    vb = weight * db[j]
+                    local_grad[j] += va * r0 + vb * r1
+                    for i in range(j, na):
+                        local[j, i] += va * da[i] + vb * db[i]
+                for j in range(na, m):
+                    va = weight * da[j]
+                    vb = weight * db[j]
+                    cj = cols[j]
+                    grad[cj] += va * r0 + vb * r1
+                    for i in range(na):
+                        if cols[i] >= 0:  # parameters come before beads
+                            hess[cols[i], cj] += va * da[i] + vb * db[i]
+                    for i in range(j, m):
+                        hess[cj, cols[i]] += va * da[i] + vb * db[i]
+            else:
+                row_index = 2 * (f * n_beads + k)
+                for j in range(m):
+                    if cols[j] >= 0:
+                        jac[row_index, cols[j]] = w0 * da[j] + w1 * db[j]
+                        jac[row_index + 1, cols[j]] = w2 * db[j]
+
+        # Frames of a group share their columns: add up until the group changes.
+        last = f == n_frames - 1 or group[f + 1] != group[f]
+        if want == 1 and last:
+            for j in range(na):
+                cj = colmap[group[f], active[j]]
+                if cj >= 0:
+                    grad[cj] += local_grad[j]
+                    for i in range(j, na):
+                        ci = colmap[group[f], active[i]]
+                        if ci >= 0:
+                            hess[min(ci, cj), max(ci, cj)] += local[j, i]
+            local[:] = 0.0
+            local_grad[:] = 0.0
     return total
