@@ -433,7 +433,8 @@ class DataSet:
 
         Example:
             >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
-            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
+            >>> counts, flat = np.full((3, 4, 5), 1000), np.full((4, 5), 1000)
+            >>> counts[:, 1:3, 2] = 500
             >>> data = DataSet.from_arrays(counts, scan, flat=flat)
             >>> data.reconstruct("fdk", voxel=1.0)
             <Volume: 2 x 3 x 3 voxels (z, y, x) of 1 mm about (0, 0, 0) mm>

@@ -5,7 +5,7 @@ Sixteen voxels at a time by register permutation where the processor has AVX-512
 AVX2, one by one elsewhere; the results differ by rounding only. Registers begin at multiples of
 their length, so that a slab of a volume that begins at one is the whole volume's, bit by bit.
 
-Places on a line are integers with 32 bits behind the point: from register to register they are
+Places on a line are integers with 44 bits behind the point: from register to register they are
 added to, and their whole part is a shift, where in floating point half the time went.
 """
 
@@ -37,7 +37,7 @@ STEEPEST = 1.9
 """Largest step [samples a voxel] for which LANES voxels lie within 2 LANES samples."""
 MARGIN = 32
 """Samples after the end of a line that may be read or written, but do not count."""
-POINT = 32
+POINT = 44
 """Bits behind the point of a place on a line."""
 
 _FLOATS = ir.VectorType(ir.FloatType(), LANES)

@@ -193,12 +193,14 @@ class Truncation:
             which is so for a helix and for images without an edge.
         one_sided: whether the object reaches beyond the near edge of a panel moved to one side,
             in less than a turn: opposite views do not say all of what is there.
+        edgeless: whether none is fitted because nothing like an edge was seen.
     """
 
     rows: FloatArray
     prisms: tuple[Outline | None, ...]
     misfit: float = 0.0
     one_sided: bool = False
+    edgeless: bool = False
 
     @property
     def beyond(self) -> bool:
@@ -213,7 +215,9 @@ class Truncation:
         wide = "the object is wider than the panel"
         why = "its outline is unlike an ellipse, a rectangle or a triangle"
         if np.isinf(self.misfit):
-            why = "a helix, or images without an edge, do not tell how far it goes on"
+            why = "a helix does not tell how far it goes on"
+        if self.edgeless:
+            why = "images without an edge do not tell how far it goes on"
         if self.one_sided:
             wide = "the object reaches beyond the near edge of a panel moved to one side"
             why = "less than a turn does not tell all of what is there"
@@ -354,17 +358,18 @@ def _fitted(
     most = max(float(np.abs(band.seen).max()) for band in bands)
     prisms: list[Outline | None] = [None] * len(bands)
     known: Outline | None = None
-    misfit = 0.0
+    misfit, edgeless = 0.0, False
     things = cache(lambda: Things.of(source, rays, bands[0].field))
     for k in np.argsort([-band.seen.sum() for band in bands]).tolist():
         if (bands[k].cut_off(NOTICEABLE * most) & edges_that_count).any():
+            edgeless = edgeless or (fit and bands[k].even)
             if not fit or bands[k].even:
                 misfit = np.inf
                 continue
             prisms[k], off = bands[k].fitted(known, things)
             known, misfit = prisms[k], max(misfit, off)
     cut_off = known is not None or misfit > 0.0
-    return Truncation(middles, tuple(prisms), misfit) if cut_off else None
+    return Truncation(middles, tuple(prisms), misfit, edgeless=edgeless) if cut_off else None
 
 
 def _at_edges(band: Float32Array) -> tuple[tuple[float, float], tuple[float, float]]:
