@@ -54,6 +54,8 @@ MOST_COLUMNS = 65_535
 """Voxel columns along y that a device's grid can hold."""
 CHUNK = 32
 """Views worked on at a time."""
+GROUP: Final = 8
+"""Views that the processor weighs and filters at a time: they stay in its caches."""
 STACKS: Final = 6
 """Stacks of so many images that a device holds: twice what came, and made wider, of three steps."""
 MOST_ASIDE: Final = 0.1
@@ -108,19 +110,27 @@ class OnProcessor:
         nz, ny, nx = like.shape
         self._first, self._size = _grid(like)
         self._data = np.zeros((ny, nx, nz), np.float32)
+        self._sizes, self._columns = (0, 0, 0, 0), self._data
 
     def add(self, views: Views) -> None:
         """Weigh and filter views, and add them to the volume."""
         from flexdt.twin.reconstruction import fdk_kernels
 
         n, wide, cols, rows = views.sizes
-        ready = np.empty((n, rows, wide), np.float32)
+        if views.sizes != self._sizes:  # new memory costs as much as filtering
+            self._sizes, self._columns = views.sizes, fdk_kernels.room(n, cols, rows)
         images = np.ascontiguousarray(views.images)
-        fdk_kernels.weigh(images, views.top, views.factors, views.across, views.up, ready)
-        columns = fdk_kernels.room(n, cols, rows)
-        fdk_kernels.stand_up(filtered(ready, views.response), views.kept.start, columns)
+        for first in range(0, n, GROUP):
+            some = slice(first, first + GROUP)
+            ready = np.empty((len(images[some]), rows, wide), np.float32)
+            fdk_kernels.weigh(
+                images[some], views.top, views.factors[some], views.across[some], views.up[some],
+                ready,
+            )  # fmt: skip
+            lines = filtered(ready, views.response)
+            fdk_kernels.stand_up(lines, views.kept.start, self._columns[some])
         fdk_kernels.backproject(
-            columns, rows, views.shares, views.table, *self._first, *self._size, self._data,
+            self._columns, rows, views.shares, views.table, *self._first, *self._size, self._data,
             threads(),
         )  # fmt: skip
 
