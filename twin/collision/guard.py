@@ -8,8 +8,8 @@ be a contact, a retreat included. Here such a pair is judged by its separation: 
 two bodies across a direction, the widest of all directions, negative for an overlap. Where the
 motion begins it is exact, from the faces of the bodies' Minkowski difference; later the same
 directions are looked at, standing and turning with either body, which can only make the separation
-seem less than it is. As long as it never decreases the motion is a retreat, and from the moment the
-pair is free the usual margin applies to it again. All other pairs keep the margin throughout.
+seem less than it is. As long as it keeps to its floor the motion is a retreat, and from the moment
+the pair is free the usual margin applies to it again. All other pairs keep the margin throughout.
 """
 
 from __future__ import annotations
@@ -33,12 +33,10 @@ from flexdt.twin.collision.scene_search import (
 from flexdt.twin.collision.stages import Body
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.motion.profiles import Trajectory
-from flexdt.twin.scanner.safety import Contact
+from flexdt.twin.scanner.safety import Contact, floor
 
 STEPS = 400
 """Moments looked at along the motion, besides the ends of its segments."""
-SLACK_MM = 1e-6
-"""Rounding allowed in a distance that must not decrease."""
 GRAZING_MM = 1e-3
 """Pairs this near are judged as overlapping ones: their direction is rounding in a sweep."""
 MANY = 100
@@ -69,13 +67,13 @@ def _of_pair(scene: Scene, path: Path, pair: Pair) -> Contact | None:
     steps = np.linspace(path.times[0], path.times[-1], STEPS)
     times = np.unique(np.concatenate([path.times, steps]))
     limit = scene.limits.margin + scene.limits.tolerance
-    widest, last = -np.inf, float(times[0])
+    least, last = -np.inf, float(times[0])
     for time, q in zip(times.tolist(), path.vectors(times), strict=True):
         apart = overlap.separation(q)
-        if apart < widest - SLACK_MM:
+        if apart < least:
             here = path.positions(last)
             return Contact(scene.names(pair), time, here, here, last, 0.0, free_before=False)
-        widest, last = max(widest, apart), time
+        least, last = max(least, floor(apart, scene.limits.margin)), time
         if separation_at(scene, pair, q) > limit and time < float(path.times[-1]):
             alone = replace(scene, pairs=(pair,), distant=())
             return first_contact(alone, path.after(time))

@@ -3,7 +3,9 @@
 It advances from certified gap to certified gap (see `relative`), so motion that counts as free
 keeps the margin everywhere, not only where it was evaluated: clearance >= margin along everything
 before the reported contact. A contact is reported where the certified gap is within `tolerance` of
-the margin.
+the margin. A pair that is as near as that when a motion begins keeps to its floor instead
+(`twin.scanner.safety.floor`), which depends on the gap alone, so that no number of motions wears it
+down.
 """
 
 from __future__ import annotations
@@ -12,9 +14,7 @@ import math
 from dataclasses import dataclass
 
 from flexdt.twin.collision.relative import START, Look, Moment, RelativeMotion, Separate
-
-ESCAPE = 0.1
-"""Of the tolerance: how much nearer a motion may come that starts within the margin."""
+from flexdt.twin.scanner.safety import ROUNDING_MM, floor
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,8 @@ def sweep_pair(
 ) -> PairResult:
     """Follow one pair until it touches, the motion ends, or `until` [s].
 
-    A pair that starts within the margin (after a halt, or a new sample) may move, but not nearer.
+    A pair that starts within the tolerance of the margin, or nearer, may move, but not below its
+    floor.
 
     Args:
         motion: of one body relative to the other.
@@ -73,22 +74,24 @@ def sweep_pair(
         start: where to begin.
         until: what happens after this time does not matter [s].
     """
-    margin, tolerance = limits.margin, limits.tolerance
+    level, near = floor(math.inf, limits.margin), limits.margin + limits.tolerance
+    clear = near + limits.tolerance
     at, before, looks, least = start, None, 0, math.inf
     while True:
         look = motion.look(at, separate)
         looks += 1
         least = min(least, look.gap)
-        if looks == 1 and 0.0 < look.gap <= margin + tolerance:
-            margin, tolerance = max(0.0, look.gap - ESCAPE * tolerance), 0.5 * ESCAPE * tolerance
-        if look.gap <= margin + tolerance:
+        if looks == 1 and 0.0 < look.gap <= near:
+            level = max(0.0, floor(look.gap, limits.margin))
+            near, clear = level + 0.5 * ROUNDING_MM, level + ROUNDING_MM
+        elif look.gap <= near:
             if before is None:
                 return PairResult(look.gap, at, None, looks)
             # The bound that led here holds as well as the look.
-            free = _last_free(motion, before, margin + 2 * tolerance)
-            return PairResult(max(look.gap, margin), at, free, looks)
+            free = _last_free(motion, before, clear)
+            return PairResult(max(look.gap, level), at, free, looks)
         before = look
-        following = motion.next_at(look, margin)
+        following = motion.next_at(look, level)
         if following is None or motion.time(following) > until:
             break
         at = following

@@ -10,6 +10,7 @@ until a reset. `Guard` is the interface of contact detection; `collision` implem
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -17,6 +18,36 @@ from typing import Protocol
 from flexdt.twin.errors import CollisionError, SafetyError
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.scanner.state import Safety
+
+
+RUNG_MM = 5e-3
+"""Spacing of the floors [mm]: what all histories together may take from a gap within the margin.
+Half the tolerance of a sweep, and large beside `ROUNDING_MM`."""
+ROUNDING_MM = 1e-4
+"""What rounding may take from a gap, and a braked path that strays from the one that was swept."""
+
+
+def floor(gap: float, margin: float) -> float:
+    """The gap that two parts keep from now on, whatever they are asked to do, until they are apart.
+
+    Floors are rungs of a ladder, `RUNG_MM` apart. Its top rung is one above the safety margin, and
+    what is free keeps to that. A pair that is nearer (after a restart with another machine file, or
+    after coasting) keeps to the rung below its gap. The rungs do not move, and a gap that was kept
+    above a rung has a floor no lower than that rung: so a thousand motions, new samples, corrections
+    and restarts take no more from a gap than one, and nothing has to be remembered between them.
+
+    Args:
+        gap: between the two now, negative for the depth of an overlap [mm].
+        margin: the machine's safety margin [mm].
+
+    Returns:
+        The least gap allowed [mm]; no more than `gap`, so that what has sunk below its rung by
+        rounding may go anywhere but nearer.
+    """
+    rung = 1.0
+    if gap < margin + RUNG_MM:
+        rung = math.floor((gap - margin + 2.0 * ROUNDING_MM) / RUNG_MM)
+    return min(gap, margin + rung * RUNG_MM - ROUNDING_MM)
 
 
 @dataclass(frozen=True)

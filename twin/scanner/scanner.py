@@ -39,6 +39,7 @@ from flexdt.twin.scanner.joining import (
 )
 from flexdt.twin.scanner.readout import readout
 from flexdt.twin.scanner.safety import (
+    ROUNDING_MM,
     Guard,
     after_contact,
     after_free_motion,
@@ -65,10 +66,6 @@ from flexdt.twin.scanner.state import (
     ScannerState,
     TubeState,
 )
-
-CONTACT_SLACK_MM = 0.01
-"""A clearance that falls short of the safety margin by no more than this is not a contact."""
-
 
 class ScannerTwin:
     """A scanner: commands change it, readers ask it, both say when.
@@ -98,6 +95,8 @@ class ScannerTwin:
         certified is bound to these."""
         self._derived: tuple[object, Readout | None] = (None, None)
         """The last readout, and what it was made of."""
+        self._judged: tuple[object, tuple[str, str] | None] = (None, None)
+        """The last pair in contact, and the positions and stage that it was found for."""
 
     # Reading ------------------------------------------------------------------------------------
 
@@ -584,16 +583,18 @@ class ScannerTwin:
             )
 
     def _touching(self, now: float) -> tuple[str, str] | None:
-        """The nearest pair that is in contact now."""
-        least = self.machine.safety_margin_mm - CONTACT_SLACK_MM
-        near = self._lookahead(now).touching()
-        found = {pair: mm for pair, mm in near.items() if mm <= 0.0 or mm < least}
-        return min(found, key=lambda pair: found[pair]) if found else None
+        """The nearest pair that is within the safety margin now; of a scanner at rest it is kept."""
+        positions = self.positions(now)
+        made_of = (tuple(positions.values()), self._stage)
+        if self._judged[0] != made_of:
+            least = self.machine.safety_margin_mm - 2.0 * ROUNDING_MM
+            near = {} if self.guard is None else self.guard.touching(positions)
+            found = {pair: mm for pair, mm in near.items() if mm <= 0.0 or mm < least}
+            self._judged = (made_of, min(found, key=lambda pair: found[pair], default=None))
+        return self._judged[1]
 
     def _safety_at(self, now: float) -> Safety:
-        """The safety state; parts that were in contact may have come apart."""
-        if self.safety.contact is None:
-            return self.safety
+        """The safety state. Contact is judged by where the parts are, however they came there."""
         return in_contact(self.safety, self._touching(now))
 
     def _require_ready(self, what: str, now: float) -> None:

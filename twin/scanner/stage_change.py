@@ -7,20 +7,17 @@ it, and where nothing moves no pair may come within the safety margin.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from flexdt.twin.errors import CollisionError, SafetyError
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.scanner.joining import Lookahead, Ways
-from flexdt.twin.scanner.safety import Contact, Guard
+from flexdt.twin.scanner.safety import Contact, Guard, floor
 from flexdt.twin.scanner.state import Correction, Sample
 
 MANY_LEGS = 500
 """A programme of more trajectories than these is too long to be swept at a takeover."""
-NEARER_MM = 1e-6
-"""A clearance that shrinks by no more than this stays the same."""
 
 
 @dataclass(frozen=True)
@@ -95,8 +92,9 @@ class StageChange:
         under_way = self.ahead.ahead()
         before = self.ahead.touching(deep=True)
         for pair, clearance in changed.touching(deep=True).items():
-            # What touches already may stay as close as it is, and no closer.
-            if clearance < before.get(pair, math.inf) - NEARER_MM:
+            # What is within the margin already may stay there, and keeps its floor.
+            margin = self.ahead.machine.safety_margin_mm
+            if pair not in before or clearance < floor(before[pair], margin):
                 raise self._refused(pair, 0.0, {})
         contact = changed.contact(under_way) if under_way else None
         halted = None
