@@ -27,8 +27,8 @@ Array = npt.NDArray[np.float64]
 Pair = tuple[str, str]
 Reading = Mapping[str, float]
 
-ALLOWED_MM = 0.02
-"""Parts may be nearer than the machine's margin by so much (the issue's figure)."""
+ALLOWED_MM = 0.01
+"""Parts may be nearer than the machine's margin by so much, all that is asked together."""
 FINEST_MM = 0.03
 """Looks at parts near the margin are no further apart than this, in relative motion."""
 KNOT_S = 1e-3
@@ -254,6 +254,7 @@ class MachineModel:
             "detector_z": ("dD_y",),
         }
         zero = float(self.profile.get(profile.get(quantity, ""), 0.0))
+        zero += float(self.data.get("fixed", {}).get(quantity, 0.0))
         return zero + sum(c.get(t, 0.0) for t in terms.get(quantity, ()))
 
     def bodies(self, sample: Placed, correction: Mapping[str, float]) -> list[Body]:
@@ -741,11 +742,18 @@ class Watch:
         self._last: tuple[Array, Array] | None = None
         self.put(stage, reading)
 
-    def put(self, stage: Stage, reading: Reading) -> None:
-        """Another stage from now on; pairs that are too near there may be so (see `begun`)."""
+    def put(self, stage: Stage, reading: Reading, *, anew: bool = True) -> None:
+        """Another stage from now on; pairs that are too near there may be so (see `begun`).
+
+        With `anew` false it is the same parts that stand a little elsewhere, and what they may not
+        fall below stays.
+        """
+        kept = (
+            {} if anew else dict(zip((p.names for p in self.stage.pairs), self._floor, strict=True))
+        )
         self.stage = stage
         self.machine = stage.machine
-        self._floor = np.full(len(stage.pairs), -math.inf)
+        self._floor = np.array([kept.get(p.names, -math.inf) for p in stage.pairs])
         self.begun(reading)
 
     def rest(self) -> None:
@@ -758,10 +766,15 @@ class Watch:
         free = self.machine.margin - ALLOWED_MM
         self._floor = np.maximum(self._floor, np.minimum(free, clear - ALLOWED_MM))
 
-    def touching(self, reading: Reading) -> list[Pair]:
-        """Pairs that touch or overlap."""
-        clear = self.stage.clearances(self.machine.vector(reading))
-        return [self.stage.pairs[i].names for i in np.flatnonzero(clear <= 0.0).tolist()]
+    def too_near(self, reading: Reading) -> list[Pair]:
+        """Pairs nearer than the margin."""
+        pose = self.machine.vector(reading)
+        near = self.machine.margin - ALLOWED_MM
+        clear = self.stage.clearances(pose)
+        pairs = [self.stage.pairs[i] for i in np.flatnonzero(clear < near).tolist()]
+        return [
+            p.names for p in pairs if (p.a.upright and p.b.upright) or p.second_opinion(pose) < near
+        ]
 
     def look(
         self,

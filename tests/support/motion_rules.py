@@ -416,9 +416,9 @@ class Episode:
                 self._coupled[axis] = {m: here[m] for m in motors}
 
     def _state(self) -> None:
-        touching = self.watch.touching(self.scanner.positions(self.now))
-        if touching and self.scanner.state(self.now).safety.state == "ready":
-            what = f"ready, although {' and '.join(touching[0])} touch"
+        near = self.watch.too_near(self.scanner.positions(self.now))
+        if near and self.scanner.state(self.now).safety.state == "ready":
+            what = f"ready, although {' and '.join(near[0])} are within the margin"
             self.found.append(Violation("state", self.now, what, 0.0))
 
     def _after(
@@ -481,7 +481,7 @@ class Episode:
                     kind = "contact" if d <= 0.0 else "margin"
                     what = f"{verb} was accepted with {' and '.join(pair.names)} {d:.4f} mm apart"
                     self.found.append(Violation(kind, now, what, self.model.margin - d))
-            self.watch.put(stage, s.positions(now))
+            self.watch.put(stage, s.positions(now), anew=verb != "correction")
         else:
             self.watch.begun(s.positions(now))
         self._state()

@@ -255,9 +255,9 @@ class WireEpisode:
         s = twin.scanner
         self.found += self._watch.look(s.positions, s.velocities, self._last, now)
         self._last = max(self._last, now)
-        touching = self._watch.touching(s.positions(now))
-        if touching and s.state(now).safety.state == "ready":
-            what = f"ready, although {' and '.join(touching[0])} touch"
+        near = self._watch.too_near(s.positions(now))
+        if near and s.state(now).safety.state == "ready":
+            what = f"ready, although {' and '.join(near[0])} are within the margin"
             self.found.append(Violation("state", now, what, 0.0))
         for end, outcome in [x for x in self._leases if x[0] <= now]:
             self.counts["lease end", outcome] += 1

@@ -19,7 +19,6 @@ from flexdt.twin.errors import CollisionError, SafetyError
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.scanner.state import Safety
 
-
 RUNG_MM = 5e-3
 """Spacing of the floors [mm]: what all histories together may take from a gap within the margin.
 Half the tolerance of a sweep, and large beside `ROUNDING_MM`."""
@@ -33,8 +32,9 @@ def floor(gap: float, margin: float) -> float:
     Floors are rungs of a ladder, `RUNG_MM` apart. Its top rung is one above the safety margin, and
     what is free keeps to that. A pair that is nearer (after a restart with another machine file, or
     after coasting) keeps to the rung below its gap. The rungs do not move, and a gap that was kept
-    above a rung has a floor no lower than that rung: so a thousand motions, new samples, corrections
-    and restarts take no more from a gap than one, and nothing has to be remembered between them.
+    above a rung has a floor no lower than that rung: so a thousand motions, new samples,
+    corrections and restarts take no more from a gap than one, and nothing has to be remembered
+    between them.
 
     Args:
         gap: between the two now, negative for the depth of an overlap [mm].

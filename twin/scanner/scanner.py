@@ -67,6 +67,7 @@ from flexdt.twin.scanner.state import (
     TubeState,
 )
 
+
 class ScannerTwin:
     """A scanner: commands change it, readers ask it, both say when.
 
@@ -583,7 +584,7 @@ class ScannerTwin:
             )
 
     def _touching(self, now: float) -> tuple[str, str] | None:
-        """The nearest pair that is within the safety margin now; of a scanner at rest it is kept."""
+        """The nearest pair within the safety margin now; of a scanner at rest it is kept."""
         positions = self.positions(now)
         made_of = (tuple(positions.values()), self._stage)
         if self._judged[0] != made_of:
