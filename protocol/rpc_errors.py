@@ -1,8 +1,8 @@
 """Error codes of the wire and the one exception that carries them.
 
-JSON-RPC's own codes, the twin's (-32001 to -32008, fixed) and two of the projector's. The `data` of
-an error holds the value that was received and what is allowed instead. The server maps the twin's
-own exceptions to these codes.
+JSON-RPC's own codes, the twin's (-32001 to -32008, fixed), two of the projector's, and one that the
+viewer answers its pages with. The `data` of an error holds the value that was received and what is
+allowed instead. The server maps the twin's own exceptions to these codes.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ class Code(IntEnum):
     TOO_LARGE = -32008, "message, image, volume or list above a stated size"
     SUPERSEDED = -32009, "a newer request of the same kind took its place"
     CANCELLED = -32010, "cancelled by its sender"
+    LINK_DOWN = -32011, "the viewer's link to the twin is not up"
 
 
 @dataclass
@@ -123,6 +124,11 @@ def too_large(what: str, asked: float | str, allowed: float, unit: str = "bytes"
 def superseded(key: str) -> RpcError:
     """A newer request with the same key took this one's place."""
     return RpcError(Code.SUPERSEDED, f"superseded by a newer request for {key!r}", {"key": key})
+
+
+def link_down(why: str) -> RpcError:
+    """There is no connection to the twin, or it was lost before the answer came."""
+    return RpcError(Code.LINK_DOWN, f"no connection to the twin: {why}")
 
 
 def cancelled(request: object) -> RpcError:

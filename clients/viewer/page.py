@@ -29,7 +29,7 @@ from websockets.exceptions import ConnectionClosed
 from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress, Unsendable
 from flexdt.clients.client.transport import ConnectionLost
 from flexdt.protocol import METHODS, Code, RpcError, parse_params
-from flexdt.protocol.rpc_errors import busy, clip, internal
+from flexdt.protocol.rpc_errors import busy, clip, internal, link_down
 from flexdt.server.runtime.log import log, traced
 
 
@@ -248,7 +248,7 @@ class Page:
             except RpcError as error:
                 self._fail(id, error)
             except ConnectionLost as error:
-                self._fail(id, RpcError(Code.INTERNAL, f"no connection to the twin: {error}"))
+                self._fail(id, link_down(str(error)))
             except Exception:
                 # Every failure is reported to the page; the process goes on for the others.
                 log("a page's request failed", logging.ERROR, error=True, method=clip(method, 100))

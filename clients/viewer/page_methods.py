@@ -34,7 +34,7 @@ from flexdt.protocol import Code, Method, RpcError, parse_params
 from flexdt.protocol import image as wire_image
 from flexdt.protocol.fields import Nothing, Params
 from flexdt.protocol.params import CalibrationAlign, CalibrationFit
-from flexdt.protocol.rpc_errors import busy
+from flexdt.protocol.rpc_errors import busy, link_down
 from flexdt.protocol.state_model import State
 from flexdt.server.wire_errors import explain
 from flexdt.twin.dataset.file_names import plain_name
@@ -354,7 +354,7 @@ def _room(viewer: Viewer) -> Iterator[None]:
 
 def _lab(viewer: Viewer) -> LabScene:
     if viewer.lab is None:
-        raise RpcError(Code.INTERNAL, "the twin has not been seen yet")
+        raise link_down("the twin has not been seen yet")
     return viewer.lab
 
 

@@ -403,7 +403,7 @@ def test_codes_and_what_may_be_called_when_are_what_they_were() -> None:
         "INVALID_PARAMS": -32602, "INTERNAL": -32603, "LIMIT": -32001, "COLLISION": -32002,
         "BUSY": -32003, "NOT_AUTHORISED": -32004, "SCRIPT_INVALID": -32005,
         "PROJECTOR_UNAVAILABLE": -32006, "NOT_IDENTIFIABLE": -32007, "TOO_LARGE": -32008,
-        "SUPERSEDED": -32009, "CANCELLED": -32010,
+        "SUPERSEDED": -32009, "CANCELLED": -32010, "LINK_DOWN": -32011,
     }  # fmt: skip
     unsafe = {name for name, m in PROJECTOR_METHODS.items() if not m.safe}
     assert unsafe == {"backproject"}

@@ -10,6 +10,7 @@ import json
 import struct
 import sys
 from collections.abc import Awaitable, Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -25,9 +26,10 @@ from flexdt.clients.viewer import main as viewer_main
 from flexdt.clients.viewer import page as tasks
 from flexdt.clients.viewer import viewer as app
 from flexdt.clients.viewer.feed import ImageFeed, ShownImage
-from flexdt.clients.viewer.page import MAX_NOTES, Page
-from flexdt.clients.viewer.page_methods import METHODS
+from flexdt.clients.viewer.page import HIDDEN, MAX_NOTES, Page
+from flexdt.clients.viewer.page_methods import METHODS, serve
 from flexdt.process_settings import Address, UpSettings, ViewerSettings, parse
+from flexdt.protocol import METHODS as WIRE
 from flexdt.protocol import Connection, Notification, Request, Response
 
 PATIENCE_S = 60.0
@@ -414,6 +416,38 @@ def test_an_internal_error_is_in_the_log_under_its_id(capsys: pytest.CaptureFixt
     line = json.loads(capsys.readouterr().err)
     assert line["trace"] == told[0]["error"]["data"]["trace"]
     assert "quite a secret" in line["traceback"]
+
+
+OF_THE_TWIN: list[tuple[str, dict[str, object]]] = [
+    ("viewer.layers", {"beam": True}),
+    ("viewer.ray", {"pixel": [1.0, 2.0]}),
+    ("viewer.spectrum", {"kV": 90.0}),
+    ("viewer.plan", {"text": "tube\txrayon"}),
+    ("viewer.compose", {}),
+    ("viewer.scrub", {"time_s": 1.0}),
+    ("calibration.apply", {"parameters": {"alpha": 0.2}}),
+    ("calibration.fit", {"datasets": ["x"], "phantom": "lego"}),
+    ("calibration.align", {"name": "x"}),
+]
+"""Sound requests to the viewer that it cannot answer before it has seen its twin."""
+
+
+def test_before_the_link_to_the_twin_is_up_no_answer_is_an_internal_error() -> None:
+    unseen: Any = SimpleNamespace(lab=None, state=None, world=None, twin_address=NOWHERE)
+    wire = [(name, {}) for name in WIRE if name not in {*HIDDEN, *METHODS}]
+    sent: dict[object, dict[str, object]] = {}
+
+    async def run() -> None:
+        local = {name: partial(serve, name, unseen) for name in METHODS}
+        page = Page("c" * 12, cast(Any, SimpleNamespace()), NOWHERE, local)
+        page.say = lambda kind, **content: sent.update({content["id"]: content["error"]})  # type: ignore[method-assign,assignment]
+        for name, params in wire + OF_THE_TWIN:
+            await page._handle(json.dumps({"id": name, "method": name, "params": params}))
+
+    asyncio.run(run())
+    codes = {name: error["code"] for name, error in sent.items()}
+    assert codes == dict.fromkeys([name for name, _ in wire + OF_THE_TWIN], -32011)
+    assert sent["axes.move"]["message"] == "no connection to the twin: not connected yet"
 
 
 def comes_in(port: int) -> bool:
