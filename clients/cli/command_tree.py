@@ -21,7 +21,6 @@ from flexdt.clients.cli.commands.data_sets import (
     study_command,
 )
 from flexdt.clients.cli.commands.processes import (
-    backup_commands,
     bench_command,
     demo_command,
     doctor_command,
@@ -73,8 +72,6 @@ COMMANDS: Final[Mapping[str, Callable[..., object]]] = {
     "follow": follow_command.follow,
     "bench": bench_command.bench,
     "doctor": doctor_command.doctor,
-    "backup": backup_commands.backup,
-    "restore": backup_commands.restore,
 }
 """Name -> what it runs, in the order of the help page."""
 GROUPS: Final[Mapping[str, tuple[str, Mapping[str, Callable[..., object]]]]] = {

@@ -9,10 +9,11 @@ from collections.abc import Sequence
 import typer
 from typer.main import get_command
 
-from flexdt.clients.cli.boundary import DONE, INTERRUPTED, describe
+from flexdt.clients.cli.boundary import DONE, INTERRUPTED, USAGE, describe
 from flexdt.clients.cli.command_tree import build
 from flexdt.clients.cli.console import hush, note, printable
 
+RETIRED = ("backup", "restore")
 COMPLETING = "_FLEXDT_COMPLETE"
 
 
@@ -26,6 +27,12 @@ def run(argv: Sequence[str]) -> int:
         The exit code.
     """
     printable()
+    if argv and argv[0] in RETIRED:
+        note(
+            f"flexdt {argv[0]}: has been removed; the data directory of a stopped twin is an "
+            "ordinary folder: `tar -cf ARCHIVE.tar DIR` copies it, `tar -xf ARCHIVE.tar` unpacks it"
+        )
+        return USAGE
     command = get_command(build())
     if COMPLETING in os.environ:  # a shell asks what could come next
         command.main(list(argv), prog_name="flexdt")

@@ -234,3 +234,14 @@ def test_a_file_that_cannot_be_written_is_called_as_it_was_asked_for(
     for number, what in ((13, "Permission denied"), (28, "No space left on device")):
         lines, code = boundary.describe(OSError(number, what, temporary))
         assert (lines, code) == ((f"flexdt: {asked}: {what}",), 1)
+
+
+@pytest.mark.parametrize("name", ["backup", "restore"])
+def test_a_retired_command_says_in_one_line_what_to_do(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert entry.run([name, "data", "copy.tar"]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.count("\n") == 1
+    assert "tar -cf" in said.err
