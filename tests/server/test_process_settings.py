@@ -23,7 +23,7 @@ from flexdt.process_settings import (
     shared,
     words,
 )
-from flexdt.server.files.directory_lock import FILE, FolderLock
+from flexdt.server.files.directory_lock import FolderLock
 from flexdt.server.projector import main as projector_main
 from flexdt.server.runtime import process
 from flexdt.server.runtime.loop import ServerLoop
@@ -149,16 +149,23 @@ def test_a_loop_without_signal_handlers_wakes_up_by_itself(monkeypatch: pytest.M
     assert asyncio.run(scenario()) >= 3
 
 
-def test_a_data_directory_is_locked_where_there_is_no_pwrite(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delattr(os, "pwrite")
-    lock = FolderLock(tmp_path)
-    assert (tmp_path / FILE).read_text() == f"{os.getpid()}\n"
-    with pytest.raises(DatasetWriteError, match=f"process {os.getpid()}"):
-        FolderLock(tmp_path)
+def test_a_data_directory_is_locked_without_a_file_in_it(tmp_path: Path) -> None:
+    """Nothing there can be deleted, or be a link to another file, of which `.lock` once was one."""
+    victim, data = tmp_path / "victim", tmp_path / "data"
+    data.mkdir()
+    victim.write_text("somebody's")
+    (data / ".lock").symlink_to(victim)
+    lock = FolderLock(data)
+    (data / ".lock").unlink()
+    by_another_way = tmp_path / "link"
+    by_another_way.symlink_to(data)
+    for path in (data, by_another_way):
+        with pytest.raises(DatasetWriteError, match="used by another twin server"):
+            FolderLock(path)
+    assert victim.read_text() == "somebody's"
+    assert list(data.iterdir()) == []
     lock.release()
-    FolderLock(tmp_path).release()
+    FolderLock(data).release()
 
 
 def test_a_system_that_does_not_say_its_memory_is_taken_to_have_some(

@@ -109,8 +109,9 @@ def flips(root: Path, count: int, rng: random.Random) -> int:
         source = rng.choice(sources)
         folder = root / "now"
         shutil.copytree(source, folder / "data")
-        kept = [f for f in sorted((folder / "data").rglob("*"))
-                if f.is_file() and f.suffix != ".tif" and f.name != ".lock"]  # fmt: skip
+        kept = [
+            f for f in sorted((folder / "data").rglob("*")) if f.is_file() and f.suffix != ".tif"
+        ]
         file = rng.choice(kept)
         kinds[how := damaged(file, rng)] += 1
         try:
