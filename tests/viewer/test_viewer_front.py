@@ -20,6 +20,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from flexdt.clients.viewer import front as module
 from flexdt.clients.viewer.front import Download, Front
+from flexdt.clients.viewer.page import ON_THE_WAY
 from flexdt.server.runtime.access import AccessError, client_tls, server_tls
 
 TOKEN = "a-token-of-sixteen-or-more"
@@ -368,16 +369,26 @@ def test_a_scene_without_viser_ends_politely() -> None:
     with_front(work)
 
 
+SILENCE_S = 300
+"""So long without any message means that none will come."""
+
+
 def test_two_pages_at_the_socket(lab: Any) -> None:
     """States and images reach every page; a page may not call what is not its business."""
 
-    async def listen(page: Any, what: Callable[[Any], bool]) -> Any:
-        async with asyncio.timeout(60):
-            async for message in page:
-                value = message if isinstance(message, bytes) else json.loads(message)
-                if what(value):
-                    return value
-        raise AssertionError("the viewer ended the connection")
+    async def listen(page: Any, *wanted: Callable[[Any], bool]) -> list[Any]:
+        """The first message of each kind, in whatever order they come, each acknowledged."""
+        found: dict[int, Any] = {}
+        while len(found) < len(wanted):
+            message = await asyncio.wait_for(page.recv(), SILENCE_S)
+            value = message if isinstance(message, bytes) else json.loads(message)
+            slot = "image" if isinstance(value, bytes) else value["type"]
+            if slot in ON_THE_WAY:
+                await page.send(json.dumps({"took": slot}, separators=(",", ":")))
+            for i, fits in enumerate(wanted):
+                if i not in found and fits(value):
+                    found[i] = value
+        return [found[i] for i in range(len(wanted))]
 
     async def run() -> None:
         host = f"127.0.0.1:{lab.viewer.port}"
@@ -386,20 +397,23 @@ def test_two_pages_at_the_socket(lab: Any) -> None:
             connect(f"ws://{host}/ws/{'e' * 12}", max_size=None, proxy=None) as two,
         ):
             for page in (one, two):
-                state = await listen(page, lambda m: isinstance(m, dict) and m["type"] == "state")
+                state, _image = await listen(
+                    page,
+                    lambda m: isinstance(m, dict) and m["type"] == "state",
+                    lambda m: isinstance(m, bytes) and m[1:5] == b"FXI2",
+                )
                 assert set(state["state"]["axes"]) >= {"mag_obj", "rot_obj"}
-                assert (await listen(page, lambda m: isinstance(m, bytes)))[1:5] == b"FXI2"
             for id, method in enumerate(
                 ("state.subscribe", "session.hello", "no.such", "viewer.nothing")
             ):
                 await one.send(json.dumps({"id": id, "method": method}))
-                answer = await listen(
+                (answer,) = await listen(
                     one, lambda m, id=id: isinstance(m, dict) and m.get("id") == id
                 )
                 assert answer["error"]["code"] == -32601
             for wrong in ("", "[]", "{", '{"id": 9}', '{"id": 9, "method": "x", "params": 3}'):
                 await one.send(wrong)
-                answer = await listen(
+                (answer,) = await listen(
                     one, lambda m: isinstance(m, dict) and m["type"] == "answer" and "error" in m
                 )
                 assert answer["error"]["code"] == -32600
