@@ -4,9 +4,10 @@ Each service prints one JSON `ready` line with its address on standard output; l
 the addresses of earlier ones. A service that ends, or is killed at any moment, is started again for
 ever on the address it had, with pauses that grow up to half a minute; it never ends the others.
 Only one that leaves by itself at its very first start ends them all: somebody has to look at its
-options. Services run in sessions of their own, so Ctrl-C reaches only the supervisor, which stops
-them in reverse order; should the supervisor itself be killed, their standard input closes and they
-stop (see `child`).
+options. A start may take as long as it works (compiling takes minutes on a busy machine): only one
+that uses no processor time for `STALLED_S` is ended. Services run in sessions of their own, so
+Ctrl-C reaches only the supervisor, which stops them in reverse order; should the supervisor itself
+be killed, their standard input closes and they stop (see `child`).
 """
 
 from __future__ import annotations
@@ -22,12 +23,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from flexdt.process_settings import Address
+from flexdt.server.runtime import processor_time
 from flexdt.server.runtime.process import stop_signal
 
-READY_TIMEOUT_S = 300.0
-"""A first start compiles the projector's kernels; on a slow, busy machine that takes minutes."""
+STALLED_S = 300.0
+"""A service that is not ready and has used no processor time for so long waits for something that
+will not come."""
 SILENT_S = 5.0
 """After so long without a `ready` line, somebody who waits is told for what."""
+STILL_S = 60.0
+"""How often somebody who waits is told how much work a start has done so far."""
 STOP_GRACE_S = 10.0
 FIRST_PAUSE_S = 0.5
 """Between the second end in a row and the next start; it doubles from there."""
@@ -198,26 +203,34 @@ class Supervisor:
         """Where it listens.
 
         Raises:
-            _Ended: before it said so, or it did not say so for too long and was ended.
+            _Ended: before it said so, or it no longer does anything.
         """
-        why = f": {service.slow}" if service.slow else ""
-        loop = asyncio.get_running_loop()
-        hint = loop.call_later(SILENT_S, self.note, f"waiting for the {service.name}{why}")
         address = asyncio.create_task(_address(process, service.name))
         end = asyncio.create_task(_ended(process))
+        telling = asyncio.create_task(self._tell(process, service))
+        stalled = asyncio.create_task(_stalled(process))
+        tasks = (address, end, telling, stalled)
         try:
-            await asyncio.wait({address, end}, timeout=READY_TIMEOUT_S,
-                               return_when=asyncio.FIRST_COMPLETED)  # fmt: skip
+            await asyncio.wait({address, end, stalled}, return_when=asyncio.FIRST_COMPLETED)
             if address.done():
                 return address.result()
             if end.done():
                 raise _Ended(_how(end.result()), end.result())
-            raise _Ended(f"not ready within {READY_TIMEOUT_S:g} s")
+            raise _Ended(f"it did nothing for {STALLED_S:g} s")
         finally:
-            hint.cancel()
-            for task in (address, end):
+            for task in tasks:
                 task.cancel()
-            await asyncio.gather(address, end, return_exceptions=True)
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _tell(self, process: Process, service: Service) -> None:
+        """Say what is waited for, and later how far it has come."""
+        await asyncio.sleep(SILENT_S)
+        self.note(f"waiting for the {service.name}" + (service.slow and f": {service.slow}"))
+        while True:
+            await asyncio.sleep(STILL_S)
+            used_s = processor_time.of_session(process.pid)
+            if used_s is not None:
+                self.note(f"the {service.name} is still starting: {used_s:.0f} s of work so far")
 
     def _bury(self, service: Service) -> None:
         """End what is left of a service: processes it started may hold its port or its files."""
@@ -289,6 +302,16 @@ async def _ended(process: Process) -> int:
     finally:
         end.cancel()
     return process.returncode
+
+
+async def _stalled(process: Process) -> None:
+    """Return once a process and what it started have used no processor time for `STALLED_S`."""
+    clock = asyncio.get_running_loop().time
+    used_s, since = processor_time.of_session(process.pid), clock()
+    while used_s is None or clock() - since < STALLED_S:
+        await asyncio.sleep(LOOK_S)
+        if (now_s := processor_time.of_session(process.pid)) != used_s:
+            used_s, since = now_s, clock()
 
 
 def _how(code: int) -> str:

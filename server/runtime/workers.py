@@ -11,6 +11,7 @@ import asyncio
 import json
 import os
 import pickle
+import selectors
 import socket
 import subprocess
 import sys
@@ -20,12 +21,15 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 from flexdt.protocol.rpc_errors import Code, RpcError, busy, too_large
+from flexdt.server.runtime import processor_time
 from flexdt.server.runtime.worker import Parts, Work, receive_parts, send_parts
 
 KEPT_BYTES = 400 << 20
 """A process that has taken more is replaced, so that the memory is given back."""
 IDLE_S = 120.0
 """How long a process without work is kept."""
+LOOK_S = 0.2
+"""How often the processor time of a process at work is looked at."""
 ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 
 
@@ -72,7 +76,7 @@ class Worker:
             work: called there.
             arguments: that it takes first, pickled.
             raw: that it takes after them, sent as they are.
-            seconds: that it may take.
+            seconds: of processor time that it may take; doing nothing for so long ends it, too.
 
         Raises:
             RpcError: the work's own refusal; -32008 where it takes too long, too much memory, or
@@ -81,10 +85,9 @@ class Worker:
         """
         try:
             self._channel.settimeout(seconds)
-            until = time.monotonic() + seconds
             call = pickle.dumps((work, arguments))
             send_parts(self._channel, [f"{seconds}".encode(), call, *raw])
-            self._channel.settimeout(max(0.001, until - time.monotonic()))
+            self._wait(seconds)
             how, peak, *answer = receive_parts(self._channel)
         except TimeoutError:
             raise too_large(_label(work), f"more than {seconds:g}", seconds, "s") from None
@@ -101,6 +104,24 @@ class Worker:
                 self.peak_bytes = self._memory
                 raise too_large(_label(work), f"more than {most}", most, "MiB of memory")
         raise RuntimeError(answer[0].decode("utf-8", "replace"))
+
+    def _wait(self, seconds: float) -> None:
+        """Wait for an answer's first byte.
+
+        Raises:
+            TimeoutError: the work has used, or done nothing for, so much time.
+        """
+        begun = used = processor_time.of_process(self.pid)
+        since = time.monotonic()
+        with selectors.DefaultSelector() as answer:
+            answer.register(self._channel, selectors.EVENT_READ)
+            while not answer.select(min(LOOK_S, seconds)):
+                now = processor_time.of_process(self.pid)
+                if now != used:
+                    used, since = now, time.monotonic()
+                worked = 0.0 if now is None or begun is None else now - begun
+                if worked > seconds or time.monotonic() - since > seconds:
+                    raise TimeoutError
 
     def _died(self, work: Work, seconds: float) -> RpcError:
         self.kill()
@@ -129,7 +150,7 @@ class Workers:
     Args:
         count: at a time; further work waits its turn.
         memory_bytes: of each.
-        seconds: that one piece of work may take.
+        seconds: of processor time that one piece of work may take.
     """
 
     def __init__(self, count: int, memory_bytes: int, seconds: float) -> None:

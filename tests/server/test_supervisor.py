@@ -22,6 +22,7 @@ import pytest
 from flexdt.clients.launch.up import main as up_main
 from flexdt.clients.launch.up import port_problem, services
 from flexdt.process_settings import Address, UpSettings, parse
+from flexdt.server.runtime import processor_time
 from flexdt.server.runtime import supervisor as module
 from flexdt.server.runtime.supervisor import Addresses, Service, ServiceError, Supervisor
 
@@ -38,6 +39,10 @@ if mode == "mute":
     time.sleep(600)
 if mode == "slow":
     time.sleep(0.3)
+if mode == "working":  # in a child, as a compiler might
+    import subprocess
+    code = "import time; any(time.process_time() > 4 for _ in iter(int, 1))"
+    subprocess.run([sys.executable, "-c", code], check=True)
 if mode == "wordy":
     print("x" * 300_000, flush=True)
     print("[" * 100_000, flush=True)
@@ -269,7 +274,7 @@ def test_what_an_ended_service_started_does_not_outlive_it(
 def test_a_service_that_says_nothing_is_ended_and_started_again(
     tmp_path: Path, fake: Callable[..., Service], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "READY_TIMEOUT_S", 1.5)
+    monkeypatch.setattr(module, "STALLED_S", 2.0)
     notes: list[str] = []
 
     async def scenario() -> None:
@@ -281,8 +286,42 @@ def test_a_service_that_says_nothing_is_ended_and_started_again(
         await running
 
     asyncio.run(scenario())
-    assert notes[0] == "the mute ended (not ready within 1.5 s, while starting); starting it again"
+    assert notes[0] == "the mute ended (it did nothing for 2 s, while starting); starting it again"
     assert not any(alive(pid) for pid in started(tmp_path, "mute"))
+
+
+def test_a_start_may_take_as_long_as_it_works(
+    tmp_path: Path, fake: Callable[..., Service], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four seconds of work where one second of nothing would end it."""
+    monkeypatch.setattr(module, "STALLED_S", 1.0)
+    monkeypatch.setattr(module, "STILL_S", 0.5)
+    _, notes = supervise([fake("working")], None)
+    assert len(started(tmp_path, "working")) == 1
+    told = [note for note in notes if "is still starting" in note]
+    assert told == notes, "no end, no second start"
+
+
+def test_processor_time_is_that_of_all_processes_of_a_session() -> None:
+    spin = "import time; any(time.process_time() > 1 for _ in iter(int, 1))"
+    code = (
+        "import subprocess, sys, time\n"
+        f"subprocess.run([sys.executable, '-c', '{spin}'])\n"
+        "print('done', flush=True)\n"
+        "time.sleep(600)"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, start_new_session=True
+    )
+    assert process.stdout is not None
+    process.stdout.readline()
+    used_s = processor_time.of_session(process.pid)
+    process.kill()
+    process.wait()
+    process.stdout.close()
+    assert used_s is not None
+    assert 1.0 <= used_s < 5.0
+    assert processor_time.of_session(process.pid) is None
 
 
 def test_lines_that_are_no_ready_line_harm_nobody(fake: Callable[..., Service]) -> None:

@@ -16,6 +16,7 @@ from in_process import script
 
 from flexdt.protocol import Codec, Connection, RpcError
 from flexdt.protocol.rpc_errors import Code
+from flexdt.server.runtime import processor_time
 from flexdt.server.runtime.workers import Workers
 from flexdt.server.scans import checking
 from flexdt.server.scans.checking import Checks, Matter, ScanVerdict
@@ -142,6 +143,35 @@ def test_work_beyond_its_time_is_ended_and_says_what_is_allowed() -> None:
         assert refused.value.data["allowed"] == 0.5  # type: ignore[index, call-overload]
         workers.seconds = 60.0
         await workers.ask(checking.verdict_of, light())  # another process
+
+    worked(body)
+
+
+def test_work_on_a_busy_machine_has_the_time_that_it_has_alone() -> None:
+    """A process that is stopped for most of the time is one of a busy machine."""
+
+    async def stutter(pid: int) -> None:
+        while True:
+            os.kill(pid, signal.SIGSTOP)
+            await asyncio.sleep(0.4)
+            os.kill(pid, signal.SIGCONT)
+            await asyncio.sleep(0.05)
+
+    some = matter(Wish(long_script(10_000)))
+
+    async def body(workers: Workers) -> None:
+        await workers.ask(checking.verdict_of, light())
+        pid = workers._idle[-1].pid
+        before = processor_time.of_process(pid)
+        await workers.ask(checking.verdict_of, some)
+        after = processor_time.of_process(pid)
+        assert before is not None
+        assert after is not None
+        workers.seconds = 3.0 * (after - before)
+        busy = asyncio.create_task(stutter(pid))
+        await workers.ask(checking.verdict_of, some)
+        busy.cancel()
+        os.kill(pid, signal.SIGCONT)
 
     worked(body)
 
