@@ -42,6 +42,12 @@ def until_written(data: Path, holds: Callable[[Any], bool]) -> None:
         time.sleep(0.02)
 
 
+def correction_of(folder: Path) -> Any:
+    correction = json.loads((folder / "flexdt.json").read_text())["correction"]
+    assert correction["name"] in ("mine", "another")
+    return correction
+
+
 def test_a_killed_twin_is_as_it_was_and_its_scan_goes_on_to_the_same_bytes(
     rays: Process, tmp_path: Path
 ) -> None:
@@ -85,13 +91,17 @@ def test_a_killed_twin_is_as_it_was_and_its_scan_goes_on_to_the_same_bytes(
         stamps = {n: (data / "cut" / n).stat().st_mtime_ns for n in there}
         assert 7 <= len(there) < 63
         assert not json.loads((data / "cut" / "flexdt.json").read_text())["complete"]
+        # A correction that comes into force now is not that of the frames that are there.
+        wire.call("calibration.apply", parameters={"dD_x": 0.9}, name="another")
         wire.call("job.resume", job=job)
         wire.call("job.resume", job=queued)
         status = wire.wait(job, "done", "failed")
         assert (status["state"], status["error"]) == ("done", None)
         assert digests(data / "cut") == digests(data / "whole")
+        assert correction_of(data / "cut") == correction_of(data / "whole")
         assert {n: (data / "cut" / n).stat().st_mtime_ns for n in stamps} == stamps
         assert wire.wait(queued, "done", "failed")["state"] == "done"
+        assert correction_of(data / "later")["name"] == "another", "none of its frames were made"
         with pytest.raises(Refused, match="-32003"):
             wire.call("job.resume", job=job)
     finally:
