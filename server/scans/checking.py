@@ -106,33 +106,20 @@ class Matter:
         return check_plan(plan, (), sweep)
 
 
-@dataclass(frozen=True)
-class ScanVerdict:
-    """What a sound scan comes to.
+@dataclass(frozen=True, eq=False)
+class Checked:
+    """A scan that was found sound: the certificate of its plan.
 
     Attributes:
-        frames: projections that are saved.
-        duration_s: of the plan.
-        bytes: of all images.
+        matter: what was checked, on what. Nothing else enters a plan, so that a scan whose matter
+            is equal has this plan and needs no other check.
+        plan: of the scan.
         warnings: in words.
     """
 
-    frames: int
-    duration_s: float
-    bytes: int
+    matter: Matter
+    plan: ScanPlan
     warnings: list[str]
-
-    @classmethod
-    def of(cls, report: CheckReport) -> ScanVerdict:
-        """The verdict.
-
-        Raises:
-            RpcError: -32005 or -32002, it may not run.
-        """
-        require_sound(report)
-        plan = report.plan
-        warnings = [p.where_and_what for p in report.warnings[:MAX_PROBLEMS]]
-        return cls(plan.frames, plan.duration_s, plan.bytes, warnings + _more(report.warnings))
 
 
 class Checks:
@@ -140,6 +127,7 @@ class Checks:
 
     def __init__(self) -> None:
         self._workers = Workers(AT_ONCE, MEMORY_BYTES, SECONDS)
+        self._last: Checked | None = None
         # Light checks of many clients take turns, so that a scan always finds a worker thread.
         self._turn = asyncio.Semaphore(AT_ONCE)
         self._light = 0
@@ -155,24 +143,29 @@ class Checks:
             return await self._threaded(lambda: _encoded(matter, codec))
         return await self._workers.ask(_encoded, _bare(matter), codec)
 
-    async def verdict(self, matter: Matter) -> ScanVerdict:
-        """Whether it may run, and what it comes to; raises as `ScanVerdict.of`."""
-        if self._here(matter):
-            return await self._threaded(lambda: ScanVerdict.of(matter.report()))
-        [answer] = await self._workers.ask(verdict_of, _bare(matter))
-        return ScanVerdict(**json.loads(answer))
+    async def sound(self, matter: Matter) -> Checked:
+        """A scan parsed, planned and swept, if it may run.
 
-    async def plan(self, matter: Matter) -> ScanPlan:
-        """Its plan, if it may run; raises as `ScanVerdict.of`."""
+        The last one is kept until it is asked for again: when a job begins where it was submitted,
+        with the same sample and correction, the plan is the one that was checked then.
+
+        Raises:
+            RpcError: -32005 or -32002, it may not run; -32008, it takes too long or too much
+                memory.
+        """
+        last, self._last = self._last, None
+        if last is not None and last.matter == matter:
+            return last
         if self._here(matter):
-            report = await self._threaded(matter.report)
-            require_sound(report)
-            return report.plan
-        parts = await self._workers.ask(_planned, _bare(matter))
-        plan = await asyncio.to_thread(_joined, parts, matter.machine, matter.profile)
-        if isinstance(asyncio.get_running_loop(), ServerLoop):  # a process that serves one twin
-            gc.freeze()  # a million objects that are no garbage, see `announce`
-        return plan
+            plan, warnings = await self._threaded(lambda: planned(matter))
+        else:
+            said, *parts = await self._workers.ask(in_pieces, _bare(matter))
+            warnings = json.loads(said)
+            plan = await asyncio.to_thread(_joined, parts, matter.machine, matter.profile)
+            if isinstance(asyncio.get_running_loop(), ServerLoop):  # a process of one twin
+                gc.freeze()  # a million objects that are no garbage, see `announce`
+        self._last = Checked(matter, plan, warnings)
+        return self._last
 
     def _here(self, matter: Matter) -> bool:
         """Whether to check in a thread: what is light, while there is no process for it.
@@ -188,7 +181,7 @@ class Checks:
 
     async def _start(self, matter: Matter) -> None:
         with suppress(RpcError):
-            await self._workers.ask(verdict_of, _bare(matter))
+            await self._workers.ask(in_pieces, _bare(matter))
         self._starting = None
 
     async def _threaded(self, do: Callable[[], _T]) -> _T:
@@ -202,15 +195,22 @@ class Checks:
         self._workers.close()
 
 
-def verdict_of(matter: Matter) -> list[bytes]:
-    """In the worker: the verdict as JSON."""
-    return [json.dumps(vars(ScanVerdict.of(matter.report()))).encode()]
+def planned(matter: Matter) -> tuple[ScanPlan, list[str]]:
+    """The plan of a scan and its warnings in words; blocks.
 
-
-def _planned(matter: Matter) -> list[bytes]:
+    Raises:
+        RpcError: -32005 or -32002, it may not run.
+    """
     report = matter.report()
     require_sound(report)
-    return _pieces_of(report.plan)
+    warnings = [p.where_and_what for p in report.warnings[:MAX_PROBLEMS]]
+    return report.plan, warnings + _more(report.warnings)
+
+
+def in_pieces(matter: Matter) -> list[bytes]:
+    """In the worker: the warnings as JSON, then the plan in pieces."""
+    plan, warnings = planned(matter)
+    return [json.dumps(warnings).encode(), *_pieces_of(plan)]
 
 
 def _bare(matter: Matter) -> Matter:

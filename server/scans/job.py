@@ -11,7 +11,6 @@ from pathlib import Path
 
 from flexdt.protocol.rpc_errors import Code
 from flexdt.protocol.state_model import JobPhase
-from flexdt.server.scans.checking import ScanVerdict
 from flexdt.server.scans.runner import Produce, Progress, ScanRunner
 from flexdt.server.scans.twin_clock import SpeedUp
 from flexdt.server.storage.dataset_writer import DatasetWriter
@@ -34,8 +33,6 @@ class JobInputs:
 
 
 Prepare = Callable[[], Awaitable[JobInputs]]
-Extent = ScanPlan | ScanVerdict
-"""How much a scan is: a plan, or what a check of it came to."""
 
 
 @dataclass

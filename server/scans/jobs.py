@@ -19,7 +19,7 @@ from pathlib import Path
 from flexdt.protocol.rpc_errors import RpcError, busy
 from flexdt.protocol.state_model import JobPhase, JobStatus
 from flexdt.server.runtime.log import log, traced
-from flexdt.server.scans.job import ENDED, Extent, Job, JobInputs, Prepare, recalled
+from flexdt.server.scans.job import ENDED, Job, JobInputs, Prepare, recalled
 from flexdt.server.scans.retry import Retry, transient
 from flexdt.server.scans.runner import JobAborted, Produce, ScanRunner
 from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
@@ -27,7 +27,7 @@ from flexdt.server.storage.memory import JobMemory
 from flexdt.server.wire_errors import explain, is_user_error
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.scanner.scanner import ScannerTwin
-from flexdt.twin.script import Exposure
+from flexdt.twin.script import Exposure, ScanPlan
 
 PUBLISH_INTERVAL_S = 0.1
 KEPT_JOBS = 200
@@ -176,7 +176,7 @@ class Jobs:
         self,
         name: str,
         folder: str,
-        plan: Extent,
+        plan: ScanPlan,
         prepare: Prepare,
         speed_up: SpeedUp | None = None,
         warnings: list[str] | None = None,
@@ -206,7 +206,7 @@ class Jobs:
     def draft_again(
         self,
         job: Job,
-        plan: Extent,
+        plan: ScanPlan,
         prepare: Prepare,
         speed_up: SpeedUp | None = None,
         warnings: list[str] | None = None,

@@ -1,9 +1,9 @@
 """From a script or poses to a job: check, name, data set, resume.
 
 Everything that can be wrong is said before a job exists: the script's problems, collisions, room on
-the disk, a name that is taken. When the job's turn comes it is planned anew from where the scanner
-then stands. What a resumed scan must repeat (start, sample, seed) lies in DATA/jobs. `jobs` runs
-it.
+the disk, a name that is taken. When the job's turn comes and the scanner, its sample or its
+correction have changed since, the scan is planned and checked anew. What a resumed scan must repeat
+(start, sample, seed) lies in DATA/jobs. `jobs` runs it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from flexdt.server.files.image_files import dated_name
 from flexdt.server.files.own_documents import used_bytes
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.scans.acquisition import Acquisition, Shown
-from flexdt.server.scans.checking import Checks, Matter, ScanVerdict
+from flexdt.server.scans.checking import Checks, Matter
 from flexdt.server.scans.job import Job, JobInputs, Prepare
 from flexdt.server.scans.jobs import Jobs
 from flexdt.server.scans.scan_record import FOLDER, Beginning, Sidecar, Wish
@@ -173,14 +173,14 @@ class Submissions:
 
     async def _ready(
         self, asked: Sidecar, name: str, resume: bool, still: Callable[[], None]
-    ) -> tuple[ScanVerdict, Prepare, list[str]]:
+    ) -> tuple[ScanPlan, Prepare, list[str]]:
         """Check all of a scan, and say how it is begun."""
         begin = asked.begin
-        verdict = await self._checks.verdict(
+        checked = await self._checks.sound(
             await self._matter(asked.wish, begin.start, begin.sample)
         )
-        await asyncio.to_thread(self._require_room, verdict.bytes, name)
-        warnings = list(verdict.warnings)
+        await asyncio.to_thread(self._require_room, checked.plan.bytes, name)
+        warnings = list(checked.warnings)
         if resume:
             there = len(list((self.root / name).glob("*.tif")))
             warnings.insert(0, f"taking up the data set {name}, of which {there} images exist")
@@ -195,13 +195,13 @@ class Submissions:
             if not resume:  # others may have moved since, and put something else on the stage
                 begin = replace(asked.begin, start=self._start(), sample=self.scanner.sample)
                 begun = replace(asked, begin=begin)
-            # Always anew: the sample's file and the correction may be others by now.
-            final = await self._checks.plan(
+            # The sample's file and the correction may be others by now; then it is checked anew.
+            final = await self._checks.sound(
                 await self._matter(begun.wish, begun.begin.start, begun.begin.sample)
             )
-            return await asyncio.to_thread(self._open, begun, final, name, resume)
+            return await asyncio.to_thread(self._open, begun, final.plan, name, resume)
 
-        return verdict, prepare, warnings
+        return checked.plan, prepare, warnings
 
     async def _matter(self, wish: Wish, start: StartState, shown: Sample) -> Matter:
         """What may collide stands on the stage; what the beam sees is `shown`."""

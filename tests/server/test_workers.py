@@ -8,9 +8,11 @@ import os
 import pickle
 import signal
 from collections.abc import Awaitable, Callable
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from in_process import script
 
@@ -19,13 +21,15 @@ from flexdt.protocol.rpc_errors import Code
 from flexdt.server.runtime import processor_time
 from flexdt.server.runtime.workers import Workers
 from flexdt.server.scans import checking
-from flexdt.server.scans.checking import Checks, Matter, ScanVerdict
+from flexdt.server.scans.checking import Checks, Matter
 from flexdt.server.scans.scan_record import PoseList, Sidecar, Wish
 from flexdt.server.twin import message_reading
 from flexdt.server.twin.message_reading import MAX_PARAMS, Reader
-from flexdt.twin.geometry.offsets import NOMINAL
+from flexdt.twin.collision.convex_solids import hull
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.script import ScanPlan, StartState
+from flexdt.twin.script.planning.plan import SampleSize
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)
@@ -66,16 +70,45 @@ def test_a_plan_made_apart_is_the_plan_made_here(wish: Wish) -> None:
     async def body(checks: Checks) -> None:
         there = matter(wish)
         assert not there.light
-        plan = await checks.plan(there)
-        assert same(plan, there.report().plan)
-        assert plan.machine is M
-        assert await checks.verdict(there) == ScanVerdict.of(there.report())
+        found = await checks.sound(there)
+        plan, warnings = checking.planned(there)
+        assert same(found.plan, plan)
+        assert found.plan.machine is M
+        assert found.warnings == warnings
         for codec in Codec:
             report = b"".join(await checks.report(there, codec))
             wire = Connection(codec)
             assert wire.codec is codec
             read = json.loads(report) if codec is Codec.JSON else _unpacked(report)
             assert read == json.loads(json.dumps(there.report().to_dict()))
+
+    checked(body)
+
+
+OTHERS: dict[str, Callable[[Matter], Any]] = {
+    "wish": lambda m: Wish(long_script(2)),
+    "machine": lambda m: M.model_copy(update={"safety_margin_mm": 3.0}),
+    "profile": lambda m: P.model_copy(update={"name": "another"}),
+    "start": lambda m: replace(m.start, xrays_on=True),
+    "size": lambda m: SampleSize(30.0, 40.0),
+    "pieces": lambda m: (hull(np.eye(4, 3) * 5.0),),
+    "parameters": lambda m: Offsets(dD_x=0.5),
+}
+
+
+def test_a_plan_is_made_once_and_anew_where_anything_it_depends_on_is_another() -> None:
+    assert set(OTHERS) == {field.name for field in fields(Matter)}
+
+    async def body(checks: Checks) -> None:
+        first = matter(Wish(long_script(1)))
+        for name, other in OTHERS.items():
+            made = await checks.sound(first)
+            assert await checks.sound(replace(first)) is made, "equal matter, the same certificate"
+            made = await checks.sound(first)
+            changed = replace(first, **{name: other(first)})
+            found = await checks.sound(changed)
+            assert found is not made, name
+            assert found.matter is changed
 
     checked(body)
 
@@ -91,7 +124,7 @@ def test_what_is_wrong_is_said_with_a_number_of_problems_and_the_rest_counted() 
 
     async def body(checks: Checks) -> None:
         with pytest.raises(RpcError) as refused:
-            await checks.verdict(matter(Wish(text)))
+            await checks.sound(matter(Wish(text)))
         assert refused.value.code == Code.SCRIPT_INVALID
         assert isinstance(refused.value.data, list)
         assert len(refused.value.data) == checking.MAX_PROBLEMS
@@ -135,14 +168,14 @@ def light() -> Matter:
 
 def test_work_beyond_its_time_is_ended_and_says_what_is_allowed() -> None:
     async def body(workers: Workers) -> None:
-        await workers.ask(checking.verdict_of, light())
+        await workers.ask(checking.in_pieces, light())
         workers.seconds = 0.5
         with pytest.raises(RpcError) as refused:
-            await workers.ask(checking.verdict_of, heavy())
+            await workers.ask(checking.in_pieces, heavy())
         assert refused.value.code == Code.TOO_LARGE
         assert refused.value.data["allowed"] == 0.5  # type: ignore[index, call-overload]
         workers.seconds = 60.0
-        await workers.ask(checking.verdict_of, light())  # another process
+        await workers.ask(checking.in_pieces, light())  # another process
 
     worked(body)
 
@@ -160,16 +193,16 @@ def test_work_on_a_busy_machine_has_the_time_that_it_has_alone() -> None:
     some = matter(Wish(long_script(10_000)))
 
     async def body(workers: Workers) -> None:
-        await workers.ask(checking.verdict_of, light())
+        await workers.ask(checking.in_pieces, light())
         pid = workers._idle[-1].pid
         before = processor_time.of_process(pid)
-        await workers.ask(checking.verdict_of, some)
+        await workers.ask(checking.in_pieces, some)
         after = processor_time.of_process(pid)
         assert before is not None
         assert after is not None
         workers.seconds = 3.0 * (after - before)
         busy = asyncio.create_task(stutter(pid))
-        await workers.ask(checking.verdict_of, some)
+        await workers.ask(checking.in_pieces, some)
         busy.cancel()
         os.kill(pid, signal.SIGCONT)
 
@@ -191,16 +224,16 @@ def test_work_beyond_its_memory_says_what_is_allowed() -> None:
 
 def test_a_process_that_is_killed_costs_who_asked_an_error_and_nobody_else() -> None:
     async def body(workers: Workers) -> None:
-        await workers.ask(checking.verdict_of, light())
+        await workers.ask(checking.in_pieces, light())
         [worker] = workers._idle
-        asked = asyncio.create_task(workers.ask(checking.verdict_of, heavy()))
+        asked = asyncio.create_task(workers.ask(checking.in_pieces, heavy()))
         await asyncio.sleep(0.3)
         os.kill(worker.pid, signal.SIGKILL)
         with pytest.raises(RpcError) as refused:
             await asked
         assert refused.value.code == Code.TOO_LARGE
         assert "ended" in refused.value.message
-        await workers.ask(checking.verdict_of, light())
+        await workers.ask(checking.in_pieces, light())
 
     worked(body)
 
@@ -208,9 +241,9 @@ def test_a_process_that_is_killed_costs_who_asked_an_error_and_nobody_else() -> 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="looks for the process in /proc")
 def test_work_that_nobody_waits_for_any_more_is_stopped() -> None:
     async def body(workers: Workers) -> None:
-        await workers.ask(checking.verdict_of, light())
+        await workers.ask(checking.in_pieces, light())
         [worker] = workers._idle
-        asked = asyncio.create_task(workers.ask(checking.verdict_of, heavy()))
+        asked = asyncio.create_task(workers.ask(checking.in_pieces, heavy()))
         await asyncio.sleep(0.3)
         asked.cancel()
         with pytest.raises(asyncio.CancelledError):
