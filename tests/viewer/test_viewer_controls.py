@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import answered, seen
+from tests.viewer.looking import answered, released, seen
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import answered, point_at, seen
+from tests.viewer.looking import answered, point_at, released, seen
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import seen
+from tests.viewer.looking import released, seen
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]
