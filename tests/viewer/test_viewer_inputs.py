@@ -145,6 +145,8 @@ def test_a_hurried_emergency_stop_does_not_reset_itself(
 ) -> None:
     page.locator("#estop").dblclick(delay=400)
     wait(lambda: twin.state().safety.estop)
+    answered(page)
+    seen(page, twin)
     released(page)
     wait(lambda: twin.state().safety.state == "ok")
     page.focus("#estop")

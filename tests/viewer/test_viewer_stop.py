@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import released
+from tests.viewer.looking import released, seen
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]
@@ -97,6 +97,7 @@ def test_the_emergency_stop_never_changes(
     everywhere()
     pressed()
     wait(lambda: twin.state().safety.estop)
+    seen(page, twin)  # the reset of the block that it has shown so far would be refused
     released(page)
     free(page)
     lab.twin.stop(signal.SIGKILL)
