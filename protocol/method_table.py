@@ -87,7 +87,7 @@ METHODS: Final = _table(
     _move("axes.set", p.AxisSet, r.AxisSetResult, "set an axis's speed and acceleration"),
     Method("axes.stop", Empty, s.Stopped, "bring all axes to rest", urgent=True),
     Method("safety.estop", Empty, s.Stopped, "emergency stop; X-rays off", urgent=True),
-    _move("safety.reset", Empty, s.State, "leave the emergency stop"),
+    _move("safety.reset", p.Reset, s.State, "leave the emergency stop"),
     _move("clock.set", p.ClockSet, s.ClockState, "set how fast the twin's time runs"),
     _move("tube.set", p.TubeSet, s.TubeState, "set kV, power and X-rays on or off"),
     _move("camera.set", p.CameraSet, s.CameraState, "set exposure, mode, ROI, averages, frames"),

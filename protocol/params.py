@@ -144,6 +144,14 @@ class AxisSet(Params):
     acceleration: Pace | None = Field(default=None, description="[mm/s2 or deg/s2]")
 
 
+class Reset(Params):
+    """Leave the emergency stop, or blocked."""
+
+    stop: Annotated[int, Ge(0), Le(2**53)] | None = Field(
+        default=None, description="release this stop (safety.stop) alone; null: any"
+    )
+
+
 class ClockSet(Params):
     """How fast the twin's time runs."""
 

@@ -97,6 +97,10 @@ class SafetyState(Result):
     state: str = Field(description="ok, estop, aborted, ...")
     estop: bool
     message: str = ""
+    stop: int = Field(default=0, description="number of the latest E-stop or block")
+    stopped_by: str | None = Field(
+        default=None, description="connection that pressed the E-stop in force, as in controller"
+    )
     blocked_attempts: int = 0
     clearance_mm: float | None = Field(default=None, description="smallest distance of two parts")
     pair: list[str] | None = Field(default=None, description="the two parts that are closest")

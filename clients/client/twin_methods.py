@@ -154,14 +154,20 @@ def estop() -> Flow[s.Stopped]:
     return ask("safety.estop", s.Stopped)
 
 
-def reset() -> Flow[s.State]:
+def reset(stop: int | None = None) -> Flow[s.State]:
     """Leave the emergency stop.
+
+    Args:
+        stop: `safety.stop` of the state on which this is decided; None releases any stop.
+
+    Raises:
+        RpcError: -32003, another stop has come since `stop`, or somebody else is the controller.
 
     Example:
         >>> twin.reset().safety.state
         'ok'
     """
-    return ask("safety.reset", s.State)
+    return ask("safety.reset", s.State, stop=stop)
 
 
 # -- settings ----------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import secrets
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Coroutine, Mapping
@@ -101,7 +102,9 @@ class TwinServer:
         machine = with_spectra(machine, physics)
         self.machine, self.profile, self.root = machine, profile, root
         self.clock = TwinClock(speed_up, wall)
-        self.scanner = ScannerTwin(machine, profile, self.clock.now())
+        self.scanner = ScannerTwin(
+            machine, profile, self.clock.now(), last_stop=secrets.randbits(48)
+        )  # numbers of a server before this one release nothing here
         self.hub = Hub(
             self.clock.now, {"log": LOG_KEPT}, self.limits.max_subscriptions, self.limits.max_views
         )

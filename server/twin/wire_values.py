@@ -57,6 +57,8 @@ def safety_view(safety: Safety, clearance: NearestPair | None, margin_mm: float)
         state=SAFETY_NAMES[safety.state],
         estop=safety.state == "estopped",
         message=safety.reason,
+        stop=safety.stop,
+        stopped_by=safety.stopped_by or None,
         blocked_attempts=safety.blocked_attempts,
         clearance_mm=None if near is None else near.mm,
         pair=None if near is None or near.pair is None else list(near.pair),

@@ -45,6 +45,13 @@ def seen(page: Any, twin: TwinClient) -> None:
     until(shown, "the page shows the twin's state")
 
 
+def released(page: Any) -> None:
+    """Resets as a person does: RESET once it is armed, then the answer to its question."""
+    page.click("#reset")
+    page.click("#reset-yes")
+    page.locator("#reset").wait_for(state="hidden")
+
+
 def answered(page: Any) -> None:
     """Waits until the twin has answered all that the page has asked for so far."""
     page.evaluate("flexdt.call('state.get').then(() => null)")

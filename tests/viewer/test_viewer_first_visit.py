@@ -106,11 +106,12 @@ def turn_the_sample(v: Visitor) -> None:
 
 
 def stop_and_go_on(v: Visitor) -> None:
-    """“Emergency stop …”; it goes with the reset"""
+    """“Emergency stop by …”; it goes with the reset"""
     v.button("E-STOP")
-    v.sees("Emergency stop: nothing moves until it is reset")
+    v.sees("nothing moves until it is reset")
     v.button("RESET")
-    v.sees_no_more("Emergency stop: nothing moves until it is reset")
+    v.button("Release this stop")
+    v.sees_no_more("nothing moves until it is reset")
 
 
 def switch_x_rays_on(v: Visitor) -> None:

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import answered, point_at, seen
+from tests.viewer.looking import answered, point_at, released, seen
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]
@@ -145,13 +145,13 @@ def test_a_hurried_emergency_stop_does_not_reset_itself(
 ) -> None:
     page.locator("#estop").dblclick(delay=400)
     wait(lambda: twin.state().safety.estop)
-    page.locator("#estop", has_text="RESET").wait_for()
-    page.click("#estop")
+    answered(page)
+    seen(page, twin)
+    released(page)
     wait(lambda: twin.state().safety.state == "ok")
-    page.locator("#estop", has_text="E-STOP").wait_for()
     page.focus("#estop")
     page.keyboard.down("Enter")
-    page.locator("#estop", has_text="RESET").wait_for()
+    page.locator("#reset").wait_for()
     for _ in range(3):
         page.keyboard.down("Enter")  # as a key repeats that is held
     page.keyboard.up("Enter")

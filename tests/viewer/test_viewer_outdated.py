@@ -131,7 +131,7 @@ def test_a_confirmed_stop_is_not_called_unconfirmed(page: Any, wait: Wait) -> No
     emitted(page, ("note", "error", "E-stop not confirmed", "no answer for 5 s"), then="0")
     assert page.locator("#notes .note", has_text="E-stop not confirmed").count() == 1
     page.evaluate("flexdt.call('safety.estop').then(() => null)")
-    wait(lambda: page.inner_text("#estop") == "RESET", "the stop")
+    page.locator("#reset").wait_for()
     assert page.locator("#notes .note", has_text="E-stop not confirmed").count() == 0
     page.evaluate("flexdt.call('safety.reset').then(() => null)")
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import seen
+from tests.viewer.looking import released, seen
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]
@@ -144,7 +144,7 @@ def test_near_contact_then_blocked_then_reset(page: Any, twin: TwinClient, wait:
     blocked = page.locator("#warnings .bad", has_text="Blocked")
     blocked.wait_for()
     assert "3 times in a row" in blocked.inner_text()
-    page.locator("#estop", has_text="RESET").click()
+    released(page)
     wait(lambda: twin.state().safety.state == "ok")
     blocked.wait_for(state="detached")
     go(page, twin, wait, mag_det=1000.0)

@@ -5,7 +5,8 @@ and counts as a blocked attempt; a motion that ends freely clears the count. At 
 `max_blocked_attempts` the state is `blocked`: motion is rejected until a reset (thesis 4.4.4).
 While parts are in contact the state is `blocked` too; a reset does not change that, and the only
 motions allowed are those that bring no touching pair nearer. `estopped` rejects motion and X-rays
-until a reset. `Guard` is the interface of contact detection; `collision` implements it.
+until a reset. Each E-stop and each block has a number, so that a reset can say which one it is to
+release. `Guard` is the interface of contact detection; `collision` implements it.
 """
 
 from __future__ import annotations
@@ -113,7 +114,9 @@ def after_contact(safety: Safety, contact: Contact) -> Safety:
     if attempts < safety.max_blocked_attempts:
         return replace(safety, blocked_attempts=attempts)
     reason = f"motion was blocked {attempts} times in a row, last by {first} and {second}"
-    return replace(safety, state="blocked", blocked_attempts=attempts, reason=reason)
+    return replace(
+        safety, state="blocked", blocked_attempts=attempts, reason=reason, stop=safety.stop + 1
+    )
 
 
 def after_free_motion(safety: Safety) -> Safety:
@@ -121,14 +124,30 @@ def after_free_motion(safety: Safety) -> Safety:
     return replace(safety, blocked_attempts=0) if safety.blocked_attempts else safety
 
 
-def estopped(safety: Safety) -> Safety:
-    """The E-stop was pressed."""
-    return replace(safety, state="estopped", reason="the E-stop is in force")
+def estopped(safety: Safety, by: str) -> Safety:
+    """The E-stop was pressed, perhaps once more: the next stop."""
+    reason = "the E-stop is in force"
+    return replace(safety, state="estopped", reason=reason, stop=safety.stop + 1, stopped_by=by)
 
 
-def released(safety: Safety) -> Safety:
-    """The state after a reset; a contact remains one."""
-    ready = replace(safety, state="ready", blocked_attempts=0, reason="")
+def released(safety: Safety, stop: int | None) -> Safety:
+    """The state after a reset; a contact remains one, and is the next stop.
+
+    Args:
+        safety: before it.
+        stop: number of the stop that it is to release; None for whichever there is.
+
+    Raises:
+        SafetyError: that is not the latest stop; nothing is released.
+    """
+    if stop is not None and stop != safety.stop:
+        by = f" by {safety.stopped_by}" if safety.stopped_by else ""
+        why = safety.reason or "it has been released"
+        raise SafetyError(
+            f"the reset is for another stop than the latest{by} ({why}); nothing is released",
+            {"asked": stop, "allowed": safety.stop, "state": safety.state, "reason": safety.reason},
+        )
+    ready = replace(safety, state="ready", blocked_attempts=0, reason="", stopped_by="")
     return ready if safety.contact is None else in_contact(ready, safety.contact)
 
 
@@ -147,7 +166,8 @@ def in_contact(safety: Safety, pair: tuple[str, str] | None) -> Safety:
     if safety.state == "estopped":
         return touching
     reason = f"{pair[0]} and {pair[1]} are in contact; only motion that brings them apart is free"
-    return replace(touching, state="blocked", reason=reason)
+    new = safety.state == "ready"
+    return replace(touching, state="blocked", reason=reason, stop=safety.stop + new)
 
 
 def collision_error(

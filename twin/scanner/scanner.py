@@ -76,10 +76,16 @@ class ScannerTwin:
         profile: zero offsets in force.
         now: time at which it stands at home [s].
         guard: finds the first contact along planned motion; None sweeps nothing.
+        last_stop: number of the stop before the first one here (`Safety.stop`).
     """
 
     def __init__(
-        self, machine: Machine, profile: Profile, now: float = 0.0, guard: Guard | None = None
+        self,
+        machine: Machine,
+        profile: Profile,
+        now: float = 0.0,
+        guard: Guard | None = None,
+        last_stop: int = 0,
     ) -> None:
         self.machine = machine
         self.profile = profile
@@ -88,7 +94,7 @@ class ScannerTwin:
         self.camera = machine.detector.camera
         self.sample = Sample()
         self.correction: Correction | None = None
-        self.safety = Safety(max_blocked_attempts=machine.max_blocked_attempts)
+        self.safety = Safety(max_blocked_attempts=machine.max_blocked_attempts, stop=last_stop)
         self._drives: dict[str, Drive] = plan.home(machine, now)
         self._coasts_until = -math.inf
         self._stage = self._stops = self._programmes = 0
@@ -296,13 +302,17 @@ class ScannerTwin:
             return Stopping.of(self.trajectories(now), "coasting", now)
         return self._stopped(self._lookahead(now).stopped())
 
-    def estop(self, now: float) -> Stopping:
+    def estop(self, now: float, by: str = "") -> Stopping:
         """Bring the motors to rest as the machine's stop category says; X-rays off.
 
         Motion and X-rays are rejected until a reset.
+
+        Args:
+            now: time of the command [s].
+            by: who pressed it.
         """
         self.tube = switched(self.machine, self.tube, False, now, warm=True)
-        self.safety = estopped(self.safety)
+        self.safety = estopped(self.safety, by)
         ahead = self._lookahead(now)
         if now < self._coasts_until:
             return self.stop(now)
@@ -313,14 +323,19 @@ class ScannerTwin:
             return self._stopped(Stopping.of(ways, "coasting", now, hit))
         return self._stopped(ahead.stopped(ahead.hardest))
 
-    def reset(self, now: float) -> None:
+    def reset(self, now: float, stop: int | None = None) -> None:
         """Leave E-stop or blocked; nothing starts by itself, and a contact remains one.
 
+        Args:
+            now: time of the command [s].
+            stop: `Safety.stop` as whoever asks has seen it; None releases whichever stop it is.
+
         Raises:
-            SafetyError: motors coast still; a reset is judged by where they come to rest.
+            SafetyError: motors coast still (a reset is judged by where they come to rest), or
+                there has been another stop since `stop`; nothing is released.
         """
         self._require_power("a reset", now)
-        self.safety = released(in_contact(self.safety, self._touching(now)))
+        self.safety = released(self._safety_at(now), stop)
 
     def place(self, positions: Mapping[str, float], now: float) -> None:
         """Put motors where they are known to stand, at rest: a start, not a motion.

@@ -143,6 +143,8 @@ class Safety:
         blocked_attempts: motions in a row that a contact cut short.
         max_blocked_attempts: at so many the state becomes blocked.
         reason: why it is not ready, as a message.
+        stop: number of the latest E-stop or block; each has the next one.
+        stopped_by: who pressed the E-stop in force; "" where nobody did or nobody knows.
         contact: two parts that touch, or are closer than the safety margin; a reset does not end
             that, and only motions that bring no such pair nearer are allowed.
     """
@@ -151,6 +153,8 @@ class Safety:
     blocked_attempts: int = 0
     max_blocked_attempts: int = 3
     reason: str = ""
+    stop: int = 0
+    stopped_by: str = ""
     contact: tuple[str, str] | None = None
 
 

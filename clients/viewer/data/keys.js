@@ -45,7 +45,7 @@ function down(e) {
     if (e.key === "Enter" && e.repeat && e.target?.tagName === "BUTTON") {
         e.preventDefault();
         return;
-    } // held, it would reset the stop
+    } // held, it would press what comes next, too
     if (e.key === "Escape" && $dialog("#help-dialog").open) {
         toggleHelp();
         return;

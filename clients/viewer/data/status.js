@@ -1,5 +1,5 @@
 // Bar, readouts, warnings and notes: who holds control, how near things are, what went wrong.
-import { $, $$, $button, el, fixed, isNumber, setText } from "./dom.js";
+import { $, $$, $button, $dialog, el, fixed, isNumber, setText } from "./dom.js";
 import { command, OLD_S, on, store } from "./link.js";
 const ROWS = [
     ["SOD", (s) => `${fixed(s.geometry.SOD_mm, 2)} mm`], ["SDD", (s) => `${fixed(s.geometry.SDD_mm, 2)} mm`],
@@ -46,10 +46,8 @@ export function truncated(s) {
 let parked = null;
 function warnings(s) {
     const list = [];
-    if (s.safety.estop)
-        list.push(["bad", "Emergency stop: nothing moves until it is reset"]);
-    else if (s.safety.state !== "ok")
-        list.push(["bad", `Blocked: ${s.safety.message || "reset to go on"}`]);
+    if (isDown(s))
+        list.push(["bad", stopped(s)]);
     for (const w of s.safety.warnings)
         list.push(["", w]);
     if (store.near?.close)
@@ -90,19 +88,17 @@ on("state", (s) => {
     }
     const factor = s.clock.real_time_factor;
     setText($("#clock"), `t = ${fixed(s.clock.time_s, 1)} s · ${factor ? `${factor >= 10 ? fixed(factor, 0) : fixed(factor, 2)}×` : s.clock.speed_up === "max" ? "max" : `${s.clock.speed_up}×`}`);
-    const estop = $button("#estop"), down = s.safety.estop || s.safety.state !== "ok";
-    if (s.safety.estop) {
+    release(s);
+    if (s.safety.estop && s.safety.stop !== pressed?.after) {
         pressed = null;
         for (const n of $$("#notes .note"))
             if (n.dataset.key?.startsWith(UNCONFIRMED))
                 n.remove();
     }
-    else if (pressed !== null && store.fresh !== null && performance.now() - Math.max(pressed, store.fresh) > 2000 * OLD_S) {
+    else if (pressed !== null && store.fresh !== null && performance.now() - Math.max(pressed.at, store.fresh) > 2000 * OLD_S) {
         pressed = null;
         note("error", "The emergency stop did not take effect", "press it again");
     }
-    estop.dataset.on = String(down);
-    setText(estop, down ? "RESET" : "E-STOP");
     near();
     holder();
 });
@@ -129,22 +125,50 @@ $button("#take").addEventListener("click", () => {
     void command("session.control", { action }, "Control");
 });
 const UNCONFIRMED = "E-stop not confirmed";
-// Who clicks twice in a hurry means to stop, not to reset. Pressed, and not confirmed by a state yet [ms].
+// Pressed when [ms], after which stop, and not confirmed by a newer one yet.
 let pressed = null;
 export async function estop() {
-    const mine = pressed = performance.now();
+    const mine = pressed = { at: performance.now(), after: store.state?.safety.stop };
     const answer = await command("safety.estop", {}, UNCONFIRMED);
     if (answer?.safety.estop && pressed === mine)
         pressed = null;
 }
-$button("#estop").addEventListener("click", (e) => {
-    if (e.detail >= 2)
+$button("#estop").addEventListener("click", () => void estop());
+// A reset releases the one stop that the page shows, and not before a person has had time to see it.
+const SEEN_MS = 1000;
+const isDown = (s) => s.safety.estop || s.safety.state !== "ok";
+function stopped({ safety: { estop, stopped_by: by, message } }) {
+    if (!estop)
+        return `Blocked: ${message || "reset to go on"}`;
+    return `Emergency stop${by ? ` by ${by === store.session ? "you" : by}` : ""}: nothing moves until it is reset`;
+}
+let shown = null;
+function release(s) {
+    const stop = isDown(s) ? s.safety.stop : null, reset = $button("#reset"), ask = $dialog("#reset-dialog");
+    reset.hidden = stop === null;
+    $button("#xrays-off").hidden = stop === null || !s.tube.on;
+    if (stop === shown)
         return;
-    if ($button("#estop").dataset.on === "true")
-        void command("safety.reset", {}, "Reset");
-    else
-        void estop();
+    shown = stop;
+    ask.close();
+    reset.disabled = true;
+    setTimeout(() => { if (shown === stop)
+        reset.disabled = false; }, SEEN_MS);
+}
+$button("#reset").addEventListener("click", () => {
+    const ask = $dialog("#reset-dialog"), s = store.state;
+    if (ask.open || !s) {
+        ask.close();
+        return;
+    }
+    setText($("#reset-what"), stopped(s));
+    setText($("#reset-tube"), s.tube.on ? "X-rays are on and stay on." : "X-rays are off and stay off.");
+    ask.show();
 });
+$button("#reset-no").addEventListener("click", () => $dialog("#reset-dialog").close());
+$button("#reset-yes").addEventListener("click", () => { $dialog("#reset-dialog").close(); if (shown !== null)
+    void command("safety.reset", { stop: shown }, "Reset"); });
+$button("#xrays-off").addEventListener("click", () => void command("tube.set", { on: false }, "X-rays off"));
 const BUTTON = "the machine's own emergency stop button is the one that counts";
 $button("#stop").addEventListener("click", () => void command("axes.stop", {}, "Stop"));
 // What is missing: nothing, the viewer's room for this page, the viewer, the twin, or news of either.
@@ -162,7 +186,7 @@ function missing() {
 }
 function connection() {
     const pill = $("#connection"), [word, title, why] = missing(), up = title === "";
-    const unconfirmed = pressed !== null && performance.now() - pressed > 1000 * OLD_S;
+    const unconfirmed = pressed !== null && performance.now() - pressed.at > 1000 * OLD_S;
     pill.dataset.state = up ? "up" : "down";
     setText(pill, word);
     pill.title = store.problem ?? "";

@@ -32,7 +32,7 @@ const typing = (e: Event) => within(e.target, "input:not([type=range]):not([type
 function down(e: KeyboardEvent) {
   if (e.code === "Space" && e.shiftKey) { e.preventDefault(); if (!e.repeat) void estop(); return; }
   if (e.code === "Space" && !e.ctrlKey && !e.metaKey && !e.altKey && !spaced(e)) { e.preventDefault(); if (!e.repeat) { jogStopAll(); void command("axes.stop", {}, "Stop"); } return; }
-  if (e.key === "Enter" && e.repeat && (e.target as Partial<Element> | null)?.tagName === "BUTTON") { e.preventDefault(); return; } // held, it would reset the stop
+  if (e.key === "Enter" && e.repeat && (e.target as Partial<Element> | null)?.tagName === "BUTTON") { e.preventDefault(); return; } // held, it would press what comes next, too
   if (e.key === "Escape" && $dialog("#help-dialog").open) { toggleHelp(); return; }
   if (e.key === "F1") { e.preventDefault(); toggleHelp(); return; }
   if (typing(e) || e.ctrlKey || e.metaKey || $dialog("#help-dialog").open) return;

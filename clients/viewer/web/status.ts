@@ -1,5 +1,5 @@
 // Bar, readouts, warnings and notes: who holds control, how near things are, what went wrong.
-import { $, $$, $button, el, fixed, isNumber, setText } from "./dom.js";
+import { $, $$, $button, $dialog, el, fixed, isNumber, setText } from "./dom.js";
 import type { State } from "./viewer.js";
 import { command, OLD_S, on, store } from "./link.js";
 
@@ -47,8 +47,7 @@ let parked: Set<string> | null = null;
 
 function warnings(s: State) {
   const list: Array<[kind: string, words: string]> = [];
-  if (s.safety.estop) list.push(["bad", "Emergency stop: nothing moves until it is reset"]);
-  else if (s.safety.state !== "ok") list.push(["bad", `Blocked: ${s.safety.message || "reset to go on"}`]);
+  if (isDown(s)) list.push(["bad", stopped(s)]);
   for (const w of s.safety.warnings) list.push(["", w]);
   if (store.near?.close) list.push([(store.near.mm ?? 0) < 2 ? "bad" : "", `${store.near.pair.join(" and ")} are ${fixed(store.near.mm, 1)} mm apart`]);
   const there = Object.entries(s.axes).filter(([, a]) => !a.moving && !a.virtual && (Math.abs(a.position - a.limits[0]) < 0.05 || Math.abs(a.limits[1] - a.position) < 0.05)).map(([n]) => n);
@@ -73,13 +72,12 @@ on("state", (s) => {
   if (key !== lastWarnings) { lastWarnings = key; $("#warnings").replaceChildren(...list.map(([kind, text]) => el("div", { class: `warning ${kind}` }, text))); }
   const factor = s.clock.real_time_factor;
   setText($("#clock"), `t = ${fixed(s.clock.time_s, 1)} s · ${factor ? `${factor >= 10 ? fixed(factor, 0) : fixed(factor, 2)}×` : s.clock.speed_up === "max" ? "max" : `${s.clock.speed_up}×`}`);
-  const estop = $button("#estop"), down = s.safety.estop || s.safety.state !== "ok";
-  if (s.safety.estop) { pressed = null; for (const n of $$("#notes .note")) if (n.dataset.key?.startsWith(UNCONFIRMED)) n.remove(); }
-  else if (pressed !== null && store.fresh !== null && performance.now() - Math.max(pressed, store.fresh) > 2000 * OLD_S) {
+  release(s);
+  if (s.safety.estop && s.safety.stop !== pressed?.after) { pressed = null; for (const n of $$("#notes .note")) if (n.dataset.key?.startsWith(UNCONFIRMED)) n.remove(); }
+  else if (pressed !== null && store.fresh !== null && performance.now() - Math.max(pressed.at, store.fresh) > 2000 * OLD_S) {
     pressed = null;
     note("error", "The emergency stop did not take effect", "press it again");
   }
-  estop.dataset.on = String(down); setText(estop, down ? "RESET" : "E-STOP");
   near(); holder();
 });
 
@@ -105,18 +103,40 @@ $button("#take").addEventListener("click", () => {
   void command("session.control", { action }, "Control");
 });
 const UNCONFIRMED = "E-stop not confirmed";
-// Who clicks twice in a hurry means to stop, not to reset. Pressed, and not confirmed by a state yet [ms].
-let pressed: number | null = null;
+// Pressed when [ms], after which stop, and not confirmed by a newer one yet.
+let pressed: { at: number; after: number | undefined } | null = null;
 export async function estop(): Promise<void> {
-  const mine = pressed = performance.now();
+  const mine = pressed = { at: performance.now(), after: store.state?.safety.stop };
   const answer = await command("safety.estop", {}, UNCONFIRMED);
   if (answer?.safety.estop && pressed === mine) pressed = null;
 }
-$button("#estop").addEventListener("click", (e) => {
-  if (e.detail >= 2) return;
-  if ($button("#estop").dataset.on === "true") void command("safety.reset", {}, "Reset");
-  else void estop();
+$button("#estop").addEventListener("click", () => void estop());
+
+// A reset releases the one stop that the page shows, and not before a person has had time to see it.
+const SEEN_MS = 1000;
+const isDown = (s: State) => s.safety.estop || s.safety.state !== "ok";
+function stopped({ safety: { estop, stopped_by: by, message } }: State): string {
+  if (!estop) return `Blocked: ${message || "reset to go on"}`;
+  return `Emergency stop${by ? ` by ${by === store.session ? "you" : by}` : ""}: nothing moves until it is reset`;
+}
+let shown: number | null = null;
+function release(s: State) {
+  const stop = isDown(s) ? s.safety.stop : null, reset = $button("#reset"), ask = $dialog("#reset-dialog");
+  reset.hidden = stop === null;
+  $button("#xrays-off").hidden = stop === null || !s.tube.on;
+  if (stop === shown) return;
+  shown = stop; ask.close(); reset.disabled = true;
+  setTimeout(() => { if (shown === stop) reset.disabled = false; }, SEEN_MS);
+}
+$button("#reset").addEventListener("click", () => {
+  const ask = $dialog("#reset-dialog"), s = store.state;
+  if (ask.open || !s) { ask.close(); return; }
+  setText($("#reset-what"), stopped(s)); setText($("#reset-tube"), s.tube.on ? "X-rays are on and stay on." : "X-rays are off and stay off.");
+  ask.show();
 });
+$button("#reset-no").addEventListener("click", () => $dialog("#reset-dialog").close());
+$button("#reset-yes").addEventListener("click", () => { $dialog("#reset-dialog").close(); if (shown !== null) void command("safety.reset", { stop: shown }, "Reset"); });
+$button("#xrays-off").addEventListener("click", () => void command("tube.set", { on: false }, "X-rays off"));
 const BUTTON = "the machine's own emergency stop button is the one that counts";
 $button("#stop").addEventListener("click", () => void command("axes.stop", {}, "Stop"));
 
@@ -131,7 +151,7 @@ function missing(): [word: string, title: string, why: string] {
 }
 function connection() {
   const pill = $("#connection"), [word, title, why] = missing(), up = title === "";
-  const unconfirmed = pressed !== null && performance.now() - pressed > 1000 * OLD_S;
+  const unconfirmed = pressed !== null && performance.now() - pressed.at > 1000 * OLD_S;
   pill.dataset.state = up ? "up" : "down";
   setText(pill, word);
   pill.title = store.problem ?? "";

@@ -467,10 +467,15 @@ export type RecordedImage = {
   kind?: "line_integral" | "counts";
   virtual?: boolean;
 };
+export type Reset = {
+  stop?: number | null;
+};
 export type SafetyState = {
   state: string;
   estop: boolean;
   message: string;
+  stop: number;
+  stopped_by: string | null;
   blocked_attempts: number;
   clearance_mm: number | null;
   pair: Array<string> | null;
@@ -695,7 +700,7 @@ export interface Requests {
   "axes.set": AxisSet;
   "axes.stop": Empty;
   "safety.estop": Empty;
-  "safety.reset": Empty;
+  "safety.reset": Reset;
   "clock.set": ClockSet;
   "tube.set": TubeSet;
   "camera.set": CameraSet;

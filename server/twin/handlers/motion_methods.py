@@ -102,14 +102,14 @@ def estop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
     """Stop as the machine's E-stop does, X-rays off; a running scan pauses."""
     twin.detours.cancel()
     twin.interrupt("E-stop")
-    stopping = twin.scanner.estop(twin.clock.now())
+    stopping = twin.scanner.estop(twin.clock.now(), client.name)
     twin.tell("warning", f"E-stop by {client.name}")
     twin.changed()
     return views.stopped_view(twin.state(), stopping, twin.clock.now())
 
 
-def reset(twin: TwinServer, client: Client, params: Empty) -> w.State:
+def reset(twin: TwinServer, client: Client, params: p.Reset) -> w.State:
     """Leave E-stop or blocked."""
-    twin.scanner.reset(twin.clock.now())
+    twin.scanner.reset(twin.clock.now(), params.stop)
     twin.changed()
     return twin.state()
