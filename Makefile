@@ -53,17 +53,20 @@ quick: lint typecheck
 	$(BIN)/pytest -q -n 2 --dist loadfile -m 'not slow' $(QUICK)
 
 test: lint typecheck $(TEST_STAMP) $(WEB_STAMP)
-	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'not slow and not browser'
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'not slow and not browser' \
+	  --junitxml=build/durations/test.xml
 
 slow: studies page
 
 # Studies in their short form, the demonstration, the site.
 studies: $(TEST_STAMP)
-	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'slow and not browser'
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'slow and not browser' \
+	  --junitxml=build/durations/studies.xml
 
 # The page in a browser, which draws on all cores: nothing else runs beside it.
 page: $(TEST_STAMP)
-	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m browser
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m browser \
+	  --junitxml=build/durations/page.xml
 
 # What failed in the last of these, once more and one after the other.
 failed: lint typecheck $(TEST_STAMP)

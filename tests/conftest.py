@@ -24,8 +24,29 @@ settings.register_profile(
 settings.load_profile("same")
 
 
+def keep_some_daily(items: list[pytest.Item]) -> None:
+    """Of a test marked `daily(n)`, n cases run every day and the others are marked `slow`.
+
+    The n cases lie evenly among all, so that each kind of a table is met.
+    """
+    cases: dict[tuple[Path, str], list[pytest.Item]] = {}
+    for item in items:
+        if item.get_closest_marker("daily") is not None:
+            name = getattr(item, "originalname", None) or item.name
+            cases.setdefault((item.path, name), []).append(item)
+    for every in cases.values():
+        mark = every[0].get_closest_marker("daily")
+        assert mark is not None
+        kept = {len(every) * i // mark.args[0] for i in range(mark.args[0])}
+        for number, item in enumerate(every):
+            if number not in kept:
+                item.add_marker(pytest.mark.slow)
+
+
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Modules that take long begin first, then those of many tests: no worker is left with one."""
+    keep_some_daily(items)
     long = {item.path for item in items if item.get_closest_marker("slow") is not None}
     count = Counter(item.path for item in items)
     items.sort(key=lambda item: (item.path not in long, -count[item.path]))

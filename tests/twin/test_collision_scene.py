@@ -108,6 +108,7 @@ def test_sizes_are_table_4_1() -> None:
     assert all("assumed" in c.source for c in M.components)
 
 
+@pytest.mark.daily(10)
 @pytest.mark.parametrize("size", TABLE_6_2)
 @pytest.mark.parametrize("name", TABLE_6_1)
 def test_simulated_geometries_are_free_at_every_angle(name: str, size: str) -> None:
@@ -119,6 +120,7 @@ def test_simulated_geometries_are_free_at_every_angle(name: str, size: str) -> N
     assert clearance(s, motors).mm > M.safety_margin_mm
 
 
+@pytest.mark.daily(10)
 @pytest.mark.parametrize("size", TABLE_6_2)
 @pytest.mark.parametrize("profile", ["thesis", M.default_profile])
 @pytest.mark.parametrize("name", TABLE_6_6)

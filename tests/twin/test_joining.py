@@ -91,6 +91,7 @@ def changed(seed: int) -> tuple[ScannerTwin, Scene, float, str, dict[str, Trajec
     return s, scene, now, "free" if halted is None else "halted", before, longest > 2
 
 
+@pytest.mark.daily(10)
 @pytest.mark.parametrize("seed", range(60))
 def test_what_is_under_way_is_free_of_a_new_stage_or_halted_or_the_stage_refused(
     seed: int,

@@ -261,6 +261,7 @@ def test_hand_computed_profile() -> None:
     assert not t.moving(13.0)
 
 
+@pytest.mark.daily(10)
 @pytest.mark.parametrize("seed", range(60))
 def test_speeds_and_laws_are_those_of_many_moments(seed: int) -> None:
     """What a motion says of itself, against differences of its positions."""

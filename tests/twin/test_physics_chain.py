@@ -90,6 +90,7 @@ def test_few_energies_hold_the_full_spectrum(substances, thickest, kV):
     assert_holds(beam, signal, noise, substances, thickest)
 
 
+@pytest.mark.daily(10)
 @pytest.mark.parametrize("metal", [STEEL, COPPER, TITANIUM, CARBIDE], ids=lambda s: s.name)
 @pytest.mark.parametrize("kV", [30.0, 60.0, 80.0, 90.0, 160.0])
 @pytest.mark.parametrize("thickest", [0.1, 4.0, 60.0])

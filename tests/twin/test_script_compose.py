@@ -324,6 +324,7 @@ def sums(machine: Machine) -> np.ndarray:
     return np.array([[factors.get(motor, 0.0) for motor in motors] for factors in rows])
 
 
+@pytest.mark.daily(10)
 @pytest.mark.parametrize("seed", range(60))
 def test_motors_that_share_a_distance_are_set_together(seed: int) -> None:
     """The witness adds up what the script's own moves say; it does not plan them."""

@@ -80,6 +80,7 @@ SOME = (
 )  # fmt: skip
 
 
+@pytest.mark.daily(8)
 @pytest.mark.parametrize("kind", SOME)
 def test_a_drawn_fault_has_its_name(kind: str) -> None:
     found = scored(kind, 40)
@@ -95,6 +96,7 @@ def test_no_drawn_fault_is_offered_wrong(kind: str) -> None:
     assert any(f.verdict == "right" for f in found), found
 
 
+@pytest.mark.daily(1)
 @pytest.mark.parametrize("seed", [50, 221])
 def test_an_sdd_that_the_images_doubt_is_not_offered_by_its_prior_alone(seed: int) -> None:
     """13 and 17 mm off where the prior says 1: images that tell it to 5 mm came second."""
@@ -102,6 +104,7 @@ def test_an_sdd_that_the_images_doubt_is_not_offered_by_its_prior_alone(seed: in
     assert not found.wrong, found
 
 
+@pytest.mark.daily(1)
 @pytest.mark.parametrize("kind", ["scanner_held", "height_held", "across_held"])
 def test_what_is_held_exactly_and_wrongly_is_never_offered_in_silence(kind: str) -> None:
     """Held 0.2 to 2 mm from where it is: dO_x came out 650 of its sigmas off without a word. Where
@@ -116,15 +119,12 @@ def test_what_is_held_exactly_and_wrongly_is_never_offered_in_silence(kind: str)
         assert found.verdict == "right"
 
 
+@pytest.mark.daily(2)
 @pytest.mark.parametrize(
     ("kind", "seed"),
     [
-        pytest.param(
-            "gap", 303, marks=pytest.mark.slow
-        ),  # both the last half and the last third fit by themselves
-        pytest.param(
-            "screw", 303, marks=pytest.mark.slow
-        ),  # panel and axis had taken up a part of it
+        ("gap", 303),  # both the last half and the last third fit by themselves
+        ("screw", 303),  # panel and axis had taken up a part of it
         ("angle_factor", 300),  # its last frames are where no others put them
         ("angle_factor", 301),  # a fifth of the frames was left out
         ("spot_drift", 1002),  # its last frames were

@@ -114,6 +114,7 @@ def build(name, circle):
     return Volume(random(shape), voxel, center), circle(*args, **options)
 
 
+@pytest.mark.daily(16)
 @pytest.mark.parametrize("walk", [0, 1, 2, 3], indirect=True)
 @pytest.mark.parametrize("name", CASES)
 def test_hard_cases_are_exact_forward_and_back(name, siddon, circle) -> None:
@@ -287,6 +288,7 @@ def test_a_ray_in_voxel_planes_takes_a_neighbour(circle) -> None:
 AXES = {"x, y, z": (0, 1, 2), "y, z, x": (1, 2, 0), "z, x, y": (2, 0, 1)}
 
 
+@pytest.mark.daily(12)
 @pytest.mark.parametrize("seed", range(12))
 @pytest.mark.parametrize("axes", AXES)
 def test_a_sheet_of_rays_in_a_voxel_plane_stays_between_its_neighbours(axes, seed) -> None:

@@ -1,0 +1,42 @@
+"""Seconds that each test file took: `durations.py [--over 10] [FILE.xml ...]`.
+
+`make test`, `studies` and `page` write what each test took to build/durations/. The files that took
+longer than `--over` seconds are listed, the longest first, with their longest test.
+"""
+
+from __future__ import annotations
+
+import argparse
+import xml.etree.ElementTree as ElementTree
+from collections import defaultdict
+from pathlib import Path
+
+FOLDER = Path(__file__).parents[2] / "build" / "durations"
+
+
+def seconds(report: Path) -> dict[str, dict[str, float]]:
+    """Test file -> test -> seconds, set-up and tear-down included."""
+    found: dict[str, dict[str, float]] = defaultdict(dict)
+    for case in ElementTree.parse(report).iter("testcase"):
+        name = case.get("name", "")
+        tests = found[case.get("classname", "")]
+        tests[name] = tests.get(name, 0.0) + float(case.get("time", "0"))
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("reports", nargs="*", type=Path, default=sorted(FOLDER.glob("*.xml")))
+    parser.add_argument("--over", type=float, default=10.0, help="list files above so many seconds")
+    chosen = parser.parse_args()
+    for report in chosen.reports:
+        files = {name: (sum(t.values()), t) for name, t in seconds(report).items()}
+        print(f"{report.stem}: {sum(t for t, _ in files.values()):.0f} s in {len(files)} files")
+        for name, (total, tests) in sorted(files.items(), key=lambda f: -f[1][0]):
+            if total > chosen.over:
+                longest = max(tests, key=lambda test: tests[test])
+                print(f"{total:8.1f} s  {name}  ({tests[longest]:.1f} s: {longest})")
+
+
+if __name__ == "__main__":
+    main()
