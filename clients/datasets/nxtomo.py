@@ -14,8 +14,8 @@ import numpy as np
 
 from flexdt.clients.datasets.data_set import Counts, DataSet
 from flexdt.clients.extras import package
-from flexdt.server.files.atomic import AtomicFolder
 from flexdt.server.files.dataset_folder import read_image
+from flexdt.server.files.directory import Directory
 from flexdt.server.files.image_files import tiff_bytes
 from flexdt.twin.dataset.dataset_errors import DatasetExistsError, DatasetFormatError
 from flexdt.twin.dataset.file_names import DOCUMENT, GEOMETRY, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS
@@ -40,7 +40,7 @@ def save_data_set(data: DataSet, folder: File) -> None:
         raise DatasetExistsError(
             f"{path} is not empty; allowed: a new or an empty folder", {"path": str(path)}
         )
-    with AtomicFolder(path, sync=False) as out:
+    with Directory(path, sync=False) as out:
         for name, image in references(data):
             out.put(name, tiff_bytes(image))
         for i in data.present:

@@ -8,10 +8,10 @@ outside the data directory or over an existing file.
 
 from __future__ import annotations
 
-import os
 import re
 import threading
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import groupby
@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.protocol.state_model import State
-from flexdt.server.files.atomic import AtomicFolder, make_folder
+from flexdt.server.files.directory import Directory, open_data
 from flexdt.server.files.image_files import free_name, tiff_bytes
 from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.dataset.file_names import DOCUMENT, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS
@@ -75,7 +75,7 @@ class Recording:
         self._states: list[State] = []
         self._settings: State | None = None
         self._began: float | None = None
-        self._folder: AtomicFolder | None = None
+        self._folder: Directory | None = None
         self._closed = False
         self._turn = threading.Lock()
         """Images are saved in threads, while another output path may be set."""
@@ -123,12 +123,13 @@ class Recording:
         Raises:
             DatasetError, OSError: the data set cannot be read, a name is taken, or no room.
         """
-        path = folder / DOCUMENT
-        document = parse_document(path.read_text(encoding="utf-8"), str(path))
+        source = Directory(folder.parent).folder(folder.name)
+        document = parse_document(source.read(DOCUMENT).decode(), str(folder / DOCUMENT))
         with self._turn:
             files = self._files([f.file for f in document.frames])
+            there = source.names()
             for frame in document.frames:
-                _same_file(folder / frame.file, files)
+                _same_file(frame.file, source, files, linked=frame.file in there)
             begun = self._time(state.time) - document.duration_s
             self._add(_blocks(document.frames, begun), state)
         return len(document.frames)
@@ -148,15 +149,18 @@ class Recording:
                 self._folder.close()
                 self._folder = None
 
-    def _files(self, names: Sequence[str]) -> AtomicFolder:
+    def _files(self, names: Sequence[str]) -> Directory:
         if self._closed:
             raise DatasetError(
                 "another output path has been set meanwhile; the image is still in the camera",
                 {"asked": list(names)},
             )
         if self._folder is None:
-            self.name = free_name(self.root, self.name)
-            self._folder = AtomicFolder(make_folder(self.root, self.name), sync=False)
+            root = open_data(self.root)
+            self.name = free_name(root, self.name)
+            folder = root.folder(self.name, sync=False)
+            folder.make()
+            self._folder = folder.held()
         taken = sorted(set(names) & self._folder.names())
         if taken:
             raise DatasetError(
@@ -233,12 +237,13 @@ def kind_of_file(file: str) -> FrameKind:
     return "projection" if kind == "preview" else kind
 
 
-def _same_file(there: Path, files: AtomicFolder) -> None:
+def _same_file(name: str, source: Directory, files: Directory, *, linked: bool) -> None:
     """Link an image, which never changes, into the folder; copy it if the disk has no links."""
-    try:
-        os.link(there, files.path / there.name, follow_symlinks=False)
-    except (OSError, NotImplementedError):
-        files.put(there.name, there.read_bytes())
+    with suppress(OSError, NotImplementedError):
+        if linked:
+            source.link(name, name, files)
+            return
+    files.put(name, source.read(name))
 
 
 def _positions(state: State) -> Mapping[str, float]:

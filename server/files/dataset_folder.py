@@ -6,15 +6,17 @@ import math
 import os
 import re
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.server.files.directory import Directory
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
 from flexdt.twin.dataset.file_names import DOCUMENT, GEOMETRY, SCAN_SETTINGS, XRE_SETTINGS
 from flexdt.twin.geometry.conventions import Float32Array
@@ -112,14 +114,53 @@ class Folder:
         return dict(sorted(found.items()))
 
 
-def list_folder(path: Path, *, links: bool = True) -> Folder:
-    """List a folder; without `links`, links to files are not among its files.
+_confined: Directory | None = None
+
+
+@contextmanager
+def confined(root: Directory) -> Iterator[None]:
+    """Inside, nothing that this process reads below `root` is reached through a link.
+
+    A user's own folders may well have links in them; what strangers ask a server for may not.
+    """
+    global _confined
+    before, _confined = _confined, root
+    try:
+        yield
+    finally:
+        _confined = before
+
+
+def _within(path: Path) -> Directory | None:
+    """The directory at a path that is below the one that reading is confined to."""
+    if _confined is None or not path.is_relative_to(_confined.path):
+        return None
+    directory = _confined
+    for name in path.relative_to(_confined.path).parts:
+        directory = directory.folder(name)
+    return directory
+
+
+def opened(path: Path) -> BinaryIO:
+    """A file of a data set, to be read.
+
+    Raises:
+        OSError: there is none, or where reading is `confined`, it is no regular file.
+    """
+    folder = _within(path.parent)
+    return path.open("rb") if folder is None else folder.open(path.name)
+
+
+def list_folder(path: Path) -> Folder:
+    """List a folder; where reading is `confined`, links to files are not among its files.
 
     Raises:
         DatasetMissingError: there is no such folder, or it cannot be read.
     """
+    within = _within(path)
     try:
-        with os.scandir(path) as entries:
+        with os.scandir(path) if within is None else within.entries() as entries:
+            links = within is None
             names = frozenset(e.name for e in entries if e.is_file(follow_symlinks=links))
     except OSError as error:
         raise DatasetMissingError(
@@ -135,10 +176,12 @@ def read_text(path: Path, most: int = MAX_TEXT_BYTES) -> str:
         DatasetFormatError: it cannot be read or has more than `most` bytes.
     """
     try:
-        size = path.stat().st_size
-        if size > most:
-            raise DatasetFormatError.instead(f"{path} has {size} bytes", size, most, path=str(path))
-        raw = path.read_bytes()
+        with opened(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            if size > most:
+                said = f"{path} has {size} bytes"
+                raise DatasetFormatError.instead(said, size, most, path=str(path))
+            raw = file.read()
     except OSError as error:
         raise DatasetFormatError(
             f"cannot read {path}: {error.strerror}", {"path": str(path)}
@@ -192,7 +235,8 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
     """
     import tifffile
 
-    with tifffile.TiffFile(path) as file:
+    # A file may name others as its images, wherever they are: only what is in it is read.
+    with opened(path) as raw, tifffile.TiffFile(raw, _multifile=False) as file:
         series = file.series[0]
         shape, kind, page = tuple(series.shape), series.dtype, file.pages[0]
         allowed = [np.dtype(k) for k in ("u2", "f4", "f8") if k[0] in kinds]
@@ -209,22 +253,24 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
         wanted = np.uint16 if kind.kind == "u" else np.float32
         packing = tifffile.COMPRESSION
         if page.compression in (packing.ADOBE_DEFLATE, packing.DEFLATE):
-            _check_inflation(path, page, size)
+            _check_inflation(path, raw, page, size)
         elif page.compression != packing.NONE:  # LZW and others, which tifffile leaves to a codec
             import cv2
 
-            image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            raw.seek(0)
+            image = cv2.imdecode(np.frombuffer(raw.read(), np.uint8), cv2.IMREAD_UNCHANGED)
             if image is None or image.shape != shape or image.dtype != kind.newbyteorder("="):
                 raise ValueError(f"its compression ({page.compression!r}) cannot be undone")
             return np.asarray(image, dtype=wanted)
         return np.asarray(series.asarray(), dtype=wanted)
 
 
-def _check_inflation(path: Path, page: Any, size: int) -> None:
+def _check_inflation(path: Path, raw: BinaryIO, page: Any, size: int) -> None:
     """Raise unless every strip inflates to no more than the image's `size` [bytes]."""
-    raw = path.read_bytes()
+    raw.seek(0)
+    content = raw.read()
     for start, length in zip(page.dataoffsets, page.databytecounts, strict=True):
-        inflated = zlib.decompressobj().decompress(raw[start : start + length], size + 1)
+        inflated = zlib.decompressobj().decompress(content[start : start + length], size + 1)
         if len(inflated) > size:
             raise DatasetFormatError(
                 f"{path} inflates to more than its {size} bytes of pixels", {"path": str(path)}

@@ -7,10 +7,7 @@ however that happens.
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
-from flexdt.server.files.atomic import writing
+from flexdt.server.files.directory import Directory
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 
 
@@ -20,33 +17,35 @@ class FolderLock:
     Without effect on Windows, where a directory cannot be opened.
 
     Args:
-        root: the data directory, which must exist.
+        root: the data directory.
 
     Raises:
-        DatasetWriteError: another process holds it, or the directory cannot be opened.
+        DatasetWriteError: another process holds it.
     """
 
-    def __init__(self, root: Path) -> None:
-        self._fd: int | None = None
+    def __init__(self, root: Directory) -> None:
+        self._root = root
         try:
-            import fcntl
-        except ImportError:  # Windows
-            return
-        with writing(root, f"cannot lock {root}"):
-            self._fd = os.open(root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._lock(exclusive=True)
         except BlockingIOError:
-            self.release()
             raise DatasetWriteError(
-                f"the data directory {root} is used by another twin server",
-                {"path": str(root), "allowed": "another --data"},
+                f"the data directory {root.path} is used by another twin server",
+                {"path": str(root.path), "allowed": "another --data"},
             ) from None
-        except OSError:  # a file system without locks
-            pass
 
     def release(self) -> None:
         """Release the lock."""
-        if self._fd is not None:
-            os.close(self._fd)
-            self._fd = None
+        self._lock(exclusive=False)
+
+    def _lock(self, *, exclusive: bool) -> None:
+        fd = self._root.fileno()
+        if fd is None:  # Windows
+            return
+        import fcntl
+
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB if exclusive else fcntl.LOCK_UN)
+        except BlockingIOError:
+            raise
+        except OSError:  # a file system without locks
+            pass

@@ -5,11 +5,11 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable
 from datetime import datetime
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.server.files.directory import Directory
 from flexdt.twin.dataset.file_names import plain_name
 
 
@@ -45,15 +45,15 @@ def tiff_bytes(image: npt.NDArray[np.uint16]) -> bytes:
     return b"".join((head, pixels, beside, struct.pack("<H", len(tags)), entries, bytes(4)))
 
 
-def free_name(root: Path, wish: str) -> str:
-    """`wish`, or `wish-2`, `wish-3`... whichever no folder in `root` has yet.
+def free_name(root: Directory, wish: str) -> str:
+    """`wish`, or `wish-2`, `wish-3`... whichever nothing in `root` has yet.
 
     Raises:
         DatasetNameError: `wish` is not plain.
     """
     plain_name(wish, "data set")
     candidates: Iterable[str] = (wish if n == 1 else f"{wish}-{n}" for n in range(1, 1_000_000))
-    return next(n for n in candidates if not (root / n).exists())
+    return next(n for n in candidates if root.stat(n) is None)
 
 
 def dated_name(moment: datetime, number: int = 1) -> str:

@@ -14,11 +14,10 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import TypeVar
 
 from flexdt.protocol.fields import MAX_STEM, encoded
-from flexdt.server.files.atomic import TEMPORARY, AtomicFolder, writing
+from flexdt.server.files.directory import BEFORE, Directory, writing
 from flexdt.server.runtime.log import log
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.errors import LimitError
@@ -26,8 +25,6 @@ from flexdt.twin.errors import LimitError
 T = TypeVar("T")
 ASIDE = ".unreadable"
 """Goes before the suffix of a file that is set aside; no name of ours has two dots."""
-BEFORE = ".before-"
-"""Begins the name under which what a change replaces is kept until the change has been made."""
 
 
 def file_stem(name: str) -> str:
@@ -45,45 +42,16 @@ def file_stem(name: str) -> str:
     return stem
 
 
-def used_bytes(root: Path) -> int:
+def used_bytes(root: Directory) -> int:
     """Bytes of all files in a directory and its folders; links are not followed."""
-    total, left = 0, [root]
-    while left:
-        with suppress(OSError), os.scandir(left.pop()) as entries:  # a job may rename meanwhile
-            for e in entries:
-                if e.is_dir(follow_symlinks=False):
-                    left.append(Path(e.path))
-                else:
-                    total += e.stat(follow_symlinks=False).st_size
+    total = 0
+    with suppress(OSError), root.entries() as entries:  # a job may rename meanwhile
+        for e in entries:
+            if e.is_dir(follow_symlinks=False):
+                total += used_bytes(root.folder(e.name))
+            else:
+                total += e.stat(follow_symlinks=False).st_size
     return total
-
-
-def make(folder: Path) -> None:
-    """Make a folder of ours if it is missing, safe when this returns.
-
-    Raises:
-        DatasetWriteError: the system refuses.
-    """
-    if folder.is_dir():
-        return
-    with writing(folder, f"cannot make {folder}"):
-        folder.mkdir(parents=True, exist_ok=True)
-    with AtomicFolder(folder.parent) as parent:
-        parent.sync()
-
-
-def put_file(folder: Path, name: str, data: bytes) -> None:
-    """Write `folder`/`name`, whole or not at all; the folder is made if missing.
-
-    It is safe when this returns: a power cut does not lose it.
-
-    Raises:
-        DatasetWriteError: the system refuses.
-    """
-    make(folder)
-    with AtomicFolder(folder) as files:
-        files.put(name, data)
-        files.sync()
 
 
 class Changes:
@@ -95,17 +63,17 @@ class Changes:
     """
 
     def __init__(self) -> None:
-        self._made: list[tuple[Path, Path | None, bytes]] = []
+        self._made: list[tuple[Directory, str, str | None, bytes]] = []
 
-    def put(self, folder: Path, name: str, data: bytes) -> None:
-        """Write a file, as `put_file`."""
-        file = folder / name
-        before = folder / f"{BEFORE}{os.getpid()}-{threading.get_native_id()}-{len(self._made)}"
-        self._made.append((file, before if _second_name(file, before) else None, data))
-        put_file(folder, name, data)
+    def put(self, folder: Directory, name: str, data: bytes) -> None:
+        """Write a file, as `Directory.keep`."""
+        before = f"{BEFORE}{os.getpid()}-{threading.get_native_id()}-{len(self._made)}"
+        kept = before if _second_name(folder, name, before) else None
+        self._made.append((folder, name, kept, data))
+        folder.keep(name, data)
 
-    def put_json(self, folder: Path, name: str, document: object) -> None:
-        """Write a JSON document, as `put_file`."""
+    def put_json(self, folder: Directory, name: str, document: object) -> None:
+        """Write a JSON document, as `put`."""
         data = json.dumps(document, indent=1, allow_nan=False).encode("utf-8")
         self.put(folder, name, data)
 
@@ -120,47 +88,46 @@ class Changes:
 
     def done(self) -> None:
         """Keep what was written."""
-        for _, before, _ in self._made:
+        for folder, _, before, _ in self._made:
             if before is not None:
                 with suppress(OSError):
-                    before.unlink()
+                    folder.unlink(before)
         self._made.clear()
 
     def undo(self) -> None:
         """Everything as it was, but for what others have written since; trouble is logged."""
-        for file, before, data in reversed(self._made):
+        for folder, name, before, data in reversed(self._made):
             try:
-                if file.read_bytes() != data:
+                if folder.read(name) != data:
                     continue
                 if before is None:
-                    file.unlink()
+                    folder.unlink(name)
                 else:
-                    os.replace(before, file)
-                with AtomicFolder(file.parent) as folder:
-                    folder.sync()
+                    folder.rename(before, name)
+                folder.sync()
             except FileNotFoundError:
                 continue
             except (OSError, DatasetWriteError) as error:
                 log("a change that was not made is still on the disk", logging.ERROR,
-                    file=str(file), reason=str(error))  # fmt: skip
+                    file=str(folder.path / name), reason=str(error))  # fmt: skip
         self.done()
 
 
-def _second_name(file: Path, name: Path) -> bool:
+def _second_name(folder: Directory, name: str, second: str) -> bool:
     """Give a file a second name; False where there is no file.
 
     Raises:
         DatasetWriteError: the system refuses.
     """
-    with writing(file, f"cannot write {file}"):
+    with writing(folder.path / name, f"cannot write {folder.path / name}"):
+        if folder.stat(name) is None:
+            return False
         with suppress(FileNotFoundError):
-            os.unlink(name)  # of a killed writer with the same numbers, as in a container
+            folder.unlink(second)  # of a killed writer with the same numbers, as in a container
         try:
-            os.link(file, name)
-        except OSError:
-            if not file.exists():
-                return False
-            put_file(name.parent, name.name, file.read_bytes())  # a file system without links
+            folder.link(name, second)
+        except OSError:  # a file system without links
+            folder.keep(second, folder.read(name))
     return True
 
 
@@ -175,45 +142,55 @@ def read_json(data: bytes) -> object:
     return document
 
 
-def read_or_set_aside(file: Path, read: Callable[[bytes], T], without: str) -> T | None:
+def read_or_set_aside(
+    folder: Directory, name: str, read: Callable[[bytes], T], without: str
+) -> T | None:
     """What `read` makes of one of our files; None where there is none.
 
     Args:
-        file: where it is.
+        folder, name: where it is; what is no regular file is damaged, too.
         read: takes its bytes; whatever it raises means damage.
         without: what the twin does without it, for the log.
     """
     try:
-        return read(file.read_bytes())
+        return read(folder.read(name))
     except FileNotFoundError:
         return None
     except Exception as error:  # a flipped bit may trip over anything
-        set_aside(file, error, without)
+        set_aside(folder, name, error, without)
         return None
 
 
-def set_aside(file: Path, error: object, without: str) -> None:
-    """Keep a damaged file under another name, and say so in one line."""
-    aside = file.with_name(f"{file.stem}{ASIDE}{file.suffix}")
+def set_aside(folder: Directory, name: str, error: object, without: str) -> None:
+    """Keep what is damaged, or another thing than it should be, under another name; log one line"""
+    file = folder.path / name
+    aside = f"{file.stem}{ASIDE}{file.suffix}"
     try:
-        file.replace(aside)
-        kept = aside.name
+        folder.rename(name, aside)
+        kept = aside
     except OSError as refused:
         kept = f"not set aside: {refused.strerror}"
     log(without, logging.ERROR, file=str(file), kept=kept, reason=str(error)[:500])
 
 
-def ours(folder: Path) -> list[Path]:
-    """The JSON documents in a folder, but for what was set aside."""
-    return [f for f in sorted(folder.glob("*.json")) if not f.stem.endswith(ASIDE)]
+def settle(root: Directory, folders: Sequence[str]) -> None:
+    """At the start: delete what killed writers left behind in a data directory and our folders.
+
+    What stands in the place of a folder of ours and is none, such as a link, is set aside.
+    """
+    for folder in (root, *map(root.folder, folders)):
+        folder.sweep()
+    for name in folders:
+        if root.stat(name) is not None and not root.is_directory(name):
+            set_aside(root, name, "it is no directory", "a folder of ours is begun anew")
 
 
-def sweep(folder: Path, left: Sequence[str] = (TEMPORARY, BEFORE)) -> None:
-    """Delete what killed writers left behind in a folder of ours: names that begin with `left`."""
-    for beginning in left:
-        for file in folder.glob(f"{beginning}*"):
-            with suppress(OSError):
-                file.unlink()
+def ours(folder: Directory) -> list[str]:
+    """Names of JSON documents in a folder, links among them, but for what was set aside."""
+    with suppress(FileNotFoundError), folder.entries() as entries:
+        names = sorted(e.name for e in entries if e.name.endswith(".json"))
+        return [n for n in names if not n.endswith(f"{ASIDE}.json")]
+    return []
 
 
 def _finite(text: str) -> float:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from flexdt.protocol.rpc_errors import Code
 from flexdt.protocol.state_model import JobPhase
+from flexdt.server.files.directory import Directory
 from flexdt.server.scans.runner import Produce, Progress, ScanRunner
 from flexdt.server.scans.twin_clock import SpeedUp
 from flexdt.server.storage.dataset_writer import DatasetWriter
@@ -77,12 +78,13 @@ class Job:
         return JobMemory(**known | {"folder": Path(self.folder).name})
 
 
-def recalled(memory: JobMemory, root: Path) -> Job:
+def recalled(memory: JobMemory, root: Directory) -> Job:
     """A job of the server before this one; one that was not ended is incomplete and says so."""
+    folder = root.folder(memory.folder)
     job = Job(
         memory.id,
         memory.name,
-        str(root / memory.folder),
+        str(folder.path),
         None,
         memory.frames_total,
         memory.duration_s,
@@ -94,12 +96,12 @@ def recalled(memory: JobMemory, root: Path) -> Job:
     )
     if job.phase in ENDED:
         return job
-    if _complete(root / memory.folder):  # it was killed between the last file and telling of it
+    if _complete(folder):  # it was killed between the last file and telling of it
         job.phase, job.error = "done", None
         job.last = Progress("done", memory.duration_s, memory.frames_total)
         return job
     was, job.phase = job.phase, "incomplete"
-    there = len(list((root / memory.folder).glob("*.tif")))
+    there = sum(name.endswith(".tif") for name in folder.names())
     job.error = {
         "code": int(Code.BUSY),
         "message": f"the server ended while this job was {was}; {there} images are on disk; "
@@ -109,9 +111,9 @@ def recalled(memory: JobMemory, root: Path) -> Job:
     return job
 
 
-def _complete(folder: Path) -> bool:
+def _complete(folder: Directory) -> bool:
     """Whether a data set lies there that says that it is complete."""
     try:
-        return parse_document((folder / DOCUMENT).read_text(encoding="utf-8")).complete
+        return parse_document(folder.read(DOCUMENT).decode()).complete
     except (OSError, ValueError, DatasetError):
         return False

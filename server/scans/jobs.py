@@ -18,6 +18,7 @@ from pathlib import Path
 
 from flexdt.protocol.rpc_errors import RpcError, busy
 from flexdt.protocol.state_model import JobPhase, JobStatus
+from flexdt.server.files.directory import Directory
 from flexdt.server.runtime.log import log, traced
 from flexdt.server.scans.job import ENDED, Job, JobInputs, Prepare, recalled
 from flexdt.server.scans.retry import Retry, transient
@@ -275,7 +276,7 @@ class Jobs:
         """All jobs for the next server, and how many were ever made."""
         return [job.memory() for job in self._all.values()], self._count
 
-    def recall(self, jobs: Sequence[JobMemory], made: int, root: Path) -> list[Job]:
+    def recall(self, jobs: Sequence[JobMemory], made: int, root: Directory) -> list[Job]:
         """Know the jobs of the server before this one; returns those that it left undone."""
         self._count = max(self._count, made)
         left = []

@@ -11,7 +11,7 @@ import asyncio
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from flexdt.server.files.atomic import free_bytes
+from flexdt.server.files.directory import free_bytes
 from flexdt.server.wire_errors import ProjectorUnavailable
 from flexdt.twin.dataset.dataset_errors import DiskFullError
 from flexdt.twin.errors import GeometryError, LimitError, TwinError

@@ -12,11 +12,11 @@ import base64
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Annotated, Any, Final
 
 from pydantic import Field, TypeAdapter
 
+from flexdt.server.files.directory import Directory
 from flexdt.server.files.own_documents import Changes, file_stem, read_json, read_or_set_aside
 from flexdt.server.imaging.radiography import Physics
 from flexdt.server.scans.twin_clock import SpeedUp, check_speed_up
@@ -122,7 +122,7 @@ class Sidecar:
     speed_up: SpeedUp | None = None
     operator: str = ""
 
-    def write(self, root: Path, name: str) -> None:
+    def write(self, root: Directory, name: str) -> None:
         """Keep it for the data set `name`.
 
         Raises:
@@ -131,7 +131,7 @@ class Sidecar:
         with Changes() as changes:
             self.keep(changes, root, name)
 
-    def keep(self, changes: Changes, root: Path, name: str) -> None:
+    def keep(self, changes: Changes, root: Directory, name: str) -> None:
         """As `write`, among other changes."""
         wish = self.wish
         document = {
@@ -145,20 +145,20 @@ class Sidecar:
             "speed_up": self.speed_up,
             "operator": self.operator,
         }
-        changes.put_json(root / FOLDER, f"{file_stem(name)}.json", document)
+        changes.put_json(root.folder(FOLDER), f"{file_stem(name)}.json", document)
 
     @classmethod
-    def read(cls, root: Path, name: str) -> Sidecar:
+    def read(cls, root: Directory, name: str) -> Sidecar:
         """The one of the data set `name`; one that is damaged is set aside.
 
         Raises:
             FileNotFoundError: there is none, or none any more.
         """
-        file = root / FOLDER / f"{file_stem(name)}.json"
+        file = f"{file_stem(name)}.json"
         without = "what a scan started from cannot be read; it cannot be resumed"
-        found = read_or_set_aside(file, cls._of, without)
+        found = read_or_set_aside(root.folder(FOLDER), file, cls._of, without)
         if found is None:
-            raise FileNotFoundError(f"{file.name} is not there, or was damaged")
+            raise FileNotFoundError(f"{file} is not there, or was damaged")
         return found
 
     @classmethod

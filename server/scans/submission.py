@@ -11,14 +11,14 @@ from __future__ import annotations
 import asyncio
 import itertools
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from pathlib import Path
 
 from flexdt.protocol import Codec
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.rpc_errors import RpcError, invalid_params
-from flexdt.server.files.atomic import free_bytes
+from flexdt.server.files.directory import Directory, free_bytes
 from flexdt.server.files.image_files import dated_name
 from flexdt.server.files.own_documents import used_bytes
 from flexdt.server.imaging.radiography import Radiography
@@ -64,7 +64,7 @@ class Submissions:
     jobs: Jobs
     radiography: Radiography
     stage: Stage
-    root: Path
+    root: Directory
     keeper: Keeper
     now: Callable[[], datetime]
     shown: Shown
@@ -116,7 +116,7 @@ class Submissions:
         chosen = name if name is not None else self._free_name()
         sidecar = Sidecar(wish, begin, speed_up, operator)
         plan, prepare, warnings = await self._ready(sidecar, chosen, resumed is not None, still)
-        folder = str(self.root / chosen)
+        folder = str(self.root.path / chosen)
         return await self._queued(
             sidecar, chosen, still,
             lambda: self.jobs.draft(chosen, folder, plan, prepare, speed_up, warnings),
@@ -135,7 +135,7 @@ class Submissions:
             sidecar = await asyncio.to_thread(Sidecar.read, self.root, name)
         except (OSError, KeyError, TypeError, ValueError) as error:
             raise taken(name, f"what it started from is not known any more ({error})") from None
-        begun = (self.root / name).exists()
+        begun = self.root.stat(name) is not None
         if begun:
             begin = self._resumable(name, sidecar.wish)
             assert begin is not None
@@ -182,7 +182,7 @@ class Submissions:
         await asyncio.to_thread(self._require_room, checked.plan.bytes, name)
         warnings = list(checked.warnings)
         if resume:
-            there = len(list((self.root / name).glob("*.tif")))
+            there = sum(n.endswith(".tif") for n in self.root.folder(name).names())
             warnings.insert(0, f"taking up the data set {name}, of which {there} images exist")
             shown, stands = asked.begin.sample, self.scanner.sample
             if shown != stands:
@@ -270,20 +270,21 @@ class Submissions:
         plain_name(name, "data set")
         if name in RESERVED:
             raise taken(name, "it is reserved")
-        folder = self.root / name
-        if self.jobs.uses(str(folder)):
+        folder = self.root.folder(name)
+        if self.jobs.uses(str(folder.path)):
             raise taken(name, "a job is writing it")
-        if not folder.exists():
+        if self.root.stat(name) is None:
             return None
         try:
-            if folder.is_symlink() or not folder.is_dir():
+            if not self.root.is_directory(name):
                 raise ValueError("it is no folder")
             kept = Sidecar.read(self.root, name)
-            there = {file.name for file in folder.iterdir() if not file.name.startswith(".")}
+            with folder.entries() as entries:
+                there = {e.name for e in entries if not e.name.startswith(".")}
             # A server killed while it made the folder leaves no document, and no image either.
             complete = False
             if DOCUMENT in there or there - {SCRIPT, SCAN_SETTINGS, XRE_SETTINGS}:
-                document = parse_document((folder / DOCUMENT).read_text(encoding="utf-8"))
+                document = parse_document(folder.read(DOCUMENT).decode())
                 complete = document.complete
         except FileNotFoundError:
             raise taken(name, "there is something that no scan of this twin has begun") from None
@@ -303,23 +304,22 @@ class Submissions:
         """As the scanner names its scans: date and number."""
         used = {job.name for job in self.jobs.all()}
         names = (dated_name(self.now(), n) for n in itertools.count(1))
-        return next(n for n in names if n not in used and not (self.root / n).exists())
+        return next(n for n in names if n not in used and self.root.stat(n) is None)
 
     def _require_room(self, size: int, name: str) -> None:
         """Refuse a scan that the disk cannot hold."""
-        self.root.mkdir(parents=True, exist_ok=True)
-        need, free = size + RESERVE_BYTES, free_bytes(self.root)
-        folder = self.root / name
-        if folder.is_dir():
-            need -= sum(f.stat().st_size for f in folder.glob("*.tif"))
+        need, free = size + RESERVE_BYTES, free_bytes(self.root.path)
+        with suppress(FileNotFoundError), self.root.folder(name).entries() as entries:
+            images = (e.stat(follow_symlinks=False) for e in entries if e.name.endswith(".tif"))
+            need -= sum(about.st_size for about in images)
         if self.quota is not None:
             left = max(0, self.quota - used_bytes(self.root))
             free = left if free is None else min(free, left)
         if free is not None and free < need:
             raise DiskFullError(
                 f"{name} needs {need / 1e6:.1f} MB, of which {RESERVE_BYTES / 1e6:.1f} MB are to "
-                f"stay free; {free / 1e6:.1f} MB are free in {self.root}",
-                {"asked": need, "allowed": free, "path": str(self.root)},
+                f"stay free; {free / 1e6:.1f} MB are free in {self.root.path}",
+                {"asked": need, "allowed": free, "path": str(self.root.path)},
             )
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
@@ -19,13 +18,13 @@ from pydantic import Field
 from flexdt.protocol.fields import ShortText
 from flexdt.protocol.rpc_errors import invalid_params
 from flexdt.protocol.scene_document import CorrectionPart
+from flexdt.server.files.directory import Directory
 from flexdt.server.files.own_documents import (
     Changes,
     file_stem,
     ours,
     read_json,
     read_or_set_aside,
-    sweep,
 )
 from flexdt.server.storage.scene import correction_fields, correction_of
 from flexdt.twin.errors import UnknownNameError
@@ -53,13 +52,13 @@ class Corrections:
         history: names in the order in which they were put in force.
     """
 
-    def __init__(self, folder: Path, history: Sequence[str | None] = ()) -> None:
+    def __init__(self, folder: Directory, history: Sequence[str | None] = ()) -> None:
         self._folder = folder
         self._all: dict[str, Correction] = {}
         self._sources: dict[str, str | None] = {}
-        sweep(folder)
         for file in ours(folder):
-            found = read_or_set_aside(file, _read, "a correction cannot be read; without it")
+            without = "a correction cannot be read; without it"
+            found = read_or_set_aside(folder, file, _read, without)
             if found is not None:
                 self.know(*found)
         known = list(history)

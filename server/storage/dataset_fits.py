@@ -6,7 +6,6 @@ and memory; one runs at a time, and it ends when nobody waits for it any more.
 
 from __future__ import annotations
 
-import os
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
@@ -15,6 +14,8 @@ from flexdt.phantoms import is_shipped, load_phantom, load_phantom_file
 from flexdt.protocol import params as p
 from flexdt.protocol import results as r
 from flexdt.protocol.method_table import FIT_LIMITS
+from flexdt.server.files.dataset_folder import read_text
+from flexdt.server.files.directory import Directory
 from flexdt.server.wire_errors import from_root
 from flexdt.twin.calibration.fit.covariance_steps import covariance_by_step
 from flexdt.twin.calibration.unknown_markers import UNKNOWN
@@ -26,7 +27,7 @@ MEMORY_BYTES: Final = int(FIT_LIMITS["memory_bytes"])
 FILES: Final = (".toml", ".json")
 
 
-def fit(root: Path, asked: p.CalibrationFit, *_: object) -> r.CalibrationFitResult:
+def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> r.CalibrationFitResult:
     """Calibrate; blocks.
 
     Raises:
@@ -34,14 +35,14 @@ def fit(root: Path, asked: p.CalibrationFit, *_: object) -> r.CalibrationFitResu
     """
     phantom: Any = asked.phantom
     if not is_shipped(phantom) and Path(phantom).suffix in FILES:
-        phantom = load_phantom_file(str(_there(root, phantom, "phantom")))
+        phantom = load_phantom_file(_text(root, phantom), phantom)
     elif phantom != UNKNOWN and not is_shipped(phantom):
         load_phantom(phantom)  # says which there are
     marks = None
     if asked.markers is not None:
         marks = [(m.frame, m.marker, m.column, m.row, m.sigma) for m in asked.markers]
     found = _face().calibrate(
-        [_there(root, name, "data set") for name in asked.datasets], phantom,
+        [_there(root, name) for name in asked.datasets], phantom,
         free=asked.free, priors=asked.priors, per_frame=asked.per_frame,
         markers=marks, scale=asked.scale,
     )  # fmt: skip
@@ -60,20 +61,26 @@ def fit(root: Path, asked: p.CalibrationFit, *_: object) -> r.CalibrationFitResu
         ]
     if asked.tracks:
         told["tracks"] = import_module("flexdt.clients.calibration.tracks").tracks_document(found)
-    return r.CalibrationFitResult.model_validate(from_root(told, root))
+    return r.CalibrationFitResult.model_validate(from_root(told, root.path))
 
 
-def align(root: Path, asked: p.CalibrationAlign, *_: object) -> r.CalibrationAlignResult:
+def align(root: Directory, asked: p.CalibrationAlign, *_: object) -> r.CalibrationAlignResult:
     """Align; blocks. Raises as `fit`."""
-    found = _face().align(_there(root, asked.name, "data set"), per_frame=asked.per_frame)
-    return r.CalibrationAlignResult.model_validate(from_root(found.document, root))
+    found = _face().align(_there(root, asked.name), per_frame=asked.per_frame)
+    return r.CalibrationAlignResult.model_validate(from_root(found.document, root.path))
 
 
-def _there(root: Path, name: str, what: str) -> Path:
-    path = root / plain_name(name, what)
-    if os.path.islink(path) or not path.exists():
-        raise DatasetMissingError(f"no {what} {name!r} in the data directory", {"asked": name})
-    return path
+def _there(root: Directory, name: str) -> Path:
+    if not root.is_directory(plain_name(name, "data set")):
+        raise DatasetMissingError(f"no data set {name!r} in the data directory", {"asked": name})
+    return root.path / name
+
+
+def _text(root: Directory, name: str) -> str:
+    """Of a phantom file, which names no files of its own."""
+    if plain_name(name, "phantom") not in root.names():
+        raise DatasetMissingError(f"no phantom {name!r} in the data directory", {"asked": name})
+    return read_text(root.path / name)
 
 
 def _face() -> Any:

@@ -8,17 +8,17 @@ than the scan's, and finishing while an image is missing are errors.
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Collection
 from dataclasses import replace
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import tifffile
 
-from flexdt.server.files.atomic import AtomicFolder, Write, free_bytes, make_folder, write_some
+from flexdt.server.files.directory import Directory, Write, free_bytes, write_some
 from flexdt.server.files.image_files import tiff_bytes
 from flexdt.twin.dataset.dataset_errors import (
     DatasetError,
@@ -47,7 +47,7 @@ class DatasetWriter:
         record: the scan about to run; its name names the folder.
         script: the script byte for byte, or None.
         resume: go on with a folder that holds the same scan; without it such a folder is an error.
-        sync, write: see `AtomicFolder`.
+        sync, write: see `Directory`.
 
     Raises:
         DatasetNameError: the record's name or a file's is not plain.
@@ -58,7 +58,7 @@ class DatasetWriter:
 
     def __init__(
         self,
-        root: Path,
+        root: Directory,
         record: ScanRecord,
         *,
         script: bytes | None = None,
@@ -69,10 +69,12 @@ class DatasetWriter:
         for file in record.files:
             plain_name(file)
         self.record = replace(record, complete=False, reason=record.reason or INTERRUPTED)
-        self.folder = make_folder(root, record.name)
+        self._files = root.folder(plain_name(record.name, "data set"), sync=sync, write=write)
+        self._files.make()
+        self._files.held()
+        self.folder = self._files.path
         self._lock = threading.Lock()
         self._shapes = {file: block.camera.shape for block in record.blocks for file in block.files}
-        self._files = AtomicFolder(self.folder, sync=sync, write=write)
         try:
             self._present = self._begin(resume)
             self._check_room()
@@ -159,12 +161,26 @@ class DatasetWriter:
             self._check_same()
         self._files.sweep()
         found = there & set(self.record.files)
-        return {name for name in found if _whole(self.folder / name, self._shapes[name])}
+        return {name for name in found if self._whole(name)}
+
+    def _whole(self, name: str) -> bool:
+        """Whether the file holds an image of the right format (only its header is read)."""
+        try:
+            with self._files.open(name) as file, tifffile.TiffFile(file) as tiff:
+                page = tiff.pages[0]
+                ends = zip(page.dataoffsets, page.databytecounts, strict=True)
+                return (
+                    tuple(page.shape) == self._shapes[name]
+                    and page.dtype == np.uint16
+                    and os.fstat(file.fileno()).st_size >= max((o + n for o, n in ends), default=0)
+                )
+        except (OSError, tifffile.TiffFileError, IndexError, ValueError):
+            return False
 
     def _check_same(self) -> None:
         path = self.folder / DOCUMENT
         try:
-            found = parse_document(path.read_text(encoding="utf-8"), str(path))
+            found = parse_document(self._files.read(DOCUMENT).decode(), str(path))
         except (DatasetError, OSError, UnicodeDecodeError) as error:
             raise DatasetExistsError(
                 f"{path} cannot be read, so the scan cannot be resumed: {error}",
@@ -215,21 +231,3 @@ def summary(names: Collection[str]) -> str:
     first = list(names)[:5]
     more = len(names) - len(first)
     return ", ".join(first) + (f" and {more} more" if more else "")
-
-
-def _whole(path: Path, shape: tuple[int, int]) -> bool:
-    """Whether the file holds an image of the right format (only its header is read)."""
-    try:
-        with tifffile.TiffFile(path) as tiff:
-            page = tiff.pages[0]
-            end = max(
-                (o + n for o, n in zip(page.dataoffsets, page.databytecounts, strict=True)),
-                default=0,
-            )
-            return (
-                tuple(page.shape) == shape
-                and page.dtype == np.uint16
-                and path.stat().st_size >= end
-            )
-    except (OSError, tifffile.TiffFileError, IndexError, ValueError):
-        return False

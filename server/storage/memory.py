@@ -16,7 +16,6 @@ import logging
 import threading
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
 from annotated_types import Ge, Le
@@ -26,7 +25,8 @@ from flexdt.protocol.fields import SpeedUp
 from flexdt.protocol.rpc_errors import RpcError
 from flexdt.protocol.scene_document import Scene
 from flexdt.protocol.state_model import JobPhase
-from flexdt.server.files.own_documents import Changes, put_file, read_json, read_or_set_aside
+from flexdt.server.files.directory import Directory
+from flexdt.server.files.own_documents import Changes, read_json, read_or_set_aside
 from flexdt.server.runtime.log import log
 from flexdt.server.storage.scene import apply_settings, require_fit, sample_of, save_scene
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetWriteError
@@ -132,10 +132,11 @@ def with_job(memory: Memory, job: JobMemory) -> Memory:
     return memory.model_copy(update={"jobs": list(jobs.values()), "jobs_made": made})
 
 
-def read_memory(root: Path) -> Memory | None:
+def read_memory(root: Directory) -> Memory | None:
     """What was remembered in data directory `root`; None where there is nothing to read."""
     return read_or_set_aside(
-        root / FILE,
+        root,
+        FILE,
         lambda data: Memory.model_validate(read_json(data)),
         "the last state cannot be read; starting anew",
     )
@@ -176,7 +177,7 @@ class Keeper:
         make: makes the document.
     """
 
-    def __init__(self, root: Path, make: Callable[[bool], Memory]) -> None:
+    def __init__(self, root: Directory, make: Callable[[bool], Memory]) -> None:
         self._root, self._make = root, make
         self._changed = asyncio.Event()
         self._writing = asyncio.Lock()
@@ -264,7 +265,7 @@ class Keeper:
             if self._ended and not memory.ended:
                 return
             self._ended = memory.ended
-            put_file(self._root, FILE, memory.model_dump_json(by_alias=True).encode("utf-8"))
+            self._root.keep(FILE, memory.model_dump_json(by_alias=True).encode("utf-8"))
 
     def _put_all(
         self, changes: Changes, document: Memory | None, files: Callable[[Changes], None] | None

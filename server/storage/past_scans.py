@@ -29,11 +29,14 @@ from flexdt.protocol.messages import Encoded
 from flexdt.protocol.rpc_errors import too_large
 from flexdt.server.files.dataset_folder import (
     Folder,
+    confined,
     list_folder,
     mean_image,
+    opened,
     read_image,
     read_text,
 )
+from flexdt.server.files.directory import Directory
 from flexdt.server.runtime.workers import Workers
 from flexdt.server.storage import dataset_fits
 from flexdt.server.wire_errors import from_root
@@ -116,7 +119,9 @@ class PastScans:
 def work(root: Path, asked: Params, around: Around, codec: Codec) -> list[bytes]:
     """In the worker: the encoded answer."""
     try:
-        result = _ANSWERS[type(asked)](root, asked, around, codec)
+        directory = Directory(root)
+        with directory, confined(directory):
+            result = _ANSWERS[type(asked)](directory, asked, around, codec)
     except OSError as error:  # it has gone meanwhile, or the disk fails
         name = getattr(asked, "name", "the data directory")
         raise DatasetMissingError(f"{name} cannot be read: {error.strerror}") from None
@@ -195,21 +200,13 @@ class _Scan:
         return (said.kV, said.power_W) if said else (None, None)
 
 
-def _place(root: Path, name: str) -> tuple[Path, tuple[object, ...]]:
+def _place(root: Directory, name: str) -> tuple[Path, tuple[object, ...]]:
     """A data set's folder, and a key that changes with its files and its document."""
-    path = root / plain_name(name, "data set")
-    about = _about(path)
+    about = root.stat(plain_name(name, "data set"))
     if about is None or not stat.S_ISDIR(about.st_mode):
         raise DatasetMissingError(f"no data set {name!r} in the data directory", {"asked": name})
-    parts = [s for s in (about, _about(path / DOCUMENT)) if s is not None]
-    return path, (name, *((s.st_ino, s.st_mtime_ns, s.st_size) for s in parts))
-
-
-def _about(path: Path) -> os.stat_result | None:
-    try:
-        return path.lstat()
-    except OSError:
-        return None
+    parts = [s for s in (about, root.folder(name).stat(DOCUMENT)) if s is not None]
+    return root.path / name, (name, *((s.st_ino, s.st_mtime_ns, s.st_size) for s in parts))
 
 
 def _document(folder: Folder, most: int) -> DatasetDocument:
@@ -250,7 +247,7 @@ def _scan(folder: Folder, most: int) -> _Scan:
 
 def _texts(folder: Folder) -> Any:
     """What the scanner's own texts say of a folder without a document; None for nothing."""
-    if folder.document or list_folder(folder.path).names != folder.names:  # links are not followed
+    if folder.document:
         return None
     try:
         return import_module("flexdt").open(folder.path)
@@ -258,10 +255,10 @@ def _texts(folder: Folder) -> Any:
         return None
 
 
-def _opened(root: Path, name: str) -> _Scan:
+def _opened(root: Directory, name: str) -> _Scan:
     """A data set; kept."""
     path, key = _place(root, name)
-    found: _Scan = _DOCUMENTS.get(key, lambda: _scan(list_folder(path, links=False), MAX_DOCUMENT))
+    found: _Scan = _DOCUMENTS.get(key, lambda: _scan(list_folder(path), MAX_DOCUMENT))
     return found
 
 
@@ -314,9 +311,11 @@ def _info(path: Path, modified: float, scan: _Scan) -> r.DatasetInfo:
 # dataset.list -------------------------------------------------------------------------------------
 
 
-def _list(root: Path, asked: p.DatasetList, around: Around, codec: Codec) -> r.DatasetListResult:
+def _list(
+    root: Directory, asked: p.DatasetList, around: Around, codec: Codec
+) -> r.DatasetListResult:
     folders, left_out = [], 0
-    with os.scandir(root) as entries:
+    with root.entries() as entries:
         for entry in entries:
             try:
                 if entry.is_dir(follow_symlinks=False) and not entry.name.startswith("."):
@@ -358,7 +357,7 @@ def _list(root: Path, asked: p.DatasetList, around: Around, codec: Codec) -> r.D
 
 def _listed(path: Path, modified: float) -> r.DatasetInfo | str:
     """A data set in a few words; "" for a folder that holds none."""
-    folder = list_folder(path, links=False)
+    folder = list_folder(path)
     if folder.document is None and not folder.projections:
         return ""
     try:
@@ -369,9 +368,9 @@ def _listed(path: Path, modified: float) -> r.DatasetInfo | str:
     return _info(path, modified, scan)
 
 
-def _with_thumbnail(root: Path, info: r.DatasetInfo, side: int, until: float) -> r.DatasetInfo:
+def _with_thumbnail(root: Directory, info: r.DatasetInfo, side: int, until: float) -> r.DatasetInfo:
     def make() -> ImageValue | str:
-        folder = list_folder(path, links=False)
+        folder = list_folder(path)
         files = list(folder.projections.values())
         if not files:
             return ""
@@ -399,10 +398,11 @@ def _with_thumbnail(root: Path, info: r.DatasetInfo, side: int, until: float) ->
 # dataset.get --------------------------------------------------------------------------------------
 
 
-def _get(root: Path, asked: p.DatasetGet, around: Around, codec: Codec) -> r.DatasetResult:
+def _get(root: Directory, asked: p.DatasetGet, around: Around, codec: Codec) -> r.DatasetResult:
     scan = _opened(root, asked.name)
     folder, document, images = scan.folder, scan.document, scan.images
-    info = _info(folder.path, folder.path.stat().st_mtime, scan)
+    about = root.stat(asked.name)
+    info = _info(folder.path, 0.0 if about is None else about.st_mtime, scan)
     if asked.name == around.running:
         info = info.model_copy(update={"state": "running", "reason": ""})
     last = len(images) - 1
@@ -445,10 +445,10 @@ def _same(scan: _Scan, around: Around) -> bool:
 def _script(folder: Folder) -> str:
     if SCRIPT not in folder.names:
         raise DatasetMissingError(f"{folder.path.name}: no script lies with this data set")
-    path = folder.path / SCRIPT
-    if (size := path.stat().st_size) > MAX_SCRIPT:
-        raise too_large("the script of a data set", size, MAX_SCRIPT)
-    return path.read_bytes().decode("utf-8", "replace")
+    with opened(folder.path / SCRIPT) as file:
+        if (size := os.fstat(file.fileno()).st_size) > MAX_SCRIPT:
+            raise too_large("the script of a data set", size, MAX_SCRIPT)
+        return file.read().decode("utf-8", "replace")
 
 
 def _measured(
@@ -497,7 +497,9 @@ def _clearances(
 # dataset.frame ------------------------------------------------------------------------------------
 
 
-def _frame(root: Path, asked: p.DatasetFrame, around: Around, codec: Codec) -> r.DatasetFrameResult:
+def _frame(
+    root: Directory, asked: p.DatasetFrame, around: Around, codec: Codec
+) -> r.DatasetFrameResult:
     scan = _opened(root, asked.name)
     folder, document, images = scan.folder, scan.document, scan.images
     if asked.index >= len(images):
@@ -549,7 +551,7 @@ def _there(folder: Folder, file: str) -> str:
 
 
 def _normal(
-    root: Path, name: str, folder: Folder, images: _Images, shape: tuple[int, ...]
+    root: Directory, name: str, folder: Folder, images: _Images, shape: tuple[int, ...]
 ) -> LineIntegrals:
     def make() -> LineIntegrals:
         dark, flat = (

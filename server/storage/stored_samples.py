@@ -9,13 +9,13 @@ no name can leave that folder. An upload whose files are damaged is set aside.
 from __future__ import annotations
 
 import asyncio
+import fnmatch
 import hashlib
 import math
 import threading
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -30,7 +30,7 @@ from flexdt.phantoms import (
 )
 from flexdt.phantoms import material as material_of
 from flexdt.protocol.rpc_errors import too_large
-from flexdt.server.files.atomic import TEMPORARY
+from flexdt.server.files.directory import TEMPORARY, Directory
 from flexdt.server.files.own_documents import (
     ASIDE,
     Changes,
@@ -39,7 +39,6 @@ from flexdt.server.files.own_documents import (
     read_json,
     read_or_set_aside,
     set_aside,
-    sweep,
 )
 from flexdt.server.storage.mesh_reading import mesh_apart, scene_apart
 from flexdt.server.storage.unfinished_uploads import Incoming, UploadHead
@@ -109,14 +108,15 @@ class SampleStore:
         limit: largest upload [bytes].
     """
 
-    def __init__(self, folder: Path, limit: int = MAX_UPLOAD_BYTES) -> None:
+    def __init__(self, folder: Directory, limit: int = MAX_UPLOAD_BYTES) -> None:
         self._folder, self._limit = folder, limit
         self._incoming: Incoming = Incoming(folder, 2 * limit)
         self._heads: dict[str, UploadHead] = {}
         self._stored: dict[str, str] = {}
         """Revisions of uploads as their files say; those of older servers say nothing."""
         for file in ours(folder):
-            head = read_or_set_aside(file, _head_of(file), "an upload cannot be read; without it")
+            without = "an upload cannot be read; without it"
+            head = read_or_set_aside(folder, file, _head_of(file), without)
             if head is not None and head.name != EMPTY and not is_shipped(head.name):
                 self._heads[head.name] = head
                 if head.revision is not None:
@@ -244,15 +244,15 @@ class SampleStore:
 
     def tidy(self) -> None:
         """Delete bytes that no upload has any more, and what killed writers left behind."""
-        sweep(self._folder, [TEMPORARY])  # what a change replaces may be needed yet
+        self._folder.sweep([TEMPORARY])  # what a change replaces may be needed yet
         with self._lock:
             known = {_bytes_file(name, self._stored.get(name)) for name in self._heads}
-        for file in self._folder.glob(f"*.{'?' * 16}.bin"):
-            stem = file.name.split(".")[0]
-            damaged = (self._folder / f"{stem}{ASIDE}.json").exists()
-            if file.name not in known and not damaged:
+        there = self._folder.names()
+        for file in fnmatch.filter(there, f"*.{'?' * 16}.bin"):
+            damaged = f"{file.split('.')[0]}{ASIDE}.json" in there
+            if file not in known and not damaged:
                 with suppress(OSError):
-                    file.unlink()
+                    self._folder.unlink(file)
 
     def _load(
         self, head: UploadHead | None, name: str, material: str | None
@@ -277,9 +277,9 @@ class SampleStore:
         """The bytes of an upload; a damaged one is set aside and raises."""
         with self._lock:
             stored = self._stored.get(head.name)
-        file = self._folder / _bytes_file(head.name, stored)
+        file = _bytes_file(head.name, stored)
         try:
-            raw = file.read_bytes()
+            raw = self._folder.read(file)
             if len(raw) != head.total:
                 raise ValueError(f"{len(raw)} bytes, not {head.total}")
             if stored is not None and _revision(head, raw) != stored:
@@ -288,9 +288,10 @@ class SampleStore:
             with self._lock:
                 if self._heads.get(head.name) is head:  # else another has come under this name
                     del self._heads[head.name]
-                    for damaged in (file, self._folder / f"{file_stem(head.name)}.json"):
-                        if damaged.exists():
-                            set_aside(damaged, error, "an upload cannot be read; without it")
+                    for damaged in (file, f"{file_stem(head.name)}.json"):
+                        if self._folder.stat(damaged) is not None:
+                            without = "an upload cannot be read; without it"
+                            set_aside(self._folder, damaged, error, without)
             raise PhantomError(f"the upload {head.name!r} cannot be read: {error}") from None
         return raw
 
@@ -329,16 +330,16 @@ def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
 
 
 def _bytes_file(name: str, revision: str | None) -> str:
-    """The path of an upload's bytes; earlier servers kept one file for each name."""
+    """The file of an upload's bytes; earlier servers kept one file for each name."""
     return f"{file_stem(name)}.bin" if revision is None else f"{file_stem(name)}.{revision}.bin"
 
 
-def _head_of(file: Path) -> Callable[[bytes], UploadHead]:
+def _head_of(file: str) -> Callable[[bytes], UploadHead]:
     """Reads what lies beside an upload, as if it was uploaded now."""
 
     def read(data: bytes) -> UploadHead:
         head = UploadHead.model_validate(read_json(data))
-        if file.stem != file_stem(head.name):
+        if file != f"{file_stem(head.name)}.json":
             raise ValueError(f"it is about {head.name!r}")
         return head
 

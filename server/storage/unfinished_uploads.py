@@ -8,12 +8,10 @@ have no name, so a killed server leaves none behind.
 from __future__ import annotations
 
 import logging
-import tempfile
 import threading
 from collections import deque
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, BinaryIO, Literal
 
 from pydantic import Field, StringConstraints
@@ -21,8 +19,7 @@ from pydantic import Field, StringConstraints
 from flexdt.phantoms.files.mesh_files import default_unit
 from flexdt.protocol.fields import Payload
 from flexdt.protocol.params import LengthUnit, SampleUpload
-from flexdt.server.files.atomic import writing
-from flexdt.server.files.own_documents import make
+from flexdt.server.files.directory import Directory, writing
 from flexdt.server.runtime.log import log
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.errors import LimitError
@@ -68,7 +65,7 @@ class Incoming:
         limit: bytes of all of them together; more than the largest upload.
     """
 
-    def __init__(self, folder: Path, limit: int) -> None:
+    def __init__(self, folder: Directory, limit: int) -> None:
         self._folder, self._limit = folder, limit
         self._open: dict[str, _Open] = {}
         self._dropped: deque[str] = deque(maxlen=TOLD)
@@ -125,9 +122,9 @@ class Incoming:
         self._close(head.name)
         while len(self._open) >= MOST:
             self._drop()
-        make(self._folder)
+        self._folder.make()
         with self._writing():
-            file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115
+            file = self._folder.nameless()
         self._open[head.name] = made = _Open(head, file)
         if head.name in self._dropped:
             self._dropped.remove(head.name)
@@ -165,4 +162,5 @@ class Incoming:
         )
 
     def _writing(self) -> AbstractContextManager[None]:
-        return writing(self._folder, f"the upload cannot be kept in {self._folder}")
+        path = self._folder.path
+        return writing(path, f"the upload cannot be kept in {path}")

@@ -16,11 +16,11 @@ from collections.abc import Callable, Collection, Coroutine, Mapping
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any, Literal
 
 from flexdt.protocol import state_model as w
-from flexdt.server.files.own_documents import sweep
+from flexdt.server.files.directory import Directory
+from flexdt.server.files.own_documents import settle
 from flexdt.server.imaging.exposure_prediction import predictors
 from flexdt.server.imaging.projections import Imaging, Projector
 from flexdt.server.imaging.radiography import Physics, Radiography, with_spectra
@@ -29,9 +29,8 @@ from flexdt.server.runtime.access import TwinLimits
 from flexdt.server.runtime.log import LEVELS, log
 from flexdt.server.scans.job import Job
 from flexdt.server.scans.jobs import Jobs, fresh_seed
-from flexdt.server.scans.scan_record import FOLDER
 from flexdt.server.scans.stage import Stage
-from flexdt.server.scans.submission import Submissions
+from flexdt.server.scans.submission import RESERVED, Submissions
 from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
 from flexdt.server.storage.corrections import Corrections
 from flexdt.server.storage.memory import Keeper, Memory, read_memory, remember, restore
@@ -86,7 +85,7 @@ class TwinServer:
         machine: Machine,
         profile: Profile,
         projector: Projector,
-        root: Path,
+        root: Directory,
         *,
         truth: TrueGeometry | None = None,
         speed_up: SpeedUp = 1.0,
@@ -100,7 +99,8 @@ class TwinServer:
         self.limits = TwinLimits() if limits is None else limits
         self.version = version("flexdt")
         machine = with_spectra(machine, physics)
-        self.machine, self.profile, self.root = machine, profile, root
+        self.machine, self.profile = machine, profile
+        self.directory, self.root = root, root.path
         self.clock = TwinClock(speed_up, wall)
         self.scanner = ScannerTwin(
             machine, profile, self.clock.now(), last_stop=secrets.randbits(48)
@@ -109,16 +109,15 @@ class TwinServer:
             self.clock.now, {"log": LOG_KEPT}, self.limits.max_subscriptions, self.limits.max_views
         )
         self.control = Control(self.limits.control_idle_s, wall)
-        self.samples = SampleStore(root / "samples", self.limits.max_upload)
+        settle(root, RESERVED)
+        self.samples = SampleStore(root.folder("samples"), self.limits.max_upload)
         self.samples.standing = lambda: (self.scanner.sample.name, self.scanner.sample.material)
         self.shapes = Shapes()
-        self.past_scans = PastScans(root, machine, profile)
+        self.past_scans = PastScans(self.root, machine, profile)
         self.predictors = predictors()
-        for folder in (root, root / FOLDER, root / "samples"):
-            sweep(folder)
         self.remembered = read_memory(root)
         known = [] if self.remembered is None else self.remembered.corrections
-        self.corrections = Corrections(root / "corrections", known)
+        self.corrections = Corrections(root.folder("corrections"), known)
         self._apply_last()
         self.stage_turn = asyncio.Lock()
         """Held while the stage is changed: such changes come one after the other."""
@@ -129,7 +128,7 @@ class TwinServer:
         )
         self.jobs = Jobs(
             self.scanner, self.clock, self._job_changed, max_waiting=self.limits.max_jobs,
-            projectors=projectors, root=root,
+            projectors=projectors, root=self.root,
         )  # fmt: skip
         self.radiography = Radiography.of(
             self.imaging, detector_model(machine), machine, physics, scatter
@@ -192,7 +191,7 @@ class TwinServer:
         memory = self.remembered
         if memory is None:
             return None
-        left = self.jobs.recall(memory.jobs, memory.jobs_made, self.root)
+        left = self.jobs.recall(memory.jobs, memory.jobs_made, self.directory)
         sample = restore(memory, self.scanner, self.clock.now())
         if not memory.ended or left:
             names = [job.id for job in left]

@@ -47,7 +47,7 @@ def speed_up_of(text: str) -> SpeedUp:
 
 async def run(options: TwinSettings) -> int:
     """Serve until SIGTERM or SIGINT; returns the exit code."""
-    from flexdt.server.files.atomic import probe
+    from flexdt.server.files.directory import open_data
     from flexdt.server.files.directory_lock import FolderLock
     from flexdt.server.imaging.projector_client import ProjectorClient
     from flexdt.server.imaging.projector_pool import ProjectorPool
@@ -67,8 +67,8 @@ async def run(options: TwinSettings) -> int:
     profile = machines.profile(options.profile, machine, options.machine)
     root = options.data.absolute()
     check_bind(options.host, read_token(options.token_file))
-    probe(root)
-    lock = FolderLock(root)
+    directory = open_data(root)
+    lock = FolderLock(directory)
     truth = None if options.truth is None else load_truth(options.truth, root)
     token = read_token(options.projector_token_file)
     secure = client_tls(options.projector_tls_ca)
@@ -86,7 +86,7 @@ async def run(options: TwinSettings) -> int:
         machine,
         profile,
         projector,
-        root,
+        directory,
         truth=truth,
         speed_up=speed_up_of(options.speed_up),
         seed=(lambda: None) if options.no_noise else fresh_seed,

@@ -9,7 +9,7 @@ from collections import Counter
 from typing import get_args
 
 from flexdt.protocol.state_model import JobPhase
-from flexdt.server.files.atomic import free_bytes
+from flexdt.server.files.directory import free_bytes
 from flexdt.server.imaging.projector_client import ProjectorClient
 from flexdt.server.imaging.projector_pool import ProjectorPool
 from flexdt.server.network.tcp import TcpServer

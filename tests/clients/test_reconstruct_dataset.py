@@ -24,6 +24,7 @@ from flexdt.clients.reconstruction.reconstruct import (
 )
 from flexdt.clients.reconstruction.volume_files import middle_slices, read_values, read_volume
 from flexdt.phantoms import lego_phantom
+from flexdt.server.files.directory import open_data
 from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.imaging.truth import TrueGeometry
@@ -56,14 +57,17 @@ def scan(root: Path, name: str, truth: Offsets, *, corrected: bool, physics: str
     plan = plan_script(parse_script(script), M, P)
     assert not plan.errors
     imaging = Imaging(
-        DirectProjector(), TrueGeometry(truth), SampleStore(root / "s"), M.detector.sensor
+        DirectProjector(),
+        TrueGeometry(truth),
+        SampleStore(open_data(root / "s")),
+        M.detector.sensor,
     )
     correction = Correction("found", "2026-01-02", truth) if corrected else None
     record = ScanRecord.from_plan(
         plan, name=name, started=datetime(2026, 1, 2), sample=SampleRecord(name="lego"),
         noise=NoiseRecord(3, {}), correction=correction,
     )  # fmt: skip
-    writer = DatasetWriter(root, record, script=script, sync=False)
+    writer = DatasetWriter(open_data(root), record, script=script, sync=False)
     way = Radiography.of(imaging, DetectorModel(), M, physics)  # type: ignore[arg-type]
     acquisition = Acquisition(plan, way, Sample("lego"), 3, writer.put)
     for exposure in plan.exposures:

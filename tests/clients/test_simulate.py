@@ -22,6 +22,7 @@ from flexdt.phantoms import Phantom, load_phantom, material
 from flexdt.phantoms.channels import channels, scatter_object
 from flexdt.phantoms.samples import as_phantom
 from flexdt.projecting import project
+from flexdt.server.files.directory import open_data
 from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.imaging.truth import TrueGeometry
@@ -315,7 +316,7 @@ def test_the_twin_makes_the_same_counts(tmp_path: Path, physics: str) -> None:
     places = poses(machine, builtin_profile(machine.default_profile), camera,
                    {"rot_obj": [0.0, 25.0]})  # fmt: skip
     imaging = Imaging(
-        DirectProjector(), TrueGeometry(), SampleStore(tmp_path), machine.detector.sensor
+        DirectProjector(), TrueGeometry(), SampleStore(open_data(tmp_path)), machine.detector.sensor
     )
     twin = Radiography.of(imaging, DetectorModel(), machine, physics)  # type: ignore[arg-type]
     exposure = ExposureSettings(70.0, 20.0, 80.0)

@@ -94,10 +94,11 @@ def written(tmp_path: Path) -> Callable[..., Path]:
     """A finished data set on the disk."""
 
     def make(record: ScanRecord | None = None) -> Path:
+        from flexdt.server.files.directory import open_data
         from flexdt.server.storage.dataset_writer import DatasetWriter
 
         chosen = record if record is not None else make_record()
-        writer = DatasetWriter(tmp_path, chosen, script=b"a\tb\r\n\x00\xff")
+        writer = DatasetWriter(open_data(tmp_path), chosen, script=b"a\tb\r\n\x00\xff")
         for name, image in make_images(chosen).items():
             writer.put(name, image)
         writer.finish()

@@ -24,7 +24,7 @@ import tifffile
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flexdt.server.files.atomic import AtomicFolder
+from flexdt.server.files.directory import Directory, open_data
 from flexdt.server.files.image_files import free_name
 from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.twin.dataset.dataset_errors import (
@@ -52,7 +52,7 @@ def test_a_finished_data_set_holds_what_the_interface_names(
     tmp_path: Path, record: Make, images: Images
 ) -> None:
     r = record()
-    writer = DatasetWriter(tmp_path, r, script=b"tube\txrayon\r\n\x00\xff")
+    writer = DatasetWriter(open_data(tmp_path), r, script=b"tube\txrayon\r\n\x00\xff")
     assert read_document(writer.folder)["complete"] is False
     for name, image in images(r).items():
         writer.put(name, image)
@@ -78,7 +78,7 @@ def test_the_document_states_only_nominal_geometry(
     """cone_vec is the uncorrected one; the correction stands beside it."""
     r = record()
     document = parse_document(
-        (DatasetWriter(tmp_path, r).folder / "flexdt.json").read_text(encoding="utf-8")
+        (DatasetWriter(open_data(tmp_path), r).folder / "flexdt.json").read_text(encoding="utf-8")
     )
     assert document.correction is not None
     assert document.correction.parameters["dO_x"] == 0.5
@@ -110,7 +110,7 @@ class FullDisk:
 
 @pytest.mark.parametrize("room", [0, 1, 699, 1500])
 def test_a_full_disk_leaves_no_part_of_a_file(tmp_path: Path, room: int) -> None:
-    with AtomicFolder(tmp_path, write=FullDisk(room)) as folder:
+    with Directory(tmp_path, write=FullDisk(room)) as folder:
         with pytest.raises(DiskFullError, match=r"no room for .*a.tif: 2000 bytes asked") as caught:
             folder.put("a.tif", bytes(2000))
         assert os.listdir(tmp_path) == []
@@ -119,14 +119,14 @@ def test_a_full_disk_leaves_no_part_of_a_file(tmp_path: Path, room: int) -> None
 
 
 def test_short_writes_are_continued(tmp_path: Path) -> None:
-    with AtomicFolder(tmp_path, write=FullDisk(10_000)) as folder:
+    with Directory(tmp_path, write=FullDisk(10_000)) as folder:
         folder.put("a.bin", bytes(range(250)) * 20)
     assert (tmp_path / "a.bin").read_bytes() == bytes(range(250)) * 20
 
 
 def test_a_full_disk_keeps_the_file_that_was_there(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("old")
-    with AtomicFolder(tmp_path, write=FullDisk(1)) as folder, pytest.raises(DiskFullError):
+    with Directory(tmp_path, write=FullDisk(1)) as folder, pytest.raises(DiskFullError):
         folder.put("a.txt", b"new and longer")
     assert (tmp_path / "a.txt").read_text() == "old"
 
@@ -139,7 +139,7 @@ def test_a_closed_folder_refuses_and_waits_for_files_in_the_making(tmp_path: Pat
         assert go.wait(10)
         return os.write(fd, data)
 
-    folder = AtomicFolder(tmp_path, write=slow)
+    folder = Directory(tmp_path, write=slow)
     with ThreadPoolExecutor(2) as pool:
         writing = pool.submit(folder.put, "a.txt", b"x")
         assert started.wait(10)
@@ -153,12 +153,12 @@ def test_a_closed_folder_refuses_and_waits_for_files_in_the_making(tmp_path: Pat
 
 
 def test_other_refusals_are_write_errors(tmp_path: Path) -> None:
-    with AtomicFolder(tmp_path, write=FullDisk(0, errno.EIO)) as folder:
+    with Directory(tmp_path, write=FullDisk(0, errno.EIO)) as folder:
         with pytest.raises(DatasetWriteError, match=r"cannot write .*a.txt") as caught:
             folder.put("a.txt", b"x")
         assert not isinstance(caught.value, DiskFullError)
     with pytest.raises(DatasetWriteError, match="cannot use folder"):
-        AtomicFolder(tmp_path / "missing")
+        Directory(tmp_path / "missing")
 
 
 def test_a_scan_survives_a_disk_that_fills_up_and_is_emptied(
@@ -166,7 +166,7 @@ def test_a_scan_survives_a_disk_that_fills_up_and_is_emptied(
 ) -> None:
     r = record()
     disk = FullDisk(10**9)
-    writer = DatasetWriter(tmp_path, r, write=disk)
+    writer = DatasetWriter(open_data(tmp_path), r, write=disk)
     writer.put("di000000.tif", images(r)["di000000.tif"])
     disk.room = 1000
     with pytest.raises(DiskFullError):
@@ -191,7 +191,7 @@ def test_room_is_checked_before_the_scan(
 ) -> None:
     monkeypatch.setattr("flexdt.server.storage.dataset_writer.free_bytes", lambda path: 1000)
     with pytest.raises(DiskFullError, match=r"8 images need .* bytes, 1000 bytes are free"):
-        DatasetWriter(tmp_path, record())
+        DatasetWriter(open_data(tmp_path), record())
 
 
 CHILD = """
@@ -200,10 +200,11 @@ import numpy as np
 spec = importlib.util.spec_from_file_location("made", sys.argv[1])
 made = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(made)
+from flexdt.server.files.directory import open_data
 from flexdt.server.storage.dataset_writer import DatasetWriter
 record = made.make_record(frames=2000)
 images = made.make_images(record)
-writer = DatasetWriter(pathlib.Path(sys.argv[2]), record, resume=True, sync=False)
+writer = DatasetWriter(open_data(pathlib.Path(sys.argv[2])), record, resume=True, sync=False)
 print("ready", flush=True)
 while True:
     for name in record.files:
@@ -232,7 +233,7 @@ def test_a_killed_writer_leaves_whole_files_and_can_be_resumed(
     assert parse_document((folder / "flexdt.json").read_text()).complete is False
     assert "SCRIPT CANCELLED!" in (folder / "scan settings.txt").read_text()
     (folder / ".part-1-1").write_bytes(b"left by an earlier kill")
-    writer = DatasetWriter(tmp_path, r, resume=True, sync=False)
+    writer = DatasetWriter(open_data(tmp_path), r, resume=True, sync=False)
     assert writer.present == {p.name for p in found}
     assert not list(folder.glob(".part*"))
     for name in writer.missing:
@@ -250,7 +251,7 @@ def test_two_threads_put_the_same_file_each_through_its_own_folder(tmp_path: Pat
         return os.write(fd, data)
 
     def put(text: bytes) -> None:
-        with AtomicFolder(tmp_path, write=write) as files:
+        with Directory(tmp_path, write=write) as files:
             files.put("state.json", text)
 
     with ThreadPoolExecutor(2) as pool:
@@ -263,7 +264,7 @@ def test_resuming_does_not_trust_a_damaged_image(
     tmp_path: Path, record: Make, images: Images
 ) -> None:
     r = record()
-    writer = DatasetWriter(tmp_path, r)
+    writer = DatasetWriter(open_data(tmp_path), r)
     for name, image in images(r).items():
         writer.put(name, image)
     writer.mark_incomplete("killed")
@@ -271,30 +272,30 @@ def test_resuming_does_not_trust_a_damaged_image(
     cut.write_bytes(cut.read_bytes()[:-10])
     (writer.folder / "scan_000002.tif").write_bytes(b"not a TIFF")
     tifffile.imwrite(writer.folder / "scan_000003.tif", np.zeros((3, 4), np.uint16))
-    again = DatasetWriter(tmp_path, r, resume=True)
+    again = DatasetWriter(open_data(tmp_path), r, resume=True)
     assert again.missing == ("scan_000001.tif", "scan_000002.tif", "scan_000003.tif")
 
 
 def test_only_the_same_scan_is_resumed(tmp_path: Path, record: Make) -> None:
-    DatasetWriter(tmp_path, record())
+    DatasetWriter(open_data(tmp_path), record())
     with pytest.raises(DatasetExistsError, match="another name, or resume"):
-        DatasetWriter(tmp_path, record())
+        DatasetWriter(open_data(tmp_path), record())
     with pytest.raises(DatasetExistsError, match=r"another scan .its frames differ"):
-        DatasetWriter(tmp_path, record(frames=6), resume=True)
+        DatasetWriter(open_data(tmp_path), record(frames=6), resume=True)
     with pytest.raises(DatasetExistsError, match="its noise differ"):
-        DatasetWriter(tmp_path, record(noise=NoiseRecord(8)), resume=True)
+        DatasetWriter(open_data(tmp_path), record(noise=NoiseRecord(8)), resume=True)
     (tmp_path / "scan" / "flexdt.json").write_text("{")
     with pytest.raises(DatasetExistsError, match="cannot be read"):
-        DatasetWriter(tmp_path, record(), resume=True)
-    assert free_name(tmp_path, "scan") == "scan-2"
+        DatasetWriter(open_data(tmp_path), record(), resume=True)
+    assert free_name(open_data(tmp_path), "scan") == "scan-2"
 
 
 def test_a_resumed_scan_keeps_the_date_and_correction_it_began_with(
     tmp_path: Path, record: Make
 ) -> None:
-    began = DatasetWriter(tmp_path, record()).record
+    began = DatasetWriter(open_data(tmp_path), record()).record
     later = record(started=datetime(2026, 4, 1), correction=None)
-    resumed = DatasetWriter(tmp_path, later, resume=True)
+    resumed = DatasetWriter(open_data(tmp_path), later, resume=True)
     assert resumed.record.started == began.started
     assert resumed.record.correction == began.correction
     assert (
@@ -304,7 +305,7 @@ def test_a_resumed_scan_keeps_the_date_and_correction_it_began_with(
 
 def test_many_threads_write_one_data_set(tmp_path: Path, record: Make, images: Images) -> None:
     r = record(frames=60)
-    writer = DatasetWriter(tmp_path, r, sync=False)
+    writer = DatasetWriter(open_data(tmp_path), r, sync=False)
     work = list(images(r).items()) * 2
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda item: writer.put(*item), work))
@@ -327,14 +328,14 @@ def test_hostile_names_are_refused_everywhere(tmp_path: Path, record: Make, name
     with pytest.raises(DatasetNameError, match="allowed: a plain name"):
         plain_name(name)
     with pytest.raises(DatasetNameError):
-        DatasetWriter(root, record(name))
-    writer = DatasetWriter(root, record())
+        DatasetWriter(open_data(root), record(name))
+    writer = DatasetWriter(open_data(root), record())
     with pytest.raises(DatasetNameError):
         writer.put(name, image)
     r = record("other")
     block = replace(r.blocks[0], files=(name,))
     with pytest.raises(DatasetNameError):
-        DatasetWriter(root, replace(r, blocks=(block, *r.blocks[1:])))
+        DatasetWriter(open_data(root), replace(r, blocks=(block, *r.blocks[1:])))
     assert [p.name for p in tmp_path.iterdir()] == ["data"]
     assert sorted(p.name for p in root.iterdir()) == ["scan"]
 
@@ -360,9 +361,9 @@ def test_links_are_never_followed(tmp_path: Path, record: Make, images: Images) 
     root.mkdir()
     (root / "scan").symlink_to(outside)
     with pytest.raises(DatasetNameError, match="nothing is written through it"):
-        DatasetWriter(root, record())
+        DatasetWriter(open_data(root), record())
     r = record("second")
-    writer = DatasetWriter(root, r)
+    writer = DatasetWriter(open_data(root), r)
     (writer.folder / "scan_000000.tif").symlink_to(outside / "victim.txt")
     writer.put("scan_000000.tif", images(r)["scan_000000.tif"])
     assert not (writer.folder / "scan_000000.tif").is_symlink()
@@ -376,7 +377,7 @@ def test_links_are_never_followed(tmp_path: Path, record: Make, images: Images) 
 
 
 def test_images_of_another_scan_are_refused(tmp_path: Path, record: Make) -> None:
-    writer = DatasetWriter(tmp_path, record())
+    writer = DatasetWriter(open_data(tmp_path), record())
     good = np.zeros((24, 30), np.uint16)
     with pytest.raises(DatasetWriteError, match="no image of scan"):
         writer.put("scan_999999.tif", good)

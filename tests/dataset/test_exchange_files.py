@@ -163,10 +163,11 @@ def _two_shapes(made: ScanRecord) -> ScanRecord:
 def test_a_geometry_has_one_shape(
     record: Callable[..., ScanRecord], tmp_path: Path
 ) -> None:  # fmt: skip
+    from flexdt.server.files.directory import open_data
     from flexdt.server.storage.dataset_writer import DatasetWriter
 
     made = _two_shapes(record())
-    writer = DatasetWriter(tmp_path, made)
+    writer = DatasetWriter(open_data(tmp_path), made)
     for block in made.blocks:
         for name in block.files:
             writer.put(name, np.full(block.camera.shape, 500, dtype=np.uint16))

@@ -15,6 +15,7 @@ import numpy as np
 from in_process import Lab, M, P, run
 
 import flexdt as fx
+from flexdt.server.files.directory import open_data
 from flexdt.server.twin.application import TwinApp
 from flexdt.server.twin.core import TwinServer
 
@@ -47,7 +48,7 @@ def test_a_twin_goes_on_where_one_of_version_0_1_stopped(tmp_path: Path) -> None
     async def body(lab: Lab) -> None:
         await lab.twin.stop()
         lab.twin = TwinServer(
-            M, P, lab.projector, root, speed_up="max"
+            M, P, lab.projector, open_data(root), speed_up="max"
         )  # as `flexdt.server.twin.main` begins
         sample = lab.twin.recall()
         assert sample is not None

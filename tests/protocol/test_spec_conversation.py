@@ -20,6 +20,7 @@ from direct_projector import DirectProjector
 
 import flexdt
 from flexdt.protocol.image import decode
+from flexdt.server.files.directory import open_data
 from flexdt.server.network.tcp import serve
 from flexdt.server.twin.application import TwinApp
 from flexdt.server.twin.core import TwinServer
@@ -39,7 +40,9 @@ def talk() -> list[str]:
 async def answers(root: Path, asked: list[str]) -> list[bytes]:
     """What a twin answers to each line, over a socket."""
     machine = builtin_machine()
-    twin = TwinServer(machine, profile_of(machine), DirectProjector(), root, speed_up="max")
+    twin = TwinServer(
+        machine, profile_of(machine), DirectProjector(), open_data(root), speed_up="max"
+    )
     await twin.start(Sample("lego"))
     server = await serve(TwinApp(twin))
     reader, writer = await asyncio.open_connection("127.0.0.1", server.port)

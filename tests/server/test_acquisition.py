@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from flexdt.server.files.directory import open_data
 from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.imaging.truth import TrueGeometry, load_truth
@@ -70,7 +71,7 @@ def scan(
     plan = plan_script(parse_script(FLY), M, P)
     assert not plan.errors
     projector = AngleProjector()
-    store = SampleStore(tmp_path)
+    store = SampleStore(open_data(tmp_path))
     imaging = Imaging(projector, TrueGeometry(Offsets(dO_x=0.5405)), store, M.detector.sensor)
     made: dict[str, npt.NDArray[np.uint16]] = {}
     way = Radiography(imaging, DetectorModel())
@@ -103,7 +104,7 @@ def test_noise_is_numbered_by_the_place_among_all_saved_images(tmp_path: Path) -
 
 def test_an_empty_stage_needs_no_projector_and_offsets_reach_it(tmp_path: Path) -> None:
     projector = AngleProjector()
-    store = SampleStore(tmp_path)
+    store = SampleStore(open_data(tmp_path))
     imaging = Imaging(projector, TrueGeometry(), store, M.detector.sensor)
     plan = plan_script(parse_script(FLY), M, P)
     camera = plan.exposures[0].camera

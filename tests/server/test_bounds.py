@@ -12,6 +12,7 @@ from in_process import Lab, run
 
 from flexdt.protocol import METHODS, RpcError, parse_params
 from flexdt.protocol.fields import MAX_STEM
+from flexdt.server.files.directory import open_data
 from flexdt.server.storage.unfinished_uploads import MOST, Incoming, UploadHead
 from flexdt.twin.errors import LimitError
 
@@ -156,7 +157,7 @@ def head(name: str, total: int) -> UploadHead:
 
 
 def test_unfinished_uploads_are_bounded_and_their_senders_are_told(tmp_path: Path) -> None:
-    incoming: Incoming = Incoming(tmp_path, limit=1000)
+    incoming: Incoming = Incoming(open_data(tmp_path), limit=1000)
     for i in range(MOST + 1):
         assert incoming.receive(head(f"n{i}", 900), 0, b"x" * 10) == 10
     with pytest.raises(LimitError, match=r"dropped for newer ones: 4 uploads and 1000 bytes"):

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from simulated_disk import Disk, Fault
 
-from flexdt.server.files.own_documents import Changes, put_file
-from flexdt.server.storage import memory as memory_module
+from flexdt.server.files.directory import Directory
+from flexdt.server.files.own_documents import Changes
 from flexdt.server.storage.memory import FILE, Keeper, Memory, remember
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
@@ -41,14 +41,15 @@ def test_a_write_that_is_under_way_does_not_undo_the_last(
             return super().model_dump_json(by_alias=True)
 
     first = Late.model_construct(**dict(make(False)))
-    keeper = Keeper(tmp_path, lambda last: make(True) if last else first)
+    keeper = Keeper(Directory(tmp_path), lambda last: make(True) if last else first)
     written: list[str] = []
+    keep = Directory.keep
 
-    def put(folder: Path, name: str, data: bytes) -> None:
+    def put(folder: Directory, name: str, data: bytes) -> None:
         written.append(name)
-        put_file(folder, name, data)
+        keep(folder, name, data)
 
-    monkeypatch.setattr(memory_module, "put_file", put)
+    monkeypatch.setattr(Directory, "keep", put)
 
     async def body() -> None:
         work = asyncio.create_task(keeper.run(lambda: False))
@@ -70,20 +71,20 @@ def test_a_change_is_undone_on_a_disk_that_stays_full(tmp_path: Path, at: int) -
     root = tmp_path / "disk"
     root.mkdir()
     for name in ("a", "b"):
-        put_file(root, name, name.encode())
+        Directory(root).keep(name, name.encode())
 
-    def change() -> None:
+    def change(folder: Directory) -> None:
         with Changes() as changes:
             for name in ("a", "c", "b"):
-                changes.put(root, name, b"new")
+                changes.put(folder, name, b"new")
 
     disk = Disk(root, random.Random(0))
-    with disk.watched():
+    with disk.watched(), Directory(root) as folder:
         disk.set(Fault(at, errno.ENOSPC, lasting=True))
         with pytest.raises(DatasetWriteError):
-            change()
+            change(folder)
     assert {f.name: f.read_bytes() for f in root.iterdir()} == {"a": b"a", "b": b"b"}
-    with Changes() as changes:
-        changes.put(root, "a", b"newer")
-        changes.put(root, "a", b"newest")
+    with Directory(root) as folder, Changes() as changes:
+        changes.put(folder, "a", b"newer")
+        changes.put(folder, "a", b"newest")
     assert {f.name: f.read_bytes() for f in root.iterdir()} == {"a": b"newest", "b": b"b"}

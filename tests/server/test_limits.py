@@ -19,6 +19,7 @@ from flexdt.clients.client.async_client import AsyncTwinClient
 from flexdt.clients.client.client import TwinClient
 from flexdt.protocol import METHODS, Connection, Failure, RpcError
 from flexdt.protocol.method_table import compatible
+from flexdt.server.files.directory import open_data
 from flexdt.server.files.own_documents import used_bytes
 from flexdt.server.runtime.access import (
     AccessError,
@@ -213,8 +214,8 @@ def test_bytes_of_a_folder_without_links(tmp_path: Path) -> None:
     (tmp_path / "c").write_bytes(b"x" * 11)
     (tmp_path / "loop").symlink_to(tmp_path, target_is_directory=True)
     link = (tmp_path / "loop").lstat().st_size
-    assert used_bytes(tmp_path) == 111 + link
-    assert used_bytes(tmp_path / "nowhere") == 0
+    assert used_bytes(open_data(tmp_path)) == 111 + link
+    assert used_bytes(open_data(tmp_path).folder("nowhere")) == 0
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from flexdt.process_settings import (
     shared,
     words,
 )
+from flexdt.server.files.directory import Directory
 from flexdt.server.files.directory_lock import FolderLock
 from flexdt.server.projector import main as projector_main
 from flexdt.server.runtime import process
@@ -155,17 +156,17 @@ def test_a_data_directory_is_locked_without_a_file_in_it(tmp_path: Path) -> None
     data.mkdir()
     victim.write_text("somebody's")
     (data / ".lock").symlink_to(victim)
-    lock = FolderLock(data)
+    lock = FolderLock(Directory(data))
     (data / ".lock").unlink()
     by_another_way = tmp_path / "link"
     by_another_way.symlink_to(data)
     for path in (data, by_another_way):
         with pytest.raises(DatasetWriteError, match="used by another twin server"):
-            FolderLock(path)
+            FolderLock(Directory(path))
     assert victim.read_text() == "somebody's"
     assert list(data.iterdir()) == []
     lock.release()
-    FolderLock(data).release()
+    FolderLock(Directory(data)).release()
 
 
 def test_a_system_that_does_not_say_its_memory_is_taken_to_have_some(

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from flexdt.phantoms import Phantom, load_phantom, voxel_phantom
+from flexdt.server.files.directory import open_data
 from flexdt.server.imaging.projections import Imaging, digest_of
 from flexdt.server.imaging.projector_client import ProjectorClient
 from flexdt.server.imaging.projector_pool import ProjectorPool
@@ -145,7 +146,7 @@ def test_a_projector_that_is_full_forgets_versions_before_it_refuses() -> None:
 
 def test_materials_of_a_sample_are_named_by_content_too(tmp_path: Path) -> None:
     async def work(server: ProjectorServer, one: Any, other: Any, pool: ProjectorPool) -> None:
-        imaging = Imaging(one, TrueGeometry(), SampleStore(tmp_path), M.detector.sensor)
+        imaging = Imaging(one, TrueGeometry(), SampleStore(open_data(tmp_path)), M.detector.sensor)
         channels, paths, _ = await imaging.path_lengths(Sample("lego"), POSES, CAMERA)
         assert len(channels) == len(paths) > 1
         names = [v.name for v in (await one.volumes()).volumes]

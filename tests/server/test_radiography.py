@@ -24,6 +24,7 @@ from flexdt.protocol import Codec
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.params import TubeSet
 from flexdt.protocol.rpc_errors import Code, RpcError
+from flexdt.server.files.directory import open_data
 from flexdt.server.imaging.exposure_flags import CUT_OFF, SATURATED, STARVED, flags_of, marks_of
 from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.radiography import Radiography, with_spectra
@@ -85,7 +86,9 @@ FLY = "\r\n".join(
 
 
 def radiography(tmp_path: Path, physics: str, **panel: float) -> Radiography:
-    imaging = Imaging(DirectProjector(), TrueGeometry(), SampleStore(tmp_path), M.detector.sensor)
+    imaging = Imaging(
+        DirectProjector(), TrueGeometry(), SampleStore(open_data(tmp_path)), M.detector.sensor
+    )
     made = Radiography.of(imaging, DetectorModel(), M, physics)  # type: ignore[arg-type]
     return replace(made, panel=replace(made.panel, **panel))
 
@@ -165,7 +168,9 @@ def test_scatter_of_a_view_does_not_depend_on_the_views_beside_it(tmp_path: Path
 
 
 def test_ideal_physics_has_no_scatter(tmp_path: Path) -> None:
-    imaging = Imaging(DirectProjector(), TrueGeometry(), SampleStore(tmp_path), M.detector.sensor)
+    imaging = Imaging(
+        DirectProjector(), TrueGeometry(), SampleStore(open_data(tmp_path)), M.detector.sensor
+    )
     with pytest.raises(LimitError, match="scatter mc needs physics mono or poly, not ideal"):
         Radiography.of(imaging, DetectorModel(), M, "ideal", "mc")
 
@@ -539,7 +544,13 @@ def test_a_twin_started_with_poly_physics_scans_with_it(tmp_path: Path) -> None:
 
     async def body() -> None:
         twin = TwinServer(
-            M, P, DirectProjector(), tmp_path, speed_up="max", seed=lambda: 1, physics="poly"
+            M,
+            P,
+            DirectProjector(),
+            open_data(tmp_path),
+            speed_up="max",
+            seed=lambda: 1,
+            physics="poly",
         )
         await twin.start(Sample("lego"))
         try:
@@ -572,7 +583,9 @@ def test_a_voltage_without_a_spectrum_is_refused_before_there_is_a_job(
     text = f"tube\tset kV\t{kV}\t\tACK\t\t\r\n{FLY}".encode()
 
     async def body() -> None:
-        twin = TwinServer(M, P, DirectProjector(), tmp_path, speed_up="max", physics="poly")
+        twin = TwinServer(
+            M, P, DirectProjector(), open_data(tmp_path), speed_up="max", physics="poly"
+        )
         report = _document(await twin.submissions.check(Wish(text), Codec.JSON))
         (problem,) = [p for p in report["problems"] if p["severity"] == "error"]
         assert problem["line"] == 1
@@ -584,7 +597,7 @@ def test_a_voltage_without_a_spectrum_is_refused_before_there_is_a_job(
         with pytest.raises(LimitError, match=r"\[20, 90\]"):
             await set_tube(twin, None, TubeSet(kV=max(kV, 1.0)))  # type: ignore[arg-type]
         assert twin.scanner.tube.kV == 90.0
-        plain = TwinServer(M, P, DirectProjector(), tmp_path / "ideal", speed_up="max")
+        plain = TwinServer(M, P, DirectProjector(), open_data(tmp_path / "ideal"), speed_up="max")
         assert _document(await plain.submissions.check(Wish(text), Codec.JSON))["ok"]
 
     asyncio.run(body())
@@ -594,13 +607,13 @@ def test_a_twin_with_another_physics_is_where_the_last_one_was(tmp_path: Path) -
     """Only a voltage that it has no spectrum for starts anew; the E-stop above all stays."""
 
     async def body() -> None:
-        first = TwinServer(M, P, DirectProjector(), tmp_path, physics="ideal")
+        first = TwinServer(M, P, DirectProjector(), open_data(tmp_path), physics="ideal")
         await first.start(Sample("lego"))
         first.scanner.set_tube(kV=10.0, power_W=30.0)
         first.scanner.place({"mag_obj": 432.0}, first.clock.now())
         first.scanner.estop(first.clock.now())
         await first.stop()
-        after = TwinServer(M, P, DirectProjector(), tmp_path, physics="poly")
+        after = TwinServer(M, P, DirectProjector(), open_data(tmp_path), physics="poly")
         assert after.recall() == Sample("lego")
         assert after.scanner.positions(after.clock.now())["mag_obj"] == 432.0
         assert (after.scanner.tube.kV, after.scanner.tube.power_W) == (90.0, 30.0)
@@ -622,7 +635,9 @@ def test_a_scan_whose_images_cannot_be_made_fails_and_the_next_one_runs(tmp_path
     """As when a scan that was begun with another physics is taken up: nothing checked it then."""
 
     async def body() -> None:
-        twin = TwinServer(M, P, DirectProjector(), tmp_path, speed_up="max", physics="ideal")
+        twin = TwinServer(
+            M, P, DirectProjector(), open_data(tmp_path), speed_up="max", physics="ideal"
+        )
         await twin.start(Sample("lego"))
         low = f"tube\tset kV\t15.0\t\tACK\t\t\r\n{FLY}".encode()
         honest = twin.submissions.radiography

@@ -10,6 +10,7 @@ import pytest
 from stored_upload import completed
 
 from flexdt.phantoms import Phantom, load_phantom
+from flexdt.server.files.directory import open_data
 from flexdt.server.storage import stored_samples as samples
 from flexdt.server.storage.stored_samples import EMPTY, KEPT, SampleStore
 from flexdt.server.storage.unfinished_uploads import UploadHead
@@ -27,7 +28,7 @@ def head(name: str) -> UploadHead:
 
 @pytest.mark.parametrize("name", TAKEN)
 def test_an_upload_does_not_stand_for_something_else(tmp_path: Path, name: str) -> None:
-    store = SampleStore(tmp_path)
+    store = SampleStore(open_data(tmp_path))
     with pytest.raises(LimitError, match="choose another") as refused:
         store.receive(head(name), 0, b"\0" * 4)
     assert refused.value.data["asked"] == name
@@ -38,7 +39,7 @@ def test_an_upload_does_not_stand_for_something_else(tmp_path: Path, name: str) 
 def test_nor_one_that_lies_there_already(tmp_path: Path, name: str) -> None:
     (tmp_path / "x.json").write_text(head(name).model_dump_json(by_alias=True))
     (tmp_path / "x.bin").write_bytes(b"\0" * 4)
-    store = SampleStore(tmp_path)
+    store = SampleStore(open_data(tmp_path))
     assert store.uploads == ()
     if name != EMPTY:
         assert store.load(name) == load_phantom(name)
@@ -46,20 +47,20 @@ def test_nor_one_that_lies_there_already(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", ["normal-0", "normal-x", "Empty", "emptiness", "lego-2"])
 def test_others_may_be_near(tmp_path: Path, name: str) -> None:
-    store = SampleStore(tmp_path)
+    store = SampleStore(open_data(tmp_path))
     assert store.receive(head(name), 0, b"\0" * 4) == 4
     completed(store, name)
-    assert SampleStore(tmp_path).uploads == (name,)
+    assert SampleStore(open_data(tmp_path)).uploads == (name,)
 
 
 def test_an_older_file_that_was_being_read_does_not_come_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Another file comes under the name while the first is still being read by somebody else."""
-    first = SampleStore(tmp_path)
+    first = SampleStore(open_data(tmp_path))
     first.receive(head("a"), 0, np.float32(1.0).tobytes())
     old = completed(first, "a")
-    store = SampleStore(tmp_path)  # knows the name, has read nothing
+    store = SampleStore(open_data(tmp_path))  # knows the name, has read nothing
     honest = samples._parse
     made = []
 
@@ -78,7 +79,7 @@ def test_an_older_file_that_was_being_read_does_not_come_back(
 
 
 def test_many_threads_may_load(tmp_path: Path) -> None:
-    store = SampleStore(tmp_path)
+    store = SampleStore(open_data(tmp_path))
     names = [f"normal-{k}" for k in range(1, 2 * KEPT)]
     with ThreadPoolExecutor(8) as pool:
         found = list(pool.map(lambda i: store.load(names[i % len(names)]), range(600)))

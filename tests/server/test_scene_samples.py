@@ -16,6 +16,7 @@ from flexdt.clients.client.uploads import scene as to_upload
 from flexdt.phantoms import Phantom, PhantomError, Surface, bead_phantom, load_phantom
 from flexdt.phantoms.files import phantom_files
 from flexdt.phantoms.samples import as_phantom
+from flexdt.server.files.directory import open_data
 from flexdt.server.scans.stage import Stage
 from flexdt.server.storage import mesh_reading
 from flexdt.server.storage.stored_samples import SampleStore
@@ -36,7 +37,7 @@ def sent(document: object, name: str = "thing") -> Phantom:
 
 
 def store_of(folder: Path, raw: bytes, form: str, name: str = "thing") -> SampleStore:
-    store = SampleStore(folder)
+    store = SampleStore(open_data(folder))
     store.receive(UploadHead(name=name, kind="scene", format=form, total=len(raw)), 0, raw)
     return store
 
@@ -49,7 +50,7 @@ def test_a_scene_is_read_apart_kept_and_read_again(tmp_path: Path, form: str) ->
     phantom = completed(store, "thing")
     assert phantom.name == "thing"
     assert len(phantom.beads) == (2 if form == "toml" else 3)
-    again = SampleStore(tmp_path)  # as after a restart
+    again = SampleStore(open_data(tmp_path))  # as after a restart
     assert again.uploads == ("thing",)
     assert again.load("thing") == phantom
 

@@ -15,7 +15,7 @@ from simulated_disk import Disk
 from simulation import Crashed, Fault, Simulation
 
 from flexdt.protocol import RpcError
-from flexdt.server.files.atomic import AtomicFolder
+from flexdt.server.files.directory import Directory
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError, DiskFullError
 
 
@@ -77,7 +77,7 @@ def folder(tmp_path: Path, seed: int = 0) -> Disk:
 
 def test_faults_come_when_they_are_told(tmp_path: Path) -> None:
     disk = folder(tmp_path)
-    with disk.watched(), AtomicFolder(disk.root) as files:
+    with disk.watched(), Directory(disk.root) as files:
         files.put("a", b"old")
         for n in range(4):  # open, write, fsync, rename
             disk.set(Fault(n, errno.EIO))
@@ -104,7 +104,7 @@ def test_a_power_cut_loses_what_was_not_made_safe(tmp_path: Path) -> None:
         root = tmp_path / str(seed)
         root.mkdir()
         disk = folder(root, seed)
-        with disk.watched(), AtomicFolder(disk.root) as files:
+        with disk.watched(), Directory(disk.root) as files:
             files.put("kept", b"1")
             fd = os.open(disk.root, os.O_RDONLY)
             os.fsync(fd)

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from in_process import Lab, run
 
+from flexdt.server.files.directory import open_data
 from flexdt.server.scans import stage as stages
 from flexdt.server.scans.stage import Stage
 from flexdt.server.storage import stored_samples as samples
@@ -32,7 +33,7 @@ def approach(guard: Guard) -> Contact:
 
 
 def test_a_guard_is_of_one_correction(tmp_path: Path) -> None:
-    stage = Stage(M, builtin_profile(M.default_profile), SampleStore(tmp_path))
+    stage = Stage(M, builtin_profile(M.default_profile), SampleStore(open_data(tmp_path)))
     guards = [stage.guard(Sample("lego"), p) for p in (NOMINAL, Offsets(dO_z=15.0, dD_z=-5.0))]
     nominal, corrected = (approach(guard) for guard in guards if guard is not None)
     # The stage stands 15 mm nearer to the detector, which stands 5 mm nearer to it.
@@ -41,7 +42,7 @@ def test_a_guard_is_of_one_correction(tmp_path: Path) -> None:
 
 
 def test_the_sample_on_the_stage_decides(tmp_path: Path) -> None:
-    stage = Stage(M, builtin_profile(M.default_profile), SampleStore(tmp_path))
+    stage = Stage(M, builtin_profile(M.default_profile), SampleStore(open_data(tmp_path)))
     far_out = Sample("lego", Placement(y=200.0))
     guards = [stage.guard(s) for s in (Sample(), Sample("lego"), far_out)]
     contacts = [approach(g) for g in guards if g is not None]
@@ -54,7 +55,7 @@ def test_the_sample_on_the_stage_decides(tmp_path: Path) -> None:
 
 def test_a_machine_without_components_has_no_guard(tmp_path: Path) -> None:
     bare = M.model_copy(update={"components": (), "allowed_contacts": ()})
-    stage = Stage(bare, builtin_profile(M.default_profile), SampleStore(tmp_path))
+    stage = Stage(bare, builtin_profile(M.default_profile), SampleStore(open_data(tmp_path)))
     assert stage.guard(Sample("lego")) is None
     assert stage.scene(Sample()) is None
 

@@ -18,6 +18,7 @@ from in_process import script
 
 from flexdt.protocol import Codec, Connection, RpcError
 from flexdt.protocol.rpc_errors import Code
+from flexdt.server.files.directory import open_data
 from flexdt.server.runtime import processor_time
 from flexdt.server.runtime.workers import Workers
 from flexdt.server.scans import checking
@@ -309,13 +310,13 @@ def test_poses_of_a_beginning_come_back(tmp_path: Path) -> None:
     from flexdt.server.scans.scan_record import Beginning
     from flexdt.twin.scanner.state import Sample
 
-    Sidecar(wish, Beginning(StartState.of(M), Sample(), 1, 1)).write(tmp_path, "a")
-    assert Sidecar.read(tmp_path, "a").wish.poses == wish.poses
+    Sidecar(wish, Beginning(StartState.of(M), Sample(), 1, 1)).write(open_data(tmp_path), "a")
+    assert Sidecar.read(open_data(tmp_path), "a").wish.poses == wish.poses
     file = tmp_path / "jobs" / "a.json"
     document = json.loads(file.read_text())
     document["wish"]["poses"] = json.loads(document["wish"]["poses"])  # as it was before
     file.write_text(json.dumps(document))
-    assert Sidecar.read(tmp_path, "a").wish.poses == wish.poses
+    assert Sidecar.read(open_data(tmp_path), "a").wish.poses == wish.poses
 
 
 def test_a_plan_comes_in_pieces_that_are_read_at_once() -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from direct_projector import DirectProjector
 
+from flexdt.server.files.directory import open_data
 from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.imaging.truth import TrueGeometry
@@ -39,14 +40,15 @@ def bead_scan_on(
     plan = plan_script(parse_script(script), machine, profile)
     assert not plan.errors
     imaging = Imaging(
-        DirectProjector(), TrueGeometry(Offsets.from_edge(truth)), SampleStore(root / "s"),
+        DirectProjector(), TrueGeometry(Offsets.from_edge(truth)),
+        SampleStore(open_data(root / "s")),
         machine.detector.sensor,
     )  # fmt: skip
     record = ScanRecord.from_plan(
         plan, name="lego", started=datetime(2026, 1, 2), sample=SampleRecord(name="lego"),
         noise=NoiseRecord(3, {}),
     )  # fmt: skip
-    writer = DatasetWriter(root, record, script=script, sync=False)
+    writer = DatasetWriter(open_data(root), record, script=script, sync=False)
     way = Radiography.of(imaging, DetectorModel(), machine, "ideal")
     acquisition = Acquisition(plan, way, Sample("lego"), 3, writer.put)
     for exposure in plan.exposures:

@@ -14,6 +14,7 @@ import pytest
 
 from flexdt.protocol import METHODS, Codec, Connection, Message, Prepared, RpcError, parse_params
 from flexdt.protocol.messages import Encoded
+from flexdt.server.files.directory import open_data
 from flexdt.server.twin.application import TwinApp
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.wire_errors import ProjectorUnavailable
@@ -113,7 +114,7 @@ class Lab:
         self.options = {"speed_up": "max", **options}
 
     async def __aenter__(self) -> Lab:
-        self.twin = TwinServer(M, P, self.projector, self.root, **self.options)
+        self.twin = TwinServer(M, P, self.projector, open_data(self.root), **self.options)
         self.app = TwinApp(self.twin)
         await self.twin.start(Sample("chiral"))
         self.count = 0

@@ -1,9 +1,10 @@
 """A disk that fails when it is told to: the n-th change of it, from then on, or by a power cut.
 
 Between the servers' file operations and a real directory: every change (open to write, write,
-fsync, rename, mkdir, unlink) is counted and noted in `ops`, and may fail with any error. After a
-power cut only what was made safe is there for certain: a file's bytes since its fsync, a name since
-its directory's; of the rest, directory by directory, the last changes are lost, as many as drawn.
+fsync, rename, link, mkdir, unlink) is counted and noted in `ops`, and may fail with any error.
+After a power cut only what was made safe is there for certain: a file's bytes since its fsync, a
+name since its directory's; of the rest, directory by directory, the last changes are lost, as many
+as drawn.
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ from pathlib import Path
 from typing import Any, Literal
 from unittest import mock
 
-Kind = Literal["open", "write", "fsync", "replace", "unlink", "mkdir"]
-TAKES_ROOM: tuple[Kind, ...] = ("open", "write", "mkdir")
+Kind = Literal["open", "write", "fsync", "replace", "link", "unlink", "mkdir"]
+TAKES_ROOM: tuple[Kind, ...] = ("open", "write", "link", "mkdir")
 """What a full disk refuses."""
 REAL: dict[str, Callable[..., Any]] = {
     name: getattr(os, name)
     for name in ("open", "close", "write", "pwrite", "ftruncate", "fsync", "replace", "rename",
-                 "unlink", "remove", "mkdir")
+                 "link", "unlink", "remove", "mkdir")
 }  # fmt: skip
 
 
@@ -59,6 +60,8 @@ class Disk:
         self.root = root
         self.ops: list[tuple[Kind, str]] = []
         """Every change so far: what, and the path from the root."""
+        self.named: set[str] = set()
+        """Every path from the root that was opened or changed, or was to be."""
         self.fault: Fault | None = None
         self.off = False
         """No change gets through: the process is dead, or the power is cut."""
@@ -119,11 +122,11 @@ class Disk:
     def _open(self, path: Any, flags: int, mode: int = 0o777, *, dir_fd: int | None = None) -> int:
         real = self._path(path, dir_fd)
         writes = bool(flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT))
-        new = real is not None and writes and not real.exists()
+        new = real is not None and writes and not os.path.lexists(real)
         if real is not None and writes:
             self._change("open", real)
         fd: int = REAL["open"](path, flags, mode, dir_fd=dir_fd)
-        if real is not None:
+        if real is not None and (writes or real.is_dir()):  # others close files behind our back
             self._paths[fd] = real
             if new and real.exists():
                 self._names.append((real.parent, lambda: _unlink(real)))
@@ -180,9 +183,27 @@ class Disk:
 
     _rename = _replace
 
+    def _link(
+        self,
+        src: Any,
+        dst: Any,
+        *,
+        src_dir_fd: int | None = None,
+        dst_dir_fd: int | None = None,
+        follow_symlinks: bool = True,
+    ) -> None:
+        self._path(src, src_dir_fd)
+        target = self._path(dst, dst_dir_fd)
+        if target is not None and not os.path.lexists(target):
+            self._change("link", target)
+            self._names.append((target.parent, lambda: _unlink(target)))
+        REAL["link"](
+            src, dst, src_dir_fd=src_dir_fd, dst_dir_fd=dst_dir_fd, follow_symlinks=follow_symlinks
+        )
+
     def _unlink(self, path: Any, *, dir_fd: int | None = None) -> None:
         real = self._path(path, dir_fd)
-        if real is not None and real.exists():
+        if real is not None and os.path.lexists(real):
             self._change("unlink", real)
             before = self._keep(real)
             if before is not None:
@@ -193,7 +214,7 @@ class Disk:
 
     def _mkdir(self, path: Any, mode: int = 0o777, *, dir_fd: int | None = None) -> None:
         real = self._path(path, dir_fd)
-        if real is not None and not real.exists():
+        if real is not None and not os.path.lexists(real):
             self._change("mkdir", real)
             self._names.append((real.parent, lambda: shutil.rmtree(real, ignore_errors=True)))
         REAL["mkdir"](path, mode, dir_fd=dir_fd)
@@ -208,7 +229,10 @@ class Disk:
                 return None
             name = self._paths[dir_fd] / name
         name = name.absolute()
-        return name if name.is_relative_to(self.root) else None
+        if not name.is_relative_to(self.root):
+            return None
+        self.named.add(str(name.relative_to(self.root)))
+        return name
 
     def _keep(self, file: Path) -> Path | None:
         """A second name for what a change is about to replace."""
@@ -217,7 +241,7 @@ class Disk:
         with suppress(FileExistsError):
             REAL["mkdir"](self._kept)
         kept = self._kept / str(next(self._count))
-        os.link(file, kept)
+        REAL["link"](file, kept, follow_symlinks=False)
         return kept
 
     def _change(self, kind: Kind, path: Path) -> bool:
@@ -241,5 +265,5 @@ class Disk:
 
 
 def _unlink(path: Path) -> None:
-    if path.exists():
+    if os.path.lexists(path):
         REAL["unlink"](path)

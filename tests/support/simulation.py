@@ -37,7 +37,7 @@ from in_process import Client, M, P, PointProjector
 from simulated_disk import Disk, Fault
 from simulated_loop import SimulatedLoop
 
-from flexdt.server.files.atomic import probe
+from flexdt.server.files.directory import open_data
 from flexdt.server.files.directory_lock import FolderLock
 from flexdt.server.twin.application import TwinApp
 from flexdt.server.twin.core import TwinServer
@@ -140,11 +140,11 @@ class Simulation:
 
     async def _start(self) -> None:
         """As `flexdt.server.twin.main` does."""
-        probe(self.data)
-        self._lock = FolderLock(self.data)
+        root = open_data(self.data)
+        self._lock = FolderLock(root)
         assert self._loop is not None
         self._twin = TwinServer(
-            self.machine, self.profile, self.projector, self.data, wall=self._loop.time,
+            self.machine, self.profile, self.projector, root, wall=self._loop.time,
             **self.options,
         )  # fmt: skip
         sample = self._twin.recall()

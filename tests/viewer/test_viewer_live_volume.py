@@ -17,6 +17,7 @@ import pytest
 import tifffile
 
 from flexdt.clients.viewer.live_volume import MOST_POINTS, Grower, grow, points_of, surface
+from flexdt.server.files.directory import open_data
 from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.twin.dataset.flexdt_json import parse_document
 from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
@@ -49,7 +50,7 @@ def begun(root: Path, kind: str, frames: int) -> Path:
         plan, name="ball", started=datetime(2026, 1, 2), sample=SampleRecord(name="ball"),
         noise=NoiseRecord(3, {}), correction=None,
     )  # fmt: skip
-    DatasetWriter(root, record, script=script, sync=False).close()
+    DatasetWriter(open_data(root), record, script=script, sync=False).close()
     return root / "ball"
 
 

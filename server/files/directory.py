@@ -1,0 +1,396 @@
+"""A directory that is reached by its descriptor, so that no link below it is ever followed.
+
+The path of the topmost directory is its owner's, who may well have put links into it. Everything
+below is opened one component after the other, relative to the descriptor of the directory above it:
+a link that somebody plants there, even between two calls, is an error that names it or an entry
+like any other. Only regular files are opened.
+
+A file is written under a temporary name, flushed to the disk, and renamed, so that it appears under
+its own name only when whole. All methods may be called from several threads. Systems that open no
+directories (Windows) get paths instead.
+"""
+
+from __future__ import annotations
+
+import errno
+import itertools
+import os
+import stat
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO, Final
+
+from flexdt.twin.dataset.dataset_errors import DatasetNameError, DatasetWriteError, DiskFullError
+from flexdt.twin.dataset.file_names import plain_name
+
+TEMPORARY: Final = ".part-"
+"""Prefix of temporary names; no plain name starts with a dot, so they never collide."""
+BEFORE: Final = ".before-"
+"""Prefix of the name under which what a change replaces is kept until the change has been made."""
+
+_NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_RELATIVE: Final = hasattr(os, "O_DIRECTORY")
+_DIRECTORY: Final = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_CLOEXEC", 0)
+_NO_FOLLOW: Final = getattr(os, "O_NOFOLLOW", 0)
+_BINARY: Final = getattr(os, "O_BINARY", 0)
+_READ: Final = os.O_RDONLY | _NO_FOLLOW | _BINARY | getattr(os, "O_NONBLOCK", 0)
+_NEW: Final = os.O_RDWR | os.O_CREAT | os.O_EXCL | _NO_FOLLOW | _BINARY
+_NUMBERS: Final = itertools.count()
+
+Write = Callable[[int, memoryview], int]
+
+
+@contextmanager
+def writing(path: Path, refused: str) -> Iterator[None]:
+    """Turn the system's refusals inside into `DatasetWriteError`, of a full disk `DiskFullError`.
+
+    Args:
+        path: of what is written.
+        refused: what cannot be done, for the message.
+    """
+    try:
+        yield
+    except OSError as error:
+        kind = DiskFullError if error.errno in _NO_ROOM else DatasetWriteError
+        raise kind(
+            f"{refused}: {error.strerror or error}", {"path": str(path), "errno": error.errno}
+        ) from None
+
+
+def write_some(fd: int, data: memoryview) -> int:
+    """Write to a descriptor; returns how many bytes it took."""
+    return os.write(fd, data)
+
+
+class Directory:
+    """A directory, held open until `close`.
+
+    Args:
+        path: of the directory; it must exist.
+        sync: flush every file to the disk before it gets its name; without it a power cut may
+            leave an empty file, a killed process never does.
+        write: writes bytes to a descriptor and returns how many (tests let it fail).
+        above: the directory it is in, see `folder`; None for the topmost.
+
+    Raises:
+        DatasetWriteError: there is no such directory.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        sync: bool = True,
+        write: Write = write_some,
+        above: Directory | None = None,
+    ) -> None:
+        self.path, self._above, self._sync, self._write = path, above, sync, write
+        self._fd: int | None = None
+        self._closed = False
+        self._busy = 0
+        self._idle = threading.Condition()
+        if above is None and _RELATIVE:
+            with writing(path, f"cannot use folder {path}"):
+                self._fd = os.open(path, _DIRECTORY)
+
+    def folder(self, name: str, *, sync: bool = True, write: Write = write_some) -> Directory:
+        """The directory called `name` in this one, which need not exist yet.
+
+        It is opened anew for every call, unless it is `held`.
+        """
+        return Directory(self.path / name, sync=sync, write=write, above=self)
+
+    def fileno(self) -> int | None:
+        """The descriptor, of one that is held open; None on a system without."""
+        return self._fd
+
+    def held(self) -> Directory:
+        """This one, held open: whatever its name comes to stand for, it stays this directory.
+
+        Raises:
+            DatasetWriteError: there is no such directory, or a link stands there.
+        """
+        assert self._above is not None
+        with writing(self.path, f"cannot use folder {self.path}"):
+            self._fd, self._above = self._open_below(self._above), None
+        return self
+
+    def make(self) -> None:
+        """Make it if it is missing; safe when this returns.
+
+        Raises:
+            DatasetNameError: a link or a file stands there.
+            DatasetWriteError: the system refuses.
+        """
+        if self._above is None:
+            return
+        with writing(self.path, f"cannot make {self.path}"), self._above._opened() as above:
+            try:
+                os.mkdir(self._above._at(self.path.name), dir_fd=above)
+            except FileExistsError:
+                if self._above.is_directory(self.path.name):
+                    return
+                raise DatasetNameError(
+                    f"{self.path} is a link or a file; nothing is written through it",
+                    {"path": str(self.path)},
+                ) from None
+            self._above.sync()
+
+    def put(self, name: str, data: bytes | memoryview) -> None:
+        """Write a file; one of that name, or a link, is replaced as a whole.
+
+        Args:
+            name: plain file name.
+            data: its content.
+
+        Raises:
+            DatasetNameError: the name is not plain.
+            DiskFullError: no room; nothing is left behind.
+            DatasetWriteError: any other refusal of the system.
+        """
+        if not name.startswith(BEFORE):
+            plain_name(name)
+        try:
+            with self._opened() as fd:
+                self._store(fd, name, memoryview(data).cast("B"))
+        except OSError as error:
+            raise self._failed(name, error, memoryview(data).nbytes) from None
+
+    def keep(self, name: str, data: bytes) -> None:
+        """As `put`, in a directory that is made if missing; safe when this returns."""
+        self.make()
+        self.put(name, data)
+        self.sync()
+
+    def nameless(self) -> BinaryIO:
+        """A new file without a name: it is gone when it is closed, or its process ends."""
+        with self._opened() as fd:
+            name, made = self._temporary(fd, 0o600, getattr(os, "O_TEMPORARY", 0))
+            if _RELATIVE:
+                os.unlink(name, dir_fd=fd)
+        return os.fdopen(made, "w+b", buffering=0)
+
+    def open(self, name: str) -> BinaryIO:
+        """A regular file, to be read.
+
+        Raises:
+            OSError: there is none: a FileNotFoundError, or what stands there is another thing.
+        """
+        with self._opened() as fd:
+            try:
+                file = os.open(self._at(name), _READ, dir_fd=fd)
+            except OSError as error:
+                if error.errno != errno.ELOOP:
+                    raise
+                raise OSError(error.errno, "it is a link", str(self.path / name)) from None
+        if not stat.S_ISREG(os.fstat(file).st_mode):
+            os.close(file)
+            raise OSError(errno.EINVAL, "it is no regular file", str(self.path / name))
+        return open(name, "rb", opener=lambda *_: file)  # some readers want to know a name
+
+    def read(self, name: str) -> bytes:
+        """The content of a regular file; raises as `open`."""
+        with self.open(name) as file:
+            return file.read()
+
+    def link(self, name: str, second: str, to: Directory | None = None) -> None:
+        """Give what stands under `name` a second name, here or in another directory.
+
+        Raises:
+            OSError: there is nothing, or the system has no links.
+        """
+        there = self if to is None else to
+        with self._opened() as fd, there._opened() as other:
+            names = self._at(name), there._at(second)
+            os.link(*names, src_dir_fd=fd, dst_dir_fd=other, follow_symlinks=False)
+
+    def rename(self, name: str, new: str) -> None:
+        """Rename an entry, in place of another one.
+
+        Raises:
+            OSError: there is none, or the system refuses.
+        """
+        with self._opened() as fd:
+            os.replace(self._at(name), self._at(new), src_dir_fd=fd, dst_dir_fd=fd)
+
+    def unlink(self, name: str) -> None:
+        """Delete an entry that is no directory.
+
+        Raises:
+            OSError: there is none, or the system refuses.
+        """
+        with self._opened() as fd:
+            os.unlink(self._at(name), dir_fd=fd)
+
+    def stat(self, name: str) -> os.stat_result | None:
+        """What an entry is, a link itself; None where there is none.
+
+        Raises:
+            OSError: it cannot be known.
+        """
+        try:
+            with self._opened() as fd:
+                return os.stat(self._at(name), dir_fd=fd, follow_symlinks=False)
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+
+    def is_directory(self, name: str) -> bool:
+        """Whether `name` is a directory and no link to one."""
+        about = self.stat(name)
+        return about is not None and stat.S_ISDIR(about.st_mode)
+
+    @contextmanager
+    def entries(self) -> Iterator[Iterator[os.DirEntry[str]]]:
+        """Everything in it, as `os.scandir`.
+
+        Raises:
+            OSError: there is no such directory.
+        """
+        with self._opened() as fd:
+            if fd is None:
+                with os.scandir(self.path) as found:
+                    yield found
+                return
+            own = os.open(".", _DIRECTORY, dir_fd=fd)  # with a place in the listing of its own
+            try:
+                with os.scandir(own) as found:
+                    yield found
+            finally:
+                os.close(own)
+
+    def names(self) -> set[str]:
+        """Names of the whole, regular files in it; none where there is no such directory."""
+        with suppress(FileNotFoundError, NotADirectoryError), self.entries() as entries:
+            return {
+                e.name
+                for e in entries
+                if not e.name.startswith(".") and e.is_file(follow_symlinks=False)
+            }
+        return set()
+
+    def sweep(self, left: Sequence[str] = (TEMPORARY, BEFORE)) -> None:
+        """Delete what killed writers left behind: names that begin with one of `left`."""
+        with suppress(OSError), self.entries() as entries:
+            stale = [e.name for e in entries if e.name.startswith(tuple(left))]
+            for name in stale:
+                with suppress(OSError):
+                    self.unlink(name)
+
+    def sync(self) -> None:
+        """Make the names safe: until then a power cut may undo the last changes of the directory.
+
+        Raises:
+            DatasetWriteError: the system refuses.
+        """
+        with writing(self.path, f"cannot write {self.path}"), self._opened() as fd:
+            if fd is not None:
+                os.fsync(fd)
+
+    def close(self) -> None:
+        """Give the descriptor back, once no call is under way."""
+        with self._idle:
+            self._idle.wait_for(lambda: self._busy == 0)
+            self._closed = True
+            if self._fd is not None:
+                os.close(self._fd)
+                self._fd = None
+
+    def __enter__(self) -> Directory:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __del__(self) -> None:
+        self.close()
+
+    @contextmanager
+    def _opened(self) -> Iterator[int | None]:
+        """The descriptor; None on a system without."""
+        if self._above is not None:
+            fd = self._open_below(self._above)
+            try:
+                yield fd
+            finally:
+                if fd is not None:
+                    os.close(fd)
+            return
+        with self._idle:
+            if self._closed:
+                raise OSError(errno.EBADF, "the folder has been closed")
+            self._busy += 1
+        try:
+            yield self._fd
+        finally:
+            with self._idle:
+                self._busy -= 1
+                self._idle.notify_all()
+
+    def _open_below(self, above: Directory) -> int | None:
+        if not _RELATIVE:
+            return None
+        with above._opened() as fd:
+            return os.open(above._at(self.path.name), _DIRECTORY | _NO_FOLLOW, dir_fd=fd)
+
+    def _at(self, name: str) -> str:
+        """`name` for a call that takes the descriptor, too: one component, whoever says it."""
+        if name in ("", ".", "..") or "/" in name or "\0" in name:
+            raise OSError(errno.EINVAL, "no name of an entry", name)
+        return name if _RELATIVE else str(self.path / name)
+
+    def _temporary(self, fd: int | None, mode: int, flags: int = 0) -> tuple[str, int]:
+        """A new file under a name that nothing has yet, and its descriptor."""
+        while True:
+            # Processes in containers may share a number, and killed ones leave files behind.
+            number = f"{os.getpid()}-{threading.get_native_id()}-{next(_NUMBERS)}"
+            name = self._at(f"{TEMPORARY}{number}")
+            with suppress(FileExistsError):
+                return name, os.open(name, _NEW | flags, mode, dir_fd=fd)
+
+    def _store(self, fd: int | None, name: str, data: memoryview) -> None:
+        temporary, file = self._temporary(fd, 0o644)
+        try:
+            try:
+                while data.nbytes:
+                    data = data[self._write(file, data) :]
+                if self._sync:
+                    os.fsync(file)
+            finally:
+                os.close(file)
+            os.replace(temporary, self._at(name), src_dir_fd=fd, dst_dir_fd=fd)
+        except OSError:
+            with suppress(OSError):
+                os.unlink(temporary, dir_fd=fd)
+            raise
+
+    def _failed(self, name: str, error: OSError, size: int) -> DatasetWriteError:
+        path = str(self.path / name)
+        data = {"path": path, "bytes": size, "errno": error.errno, "free": free_bytes(self.path)}
+        if error.errno in _NO_ROOM:
+            free = "" if data["free"] is None else f", {data['free']} bytes free"
+            return DiskFullError(f"no room for {path}: {size} bytes asked{free}", data)
+        return DatasetWriteError(f"cannot write {path}: {error.strerror or error}", data)
+
+
+def free_bytes(path: Path) -> int | None:
+    """Bytes free for this user on the disk of `path`; None where the system does not say."""
+    try:
+        usage = os.statvfs(path)
+    except (OSError, AttributeError):
+        return None
+    return usage.f_bavail * usage.f_frsize
+
+
+def open_data(root: Path) -> Directory:
+    """A twin's data directory, made if it is missing, once files can be written into it.
+
+    Raises:
+        DatasetWriteError: they cannot; says why.
+    """
+    with writing(root, f"the data directory {root} cannot be written"):
+        root.mkdir(parents=True, exist_ok=True)
+        directory = Directory(root)
+        directory.nameless().close()
+    return directory
