@@ -20,7 +20,6 @@ from flexdt.protocol import Connection, Failure, Message, Prepared, Response, Rp
 from flexdt.protocol.messages import to_plain
 from flexdt.protocol.rpc_errors import internal
 from flexdt.server.runtime.access import ConnectionLimits
-from flexdt.server.runtime.log import log
 
 A_WRITE = 1 << 18
 """Bytes given to the transport at a time, since it copies what it cannot send at once."""
@@ -32,10 +31,14 @@ class SendTarget(Protocol):
     wire: Connection
     limits: ConnectionLimits
     transport: asyncio.Transport
-    name: str
 
     def abort(self, reason: str) -> None:
         """Abort the connection."""
+
+    def log(
+        self, event: str, level: int = logging.INFO, *, error: bool = False, **facts: object
+    ) -> None:
+        """Write a line about the connection."""
 
 
 class Outbox:
@@ -72,8 +75,8 @@ class Outbox:
         except RpcError as error:
             return wire.body(Failure(message.id, error))
         except (ValueError, TypeError, OverflowError):
-            log("reply not sent", logging.ERROR, error=True, client=self.link.name,
-                where=_not_finite(to_plain(message)))  # fmt: skip
+            where = _not_finite(to_plain(message))
+            self.link.log("reply not sent", logging.ERROR, error=True, where=where)
             return wire.body(Failure(message.id, internal()))
         return body
 
@@ -94,7 +97,7 @@ class Outbox:
         try:
             self._put_all(self.link.wire.pieces(message))
         except (RpcError, ValueError, TypeError, OverflowError):
-            log("event not sent", logging.ERROR, error=True, client=self.link.name)
+            self.link.log("event not sent", logging.ERROR, error=True)
 
     def _put_all(self, pieces: Sequence[bytes]) -> None:
         if sum(map(len, pieces)) <= A_WRITE:

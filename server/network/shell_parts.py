@@ -3,6 +3,11 @@
 The shells differ in how they read and write: lines or frames in order for the twin, frames side by
 side and without copies for the projector.
 
+Connections without a place wait in a `Room`: those that have not shown the token yet, those that
+came when all places were taken, and clients with the token who came then. A newcomer always gets
+in, so that it can say hello or stop the scanner; what it displaces belongs to the address that has
+most there.
+
 A client beyond the limit is told so. The error has to be in the client's codec, which follows from
 the client's first byte. An excess connection therefore waits for that byte for a limited time, at
 the cost of a socket and a timer. It has no session and no worker and does not count as a client.
@@ -11,17 +16,74 @@ the cost of a socket and a timer. It has no session and no worker and does not c
 from __future__ import annotations
 
 import asyncio
+import ipaddress
 import logging
+from collections import Counter
 from collections.abc import Awaitable, Callable, Collection
+from typing import Protocol
 
 from flexdt.protocol import Connection, Failure, Response, RpcError
 from flexdt.protocol.rpc_errors import not_authorised
 from flexdt.server.network.shell_application import Observe
 from flexdt.server.runtime.access import token_matches
-from flexdt.server.runtime.log import LOGGER, log, traced
+from flexdt.server.runtime.log import LOGGER, Sparing, log, traced
 
 WRONG_TOKENS = 3
 """Wrong tokens after which a connection is closed."""
+WAITING = 512
+"""Connections that may wait for a hello or an error: where one address opens 167 a second, each of
+them still has 3 s for it."""
+
+
+class Guest(Protocol):
+    """A connection that may be in a room."""
+
+    address: str
+    """Where it comes from, as `neighbourhood` has it."""
+    gone: asyncio.Event
+    """Whether it has ended."""
+
+    def end(self) -> None:
+        """Cut the connection off."""
+
+
+class Room:
+    """Connections without a place, in the order in which they came.
+
+    Where it is full, the oldest connection of the address that has most goes. A newcomer thus
+    always gets in, and an address with many connections displaces its own.
+
+    Args:
+        most: connections.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self.guests: dict[Guest, None] = {}
+
+    def enter(self, guest: Guest) -> None:
+        """Let a connection in; cuts off another one if need be."""
+        self.guests[guest] = None
+        if len(self.guests) > self._most:
+            [(crowd, _)] = Counter(g.address for g in self.guests).most_common(1)
+            oldest = next(g for g in self.guests if g.address == crowd)
+            self.leave(oldest)
+            oldest.end()
+
+    def leave(self, guest: Guest) -> None:
+        """A connection has a place now, or has ended; it need not be here."""
+        self.guests.pop(guest, None)
+
+
+def neighbourhood(host: str) -> str:
+    """The address for a share: an IPv4 address, or the 64 bits of an IPv6 network (one owner's)."""
+    try:
+        address = ipaddress.ip_address(host.partition("%")[0])
+    except ValueError:
+        return host
+    if address.version == 4:
+        return str(address)
+    return str(address.ipv4_mapped or ipaddress.ip_network((address, 64), strict=False))
 
 
 class Deadlines:
@@ -60,10 +122,11 @@ class TokenCheck:
     Args:
         token: of the server; None where it has none.
         close: ends the connection after too many wrong tokens.
+        lines: of the log.
     """
 
-    def __init__(self, token: str | None, close: Callable[[], object]) -> None:
-        self._token, self._close = token, close
+    def __init__(self, token: str | None, close: Callable[[], object], lines: Sparing) -> None:
+        self._token, self._close, self._lines = token, close, lines
         self._wrong = 0
 
     async def check(self, given: str | None, client: str) -> None:
@@ -75,7 +138,7 @@ class TokenCheck:
         if self._token is None or token_matches(given, self._token):
             return
         self._wrong += 1
-        log("wrong token", logging.WARNING, client=client, count=self._wrong)
+        self._lines.log("wrong token", logging.WARNING, client=client, count=self._wrong)
         await asyncio.sleep(0.2 * self._wrong)
         if self._wrong >= WRONG_TOKENS:
             self._close()
@@ -114,38 +177,37 @@ async def answered(
     return answer
 
 
-MOST = 512
-"""Excess connections that may wait for their error; any more are aborted without one."""
-
-
 class TurnedAway(asyncio.Protocol):
     """An excess connection; takes over the transport from the protocol that accepted it.
 
     Args:
         transport: of the connection.
+        address: where it comes from.
         error: that it gets.
         timeout_s: within which it must send a byte, read the error and disconnect [s].
-        others: all excess connections; this one is a member until it ends.
+        others: all excess connections; this one is among them until it ends.
+        urgent: told of the first bytes; true where it serves them after all, and takes over.
     """
 
     def __init__(
         self,
         transport: asyncio.Transport,
+        address: str,
         error: RpcError,
         timeout_s: float,
-        others: set[TurnedAway],
+        others: Room,
+        urgent: Callable[[bytes], bool],
     ) -> None:
         self._transport, self._error, self._others = transport, error, others
+        self.address, self._urgent = address, urgent
         self.gone = asyncio.Event()
         self._told = False
-        others.add(self)
         self._timer = asyncio.get_running_loop().call_later(timeout_s, transport.abort)
         transport.set_protocol(self)
-        if len(others) > MOST:
-            transport.abort()
+        others.enter(self)
 
     def end(self) -> None:
-        """End the connection, because the server stops."""
+        """Cut the connection off."""
         self._transport.abort()
 
     def data_received(self, data: bytes) -> None:
@@ -153,6 +215,9 @@ class TurnedAway(asyncio.Protocol):
         if self._told or self._transport.is_closing():
             return  # read and discard: closing with bytes unread would lose the answer
         self._told = True
+        if self._urgent(data):
+            self._forget()
+            return
         wire = Connection()
         wire.receive_data(data[:1])
         self._transport.write(wire.send(Failure(None, self._error)))
@@ -163,6 +228,9 @@ class TurnedAway(asyncio.Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """The connection has ended."""
-        self._timer.cancel()
-        self._others.discard(self)
+        self._forget()
         self.gone.set()
+
+    def _forget(self) -> None:
+        self._timer.cancel()
+        self._others.leave(self)

@@ -7,6 +7,10 @@ turn of the loop (`turns`). Bytes that name an urgent method are looked at as th
 that does not read costs only its own connection: state events keep the newest value per slot,
 ordered events have a bounded queue, and what stays stuck is cut off. This module knows nothing of
 what methods mean, except that `session.hello` brings the token and that an E-stop comes first.
+
+A client takes one of `max_clients` places when it has shown the token (at once where there is
+none). Until then, and while all places are taken, it is in a `Room`: there it is answered to hello,
+and to what is urgent once it has shown the token, but to nothing else.
 """
 
 from __future__ import annotations
@@ -62,10 +66,19 @@ from flexdt.server.network.shell_application import (
     Session,
     unobserved,
 )
-from flexdt.server.network.shell_parts import Deadlines, TokenCheck, TurnedAway, answered
+from flexdt.server.network.shell_parts import (
+    WAITING,
+    Deadlines,
+    Guest,
+    Room,
+    TokenCheck,
+    TurnedAway,
+    answered,
+    neighbourhood,
+)
 from flexdt.server.network.turns import FIRST, ORDINARY, URGENT, LoopTurns
 from flexdt.server.runtime.access import ConnectionLimits, check_bind
-from flexdt.server.runtime.log import log
+from flexdt.server.runtime.log import Sparing
 from flexdt.server.runtime.loop import ListeningServer, tune
 
 READ_AHEAD = 512 << 10
@@ -82,6 +95,11 @@ URGENT_AT_ONCE = 8
 E-stops may be four times as many."""
 LOOK_S = 0.001
 """How long one turn of the loop looks for urgent requests other than E-stops [s]."""
+RESERVED = 16
+"""Clients beyond `max_clients` that are served what is urgent."""
+STRANGE = 10
+"""Messages without the token after which a connection is closed."""
+HELLO = "session.hello"
 
 
 @dataclass(eq=False, repr=False)
@@ -97,7 +115,8 @@ class TcpServer(ListeningServer):
 
     def __post_init__(self) -> None:
         self.links: set[_Link] = set()
-        self.turned_away: set[TurnedAway] = set()
+        self.waiting, self.reserved = Room(WAITING), Room(RESERVED)
+        self.lines = Sparing()
         self.turns = LoopTurns()
         self.urgent = tuple(m.name.encode() for m in self.methods.values() if m.urgent)
         self._to_look_at: dict[_Link, None] = {}  # in the order in which they came
@@ -129,7 +148,7 @@ class TcpServer(ListeningServer):
         """Stop listening, end every connection, wait until all are gone."""
         if self.server is not None:
             self.server.close()
-        links: list[_Link | TurnedAway] = [*self.links, *self.turned_away]
+        links: list[Guest] = [*self.links, *self.waiting.guests, *self.reserved.guests]
         for link in links:
             link.end()
         await asyncio.gather(*(link.gone.wait() for link in links))
@@ -176,7 +195,7 @@ class _Link(asyncio.Protocol):
     def __init__(self, server: TcpServer) -> None:
         self.server, self.limits = server, server.limits
         self.wire = Connection(max_message=self.limits.max_message, max_batch=self.limits.max_batch)
-        self.name = ""
+        self.name = self.address = ""
         self.number = self.served = 0
         self.calls: Correlation[None] = Correlation(Role.SERVER)
         self.gone = asyncio.Event()
@@ -186,7 +205,7 @@ class _Link(asyncio.Protocol):
         self.ended = False
         self.broken = 0
         self.token_check = TokenCheck(
-            server.token, lambda: self.loop.call_soon(self.close, "wrong tokens")
+            server.token, lambda: self.loop.call_soon(self.close, "wrong tokens"), server.lines
         )
         self.allowance = 0.0
         self.allowance_at = 0.0
@@ -208,20 +227,45 @@ class _Link(asyncio.Protocol):
         self.name = f"{peer[0]}:{peer[1]}#{self.number}"
         self.transport.set_write_buffer_limits(high=64 * 1024)
         tune(self.transport.get_extra_info("socket"))
-        allowed = self.limits.max_clients
-        if len(self.server.links) >= allowed:
-            log("refused", logging.WARNING, client=self.name, reason="too many clients")
-            error = busy("too many clients", {"allowed": allowed})
-            timeout_s, others = self.limits.hello_timeout_s, self.server.turned_away
-            TurnedAway(self.transport, error, timeout_s, others)  # takes over from here
-            return
-        self.server.links.add(self)
+        self.address = neighbourhood(str(peer[0]))
+        if self.let_in and not self._seat():
+            self.log("refused", logging.WARNING, reason="too many clients")
+            timeout_s, others = self.limits.hello_timeout_s, self.server.waiting
+            error = self._no_place()
+            TurnedAway(
+                self.transport, self.address, error, timeout_s, others, self._urgent_after_all
+            )
+            return  # it takes over from here
+        self._begin()
+
+    def _begin(self) -> None:
         if self.let_in:
             self._open()
         else:
+            self.server.waiting.enter(self)
             self.deadlines.start("hello", self.limits.hello_timeout_s)
         self.worker = self.loop.create_task(self._work())
         self.worker.add_done_callback(self._crashed)
+
+    def _urgent_after_all(self, data: bytes) -> bool:
+        """Serve a connection that was turned away, if its first bytes name an urgent method."""
+        if not any(name in data for name in self.server.urgent):
+            return False
+        self.transport.set_protocol(self)
+        self._begin()
+        self.data_received(data)
+        return True
+
+    def _seat(self) -> bool:
+        """Take a place if there is one; whether it has one."""
+        links = self.server.links
+        if self not in links and len(links) < self.limits.max_clients:
+            links.add(self)
+            self.server.reserved.leave(self)
+        return self in links
+
+    def _no_place(self) -> RpcError:
+        return busy("too many clients", {"allowed": self.limits.max_clients})
 
     def data_received(self, data: bytes) -> None:
         before = self.wire.waiting
@@ -279,12 +323,14 @@ class _Link(asyncio.Protocol):
             task.cancel()
         self.out.lost()
         self.server.links.discard(self)
+        self.server.waiting.leave(self)
+        self.server.reserved.leave(self)
         if self.session is not None:
             session, self.session = self.session, None
             try:
                 session.close()
             except Exception:
-                log("close failed", logging.ERROR, error=True, client=self.name)
+                self.log("close failed", logging.ERROR, error=True)
         self.gone.set()
 
     def pause_writing(self) -> None:
@@ -305,16 +351,23 @@ class _Link(asyncio.Protocol):
         self.out.event(message, slot)
 
     def close(self, reason: str) -> None:
-        log("closing", client=self.name, reason=reason)
+        self.log("closing", reason=reason)
         self.transport.close()
         self.deadlines.start("send", self.limits.send_timeout_s)
 
     def end(self) -> None:
-        """The server ends."""
+        """The server ends, or others need the room."""
         self.transport.abort()
 
+    def log(
+        self, event: str, level: int = logging.INFO, *, error: bool = False, **facts: object
+    ) -> None:
+        """Write a line about this connection, unless there are too many of its kind."""
+        kind = event if self.let_in else f"{event}, no token"
+        self.server.lines.log(event, level, kind=kind, error=error, client=self.name, **facts)
+
     def abort(self, reason: str) -> None:
-        log("cut off", logging.WARNING, client=self.name, reason=reason)
+        self.log("cut off", logging.WARNING, reason=reason)
         self.transport.abort()
 
     # -- requests ----------------------------------------------------------------------------
@@ -323,10 +376,14 @@ class _Link(asyncio.Protocol):
         self.let_in = True
         self.loop.call_soon(self.overtake)  # what came before was not looked at
         self.deadlines.stop("hello")
+        self.server.waiting.leave(self)
+        self._relax()
+        if not self._seat():
+            self.server.reserved.enter(self)
         try:
             self.session = self.server.app.open(self)
         except Exception:
-            log("open failed", logging.ERROR, error=True, client=self.name)
+            self.log("open failed", logging.ERROR, error=True)
             self.abort("the application did not open a session")
 
     def _lane(self, message: Message | Frozen) -> int:
@@ -347,7 +404,7 @@ class _Link(asyncio.Protocol):
     async def _work(self) -> None:
         while True:
             while self.wire.whole:
-                await self.server.turns.take(self, ORDINARY)
+                await self.server.turns.take(self, ORDINARY if self.let_in else URGENT)
                 raw = self.wire.next_raw()
                 self._relax()
                 if isinstance(raw, Malformed) and raw.fatal:
@@ -378,6 +435,8 @@ class _Link(asyncio.Protocol):
 
     async def _decoded(self, raw: Raw) -> Message | Frozen | tuple[Frozen, ...]:
         read = self.server.read
+        if not self.let_in and (isinstance(raw, tuple) or len(raw) > LARGE):
+            return Malformed(not_authorised())
         if read is None or (isinstance(raw, bytes) and len(raw) <= LARGE):
             return self.wire.decode(raw)
         try:
@@ -385,7 +444,7 @@ class _Link(asyncio.Protocol):
         except RpcError as error:
             return Malformed(error)
         except Exception:
-            log("a message was not read", logging.ERROR, error=True, client=self.name)
+            self.log("a message was not read", logging.ERROR, error=True)
             return Malformed(internal())
 
     async def _serve(
@@ -443,17 +502,22 @@ class _Link(asyncio.Protocol):
             return Failure(None, invalid_request(str(error)))
         match item:
             case Request(id, name, params) | Call(id, name, params, True):
-                self.broken = 0
                 answer = await self._call(id, name, params if refused is None else refused)
+                self._count(broken=False)
                 return self.calls.answer(answer)
             case Notification(name, params) | Call(_, name, params, False):
                 await self._call(None, name, params if refused is None else refused)
+                self._count(broken=False)
             case Malformed() as malformed:
-                self.broken += 1
-                if self.broken >= self.limits.malformed:
-                    self.loop.call_soon(self.close, f"{self.broken} broken messages in a row")
+                self._count(broken=True)
                 return self.calls.answer(malformed.reply)
         return None
+
+    def _count(self, *, broken: bool) -> None:
+        """Close after too many broken messages in a row; without the token any message is one."""
+        self.broken = self.broken + 1 if broken or not self.let_in else 0
+        if self.broken >= (self.limits.malformed if self.let_in else STRANGE):
+            self.loop.call_soon(self.close, f"{self.broken} broken messages in a row")
 
     async def _call(self, id: Id, name: str, given: Given) -> Response | Failure:
         self.served += 1
@@ -465,11 +529,13 @@ class _Link(asyncio.Protocol):
 
     async def _try(self, id: Id, name: str, given: Given, trace: str) -> Response | Failure:
         try:
-            if not self.let_in and name != "session.hello":
+            if not self.let_in and name != HELLO:
                 raise not_authorised()
             method = find(name, self.server.methods)
             if not method.urgent:
                 self._check_rate()
+                if not (self._seat() if self.let_in else name == HELLO):
+                    raise self._no_place()
             if isinstance(given, RpcError):
                 raise given
             params = given if isinstance(given, Params) else parse_params(method, given)
@@ -481,7 +547,7 @@ class _Link(asyncio.Protocol):
         except RpcError as error:
             return Failure(id, error)
         except Exception:
-            log("handler failed", logging.ERROR, error=True, client=self.name, method=name[:100])
+            self.log("handler failed", logging.ERROR, error=True, method=name[:100])
             # The id is what a person needs to find the traceback.
             return Failure(id, internal(trace))
 
@@ -512,8 +578,9 @@ class _Link(asyncio.Protocol):
     @property
     def _full(self) -> bool:
         """Whether enough waits to stop reading; a message that has begun may come to its end."""
-        ahead = self.wire.pending if self.wire.whole else 0
-        return self._load >= self.limits.max_waiting or ahead > READ_AHEAD
+        ahead = self.wire.pending if self.wire.whole or not self.let_in else 0
+        most = READ_AHEAD if self.let_in else LARGE
+        return self._load >= self.limits.max_waiting or ahead > most
 
     def _relax(self) -> None:
         """Read again once enough of what was read has been served."""
@@ -530,7 +597,7 @@ class _Link(asyncio.Protocol):
     def _crashed(self, task: asyncio.Task[None]) -> None:
         """Handlers' failures are answered; anything that still gets here ends the connection."""
         if not task.cancelled() and (error := task.exception()) is not None:
-            log("connection failed", logging.ERROR, client=self.name, error_type=repr(error))
+            self.log("connection failed", logging.ERROR, error_type=repr(error))
             self.transport.abort()
 
     def _start(self, work: Coroutine[object, object, None]) -> None:

@@ -23,6 +23,7 @@ from flexdt.server.network.shell_parts import TokenCheck
 from flexdt.server.projector.compute import ComputeJob, ComputeThread, Customer
 from flexdt.server.projector.volumes import VolumeStore
 from flexdt.server.projector.wire import FrameLink
+from flexdt.server.runtime.log import Sparing
 
 PART_BYTES: Final = 8 * 2**20
 """Payload of a part of what does not fit into one frame."""
@@ -33,14 +34,14 @@ SPARE: Final = 4096
 class JobClient(Customer):
     """One connection, its jobs and its requests that are under way."""
 
-    def __init__(self, link: FrameLink, token: str | None) -> None:
+    def __init__(self, link: FrameLink, token: str | None, lines: Sparing) -> None:
         super().__init__()
         self.link, self.let_in = link, token is None
         self.jobs: dict[Id, ComputeJob] = {}
         self.calls: Correlation[None] = Correlation(Role.SERVER)
         self.tasks: set[asyncio.Task[None]] = set()
         self.pending_bytes = 0
-        self.token_check = TokenCheck(token, self._close_soon)
+        self.token_check = TokenCheck(token, self._close_soon, lines)
 
     def _close_soon(self) -> None:
         """End the connection once its last answer has gone out."""
@@ -61,6 +62,7 @@ class Context:
         started: when it was [s], monotonic.
         views: projected so far.
         superseded: requests that newer ones have replaced.
+        lines: of the log about connections.
     """
 
     compute: ComputeThread
@@ -72,6 +74,7 @@ class Context:
     started: float = field(default_factory=time.monotonic)
     views: int = 0
     superseded: int = 0
+    lines: Sparing = field(default_factory=Sparing)
 
     def start(self, client: JobClient, id: Id, job: ComputeJob) -> ComputeJob:
         """Submit a job, known by its request's id until that is answered."""

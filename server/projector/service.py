@@ -83,7 +83,7 @@ class ProjectorServer(ListeningServer):
 
     def made(self, link: FrameLink) -> None:
         """A client has connected."""
-        client = JobClient(link, self.context.token)
+        client = JobClient(link, self.context.token, self.context.lines)
         self.context.clients[link] = client
         if len(self.context.clients) > self.limits.max_clients:
             allowed = {"allowed": self.limits.max_clients}
@@ -104,7 +104,7 @@ class ProjectorServer(ListeningServer):
 
     def refuse(self, link: FrameLink, error: RpcError) -> None:
         """Send an error and end the connection."""
-        log("refused", logging.WARNING, client=link.peer, reason=error.message)
+        self.context.lines.log("refused", logging.WARNING, client=link.peer, reason=error.message)
         link.dismiss(Failure(None, error))
 
     def frame(self, link: FrameLink, body: memoryview) -> None:

@@ -19,13 +19,12 @@ from collections.abc import Callable
 from time import perf_counter
 from typing import Any, Final
 
-from flexdt.server.runtime.log import log
+from flexdt.server.runtime.log import Sparing
 from flexdt.server.runtime.metrics import Histogram
 
-COMPLAIN_S = 10.0
-"""The same complaint is logged once in this time [s]."""
-BACKLOG = 128
-"""Connections that the system keeps until they are accepted."""
+BACKLOG = 1024
+"""Connections that the system keeps until they are accepted. Beyond them it drops a client's first
+packet, which is sent again after a whole second: six seconds of 10 000 connections a minute fit."""
 TLS_HANDSHAKE_S = 10.0
 
 
@@ -91,27 +90,20 @@ class Complaints:
     """
 
     def __init__(self) -> None:
-        self._last: dict[str, tuple[float, int]] = {}
+        self._sparing = Sparing(burst=1)
 
     def __call__(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         """Handle one error."""
         what, error = str(context.get("message")), context.get("exception")
-        expected = isinstance(error, OSError)
         kind = f"{what} {type(error).__name__}"
-        at, more = self._last.get(kind, (-COMPLAIN_S, 0))
-        now = loop.time()
-        if now - at < COMPLAIN_S:
-            self._last[kind] = (at, more + 1)
-            return
-        self._last = {k: v for k, v in self._last.items() if now - v[0] < COMPLAIN_S}
-        self._last[kind] = (now, 0)
-        if expected or error is None:
-            log("event loop", logging.WARNING, message=what, reason=str(error), before=more)
+        if error is None or isinstance(error, OSError):
+            self._sparing.log("event loop", logging.WARNING, kind=kind,
+                              message=what, reason=str(error))  # fmt: skip
             return
         try:
             raise error
         except BaseException:
-            log("event loop", logging.ERROR, error=True, message=what, before=more)
+            self._sparing.log("event loop", logging.ERROR, kind=kind, error=True, message=what)
 
 
 class ListeningServer:

@@ -27,7 +27,7 @@ from flexdt.protocol import (
     event,
 )
 from flexdt.protocol.fields import Params
-from flexdt.server.network import shell_parts as refusal
+from flexdt.server.network import tcp
 from flexdt.server.network.shell_application import Peer
 from flexdt.server.network.tcp import TcpServer, serve
 from flexdt.server.runtime.access import AccessError, ConnectionLimits
@@ -553,7 +553,7 @@ def test_one_too_many_that_says_nothing_or_does_not_go_is_cut_off() -> None:
         assert json.loads(await stays.read())["error"]["code"] == -32003
         with contextlib.suppress(ConnectionError):  # cut off, not said goodbye to
             assert await mute.read() == b""
-        while server.turned_away:  # `two` has not closed its side
+        while server.waiting.guests:  # `two` has not closed its side
             await asyncio.sleep(0.01)
         for writer in (first, one, two):
             writer.close()
@@ -562,14 +562,14 @@ def test_one_too_many_that_says_nothing_or_does_not_go_is_cut_off() -> None:
 
 
 def test_many_too_many_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(refusal, "MOST", 3)
+    monkeypatch.setattr(tcp, "WAITING", 3)
 
     async def body(server: TcpServer, app: FakeApp) -> None:
         links = [await dial(server) for _ in range(9)]
         ends = [asyncio.create_task(reader.read()) for reader, _ in links]
         while sum(end.done() for end in ends) < 5:  # one is served and three wait
             await asyncio.sleep(0.01)
-        assert len(server.turned_away) == 3
+        assert len(server.waiting.guests) == 3
         await asyncio.wait(ends, timeout=0.05)
         assert sum(end.done() for end in ends) == 5
         for _, writer in links:

@@ -217,7 +217,7 @@ def many(g: Ground) -> str:
     served, turned_away = 0, 0
     for s in open_:
         with contextlib.suppress(ConnectionError):
-            s.sendall(ping)
+            s.sendall(ping.replace(b"session.ping", b"state.get"))
     for s in open_:
         with contextlib.suppress(ConnectionError), s.makefile("rb") as answers:
             line = answers.readline()

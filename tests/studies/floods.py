@@ -1,6 +1,14 @@
 """Floods on the viewer and the gateway, and what an honest page and program notice of them.
 
     python tests/studies/floods.py [--seconds 8] [NAME...]
+    python tests/studies/floods.py --connections 1000 [--real-time]
+
+The second one is about a twin with a token. A peer without the token makes 10 000 connections a
+minute (`strangers.py`), while so many new clients with the token connect, say hello, ping and send
+an E-stop, every other one from the address of the peer. It prints the times from before connecting
+to the answers (without the flood, beside it, and with all places taken) and the bytes of log, apart
+from the lines about those E-stops. `--real-time` is for machines that are busy with other things.
+Exit code 1 when a client had no answer, or an hour would log more than 1 MB; times are not judged.
 
 Starts the servers, lets attackers loose one kind at a time, and prints for each the round trips of
 an honest `state.get` (of a page) or `status_time_get` (of a program) and the memory of the process
@@ -15,6 +23,8 @@ import contextlib
 import itertools
 import json
 import multiprocessing
+import os
+import random
 import sys
 import tempfile
 import time
@@ -26,6 +36,9 @@ import msgpack
 import viser
 import zmq
 import zmq.asyncio
+from lab import machine, percentile, twin
+from latency import Stalls
+from strangers import draw, hello, play, request
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
@@ -277,12 +290,163 @@ async def trial(ports: Ports, name: str, seconds: float) -> bool:
     return alive and not ended and honest.internal == 0 and bool(honest.times)
 
 
+TOKEN = "sixteen letters or more"
+A_MINUTE = 10_000
+CLIENTS_S = 16.0
+"""New clients a second."""
+PEER, OTHER = "127.0.0.2", "127.0.0.3"
+PLACES = 64
+PATIENCE_S = 10.0
+SETTLED_S = 5.0
+"""After this the flood has as many connections as it gets, and the log has had its first lines."""
+
+
+def strangers(port: int, seed: int, made: Any) -> None:
+    """In a process of its own: connections at an even rate, counted, until it is killed."""
+    os.nice(10)  # its own cost apart
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+    async def work() -> None:
+        rng, open_ = random.Random(seed), set[asyncio.Task[bytes]]()
+        begun = time.monotonic()
+        for i in itertools.count(1):
+            task = asyncio.create_task(play(draw(rng), "127.0.0.1", port, PEER))
+            open_.add(task)
+            task.add_done_callback(open_.discard)
+            made.value = i
+            await asyncio.sleep(max(0.0, begun + 60.0 / A_MINUTE * i - time.monotonic()))
+
+    asyncio.run(work())
+
+
+async def client(port: int, source: str) -> dict[str, float]:
+    """A new client with the token: answer -> time from before it connected [ms]."""
+    begun, times = time.perf_counter(), dict[str, float]()
+    with contextlib.suppress(OSError, TimeoutError):
+        async with asyncio.timeout(PATIENCE_S):
+            reader, writer = await asyncio.open_connection(
+                "127.0.0.1", port, local_addr=(source, 0)
+            )
+            try:
+                said = (hello(TOKEN), request("session.ping"), request("safety.estop"))
+                for name, line in zip(("hello", "ping", "E-stop"), said, strict=True):
+                    writer.write(line)
+                    if "result" not in json.loads(await reader.readline() or b"{}"):
+                        break
+                    times[name] = 1000 * (time.perf_counter() - begun)
+            finally:
+                writer.transport.abort()
+    return times
+
+
+async def newcomers(port: int, count: int) -> dict[str, list[dict[str, float]]]:
+    """Clients that come one after the other; by their address."""
+    tasks: dict[str, list[asyncio.Task[dict[str, float]]]] = {OTHER: [], PEER: []}
+    begun = time.monotonic()
+    for i in range(count):
+        source = (OTHER, PEER)[i % 2]
+        tasks[source].append(asyncio.create_task(client(port, source)))
+        await asyncio.sleep(max(0.0, begun + (i + 1) / CLIENTS_S - time.monotonic()))
+    return {source: await asyncio.gather(*each) for source, each in tasks.items()}
+
+
+async def holders(port: int) -> list[asyncio.StreamWriter]:
+    """Clients that hold all places: each has asked for something ordinary."""
+    held = []
+    for _ in range(PLACES):
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(hello(TOKEN) + request("rpc.discover"))
+        await reader.readline()
+        held.append(writer)
+    return held
+
+
+def real_time(pid: int) -> None:
+    """Have a process (0: this one) run before others, where the system grants it."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(pid, os.SCHED_RR, os.sched_param(1))
+
+
+async def part(count: int, folder: Path, *, flood: bool, full: bool, alone: bool) -> bool:
+    """So many new clients of one twin; prints their times, returns whether all was well."""
+    secret = folder / "token"
+    secret.write_text(TOKEN)
+    limit = f"max_clients={PLACES}"
+    server = twin(9, folder / "data", "--token-file", secret, "--limit", limit, log=folder / "log")
+    made = PROCESSES.Value("l", 0)
+    attacker = PROCESSES.Process(target=strangers, args=(server.port, 1, made), daemon=True)
+    try:
+        held = await holders(server.port) if full else []
+        await newcomers(server.port, 8)  # what the first answers need is loaded now
+        sizes = [logged(folder / "log")]
+        if flood:
+            attacker.start()
+        await asyncio.sleep(SETTLED_S)
+        sizes.append(logged(folder / "log"))
+        if alone:
+            real_time(server.pid)
+            real_time(0)
+        begun, work, before = time.monotonic(), server.processor_s(), made.value
+        got = await newcomers(server.port, count)
+        lasted = time.monotonic() - begun
+        sizes.append(logged(folder / "log"))
+        rate = (made.value - before) * 60.0 / lasted
+        share = (server.processor_s() - work) / lasted
+        for writer in held:
+            writer.close()
+    finally:
+        if attacker.pid is not None:
+            attacker.kill()
+            attacker.join()
+        server.end()
+    hour = sizes[1] - sizes[0] + (sizes[2] - sizes[1]) * 3600.0 / lasted
+    sound = hour < 1e6
+    for source, each in got.items():
+        where = "the peer's address" if source == PEER else "another address"
+        for name in ("ping", "E-stop"):
+            ms = [times[name] for times in each if name in times]
+            sound = sound and len(ms) == len(each)
+            shown = [percentile(ms, q) for q in (0.5, 0.99, 0.999, 1.0)] if ms else []
+            late = sum(t > 100.0 for t in ms) + len(each) - len(ms)
+            times_ms = " | ".join(f"{t:.1f}" for t in shown)
+            print(f"| {rate:.0f} | {'taken' if full else 'free'} | {where} | "
+                  f"{name} | {len(ms)} of {len(each)} | {late} | {times_ms} | {share:.0%} | "
+                  f"{hour / 1e3:.0f} kB |", flush=True)  # fmt: skip
+    return sound
+
+
+def logged(log: Path) -> int:
+    """Bytes of log but for the lines that the new clients' own E-stops write."""
+    return sum(len(line) for line in log.read_bytes().splitlines() if b"E-stop by" not in line)
+
+
+async def connections(count: int, *, alone: bool) -> bool:
+    """New clients without the flood, beside it, and beside it with all places taken."""
+    sound, stalls = True, Stalls()
+    print("| connections a minute | places | clients from | | answered | beyond 100 ms | p50 | "
+          "p99 | p99.9 | worst | processor | log in an hour |")  # fmt: skip
+    print("|---|---|---|---|---|---|---|---|---|---|---|---|")
+    for flood, full in ((False, False), (True, False), (True, True)):
+        with tempfile.TemporaryDirectory(prefix="flexdt-floods-") as folder:
+            well = await part(count, Path(folder), flood=flood, full=full, alone=alone)
+            sound = sound and well
+    print(f"times in ms; the machine stood still for {stalls.take():.0f} ms at most. {machine()}.")
+    return sound
+
+
 def main() -> int:
     """Run the floods; returns the exit code."""
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(FLOODS)}")
     options.add_argument("--seconds", type=float, default=8.0, help="of each flood")
+    options.add_argument("--connections", type=int, metavar="CLIENTS", help="see above")
+    options.add_argument(
+        "--real-time", action="store_true", help="give the clients and the twin's loop priority"
+    )
     chosen = options.parse_args()
+    if chosen.connections:
+        return 0 if asyncio.run(connections(chosen.connections, alone=chosen.real_time)) else 1
     with tempfile.TemporaryDirectory(prefix="flexdt-floods-") as folder:
         log = Path(folder) / "log"
         given = {"data": Path(folder) / "data", "speed-up": 8, "gateway-port": 0}

@@ -96,6 +96,11 @@ class Process:
         status = Path(f"/proc/{self.pid}/status").read_text()
         return int(next(x for x in status.splitlines() if x.startswith("VmRSS")).split()[1]) / 1024
 
+    def processor_s(self) -> float:
+        """Processor time so far [s]."""
+        words = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+
     def children_mb(self) -> float:
         """Most memory that a child of it has taken so far [MB]; 0 without children."""
         most = 0.0
