@@ -12,9 +12,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from flexdt.phantoms import is_shipped, load_phantom, load_phantom_file
-from flexdt.protocol import params as p
-from flexdt.protocol import results as r
-from flexdt.protocol.method_table import FIT_LIMITS
+from flexdt.protocol.methods.calibration import (
+    FIT_LIMITS,
+    CalibrationAlign,
+    CalibrationAlignResult,
+    CalibrationFit,
+    CalibrationFitResult,
+)
 from flexdt.server.wire_errors import from_root
 from flexdt.twin.calibration.fit.covariance_steps import covariance_by_step
 from flexdt.twin.calibration.unknown_markers import UNKNOWN
@@ -26,7 +30,7 @@ MEMORY_BYTES: Final = int(FIT_LIMITS["memory_bytes"])
 FILES: Final = (".toml", ".json")
 
 
-def fit(root: Path, asked: p.CalibrationFit, *_: object) -> r.CalibrationFitResult:
+def fit(root: Path, asked: CalibrationFit, *_: object) -> CalibrationFitResult:
     """Calibrate; blocks.
 
     Raises:
@@ -60,13 +64,13 @@ def fit(root: Path, asked: p.CalibrationFit, *_: object) -> r.CalibrationFitResu
         ]
     if asked.tracks:
         told["tracks"] = import_module("flexdt.clients.calibration.tracks").tracks_document(found)
-    return r.CalibrationFitResult.model_validate(from_root(told, root))
+    return CalibrationFitResult.model_validate(from_root(told, root))
 
 
-def align(root: Path, asked: p.CalibrationAlign, *_: object) -> r.CalibrationAlignResult:
+def align(root: Path, asked: CalibrationAlign, *_: object) -> CalibrationAlignResult:
     """Align; blocks. Raises as `fit`."""
     found = _face().align(_there(root, asked.name, "data set"), per_frame=asked.per_frame)
-    return r.CalibrationAlignResult.model_validate(from_root(found.document, root))
+    return CalibrationAlignResult.model_validate(from_root(found.document, root))
 
 
 def _there(root: Path, name: str, what: str) -> Path:

@@ -21,11 +21,19 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.protocol import Codec, image
-from flexdt.protocol import params as p
-from flexdt.protocol import results as r
 from flexdt.protocol.connection import MAX_ANSWER, encoded
 from flexdt.protocol.fields import ImageValue, Params
 from flexdt.protocol.messages import Encoded
+from flexdt.protocol.methods.calibration import CalibrationAlign, CalibrationFit
+from flexdt.protocol.methods.datasets import (
+    DatasetFrame,
+    DatasetFrameResult,
+    DatasetGet,
+    DatasetInfo,
+    DatasetList,
+    DatasetListResult,
+    DatasetResult,
+)
 from flexdt.protocol.rpc_errors import too_large
 from flexdt.server.files.dataset_folder import (
     Folder,
@@ -103,7 +111,7 @@ class PastScans:
                 larger, or takes longer to read, than is allowed.
         """
         around = Around(running, self._machine, self._profile)
-        slow = isinstance(params, p.CalibrationFit | p.CalibrationAlign)
+        slow = isinstance(params, CalibrationFit | CalibrationAlign)
         workers = self._fitters if slow else self._workers
         return Encoded(tuple(await workers.ask(work, self._root, params, around, codec)))
 
@@ -265,7 +273,7 @@ def _opened(root: Path, name: str) -> _Scan:
     return found
 
 
-def _info(path: Path, modified: float, scan: _Scan) -> r.DatasetInfo:
+def _info(path: Path, modified: float, scan: _Scan) -> DatasetInfo:
     folder, document = scan.folder, scan.document
     kV, power_W = scan.beam
     if document is None:
@@ -280,7 +288,7 @@ def _info(path: Path, modified: float, scan: _Scan) -> r.DatasetInfo:
                 "exposure_ms": said.exposure_ms, "projections": len(texts), "kV": kV,
                 "power_W": power_W,
             }  # fmt: skip
-        info = r.DatasetInfo(
+        info = DatasetInfo(
             name=path.name, modified=modified, projections=there, present=there,
             problem=scan.problem[:500],
         )  # fmt: skip
@@ -291,7 +299,7 @@ def _info(path: Path, modified: float, scan: _Scan) -> r.DatasetInfo:
     if lost and document.complete:
         reason = f"{lost[0]} is missing" + (f", and {len(lost) - 1} more" if lost[1:] else "")
     detector, named = document.detector, document.machine.get("name")
-    return r.DatasetInfo(
+    return DatasetInfo(
         name=path.name,
         modified=modified,
         started=document.started.isoformat(),
@@ -314,7 +322,7 @@ def _info(path: Path, modified: float, scan: _Scan) -> r.DatasetInfo:
 # dataset.list -------------------------------------------------------------------------------------
 
 
-def _list(root: Path, asked: p.DatasetList, around: Around, codec: Codec) -> r.DatasetListResult:
+def _list(root: Path, asked: DatasetList, around: Around, codec: Codec) -> DatasetListResult:
     folders, left_out = [], 0
     with os.scandir(root) as entries:
         for entry in entries:
@@ -338,7 +346,7 @@ def _list(root: Path, asked: p.DatasetList, around: Around, codec: Codec) -> r.D
         except DatasetError:
             continue  # it has gone meanwhile, or is no data set
         if info is None:
-            info = r.DatasetInfo(name=name, modified=modified, problem="not read yet")
+            info = DatasetInfo(name=name, modified=modified, problem="not read yet")
         elif info == "":
             continue
         if name == around.running:
@@ -353,10 +361,10 @@ def _list(root: Path, asked: p.DatasetList, around: Around, codec: Codec) -> r.D
     shown = found[asked.start : asked.start + asked.count]
     if asked.thumbnail:
         shown = [_with_thumbnail(root, info, asked.thumbnail, until + LIST_S) for info in shown]
-    return r.DatasetListResult(datasets=shown, total=len(found), unread=unread, left_out=left_out)
+    return DatasetListResult(datasets=shown, total=len(found), unread=unread, left_out=left_out)
 
 
-def _listed(path: Path, modified: float) -> r.DatasetInfo | str:
+def _listed(path: Path, modified: float) -> DatasetInfo | str:
     """A data set in a few words; "" for a folder that holds none."""
     folder = list_folder(path, links=False)
     if folder.document is None and not folder.projections:
@@ -369,7 +377,7 @@ def _listed(path: Path, modified: float) -> r.DatasetInfo | str:
     return _info(path, modified, scan)
 
 
-def _with_thumbnail(root: Path, info: r.DatasetInfo, side: int, until: float) -> r.DatasetInfo:
+def _with_thumbnail(root: Path, info: DatasetInfo, side: int, until: float) -> DatasetInfo:
     def make() -> ImageValue | str:
         folder = list_folder(path, links=False)
         files = list(folder.projections.values())
@@ -399,7 +407,7 @@ def _with_thumbnail(root: Path, info: r.DatasetInfo, side: int, until: float) ->
 # dataset.get --------------------------------------------------------------------------------------
 
 
-def _get(root: Path, asked: p.DatasetGet, around: Around, codec: Codec) -> r.DatasetResult:
+def _get(root: Path, asked: DatasetGet, around: Around, codec: Codec) -> DatasetResult:
     scan = _opened(root, asked.name)
     folder, document, images = scan.folder, scan.document, scan.images
     info = _info(folder.path, folder.path.stat().st_mtime, scan)
@@ -416,7 +424,7 @@ def _get(root: Path, asked: p.DatasetGet, around: Around, codec: Codec) -> r.Dat
         told = _MEASURED.get(
             key, lambda: _measured(folder, document, chosen), lambda m: None not in m["counts"]
         )
-    return r.DatasetResult(
+    return DatasetResult(
         info=info,
         images=len(images),
         indices=at,
@@ -497,7 +505,7 @@ def _clearances(
 # dataset.frame ------------------------------------------------------------------------------------
 
 
-def _frame(root: Path, asked: p.DatasetFrame, around: Around, codec: Codec) -> r.DatasetFrameResult:
+def _frame(root: Path, asked: DatasetFrame, around: Around, codec: Codec) -> DatasetFrameResult:
     scan = _opened(root, asked.name)
     folder, document, images = scan.folder, scan.document, scan.images
     if asked.index >= len(images):
@@ -522,7 +530,7 @@ def _frame(root: Path, asked: p.DatasetFrame, around: Around, codec: Codec) -> r
     size = small.nbytes if codec is Codec.MSGPACK else small.nbytes * 4 // 3
     if size > (most := MAX_ANSWER[codec] - (1 << 16)):  # beside the pixels
         raise too_large("an image (ask for a binned one)", size, most)
-    return r.DatasetFrameResult(
+    return DatasetFrameResult(
         **image.encode(small),  # type: ignore[arg-type]
         name=asked.name,
         index=asked.index,
@@ -567,9 +575,9 @@ def _normal(
 
 
 _ANSWERS: Final[Mapping[type[Params], Callable[..., object]]] = {
-    p.DatasetList: _list,
-    p.DatasetGet: _get,
-    p.DatasetFrame: _frame,
-    p.CalibrationFit: dataset_fits.fit,
-    p.CalibrationAlign: dataset_fits.align,
+    DatasetList: _list,
+    DatasetGet: _get,
+    DatasetFrame: _frame,
+    CalibrationFit: dataset_fits.fit,
+    CalibrationAlign: dataset_fits.align,
 }

@@ -20,7 +20,7 @@ from pydantic import Field, StringConstraints
 
 from flexdt.phantoms.files.mesh_files import default_unit
 from flexdt.protocol.fields import Payload
-from flexdt.protocol.params import LengthUnit, SampleUpload
+from flexdt.protocol.methods.samples import LengthUnit, SampleUpload
 from flexdt.server.files.atomic import writing
 from flexdt.server.files.own_documents import make
 from flexdt.server.runtime.log import log
