@@ -72,8 +72,10 @@ page: $(TEST_STAMP)
 failed: lint typecheck $(TEST_STAMP)
 	$(BIN)/pytest --last-failed --last-failed-no-failures none
 
-# The page from its TypeScript, after changes there or in the wire.
+# What follows from the table of methods, and the page from its TypeScript.
 web: install $(WEB_STAMP)
+	$(BIN)/python tests/protocol/test_openrpc_file.py
+	$(BIN)/python tests/clients/test_shared_methods.py
 	$(BIN)/python tests/viewer/test_page_source.py
 
 # The site, notebooks executed; warnings are errors. Result: docs/_build/html/index.html

@@ -13,15 +13,15 @@ from flexdt.protocol.messages import (
     Response,
     event,
 )
-from flexdt.protocol.method_table import (
-    METHODS,
+from flexdt.protocol.method import (
     PROTOCOL,
+    AnyMethod,
     Method,
-    find,
     parse_params,
     parse_result,
     require_compatible,
 )
+from flexdt.protocol.methods import METHODS, find
 from flexdt.protocol.rpc_errors import Code, ProtocolError, RpcError
 
 __all__ = [
@@ -29,6 +29,7 @@ __all__ = [
     "METHODS",
     "PROTOCOL",
     "Answered",
+    "AnyMethod",
     "Batch",
     "Code",
     "Codec",

@@ -32,7 +32,7 @@ from flexdt.protocol.messages import (
     Request,
     Response,
 )
-from flexdt.protocol.method_table import PROTOCOL
+from flexdt.protocol.method import PROTOCOL
 from flexdt.protocol.rpc_errors import Code, ProtocolError, RpcError, clip
 
 _W = TypeVar("_W")

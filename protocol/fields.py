@@ -2,7 +2,7 @@
 
 Parameters are strict (no text for a number, no unknown member); results may grow, so a client
 keeps members that it does not know. The types of requests are bounded, so that the schema rejects
-what the code behind it could not handle. `params` and `results` have the models of the methods.
+what the code behind it could not handle. `methods` has the models of the methods.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """JSON-RPC 2.0 messages as frozen values, and their plain (dict and list) form.
 
 `from_plain` never raises: a document that is not a message becomes `Malformed`, which holds the
-error to answer with. Bytes are the business of `codec`, methods of `method_table`.
+error to answer with. Bytes are the business of `codec`, methods of `methods`.
 """
 
 from __future__ import annotations

@@ -11,12 +11,13 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
-from flexdt.protocol.method_table import METHODS, PROTOCOL, Method
+from flexdt.protocol.method import PROTOCOL, AnyMethod
+from flexdt.protocol.methods import METHODS
 from flexdt.protocol.rpc_errors import Code
 
 
 def document(
-    methods: Mapping[str, Method] = METHODS,
+    methods: Mapping[str, AnyMethod] = METHODS,
     *,
     title: str = "flexdt twin server",
     version: str = PROTOCOL,
@@ -53,7 +54,7 @@ def document(
     }
 
 
-def _method(method: Method, schemas: Mapping[str, Any], result: str) -> dict[str, Any]:
+def _method(method: AnyMethod, schemas: Mapping[str, Any], result: str) -> dict[str, Any]:
     schema = schemas[method.params.__name__]
     required = schema.get("required", [])
     params = []

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from functools import partial
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
@@ -30,9 +29,10 @@ from flexdt.protocol.fields import (
     VoxelShape,
     require_extent,
 )
-from flexdt.protocol.method_table import Method
-from flexdt.protocol.params import Bytes, Hello
-from flexdt.protocol.results import Discovery, HelloResult
+from flexdt.protocol.method import AnyMethod, Method, read
+from flexdt.protocol.methods.documents import Discovery
+from flexdt.protocol.methods.samples import Bytes
+from flexdt.protocol.methods.session import Hello, HelloResult
 from flexdt.protocol.rpc_errors import RpcError
 
 MAX_VIEWS: Final = 100_000
@@ -286,21 +286,19 @@ class Health(Result):
     memory_limit: int
 
 
-_read = partial(Method, safe=True)
-
-PROJECTOR_METHODS: Final[Mapping[str, Method]] = {
+PROJECTOR_METHODS: Final[Mapping[str, AnyMethod]] = {
     m.name: m
     for m in (
-        _read("session.hello", Hello, HelloResult, "introduce the client; bring the token"),
-        _read("volume.put", VolumePut, PutResult, "store a named volume or scene"),
-        _read("volume.get", VolumeRef, Array, "read a named volume of voxels back"),
-        _read("volume.list", Empty, VolumeList, "the volumes there are"),
-        _read("volume.remove", VolumeRef, Removed, "forget a volume"),
-        _read("project", Project, Array, "line integrals, float32 (n, rows, cols)"),
+        read("session.hello", Hello, HelloResult, "introduce the client; bring the token"),
+        read("volume.put", VolumePut, PutResult, "store a named volume or scene"),
+        read("volume.get", VolumeRef, Array, "read a named volume of voxels back"),
+        read("volume.list", Empty, VolumeList, "the volumes there are"),
+        read("volume.remove", VolumeRef, Removed, "forget a volume"),
+        read("project", Project, Array, "line integrals, float32 (n, rows, cols)"),
         Method("backproject", Backproject, Array, "the adjoint of project, float32 (z, y, x)"),
-        _read("health", Empty, Health, "how the server is"),
-        _read("cancel", Cancel, Cancelled, "give up a request of this connection"),
-        _read("rpc.discover", Empty, Discovery, "this table as an OpenRPC document"),
+        read("health", Empty, Health, "how the server is"),
+        read("cancel", Cancel, Cancelled, "give up a request of this connection"),
+        read("rpc.discover", Empty, Discovery, "this table as an OpenRPC document"),
     )
 }
 """Every method of the projector server, by name."""

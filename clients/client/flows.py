@@ -11,12 +11,11 @@ from collections.abc import Awaitable, Callable, Generator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, TypeAlias, TypeVar
 
-from pydantic import BaseModel
-
-from flexdt.protocol import parse_result
+from flexdt.protocol import Method, parse_result
+from flexdt.protocol.fields import Params, Result
 
 _R = TypeVar("_R")
-_M = TypeVar("_M", bound=BaseModel)
+_M = TypeVar("_M", bound=Result)
 
 OWN_PATIENCE: Final = -1.0
 """As a timeout: the client's own."""
@@ -57,22 +56,21 @@ Flow: TypeAlias = Generator[Effect, Any, _R]
 
 
 def ask(
-    method: str, model: type[_M], patience_s: float | None = OWN_PATIENCE, /, **params: object
+    method: Method[Params, _M], patience_s: float | None = OWN_PATIENCE, /, **params: object
 ) -> Flow[_M]:
-    """Call `method` and validate its result as `model`; params that are None are not sent.
+    """Call `method` and validate its result; params that are None are not sent.
 
     Args:
         method: of the wire.
-        model: of its result.
-        patience_s: see `Ask`.
+        patience_s: see `Ask`; a method whose time the server limits is waited for in any case.
         params: of the method, by name.
 
     Raises:
-        RpcError: the server's answer is an error, or does not fit `model`.
+        RpcError: the server's answer is an error, or is not the method's result.
     """
     given = {k: v for k, v in params.items() if v is not None}
-    answer = yield Ask(method, given, patience_s)
-    return parse_result(model, answer)
+    answer = yield Ask(method.name, given, None if "seconds" in method.limits else patience_s)
+    return parse_result(method.result, answer)
 
 
 def drive(flow: Flow[_R], perform: Callable[[Effect], object]) -> _R:

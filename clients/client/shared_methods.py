@@ -54,7 +54,7 @@ class Method(Generic[_P, _R]):
 
 
 class SharedMethods:
-    """The methods of the wire; how they wait is the client's."""
+    """The methods of the wire; how they wait is the client's. Written by `make web`."""
 
     control = Method(m.control)
     ping = Method(m.ping)
@@ -70,8 +70,8 @@ class SharedMethods:
     set_tube = Method(m.set_tube)
     set_camera = Method(m.set_camera)
     samples = Method(m.samples)
-    sample_mesh = Method(m.sample_mesh)
     set_sample = Method(m.set_sample)
+    sample_mesh = Method(m.sample_mesh)
     upload_mesh = Method(m.upload_mesh)
     upload_scene = Method(m.upload_scene)
     upload_voxels = Method(m.upload_voxels)

@@ -20,11 +20,12 @@ from flexdt.clients.client import uploads
 from flexdt.clients.client.events import Projection
 from flexdt.clients.client.flows import OWN_PATIENCE, Flow, Sleep, Tell, ask
 from flexdt.protocol import image as wire_image
-from flexdt.protocol import results as r
 from flexdt.protocol import state_model as s
-from flexdt.protocol.fields import Result
-from flexdt.protocol.params import Mark
-from flexdt.protocol.results import Projection as WireProjection
+from flexdt.protocol.methods import calibration as corrections
+from flexdt.protocol.methods import datasets as past_scans
+from flexdt.protocol.methods import documents, images, motion, session, settings
+from flexdt.protocol.methods import jobs as scans
+from flexdt.protocol.methods import samples as stage
 
 if TYPE_CHECKING:
     from flexdt.phantoms import Phantom
@@ -38,14 +39,14 @@ FINAL_STATES: Final = ("done", "failed", "aborted", "incomplete")
 """States in which a job has ended."""
 
 
-def control(action: Literal["acquire", "release", "force"]) -> Flow[r.ControlResult]:
+def control(action: Literal["acquire", "release", "force"]) -> Flow[session.ControlResult]:
     """Acquire control, release it, or take it over from its holder.
 
     Example:
         >>> twin.control("acquire").yours
         True
     """
-    return ask("session.control", r.ControlResult, action=action)
+    return ask(session.SESSION_CONTROL, action=action)
 
 
 def ping() -> Flow[float]:
@@ -55,7 +56,7 @@ def ping() -> Flow[float]:
         >>> twin.ping() <= twin.ping()  # the twin's clock [s]
         True
     """
-    return (yield from ask("session.ping", r.Pong)).time
+    return (yield from ask(session.SESSION_PING)).time
 
 
 def discover() -> Flow[dict[str, Any]]:
@@ -65,7 +66,7 @@ def discover() -> Flow[dict[str, Any]]:
         >>> "axes.move" in [method["name"] for method in twin.discover()["methods"]]
         True
     """
-    return (yield from ask("rpc.discover", Result)).model_dump(mode="python")
+    return (yield from ask(documents.RPC_DISCOVER)).model_dump(mode="python")
 
 
 # -- state and motion --------------------------------------------------------------------
@@ -78,7 +79,7 @@ def state() -> Flow[s.State]:
         >>> twin.state().axes["rot_obj"].unit
         'deg'
     """
-    return ask("state.get", s.State)
+    return ask(session.STATE_GET)
 
 
 def move(
@@ -88,7 +89,7 @@ def move(
     wait: bool = False,
     plan: bool = False,
     shortest: bool = False,
-) -> Flow[r.MoveResult]:
+) -> Flow[motion.MoveResult]:
     """Move axes [mm, deg, script's sign]; they start together.
 
     Args:
@@ -107,31 +108,31 @@ def move(
         30.0
     """
     return ask(
-        "axes.move", r.MoveResult, None if wait else OWN_PATIENCE, targets=dict(targets),
+        motion.AXES_MOVE, None if wait else OWN_PATIENCE, targets=dict(targets),
         relative=relative, wait=wait, plan=plan, shortest=shortest,
     )  # fmt: skip
 
 
-def jog(axis: str, velocity: float, lease_s: float = 0.5) -> Flow[r.MoveResult]:
+def jog(axis: str, velocity: float, lease_s: float = 0.5) -> Flow[motion.MoveResult]:
     """Move at `velocity` [mm/s, deg/s] until the lease [s] runs out or is renewed.
 
     Example:
         >>> twin.jog("rot_obj", 5.0, lease_s=0.2).warnings
         []
     """
-    return ask("axes.jog", r.MoveResult, axis=axis, velocity=velocity, lease_s=lease_s)
+    return ask(motion.AXES_JOG, axis=axis, velocity=velocity, lease_s=lease_s)
 
 
 def set_axis(
     axis: str, *, speed: float | None = None, acceleration: float | None = None
-) -> Flow[r.AxisSetResult]:
+) -> Flow[motion.AxisSetResult]:
     """Set speed [unit/s] and acceleration [unit/s2] of later moves.
 
     Example:
         >>> twin.set_axis("rot_obj", speed=10.0).speed
         10.0
     """
-    return ask("axes.set", r.AxisSetResult, axis=axis, speed=speed, acceleration=acceleration)
+    return ask(motion.AXES_SET, axis=axis, speed=speed, acceleration=acceleration)
 
 
 def stop() -> Flow[s.Stopped]:
@@ -141,7 +142,7 @@ def stop() -> Flow[s.Stopped]:
         >>> twin.stop().safety.estop
         False
     """
-    return ask("axes.stop", s.Stopped)
+    return ask(motion.AXES_STOP)
 
 
 def estop() -> Flow[s.Stopped]:
@@ -151,7 +152,7 @@ def estop() -> Flow[s.Stopped]:
         >>> twin.estop().safety.estop, twin.reset().safety.estop
         (True, False)
     """
-    return ask("safety.estop", s.Stopped)
+    return ask(motion.SAFETY_ESTOP)
 
 
 def reset(stop: int | None = None) -> Flow[s.State]:
@@ -167,7 +168,7 @@ def reset(stop: int | None = None) -> Flow[s.State]:
         >>> twin.reset().safety.state
         'ok'
     """
-    return ask("safety.reset", s.State, stop=stop)
+    return ask(motion.SAFETY_RESET, stop=stop)
 
 
 # -- settings ----------------------------------------------------------------------------
@@ -180,7 +181,7 @@ def set_clock(speed_up: SpeedUp) -> Flow[s.ClockState]:
         >>> twin.set_clock("max").speed_up
         'max'
     """
-    return ask("clock.set", s.ClockState, speed_up=speed_up)
+    return ask(settings.CLOCK_SET, speed_up=speed_up)
 
 
 def set_tube(
@@ -193,7 +194,7 @@ def set_tube(
         >>> tube.kV, tube.power_W
         (80.0, 20.0)
     """
-    return ask("tube.set", s.TubeState, kV=kV, power_W=power_W, on=on)
+    return ask(settings.TUBE_SET, kV=kV, power_W=power_W, on=on)
 
 
 def set_camera(
@@ -211,7 +212,7 @@ def set_camera(
         200.0
     """
     return ask(
-        "camera.set", s.CameraState, exposure_ms=exposure_ms, mode=mode,
+        settings.CAMERA_SET, exposure_ms=exposure_ms, mode=mode,
         roi=None if roi is None else list(roi), averages=averages, frames=frames,
     )  # fmt: skip
 
@@ -219,14 +220,14 @@ def set_camera(
 # -- samples -----------------------------------------------------------------------------
 
 
-def samples() -> Flow[r.SampleListResult]:
+def samples() -> Flow[stage.SampleListResult]:
     """All samples that may be set, and the materials of meshes.
 
     Example:
         >>> "lego" in [sample.name for sample in twin.samples().samples]
         True
     """
-    return ask("sample.list", r.SampleListResult)
+    return ask(stage.SAMPLE_LIST)
 
 
 def set_sample(
@@ -235,7 +236,7 @@ def set_sample(
     file: str | None = None,
     material: str | None = None,
     offset: Mapping[str, float] | None = None,
-) -> Flow[r.SampleResult]:
+) -> Flow[stage.SampleResult]:
     """Put a phantom (`name`) or an upload (`file`) on the stage.
 
     Args:
@@ -249,7 +250,7 @@ def set_sample(
         'lego'
     """
     place = None if offset is None else dict(offset)
-    return ask("sample.set", r.SampleResult, name=name, file=file, material=material, offset=place)
+    return ask(stage.SAMPLE_SET, name=name, file=file, material=material, offset=place)
 
 
 def sample_mesh() -> Flow[bytes]:
@@ -267,7 +268,7 @@ def sample_mesh() -> Flow[bytes]:
     while True:
         content, first = b"", None
         while first is None or len(content) < first.total:
-            part = yield from ask("sample.mesh", r.SampleMeshResult, start=len(content))
+            part = yield from ask(stage.SAMPLE_MESH, start=len(content))
             first = part if first is None else first
             if (part.name, part.revision, part.total) != (first.name, first.revision, first.total):
                 break  # another sample is on the stage by now: start again
@@ -284,7 +285,7 @@ def upload_mesh(
     unit: Literal["um", "mm", "cm", "m", "inch"] | None = None,
     material: str | None = None,
     progress: Callable[[int, int], object] | None = None,
-) -> Flow[r.UploadResult]:
+) -> Flow[stage.UploadResult]:
     """Upload a mesh in chunks; afterwards `set_sample(file=name)` puts it on the stage.
 
     Args:
@@ -313,7 +314,7 @@ def upload_scene(
     name: str | None = None,
     *,
     progress: Callable[[int, int], object] | None = None,
-) -> Flow[r.UploadResult]:
+) -> Flow[stage.UploadResult]:
     """Upload a phantom in chunks; afterwards `set_sample(file=name)` puts it on the stage.
 
     Args:
@@ -339,7 +340,7 @@ def upload_voxels(
     *,
     material: str | None = None,
     progress: Callable[[int, int], object] | None = None,
-) -> Flow[r.UploadResult]:
+) -> Flow[stage.UploadResult]:
     """Upload voxels in chunks.
 
     Args:
@@ -361,10 +362,10 @@ def upload_voxels(
 
 def _upload(
     upload: uploads.Upload, progress: Callable[[int, int], object] | None
-) -> Flow[r.UploadResult]:
+) -> Flow[stage.UploadResult]:
     done = None
     for chunk in upload.chunks():
-        done = yield from ask("sample.upload", r.UploadResult, **chunk)
+        done = yield from ask(stage.SAMPLE_UPLOAD, **chunk)
         if progress is not None:
             yield Tell(progress, (done.received, len(upload.data)))
     assert done is not None
@@ -402,7 +403,7 @@ def projection(
         ((95, 119), 'line_integral')
     """
     answer = yield from ask(
-        "projection.get", WireProjection, kind=kind, binning=binning, marks=marks or None,
+        images.PROJECTION_GET, kind=kind, binning=binning, marks=marks or None,
         positions=positions, tube=tube, camera=camera,
     )  # fmt: skip
     return Projection.from_wire(answer)
@@ -424,7 +425,7 @@ def ray(column: float, row: float) -> Flow[dict[str, float]]:
         >>> all(mm >= 0.0 for mm in twin.ray(477.5, 379.5).values())
         True
     """
-    told = yield from ask("projection.ray", r.RayResult, pixel=[column, row])
+    told = yield from ask(images.PROJECTION_RAY, pixel=[column, row])
     return dict(told.paths_mm)
 
 
@@ -435,7 +436,7 @@ def geometry() -> Flow[s.GeometryResult]:
         >>> len(twin.geometry().cone_vec)
         12
     """
-    return ask("geometry.get", s.GeometryResult)
+    return ask(images.GEOMETRY_GET)
 
 
 # -- scripts and jobs --------------------------------------------------------------------
@@ -453,7 +454,7 @@ def predict_exposure(
     sod_mm: float | None = None,
     sdd_mm: float | None = None,
     detail: str = "void:0.5",
-) -> Flow[r.ExposurePrediction]:
+) -> Flow[images.ExposurePrediction]:
     """Transmission, contrast to noise and dose of a circular scan.
 
     Args:
@@ -473,13 +474,13 @@ def predict_exposure(
         (True, 60.0)
     """
     return ask(
-        "exposure.predict", r.ExposurePrediction, sample=sample, kV=kV, power_W=power_W,
+        images.EXPOSURE_PREDICT, sample=sample, kV=kV, power_W=power_W,
         filter=filter, exposure_ms=exposure_ms, averages=averages, frames=frames, detail=detail,
         sod_mm=sod_mm, sdd_mm=sdd_mm,
     )  # fmt: skip
 
 
-def check_script(script: str | bytes, name: str | None = None) -> Flow[r.CheckResult]:
+def check_script(script: str | bytes, name: str | None = None) -> Flow[scans.CheckResult]:
     """Parse, plan and check a script; nothing moves.
 
     Example:
@@ -487,7 +488,7 @@ def check_script(script: str | bytes, name: str | None = None) -> Flow[r.CheckRe
         >>> twin.check_script(script).ok
         True
     """
-    return ask("script.check", r.CheckResult, None, **_script(script), name=name)
+    return ask(scans.SCRIPT_CHECK, **_script(script), name=name)
 
 
 def submit_script(
@@ -497,7 +498,7 @@ def submit_script(
     *,
     seed: int | None = None,
     motion_samples: int = 1,
-) -> Flow[r.SubmitResult]:
+) -> Flow[scans.SubmitResult]:
     """Run a script as a job.
 
     Args:
@@ -517,14 +518,14 @@ def submit_script(
         'done'
     """
     return ask(
-        "script.submit", r.SubmitResult, None, **_script(script), name=name, speed_up=speed_up,
+        scans.SCRIPT_SUBMIT, **_script(script), name=name, speed_up=speed_up,
         seed=seed, motion_samples=motion_samples,
     )  # fmt: skip
 
 
 def check_trajectory(
     poses: Sequence[Positions], exposure_ms: float | None = None
-) -> Flow[r.CheckResult]:
+) -> Flow[scans.CheckResult]:
     """Plan and check poses, one image each; nothing moves.
 
     Example:
@@ -533,7 +534,7 @@ def check_trajectory(
         2
     """
     places = [dict(p) for p in poses]
-    return ask("trajectory.check", r.CheckResult, None, poses=places, exposure_ms=exposure_ms)
+    return ask(scans.TRAJECTORY_CHECK, poses=places, exposure_ms=exposure_ms)
 
 
 def submit_trajectory(
@@ -543,7 +544,7 @@ def submit_trajectory(
     speed_up: SpeedUp | None = None,
     *,
     seed: int | None = None,
-) -> Flow[r.SubmitResult]:
+) -> Flow[scans.SubmitResult]:
     """Run poses as a job, one image each; the rest as in `submit_script`.
 
     Example:
@@ -553,19 +554,19 @@ def submit_trajectory(
         2
     """
     return ask(
-        "trajectory.submit", r.SubmitResult, None, poses=[dict(p) for p in poses],
+        scans.TRAJECTORY_SUBMIT, poses=[dict(p) for p in poses],
         exposure_ms=exposure_ms, name=name, speed_up=speed_up, seed=seed,
     )  # fmt: skip
 
 
-def jobs() -> Flow[r.JobListResult]:
+def jobs() -> Flow[scans.JobListResult]:
     """All jobs, oldest first.
 
     Example:
         >>> all(job.frames_done <= job.frames_total for job in twin.jobs().jobs)
         True
     """
-    return ask("job.list", r.JobListResult)
+    return ask(scans.JOB_LIST)
 
 
 def job_status(job: str | None = None) -> Flow[s.JobStatus]:
@@ -578,7 +579,7 @@ def job_status(job: str | None = None) -> Flow[s.JobStatus]:
         >>> twin.wait_job(twin.abort_job(job).job).state in FINAL_STATES
         True
     """
-    return ask("job.status", s.JobStatus, job=job)
+    return ask(scans.JOB_STATUS, job=job)
 
 
 def pause_job(job: str | None = None) -> Flow[s.JobStatus]:
@@ -593,7 +594,7 @@ def pause_job(job: str | None = None) -> Flow[s.JobStatus]:
         >>> twin.wait_job(twin.abort_job(job).job).state in FINAL_STATES
         True
     """
-    return ask("job.pause", s.JobStatus, job=job)
+    return ask(scans.JOB_PAUSE, job=job)
 
 
 def resume_job(job: str | None = None) -> Flow[s.JobStatus]:
@@ -608,7 +609,7 @@ def resume_job(job: str | None = None) -> Flow[s.JobStatus]:
         >>> twin.wait_job(twin.abort_job(job).job).state in FINAL_STATES
         True
     """
-    return ask("job.resume", s.JobStatus, job=job)
+    return ask(scans.JOB_RESUME, job=job)
 
 
 def step_job(job: str | None = None) -> Flow[s.JobStatus]:
@@ -627,7 +628,7 @@ def step_job(job: str | None = None) -> Flow[s.JobStatus]:
         >>> twin.wait_job(twin.abort_job(job).job).state in FINAL_STATES
         True
     """
-    return ask("job.step", s.JobStatus, job=job)
+    return ask(scans.JOB_STEP, job=job)
 
 
 def abort_job(job: str | None = None) -> Flow[s.JobStatus]:
@@ -638,7 +639,7 @@ def abort_job(job: str | None = None) -> Flow[s.JobStatus]:
         >>> twin.wait_job(twin.abort_job(job).job).state
         'aborted'
     """
-    return ask("job.abort", s.JobStatus, job=job)
+    return ask(scans.JOB_ABORT, job=job)
 
 
 def wait_job(
@@ -683,7 +684,9 @@ def wait_job(
 # -- data sets ---------------------------------------------------------------------------
 
 
-def datasets(search: str = "", *, start: int = 0, count: int = 50) -> Flow[r.DatasetListResult]:
+def datasets(
+    search: str = "", *, start: int = 0, count: int = 50
+) -> Flow[past_scans.DatasetListResult]:
     """Data sets of the data directory, the newest first.
 
     Args:
@@ -698,12 +701,12 @@ def datasets(search: str = "", *, start: int = 0, count: int = 50) -> Flow[r.Dat
         >>> [found.name for found in twin.datasets("listed").datasets]
         ['listed']
     """
-    return ask("dataset.list", r.DatasetListResult, search=search, start=start, count=count)
+    return ask(past_scans.DATASET_LIST, search=search, start=start, count=count)
 
 
 def dataset(
     name: str, points: int = 400, *, measure: bool = False, script: bool = False
-) -> Flow[r.DatasetResult]:
+) -> Flow[past_scans.DatasetResult]:
     """A data set: its settings, and poses and times of at most `points` of its images.
 
     Args:
@@ -723,14 +726,12 @@ def dataset(
         >>> twin.dataset("looked-at").positions["rot_obj"]
         [90.0, 0.0, 90.0]
     """
-    return ask(
-        "dataset.get", r.DatasetResult, name=name, points=points, measure=measure, script=script
-    )
+    return ask(past_scans.DATASET_GET, name=name, points=points, measure=measure, script=script)
 
 
 def dataset_frame(
     name: str, index: int, kind: Kind = "counts", binning: int = 1
-) -> Flow[tuple[npt.NDArray[np.generic], r.DatasetFrameResult]]:
+) -> Flow[tuple[npt.NDArray[np.generic], past_scans.DatasetFrameResult]]:
     """An image of a data set.
 
     Args:
@@ -755,7 +756,7 @@ def dataset_frame(
         (True, 'dark')
     """
     told = yield from ask(
-        "dataset.frame", r.DatasetFrameResult, name=name, index=index, kind=kind, binning=binning
+        past_scans.DATASET_FRAME, name=name, index=index, kind=kind, binning=binning
     )
     return wire_image.from_bytes(told.data, told.dtype, told.shape), told
 
@@ -769,7 +770,7 @@ def apply_calibration(
     *,
     comment: str | None = None,
     source: str | None = None,
-) -> Flow[r.CorrectionResult]:
+) -> Flow[corrections.CorrectionResult]:
     """Put a correction (mm, deg; true minus nominal) in force; it replaces the last.
 
     Example:
@@ -779,7 +780,7 @@ def apply_calibration(
         True
     """
     return ask(
-        "calibration.apply", r.CorrectionResult, parameters=dict(parameters), name=name,
+        corrections.CALIBRATION_APPLY, parameters=dict(parameters), name=name,
         comment=comment, source=source,
     )  # fmt: skip
 
@@ -791,20 +792,20 @@ def calibration(name: str | None = None) -> Flow[s.Correction | None]:
         >>> twin.calibration() is None  # none is in force
         True
     """
-    return (yield from ask("calibration.get", r.CorrectionResult, name=name)).correction
+    return (yield from ask(corrections.CALIBRATION_GET, name=name)).correction
 
 
-def calibrations() -> Flow[r.CorrectionListResult]:
+def calibrations() -> Flow[corrections.CorrectionListResult]:
     """All corrections, oldest first.
 
     Example:
         >>> twin.calibrations().current is None
         True
     """
-    return ask("calibration.list", r.CorrectionListResult)
+    return ask(corrections.CALIBRATION_LIST)
 
 
-def revert_calibration() -> Flow[r.CorrectionResult]:
+def revert_calibration() -> Flow[corrections.CorrectionResult]:
     """Go back to the correction before.
 
     Example:
@@ -813,7 +814,7 @@ def revert_calibration() -> Flow[r.CorrectionResult]:
         >>> twin.revert_calibration().correction is None
         True
     """
-    return ask("calibration.revert", r.CorrectionResult)
+    return ask(corrections.CALIBRATION_REVERT)
 
 
 def fit_calibration(
@@ -828,7 +829,7 @@ def fit_calibration(
     tracks: bool = False,
     markers: Sequence[tuple[int, str, float, float, float | None]] | None = None,
     scale: str | None = None,
-) -> Flow[r.CalibrationFitResult]:
+) -> Flow[corrections.CalibrationFitResult]:
     """Calibrate from data sets of the twin's data directory; nothing is applied.
 
     Other calls of this connection wait for the answer.
@@ -858,20 +859,23 @@ def fit_calibration(
         ...
         flexdt.protocol.rpc_errors.RpcError: no data set 'gone' in the data directory
     """
+    fields = corrections.Mark.model_fields
     for i, row in enumerate(markers or ()):
-        if len(row) != len(Mark.model_fields):
-            raise ValueError(f"mark {i} is {row!r}; allowed: ({', '.join(Mark.model_fields)})")
+        if len(row) != len(fields):
+            raise ValueError(f"mark {i} is {row!r}; allowed: ({', '.join(fields)})")
     marks = None if markers is None else [
-        dict(zip(Mark.model_fields, row, strict=True)) for row in markers
+        dict(zip(fields, row, strict=True)) for row in markers
     ]  # fmt: skip
     return ask(
-        "calibration.fit", r.CalibrationFitResult, None, datasets=list(datasets), phantom=phantom,
+        corrections.CALIBRATION_FIT, datasets=list(datasets), phantom=phantom,
         free=free and list(free), priors=dict(priors or {}), per_frame=list(per_frame),
         steps=steps, residuals=residuals, tracks=tracks, markers=marks, scale=scale,
     )  # fmt: skip
 
 
-def align_dataset(name: str, *, per_frame: bool = False) -> Flow[r.CalibrationAlignResult]:
+def align_dataset(
+    name: str, *, per_frame: bool = False
+) -> Flow[corrections.CalibrationAlignResult]:
     """Find the axis of a full-turn scan of anything by symmetry; nothing is applied.
 
     Args:
@@ -887,7 +891,7 @@ def align_dataset(name: str, *, per_frame: bool = False) -> Flow[r.CalibrationAl
         ...
         flexdt.protocol.rpc_errors.RpcError: no data set 'gone' in the data directory
     """
-    return ask("calibration.align", r.CalibrationAlignResult, None, name=name, per_frame=per_frame)
+    return ask(corrections.CALIBRATION_ALIGN, name=name, per_frame=per_frame)
 
 
 def save_scene(name: str | None = None) -> Flow[dict[str, Any]]:
@@ -897,7 +901,7 @@ def save_scene(name: str | None = None) -> Flow[dict[str, Any]]:
         >>> sorted(twin.save_scene("mine"))[:3]
         ['accelerations', 'camera', 'correction']
     """
-    return dict((yield from ask("scene.save", r.SceneResult, name=name)).document)
+    return dict((yield from ask(documents.SCENE_SAVE, name=name)).document)
 
 
 def load_scene(document: Mapping[str, Any]) -> Flow[s.State]:
@@ -907,7 +911,7 @@ def load_scene(document: Mapping[str, Any]) -> Flow[s.State]:
         >>> twin.load_scene(twin.save_scene()).safety.state
         'ok'
     """
-    return ask("scene.load", s.State, document=dict(document))
+    return ask(documents.SCENE_LOAD, document=dict(document))
 
 
 def _script(script: str | bytes) -> dict[str, object]:

@@ -44,7 +44,7 @@ from flexdt.clients.client.twin_methods import FINAL_STATES
 from flexdt.clients.lab.axes import LimitsExceeded
 from flexdt.clients.lab.camera_device import tiff_stream
 from flexdt.clients.lab.lab_connection import LabConnection
-from flexdt.protocol.results import CheckResult
+from flexdt.protocol.methods.jobs import CheckResult
 from flexdt.protocol.rpc_errors import RpcError
 from flexdt.protocol.state_model import JobStatus
 from flexdt.twin.errors import TwinError

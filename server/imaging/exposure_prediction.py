@@ -8,9 +8,8 @@ from typing import Any, Final
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.exposure_forecast import expose
 from flexdt.protocol import Codec
-from flexdt.protocol import results as r
 from flexdt.protocol.connection import encoded
-from flexdt.protocol.method_table import PREDICTION_LIMITS
+from flexdt.protocol.methods.images import PREDICTION_LIMITS, ExposurePrediction
 from flexdt.server.runtime.workers import Workers
 from flexdt.twin.machine.description import Machine
 
@@ -35,5 +34,5 @@ def predict(
     told = asdict(expose(phantom, machine=machine, **settings))
     told["transmission"]["edges"] = told["transmission"]["edges"][:-1]  # no infinity in JSON
     told |= {"sample": phantom.name, "best": told["best"][:BEST], "frames": told.pop("images")}
-    result = r.ExposurePrediction.model_validate(told, strict=False)
+    result = ExposurePrediction.model_validate(told, strict=False)
     return list(encoded(result, codec).pieces)

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from flexdt.protocol import (
+    AnyMethod,
     Codec,
     Connection,
     Message,
-    Method,
     Notification,
     Prepared,
     Request,
@@ -76,7 +76,7 @@ Raises `RpcError` where that takes too much.
 class Session(Protocol):
     """The application's state of one connection."""
 
-    async def handle(self, method: Method, params: Params) -> object:
+    async def handle(self, method: AnyMethod, params: Params) -> object:
         """Answer a call: a result model or plain data, or raise `RpcError`."""
 
     def close(self) -> None:

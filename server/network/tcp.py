@@ -25,6 +25,7 @@ from typing import cast
 
 from flexdt.protocol import (
     METHODS,
+    AnyMethod,
     Batch,
     Codec,
     Connection,
@@ -32,7 +33,6 @@ from flexdt.protocol import (
     Failure,
     Malformed,
     Message,
-    Method,
     Notification,
     Prepared,
     Request,
@@ -46,7 +46,7 @@ from flexdt.protocol import (
 from flexdt.protocol.connection import MAX_ANSWER, Raw
 from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Id, Single
-from flexdt.protocol.params import Hello
+from flexdt.protocol.methods.session import Hello
 from flexdt.protocol.rpc_errors import (
     ProtocolError,
     busy,
@@ -109,7 +109,7 @@ class TcpServer(ListeningServer):
     app: App
     limits: ConnectionLimits
     token: str | None
-    methods: Mapping[str, Method]
+    methods: Mapping[str, AnyMethod]
     observe: Observe = unobserved
     read: Read | None = None
 
@@ -162,7 +162,7 @@ async def serve(
     limits: ConnectionLimits | None = None,
     token: str | None = None,
     ssl: tls.SSLContext | None = None,
-    methods: Mapping[str, Method] = METHODS,
+    methods: Mapping[str, AnyMethod] = METHODS,
     observe: Observe = unobserved,
     read: Read | None = None,
 ) -> TcpServer:

@@ -11,9 +11,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from flexdt.phantoms import is_shipped, load_phantom, load_phantom_file
-from flexdt.protocol import params as p
-from flexdt.protocol import results as r
-from flexdt.protocol.method_table import FIT_LIMITS
+from flexdt.protocol.methods.calibration import (
+    FIT_LIMITS,
+    CalibrationAlign,
+    CalibrationAlignResult,
+    CalibrationFit,
+    CalibrationFitResult,
+)
 from flexdt.server.files.dataset_folder import read_text
 from flexdt.server.files.directory import Directory
 from flexdt.server.wire_errors import from_root
@@ -27,7 +31,7 @@ MEMORY_BYTES: Final = int(FIT_LIMITS["memory_bytes"])
 FILES: Final = (".toml", ".json")
 
 
-def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> r.CalibrationFitResult:
+def fit(root: Directory, asked: CalibrationFit, *_: object) -> CalibrationFitResult:
     """Calibrate; blocks.
 
     Raises:
@@ -61,13 +65,13 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> r.CalibrationFi
         ]
     if asked.tracks:
         told["tracks"] = import_module("flexdt.clients.calibration.tracks").tracks_document(found)
-    return r.CalibrationFitResult.model_validate(from_root(told, root.path))
+    return CalibrationFitResult.model_validate(from_root(told, root.path))
 
 
-def align(root: Directory, asked: p.CalibrationAlign, *_: object) -> r.CalibrationAlignResult:
+def align(root: Directory, asked: CalibrationAlign, *_: object) -> CalibrationAlignResult:
     """Align; blocks. Raises as `fit`."""
     found = _face().align(_there(root, asked.name), per_frame=asked.per_frame)
-    return r.CalibrationAlignResult.model_validate(from_root(found.document, root.path))
+    return CalibrationAlignResult.model_validate(from_root(found.document, root.path))
 
 
 def _there(root: Directory, name: str) -> Path:

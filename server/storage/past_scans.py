@@ -21,11 +21,19 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.protocol import Codec, image
-from flexdt.protocol import params as p
-from flexdt.protocol import results as r
 from flexdt.protocol.connection import MAX_ANSWER, encoded
 from flexdt.protocol.fields import ImageValue, Params
 from flexdt.protocol.messages import Encoded
+from flexdt.protocol.methods.calibration import CalibrationAlign, CalibrationFit
+from flexdt.protocol.methods.datasets import (
+    DatasetFrame,
+    DatasetFrameResult,
+    DatasetGet,
+    DatasetInfo,
+    DatasetList,
+    DatasetListResult,
+    DatasetResult,
+)
 from flexdt.protocol.rpc_errors import too_large
 from flexdt.server.files.dataset_folder import (
     Folder,
@@ -106,7 +114,7 @@ class PastScans:
                 larger, or takes longer to read, than is allowed.
         """
         around = Around(running, self._machine, self._profile)
-        slow = isinstance(params, p.CalibrationFit | p.CalibrationAlign)
+        slow = isinstance(params, CalibrationFit | CalibrationAlign)
         workers = self._fitters if slow else self._workers
         return Encoded(tuple(await workers.ask(work, self._root, params, around, codec)))
 
@@ -262,7 +270,7 @@ def _opened(root: Directory, name: str) -> _Scan:
     return found
 
 
-def _info(path: Path, modified: float, scan: _Scan) -> r.DatasetInfo:
+def _info(path: Path, modified: float, scan: _Scan) -> DatasetInfo:
     folder, document = scan.folder, scan.document
     kV, power_W = scan.beam
     if document is None:
@@ -277,7 +285,7 @@ def _info(path: Path, modified: float, scan: _Scan) -> r.DatasetInfo:
                 "exposure_ms": said.exposure_ms, "projections": len(texts), "kV": kV,
                 "power_W": power_W,
             }  # fmt: skip
-        info = r.DatasetInfo(
+        info = DatasetInfo(
             name=path.name, modified=modified, projections=there, present=there,
             problem=scan.problem[:500],
         )  # fmt: skip
@@ -288,7 +296,7 @@ def _info(path: Path, modified: float, scan: _Scan) -> r.DatasetInfo:
     if lost and document.complete:
         reason = f"{lost[0]} is missing" + (f", and {len(lost) - 1} more" if lost[1:] else "")
     detector, named = document.detector, document.machine.get("name")
-    return r.DatasetInfo(
+    return DatasetInfo(
         name=path.name,
         modified=modified,
         started=document.started.isoformat(),
@@ -311,9 +319,7 @@ def _info(path: Path, modified: float, scan: _Scan) -> r.DatasetInfo:
 # dataset.list -------------------------------------------------------------------------------------
 
 
-def _list(
-    root: Directory, asked: p.DatasetList, around: Around, codec: Codec
-) -> r.DatasetListResult:
+def _list(root: Directory, asked: DatasetList, around: Around, codec: Codec) -> DatasetListResult:
     folders, left_out = [], 0
     with root.entries() as entries:
         for entry in entries:
@@ -337,7 +343,7 @@ def _list(
         except DatasetError:
             continue  # it has gone meanwhile, or is no data set
         if info is None:
-            info = r.DatasetInfo(name=name, modified=modified, problem="not read yet")
+            info = DatasetInfo(name=name, modified=modified, problem="not read yet")
         elif info == "":
             continue
         if name == around.running:
@@ -352,10 +358,10 @@ def _list(
     shown = found[asked.start : asked.start + asked.count]
     if asked.thumbnail:
         shown = [_with_thumbnail(root, info, asked.thumbnail, until + LIST_S) for info in shown]
-    return r.DatasetListResult(datasets=shown, total=len(found), unread=unread, left_out=left_out)
+    return DatasetListResult(datasets=shown, total=len(found), unread=unread, left_out=left_out)
 
 
-def _listed(path: Path, modified: float) -> r.DatasetInfo | str:
+def _listed(path: Path, modified: float) -> DatasetInfo | str:
     """A data set in a few words; "" for a folder that holds none."""
     folder = list_folder(path)
     if folder.document is None and not folder.projections:
@@ -368,7 +374,7 @@ def _listed(path: Path, modified: float) -> r.DatasetInfo | str:
     return _info(path, modified, scan)
 
 
-def _with_thumbnail(root: Directory, info: r.DatasetInfo, side: int, until: float) -> r.DatasetInfo:
+def _with_thumbnail(root: Directory, info: DatasetInfo, side: int, until: float) -> DatasetInfo:
     def make() -> ImageValue | str:
         folder = list_folder(path)
         files = list(folder.projections.values())
@@ -398,7 +404,7 @@ def _with_thumbnail(root: Directory, info: r.DatasetInfo, side: int, until: floa
 # dataset.get --------------------------------------------------------------------------------------
 
 
-def _get(root: Directory, asked: p.DatasetGet, around: Around, codec: Codec) -> r.DatasetResult:
+def _get(root: Directory, asked: DatasetGet, around: Around, codec: Codec) -> DatasetResult:
     scan = _opened(root, asked.name)
     folder, document, images = scan.folder, scan.document, scan.images
     about = root.stat(asked.name)
@@ -416,7 +422,7 @@ def _get(root: Directory, asked: p.DatasetGet, around: Around, codec: Codec) -> 
         told = _MEASURED.get(
             key, lambda: _measured(folder, document, chosen), lambda m: None not in m["counts"]
         )
-    return r.DatasetResult(
+    return DatasetResult(
         info=info,
         images=len(images),
         indices=at,
@@ -498,8 +504,8 @@ def _clearances(
 
 
 def _frame(
-    root: Directory, asked: p.DatasetFrame, around: Around, codec: Codec
-) -> r.DatasetFrameResult:
+    root: Directory, asked: DatasetFrame, around: Around, codec: Codec
+) -> DatasetFrameResult:
     scan = _opened(root, asked.name)
     folder, document, images = scan.folder, scan.document, scan.images
     if asked.index >= len(images):
@@ -524,7 +530,7 @@ def _frame(
     size = small.nbytes if codec is Codec.MSGPACK else small.nbytes * 4 // 3
     if size > (most := MAX_ANSWER[codec] - (1 << 16)):  # beside the pixels
         raise too_large("an image (ask for a binned one)", size, most)
-    return r.DatasetFrameResult(
+    return DatasetFrameResult(
         **image.encode(small),  # type: ignore[arg-type]
         name=asked.name,
         index=asked.index,
@@ -569,9 +575,9 @@ def _normal(
 
 
 _ANSWERS: Final[Mapping[type[Params], Callable[..., object]]] = {
-    p.DatasetList: _list,
-    p.DatasetGet: _get,
-    p.DatasetFrame: _frame,
-    p.CalibrationFit: dataset_fits.fit,
-    p.CalibrationAlign: dataset_fits.align,
+    DatasetList: _list,
+    DatasetGet: _get,
+    DatasetFrame: _frame,
+    CalibrationFit: dataset_fits.fit,
+    CalibrationAlign: dataset_fits.align,
 }

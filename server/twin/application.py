@@ -9,11 +9,11 @@ from __future__ import annotations
 import inspect
 from contextlib import AbstractContextManager, nullcontext
 
-from flexdt.protocol import Method
+from flexdt.protocol import AnyMethod
 from flexdt.protocol.fields import Params
 from flexdt.server.network.shell_application import Peer
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers import HANDLERS, NOT_DURING_A_SCAN
+from flexdt.server.twin.handlers import HANDLERS
 from flexdt.server.twin.handlers.handler import Client
 from flexdt.server.wire_errors import explain, is_user_error
 
@@ -25,7 +25,7 @@ class TwinSession:
         self._twin = twin
         self._client = Client(peer)
 
-    async def handle(self, method: Method, params: Params) -> object:
+    async def handle(self, method: AnyMethod, params: Params) -> object:
         """Answer one call.
 
         Raises:
@@ -37,7 +37,7 @@ class TwinSession:
             if method.control:
                 self._take_control(method.name)
             by_hand: AbstractContextManager[None] = nullcontext()
-            if method.name in NOT_DURING_A_SCAN:
+            if method.by_hand:
                 twin.jobs.require_free(method.name)
                 by_hand = twin.jobs.hands_on()
             with by_hand:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from flexdt.protocol import RpcError, image
-from flexdt.protocol import results as r
+from flexdt.protocol.methods.images import Projection
 from flexdt.protocol.state_model import ImageFlags
 from flexdt.server.imaging.exposure_flags import flags_of
 from flexdt.server.imaging.radiography import Radiography
@@ -86,7 +86,7 @@ def image_of(
     view: ImageWish,
     radiography: Radiography,
     rng: np.random.Generator | None,
-) -> r.Projection:
+) -> Projection:
     """One image as the wire has it.
 
     Args:
@@ -109,7 +109,7 @@ def image_of(
         value = image.encode(binned_mean(integrals, factor))
     if factor > 1:
         cone = cone.binned(factor, (integrals.shape[0], integrals.shape[1]))
-    return r.Projection(
+    return Projection(
         **value,  # type: ignore[arg-type]
         cone_vec=cone.rows[0].tolist(),
         kind=view.kind,

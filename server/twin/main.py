@@ -58,7 +58,7 @@ async def run(options: TwinSettings) -> int:
     from flexdt.server.scans.jobs import fresh_seed
     from flexdt.server.twin.application import TwinApp
     from flexdt.server.twin.core import TwinServer
-    from flexdt.server.twin.handlers.session_methods import document
+    from flexdt.server.twin.handlers.document_methods import document
     from flexdt.server.twin.message_reading import Reader
     from flexdt.server.twin.twin_health import twin_pages
     from flexdt.twin.scanner.state import Sample

@@ -10,22 +10,28 @@ import pickle
 from dataclasses import replace
 from typing import Final
 
-from flexdt.protocol import METHODS, Batch, Codec, Connection, Notification, Request, RpcError
+from flexdt.protocol import (
+    METHODS,
+    Batch,
+    Codec,
+    Connection,
+    Notification,
+    Request,
+    RpcError,
+    find,
+)
 from flexdt.protocol.connection import Raw
 from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Single
-from flexdt.protocol.method_table import find, parse_params
-from flexdt.protocol.params import TrajectoryInput
+from flexdt.protocol.method import parse_params
+from flexdt.protocol.methods.jobs import TrajectoryInput
 from flexdt.protocol.rpc_errors import too_large
 from flexdt.server.network.shell_application import Call, Frozen
 from flexdt.server.runtime.workers import Workers
 from flexdt.server.scans.scan_record import PoseList
 
 MAX_PARAMS: Final = 1 << 20
-"""Bytes of a call's parameters, but for the methods of `TAKE_MORE`."""
-TAKE_MORE: Final = (
-    "sample.upload", "script.check", "script.submit", "trajectory.check", "trajectory.submit",
-)  # fmt: skip
+"""Bytes of a call's parameters, unless its method says that they may be `bulky`."""
 MEMORY_BYTES: Final = 3 << 30
 SECONDS: Final = 60.0
 
@@ -76,7 +82,8 @@ def _frozen(message: Single) -> bytes:
     answered = isinstance(message, Request)
     call = Call(id, message.method, _params(message), answered)
     data = pickle.dumps(call)
-    if len(data) > MAX_PARAMS and message.method not in TAKE_MORE:
+    method = METHODS.get(message.method)
+    if len(data) > MAX_PARAMS and (method is None or not method.bulky):
         what = f"what {message.method[:100]} is given"
         data = pickle.dumps(replace(call, params=too_large(what, len(data), MAX_PARAMS)))
     return data

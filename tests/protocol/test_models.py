@@ -27,10 +27,10 @@ from flexdt.protocol import (
     parse_result,
 )
 from flexdt.protocol.fields import require_extent
-from flexdt.protocol.method_table import compatible
-from flexdt.protocol.params import SampleUpload
+from flexdt.protocol.method import compatible
+from flexdt.protocol.methods.motion import MoveResult
+from flexdt.protocol.methods.samples import SampleUpload
 from flexdt.protocol.projector import PROJECTOR_METHODS
-from flexdt.protocol.results import MoveResult
 from flexdt.protocol.rpc_errors import Code, clip, internal, invalid_params
 
 BAD: list[tuple[str, object, str]] = [

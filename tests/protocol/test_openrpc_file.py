@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import get_args
 
 from flexdt.protocol import METHODS
+from flexdt.protocol.methods.images import ProjectionGet
+from flexdt.protocol.methods.samples import SampleUpload
 from flexdt.protocol.openrpc import document
-from flexdt.protocol.params import ProjectionGet, SampleUpload
 from flexdt.protocol.state_model import JobPhase
 
 PROTOCOL = Path(__file__).parents[2] / "protocol"

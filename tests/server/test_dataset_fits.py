@@ -16,7 +16,7 @@ from in_process import Lab, M, run
 import flexdt as fx
 from flexdt.phantoms import load_phantom
 from flexdt.protocol import Codec, RpcError
-from flexdt.protocol import params as p
+from flexdt.protocol.methods.calibration import CalibrationFit
 from flexdt.server.storage.past_scans import PastScans
 from flexdt.twin.calibration.fit.covariance_steps import covariance_by_step
 from flexdt.twin.machine.description import profile_of
@@ -228,7 +228,7 @@ def test_a_fit_that_nobody_waits_for_ends(data: Path) -> None:
 
     async def run() -> bytes:
         scans = PastScans(data, M, profile_of(M, None))
-        asked = p.CalibrationFit(datasets=["lego"], phantom="lego")
+        asked = CalibrationFit(datasets=["lego"], phantom="lego")
         try:
             first = asyncio.create_task(scans.ask(asked, "", Codec.JSON))
             while not first.done() and _working() <= before:
@@ -236,7 +236,7 @@ def test_a_fit_that_nobody_waits_for_ends(data: Path) -> None:
             first.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await first
-            gone = p.CalibrationFit(datasets=["gone"], phantom="lego")
+            gone = CalibrationFit(datasets=["gone"], phantom="lego")
             with pytest.raises(RpcError, match="no data set 'gone'"):
                 await scans.ask(gone, "", Codec.JSON)
         finally:

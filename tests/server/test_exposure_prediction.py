@@ -11,18 +11,18 @@ import pytest
 import flexdt as fx
 from flexdt.phantoms.samples import as_phantom
 from flexdt.protocol import METHODS, Codec, RpcError
-from flexdt.protocol import results as r
+from flexdt.protocol.methods.images import ExposurePrediction
 from flexdt.server.imaging.exposure_prediction import BEST, predict
 from flexdt.twin.errors import LimitError
 
 ROD = {"kind": "cylinder", "center": [0, 0, 0], "radius": 12.0, "height": 60, "material": "pmma"}
 
 
-def predicted(**settings: Any) -> r.ExposurePrediction:
+def predicted(**settings: Any) -> ExposurePrediction:
     """As in the worker; through JSON, as on the wire."""
     given = {"kV": 70.0, "images": 100, "sod": 600.0, "sdd": 1059.0, **settings}
     told = b"".join(predict(as_phantom(ROD), fx.machine("flexray"), given, Codec.JSON))
-    return r.ExposurePrediction.model_validate(json.loads(told))
+    return ExposurePrediction.model_validate(json.loads(told))
 
 
 def test_a_prediction_is_what_noisy_images_show() -> None:

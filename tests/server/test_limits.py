@@ -18,7 +18,7 @@ from flexdt.clients.cli.entry import run
 from flexdt.clients.client.async_client import AsyncTwinClient
 from flexdt.clients.client.client import TwinClient
 from flexdt.protocol import METHODS, Connection, Failure, RpcError
-from flexdt.protocol.method_table import compatible
+from flexdt.protocol.method import compatible
 from flexdt.server.files.directory import open_data
 from flexdt.server.files.own_documents import used_bytes
 from flexdt.server.runtime.access import (

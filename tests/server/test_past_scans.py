@@ -19,8 +19,13 @@ from lab import Process, fly_script, projector, twin
 
 from flexdt.clients.client.client import TwinClient
 from flexdt.protocol import Codec, RpcError
-from flexdt.protocol import params as p
-from flexdt.protocol import results as r
+from flexdt.protocol.fields import Params
+from flexdt.protocol.methods.datasets import (
+    DatasetFrame,
+    DatasetFrameResult,
+    DatasetGet,
+    DatasetList,
+)
 from flexdt.server.storage import past_scans
 from flexdt.server.storage.past_scans import Around, PastScans, work
 from flexdt.server.wire_errors import explain, from_root, is_user_error
@@ -48,7 +53,7 @@ def server(data: Path) -> Iterator[Process]:
     rays.end()
 
 
-def asked(root: Path, params: p.Params, running: str = "") -> Any:
+def asked(root: Path, params: Params, running: str = "") -> Any:
     """In this process, what a worker does; the wire's error where it is one for a user."""
     machine = MACHINE.model_dump(mode="json", by_alias=True)
     around = Around(running, machine, PROFILE.model_dump(mode="json"))
@@ -61,7 +66,7 @@ def asked(root: Path, params: p.Params, running: str = "") -> Any:
 
 
 def listed(root: Path, **how: Any) -> list[dict[str, Any]]:
-    return list(asked(root, p.DatasetList(**how))["datasets"])
+    return list(asked(root, DatasetList(**how))["datasets"])
 
 
 def test_a_scan_is_told_as_its_folder_says(server: Process, data: Path) -> None:
@@ -120,7 +125,7 @@ def test_a_scanner_s_own_texts_tell_the_poses(server: Process, data: Path) -> No
     shutil.copytree(data / "first scan", data / "texts")
     (data / "texts" / "flexdt.json").unlink()
     try:
-        told = asked(data, p.DatasetGet(name="texts"))
+        told = asked(data, DatasetGet(name="texts"))
         assert told["same_machine"]
         assert told["times_s"] is None
         assert (told["info"]["kV"], told["info"]["state"]) == (whole["tube"]["kV"], "complete")
@@ -131,16 +136,16 @@ def test_a_scanner_s_own_texts_tell_the_poses(server: Process, data: Path) -> No
             stated = [f["positions"][motor] for f in shots]
             assert values[first:] == pytest.approx(stated, abs=2e-3)
         for index, shot in enumerate(shots):
-            frame = asked(data, p.DatasetFrame(name="texts", index=first + index))
+            frame = asked(data, DatasetFrame(name="texts", index=first + index))
             assert frame["cone_vec"] == pytest.approx(shot["cone_vec"], abs=2e-2)
             assert frame["tube"] == {**whole["tube"], "on": True}
             there = {n: shot[n] for n in ("exposure_ms", "mode", "averages", "roi")}
             assert frame["camera"] == there
-            there = asked(data, p.DatasetFrame(name="first scan", index=first + index))
+            there = asked(data, DatasetFrame(name="first scan", index=first + index))
             assert frame["camera"] == there["camera"]
         (data / "texts" / "io000000.tif").unlink()  # a link among the files is none of them
         (data / "texts" / "io000000.tif").symlink_to(data / "first scan" / "io000000.tif")
-        told = asked(data, p.DatasetGet(name="texts"))
+        told = asked(data, DatasetGet(name="texts"))
         assert "io000000.tif" not in told["files"]
         assert (told["kinds"].count("projection"), told["same_machine"]) == (FRAMES, True)
     finally:
@@ -155,7 +160,7 @@ def test_the_nearest_parts_are_those_the_check_finds(server: Process, data: Path
         checked = client.check_script(fly_script(frames=FRAMES)).min_clearance_mm
     assert near is not None
     assert checked is not None
-    bare = asked(data, p.DatasetGet(name="first scan", measure=True))["clearance_mm"]
+    bare = asked(data, DatasetGet(name="first scan", measure=True))["clearance_mm"]
     assert bare == near
     assert all(mm is not None for mm in near)
     assert min(mm for mm in near if mm is not None) > 0.2 * checked
@@ -288,7 +293,7 @@ def answers(root: Path) -> list[dict[str, Any]]:
     found = listed(root, thumbnail=64)
     for name in ["scan", *(info["name"] for info in found)]:
         try:
-            told = asked(root, p.DatasetGet(name=name, measure=True))
+            told = asked(root, DatasetGet(name=name, measure=True))
         except RpcError as error:
             if error.code not in FOR_USERS:
                 raise
@@ -296,12 +301,12 @@ def answers(root: Path) -> list[dict[str, Any]]:
         for index in {0, told["images"] // 2, max(0, told["images"] - 1)}:
             for kind in ("counts", "line_integral"):
                 try:
-                    frame = asked(root, p.DatasetFrame(name=name, index=index, kind=kind))  # type: ignore[arg-type]
+                    frame = asked(root, DatasetFrame(name=name, index=index, kind=kind))  # type: ignore[arg-type]
                 except RpcError as error:
                     if error.code not in FOR_USERS:
                         raise
                 else:
-                    r.DatasetFrameResult.model_validate(frame)
+                    DatasetFrameResult.model_validate(frame)
     return found
 
 
@@ -340,14 +345,14 @@ def test_a_huge_document_is_listed_unread_and_refused(
     [info] = listed(tmp_path)
     assert info["state"] == "unknown"
     assert "allowed: " in info["problem"]
-    told = asked(tmp_path, p.DatasetGet(name="big"))
+    told = asked(tmp_path, DatasetGet(name="big"))
     assert told["times_s"] is None
     assert not told["same_machine"]
     assert told["positions"] == {}
     assert told["images"] == FRAMES + 2
     monkeypatch.setattr(past_scans, "MAX_SCRIPT", 10)
     with pytest.raises(RpcError) as refused:
-        asked(tmp_path, p.DatasetGet(name="big", script=True))
+        asked(tmp_path, DatasetGet(name="big", script=True))
     assert refused.value.code == -32008
 
 
@@ -360,24 +365,24 @@ def test_odd_names_and_other_folders_are_no_data_sets(
         shutil.copytree(data / "first scan", tmp_path / name, dirs_exist_ok=True)
     os.mkdir(os.fsencode(tmp_path) + b"/\xff\xfe")
     (tmp_path / "link").symlink_to(data / "first scan")
-    told = asked(tmp_path, p.DatasetList())
+    told = asked(tmp_path, DatasetList())
     assert [info["name"] for info in told["datasets"]] == ["ünïcode ✓"]
     assert told["left_out"] == 4  # <b>, a\nb, the long one, and bytes that are no text
     with pytest.raises(RpcError):
-        asked(tmp_path, p.DatasetGet(name="link"))
+        asked(tmp_path, DatasetGet(name="link"))
 
 
 def test_search_pages_and_what_is_running(data: Path, server: Process, tmp_path: Path) -> None:
     for k in range(5):
         shutil.copytree(data / "first scan", tmp_path / f"set-{k}")
         os.utime(tmp_path / f"set-{k}", (k, k))
-    told = asked(tmp_path, p.DatasetList(count=2, start=1))
+    told = asked(tmp_path, DatasetList(count=2, start=1))
     assert [d["name"] for d in told["datasets"]] == ["set-3", "set-2"]
     assert told["total"] == 5
     assert [d["name"] for d in listed(tmp_path, search="LEGO set-4 complete")] == ["set-4"]
     assert [d["name"] for d in listed(tmp_path, search="90kV set")][:1] == ["set-4"]
     assert listed(tmp_path, search="no such word") == []
-    states = {d["name"]: d["state"] for d in asked(tmp_path, p.DatasetList(), "set-1")["datasets"]}
+    states = {d["name"]: d["state"] for d in asked(tmp_path, DatasetList(), "set-1")["datasets"]}
     assert states == {f"set-{k}": "running" if k == 1 else "complete" for k in range(5)}
 
 
@@ -387,11 +392,11 @@ def test_a_list_without_time_says_what_it_has_not_read(
     for k in range(3):
         shutil.copytree(data / "first scan", tmp_path / f"late {k}")
     monkeypatch.setattr(past_scans, "LIST_S", -1.0)
-    told = asked(tmp_path, p.DatasetList(thumbnail=64))
+    told = asked(tmp_path, DatasetList(thumbnail=64))
     assert told["unread"] == 3
     assert {d["problem"] for d in told["datasets"]} == {"not read yet"}
     monkeypatch.undo()
-    told = asked(tmp_path, p.DatasetList(thumbnail=32))
+    told = asked(tmp_path, DatasetList(thumbnail=32))
     assert told["unread"] == 0
     assert {d["problem"] for d in told["datasets"]} == {""}
     assert {tuple(d["thumbnail"]["shape"]) for d in told["datasets"]} == {(32, 32)}
@@ -426,7 +431,7 @@ def test_the_loop_goes_on_while_something_is_read(data: Path, server: Process) -
     async def both() -> tuple[int, bytes]:
         scans, turns = PastScans(data, MACHINE, PROFILE), 0
         try:
-            params = p.DatasetGet(name="first scan", measure=True)
+            params = DatasetGet(name="first scan", measure=True)
             answer = asyncio.create_task(scans.ask(params, "", Codec.JSON))
             while not answer.done():
                 await asyncio.sleep(0.001)
@@ -450,10 +455,10 @@ def test_work_that_takes_too_long_is_ended_and_the_next_is_done(
         try:
             scans._workers.seconds = 0.001
             with pytest.raises(RpcError) as refused:
-                await scans.ask(p.DatasetList(), "", Codec.JSON)
+                await scans.ask(DatasetList(), "", Codec.JSON)
             assert refused.value.code == -32008
             scans._workers.seconds = past_scans.SECONDS * 10
-            answer = await scans.ask(p.DatasetList(), "", Codec.JSON)
+            answer = await scans.ask(DatasetList(), "", Codec.JSON)
             return str(json.loads(b"".join(answer.pieces))["datasets"][0]["name"])
         finally:
             scans.close()

@@ -26,7 +26,8 @@ from simulation import Simulation
 from whole_run import voxels
 
 from flexdt.protocol import Codec, RpcError
-from flexdt.protocol import params as p
+from flexdt.protocol.methods.calibration import CalibrationAlign, CalibrationFit
+from flexdt.protocol.methods.datasets import DatasetFrame, DatasetGet, DatasetList
 from flexdt.server.files import directory
 from flexdt.server.storage.past_scans import Around, work
 from flexdt.twin.errors import TwinError
@@ -152,14 +153,14 @@ class Life:
     def past(self) -> None:
         """What worker processes do, here."""
         around = Around("", M.model_dump(mode="json", by_alias=True), P.model_dump(mode="json"))
-        asked: list[Any] = [p.DatasetList(thumbnail=32)]
+        asked: list[Any] = [DatasetList(thumbnail=32)]
         for name in ("first", "second"):
-            asked.append(p.DatasetGet(name=name, measure=True, script=True))
-            asked += [p.DatasetFrame(name=name, index=i) for i in range(FRAMES + 1)]
-            asked.append(p.DatasetFrame(name=name, index=1, kind="line_integral"))
-            asked.append(p.CalibrationFit(datasets=[name], phantom="normal-3"))
-            asked.append(p.CalibrationAlign(name=name))
-        asked.append(p.CalibrationFit(datasets=["first"], phantom="beads.toml"))
+            asked.append(DatasetGet(name=name, measure=True, script=True))
+            asked += [DatasetFrame(name=name, index=i) for i in range(FRAMES + 1)]
+            asked.append(DatasetFrame(name=name, index=1, kind="line_integral"))
+            asked.append(CalibrationFit(datasets=[name], phantom="normal-3"))
+            asked.append(CalibrationAlign(name=name))
+        asked.append(CalibrationFit(datasets=["first"], phantom="beads.toml"))
         for params in asked:
             try:
                 self.said.append(b"".join(work(self.data, params, around, Codec.JSON)).decode())

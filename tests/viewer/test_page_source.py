@@ -19,7 +19,7 @@ import pytest
 from flexdt.clients.viewer.page_methods import METHODS as PAGE_METHODS
 from flexdt.protocol import METHODS
 from flexdt.protocol.fields import Nothing
-from flexdt.protocol.method_table import Method
+from flexdt.protocol.method import Method
 from flexdt.protocol.openrpc import document
 
 ROOT = Path(__file__).parents[2]

@@ -1,70 +1,47 @@
-"""The table of methods: each has a short function that translates between wire and twin."""
+"""The methods' handlers: short functions that translate between wire and twin."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import ModuleType
 
-from flexdt.server.twin.handlers import calibration_methods as calibration
-from flexdt.server.twin.handlers import dataset_methods as datasets
-from flexdt.server.twin.handlers import image_methods as images
-from flexdt.server.twin.handlers import job_methods as jobs
-from flexdt.server.twin.handlers import motion_methods as motion
-from flexdt.server.twin.handlers import sample_methods as samples
-from flexdt.server.twin.handlers import scene_methods as scenes
-from flexdt.server.twin.handlers import session_methods as sessions
-from flexdt.server.twin.handlers import setting_methods as settings
-from flexdt.server.twin.handlers.handler import Handler
+from flexdt.protocol import METHODS
+from flexdt.server.twin.handlers import (
+    calibration_methods,
+    dataset_methods,
+    document_methods,
+    image_methods,
+    job_methods,
+    motion_methods,
+    sample_methods,
+    session_methods,
+    setting_methods,
+)
+from flexdt.server.twin.handlers.handler import Handler, answered
 
-HANDLERS: Mapping[str, Handler] = {
-    "session.hello": sessions.hello,
-    "session.control": sessions.control,
-    "session.ping": sessions.ping,
-    "state.get": sessions.get_state,
-    "state.subscribe": sessions.subscribe,
-    "state.unsubscribe": sessions.unsubscribe,
-    "rpc.discover": sessions.discover,
-    "axes.move": motion.move,
-    "axes.jog": motion.jog,
-    "axes.stop": motion.stop,
-    "safety.estop": motion.estop,
-    "safety.reset": motion.reset,
-    "clock.set": settings.set_clock,
-    "tube.set": settings.set_tube,
-    "camera.set": settings.set_camera,
-    "axes.set": settings.set_axis,
-    "sample.set": samples.set_sample,
-    "sample.list": samples.list_samples,
-    "sample.mesh": samples.mesh,
-    "sample.upload": samples.upload,
-    "projection.get": images.get_projection,
-    "projection.ray": images.ray,
-    "geometry.get": images.get_geometry,
-    "exposure.predict": images.predict,
-    "script.check": jobs.check_script,
-    "script.submit": jobs.submit_script,
-    "trajectory.check": jobs.check_trajectory,
-    "trajectory.submit": jobs.submit_trajectory,
-    "job.status": jobs.status,
-    "job.pause": jobs.pause,
-    "job.resume": jobs.resume,
-    "job.step": jobs.step,
-    "job.abort": jobs.abort,
-    "job.list": jobs.list_jobs,
-    "dataset.list": datasets.answer,
-    "dataset.get": datasets.answer,
-    "dataset.frame": datasets.answer,
-    "calibration.apply": calibration.apply,
-    "calibration.get": calibration.get,
-    "calibration.list": calibration.list_all,
-    "calibration.revert": calibration.revert,
-    "calibration.fit": datasets.answer,
-    "calibration.align": datasets.answer,
-    "scene.save": scenes.save,
-    "scene.load": scenes.load,
-}
-"""Method name -> what answers it."""
 
-NOT_DURING_A_SCAN = (
-    "axes.move", "axes.jog", "axes.set", "tube.set", "camera.set", "sample.set", "scene.load",
+def table(*modules: ModuleType) -> Mapping[str, Handler]:
+    """Method name -> what answers it: the functions of `modules` that `answers` marks.
+
+    Raises:
+        TypeError: a method of the wire has no handler, or two; or a handler's method is not one.
+    """
+    pairs = [
+        (method.name, function)
+        for module in modules
+        for function in vars(module).values()
+        for method in answered(function)
+        if function.__module__ == module.__name__
+    ]
+    names = [name for name, _ in pairs]
+    wrong = {name for name in {*names, *METHODS} if names.count(name) != 1 or name not in METHODS}
+    if wrong:
+        raise TypeError(f"not one handler for each method of the wire: {', '.join(sorted(wrong))}")
+    return dict(pairs)
+
+
+HANDLERS = table(
+    session_methods, motion_methods, setting_methods, sample_methods, image_methods, job_methods,
+    dataset_methods, calibration_methods, document_methods,
 )  # fmt: skip
-"""Methods that are an error while a job runs, and allowed while it is paused."""
+"""Method name -> what answers it."""

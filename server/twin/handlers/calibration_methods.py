@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from flexdt.protocol import params as p
-from flexdt.protocol import results as r
 from flexdt.protocol.fields import Empty
+from flexdt.protocol.messages import Encoded
+from flexdt.protocol.methods import calibration as p
 from flexdt.server.twin.changes import change_stage
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, encoded_apart, in_turns, still
+from flexdt.server.twin.handlers.handler import Client, answers, encoded_apart, in_turns, still
 
 
-async def apply(twin: TwinServer, client: Client, params: p.CalibrationApply) -> r.CorrectionResult:
+@answers(p.CALIBRATION_APPLY)
+async def apply(twin: TwinServer, client: Client, params: p.CalibrationApply) -> p.CorrectionResult:
     """A new correction in force, instead of the last."""
     async with twin.stage_turn:
         correction = twin.corrections.make(params.parameters, params.name, params.comment)
@@ -22,25 +23,30 @@ async def apply(twin: TwinServer, client: Client, params: p.CalibrationApply) ->
     return _in_force(twin, f"correction {correction.name!r} is in force", warnings)
 
 
-def get(twin: TwinServer, client: Client, params: p.CalibrationGet) -> r.CorrectionResult:
+@answers(p.CALIBRATION_GET)
+def get(twin: TwinServer, client: Client, params: p.CalibrationGet) -> p.CorrectionResult:
     """The one in force, or the one named."""
     if params.name is None:
-        return r.CorrectionResult(correction=twin.correction_state(twin.scanner.correction))
-    return r.CorrectionResult(correction=twin.correction_state(twin.corrections.get(params.name)))
+        return p.CorrectionResult(correction=twin.correction_state(twin.scanner.correction))
+    return p.CorrectionResult(correction=twin.correction_state(twin.corrections.get(params.name)))
 
 
-async def list_all(twin: TwinServer, client: Client, params: Empty) -> object:
+@answers(p.CALIBRATION_LIST)
+async def list_all(
+    twin: TwinServer, client: Client, params: Empty
+) -> p.CorrectionListResult | Encoded:
     """All, oldest first."""
     current = twin.scanner.correction
     views = await in_turns(twin.corrections.all(), twin.correction_state)
-    result = r.CorrectionListResult(
+    result = p.CorrectionListResult(
         corrections=[view for view in views if view is not None],
         current=None if current is None else current.name,
     )
     return await encoded_apart(client, result, len(views))
 
 
-async def revert(twin: TwinServer, client: Client, params: Empty) -> r.CorrectionResult:
+@answers(p.CALIBRATION_REVERT)
+async def revert(twin: TwinServer, client: Client, params: Empty) -> p.CorrectionResult:
     """The one before, or none."""
     async with twin.stage_turn:
         history = twin.corrections.history[:-1]
@@ -50,10 +56,10 @@ async def revert(twin: TwinServer, client: Client, params: Empty) -> r.Correctio
     return _in_force(twin, "the correction was reverted", warnings)
 
 
-def _in_force(twin: TwinServer, message: str, warnings: list[str]) -> r.CorrectionResult:
+def _in_force(twin: TwinServer, message: str, warnings: list[str]) -> p.CorrectionResult:
     """Notify subscribers; motion that would collide in the new geometry has been halted."""
     twin.tell("info", message)
     for warning in warnings:
         twin.tell("warning", f"{message}: {warning}")
     correction = twin.correction_state(twin.scanner.correction)
-    return r.CorrectionResult(correction=correction, warnings=warnings)
+    return p.CorrectionResult(correction=correction, warnings=warnings)

@@ -6,10 +6,13 @@ from pathlib import Path
 
 from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Encoded
+from flexdt.protocol.methods import datasets as p
+from flexdt.protocol.methods.calibration import CALIBRATION_ALIGN, CALIBRATION_FIT
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client
+from flexdt.server.twin.handlers.handler import Client, answers
 
 
+@answers(p.DATASET_LIST, p.DATASET_GET, p.DATASET_FRAME, CALIBRATION_FIT, CALIBRATION_ALIGN)
 async def answer(twin: TwinServer, client: Client, params: Params) -> Encoded:
     """What a worker process reads of the data directory."""
     job = twin.jobs.current

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
+from flexdt.protocol import AnyMethod, Method
 from flexdt.protocol.connection import encoded
+from flexdt.protocol.fields import Params, Result
+from flexdt.protocol.messages import Encoded
 from flexdt.server.network.shell_application import Peer
 from flexdt.server.twin.core import TwinServer
 
 Item = TypeVar("Item")
 View = TypeVar("View")
+_P = TypeVar("_P", bound=Params)
+_R = TypeVar("_R", bound=Result)
 A_TURN = 20
 """Items of a list that are looked at in one turn of the loop, well below a millisecond."""
 
@@ -36,7 +41,26 @@ class Client:
 
 
 Handler = Callable[[TwinServer, Client, Any], object | Awaitable[object]]
-"""(twin, client, parameters) -> result model; the table says which parameters' model it is."""
+"""(twin, client, parameters) -> result."""
+Answer: TypeAlias = _R | Encoded | Mapping[str, Any]
+"""A method's result: as its model, or as bytes or plain data that were made of it."""
+_Handler: TypeAlias = Callable[[TwinServer, Client, _P], Answer[_R] | Awaitable[Answer[_R]]]
+
+
+def answers(*methods: Method[_P, _R]) -> Callable[[_Handler[_P, _R]], _Handler[_P, _R]]:
+    """Mark a function as the handler of `methods`, whose parameters and result it has."""
+
+    def mark(handler: _Handler[_P, _R]) -> _Handler[_P, _R]:
+        handler.answered = methods  # type: ignore[attr-defined]
+        return handler
+
+    return mark
+
+
+def answered(function: object) -> Sequence[AnyMethod]:
+    """The methods of which `function` is the handler; none for any other object."""
+    methods: Sequence[AnyMethod] = getattr(function, "answered", ())
+    return methods
 
 
 def still(twin: TwinServer, client: Client, what: str) -> Callable[[], None]:
@@ -64,7 +88,7 @@ async def in_turns(items: Sequence[Item], view: Callable[[Item], View]) -> list[
     return views
 
 
-async def encoded_apart(client: Client, result: object, count: int) -> object:
+async def encoded_apart(client: Client, result: _R, count: int) -> _R | Encoded:
     """An answer of `count` items; a long one as bytes, made in a thread."""
     if count <= A_TURN:
         return result

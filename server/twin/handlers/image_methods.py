@@ -8,18 +8,18 @@ from dataclasses import replace
 import numpy as np
 
 from flexdt.protocol import Codec, image
-from flexdt.protocol import params as p
-from flexdt.protocol import results as r
 from flexdt.protocol import state_model as w
 from flexdt.protocol.connection import MAX_ANSWER, encoded
 from flexdt.protocol.fields import Empty, ImageValue
 from flexdt.protocol.messages import Encoded
+from flexdt.protocol.methods import images as p
+from flexdt.protocol.methods.settings import CameraSet, TubeSet
 from flexdt.protocol.rpc_errors import invalid_params, too_large
 from flexdt.server.imaging.exposure_flags import marks_of
 from flexdt.server.imaging.exposure_prediction import predict as forecast
 from flexdt.server.storage.stored_samples import EMPTY
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client
+from flexdt.server.twin.handlers.handler import Client, answers
 from flexdt.server.twin.handlers.setting_methods import camera_change
 from flexdt.server.twin.hub import ImageWish
 from flexdt.server.twin.live import Shot, image_of
@@ -28,6 +28,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.scanner.settings import changed_camera, changed_tube, switched
 
 
+@answers(p.PROJECTION_GET)
 async def get_projection(twin: TwinServer, client: Client, params: p.ProjectionGet) -> Encoded:
     """An image at the pose of this moment, or predicted for another pose or other settings.
 
@@ -64,10 +65,10 @@ async def get_projection(twin: TwinServer, client: Client, params: p.ProjectionG
 
 
 def _as_though(twin: TwinServer, shot: Shot, params: p.ProjectionGet) -> Shot:
-    machine, asked = twin.machine, params.tube or p.TubeSet()
+    machine, asked = twin.machine, params.tube or TubeSet()
     tube = changed_tube(machine.tube, shot.tube, asked.kV, asked.power_W)
     tube = switched(machine, tube, tube.on if asked.on is None else asked.on, None, warm=True)
-    change = camera_change(params.camera or p.CameraSet())
+    change = camera_change(params.camera or CameraSet())
     camera = changed_camera(machine.detector, shot.camera, change)
     there = dict(shot.positions) | (params.positions or {})
     return replace(shot, positions=tuple(sorted(there.items())), tube=tube, camera=camera)
@@ -82,7 +83,8 @@ def _require_room(shape: tuple[int, int], params: p.ProjectionGet, codec: Codec)
         raise too_large("an image", size, most)
 
 
-async def ray(twin: TwinServer, client: Client, params: p.RayGet) -> r.RayResult:
+@answers(p.PROJECTION_RAY)
+async def ray(twin: TwinServer, client: Client, params: p.RayGet) -> p.RayResult:
     """Path lengths on the ray of a pixel, in the public geometry.
 
     Raises:
@@ -96,9 +98,10 @@ async def ray(twin: TwinServer, client: Client, params: p.RayGet) -> r.RayResult
     whole = scanner.cone_vec(twin.clock.now())
     off = (column - (cols - 1) / 2) * whole.u + (row - (rows - 1) / 2) * whole.v
     pixel = ConeVec(np.hstack([whole.source, whole.detector + off, whole.u, whole.v]))
-    return r.RayResult(paths_mm=await twin.imaging.ray(scanner.sample, pixel))
+    return p.RayResult(paths_mm=await twin.imaging.ray(scanner.sample, pixel))
 
 
+@answers(p.GEOMETRY_GET)
 def get_geometry(twin: TwinServer, client: Client, params: Empty) -> w.GeometryResult:
     """Nominal plus the correction in force."""
     cone = twin.scanner.cone_vec(twin.clock.now())
@@ -109,6 +112,7 @@ def get_geometry(twin: TwinServer, client: Client, params: Empty) -> w.GeometryR
     )
 
 
+@answers(p.EXPOSURE_PREDICT)
 async def predict(twin: TwinServer, client: Client, params: p.ExposurePredict) -> Encoded:
     """Image quality of a circular scan at the distances of this moment.
 

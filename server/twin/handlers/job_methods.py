@@ -8,16 +8,15 @@ import binascii
 import contextlib
 from collections.abc import Callable
 
-from flexdt.protocol import params as p
-from flexdt.protocol import results as r
 from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty
 from flexdt.protocol.messages import Encoded
+from flexdt.protocol.methods import jobs as p
 from flexdt.protocol.rpc_errors import invalid_params, too_large
 from flexdt.server.scans.job import ENDED, Job
 from flexdt.server.scans.scan_record import Wish
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, encoded_apart, in_turns, still
+from flexdt.server.twin.handlers.handler import Client, answers, encoded_apart, in_turns, still
 from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.errors import CollisionError
 
@@ -26,25 +25,29 @@ PATIENCE_S = 2.0
 """How long an answer waits for a job to reach the requested state."""
 
 
+@answers(p.SCRIPT_CHECK)
 async def check_script(twin: TwinServer, client: Client, params: p.ScriptInput) -> Encoded:
     """The dry-run report; nothing moves."""
     return await twin.submissions.check(_script(params), client.peer.codec)
 
 
-async def submit_script(twin: TwinServer, client: Client, params: p.ScriptInput) -> r.SubmitResult:
+@answers(p.SCRIPT_SUBMIT)
+async def submit_script(twin: TwinServer, client: Client, params: p.ScriptInput) -> p.SubmitResult:
     """A script as a job."""
     return await _submitted(twin, client, params, _script(params))
 
 
+@answers(p.TRAJECTORY_CHECK)
 async def check_trajectory(twin: TwinServer, client: Client, params: p.TrajectoryInput) -> Encoded:
     """The dry-run report; nothing moves."""
     wish = Wish.of_poses(params.poses, params.exposure_ms)
     return await twin.submissions.check(wish, client.peer.codec)
 
 
+@answers(p.TRAJECTORY_SUBMIT)
 async def submit_trajectory(
     twin: TwinServer, client: Client, params: p.TrajectoryInput
-) -> r.SubmitResult:
+) -> p.SubmitResult:
     """Poses as a job, one image each."""
     wish = Wish.of_poses(params.poses, params.exposure_ms, params.motion_samples, params.seed)
     return await _submitted(twin, client, params, wish)
@@ -52,18 +55,20 @@ async def submit_trajectory(
 
 async def _submitted(
     twin: TwinServer, client: Client, params: p.ScriptInput | p.TrajectoryInput, wish: Wish
-) -> r.SubmitResult:
+) -> p.SubmitResult:
     job = await twin.submissions.submit(
         wish, params.name, params.speed_up, client.program, still(twin, client, "a scan")
     )
-    return r.SubmitResult(job=job.id, dataset=job.folder, warnings=job.warnings)
+    return p.SubmitResult(job=job.id, dataset=job.folder, warnings=job.warnings)
 
 
+@answers(p.JOB_STATUS)
 def status(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
     """How far a job is."""
     return twin.jobs.status(twin.jobs.get(params.job))
 
 
+@answers(p.JOB_PAUSE)
 async def pause(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
     """Motion stops; frames in the making are finished."""
     job = twin.jobs.get(params.job)
@@ -71,6 +76,7 @@ async def pause(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStat
     return await _when(twin, job, lambda: job.phase != "running")
 
 
+@answers(p.JOB_RESUME)
 async def resume(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
     """Back to the pose of the pause, and on; a job that ended early is queued once more.
 
@@ -86,6 +92,7 @@ async def resume(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobSta
     return _free(job, status)
 
 
+@answers(p.JOB_STEP)
 async def step(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
     """One frame or command, then paused again; -32002 as for `resume`."""
     job = twin.jobs.get(params.job)
@@ -94,6 +101,7 @@ async def step(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatu
     return _free(job, await _when(twin, job, lambda: runner is None or not runner.stepping))
 
 
+@answers(p.JOB_ABORT)
 async def abort(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
     """The data set stays, marked incomplete."""
     job = twin.jobs.get(params.job)
@@ -103,10 +111,11 @@ async def abort(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStat
     return await _when(twin, job, lambda: job.phase in ENDED)
 
 
-async def list_jobs(twin: TwinServer, client: Client, params: Empty) -> object:
+@answers(p.JOB_LIST)
+async def list_jobs(twin: TwinServer, client: Client, params: Empty) -> p.JobListResult | Encoded:
     """All jobs, oldest first."""
     jobs = await in_turns(twin.jobs.all(), twin.jobs.status)
-    return await encoded_apart(client, r.JobListResult(jobs=jobs), len(jobs))
+    return await encoded_apart(client, p.JobListResult(jobs=jobs), len(jobs))
 
 
 async def _when(twin: TwinServer, job: Job, condition: Callable[[], bool]) -> w.JobStatus:

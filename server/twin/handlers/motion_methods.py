@@ -1,4 +1,4 @@
-"""axes.* (but their settings) and safety.*: commands to the motors."""
+"""axes.* and safety.*: commands to the motors, and their settings."""
 
 from __future__ import annotations
 
@@ -6,17 +6,19 @@ import asyncio
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
-from flexdt.protocol import params as p
-from flexdt.protocol import results as r
 from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty
+from flexdt.protocol.methods import motion as p
 from flexdt.server.twin import wire_values as views
+from flexdt.server.twin.changes import change_settings
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client
+from flexdt.server.twin.handlers.handler import Client, answers, free
 from flexdt.server.twin.obstacle_move import finished
+from flexdt.twin.scanner.scanner import ScannerTwin
 
 
-async def move(twin: TwinServer, client: Client, params: p.Move) -> r.MoveResult:
+@answers(p.AXES_MOVE)
+async def move(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult:
     """The answer goes at once, or with `wait` when the motors rest."""
     if params.plan:
         return await _around(twin, client, params)
@@ -31,7 +33,7 @@ async def move(twin: TwinServer, client: Client, params: p.Move) -> r.MoveResult
         warnings = await _elsewhere(twin, wanted)
         arrived = not warnings
     seconds = max(durations.values(), default=0.0)
-    return r.MoveResult(duration_s=seconds, warnings=warnings, moves=None, arrived=arrived)
+    return p.MoveResult(duration_s=seconds, warnings=warnings, moves=None, arrived=arrived)
 
 
 async def _elsewhere(twin: TwinServer, wanted: Mapping[str, float]) -> list[str]:
@@ -59,7 +61,7 @@ def _instead(twin: TwinServer) -> Iterator[None]:
         twin.changed()
 
 
-async def _around(twin: TwinServer, client: Client, params: p.Move) -> r.MoveResult:
+async def _around(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult:
     """One free move after the other; an earlier way ends with its present leg."""
     twin.detours.cancel()
     way = await twin.detours.plan(
@@ -79,16 +81,30 @@ async def _around(twin: TwinServer, client: Client, params: p.Move) -> r.MoveRes
         short = await finished(task)
         short += await _elsewhere(twin, {m: t for leg in moves for m, t in leg.items()})
         warnings, arrived = warnings + short, not short
-    return r.MoveResult(duration_s=way.duration_s, warnings=warnings, moves=moves, arrived=arrived)
+    return p.MoveResult(duration_s=way.duration_s, warnings=warnings, moves=moves, arrived=arrived)
 
 
-def jog(twin: TwinServer, client: Client, params: p.Jog) -> r.MoveResult:
+@answers(p.AXES_JOG)
+def jog(twin: TwinServer, client: Client, params: p.Jog) -> p.MoveResult:
     """Run until the lease ends (`twin.motion.drives.plan_jog`), or as far as it is free."""
     with _instead(twin):
         jogged = twin.scanner.jog(params.axis, params.velocity, params.lease_s, twin.clock.now())
-    return r.MoveResult(duration_s=jogged.duration_s, warnings=jogged.warnings, moves=None)
+    return p.MoveResult(duration_s=jogged.duration_s, warnings=jogged.warnings, moves=None)
 
 
+@answers(p.AXES_SET)
+async def set_axis(twin: TwinServer, client: Client, params: p.AxisSet) -> p.AxisSetResult:
+    """Speed and acceleration of motions to come."""
+
+    def change(scanner: ScannerTwin) -> None:
+        scanner.set_axis(params.axis, speed=params.speed, acceleration=params.acceleration)
+
+    await change_settings(twin, change, free(twin, client, "axes.set", "axes.set"))
+    axis = twin.scanner.state(twin.clock.now()).axes[params.axis]
+    return p.AxisSetResult(axis=params.axis, speed=axis.speed, acceleration=axis.acceleration)
+
+
+@answers(p.AXES_STOP)
 def stop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
     """Bring the motors to rest; a running scan pauses."""
     twin.detours.cancel()
@@ -98,6 +114,7 @@ def stop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
     return views.stopped_view(twin.state(), stopping, twin.clock.now())
 
 
+@answers(p.SAFETY_ESTOP)
 def estop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
     """Stop as the machine's E-stop does, X-rays off; a running scan pauses."""
     twin.detours.cancel()
@@ -108,6 +125,7 @@ def estop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
     return views.stopped_view(twin.state(), stopping, twin.clock.now())
 
 
+@answers(p.SAFETY_RESET)
 def reset(twin: TwinServer, client: Client, params: p.Reset) -> w.State:
     """Leave E-stop or blocked."""
     twin.scanner.reset(twin.clock.now(), params.stop)

@@ -6,19 +6,20 @@ import asyncio
 from dataclasses import replace
 
 from flexdt.phantoms import Phantom, load_phantom, materials, phantom_names
-from flexdt.protocol import params as p
-from flexdt.protocol import results as r
 from flexdt.protocol.fields import Empty
+from flexdt.protocol.messages import Encoded
+from flexdt.protocol.methods import samples as p
 from flexdt.server.storage.stored_samples import EMPTY
 from flexdt.server.storage.unfinished_uploads import UploadHead
 from flexdt.server.twin.changes import change_stage
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, encoded_apart, free, in_turns
+from flexdt.server.twin.handlers.handler import Client, answers, encoded_apart, free, in_turns
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.scanner.state import Placement, Sample
 
 
-async def set_sample(twin: TwinServer, client: Client, params: p.SampleSet) -> r.SampleResult:
+@answers(p.SAMPLE_SET)
+async def set_sample(twin: TwinServer, client: Client, params: p.SampleSet) -> p.SampleResult:
     """Put a shipped phantom or an upload on the stage; without an offset it is centred."""
     name = params.file if params.name is None else params.name
     assert name is not None
@@ -36,21 +37,25 @@ async def set_sample(twin: TwinServer, client: Client, params: p.SampleSet) -> r
     ready()
     async with twin.stage_turn:
         warnings = await change_stage(twin, sample, twin.scanner.correction, ready)
-    return r.SampleResult(sample=twin.sample_state(), warnings=warnings)
+    return p.SampleResult(sample=twin.sample_state(), warnings=warnings)
 
 
-async def list_samples(twin: TwinServer, client: Client, params: Empty) -> object:
+@answers(p.SAMPLE_LIST)
+async def list_samples(
+    twin: TwinServer, client: Client, params: Empty
+) -> p.SampleListResult | Encoded:
     """Everything that may stand on the stage."""
-    empty = r.SampleInfo(name=EMPTY, description="nothing on the stage", size_mm=(0.0, 0.0, 0.0))
+    empty = p.SampleInfo(name=EMPTY, description="nothing on the stage", size_mm=(0.0, 0.0, 0.0))
     shipped = await in_turns(phantom_names(), lambda name: _info(name, load_phantom(name)))
     heads = [head for name in twin.samples.uploads if (head := twin.samples.head(name)) is not None]
     uploads = await in_turns(heads, _upload_info)
     samples = [empty, *shipped, *uploads]
-    result = r.SampleListResult(samples=samples, materials=list(materials()))
+    result = p.SampleListResult(samples=samples, materials=list(materials()))
     return await encoded_apart(client, result, len(samples))
 
 
-async def mesh(twin: TwinServer, client: Client, params: p.SampleMesh) -> r.SampleMeshResult:
+@answers(p.SAMPLE_MESH)
+async def mesh(twin: TwinServer, client: Client, params: p.SampleMesh) -> p.SampleMeshResult:
     """A part of the mesh of the sample on the stage, for drawing."""
     sample = twin.scanner.sample
     if not sample.name:
@@ -65,7 +70,7 @@ async def mesh(twin: TwinServer, client: Client, params: p.SampleMesh) -> r.Samp
                 make = twin.shapes.make
                 shape = await asyncio.to_thread(make, sample.name, revision, phantom)
     part = shape.stl[params.start : params.start + params.count]
-    return r.SampleMeshResult(
+    return p.SampleMeshResult(
         name=shape.name,
         revision=shape.revision,
         total=len(shape.stl),
@@ -74,13 +79,14 @@ async def mesh(twin: TwinServer, client: Client, params: p.SampleMesh) -> r.Samp
     )
 
 
-async def upload(twin: TwinServer, client: Client, params: p.SampleUpload) -> r.UploadResult:
+@answers(p.SAMPLE_UPLOAD)
+async def upload(twin: TwinServer, client: Client, params: p.SampleUpload) -> p.UploadResult:
     """One chunk; the last one makes the sample."""
     head = UploadHead.of(params)
     _require_free(twin, client, head.name)
     received = await asyncio.to_thread(twin.samples.receive, head, params.start, params.data)
     if received < head.total:
-        return r.UploadResult(name=head.name, received=received, complete=False)
+        return p.UploadResult(name=head.name, received=received, complete=False)
     async with twin.samples.turn, twin.stage_turn:
         _require_free(twin, client, head.name)
         stands = twin.scanner.sample
@@ -102,7 +108,7 @@ async def upload(twin: TwinServer, client: Client, params: p.SampleUpload) -> r.
             )
         await asyncio.to_thread(twin.samples.tidy)
     twin.tell("info", f"sample {head.name!r} was uploaded", bytes=received)
-    return r.UploadResult(
+    return p.UploadResult(
         name=head.name,
         received=received,
         complete=True,
@@ -121,8 +127,8 @@ def _require_free(twin: TwinServer, client: Client, name: str) -> None:
         free(twin, client, "sample.upload", "sample.upload")()
 
 
-def _info(name: str, phantom: Phantom, head: UploadHead | None = None) -> r.SampleInfo:
-    return r.SampleInfo(
+def _info(name: str, phantom: Phantom, head: UploadHead | None = None) -> p.SampleInfo:
+    return p.SampleInfo(
         name=name,
         kind="phantom" if head is None else head.kind,
         description=phantom.description,
@@ -131,10 +137,10 @@ def _info(name: str, phantom: Phantom, head: UploadHead | None = None) -> r.Samp
     )
 
 
-def _upload_info(head: UploadHead) -> r.SampleInfo:
+def _upload_info(head: UploadHead) -> p.SampleInfo:
     """An upload, without reading it."""
     what = f"{head.format} {head.kind}, {head.total} bytes"
-    return r.SampleInfo(name=head.name, kind=head.kind, description=what, uploaded=True)
+    return p.SampleInfo(name=head.name, kind=head.kind, description=what, uploaded=True)
 
 
 def _unknown(twin: TwinServer, name: str) -> UnknownNameError:

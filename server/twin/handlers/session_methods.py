@@ -1,26 +1,23 @@
-"""session.*, state.* and rpc.discover."""
+"""session.* and state.*."""
 
 from __future__ import annotations
 
-from functools import cache
-from typing import Any
-
-from flexdt.protocol import PROTOCOL, openrpc, require_compatible
-from flexdt.protocol import params as p
-from flexdt.protocol import results as r
+from flexdt.protocol import PROTOCOL, require_compatible
 from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty, Nothing
+from flexdt.protocol.methods import session as p
 from flexdt.server.scans.job import ENDED
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client
+from flexdt.server.twin.handlers.handler import Client, answers
 from flexdt.server.twin.hub import ImageWish
 
 
-def hello(twin: TwinServer, client: Client, params: p.Hello) -> r.HelloResult:
+@answers(p.SESSION_HELLO)
+def hello(twin: TwinServer, client: Client, params: p.Hello) -> p.HelloResult:
     """Greet a client whose token `network.shell_parts.TokenCheck` has found right."""
     require_compatible(params.protocol)
     client.program = params.client
-    return r.HelloResult(
+    return p.HelloResult(
         protocol=PROTOCOL,
         server=f"flexdt {twin.version}",
         machine=twin.machine.name,
@@ -30,7 +27,8 @@ def hello(twin: TwinServer, client: Client, params: p.Hello) -> r.HelloResult:
     )
 
 
-def control(twin: TwinServer, client: Client, params: p.Control) -> r.ControlResult:
+@answers(p.SESSION_CONTROL)
+def control(twin: TwinServer, client: Client, params: p.Control) -> p.ControlResult:
     """One controller at a time."""
     before = twin.control.holder
     match params.action:
@@ -46,19 +44,22 @@ def control(twin: TwinServer, client: Client, params: p.Control) -> r.ControlRes
     holder = twin.control.holder
     if before is not None and holder != before:
         twin.detours.cancel()  # what the last controller planned ends with the present leg
-    return r.ControlResult(controller=holder, yours=holder == client.name)
+    return p.ControlResult(controller=holder, yours=holder == client.name)
 
 
-def ping(twin: TwinServer, client: Client, params: Empty) -> r.Pong:
+@answers(p.SESSION_PING)
+def ping(twin: TwinServer, client: Client, params: Empty) -> p.Pong:
     """A sign of life."""
-    return r.Pong(time=twin.clock.now())
+    return p.Pong(time=twin.clock.now())
 
 
+@answers(p.STATE_GET)
 def get_state(twin: TwinServer, client: Client, params: Empty) -> w.State:
     """Everything."""
     return twin.state()
 
 
+@answers(p.STATE_SUBSCRIBE)
 def subscribe(twin: TwinServer, client: Client, params: p.Subscribe) -> Nothing:
     """Events from now on; the present state, image and jobs come at once."""
     view = ImageWish(params.projection_kind, params.projection_binning)
@@ -74,16 +75,8 @@ def subscribe(twin: TwinServer, client: Client, params: p.Subscribe) -> Nothing:
     return Nothing()
 
 
+@answers(p.STATE_UNSUBSCRIBE)
 def unsubscribe(twin: TwinServer, client: Client, params: p.Unsubscribe) -> Nothing:
     """No more of these."""
     twin.hub.unsubscribe(client.peer, params.topics)
     return Nothing()
-
-
-def discover(twin: TwinServer, client: Client, params: Empty) -> dict[str, Any]:
-    """The wire as an OpenRPC document."""
-    return document()
-
-
-document = cache(openrpc.document)
-"""Made once: it takes 0.1 s of the loop."""

@@ -1,20 +1,20 @@
-"""clock.set, tube.set, camera.set and axes.set."""
+"""clock.set, tube.set and camera.set."""
 
 from __future__ import annotations
 
-from flexdt.protocol import params as p
-from flexdt.protocol import results as r
 from flexdt.protocol import state_model as w
+from flexdt.protocol.methods import settings as p
 from flexdt.server.twin import wire_values as views
 from flexdt.server.twin.changes import change_settings
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, free
+from flexdt.server.twin.handlers.handler import Client, answers, free
 from flexdt.twin.errors import SafetyError
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.settings import CameraChange
 
 
+@answers(p.CLOCK_SET)
 def set_clock(twin: TwinServer, client: Client, params: p.ClockSet) -> w.ClockState:
     """How fast twin time runs."""
     twin.clock.set_speed_up(params.speed_up)
@@ -22,6 +22,7 @@ def set_clock(twin: TwinServer, client: Client, params: p.ClockSet) -> w.ClockSt
     return views.clock_view(twin.clock)
 
 
+@answers(p.TUBE_SET)
 async def set_tube(twin: TwinServer, client: Client, params: p.TubeSet) -> w.TubeState:
     """Change the tube; omitted settings stay."""
 
@@ -44,6 +45,7 @@ async def set_tube(twin: TwinServer, client: Client, params: p.TubeSet) -> w.Tub
     return views.tube_view(twin.scanner.tube, twin.clock.now())
 
 
+@answers(p.CAMERA_SET)
 async def set_camera(twin: TwinServer, client: Client, params: p.CameraSet) -> w.CameraState:
     """Change the camera; omitted settings stay."""
 
@@ -59,14 +61,3 @@ def camera_change(params: p.CameraSet) -> CameraChange:
     roi = None if params.roi is None else Roi(*params.roi)
     change: CameraChange = {**params.model_dump(), "roi": roi}  # type: ignore[typeddict-item]
     return change
-
-
-async def set_axis(twin: TwinServer, client: Client, params: p.AxisSet) -> r.AxisSetResult:
-    """Speed and acceleration of motions to come."""
-
-    def change(scanner: ScannerTwin) -> None:
-        scanner.set_axis(params.axis, speed=params.speed, acceleration=params.acceleration)
-
-    await change_settings(twin, change, free(twin, client, "axes.set", "axes.set"))
-    axis = twin.scanner.state(twin.clock.now()).axes[params.axis]
-    return r.AxisSetResult(axis=params.axis, speed=axis.speed, acceleration=axis.acceleration)

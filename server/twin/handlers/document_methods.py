@@ -1,21 +1,25 @@
-"""scene.*: the whole state as one document, and back."""
+"""scene.* and rpc.discover: the whole state, and the wire itself, as documents."""
 
 from __future__ import annotations
 
 import asyncio
 from datetime import UTC, datetime
+from functools import cache
+from typing import Any
 
-from flexdt.protocol import params as p
-from flexdt.protocol import results as r
+from flexdt.protocol import openrpc
 from flexdt.protocol import state_model as w
+from flexdt.protocol.fields import Empty
+from flexdt.protocol.methods import documents as p
 from flexdt.server.storage.scene import require_fit, sample_of, save_scene
 from flexdt.server.twin.changes import change_stage
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client
+from flexdt.server.twin.handlers.handler import Client, answers
 from flexdt.twin.errors import SafetyError
 
 
-def save(twin: TwinServer, client: Client, params: p.SceneSave) -> r.SceneResult:
+@answers(p.SCENE_SAVE)
+def save(twin: TwinServer, client: Client, params: p.SceneSave) -> p.SceneResult:
     """Where motors are bound, settings, sample, correction."""
     scene = save_scene(
         twin.scanner,
@@ -24,9 +28,10 @@ def save(twin: TwinServer, client: Client, params: p.SceneSave) -> r.SceneResult
         saved=datetime.now(UTC).isoformat(timespec="seconds"),
         version=twin.version,
     )
-    return r.SceneResult(document=scene.model_dump(mode="json", by_alias=True))
+    return p.SceneResult(document=scene.model_dump(mode="json", by_alias=True))
 
 
+@answers(p.SCENE_LOAD)
 async def load(twin: TwinServer, client: Client, params: p.SceneLoad) -> w.State:
     """Checked whole first, the motion included; then all of it changes and the motors set off."""
     scene, stops = params.document, twin.scanner.stops
@@ -58,3 +63,13 @@ async def load(twin: TwinServer, client: Client, params: p.SceneLoad) -> w.State
     for warning in warnings:
         twin.tell("warning", f"the scene was loaded: {warning}")
     return twin.state()
+
+
+@answers(p.RPC_DISCOVER)
+def discover(twin: TwinServer, client: Client, params: Empty) -> dict[str, Any]:
+    """The wire as an OpenRPC document."""
+    return document()
+
+
+document = cache(openrpc.document)
+"""Made once: it takes 0.1 s of the loop."""

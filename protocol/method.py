@@ -1,0 +1,133 @@
+"""A method of a wire: its parameters and result, how it may be called, and the check of a call.
+
+The twin server's methods are in `methods`, the projector's in `projector`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Final, Generic, TypeAlias, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from flexdt.protocol.fields import Params, Result
+from flexdt.protocol.rpc_errors import Code, RpcError, clip, invalid_params
+
+PROTOCOL: Final = "1.0"
+"""Version of the wire: a server serves every client of the same major number (before the dot)."""
+
+_M = TypeVar("_M", bound=BaseModel)
+_P = TypeVar("_P", bound=Params, covariant=True)
+_R = TypeVar("_R", bound=Result, covariant=True)
+
+
+@dataclass(frozen=True)
+class Method(Generic[_P, _R]):
+    """One method of the wire.
+
+    Attributes:
+        name: as on the wire.
+        params, result: their models.
+        summary: one line for people.
+        control: only the controller may call it (it is taken where nobody holds it).
+        safe: reads only, so a client may repeat it after a lost connection.
+        urgent: handled on arrival, ahead of the connection's earlier requests.
+        by_hand: an error while a job runs, and allowed while it is paused.
+        bulky: its parameters may be larger than other methods' may.
+        limits: on what one call may cost, by name with its unit; beyond them is -32008.
+    """
+
+    name: str
+    params: type[_P]
+    result: type[_R]
+    summary: str
+    control: bool = False
+    safe: bool = False
+    urgent: bool = False
+    by_hand: bool = False
+    bulky: bool = False
+    limits: Mapping[str, float] = field(default_factory=dict)
+
+
+AnyMethod: TypeAlias = Method[Params, Result]
+
+
+read = partial(Method, safe=True)
+"""A method that changes nothing."""
+command = partial(Method, control=True)
+"""A method of the controller."""
+by_hand = partial(Method, control=True, by_hand=True)
+"""A method of the controller, while no job runs."""
+
+
+def compatible(protocol: str) -> bool:
+    """Whether a server of this version serves a client that speaks `protocol`."""
+    return protocol.split(".")[0] == PROTOCOL.split(".")[0]
+
+
+def require_compatible(protocol: str) -> None:
+    """Refuse a client of another protocol.
+
+    Raises:
+        RpcError: -32602, says what is spoken here.
+    """
+    if not compatible(protocol):
+        raise invalid_params(
+            f"protocol {protocol!r} is not spoken here; this server speaks {PROTOCOL}",
+            [{"path": "protocol", "message": "another version", "asked": protocol}],
+            PROTOCOL,
+        )
+
+
+def parse_params(
+    method: Method[_P, Result], given: Mapping[str, object] | list[object] | None
+) -> _P:
+    """Validated parameters of a call, given by name, by position, or not at all.
+
+    Raises:
+        RpcError: -32602, every problem with its path and what was asked.
+    """
+    fields = method.params.model_fields
+    if isinstance(given, list):
+        if len(given) > len(fields):
+            raise invalid_params(
+                f"{method.name} takes {len(fields)} parameters, got {len(given)}",
+                allowed=list(fields),
+            )
+        given = dict(zip(fields, given, strict=False))
+    try:
+        return method.params.model_validate({} if given is None else dict(given))
+    except ValidationError as error:
+        raise _explain(method.name, error, list(fields)) from None
+
+
+def parse_result(model: type[_M], given: object) -> _M:
+    """A result as its model (for clients).
+
+    Raises:
+        RpcError: -32603, the server answered something else than the protocol says.
+    """
+    try:
+        return model.model_validate(given)
+    except ValidationError as error:
+        message = f"the server's answer is no {model.__name__}: {error}"
+        raise RpcError(Code.INTERNAL, message) from None
+
+
+def _explain(method: str, error: ValidationError, allowed: list[str]) -> RpcError:
+    problems: list[dict[str, object]] = []
+    for e in error.errors()[:50]:
+        problem: dict[str, object] = {
+            "path": ".".join(clip(str(part), 80) for part in e["loc"]) or "params",
+            "message": e["msg"].removeprefix("Value error, "),
+            "asked": clip(e["input"], 80),
+        }
+        limits = {k: v for k, v in e.get("ctx", {}).items() if isinstance(v, (int, float, str))}
+        if limits:
+            problem["allowed"] = limits
+        problems.append(problem)
+    first = problems[0]
+    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    return invalid_params(f"{method}: {first['path']}: {first['message']}{more}", problems, allowed)

@@ -1,0 +1,204 @@
+"""calibration.*: corrections, and fits to data sets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Final, Literal
+
+from annotated_types import Ge, Le, Len, MaxLen, MinLen
+from pydantic import Field, JsonValue
+
+from flexdt.protocol.fields import (
+    AxisName,
+    Comment,
+    Deviation,
+    Empty,
+    Name,
+    NonNegative,
+    Pair,
+    Params,
+    Place,
+    Result,
+    ShortText,
+    few,
+)
+from flexdt.protocol.method import command, read
+from flexdt.protocol.methods.datasets import DataSetName
+from flexdt.protocol.state_model import Correction
+
+Parameters = Annotated[list[AxisName], MaxLen(17)]
+
+
+class CalibrationApply(Params):
+    """A correction to put in force; it replaces the last."""
+
+    parameters: Annotated[dict[AxisName, Deviation], MaxLen(64), few(64)] = Field(
+        description="name -> value [mm or deg], true minus nominal"
+    )
+    name: Name | None = None
+    comment: Comment = ""
+    source: ShortText | None = None
+
+
+class CalibrationGet(Params):
+    """Which correction; the one in force if left out."""
+
+    name: Name | None = None
+
+
+class Mark(Params):
+    """Where a bead was seen in a projection; pixel (0, 0) is the middle of the upper left one."""
+
+    frame: Annotated[int, Ge(0), Le(10_000_000)] = Field(description="projection, counted from 0")
+    marker: AxisName = Field(
+        description="number of the bead in its phantom, counted from 0; any name of an unknown one"
+    )
+    column: Place
+    row: Place
+    sigma: Annotated[float, Ge(1e-3), Le(1e4)] | None = Field(
+        default=None, description="standard deviation of each [px]; 0.5 if left out"
+    )
+
+
+class CalibrationFit(Params):
+    """Data sets of a bead phantom, and what to estimate from them."""
+
+    datasets: Annotated[list[DataSetName], Len(1, 8)] = Field(description="of their folders")
+    phantom: Name = Field(
+        description="one that ships, a TOML or JSON file among the data sets, or unknown: markers "
+        "of which nobody knows where they are, in one data set"
+    )
+    free: Annotated[Parameters, MinLen(1)] | None = Field(
+        default=None,
+        description="what is estimated; default: dO_x, dO_y, dO_z, alpha, tau_*, of unknown "
+        "markers dO_x",
+    )
+    priors: Annotated[dict[AxisName, NonNegative], MaxLen(17), few(17)] = Field(
+        default_factory=dict, description="name -> standard deviation [mm or deg]; 0: exactly known"
+    )
+    per_frame: Parameters = Field(
+        default_factory=list, description="what may also move during the scan"
+    )
+    steps: Annotated[int, Ge(0), Le(50)] = Field(
+        default=0, description="covariances after so many parts of the frames are told"
+    )
+    residuals: bool = Field(default=False, description="tell those of every bead in every frame")
+    tracks: bool = Field(
+        default=False, description="tell where beads are, and were put before and after"
+    )
+    markers: Annotated[list[Mark], Len(1, 10_000)] | None = Field(
+        default=None, description="where beads were seen in the one data set; default: found there"
+    )
+    scale: Annotated[ShortText, MaxLen(300)] | None = Field(
+        default=None, description="distance of two unknown markers [mm]: A-B=MM or A-B=MM+-SIGMA"
+    )
+
+
+class CalibrationAlign(Params):
+    """A scan of anything over a full turn."""
+
+    name: DataSetName = Field(description="of its folder")
+    per_frame: bool = Field(default=False, description="look for shifts of single frames too")
+
+
+class CorrectionResult(Result):
+    """The correction in force (or asked for), if there is one.
+
+    Warnings: parts that its geometry brings within the safety margin where they stand.
+    """
+
+    correction: Correction | None
+    warnings: list[str] = Field(default_factory=list)
+
+
+class Estimated(Result):
+    """An estimate [mm, deg, px or 1]; None where the images do not tell or must not be trusted."""
+
+    value: float | None
+    sigma: float | None
+    unit: str
+
+
+class CalibrationStep(Result):
+    """What the first frames of a fit would know by themselves."""
+
+    frames: int
+    covariance: list[list[float]] | None = Field(
+        description="[mm, deg], in the order of `parameters`; None: not all are determined"
+    )
+
+
+class CalibrationProblem(Result):
+    """Something about the data; an error forbids the numbers."""
+
+    code: str
+    severity: Literal["error", "warning"]
+    text: str
+
+
+class CalibrationFitResult(Result):
+    """A calibration; nothing is applied. Further fields are those of `flexdt calibrate --json`."""
+
+    identifiable: bool
+    parameters: dict[str, Estimated]
+    correction: dict[str, float] | None = Field(default=None, description="for calibration.apply")
+    covariance: list[list[float | None]] = Field(default_factory=list)
+    rms_px: float | None
+    rms_per_bead_px: list[float | None] = Field(default_factory=list)
+    residuals_px: list[list[Pair | None]] | None = Field(
+        default=None, description="of each frame and bead: measured minus predicted column and row"
+    )
+    steps: list[CalibrationStep] = Field(default_factory=list)
+    tracks: dict[str, JsonValue] | None = Field(
+        default=None, description="as `flexdt calibrate --tracks` writes them"
+    )
+    problems: list[CalibrationProblem]
+
+
+class CalibrationAlignResult(Result):
+    """The geometry that an ordinary scan tells; nothing is applied."""
+
+    identifiable: bool
+    parameters: dict[str, Estimated]
+    refused: dict[str, str] = Field(description="what such a scan cannot tell, and why")
+    warnings: list[str]
+    correction: dict[str, float] | None = Field(default=None, description="for calibration.apply")
+    motion: list[dict[str, JsonValue]] | None = Field(
+        default=None, description="shifts of single frames, as `flexdt align --json` tells them"
+    )
+
+
+class CorrectionListResult(Result):
+    """All corrections, oldest first, and which one is in force."""
+
+    corrections: list[Correction]
+    current: str | None = None
+
+
+FIT_LIMITS: Final[Mapping[str, float]] = {"seconds": 300, "memory_bytes": 6 << 30}
+"""What a calibration from images may cost."""
+
+CALIBRATION_APPLY = command(
+    "calibration.apply", CalibrationApply, CorrectionResult, "put a correction in force"
+)
+CALIBRATION_GET = read(
+    "calibration.get", CalibrationGet, CorrectionResult, "the correction in force"
+)
+CALIBRATION_LIST = read("calibration.list", Empty, CorrectionListResult, "all corrections")
+CALIBRATION_REVERT = command(
+    "calibration.revert", Empty, CorrectionResult, "back to the correction before"
+)
+CALIBRATION_FIT = read(
+    "calibration.fit",
+    CalibrationFit,
+    CalibrationFitResult,
+    "calibrate from data sets",
+    limits=FIT_LIMITS,
+)
+CALIBRATION_ALIGN = read(
+    "calibration.align",
+    CalibrationAlign,
+    CalibrationAlignResult,
+    "align without beads",
+    limits=FIT_LIMITS,
+)

@@ -1,0 +1,153 @@
+"""projection.*, geometry.get and exposure.predict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Final, Literal
+
+from annotated_types import Ge, Le, MaxLen
+from pydantic import Field
+
+from flexdt.protocol.fields import (
+    Distance,
+    Empty,
+    Exposure,
+    ImageValue,
+    Name,
+    Params,
+    PixelAsked,
+    Power,
+    Result,
+    ShortText,
+    Targets,
+    Voltage,
+)
+from flexdt.protocol.method import read
+from flexdt.protocol.methods.settings import CameraSet, TubeSet
+from flexdt.protocol.scene_document import Averages, Frames
+from flexdt.protocol.state_model import GeometryResult, ImageFlags
+
+LayerText = Annotated[ShortText, MaxLen(100)]
+
+
+class ProjectionGet(Params):
+    """What kind of image, at the current pose, or as though it stood and were set otherwise.
+
+    Such an image is predicted: from the geometry of `geometry.get`, without noise.
+    """
+
+    kind: Literal["line_integral", "counts"] = "line_integral"
+    binning: Annotated[int, Ge(1), Le(32)] = Field(
+        default=1, description="mean over so many pixels a side, beyond the camera's mode"
+    )
+    marks: bool = Field(
+        default=False, description="say which pixels are saturated, starved or cut off as well"
+    )
+    positions: Targets | None = Field(
+        default=None,
+        description="motor -> [mm, deg] there, beyond its travel too; others stand as they do",
+    )
+    tube: TubeSet | None = Field(default=None, description="as though set so")
+    camera: CameraSet | None = Field(default=None, description="as though set so")
+
+
+class RayGet(Params):
+    """A pixel of the image of this moment."""
+
+    pixel: PixelAsked = Field(description="(column, row); (0, 0) is the centre of the top left one")
+
+
+class ExposurePredict(Params):
+    """A scan to predict; what is left out is as it is now."""
+
+    sample: Name | None = Field(default=None, description="default: the one on the stage")
+    kV: Voltage | None = None
+    power_W: Power | None = None
+    filter: LayerText = Field(default="", description="MATERIAL:MM beside the machine's own")
+    exposure_ms: Exposure | None = None
+    averages: Averages | None = None
+    frames: Frames = Field(default=361, description="of the scan")
+    sod_mm: Distance | None = Field(default=None, description="default: as it stands")
+    sdd_mm: Distance | None = Field(default=None, description="default: as it stands")
+    detail: LayerText = Field(
+        default="void:0.5", description="MATERIAL:MM or void:MM on the darkest ray, to be seen"
+    )
+
+
+class Projection(ImageValue):
+    """An image and the geometry it was made with (nominal plus correction)."""
+
+    cone_vec: list[float] = Field(min_length=12, max_length=12)
+    kind: Literal["line_integral", "counts"] = "line_integral"
+    time: float | None = Field(default=None, description="of the pose, on the twin's clock [s]")
+    flags: ImageFlags | None = None
+    marks: ImageValue | None = Field(
+        default=None,
+        description="uint8, as large as the image, where asked for: sum of 1 saturated, 2 starved, "
+        "4 sample cut off at this pixel of the edge; judged as though X-rays were on",
+    )
+
+
+class RayResult(Result):
+    """What the ray of a pixel goes through, in the geometry of geometry.get."""
+
+    paths_mm: dict[str, float] = Field(description="material -> path through it")
+
+
+class TransmissionShares(Result):
+    """How much of the open beam the pixels see, in a few views of a turn."""
+
+    least: float
+    p1: float = Field(description="1 % of the pixels see less")
+    p5: float
+    median: float
+    edges: list[float] = Field(description="of the bins; the last one has no upper edge")
+    shares: list[float] = Field(description="of the pixels in each bin")
+
+
+class PredictedSetting(Result):
+    """Tube and camera, and what they give on the darkest ray."""
+
+    kV: float
+    filter: str
+    exposure_ms: float
+    averages: int
+    cnr: float = Field(description="contrast of the detail to the noise of a pixel of one image")
+    kerma_mGy: float = Field(description="air kerma of the scan on the axis, without a sample")
+
+
+class ExposurePrediction(Result):
+    """What a circular scan of a sample will look like, without scattered radiation."""
+
+    sample: str
+    transmission: TransmissionShares
+    saturated: float = Field(ge=0, le=1, description="part of the pixels")
+    starved: float = Field(ge=0, le=1, description="part of the pixels")
+    detail: str
+    asked: PredictedSetting
+    best: list[PredictedSetting] = Field(description="of the same power and time, the best first")
+    frames: int
+    seconds: float = Field(description="that the frames take at least")
+    bytes: int
+    assumed: list[str] = Field(description="what is not known of the sample")
+
+
+PREDICTION_LIMITS: Final[Mapping[str, float]] = {"seconds": 60, "memory_bytes": 4 << 30}
+"""What a prediction of image quality may cost."""
+
+PROJECTION_GET = read(
+    "projection.get", ProjectionGet, Projection, "an image at the current pose, or another"
+)
+PROJECTION_RAY = read(
+    "projection.ray", RayGet, RayResult, "paths through materials on the ray of a pixel"
+)
+GEOMETRY_GET = read(
+    "geometry.get", Empty, GeometryResult, "cone_vec, detector shape and pixel pitch"
+)
+EXPOSURE_PREDICT = read(
+    "exposure.predict",
+    ExposurePredict,
+    ExposurePrediction,
+    "transmission, contrast to noise and dose of a scan",
+    limits=PREDICTION_LIMITS,
+)

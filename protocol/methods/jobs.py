@@ -1,0 +1,182 @@
+"""script.*, trajectory.* and job.*: scans."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Final, Literal
+
+from annotated_types import Ge, Le, Len, MaxLen, MinLen
+from pydantic import FailFast, Field, model_validator
+
+from flexdt.protocol.codec import Codec
+from flexdt.protocol.connection import MAX_ANSWER
+from flexdt.protocol.fields import (
+    Empty,
+    Exposure,
+    Name,
+    Params,
+    Result,
+    ShortText,
+    SpeedUp,
+    Targets,
+)
+from flexdt.protocol.method import Method, command, read
+from flexdt.protocol.state_model import JobStatus
+
+Moments = Annotated[
+    int,
+    Ge(1),
+    Le(64),
+    Field(description="moments averaged within the exposure of an image taken in motion"),
+]
+
+Seed = Annotated[
+    int | None, Field(ge=0, le=2**63 - 1, description="of the noise; made up if left out")
+]
+
+ScriptText = Annotated[str, MaxLen(8 * 2**20)]
+
+
+class ScriptInput(Params):
+    """An Acquila script, as text or (byte for byte) as base64."""
+
+    text: ScriptText | None = None
+    data_base64: ScriptText | None = None
+    name: Name | None = Field(default=None, description="name of the data set; made up if left out")
+    speed_up: SpeedUp | None = Field(
+        default=None, description="for this job; the clock's if left out"
+    )
+    motion_samples: Moments = 1
+    seed: Seed = None
+
+    @model_validator(mode="after")
+    def _one(self) -> ScriptInput:
+        if (self.text is None) == (self.data_base64 is None):
+            raise ValueError("give either text or data_base64")
+        return self
+
+
+class TrajectoryInput(Params):
+    """Poses to go through, one image each (thesis 4.6.2)."""
+
+    poses: Annotated[list[Targets], FailFast(), MinLen(1), MaxLen(200_000)] = Field(
+        description="each: axis -> value [mm or deg]; axes left out stay"
+    )
+    exposure_ms: Exposure | None = None
+    name: Name | None = None
+    speed_up: SpeedUp | None = None
+    motion_samples: Moments = 1
+    seed: Seed = None
+
+
+class JobRef(Params):
+    """Which job; the current or last one if left out."""
+
+    job: Annotated[ShortText, Len(1, 120)] | None = None
+
+
+class Problem(Result):
+    """Something about a script, with its place."""
+
+    severity: Literal["error", "warning"]
+    code: str
+    line: int | None = None
+    column: int | None = None
+    message: str
+
+
+class CheckStep(Result):
+    """A step of the plan."""
+
+    line: int | None = None
+    start_s: float
+    duration_s: float
+    what: str
+
+
+class CheckCollision(Result):
+    """A contact that the plan would run into."""
+
+    line: int | None = None
+    time_s: float
+    pair: list[str]
+    last_free: dict[str, float]
+
+
+class CheckResult(Result):
+    """The dry-run report: the same document as `flexdt check --json`."""
+
+    ok: bool
+    problems: list[Problem]
+    steps: list[CheckStep]
+    duration_s: float
+    frames: int
+    bytes: int
+    collisions: list[CheckCollision] = Field(default_factory=list)
+    min_clearance_mm: float | None = None
+
+
+class SubmitResult(Result):
+    """The job that was made."""
+
+    job: str
+    dataset: str | None = None
+    warnings: list[str] = Field(default_factory=list)
+
+
+class JobListResult(Result):
+    """All jobs, oldest first."""
+
+    jobs: list[JobStatus]
+
+
+CHECK_LIMITS: Final[Mapping[str, float]] = {
+    "seconds": 120,
+    "memory_bytes": 4 << 30,
+    "report_bytes_json": MAX_ANSWER[Codec.JSON],
+    "report_bytes_msgpack": MAX_ANSWER[Codec.MSGPACK],
+}
+"""What parsing, planning and sweeping a script or poses may cost."""
+
+SCRIPT_CHECK = read(
+    "script.check",
+    ScriptInput,
+    CheckResult,
+    "parse, plan and check a script",
+    limits=CHECK_LIMITS,
+    bulky=True,
+)
+SCRIPT_SUBMIT = command(
+    "script.submit",
+    ScriptInput,
+    SubmitResult,
+    "run a script as a job",
+    limits=CHECK_LIMITS,
+    bulky=True,
+)
+TRAJECTORY_CHECK = read(
+    "trajectory.check",
+    TrajectoryInput,
+    CheckResult,
+    "plan and check poses",
+    limits=CHECK_LIMITS,
+    bulky=True,
+)
+TRAJECTORY_SUBMIT = command(
+    "trajectory.submit",
+    TrajectoryInput,
+    SubmitResult,
+    "run poses as a job",
+    limits=CHECK_LIMITS,
+    bulky=True,
+)
+JOB_STATUS = read("job.status", JobRef, JobStatus, "how far a job is")
+JOB_PAUSE = command(
+    "job.pause", JobRef, JobStatus, "pause a job; a frame under exposure is taken again"
+)
+JOB_RESUME = command("job.resume", JobRef, JobStatus, "return to the pose of the pause and go on")
+JOB_STEP = command("job.step", JobRef, JobStatus, "run a paused job for one step")
+JOB_ABORT = Method(
+    "job.abort", JobRef, JobStatus, "end a job, its data set incomplete", urgent=True
+)
+JOB_LIST = read("job.list", Empty, JobListResult, "all jobs, oldest first")

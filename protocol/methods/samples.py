@@ -1,0 +1,150 @@
+"""sample.*: the sample on the stage, and uploads."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from annotated_types import Ge, Gt, Le
+from pydantic import Field, model_validator
+
+from flexdt.protocol.fields import (
+    Empty,
+    Material,
+    Name,
+    Params,
+    Payload,
+    Result,
+    Triple,
+    VoxelPitch,
+    VoxelShape,
+    require_extent,
+)
+from flexdt.protocol.method import Method, by_hand, read
+from flexdt.protocol.scene_document import Placement
+from flexdt.protocol.state_model import SampleState
+
+Bytes = Annotated[int, Ge(0), Le(2**53)]
+"""A place in, or a size of, something sent in parts [bytes]."""
+
+MESH_CHUNK = 4 << 20
+"""Bytes of a mesh in one answer: below a frame, also as base64."""
+
+LengthUnit = Literal["um", "mm", "cm", "m", "inch"]
+
+
+class SampleSet(Params):
+    """Which sample stands on the stage: a shipped phantom's name, or an uploaded file's."""
+
+    name: Name | None = None
+    file: Name | None = Field(default=None, description="name under which it was uploaded")
+    material: Material | None = None
+    offset: Placement | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> SampleSet:
+        if (self.name is None) == (self.file is None):
+            raise ValueError("give either name or file")
+        return self
+
+
+class SampleMesh(Params):
+    """A part of the shape of the sample on the stage."""
+
+    start: Bytes = Field(default=0, description="first byte")
+    count: Annotated[int, Ge(1), Le(MESH_CHUNK)] = Field(
+        default=1 << 20, description="bytes at most"
+    )
+
+
+class SampleUpload(Params):
+    """A chunk of a mesh, of voxels or of a scene; the sample exists when all bytes have come."""
+
+    name: Name
+    kind: Literal["mesh", "voxels", "scene"] = "mesh"
+    format: Literal["stl", "obj", "ply", "glb", "off", "raw", "json", "toml"] = Field(
+        description="raw: float32 little-endian voxels [z, y, x] of attenuation [1/mm]; json, "
+        "toml: the text of a phantom or scene file"
+    )
+    total: Annotated[Bytes, Gt(0)] = Field(description="size of the whole [bytes]")
+    start: Bytes = Field(default=0, description="position of this chunk [bytes]")
+    data: Payload
+    unit: LengthUnit | None = Field(
+        default=None, description="of mesh coordinates; left out: m for glb, mm for the others"
+    )
+    material: Material | None = None
+    shape: VoxelShape | None = Field(default=None, description="(z, y, x) of voxels")
+    voxel_mm: VoxelPitch | None = Field(default=None, description="(x, y, z)")
+
+    @model_validator(mode="after")
+    def _fits(self) -> SampleUpload:
+        if self.start + len(self.data) > self.total:
+            raise ValueError(f"chunk ends at {self.start + len(self.data)}, total is {self.total}")
+        own = {"raw": "voxels", "json": "scene", "toml": "scene"}.get(self.format, "mesh")
+        if self.kind != own:
+            raise ValueError(f"format {self.format} is for kind {own}, not {self.kind}")
+        if self.kind == "scene" and self.material is not None:
+            raise ValueError("a scene has its own materials")
+        if self.kind == "voxels" and (self.shape is None or self.voxel_mm is None):
+            raise ValueError("voxels need shape and voxel_mm")
+        if self.shape is not None and self.voxel_mm is not None:
+            require_extent(self.shape, self.voxel_mm)
+        return self
+
+
+class SampleResult(Result):
+    """What stands on the stage now."""
+
+    sample: SampleState
+    warnings: list[str] = Field(default_factory=list)
+
+
+class SampleInfo(Result):
+    """A sample that could be set."""
+
+    name: str
+    kind: Literal["phantom", "mesh", "voxels", "scene"] = "phantom"
+    description: str = ""
+    size_mm: Triple | None = None
+    uploaded: bool = False
+
+
+class SampleListResult(Result):
+    """All samples, and the materials a mesh may be made of."""
+
+    samples: list[SampleInfo]
+    materials: list[str] = Field(default_factory=list)
+
+
+class UploadResult(Result):
+    """How much of an upload has come."""
+
+    name: str
+    received: int = Field(description="bytes so far")
+    complete: bool
+    sample: SampleInfo | None = None
+    warnings: list[str] = Field(default_factory=list)
+
+
+class SampleMeshResult(Result):
+    """A part of a mesh: binary STL, mm, in the sample's own frame (before its offset)."""
+
+    name: str
+    revision: str | None = None
+    format: Literal["stl"] = "stl"
+    total: int = Field(description="size of the whole [bytes]")
+    start: int = Field(description="position of this part [bytes]")
+    data: Payload
+
+
+SAMPLE_SET = by_hand("sample.set", SampleSet, SampleResult, "put a sample on the stage")
+SAMPLE_LIST = read("sample.list", Empty, SampleListResult, "the samples there are")
+SAMPLE_MESH = read(
+    "sample.mesh", SampleMesh, SampleMeshResult, "the shape of the sample on the stage"
+)
+SAMPLE_UPLOAD = Method(
+    "sample.upload",
+    SampleUpload,
+    UploadResult,
+    "send a mesh, voxels or a scene in chunks",
+    bulky=True,
+)

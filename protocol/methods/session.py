@@ -1,0 +1,107 @@
+"""session.* and state.*: who is connected, and what it hears of."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from annotated_types import Ge, Le, Len, MaxLen
+from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic.json_schema import WithJsonSchema
+
+from flexdt.protocol.fields import Empty, Nothing, Params, Result, ShortText, TopicName, line
+from flexdt.protocol.method import Method, read
+from flexdt.protocol.state_model import State
+
+
+def _version(value: object) -> object:
+    if type(value) is int or type(value) is float:
+        return str(value) if abs(value) < 1000 else value
+    return value
+
+
+Version = Annotated[
+    str,
+    BeforeValidator(_version),
+    MaxLen(40),
+    AfterValidator(line),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {"type": "string", "maxLength": 40},
+                {"type": "number", "exclusiveMinimum": -1000, "exclusiveMaximum": 1000},
+            ]
+        }
+    ),
+]
+"""A version, as text or as a number."""
+
+
+class Hello(Params):
+    """Who the client is; the token where the server wants one."""
+
+    protocol: Version = Field(description='the protocol the client speaks, e.g. "1.0"')
+    client: ShortText = Field(description="name of the program, for people")
+    token: Annotated[str, MaxLen(4096)] | None = None
+
+
+class Control(Params):
+    """Take control, give it back, or take it from whoever has it."""
+
+    action: Literal["acquire", "release", "force"]
+
+
+class Subscribe(Params):
+    """Which events to send."""
+
+    topics: Annotated[list[TopicName], Len(1, 16)]
+    max_rate_hz: Annotated[float, Ge(1e-3), Le(1000)] | None = Field(
+        default=None, description="at most so many events a second and topic; the newest value wins"
+    )
+    projection_kind: Literal["line_integral", "counts"] = "line_integral"
+    projection_binning: Annotated[int, Ge(1), Le(32)] = Field(
+        default=1, description="mean over so many pixels a side, for the topic projection"
+    )
+
+
+class Unsubscribe(Params):
+    """Which events to send no longer."""
+
+    topics: Annotated[list[TopicName], Len(1, 16)]
+
+
+class HelloResult(Result):
+    """Who the server is."""
+
+    protocol: str
+    server: str = Field(description="name and version")
+    machine: str
+    profile: str | None = None
+    session: str | None = Field(
+        default=None, description="this connection's name, as in `controller`"
+    )
+    physics: str | None = Field(
+        default=None, description="how images are made: ideal, mono or poly"
+    )
+
+
+class ControlResult(Result):
+    """Who may move now."""
+
+    controller: str | None
+    yours: bool = Field(default=False, description="whether that is this connection")
+
+
+class Pong(Result):
+    """The server is alive."""
+
+    time: float = Field(description="the twin's clock [s]")
+
+
+SESSION_HELLO = read("session.hello", Hello, HelloResult, "introduce the client; bring the token")
+SESSION_CONTROL = Method(
+    "session.control", Control, ControlResult, "acquire, release or force control"
+)
+SESSION_PING = read("session.ping", Empty, Pong, "a heartbeat", urgent=True)
+STATE_GET = read("state.get", Empty, State, "everything, as one snapshot")
+STATE_SUBSCRIBE = read("state.subscribe", Subscribe, Nothing, "send events of these topics")
+STATE_UNSUBSCRIBE = read("state.unsubscribe", Unsubscribe, Nothing, "send them no longer")

@@ -1,0 +1,33 @@
+"""The clients' methods are the public functions of `twin_methods`.
+
+`python tests/clients/test_shared_methods.py` writes the list of them anew.
+"""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+
+from flexdt.clients.client import shared_methods, twin_methods
+
+FILE = Path(shared_methods.__file__)
+HEAD = (
+    '    """The methods of the wire; how they wait is the client\'s. Written by `make web`."""\n\n'
+)
+
+
+def lines() -> str:
+    functions = inspect.getmembers(twin_methods, inspect.isfunction)
+    own = [
+        f for _, f in functions if f.__module__ == twin_methods.__name__ and f.__name__[0] != "_"
+    ]
+    own.sort(key=lambda f: f.__code__.co_firstlineno)
+    return "".join(f"    {f.__name__} = Method(m.{f.__name__})\n" for f in own)
+
+
+def test_the_list_of_methods_is_current() -> None:
+    assert FILE.read_text("utf-8").split(HEAD)[1] == lines(), "run `make web`, or this file"
+
+
+if __name__ == "__main__":
+    FILE.write_text(FILE.read_text("utf-8").split(HEAD)[0] + HEAD + lines(), "utf-8")
