@@ -42,7 +42,6 @@ from flexdt.twin.reconstruction import (
     fdk_parts,
     field_of_view,
     hardening,
-    kernel_scatter,
     ring_errors,
     sart,
     sirt,
@@ -75,7 +74,6 @@ PART: Final = 16
 """Frames read at a time."""
 PREVIEW_VIEWS: Final = 180
 PREVIEW_VOXELS: Final = 160
-SCATTER_METHODS: Final = ("simulation", "kernel")
 SCATTER_VIEWS, SCATTER_PIXELS = 180, 100
 """Frames, and about their pixels a side, from which it is found what scatters."""
 
@@ -103,8 +101,6 @@ class VolumeRequest:
         weight: of the total variation (`tv`); None is its own default.
         scatter_correction: materials of the object: find their scatter and subtract it; None
             for no correction.
-        scatter_method: one of `SCATTER_METHODS`: simulate the scatter of the whole scan in rounds,
-            or that of few views and fit kernels to it.
         tube: of the scan, in place of what the data set says and of `kV`.
     """
 
@@ -123,7 +119,6 @@ class VolumeRequest:
     weight: float | None = None
     scatter_correction: tuple[str, ...] | None = None
     tube: Tube | None = None
-    scatter_method: str = "simulation"
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +239,7 @@ def reconstruct_dataset(
         correction (edge units), seconds.
 
     Raises:
-        UnknownNameError: no such algorithm, window, material or scatter method.
+        UnknownNameError: no such algorithm, window or material.
         TwinError: beam hardening cannot be corrected, because the data set has none.
         LimitError: another ending, one of the data set's own files, or a volume too large for this
             machine.
@@ -378,12 +373,9 @@ def _task(
 ) -> tuple[VolumeRequest, ScanFrames, Grid]:
     """A request that can be met, its views, not yet corrected, and its grid."""
     wanted = VolumeRequest() if request is None else request
-    for what, name, allowed in (
-        ("algorithm", wanted.algorithm, ALGORITHMS),
-        ("scatter method", wanted.scatter_method, SCATTER_METHODS),
-    ):
-        if name not in allowed:
-            raise UnknownNameError.among(f"unknown {what} {name!r}; allowed", name, allowed)
+    name = wanted.algorithm
+    if name not in ALGORITHMS:
+        raise UnknownNameError.among(f"unknown algorithm {name!r}; allowed", name, ALGORITHMS)
     views = views_of(dataset, parameters, binning=wanted.binning, every=wanted.every)
     return wanted, views, grid_of(views, wanted)
 
@@ -455,9 +447,6 @@ def _without_scatter(
     geometry = views.cone_vec[::each].binned(factor, views.shape)
     coarse = ScanFrames(views.dataset, views.indices[::each], geometry, views.binning * factor)
     stack = np.concatenate(list(coarse.parts()))
-    if request.scatter_method == "kernel":
-        kernels = kernel_scatter(stack, geometry, chain, kV, None, (views.cone_vec, views.shape))
-        return replace(views, scatter=kernels.scatter, doubts=kernels.doubts)
     found = scatterer_of(stack, geometry, chain, kV)
     beam = Beam.of(chain, kV)
     scatter = scan_scatter(found.thing, views.cone_vec.rows, views.shape, beam)
