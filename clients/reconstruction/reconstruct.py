@@ -23,7 +23,7 @@ import numpy as np
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.reconstruction.volume_files import (
     check_name,
-    read_values,
+    read_volume,
     volume_writer,
     write_slices,
 )
@@ -227,7 +227,7 @@ def reconstruct_dataset(
 
     Args:
         dataset: from `load_dataset`.
-        out: the file: .tif, .npy, .nrrd, .mha, .nii.gz, .h5 or .zarr.
+        out: the file: .tif, .nrrd, .mha, .nii.gz, .h5 or .zarr.
         request: the volume; None is FDK of the whole field of view.
         parameters: correction; None is the one in force during the scan, if any.
         progress: called with the work done and the whole.
@@ -264,7 +264,7 @@ def reconstruct_dataset(
         else:
             doubts = _by_workers(views, grid, wanted, out, pool, tell)
     doubts = [*views.doubts, *doubts]
-    slices = write_slices(out, read_values(out)) if wanted.png else []
+    slices = write_slices(out, read_volume(out).data) if wanted.png else []
     in_force = dataset.correction
     used = parameters if parameters is not None else in_force.parameters if in_force else None
     return {

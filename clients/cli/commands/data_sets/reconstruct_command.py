@@ -30,7 +30,7 @@ Algorithm = Literal["fdk", "sirt", "sart", "cgls", "em", "tv"]
 def reconstruct(
     twin: Twin,
     dataset: Path = argument(..., "DATASET"),
-    out: Path = option(..., ".tif .npy .nrrd .mha .nii.gz .h5 .zarr", metavar="FILE"),
+    out: Path = option(..., ".tif .nrrd .mha .nii.gz .h5 .zarr", metavar="FILE"),
     algorithm: Algorithm | None = option(None, "Default: fdk."),
     voxel: float | None = option(None, "Default: a pixel at the axis.", metavar="MM"),
     shape: str | None = option(None, "Default: the field of view.", metavar="Z,Y,X"),
@@ -117,13 +117,13 @@ def reconstruct(
 
 def _check_together(chosen: Mapping[str, object], out: Path, kept_out: Iterable[str]) -> None:
     """Usage errors of options that do not go together; a preview keeps some out."""
-    from flexdt.clients.reconstruction.volume_files import SUFFIXES
+    from flexdt.clients.reconstruction.volume_files import SUFFIXES, ending
 
     algorithm = chosen.get("algorithm", "fdk")
     corrects = {"material", "scatter-correction"} & chosen.keys()
     for wrong, name, why in (
         *((True, name, "--preview chooses for itself") for name in kept_out),
-        (out.suffix.lower() not in SUFFIXES, "out",
+        (ending(out) not in SUFFIXES, "out",
          f"{out}: the ending must be one of {', '.join(SUFFIXES)}"),
         ("kv" in chosen and not corrects, "kv", "it is for --material and --scatter-correction"),
         ("iterations" in chosen and algorithm == "fdk", "iterations", "fdk has none"),
