@@ -67,8 +67,6 @@ ITERATIVE: Final[Mapping[str, Callable[..., Volume]]] = {
     "tv": tv,
 }
 ALGORITHMS: Final = ("fdk", *ITERATIVE)
-ON_WORKERS: Final = ("fdk", "sirt", "cgls", "tv")
-"""Algorithms that workers of a scheduler can share."""
 SLAB_BYTES: Final = 512 << 20
 PART: Final = 16
 """Frames read at a time."""
@@ -231,8 +229,8 @@ def reconstruct_dataset(
         request: the volume; None is FDK of the whole field of view.
         parameters: correction; None is the one in force during the scan, if any.
         progress: called with the work done and the whole.
-        workers: do the work of FDK, SIRT, CGLS or TV; they see the data set and `out` under the
-            same paths. An interrupted reconstruction is taken up.
+        workers: make the slabs of FDK; they see the data set and `out` under the same paths. An
+            interrupted reconstruction is taken up.
 
     Returns:
         JSON-able: file, slices, algorithm, shape (z, y, x), voxel_mm, center_mm, frames, missing,
@@ -317,14 +315,13 @@ def _by_workers(
 ) -> list[str]:
     """As `_here`, by workers."""
     from flexdt.clients.reconstruction.on_workers import SlabWork, fdk_on_workers
-    from flexdt.clients.reconstruction.subsets_on_workers import reconstruct_on_workers
 
     data = views.dataset
-    if request.algorithm not in ON_WORKERS or data.folder is None:
+    if request.algorithm != "fdk" or data.folder is None:
         raise LimitError(
-            f"workers reconstruct data sets in folders, by {', '.join(ON_WORKERS)}; not "
-            f"{data.where} by {request.algorithm}",
-            {"asked": request.algorithm, "allowed": ON_WORKERS},
+            f"workers reconstruct data sets in folders, by fdk; not {data.where} by "
+            f"{request.algorithm}",
+            {"asked": request.algorithm, "allowed": ["fdk"]},
         )
     files = [path for i in views.indices if (path := data.frames[i].path) is not None]
     stats = [(str(file), file.stat()) for file in (*files, *data.darks, *data.flats)]
@@ -334,14 +331,6 @@ def _by_workers(
     )  # fmt: skip
     # Workers compute for themselves what this process has computed of the data set.
     sent = replace(views, dataset=replace(data))
-    if request.algorithm != "fdk":
-        held = 12 if request.algorithm == "tv" else 4
-        _require("of memory", held * grid.bytes, _memory(), grid)
-        reconstruct_on_workers(
-            request.algorithm, sent.image, views.indices, views.cone_vec, views.shape, grid,
-            request.iterations, request.weight, out, identity, pool, tell,
-        )  # fmt: skip
-        return []
     truncation = views.truncation()
     work = SlabWork(sent.parts, views.cone_vec, views.shape, grid, request.window, truncation)
     return _doubts(truncation) + fdk_on_workers(work, out, identity, pool, tell)

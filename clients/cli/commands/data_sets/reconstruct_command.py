@@ -130,8 +130,7 @@ def _check_together(chosen: Mapping[str, object], out: Path, kept_out: Iterable[
         ("weight" in chosen and algorithm != "tv", "weight", f"{algorithm} has none"),
         ("window" in chosen and algorithm != "fdk", "window", f"{algorithm} has no filter"),
         ({"scheduler", "slurm"} <= chosen.keys(), "slurm", "not together with --scheduler"),
-        *((algorithm in ("sart", "em"), name,
-           f"{algorithm} is not done by workers; allowed: fdk, sirt, cgls, tv")
+        *((algorithm != "fdk", name, f"{algorithm} is not done by workers; allowed: fdk")
           for name in ("scheduler", "slurm") if name in chosen),
         ({"correction", "geometry"} <= chosen.keys(), "correction",
          "no correction is added to a geometry from a file"),
