@@ -166,9 +166,8 @@ def simulate(
         detector: default: the machine's, else the twin's panel with the geometry's pixels.
         noise: seed, >= 0; None for the expectation. Image i has a random generator of its own,
             counting the dark image (0), the flat image (1) and the projections.
-        scatter: "first" adds the radiation that the sample scatters once, a quick preview; "mc"
-            all of it, by Monte Carlo with the seed of `noise`. `ScatterSettings` state more. It is
-            in the data set's `truth.scatter`.
+        scatter: "mc" adds the radiation that the sample scatters, by Monte Carlo with the seed of
+            `noise`. `ScatterSettings` state more. It is in the data set's `truth.scatter`.
         machine: a machine, its name or file, whose tube and detector are taken where `tube` and
             `detector` leave them open.
         shape: detector (rows, cols), where the geometry does not say.
@@ -206,8 +205,9 @@ def simulate(
         return ScenarioImages(sample, noise, 3 if rays is None else rays).dataset()
     rays = 1 if rays is None else rays
     if not isinstance(scatter, ScatterSettings) and scatter not in get_args(Scatter):
+        gone = "; 'first' has been removed, use 'mc'" if scatter == "first" else ""
         raise LimitError(
-            f"scatter is {scatter!r}; allowed: {', '.join(get_args(Scatter))}",
+            f"scatter is {scatter!r}; allowed: {', '.join(get_args(Scatter))}{gone}",
             {"asked": scatter, "allowed": list(get_args(Scatter))},
         )
     if noise is not None and (not isinstance(noise, int | np.integer) or noise < 0):
@@ -231,9 +231,8 @@ def simulate(
     exposure = settings.exposure(camera.exposure_ms, camera.averages)
     scattered = None
     if scatter != "off":
-        how = scatter
-        if not isinstance(how, ScatterSettings):
-            how = ScatterSettings(kind=how, seed=noise or 0)
+        given = isinstance(scatter, ScatterSettings)
+        how = scatter if given else ScatterSettings(seed=noise or 0)
         grid = scatter_object(parts, phantom.size_mm, how.voxels)
         scattered = scan_scatter(grid, cone.rows, size, Beam.of(chain, exposure.kV), how)
     truth = Truth(

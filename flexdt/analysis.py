@@ -114,7 +114,6 @@ def reconstruct(
     window: str = "ram-lak",
     material: str | None = None,
     scatter_correction: str | Sequence[str] | None = None,
-    scatter_method: str = "simulation",
     tube: Tube | None = None,
     parameters: Offsets | None = None,
 ) -> Volume:
@@ -135,7 +134,6 @@ def reconstruct(
         material: the object is made of this alone: correct beam hardening.
         scatter_correction: the material that the object is made of, or all of them: simulate its
             scatter and subtract it (a circular scan).
-        scatter_method: "kernel" simulates ten views only and fits kernels to them.
         tube: of the scan, for the two corrections; default: what the data set says.
         parameters: correction; default: the one in force during the scan, if any.
 
@@ -153,7 +151,7 @@ def reconstruct(
     names = [scatter_correction] if isinstance(scatter_correction, str) else scatter_correction
     request = VolumeRequest(
         algorithm, voxel, shape, binning, every, iterations, window, center, False, material,
-        weight=weight, tube=tube, scatter_method=scatter_method,
+        weight=weight, tube=tube,
         scatter_correction=None if names is None else tuple(names),
     )  # fmt: skip
     return reconstruct_volume(_opened(data), request, parameters=parameters)

@@ -16,7 +16,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeVar, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeVar, get_args, get_type_hints
 
 import typer
 from typer.main import get_command
@@ -26,7 +26,7 @@ LARGEST_PORT = 65535
 UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
 LogLevel = Literal["debug", "info", "warning", "error"]
 Physics = Literal["ideal", "mono", "poly"]
-Scatter = Literal["off", "first", "mc"]
+Scatter = Literal["off", "mc"]
 
 
 @dataclass(frozen=True)
@@ -81,6 +81,18 @@ def memory_size(text: str) -> int:
     if size <= 0:
         raise typer.BadParameter(f"{text!r} is not a size such as 512M or 4GiB")
     return size
+
+
+def scatter_method(text: str) -> str:
+    """Read a method of simulating scatter: off or mc.
+
+    Raises:
+        typer.BadParameter: another one.
+    """
+    if text not in get_args(Scatter):
+        gone = "; 'first' has been removed, use 'mc'" if text == "first" else ""
+        raise typer.BadParameter(f"{text!r} is not one of {', '.join(get_args(Scatter))}{gone}")
+    return text
 
 
 def option(default: object, help: str, *flags: str, public: bool = True, **details: Any) -> Any:
@@ -170,7 +182,10 @@ class ScannerSettings(ServerSettings):
     sample: str | None = option(None, "On the stage at start, or 'empty'.", metavar="NAME")
     speed_up: str = option("1", "Twin seconds per second of yours.", metavar="X or max")
     physics: Physics = option("ideal", "How images are made, see docs/physics.md.")
-    scatter: Scatter = option("off", "Scattered radiation, for physics mono and poly.")
+    scatter: Scatter = option(
+        "off", "Scattered radiation, for physics mono and poly.", metavar="off or mc",
+        parser=scatter_method,
+    )  # fmt: skip
     fresh: bool = option(False, "Forget where the last twin left off.")
 
 

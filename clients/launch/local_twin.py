@@ -28,7 +28,7 @@ class LocalTwin:
         machine: description of the scanner, a shipped name or a file; None for the FleX-ray.
         profile: calibration profile; None for the machine's default.
         physics: how images are made: ideal, mono or poly.
-        scatter: what the sample scatters onto the panel, of mono and poly: off, first (once) or mc.
+        scatter: what the sample scatters onto the panel, of mono and poly: off or mc.
         speed_up: the twin's seconds for each of yours, or "max".
         truth: file with a hidden misalignment.
         viewer: whether to start the viewer as well; see `viewer_url`.
@@ -49,7 +49,7 @@ class LocalTwin:
         machine: str | PathLike[str] | None = None,
         profile: str | None = None,
         physics: Literal["ideal", "mono", "poly"] = "ideal",
-        scatter: Literal["off", "first", "mc"] = "off",
+        scatter: Literal["off", "mc"] = "off",
         speed_up: float | Literal["max"] = "max",
         truth: str | PathLike[str] | None = None,
         viewer: bool = False,

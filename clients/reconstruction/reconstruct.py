@@ -23,7 +23,7 @@ import numpy as np
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.reconstruction.volume_files import (
     check_name,
-    read_values,
+    read_volume,
     volume_writer,
     write_slices,
 )
@@ -42,7 +42,6 @@ from flexdt.twin.reconstruction import (
     fdk_parts,
     field_of_view,
     hardening,
-    kernel_scatter,
     ring_errors,
     sart,
     sirt,
@@ -68,14 +67,11 @@ ITERATIVE: Final[Mapping[str, Callable[..., Volume]]] = {
     "tv": tv,
 }
 ALGORITHMS: Final = ("fdk", *ITERATIVE)
-ON_WORKERS: Final = ("fdk", "sirt", "cgls", "tv")
-"""Algorithms that workers of a scheduler can share."""
 SLAB_BYTES: Final = 512 << 20
 PART: Final = 16
 """Frames read at a time."""
 PREVIEW_VIEWS: Final = 180
 PREVIEW_VOXELS: Final = 160
-SCATTER_METHODS: Final = ("simulation", "kernel")
 SCATTER_VIEWS, SCATTER_PIXELS = 180, 100
 """Frames, and about their pixels a side, from which it is found what scatters."""
 
@@ -103,8 +99,6 @@ class VolumeRequest:
         weight: of the total variation (`tv`); None is its own default.
         scatter_correction: materials of the object: find their scatter and subtract it; None
             for no correction.
-        scatter_method: one of `SCATTER_METHODS`: simulate the scatter of the whole scan in rounds,
-            or that of few views and fit kernels to it.
         tube: of the scan, in place of what the data set says and of `kV`.
     """
 
@@ -123,7 +117,6 @@ class VolumeRequest:
     weight: float | None = None
     scatter_correction: tuple[str, ...] | None = None
     tube: Tube | None = None
-    scatter_method: str = "simulation"
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,19 +225,19 @@ def reconstruct_dataset(
 
     Args:
         dataset: from `load_dataset`.
-        out: the file: .tif, .npy, .nrrd, .mha, .nii.gz, .h5 or .zarr.
+        out: the file: .tif, .nrrd, .mha, .nii.gz, .h5 or .zarr.
         request: the volume; None is FDK of the whole field of view.
         parameters: correction; None is the one in force during the scan, if any.
         progress: called with the work done and the whole.
-        workers: do the work of FDK, SIRT, CGLS or TV; they see the data set and `out` under the
-            same paths. An interrupted reconstruction is taken up.
+        workers: make the slabs of FDK; they see the data set and `out` under the same paths. An
+            interrupted reconstruction is taken up.
 
     Returns:
         JSON-able: file, slices, algorithm, shape (z, y, x), voxel_mm, center_mm, frames, missing,
         correction (edge units), seconds.
 
     Raises:
-        UnknownNameError: no such algorithm, window, material or scatter method.
+        UnknownNameError: no such algorithm, window or material.
         TwinError: beam hardening cannot be corrected, because the data set has none.
         LimitError: another ending, one of the data set's own files, or a volume too large for this
             machine.
@@ -269,7 +262,7 @@ def reconstruct_dataset(
         else:
             doubts = _by_workers(views, grid, wanted, out, pool, tell)
     doubts = [*views.doubts, *doubts]
-    slices = write_slices(out, read_values(out)) if wanted.png else []
+    slices = write_slices(out, read_volume(out).data) if wanted.png else []
     in_force = dataset.correction
     used = parameters if parameters is not None else in_force.parameters if in_force else None
     return {
@@ -322,14 +315,13 @@ def _by_workers(
 ) -> list[str]:
     """As `_here`, by workers."""
     from flexdt.clients.reconstruction.on_workers import SlabWork, fdk_on_workers
-    from flexdt.clients.reconstruction.subsets_on_workers import reconstruct_on_workers
 
     data = views.dataset
-    if request.algorithm not in ON_WORKERS or data.folder is None:
+    if request.algorithm != "fdk" or data.folder is None:
         raise LimitError(
-            f"workers reconstruct data sets in folders, by {', '.join(ON_WORKERS)}; not "
-            f"{data.where} by {request.algorithm}",
-            {"asked": request.algorithm, "allowed": ON_WORKERS},
+            f"workers reconstruct data sets in folders, by fdk; not {data.where} by "
+            f"{request.algorithm}",
+            {"asked": request.algorithm, "allowed": ["fdk"]},
         )
     files = [path for i in views.indices if (path := data.frames[i].path) is not None]
     stats = [(str(file), file.stat()) for file in (*files, *data.darks, *data.flats)]
@@ -339,14 +331,6 @@ def _by_workers(
     )  # fmt: skip
     # Workers compute for themselves what this process has computed of the data set.
     sent = replace(views, dataset=replace(data))
-    if request.algorithm != "fdk":
-        held = 12 if request.algorithm == "tv" else 4
-        _require("of memory", held * grid.bytes, _memory(), grid)
-        reconstruct_on_workers(
-            request.algorithm, sent.image, views.indices, views.cone_vec, views.shape, grid,
-            request.iterations, request.weight, out, identity, pool, tell,
-        )  # fmt: skip
-        return []
     truncation = views.truncation()
     work = SlabWork(sent.parts, views.cone_vec, views.shape, grid, request.window, truncation)
     return _doubts(truncation) + fdk_on_workers(work, out, identity, pool, tell)
@@ -378,12 +362,9 @@ def _task(
 ) -> tuple[VolumeRequest, ScanFrames, Grid]:
     """A request that can be met, its views, not yet corrected, and its grid."""
     wanted = VolumeRequest() if request is None else request
-    for what, name, allowed in (
-        ("algorithm", wanted.algorithm, ALGORITHMS),
-        ("scatter method", wanted.scatter_method, SCATTER_METHODS),
-    ):
-        if name not in allowed:
-            raise UnknownNameError.among(f"unknown {what} {name!r}; allowed", name, allowed)
+    name = wanted.algorithm
+    if name not in ALGORITHMS:
+        raise UnknownNameError.among(f"unknown algorithm {name!r}; allowed", name, ALGORITHMS)
     views = views_of(dataset, parameters, binning=wanted.binning, every=wanted.every)
     return wanted, views, grid_of(views, wanted)
 
@@ -455,9 +436,6 @@ def _without_scatter(
     geometry = views.cone_vec[::each].binned(factor, views.shape)
     coarse = ScanFrames(views.dataset, views.indices[::each], geometry, views.binning * factor)
     stack = np.concatenate(list(coarse.parts()))
-    if request.scatter_method == "kernel":
-        kernels = kernel_scatter(stack, geometry, chain, kV, None, (views.cone_vec, views.shape))
-        return replace(views, scatter=kernels.scatter, doubts=kernels.doubts)
     found = scatterer_of(stack, geometry, chain, kV)
     beam = Beam.of(chain, kV)
     scatter = scan_scatter(found.thing, views.cone_vec.rows, views.shape, beam)

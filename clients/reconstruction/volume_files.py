@@ -1,4 +1,4 @@
-"""Volumes to files, slab by slab: TIFF, NumPy, NRRD, MetaImage, NIfTI, HDF5, Zarr; slices as PNG.
+"""Volumes to files, slab by slab: TIFF, NRRD, MetaImage, NIfTI, HDF5, Zarr; slices as PNG.
 
 A file appears under its final name only when whole. Values are float32 [1/mm], index order z, y, x;
 voxel size and position go into the file where its format has a place for them.
@@ -7,7 +7,6 @@ voxel size and position go into the file where its format has a place for them.
 from __future__ import annotations
 
 import gzip
-import io
 import json
 import os
 import shutil
@@ -29,10 +28,14 @@ from flexdt.twin.projection import Grid, Volume
 if TYPE_CHECKING:
     from flexdt.twin.geometry.conventions import Float32Array
 
-SUFFIXES: Final = (".tif", ".tiff", ".npy", ".nrrd", ".mha", ".nii.gz", ".h5", ".zarr")
+SUFFIXES: Final = (".tif", ".tiff", ".nrrd", ".mha", ".nii.gz", ".h5", ".zarr")
 PACKAGES: Final = {".nii.gz": "nibabel", ".h5": "h5py", ".zarr": "zarr"}
 """What writes these formats; the others need nothing more."""
 ZARR_MARK: Final = "zarr.json"
+NO_PLACE: Final = (
+    "NumPy's files have no room for the voxel size; write with numpy.save(FILE, volume.data) and "
+    "read with Volume(numpy.load(FILE), voxel_mm)"
+)
 
 
 Sink = Callable[["Float32Array"], None]
@@ -85,16 +88,21 @@ def ending(path: Path) -> str:
 
 def check_name(path: Path) -> None:
     """Check, before any work, that a file of this name can be written."""
-    if ending(path) not in SUFFIXES:
-        raise LimitError(
-            f"{path}: the ending must be one of {', '.join(SUFFIXES)}",
-            {"asked": path.suffix, "allowed": list(SUFFIXES)},
-        )
+    _check_ending(path)
     if not path.absolute().parent.is_dir():
         raise LimitError(f"{path}: the folder does not exist", {"asked": str(path.parent)})
     needed = PACKAGES.get(ending(path))
     if needed is not None:
         package(needed)
+
+
+def _check_ending(path: Path) -> None:
+    if ending(path) not in SUFFIXES:
+        why = f". {NO_PLACE}" if ending(path) == ".npy" else ""
+        raise LimitError(
+            f"{path}: the ending must be one of {', '.join(SUFFIXES)}{why}",
+            {"asked": path.suffix, "allowed": list(SUFFIXES)},
+        )
 
 
 def save_volume(volume: Volume, file: File) -> None:
@@ -152,13 +160,6 @@ def _low(grid: Grid) -> list[float]:
     return [
         c - (n - 1) / 2 * grid.voxel_mm for c, n in zip(grid.center_mm, (nx, ny, nz), strict=True)
     ]
-
-
-def _npy_header(grid: Grid) -> bytes:
-    buffer = io.BytesIO()
-    about = {"descr": "<f4", "fortran_order": False, "shape": grid.shape}
-    np.lib.format.write_array_header_1_0(buffer, about)
-    return buffer.getvalue()
 
 
 def _nrrd_header(grid: Grid) -> bytes:
@@ -223,7 +224,6 @@ def _nifti_header(grid: Grid) -> bytes:
 
 
 HEADERS: Final[Mapping[str, Callable[[Grid], bytes]]] = {
-    ".npy": _npy_header,
     ".nrrd": _nrrd_header,
     ".mha": _mha_header,
 }
@@ -269,26 +269,15 @@ def _filling(values: Any) -> Sink:
     return write
 
 
-def read_values(path: Path) -> npt.NDArray[np.float32]:
-    """Values of a file that `volume_writer` made, (nz, ny, nx).
-
-    Raises:
-        OSError: it cannot be read.
-        LimitError: it is not such a file.
-    """
-    if ending(path) == ".npy":
-        return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
-    return read_volume(path).data
-
-
 def read_volume(file: File) -> Volume:
     """A volume with its place, from a file that `volume_writer` made.
 
     Raises:
         OSError: it cannot be read.
-        LimitError: it is not such a file (NumPy's format has no room for the place).
+        LimitError: it is not such a file.
     """
     path = Path(file)
+    _check_ending(path)
     try:
         values, voxel, place, first = READERS[ending(path)](path)
         if first:  # the place is that of the first voxel

@@ -7,16 +7,17 @@ unpickled, and references to other files are not followed. A mesh must be closed
 from __future__ import annotations
 
 import io
+import json
 import os
+import struct
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from flexdt.phantoms.checked_reading import PhantomError
-from flexdt.phantoms.files.gltf import read_glb
 from flexdt.phantoms.materials import material as material_of
 from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.pieces import Surface, Voxels
@@ -45,6 +46,18 @@ MAX_PART_FACES: Final = 300_000
 MAX_PART_MM: Final = 20_000.0
 """Of a machine's part: browsers draw a dozen of them at once."""
 MAX_PLY_HEADER: Final = 1 << 16
+MAX_GLB_DOCUMENT: Final = 32 << 20
+MAX_PARTS: Final = 1000
+"""Nodes of a GLB file, and primitives, each counted as often as it stands in the scene: trimesh
+walks from the scene's root to each."""
+HARMLESS: Final = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "EXT_texture_")
+"""Beginnings of the names of glTF extensions that change how a thing looks, not its shape."""
+ITEM_BYTES: Final = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
+ITEM_COLUMNS: Final = {
+    "SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16,
+}  # fmt: skip
+"""Sizes of glTF's component types and element types (glTF 2.0 specification, 3.6.2)."""
+TRIANGLE_FAN: Final = 6
 MAX_PLANES: Final = 128
 """A convex mesh with at most so many planes is projected as a solid, others as their triangles."""
 
@@ -260,13 +273,16 @@ def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
 
     mesh: object
     try:
-        if kind == "glb":
-            mesh = trimesh.Trimesh(*read_glb(raw, MAX_FACES), process=False)
-        else:
-            if kind == "ply":
-                _check_ply(raw)
+        if kind in _CHECKS:
+            _CHECKS[kind](raw)
+        # Parts that lie too far away are refused below, as vertices that are not finite.
+        with np.errstate(all="ignore" if kind == "glb" else None):
             mesh = trimesh.load(
-                io.BytesIO(raw), file_type=kind, force="mesh", process=True, skip_materials=True
+                io.BytesIO(raw),
+                file_type=kind,
+                force="mesh",
+                process=kind != "glb",  # It drops vertices that are not finite without a word.
+                skip_materials=True,
             )
     except MemoryError:
         raise PhantomError(f"reading this {kind.upper()} file takes too much memory") from None
@@ -279,7 +295,10 @@ def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
         raise PhantomError.instead(f"the mesh has {count} triangles", count, MAX_FACES)
     if len(mesh.vertices) == 0 or not np.isfinite(mesh.vertices).all():
         raise PhantomError("the mesh has vertices that are not finite numbers")
-    return mesh
+    if not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
+        raise PhantomError(f"a triangle uses a vertex beyond the {len(mesh.vertices)} of the mesh")
+    # Its triangles alone: colours and normals of the file may be anything.
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
 
 def _check_ply(raw: bytes) -> None:
@@ -293,6 +312,62 @@ def _check_ply(raw: bytes) -> None:
             raise ValueError(
                 f"{line[:80].decode('ascii', 'replace').strip()!r}: more than it holds"
             )
+
+
+def _check_glb(raw: bytes) -> None:
+    """The file refers to no other, claims no more than it holds, and puts each node in one place.
+
+    trimesh allocates what the document claims, and copies a mesh to each of its places.
+    """
+    if len(raw) < 20 or raw[:8] != b"glTF\2\0\0\0" or raw[16:20] != b"JSON":
+        raise ValueError("it does not begin as a GLB file (glTF 2.0) does")
+    (size,) = struct.unpack_from("<I", raw, 12)
+    if size > min(MAX_GLB_DOCUMENT, len(raw) - 20):
+        what = f"its document has {size} bytes; allowed: {MAX_GLB_DOCUMENT}, all in the file"
+        raise ValueError(what)
+    try:
+        _check_gltf(json.loads(raw[20 : 20 + size]), len(raw))
+    except (AttributeError, LookupError, TypeError, RecursionError) as error:
+        raise ValueError(f"its document does not hold together: {error!r}") from None
+
+
+def _check_gltf(document: Any, total: int) -> None:
+    for name in document.get("extensionsRequired", []):
+        if not name.startswith(HARMLESS):
+            raise ValueError(f"it needs the extension {name[:80]!r}, which is not read here")
+    if any("uri" in buffer for buffer in document.get("buffers", [])):
+        raise ValueError("its data are not in this file")
+    accessors = document.get("accessors", [])
+    for i, one in enumerate(accessors):
+        if "bufferView" not in one or "sparse" in one:
+            raise ValueError(f"accessor {i}: its data are not in the file as they are")
+    views = [view["byteLength"] for view in document.get("bufferViews", [])]
+    sizes = [a["count"] * ITEM_BYTES[a["componentType"]] * ITEM_COLUMNS[a["type"]]
+             for a in accessors]  # fmt: skip
+    if min((*views, *sizes), default=0) < 0 or not max(sum(views), sum(sizes)) <= total:
+        raise ValueError(f"it claims more than its {total} bytes hold")
+    nodes, meshes = document.get("nodes", []), document.get("meshes", [])
+    scenes = document.get("scenes", [{}])
+    places = [*scenes[document.get("scene", 0)].get("nodes", [])]
+    places += [child for node in nodes for child in node.get("children", [])]
+    if len(set(places)) < len(places):
+        raise ValueError("a node has two places in the scene")
+    drawn = [meshes[node["mesh"]]["primitives"] for node in nodes if "mesh" in node]
+    parts = len(nodes) + sum(len(primitives) for primitives in drawn)
+    if parts > MAX_PARTS:
+        raise ValueError(f"it has {parts} nodes and parts; allowed: {MAX_PARTS}")
+    corners = 0
+    for part in (part for primitives in drawn for part in primitives):
+        if part.get("mode") == TRIANGLE_FAN:
+            raise ValueError("it has triangle fans, which are not read here")
+        used = [part["attributes"]["POSITION"], *([part["indices"]] if "indices" in part else [])]
+        corners += max(accessors[i]["count"] for i in used)
+    if corners > 3 * MAX_FACES:
+        raise ValueError(f"it has more than {MAX_FACES} triangles")
+
+
+_CHECKS: Final = {"glb": _check_glb, "ply": _check_ply}
+"""What is checked of a file's claims before trimesh reads it."""
 
 
 def _closed(mesh: trimesh.Trimesh, label: str) -> trimesh.Trimesh:

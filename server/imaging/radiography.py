@@ -76,7 +76,7 @@ class Radiography:
         model: the ideal detector.
         physics: ideal, mono or poly.
         panel, tube: of the other two.
-        scatter: what the sample scatters onto the panel, of the other two: off, first (once) or mc.
+        scatter: what the sample scatters onto the panel, of the other two: off or mc.
     """
 
     imaging: Imaging
@@ -204,7 +204,7 @@ class Radiography:
 
     @property
     def _settings(self) -> ScatterSettings:
-        return ScatterSettings(kind="first" if self.scatter == "first" else "mc")
+        return ScatterSettings()
 
     def _scattered(
         self,

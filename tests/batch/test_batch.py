@@ -539,9 +539,9 @@ def test_reconstruct_by_jobs_of_a_stand_in_for_slurm(
     fx.simulate(fx.Volume(np.full((8, 8, 8), 0.02, np.float32), 2.0), geometry).save("scan")
     Path("slurm.toml").write_text('jobs = 1\ncores = 2\nmemory = "1GiB"\n')
     words = ["reconstruct", "scan", "--shape", "80,12,12", "--voxel", "2", "--json", "--out"]
-    assert run([*words, "v.npy", "--slurm", "slurm.toml"]) == 0, capsys.readouterr().err
-    assert run([*words, "here.npy"]) == 0
-    made, here = np.load("v.npy"), np.load("here.npy")
+    assert run([*words, "v.mha", "--slurm", "slurm.toml"]) == 0, capsys.readouterr().err
+    assert run([*words, "here.mha"]) == 0
+    made, here = (fx.Volume.load(f"{n}.mha").data for n in ("v", "here"))
     assert np.abs(made - here).max() <= 1e-6 * here.max()
 
 

@@ -362,8 +362,8 @@ def test_the_command_writes_a_correction_that_reconstruct_takes(
     assert abs(column - scanner.axis()[0]) < 4 * sigma
     words = ["--correction", str(report), "--voxel", "1.5", "--shape", "8,30,30"]
     folder = str(tmp_path / "scan")
-    assert run(["reconstruct", folder, "--out", str(tmp_path / "v.npy"), *words]) == 0
-    given = np.load(tmp_path / "v.npy")
+    assert run(["reconstruct", folder, "--out", str(tmp_path / "v.mha"), *words]) == 0
+    given = fx.Volume.load(tmp_path / "v.mha").data
     own = fx.open(folder)
     ours = own.with_correction(own.align().correction).reconstruct(
         "fdk", voxel=1.5, shape=(8, 30, 30)

@@ -71,12 +71,12 @@ def test_a_screw_is_followed_from_calibration_to_volume(
 
     steepest = {}
     for name, correction in (("with", str(report)), ("without", "none")):
-        out = tmp_path / f"{name}.npy"
+        out = tmp_path / f"{name}.mha"
         bead = ",".join(f"{v:.3f}" for v in beads[0])
         assert run(["reconstruct", str(folder), "--correction", correction, "--out", str(out),
                     "--voxel", "0.2", "--shape", "30,30,30", "--center", bead]) == 0  # fmt: skip
         # The steepest rise of the vertical profile through the bead's centre.
-        profile = np.load(out)[:, 13:17, 13:17].mean(axis=(1, 2))
+        profile = fx.Volume.load(out).data[:, 13:17, 13:17].mean(axis=(1, 2))
         steepest[name] = float(np.diff(profile).max() / np.median(profile[13:17]))
     assert steepest["with"] > 0.7
     assert steepest["without"] < 0.35

@@ -26,6 +26,7 @@ from flexdt.clients.datasets.exchange import (
 )
 from flexdt.twin.dataset.record import FrameBlock, ScanRecord
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.projection import Volume
 
 ENDINGS = {"ctsimu": "json", "rtk": "xml", "astra": "npy", "tomosipo": "npz", "flexdata": "toml",
            "csv": "csv"}  # fmt: skip
@@ -139,13 +140,13 @@ def test_reconstruct_takes_an_imported_geometry(
     assert flexdt("import", file, "--format", "rtk", "--like", folder, "--out", geometry)[0] == 0
     words = ("--algorithm", "sirt", "--iterations", 2, "--voxel", 0.3, "--shape", "4,8,8")
     volumes = []
-    for name, more in (("a.npy", ()), ("b.npy", ("--geometry", geometry))):
+    for name, more in (("a.mha", ()), ("b.mha", ("--geometry", geometry))):
         code, _, err = flexdt("reconstruct", folder, "--out", tmp_path / name, *words, *more)
         assert code == 0, err
-        volumes.append(np.load(tmp_path / name))
+        volumes.append(Volume.load(tmp_path / name).data)
     assert np.abs(volumes[0] - volumes[1]).max() < 1e-5 * np.abs(volumes[0]).max()
     code, _, err = flexdt(
-        "reconstruct", folder, "--out", tmp_path / "c.npy", "--geometry", tmp_path / "no.json"
+        "reconstruct", folder, "--out", tmp_path / "c.mha", "--geometry", tmp_path / "no.json"
     )  # fmt: skip
     assert code == 1
     assert "no.json" in err

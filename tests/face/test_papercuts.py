@@ -113,9 +113,9 @@ def test_a_volume_file_may_be_named_by_text(tmp_path: Path) -> None:
     data = fx.DataSet.from_arrays(
         np.full((16, 16, 16), 500), SCAN, dark=np.zeros((16, 16)), flat=np.full((16, 16), 900)
     )
-    out = str(tmp_path / "v.npy")
+    out = str(tmp_path / "v.mha")
     assert reconstruct_dataset(data, out, VolumeRequest(shape=(4, 4, 4)))["file"] == out
-    assert np.load(out).shape == (4, 4, 4)
+    assert fx.Volume.load(out).shape == (4, 4, 4)
 
 
 @pytest.mark.parametrize("name", ["torch", "odl", "cil"])

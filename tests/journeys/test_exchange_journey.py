@@ -13,6 +13,7 @@ import pytest
 
 from flexdt.clients.cli.entry import run
 from flexdt.clients.launch.processes import Servers
+from flexdt.twin.projection import Volume
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "reconstruct_with_rtk.py"
 
@@ -33,10 +34,10 @@ def test_rtk_reconstructs_what_we_export(
         capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    ours = tmp_path / "ours.npy"
+    ours = tmp_path / "ours.mha"
     words = ["--voxel", "0.25", "--shape", "48,48,48"]
     assert run(["reconstruct", str(scan), "--out", str(ours), *words]) == 0
-    a, b = np.load(out), np.load(ours)
+    a, b = np.load(out), Volume.load(ours).data
     assert a.shape == b.shape
 
     def alike(x: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> float:

@@ -76,6 +76,15 @@ def test_a_wrong_option_is_reported_in_one_line(
     assert err.count("\n") == 1
 
 
+def test_a_removed_method_of_scatter_names_its_successor(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert parse(TwinSettings, ["--scatter", "mc"]).scatter == "mc"
+    with pytest.raises(SystemExit):
+        parse(TwinSettings, ["--scatter", "first"])
+    assert "'first' has been removed, use 'mc'" in capsys.readouterr().err
+
+
 def test_up_leaves_the_data_directory_of_the_viewer_open() -> None:
     """Without --data the twin has its default, and the viewer has none to calibrate from."""
     assert shared(UpSettings(), TwinSettings)["data"] is None

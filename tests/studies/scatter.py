@@ -5,7 +5,6 @@
     python tests/studies/scatter.py pulls       # standard errors over 100 seeds
     python tests/studies/scatter.py cost        # seconds for a frame on one core
     python tests/studies/scatter.py cupping     # of cylinders with scatter, and corrected
-    python tests/studies/scatter.py kernels     # the same by kernels; other samples, other kernels
 
 The scenario of 2D-SW-1 is not public. Spherical wedges, steps and regions are those of the
 evaluation's documentation, thicknesses follow from its primary signals, the panel stands at
@@ -24,14 +23,10 @@ from itertools import product
 
 import numba
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 
 import flexdt as fx
-from flexdt.phantoms import material as material_of
 from flexdt.twin.attenuation.scattering import cross_sections
 from flexdt.twin.attenuation.substances import Substance
-from flexdt.twin.physics.chain import Chain
-from flexdt.twin.physics.panel import Panel
 from flexdt.twin.physics.scatter.simulation import (
     Beam,
     Object,
@@ -39,7 +34,6 @@ from flexdt.twin.physics.scatter.simulation import (
     ScatterSettings,
     scatter_image,
 )
-from flexdt.twin.reconstruction import kernel_scatter
 
 ENERGY = cross_sections(()).energy_keV
 EVEN = np.ones(len(ENERGY))
@@ -56,22 +50,6 @@ BLOCKS = (
 )
 CYLINDERS = (("pmma", 35.0), ("aluminium", 15.0))
 """Material and radius [mm]."""
-SAMPLES: dict[str, list[dict[str, object]]] = {
-    "PMMA cylinder of 70 mm": [{"kind": "cylinder", "center": [0, 0, 0], "radius": 35, "height": 40,
-                                "material": "pmma"}],
-    "aluminium cylinder of 30 mm": [{"kind": "cylinder", "center": [0, 0, 0], "radius": 15,
-                                     "height": 40, "material": "aluminium"}],
-    "PMMA cylinder of 40 mm, 15 mm aside": [{"kind": "cylinder", "center": [14, -6, 0],
-                                             "radius": 20, "height": 40, "material": "pmma"}],
-    "PMMA box 60 x 25 x 40 mm": [{"kind": "box", "center": [0, 0, 0], "size": [60, 25, 40],
-                                  "material": "pmma"}],
-    "aluminium box 30 x 12 x 30, aside": [{"kind": "box", "center": [6, -3, 0],
-                                           "size": [30, 12, 30], "material": "aluminium"}],
-    "PMMA and aluminium cylinders apart": [
-        {"kind": "cylinder", "center": [-22, 0, 0], "radius": 10, "height": 40, "material": "pmma"},
-        {"kind": "cylinder", "center": [20, 8, 0], "radius": 9, "height": 40,
-         "material": "aluminium"}],
-}  # fmt: skip
 GAPS = ((600, 1059), (300, 400))
 """Source to axis and to panel [mm]: FleX-ray's, and a panel that stands close to the object."""
 
@@ -194,8 +172,8 @@ def cost() -> None:
     for name, formula, density, size in BLOCKS:
         thing = block(formula, density, size)
         line = f"  {name:34s}"
-        for kind, nodes in (("first", 720), ("mc", 720), ("mc", 11400)):
-            settings = ScatterSettings(kind=kind, nodes=nodes)  # type: ignore[arg-type]
+        for nodes in (720, 11400):
+            settings = ScatterSettings(nodes=nodes)
             scatter_image(thing, FLEXRAY, SHAPE, mono(45.0), settings)
             took = []
             for stream in range(5):
@@ -203,7 +181,7 @@ def cost() -> None:
                 image = scatter_image(thing, FLEXRAY, SHAPE, mono(45.0), settings, stream)
                 took.append(time.perf_counter() - begun)
             nv, nu = image.mean.shape
-            line += (f" | {kind} {nu} x {nv}: {np.median(took):5.2f} s, "
+            line += (f" | {nu} x {nv}: {np.median(took):5.2f} s, "
                      f"{100 * image.error.mean() / image.mean.mean():.1f} %")  # fmt: skip
         print(line)
 
@@ -249,69 +227,12 @@ def cupping() -> None:
         print(f"{line}; S/P at the centre {100 * ratio:.1f} %; correction {took:.0f} s")
 
 
-def kernels() -> None:
-    """Scatter taken out by kernels: mean error of the attenuation, and cupping.
-
-    120 views of 76 x 95, 60 keV, panel at 400 mm. Scatter is simulated with other photons, 20 000
-    voxels and 300 nodes, in steps of 30 degrees. The error is that against FDK without scatter in
-    the middle layers. Cupping: by how much it is lower in the sample's middle (deeper than 0.75 of
-    the greatest depth) than near its rim (0.15 to 0.3 of it). Kernels are fitted to each sample,
-    then those of the PMMA cylinder are taken.
-    """
-    sod, sdd = GAPS[1]
-    scan = fx.ConeVec.circular(sod=sod, sdd=sdd, angles=120, shape=(76, 95), pixel=1.5)
-    tube = fx.Tube(kV=120, power_W=5, filters=[("Cu@8.96", 0.25)], mono_keV=60.0)
-    truth = ScatterSettings(seed=77, voxels=20_000, nodes=300, step_deg=30.0)
-    detector = fx.Detector.ideal(bits=16)
-
-    def layer(stack: np.ndarray) -> np.ndarray:
-        return fx.fdk(stack, scan, fx.Grid((3, 90, 90), 0.7), window="hann").data.mean(axis=0)
-
-    def figures(stack: np.ndarray, true: np.ndarray) -> str:
-        depth = distance_transform_edt(true > 0.3 * true.max())
-        depth /= depth.max()
-        wrong = layer(stack) - true
-        middle, rim, inside = (
-            100 * wrong[where].mean() / true[where].mean()
-            for where in (depth > 0.75, (depth > 0.15) & (depth < 0.3), depth > 0.15)
-        )
-        return f"{inside:+6.2f} % ({rim - middle:+.2f} %)"
-
-    of_cylinder = None
-    for name, sample in SAMPLES.items():
-        plain, scattered = (
-            np.stack([data[i] for i in range(len(scan))]).astype(np.float32)
-            for data in (
-                fx.simulate(sample, scan, tube=tube, detector=detector, scatter=kind)
-                for kind in ("off", truth)
-            )
-        )
-        names = list(dict.fromkeys(str(part["material"]) for part in sample))
-        substances = tuple(material_of(one).substance for one in names)
-        chain = Chain(Panel(), tube.model(), substances, mono_keV=60.0)
-        begun = time.perf_counter()
-        ways = [kernel_scatter(scattered, scan, chain, 120.0)]
-        took = time.perf_counter() - begun
-        if of_cylinder is None:
-            of_cylinder = ways[0].amplitudes
-        elif len(names) == 1:
-            ways.append(kernel_scatter(scattered, scan, chain, 120.0, amplitudes=of_cylinder))
-        true = layer(plain)
-        line = f"  {name:35s} {figures(scattered, true)}"
-        for found in ways:
-            signal = np.stack([found.scatter.signal(i) for i in range(len(scan))])
-            line += f" | {figures(-np.log(np.exp(-scattered) - signal), true)}"
-            line += f", missed {100 * found.missed:.1f} %{', said so' * bool(found.doubts)}"
-        print(f"{line}; {took:.0f} s", flush=True)
-
-
 STUDIES: dict[str, Callable[[], None]] = {
     "ctsimu": ctsimu,
     "table": table,
     "pulls": pulls,
     "cost": cost,
     "cupping": cupping,
-    "kernels": kernels,
 }
 
 

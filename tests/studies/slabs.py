@@ -7,11 +7,10 @@ kills   SIGKILL of workers, client and scheduler at random moments; what is kill
 memory  a volume of four times the address space (`ulimit -v`) that each process is allowed:
         --limit MIB.
 
-All is compared with what one undisturbed worker made (`--algorithm sirt`, `cgls` or `tv`: by 10
-iterations of it). Exit code 1 when anything differs or is lost. --views, --panel ROWS,COLS and
---side choose the scan and the volume's voxels a side; the default, which the figures in
-docs/reconstruction.md say, is 360 views of 380 x 478 into 256. Processes are started and judged
-from outside; the scan alone is made by flexdt.
+All is compared with what one undisturbed worker made. Exit code 1 when anything differs or
+is lost. --views, --panel ROWS,COLS and --side choose the scan and the volume's voxels a side; the
+default, which the figures in docs/reconstruction.md say, is 360 views of 380 x 478 into 256.
+Processes are started and judged from outside; the scan alone is made by flexdt.
 """
 
 from __future__ import annotations
@@ -137,22 +136,19 @@ def make_scan(folder: Path, views: int, panel: tuple[int, int]) -> Path:
     return folder / "scan"
 
 
-def speed(folder: Path, scan: Path, side: int, more: list[str]) -> bool:
+def speed(folder: Path, scan: Path, side: int) -> bool:
     """Seconds with 1, 2 and 4 processes."""
-    whole = undisturbed(folder, scan, side, more)
+    whole = undisturbed(folder, scan, side)
     same, first = True, 0.0
     for count in (1, 2, 4):
         cluster = Cluster(folder, count)
         try:
             out = folder / f"by-{count}.zarr"
-            # A first one on a coarse grid, so that imports and compiled kernels are loaded; of one
-            # iteration, since an algorithm's own number of them may take minutes.
-            short = ["--iterations", "1"] if more else []
-            warm = command(scan, folder / f"warm-{count}.zarr", 32, *more[:2], *short,
-                           "--scheduler", cluster.address)  # fmt: skip
+            # A first one on a coarse grid, so that imports and compiled kernels are loaded.
+            warm = command(scan, folder / f"warm-{count}.zarr", 32, "--scheduler", cluster.address)
             subprocess.run(warm, check=True, capture_output=True)
             begun = time.monotonic()
-            words = command(scan, out, side, *more, "--scheduler", cluster.address)
+            words = command(scan, out, side, "--scheduler", cluster.address)
             subprocess.run(words, check=True, capture_output=True)
             seconds = time.monotonic() - begun
         finally:
@@ -164,22 +160,22 @@ def speed(folder: Path, scan: Path, side: int, more: list[str]) -> bool:
     return same
 
 
-def undisturbed(folder: Path, scan: Path, side: int, more: list[str]) -> dict[str, str]:
+def undisturbed(folder: Path, scan: Path, side: int) -> dict[str, str]:
     """Digests of what all others must be."""
     out = folder / "undisturbed.zarr"
     cluster = Cluster(folder, 1)
     try:
-        words = command(scan, out, side, *more, "--scheduler", cluster.address)
+        words = command(scan, out, side, "--scheduler", cluster.address)
         subprocess.run(words, check=True, capture_output=True)
     finally:
         cluster.end()
     return digests(out)
 
 
-def kills(folder: Path, scan: Path, side: int, more: list[str], count: int, seed: int) -> bool:
+def kills(folder: Path, scan: Path, side: int, count: int, seed: int) -> bool:
     """Kill at random until `count` processes are killed and the last volume is there."""
     rng = random.Random(seed)
-    whole = undisturbed(folder, scan, side, more)
+    whole = undisturbed(folder, scan, side)
     killed = {"worker": 0, "client": 0, "scheduler": 0}
     volumes = runs = wrong = 0
     codes: dict[int, int] = {}
@@ -189,7 +185,7 @@ def kills(folder: Path, scan: Path, side: int, more: list[str], count: int, seed
     try:
         while True:
             cluster.mend()
-            client = start(command(scan, out, side, *more, "--scheduler", cluster.address), log)
+            client = start(command(scan, out, side, "--scheduler", cluster.address), log)
             runs += 1
             until = time.monotonic() + WITHIN_S
             while client.poll() is None and time.monotonic() < until:
@@ -283,27 +279,20 @@ def main() -> int:
     p.add_argument("--views", type=int, default=360)
     p.add_argument("--panel", default="380,478")
     p.add_argument("--side", type=int, default=256)
-    p.add_argument("--algorithm", choices=("fdk", "sirt", "cgls", "tv"), default="fdk")
-    p.add_argument("--iterations", type=int, default=10, help="Of all but FDK.")
     p.add_argument("--kills", type=int, default=50)
     p.add_argument("--seed", type=int, default=1)
     p.add_argument("--limit", type=int, default=1024, help="MiB")
     o = p.parse_args()
-    more = (
-        []
-        if o.algorithm == "fdk"
-        else ["--algorithm", o.algorithm, "--iterations", str(o.iterations)]
-    )
     rows, cols = (int(n) for n in o.panel.split(","))
-    print(f"{o.what}, {o.algorithm}: {o.views} views of {rows} x {cols}. {machine()}.", flush=True)
+    print(f"{o.what}: {o.views} views of {rows} x {cols}. {machine()}.", flush=True)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that no process is left
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
         folder = Path(name)
         scan = make_scan(folder, o.views, (rows, cols))
         if o.what == "speed":
-            good = speed(folder, scan, o.side, more)
+            good = speed(folder, scan, o.side)
         elif o.what == "kills":
-            good = kills(folder, scan, o.side, more, o.kills, o.seed)
+            good = kills(folder, scan, o.side, o.kills, o.seed)
         else:
             good = memory(folder, scan, o.limit << 20)
     return 0 if good else 1

@@ -10,7 +10,6 @@ from __future__ import annotations
 import doctest
 from dataclasses import replace
 from importlib import import_module, resources
-from typing import Literal
 
 import numba
 import numpy as np
@@ -27,6 +26,7 @@ from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.physics.chain import Chain
 from flexdt.twin.physics.panel import Panel
+from flexdt.twin.physics.scatter import scatter_kernels
 from flexdt.twin.physics.scatter.simulation import (
     Beam,
     Object,
@@ -35,7 +35,7 @@ from flexdt.twin.physics.scatter.simulation import (
     scan_scatter,
     scatter_image,
 )
-from flexdt.twin.reconstruction import Grid, fdk, kernel_scatter, without_scatter
+from flexdt.twin.reconstruction import Grid, fdk, without_scatter
 from flexdt.twin.reconstruction.scatter_correction import scatterer_of, subtracted
 
 R2 = 0.0794078767e-22  # classical electron radius squared [mm2], 7.94e-30 m2
@@ -132,7 +132,7 @@ def test_first_order_is_the_integral_over_the_box(seed: int) -> None:
     picked = np.searchsorted(ENERGY, rng.uniform(25.0, 140.0, 2))
     signal[picked] = rng.uniform(0.3, 1.0, 2)
     image = scatter_image(
-        thing, view, shape, Beam(signal, ENERGY, ENERGY), ScatterSettings(kind="first", nodes=35)
+        thing, view, shape, Beam(signal, ENERGY, ENERGY), ScatterSettings(error=0.005, nodes=35)
     )
 
     n = 40
@@ -144,7 +144,7 @@ def test_first_order_is_the_integral_over_the_box(seed: int) -> None:
     d = inward / distance[:, None]
     into = in_box(p, -d, size / 2)
     normal = np.cross(x, z)
-    nv, nu = image.mean.shape
+    nv, nu = image.single.shape
     for i, j in ((0, 0), (nv // 2, nu // 2), (nv - 1, nu // 3)):
         row, col = i * (shape[0] - 1) / (nv - 1), j * (shape[1] - 1) / (nu - 1)
         node = (
@@ -169,7 +169,7 @@ def test_first_order_is_the_integral_over_the_box(seed: int) -> None:
             total += signal[at] * np.sum(first * arrives * slant) * volume
         away = node - source
         open_beam = np.abs(away @ normal) / np.linalg.norm(away) ** 3 * signal.sum()
-        assert image.mean[i, j] == pytest.approx(total / open_beam, rel=0.02)
+        assert image.single[i, j] == pytest.approx(total / open_beam, rel=0.02)
 
 
 def analog(size, atoms, density, energy, source, panel_y, half_panel, photons, rng):  # type: ignore[no-untyped-def]
@@ -300,7 +300,8 @@ def test_standard_errors_hold_and_photons_and_energy_are_kept() -> None:
     assert (balances[:, 1:3] > 0.1).all()
 
 
-def test_views_between_simulated_ones_are_interpolated() -> None:
+def test_views_between_simulated_ones_are_interpolated(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scatter_kernels, "ORDERS_AT_MOST", 1)
     thing = box(WATER, 1.0, (20, 30, 20))
     beam, _ = mono(60.0)
     angle = np.radians(np.arange(0.0, 21.0, 1.0))
@@ -308,7 +309,7 @@ def test_views_between_simulated_ones_are_interpolated() -> None:
     across = np.stack([-np.sin(angle), np.cos(angle), 0 * angle], axis=1)
     down = np.broadcast_to([0.0, 0.0, -1.0], turned.shape)
     views = np.concatenate([-300 * turned, 200 * turned, 2 * across, 2 * down], axis=1)
-    settings = ScatterSettings(kind="first", step_deg=5.0, nodes=80)
+    settings = ScatterSettings(error=0.001, step_deg=5.0, nodes=80)
     scan = scan_scatter(thing, views, (40, 50), beam, settings)
     gaps = np.diff(scan.simulated)
     assert scan.simulated[0] == 0
@@ -423,16 +424,18 @@ def cupping(line_integrals: np.ndarray, size: float) -> tuple[float, float]:
     ("atoms", "density", "radius"), [(PMMA, 1.19, 35.0), ({"Al": 1}, 2.7, 15.0)]
 )
 def test_subtracted_scatter_leaves_no_cupping(
-    atoms: dict[str, int], density: float, radius: float
+    atoms: dict[str, int], density: float, radius: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Scatter summed over the cylinder here, found and subtracted there from the images alone."""
+    """Single scatter summed over the cylinder here, found and subtracted there from the images
+    alone, where a photon interacts once."""
+    monkeypatch.setattr(scatter_kernels, "ORDERS_AT_MOST", 1)
     straight, scatter = cylinder_scan(atoms, density, radius)
     views = (len(TURN), 1, 1)
     clean = np.tile(-np.log(straight), views)
     measured = np.tile(-np.log(straight + scatter), views)
     formula = "".join(f"{s}{n}" for s, n in atoms.items())
     chain = Chain(Panel(), substances=(Substance.of(formula, formula, density),), mono_keV=KEV)
-    settings = ScatterSettings(kind="first", nodes=100, step_deg=90.0)
+    settings = ScatterSettings(nodes=100, step_deg=90.0)
     corrected = without_scatter(measured, TURN, chain, 90.0, settings)
     truth, cupped, flat = (np.array(cupping(one, radius)) for one in (clean, measured, corrected))
     assert (cupped / truth)[0] < 0.98 * (cupped / truth)[1]
@@ -447,71 +450,6 @@ def test_subtracted_scatter_leaves_no_cupping(
         measured.astype(np.float32), TURN, replace(chain, substances=(wrong,)), 90.0, settings
     ).doubts
     assert any("either it is not Fe" in doubt for doubt in doubts)
-
-
-FIRST = ScatterSettings(kind="first", nodes=100, step_deg=90.0)
-
-
-def without_by_kernels(measured, chain, amplitudes=None):  # type: ignore[no-untyped-def]
-    found = kernel_scatter(
-        measured.astype(np.float32), TURN, chain, 90.0, FIRST, amplitudes=amplitudes
-    )
-    scatter = np.stack([found.scatter.signal(i) for i in range(len(TURN))])
-    return -np.log(np.exp(-measured) - scatter), found
-
-
-@pytest.mark.parametrize(
-    ("atoms", "density", "radius"), [(PMMA, 1.19, 35.0), ({"Al": 1}, 2.7, 15.0)]
-)
-def test_kernels_leave_no_cupping(atoms: dict[str, int], density: float, radius: float) -> None:
-    straight, scatter = cylinder_scan(atoms, density, radius)
-    clean, measured = (
-        np.tile(-np.log(one), (len(TURN), 1, 1)) for one in (straight, straight + scatter)
-    )
-    formula = "".join(f"{s}{n}" for s, n in atoms.items())
-    chain = Chain(Panel(), substances=(Substance.of(formula, formula, density),), mono_keV=KEV)
-    corrected, found = without_by_kernels(measured, chain)
-    truth, flat = (np.array(cupping(one, radius)) for one in (clean, corrected))
-    assert (flat / truth)[0] == pytest.approx((flat / truth)[1], rel=0.01)
-    np.testing.assert_allclose(flat / truth, 1.0, rtol=0.012)  # a simulation of all views: 0.007
-    assert not found.doubts
-
-
-def test_kernels_of_one_object_correct_another_or_say_that_they_do_not() -> None:
-    """Fitted to a cylinder on the axis; then a box of drawn sides and place, a sum over it."""
-    pmma = Chain(Panel(), substances=(Substance.of("pmma", "C5H8O2", 1.19),), mono_keV=KEV)
-    straight, scatter = cylinder_scan(PMMA, 1.19, 35.0)
-    cylinder = np.tile(-np.log(straight + scatter), (len(TURN), 1, 1))
-    amplitudes = without_by_kernels(cylinder, pmma)[1].amplitudes
-    rng = np.random.default_rng(19)
-    half, angle = rng.uniform((12.0, 6.0, 10.0), (26.0, 12.0, 18.0)), rng.uniform(0, np.pi)
-    place = np.array([*rng.uniform(-14.0, 14.0, 2), 0.0])
-    turned = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0],
-                       [0, 0, 1]])  # fmt: skip
-    grid = (np.arange(8) + 0.5) / 4 - 1
-    points = np.stack(np.meshgrid(*(grid * h for h in half), indexing="ij"), -1).reshape(-1, 3)
-    pairs = [
-        radiograph(
-            row, PMMA, 1.19, lambda p, d: in_box((p - place) @ turned.T, d @ turned.T, half),
-            points @ turned + place, np.full(len(points), np.prod(half / 4)), (5, 7),
-        )
-        for row in TURN.rows
-    ]  # fmt: skip
-    clean = np.stack([-np.log(one) for one, _ in pairs])
-    measured = np.stack([-np.log(one + more) for one, more in pairs])
-    shadow = clean > 0.1
-
-    def error(found: np.ndarray) -> float:
-        return float(np.sqrt(np.mean((found - clean)[shadow] ** 2 / np.mean(clean[shadow] ** 2))))
-
-    assert error(measured) > 0.03
-    for known in (amplitudes, None):
-        corrected, found = without_by_kernels(measured, pmma, known)
-        assert error(corrected) < 0.01
-        assert not found.doubts
-    corrected, found = without_by_kernels(measured, pmma, 3.0 * amplitudes)
-    assert error(corrected) > 0.02
-    assert any("kernels miss" in doubt for doubt in found.doubts)
 
 
 def test_a_scatter_correction_needs_materials_that_differ() -> None:
@@ -531,13 +469,12 @@ def test_any_scatter_is_subtracted_from_any_line_integral(integral: float, scatt
     assert (left >= image).all()
 
 
-@pytest.mark.parametrize("kind", ["first", "mc"])
 @pytest.mark.parametrize("shape", [(1, 1), (1, 30), (30, 1)])
-def test_panels_of_one_row_or_column(kind: Literal["first", "mc"], shape: tuple[int, int]) -> None:
+def test_panels_of_one_row_or_column(shape: tuple[int, int]) -> None:
     beam, _ = mono(60.0)
     thing = box(WATER, 1.0, (20, 30, 20))
     view = [0, -300, 0, 0, 200, 0, 1, 0, 0, 0, 0, -1]
-    settings = ScatterSettings(kind=kind, error=0.2, nodes=16)
+    settings = ScatterSettings(error=0.2, nodes=16)
     full = scatter_image(thing, view, (31, 31), beam, settings).full()
     narrow = scatter_image(thing, view, shape, beam, settings).full()
     assert narrow.shape == shape
@@ -551,17 +488,16 @@ def test_line_integrals_that_are_not_finite_are_refused(value: float) -> None:
     chain = Chain(Panel(), substances=(Substance.of("water", "H2O", 1.0),))
     images = np.zeros((24, 10, 16), np.float32)
     images[3, 4, 5] = value
-    for correct in (without_scatter, kernel_scatter):
-        with pytest.raises(GeometryError, match="not finite"):
-            correct(images, scan, chain, 90.0)
-        with pytest.raises(GeometryError, match="projections"):
-            correct(np.zeros((5, 10, 16)), scan, chain, 90.0)
+    with pytest.raises(GeometryError, match="not finite"):
+        without_scatter(images, scan, chain, 90.0)
+    with pytest.raises(GeometryError, match="projections"):
+        without_scatter(np.zeros((5, 10, 16)), scan, chain, 90.0)
 
 
 def test_what_cannot_be_is_refused() -> None:
     beam, _ = mono(60.0)
     thing = box(WATER, 1.0, (20, 30, 20))
-    for wrong in ({"kind": "all"}, {"error": 0.0}, {"nodes": 3}, {"error": float("nan")}):
+    for wrong in ({"error": 0.0}, {"nodes": 3}, {"error": float("nan")}):
         with pytest.raises(LimitError, match="allowed"):
             ScatterSettings(**wrong)  # type: ignore[arg-type]
     with pytest.raises(GeometryError, match="beside the sample"):
@@ -576,8 +512,7 @@ def test_what_cannot_be_is_refused() -> None:
 @pytest.mark.parametrize(
     "name",
     ["flexdt.twin.attenuation.scattering", "flexdt.twin.physics.scatter.simulation",
-     "flexdt.phantoms.channels", "flexdt.twin.reconstruction.scatter_correction",
-     "flexdt.twin.reconstruction.scatter_kernel"],
+     "flexdt.phantoms.channels", "flexdt.twin.reconstruction.scatter_correction"],
 )  # fmt: skip
 def test_examples(name: str) -> None:
     result = doctest.testmod(import_module(name))

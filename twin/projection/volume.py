@@ -230,8 +230,7 @@ class Volume:
         return DeviceVolume(there, self.shape, self.voxel_xyz, self.center_mm)
 
     def save(self, file: File) -> None:
-        """Write the volume; the ending chooses the format: .tif, .npy, .nrrd, .mha, .nii.gz, .h5,
-        .zarr.
+        """Write the volume; the ending chooses the format: .tif, .nrrd, .mha, .nii.gz, .h5, .zarr.
 
         Raises:
             TwinError: another ending, or the package that writes it is not installed.
@@ -252,7 +251,7 @@ class Volume:
         """A volume that `save` or `flexdt reconstruct` wrote.
 
         Raises:
-            TwinError: it is no such file, or its format has no room for the voxel size (.npy).
+            TwinError: another ending, or it is no such file.
             OSError: it cannot be read.
 
         Example:

@@ -10,7 +10,6 @@ from flexdt.twin.reconstruction.scatter_correction import (
     ring_errors,
     without_scatter,
 )
-from flexdt.twin.reconstruction.scatter_kernel import kernel_scatter
 from flexdt.twin.reconstruction.truncation import Truncation, truncation_of
 from flexdt.twin.reconstruction.tv import Minimised, minimise_tv, tv
 
@@ -26,7 +25,6 @@ __all__ = [
     "fdk_parts",
     "field_of_view",
     "hardening",
-    "kernel_scatter",
     "minimise_tv",
     "ring_errors",
     "sart",

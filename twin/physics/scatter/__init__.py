@@ -1,4 +1,4 @@
-"""Scattered X-rays in a radiograph: Monte Carlo, and a first-order preview."""
+"""Scattered X-rays in a radiograph, by Monte Carlo."""
 
 from flexdt.twin.physics.scatter.simulation import ScatterSettings
 

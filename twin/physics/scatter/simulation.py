@@ -28,8 +28,6 @@ from flexdt.twin.physics.exposure import ExposureSettings
 
 BATCHES: Final = 32
 """Independent estimates whose spread is the standard error; also the work that threads share."""
-FIRST_POINTS: Final = 32
-"""Interaction points of each batch of the first-order preview."""
 ROUND: Final = 8
 """Histories of each batch before the first look at the error; their number then doubles."""
 MOST_HISTORIES: Final = 1 << 16
@@ -38,8 +36,7 @@ POINTS_AT_A_TIME: Final = 1 << 12
 LATER_FAN: Final = 2
 """Interactions after the first send their signal to every second node, half of all."""
 
-Kind = Literal["first", "mc"]
-Scatter = Literal["off", "first", "mc"]
+Scatter = Literal["off", "mc"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,9 +44,7 @@ class ScatterSettings:
     """How the scatter of a scan is simulated.
 
     Args:
-        kind: "mc" follows photons through all their interactions; "first" integrates single
-            scatter on a fixed lattice, a preview that lacks multiple scatter.
-        error: requested standard error of a node, as part of the image's mean; "mc" stops there.
+        error: standard error of a node at which the simulation stops, as part of the image's mean.
         nodes: of the panel, about; they are spread evenly from corner to corner.
         voxels: of the grid that stands for the sample, about.
         step_deg: views closer than this angle apart are interpolated; 0: every view by itself.
@@ -60,11 +55,10 @@ class ScatterSettings:
         LimitError: a setting that cannot be used; says what is allowed.
 
     Example:
-        >>> ScatterSettings(error=0.01).kind
-        'mc'
+        >>> ScatterSettings(error=0.01).step_deg
+        5.0
     """
 
-    kind: Kind = "mc"
     error: float = 0.03
     nodes: int = 720
     voxels: int = 40_000
@@ -73,11 +67,6 @@ class ScatterSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.kind not in ("first", "mc"):
-            raise LimitError(
-                f"scatter of kind {self.kind!r}; allowed: first, mc",
-                {"asked": self.kind, "allowed": ["first", "mc"]},
-            )
         for name, (low, high) in _BOUNDS.items():
             require_within(f"scatter: {name}", getattr(self, name), low, high)
 
@@ -192,7 +181,7 @@ def scatter_image(
         view: the cone_vec row (12,) [mm].
         shape: the panel's (rows, cols).
         beam: spectrum and panel.
-        settings: how; default: Monte Carlo.
+        settings: of the simulation.
         stream: number of the view: others draw other photons.
 
     Raises:
@@ -238,9 +227,7 @@ def scatter_image(
     bins = np.flatnonzero(beam.signal > 0.0)
     share = beam.signal[bins] / beam.signal.sum()
     chance = _energy_chances(thing, row, sections.total[:, bins], share)
-    first = wanted.kind == "first"
-    words = np.random.SeedSequence([0, 0] if first else [wanted.seed, stream])
-    rng = np.random.Generator(np.random.PCG64(words))
+    rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([wanted.seed, stream])))
     keys = rng.integers(0, 2**64, BATCHES, dtype=np.uint64)
     sequences = [qmc.Sobol(kernels.DIMENSIONS, rng=one) for one in rng.spawn(BATCHES)]
     images = np.zeros((BATCHES, nv * nu, 3))
@@ -248,11 +235,11 @@ def scatter_image(
     lower, _ = thing.corners
     step = float(sections.energy_keV[1] - sections.energy_keV[0])
     done, fans = 0, np.array([nv * nu, max(1, nv * nu // LATER_FAN)])
-    each = FIRST_POINTS if first else ROUND
+    each = ROUND
     while True:
         kernels.histories(
             np.stack([one.random(each) for one in sequences]), done, keys, fans,
-            1 if first else kernels.ORDERS_AT_MOST, source, corner, along_u, along_v, normal, area,
+            kernels.ORDERS_AT_MOST, source, corner, along_u, along_v, normal, area,
             nodes, per_open, thing.amounts, lower, np.array(thing.voxel_mm, dtype=np.float64),
             float(sections.energy_keV[0]), step, sections.total, sections.coherent,
             sections.incoherent, sections.root_step, sections.form, sections.shell,
@@ -264,7 +251,7 @@ def scatter_image(
         mean = batches.mean(axis=0)
         error = batches.std(axis=0, ddof=1) / np.sqrt(BATCHES)
         relative = float(error.mean() / max(mean.mean(), 1e-300))
-        if first or relative <= wanted.error or done >= MOST_HISTORIES:
+        if relative <= wanted.error or done >= MOST_HISTORIES:
             break
         each = min(done, POINTS_AT_A_TIME)  # Sobol's points are even in powers of two
     whole = images.sum(axis=0) / (done * BATCHES)
@@ -461,7 +448,7 @@ def scan_scatter(
         views: (n, 12) cone_vec rows [mm].
         shape: the panel's (rows, cols).
         beam: spectrum and panel.
-        settings: how; default: Monte Carlo.
+        settings: of the simulation.
 
     Raises:
         GeometryError: the source lies beside or inside the object's box in a view.

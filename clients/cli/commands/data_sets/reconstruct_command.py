@@ -30,7 +30,7 @@ Algorithm = Literal["fdk", "sirt", "sart", "cgls", "em", "tv"]
 def reconstruct(
     twin: Twin,
     dataset: Path = argument(..., "DATASET"),
-    out: Path = option(..., ".tif .npy .nrrd .mha .nii.gz .h5 .zarr", metavar="FILE"),
+    out: Path = option(..., ".tif .nrrd .mha .nii.gz .h5 .zarr", metavar="FILE"),
     algorithm: Algorithm | None = option(None, "Default: fdk."),
     voxel: float | None = option(None, "Default: a pixel at the axis.", metavar="MM"),
     shape: str | None = option(None, "Default: the field of view.", metavar="Z,Y,X"),
@@ -53,7 +53,6 @@ def reconstruct(
         "The object is of these, e.g. pmma,aluminium: subtract their scatter.",
         metavar="MATERIALS",
     ),
-    scatter_method: Literal["simulation", "kernel"] | None = option(None, "Default: simulation."),
     kv: float | None = option(None, "Of the tube; default: what the data set says."),
     png: bool = option(False, "Three slices beside it.", "--png"),
     preview: bool = option(
@@ -73,8 +72,7 @@ def reconstruct(
         "algorithm": None if algorithm == "fdk" else algorithm, "voxel": voxel, "shape": shape,
         "binning": binning, "every": every, "iterations": iterations, "window": window,
         "weight": weight, "center": center, "rings": rings or None, "material": material,
-        "scatter-correction": scatter_correction, "scatter-method": scatter_method,
-        "scheduler": scheduler, "slurm": slurm,
+        "scatter-correction": scatter_correction, "scheduler": scheduler, "slurm": slurm,
     }  # fmt: skip
     other = {"kv": kv, "correction": correction, "geometry": geometry}
     chosen = {name: value for name, value in (own | other).items() if value is not None}
@@ -88,7 +86,6 @@ def reconstruct(
         None if center is None else option_values.triple(center, "center", "X,Y,Z, e.g. 0,0,-5.5"),
         rings, material, kv, png, weight,
         None if scatter_correction is None else option_values.names(scatter_correction),
-        scatter_method=scatter_method or "simulation",
     )  # fmt: skip
     if not out.absolute().parent.is_dir():
         raise CommandError(f"{out}: the folder does not exist")
@@ -120,23 +117,20 @@ def reconstruct(
 
 def _check_together(chosen: Mapping[str, object], out: Path, kept_out: Iterable[str]) -> None:
     """Usage errors of options that do not go together; a preview keeps some out."""
-    from flexdt.clients.reconstruction.volume_files import SUFFIXES
+    from flexdt.clients.reconstruction.volume_files import SUFFIXES, ending
 
     algorithm = chosen.get("algorithm", "fdk")
     corrects = {"material", "scatter-correction"} & chosen.keys()
     for wrong, name, why in (
         *((True, name, "--preview chooses for itself") for name in kept_out),
-        (out.suffix.lower() not in SUFFIXES, "out",
+        (ending(out) not in SUFFIXES, "out",
          f"{out}: the ending must be one of {', '.join(SUFFIXES)}"),
         ("kv" in chosen and not corrects, "kv", "it is for --material and --scatter-correction"),
-        ("scatter-method" in chosen and "scatter-correction" not in chosen, "scatter-method",
-         "it is for --scatter-correction"),
         ("iterations" in chosen and algorithm == "fdk", "iterations", "fdk has none"),
         ("weight" in chosen and algorithm != "tv", "weight", f"{algorithm} has none"),
         ("window" in chosen and algorithm != "fdk", "window", f"{algorithm} has no filter"),
         ({"scheduler", "slurm"} <= chosen.keys(), "slurm", "not together with --scheduler"),
-        *((algorithm in ("sart", "em"), name,
-           f"{algorithm} is not done by workers; allowed: fdk, sirt, cgls, tv")
+        *((algorithm != "fdk", name, f"{algorithm} is not done by workers; allowed: fdk")
           for name in ("scheduler", "slurm") if name in chosen),
         ({"correction", "geometry"} <= chosen.keys(), "correction",
          "no correction is added to a geometry from a file"),
