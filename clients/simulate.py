@@ -205,10 +205,11 @@ def simulate(
         return ScenarioImages(sample, noise, 3 if rays is None else rays).dataset()
     rays = 1 if rays is None else rays
     if not isinstance(scatter, ScatterSettings) and scatter not in get_args(Scatter):
-        gone = "; 'first' has been removed, use 'mc'" if scatter == "first" else ""
+        asked = str(scatter)
+        gone = "; 'first' has been removed, use 'mc'" if asked == "first" else ""
         raise LimitError(
-            f"scatter is {scatter!r}; allowed: {', '.join(get_args(Scatter))}{gone}",
-            {"asked": scatter, "allowed": list(get_args(Scatter))},
+            f"scatter is {asked!r}; allowed: {', '.join(get_args(Scatter))}{gone}",
+            {"asked": asked, "allowed": list(get_args(Scatter))},
         )
     if noise is not None and (not isinstance(noise, int | np.integer) or noise < 0):
         raise LimitError(f"noise is {noise}; allowed: a seed >= 0, or None", {"asked": noise})
@@ -231,8 +232,9 @@ def simulate(
     exposure = settings.exposure(camera.exposure_ms, camera.averages)
     scattered = None
     if scatter != "off":
-        given = isinstance(scatter, ScatterSettings)
-        how = scatter if given else ScatterSettings(seed=noise or 0)
+        how = scatter
+        if not isinstance(how, ScatterSettings):
+            how = ScatterSettings(seed=noise or 0)
         grid = scatter_object(parts, phantom.size_mm, how.voxels)
         scattered = scan_scatter(grid, cone.rows, size, Beam.of(chain, exposure.kV), how)
     truth = Truth(
