@@ -12,25 +12,19 @@ from pathlib import Path
 from typing import Any, Final
 
 from flexdt.phantoms import is_shipped, load_phantom, load_phantom_file
-from flexdt.protocol.methods.calibration import (
-    FIT_LIMITS,
-    CalibrationAlign,
-    CalibrationAlignResult,
-    CalibrationFit,
-    CalibrationFitResult,
-)
+from flexdt.protocol.methods import calibration as p
 from flexdt.server.wire_errors import from_root
 from flexdt.twin.calibration.fit.covariance_steps import covariance_by_step
 from flexdt.twin.calibration.unknown_markers import UNKNOWN
 from flexdt.twin.dataset.dataset_errors import DatasetMissingError
 from flexdt.twin.dataset.file_names import plain_name
 
-SECONDS: Final = float(FIT_LIMITS["seconds"])
-MEMORY_BYTES: Final = int(FIT_LIMITS["memory_bytes"])
+SECONDS: Final = float(p.FIT_LIMITS["seconds"])
+MEMORY_BYTES: Final = int(p.FIT_LIMITS["memory_bytes"])
 FILES: Final = (".toml", ".json")
 
 
-def fit(root: Path, asked: CalibrationFit, *_: object) -> CalibrationFitResult:
+def fit(root: Path, asked: p.CalibrationFit, *_: object) -> p.CalibrationFitResult:
     """Calibrate; blocks.
 
     Raises:
@@ -64,13 +58,13 @@ def fit(root: Path, asked: CalibrationFit, *_: object) -> CalibrationFitResult:
         ]
     if asked.tracks:
         told["tracks"] = import_module("flexdt.clients.calibration.tracks").tracks_document(found)
-    return CalibrationFitResult.model_validate(from_root(told, root))
+    return p.CalibrationFitResult.model_validate(from_root(told, root))
 
 
-def align(root: Path, asked: CalibrationAlign, *_: object) -> CalibrationAlignResult:
+def align(root: Path, asked: p.CalibrationAlign, *_: object) -> p.CalibrationAlignResult:
     """Align; blocks. Raises as `fit`."""
     found = _face().align(_there(root, asked.name, "data set"), per_frame=asked.per_frame)
-    return CalibrationAlignResult.model_validate(from_root(found.document, root))
+    return p.CalibrationAlignResult.model_validate(from_root(found.document, root))
 
 
 def _there(root: Path, name: str, what: str) -> Path:
