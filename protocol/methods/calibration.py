@@ -8,63 +8,50 @@ from typing import Annotated, Final, Literal
 from annotated_types import Ge, Le, Len, MaxLen, MinLen
 from pydantic import Field, JsonValue
 
-from flexdt.protocol.fields import (
-    AxisName,
-    Comment,
-    Deviation,
-    Empty,
-    Name,
-    NonNegative,
-    Pair,
-    Params,
-    Place,
-    Result,
-    ShortText,
-    few,
-)
+from flexdt.protocol import fields as f
 from flexdt.protocol.method import command, read
 from flexdt.protocol.methods.datasets import DataSetName
 from flexdt.protocol.state_model import Correction
 
-Parameters = Annotated[list[AxisName], MaxLen(17)]
+Parameters = Annotated[list[f.AxisName], MaxLen(17)]
 
 
-class CalibrationApply(Params):
+class CalibrationApply(f.Params):
     """A correction to put in force; it replaces the last."""
 
-    parameters: Annotated[dict[AxisName, Deviation], MaxLen(64), few(64)] = Field(
+    parameters: Annotated[dict[f.AxisName, f.Deviation], MaxLen(64), f.few(64)] = Field(
         description="name -> value [mm or deg], true minus nominal"
     )
-    name: Name | None = None
-    comment: Comment = ""
-    source: ShortText | None = None
+    name: f.Name | None = None
+    comment: f.Comment = ""
+    source: f.ShortText | None = None
 
 
-class CalibrationGet(Params):
+class CalibrationGet(f.Params):
     """Which correction; the one in force if left out."""
 
-    name: Name | None = None
+    name: f.Name | None = None
 
 
-class Mark(Params):
+class Mark(f.Params):
     """Where a bead was seen in a projection; pixel (0, 0) is the middle of the upper left one."""
 
     frame: Annotated[int, Ge(0), Le(10_000_000)] = Field(description="projection, counted from 0")
-    marker: AxisName = Field(
+    marker: f.AxisName = Field(
         description="number of the bead in its phantom, counted from 0; any name of an unknown one"
     )
-    column: Place
-    row: Place
+    column: f.Place
+    row: f.Place
     sigma: Annotated[float, Ge(1e-3), Le(1e4)] | None = Field(
         default=None, description="standard deviation of each [px]; 0.5 if left out"
     )
 
 
-class CalibrationFit(Params):
+class CalibrationFit(f.Params):
     """Data sets of a bead phantom, and what to estimate from them."""
 
     datasets: Annotated[list[DataSetName], Len(1, 8)] = Field(description="of their folders")
-    phantom: Name = Field(
+    phantom: f.Name = Field(
         description="one that ships, a TOML or JSON file among the data sets, or unknown: markers "
         "of which nobody knows where they are, in one data set"
     )
@@ -73,7 +60,7 @@ class CalibrationFit(Params):
         description="what is estimated; default: dO_x, dO_y, dO_z, alpha, tau_*, of unknown "
         "markers dO_x",
     )
-    priors: Annotated[dict[AxisName, NonNegative], MaxLen(17), few(17)] = Field(
+    priors: Annotated[dict[f.AxisName, f.NonNegative], MaxLen(17), f.few(17)] = Field(
         default_factory=dict, description="name -> standard deviation [mm or deg]; 0: exactly known"
     )
     per_frame: Parameters = Field(
@@ -89,19 +76,19 @@ class CalibrationFit(Params):
     markers: Annotated[list[Mark], Len(1, 10_000)] | None = Field(
         default=None, description="where beads were seen in the one data set; default: found there"
     )
-    scale: Annotated[ShortText, MaxLen(300)] | None = Field(
+    scale: Annotated[f.ShortText, MaxLen(300)] | None = Field(
         default=None, description="distance of two unknown markers [mm]: A-B=MM or A-B=MM+-SIGMA"
     )
 
 
-class CalibrationAlign(Params):
+class CalibrationAlign(f.Params):
     """A scan of anything over a full turn."""
 
     name: DataSetName = Field(description="of its folder")
     per_frame: bool = Field(default=False, description="look for shifts of single frames too")
 
 
-class CorrectionResult(Result):
+class CorrectionResult(f.Result):
     """The correction in force (or asked for), if there is one.
 
     Warnings: parts that its geometry brings within the safety margin where they stand.
@@ -111,7 +98,7 @@ class CorrectionResult(Result):
     warnings: list[str] = Field(default_factory=list)
 
 
-class Estimated(Result):
+class Estimated(f.Result):
     """An estimate [mm, deg, px or 1]; None where the images do not tell or must not be trusted."""
 
     value: float | None
@@ -119,7 +106,7 @@ class Estimated(Result):
     unit: str
 
 
-class CalibrationStep(Result):
+class CalibrationStep(f.Result):
     """What the first frames of a fit would know by themselves."""
 
     frames: int
@@ -128,7 +115,7 @@ class CalibrationStep(Result):
     )
 
 
-class CalibrationProblem(Result):
+class CalibrationProblem(f.Result):
     """Something about the data; an error forbids the numbers."""
 
     code: str
@@ -136,7 +123,7 @@ class CalibrationProblem(Result):
     text: str
 
 
-class CalibrationFitResult(Result):
+class CalibrationFitResult(f.Result):
     """A calibration; nothing is applied. Further fields are those of `flexdt calibrate --json`."""
 
     identifiable: bool
@@ -145,7 +132,7 @@ class CalibrationFitResult(Result):
     covariance: list[list[float | None]] = Field(default_factory=list)
     rms_px: float | None
     rms_per_bead_px: list[float | None] = Field(default_factory=list)
-    residuals_px: list[list[Pair | None]] | None = Field(
+    residuals_px: list[list[f.Pair | None]] | None = Field(
         default=None, description="of each frame and bead: measured minus predicted column and row"
     )
     steps: list[CalibrationStep] = Field(default_factory=list)
@@ -155,7 +142,7 @@ class CalibrationFitResult(Result):
     problems: list[CalibrationProblem]
 
 
-class CalibrationAlignResult(Result):
+class CalibrationAlignResult(f.Result):
     """The geometry that an ordinary scan tells; nothing is applied."""
 
     identifiable: bool
@@ -168,7 +155,7 @@ class CalibrationAlignResult(Result):
     )
 
 
-class CorrectionListResult(Result):
+class CorrectionListResult(f.Result):
     """All corrections, oldest first, and which one is in force."""
 
     corrections: list[Correction]
@@ -178,27 +165,14 @@ class CorrectionListResult(Result):
 FIT_LIMITS: Final[Mapping[str, float]] = {"seconds": 300, "memory_bytes": 6 << 30}
 """What a calibration from images may cost."""
 
-CALIBRATION_APPLY = command(
-    "calibration.apply", CalibrationApply, CorrectionResult, "put a correction in force"
-)
-CALIBRATION_GET = read(
-    "calibration.get", CalibrationGet, CorrectionResult, "the correction in force"
-)
-CALIBRATION_LIST = read("calibration.list", Empty, CorrectionListResult, "all corrections")
-CALIBRATION_REVERT = command(
-    "calibration.revert", Empty, CorrectionResult, "back to the correction before"
-)
-CALIBRATION_FIT = read(
-    "calibration.fit",
-    CalibrationFit,
-    CalibrationFitResult,
-    "calibrate from data sets",
-    limits=FIT_LIMITS,
-)
-CALIBRATION_ALIGN = read(
-    "calibration.align",
-    CalibrationAlign,
-    CalibrationAlignResult,
-    "align without beads",
-    limits=FIT_LIMITS,
-)
+CALIBRATION_APPLY = command("calibration.apply", CalibrationApply, CorrectionResult,
+                            "put a correction in force")  # fmt: skip
+CALIBRATION_GET = read("calibration.get", CalibrationGet, CorrectionResult,
+                       "the correction in force")  # fmt: skip
+CALIBRATION_LIST = read("calibration.list", f.Empty, CorrectionListResult, "all corrections")
+CALIBRATION_REVERT = command("calibration.revert", f.Empty, CorrectionResult,
+                             "back to the correction before")  # fmt: skip
+CALIBRATION_FIT = read("calibration.fit", CalibrationFit, CalibrationFitResult,
+                       "calibrate from data sets", limits=FIT_LIMITS)  # fmt: skip
+CALIBRATION_ALIGN = read("calibration.align", CalibrationAlign, CalibrationAlignResult,
+                         "align without beads", limits=FIT_LIMITS)  # fmt: skip

@@ -134,7 +134,6 @@ class DatasetFrameResult(ImageValue):
 
 
 DATASET_LIST = read("dataset.list", DatasetList, DatasetListResult, "data sets, the newest first")
-DATASET_GET = read(
-    "dataset.get", DatasetGet, DatasetResult, "a data set: settings, poses over time"
-)
+DATASET_GET = read("dataset.get", DatasetGet, DatasetResult,
+                   "a data set: settings, poses over time")  # fmt: skip
 DATASET_FRAME = read("dataset.frame", DatasetFrame, DatasetFrameResult, "an image of a data set")

@@ -8,29 +8,16 @@ from typing import Annotated, Final, Literal
 from annotated_types import Ge, Le, MaxLen
 from pydantic import Field
 
-from flexdt.protocol.fields import (
-    Distance,
-    Empty,
-    Exposure,
-    ImageValue,
-    Name,
-    Params,
-    PixelAsked,
-    Power,
-    Result,
-    ShortText,
-    Targets,
-    Voltage,
-)
+from flexdt.protocol import fields as f
 from flexdt.protocol.method import read
 from flexdt.protocol.methods.settings import CameraSet, TubeSet
 from flexdt.protocol.scene_document import Averages, Frames
 from flexdt.protocol.state_model import GeometryResult, ImageFlags
 
-LayerText = Annotated[ShortText, MaxLen(100)]
+LayerText = Annotated[f.ShortText, MaxLen(100)]
 
 
-class ProjectionGet(Params):
+class ProjectionGet(f.Params):
     """What kind of image, at the current pose, or as though it stood and were set otherwise.
 
     Such an image is predicted: from the geometry of `geometry.get`, without noise.
@@ -43,7 +30,7 @@ class ProjectionGet(Params):
     marks: bool = Field(
         default=False, description="say which pixels are saturated, starved or cut off as well"
     )
-    positions: Targets | None = Field(
+    positions: f.Targets | None = Field(
         default=None,
         description="motor -> [mm, deg] there, beyond its travel too; others stand as they do",
     )
@@ -51,50 +38,52 @@ class ProjectionGet(Params):
     camera: CameraSet | None = Field(default=None, description="as though set so")
 
 
-class RayGet(Params):
+class RayGet(f.Params):
     """A pixel of the image of this moment."""
 
-    pixel: PixelAsked = Field(description="(column, row); (0, 0) is the centre of the top left one")
+    pixel: f.PixelAsked = Field(
+        description="(column, row); (0, 0) is the centre of the top left one"
+    )
 
 
-class ExposurePredict(Params):
+class ExposurePredict(f.Params):
     """A scan to predict; what is left out is as it is now."""
 
-    sample: Name | None = Field(default=None, description="default: the one on the stage")
-    kV: Voltage | None = None
-    power_W: Power | None = None
+    sample: f.Name | None = Field(default=None, description="default: the one on the stage")
+    kV: f.Voltage | None = None
+    power_W: f.Power | None = None
     filter: LayerText = Field(default="", description="MATERIAL:MM beside the machine's own")
-    exposure_ms: Exposure | None = None
+    exposure_ms: f.Exposure | None = None
     averages: Averages | None = None
     frames: Frames = Field(default=361, description="of the scan")
-    sod_mm: Distance | None = Field(default=None, description="default: as it stands")
-    sdd_mm: Distance | None = Field(default=None, description="default: as it stands")
+    sod_mm: f.Distance | None = Field(default=None, description="default: as it stands")
+    sdd_mm: f.Distance | None = Field(default=None, description="default: as it stands")
     detail: LayerText = Field(
         default="void:0.5", description="MATERIAL:MM or void:MM on the darkest ray, to be seen"
     )
 
 
-class Projection(ImageValue):
+class Projection(f.ImageValue):
     """An image and the geometry it was made with (nominal plus correction)."""
 
     cone_vec: list[float] = Field(min_length=12, max_length=12)
     kind: Literal["line_integral", "counts"] = "line_integral"
     time: float | None = Field(default=None, description="of the pose, on the twin's clock [s]")
     flags: ImageFlags | None = None
-    marks: ImageValue | None = Field(
+    marks: f.ImageValue | None = Field(
         default=None,
         description="uint8, as large as the image, where asked for: sum of 1 saturated, 2 starved, "
         "4 sample cut off at this pixel of the edge; judged as though X-rays were on",
     )
 
 
-class RayResult(Result):
+class RayResult(f.Result):
     """What the ray of a pixel goes through, in the geometry of geometry.get."""
 
     paths_mm: dict[str, float] = Field(description="material -> path through it")
 
 
-class TransmissionShares(Result):
+class TransmissionShares(f.Result):
     """How much of the open beam the pixels see, in a few views of a turn."""
 
     least: float
@@ -105,7 +94,7 @@ class TransmissionShares(Result):
     shares: list[float] = Field(description="of the pixels in each bin")
 
 
-class PredictedSetting(Result):
+class PredictedSetting(f.Result):
     """Tube and camera, and what they give on the darkest ray."""
 
     kV: float
@@ -116,7 +105,7 @@ class PredictedSetting(Result):
     kerma_mGy: float = Field(description="air kerma of the scan on the axis, without a sample")
 
 
-class ExposurePrediction(Result):
+class ExposurePrediction(f.Result):
     """What a circular scan of a sample will look like, without scattered radiation."""
 
     sample: str
@@ -135,19 +124,11 @@ class ExposurePrediction(Result):
 PREDICTION_LIMITS: Final[Mapping[str, float]] = {"seconds": 60, "memory_bytes": 4 << 30}
 """What a prediction of image quality may cost."""
 
-PROJECTION_GET = read(
-    "projection.get", ProjectionGet, Projection, "an image at the current pose, or another"
-)
-PROJECTION_RAY = read(
-    "projection.ray", RayGet, RayResult, "paths through materials on the ray of a pixel"
-)
-GEOMETRY_GET = read(
-    "geometry.get", Empty, GeometryResult, "cone_vec, detector shape and pixel pitch"
-)
-EXPOSURE_PREDICT = read(
-    "exposure.predict",
-    ExposurePredict,
-    ExposurePrediction,
-    "transmission, contrast to noise and dose of a scan",
-    limits=PREDICTION_LIMITS,
-)
+PROJECTION_GET = read("projection.get", ProjectionGet, Projection,
+                      "an image at the current pose, or another")  # fmt: skip
+PROJECTION_RAY = read("projection.ray", RayGet, RayResult,
+                      "paths through materials on the ray of a pixel")  # fmt: skip
+GEOMETRY_GET = read("geometry.get", f.Empty, GeometryResult,
+                    "cone_vec, detector shape and pixel pitch")  # fmt: skip
+EXPOSURE_PREDICT = read("exposure.predict", ExposurePredict, ExposurePrediction,
+    "transmission, contrast to noise and dose of a scan", limits=PREDICTION_LIMITS)  # fmt: skip

@@ -8,18 +8,9 @@ from typing import Annotated, Final, Literal
 from annotated_types import Ge, Le, Len, MaxLen, MinLen
 from pydantic import FailFast, Field, model_validator
 
+from flexdt.protocol import fields as f
 from flexdt.protocol.codec import Codec
 from flexdt.protocol.connection import MAX_ANSWER
-from flexdt.protocol.fields import (
-    Empty,
-    Exposure,
-    Name,
-    Params,
-    Result,
-    ShortText,
-    SpeedUp,
-    Targets,
-)
 from flexdt.protocol.method import Method, command, read
 from flexdt.protocol.state_model import JobStatus
 
@@ -37,13 +28,15 @@ Seed = Annotated[
 ScriptText = Annotated[str, MaxLen(8 * 2**20)]
 
 
-class ScriptInput(Params):
+class ScriptInput(f.Params):
     """An Acquila script, as text or (byte for byte) as base64."""
 
     text: ScriptText | None = None
     data_base64: ScriptText | None = None
-    name: Name | None = Field(default=None, description="name of the data set; made up if left out")
-    speed_up: SpeedUp | None = Field(
+    name: f.Name | None = Field(
+        default=None, description="name of the data set; made up if left out"
+    )
+    speed_up: f.SpeedUp | None = Field(
         default=None, description="for this job; the clock's if left out"
     )
     motion_samples: Moments = 1
@@ -56,26 +49,26 @@ class ScriptInput(Params):
         return self
 
 
-class TrajectoryInput(Params):
+class TrajectoryInput(f.Params):
     """Poses to go through, one image each (thesis 4.6.2)."""
 
-    poses: Annotated[list[Targets], FailFast(), MinLen(1), MaxLen(200_000)] = Field(
+    poses: Annotated[list[f.Targets], FailFast(), MinLen(1), MaxLen(200_000)] = Field(
         description="each: axis -> value [mm or deg]; axes left out stay"
     )
-    exposure_ms: Exposure | None = None
-    name: Name | None = None
-    speed_up: SpeedUp | None = None
+    exposure_ms: f.Exposure | None = None
+    name: f.Name | None = None
+    speed_up: f.SpeedUp | None = None
     motion_samples: Moments = 1
     seed: Seed = None
 
 
-class JobRef(Params):
+class JobRef(f.Params):
     """Which job; the current or last one if left out."""
 
-    job: Annotated[ShortText, Len(1, 120)] | None = None
+    job: Annotated[f.ShortText, Len(1, 120)] | None = None
 
 
-class Problem(Result):
+class Problem(f.Result):
     """Something about a script, with its place."""
 
     severity: Literal["error", "warning"]
@@ -85,7 +78,7 @@ class Problem(Result):
     message: str
 
 
-class CheckStep(Result):
+class CheckStep(f.Result):
     """A step of the plan."""
 
     line: int | None = None
@@ -94,7 +87,7 @@ class CheckStep(Result):
     what: str
 
 
-class CheckCollision(Result):
+class CheckCollision(f.Result):
     """A contact that the plan would run into."""
 
     line: int | None = None
@@ -103,7 +96,7 @@ class CheckCollision(Result):
     last_free: dict[str, float]
 
 
-class CheckResult(Result):
+class CheckResult(f.Result):
     """The dry-run report: the same document as `flexdt check --json`."""
 
     ok: bool
@@ -116,7 +109,7 @@ class CheckResult(Result):
     min_clearance_mm: float | None = None
 
 
-class SubmitResult(Result):
+class SubmitResult(f.Result):
     """The job that was made."""
 
     job: str
@@ -124,7 +117,7 @@ class SubmitResult(Result):
     warnings: list[str] = Field(default_factory=list)
 
 
-class JobListResult(Result):
+class JobListResult(f.Result):
     """All jobs, oldest first."""
 
     jobs: list[JobStatus]
@@ -138,45 +131,19 @@ CHECK_LIMITS: Final[Mapping[str, float]] = {
 }
 """What parsing, planning and sweeping a script or poses may cost."""
 
-SCRIPT_CHECK = read(
-    "script.check",
-    ScriptInput,
-    CheckResult,
-    "parse, plan and check a script",
-    limits=CHECK_LIMITS,
-    bulky=True,
-)
-SCRIPT_SUBMIT = command(
-    "script.submit",
-    ScriptInput,
-    SubmitResult,
-    "run a script as a job",
-    limits=CHECK_LIMITS,
-    bulky=True,
-)
-TRAJECTORY_CHECK = read(
-    "trajectory.check",
-    TrajectoryInput,
-    CheckResult,
-    "plan and check poses",
-    limits=CHECK_LIMITS,
-    bulky=True,
-)
-TRAJECTORY_SUBMIT = command(
-    "trajectory.submit",
-    TrajectoryInput,
-    SubmitResult,
-    "run poses as a job",
-    limits=CHECK_LIMITS,
-    bulky=True,
-)
+SCRIPT_CHECK = read("script.check", ScriptInput, CheckResult,
+                    "parse, plan and check a script", limits=CHECK_LIMITS, bulky=True)  # fmt: skip
+SCRIPT_SUBMIT = command("script.submit", ScriptInput, SubmitResult,
+                        "run a script as a job", limits=CHECK_LIMITS, bulky=True)  # fmt: skip
+TRAJECTORY_CHECK = read("trajectory.check", TrajectoryInput, CheckResult,
+                        "plan and check poses", limits=CHECK_LIMITS, bulky=True)  # fmt: skip
+TRAJECTORY_SUBMIT = command("trajectory.submit", TrajectoryInput, SubmitResult,
+                            "run poses as a job", limits=CHECK_LIMITS, bulky=True)  # fmt: skip
 JOB_STATUS = read("job.status", JobRef, JobStatus, "how far a job is")
-JOB_PAUSE = command(
-    "job.pause", JobRef, JobStatus, "pause a job; a frame under exposure is taken again"
-)
+JOB_PAUSE = command("job.pause", JobRef, JobStatus,
+                    "pause a job; a frame under exposure is taken again")  # fmt: skip
 JOB_RESUME = command("job.resume", JobRef, JobStatus, "return to the pose of the pause and go on")
 JOB_STEP = command("job.step", JobRef, JobStatus, "run a paused job for one step")
-JOB_ABORT = Method(
-    "job.abort", JobRef, JobStatus, "end a job, its data set incomplete", urgent=True
-)
-JOB_LIST = read("job.list", Empty, JobListResult, "all jobs, oldest first")
+JOB_ABORT = Method("job.abort", JobRef, JobStatus,
+                   "end a job, its data set incomplete", urgent=True)  # fmt: skip
+JOB_LIST = read("job.list", f.Empty, JobListResult, "all jobs, oldest first")

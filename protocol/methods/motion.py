@@ -7,24 +7,15 @@ from typing import Annotated
 from annotated_types import Ge, Le
 from pydantic import Field
 
-from flexdt.protocol.fields import (
-    AxisName,
-    Empty,
-    NonNegative,
-    Pace,
-    Params,
-    Result,
-    Targets,
-    Velocity,
-)
+from flexdt.protocol import fields as f
 from flexdt.protocol.method import Method, by_hand, command
 from flexdt.protocol.state_model import State, Stopped
 
 
-class Move(Params):
+class Move(f.Params):
     """Targets of one or several axes, which start together."""
 
-    targets: Targets = Field(description="axis -> position [mm or deg], in the script's sign")
+    targets: f.Targets = Field(description="axis -> position [mm or deg], in the script's sign")
     relative: bool = Field(default=False, description="targets are displacements")
     wait: bool = Field(default=False, description="answer when the motion has ended")
     plan: bool = Field(default=False, description="go around obstacles, as a series of free moves")
@@ -33,25 +24,25 @@ class Move(Params):
     )
 
 
-class Jog(Params):
+class Jog(f.Params):
     """Move at a velocity until the lease runs out or is renewed."""
 
-    axis: AxisName
-    velocity: Velocity = Field(description="[mm/s or deg/s], signed; 0 stops")
+    axis: f.AxisName
+    velocity: f.Velocity = Field(description="[mm/s or deg/s], signed; 0 stops")
     lease_s: Annotated[float, Ge(1e-6), Le(10)] = Field(
         default=0.5, description="of the twin's clock"
     )
 
 
-class AxisSet(Params):
+class AxisSet(f.Params):
     """Speed and acceleration of later moves."""
 
-    axis: AxisName
-    speed: Pace | None = Field(default=None, description="[mm/s or deg/s]")
-    acceleration: Pace | None = Field(default=None, description="[mm/s2 or deg/s2]")
+    axis: f.AxisName
+    speed: f.Pace | None = Field(default=None, description="[mm/s or deg/s]")
+    acceleration: f.Pace | None = Field(default=None, description="[mm/s2 or deg/s2]")
 
 
-class Reset(Params):
+class Reset(f.Params):
     """Leave the emergency stop, or blocked."""
 
     stop: Annotated[int, Ge(0), Le(2**53)] | None = Field(
@@ -59,10 +50,10 @@ class Reset(Params):
     )
 
 
-class MoveResult(Result):
+class MoveResult(f.Result):
     """What the motion will take."""
 
-    duration_s: NonNegative = Field(description="of the twin's clock")
+    duration_s: f.NonNegative = Field(description="of the twin's clock")
     warnings: list[str] = Field(default_factory=list)
     moves: list[dict[str, float]] | None = Field(
         default=None, description="with plan: the moves in order, axis -> target"
@@ -73,7 +64,7 @@ class MoveResult(Result):
     )
 
 
-class AxisSetResult(Result):
+class AxisSetResult(f.Result):
     """Speed and acceleration in force."""
 
     axis: str
@@ -84,6 +75,6 @@ class AxisSetResult(Result):
 AXES_MOVE = by_hand("axes.move", Move, MoveResult, "move axes to targets, starting together")
 AXES_JOG = by_hand("axes.jog", Jog, MoveResult, "move at a velocity until the lease runs out")
 AXES_SET = by_hand("axes.set", AxisSet, AxisSetResult, "set an axis's speed and acceleration")
-AXES_STOP = Method("axes.stop", Empty, Stopped, "bring all axes to rest", urgent=True)
-SAFETY_ESTOP = Method("safety.estop", Empty, Stopped, "emergency stop; X-rays off", urgent=True)
+AXES_STOP = Method("axes.stop", f.Empty, Stopped, "bring all axes to rest", urgent=True)
+SAFETY_ESTOP = Method("safety.estop", f.Empty, Stopped, "emergency stop; X-rays off", urgent=True)
 SAFETY_RESET = command("safety.reset", Reset, State, "leave the emergency stop")

@@ -7,18 +7,7 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Gt, Le
 from pydantic import Field, model_validator
 
-from flexdt.protocol.fields import (
-    Empty,
-    Material,
-    Name,
-    Params,
-    Payload,
-    Result,
-    Triple,
-    VoxelPitch,
-    VoxelShape,
-    require_extent,
-)
+from flexdt.protocol import fields as f
 from flexdt.protocol.method import Method, by_hand, read
 from flexdt.protocol.scene_document import Placement
 from flexdt.protocol.state_model import SampleState
@@ -32,12 +21,12 @@ MESH_CHUNK = 4 << 20
 LengthUnit = Literal["um", "mm", "cm", "m", "inch"]
 
 
-class SampleSet(Params):
+class SampleSet(f.Params):
     """Which sample stands on the stage: a shipped phantom's name, or an uploaded file's."""
 
-    name: Name | None = None
-    file: Name | None = Field(default=None, description="name under which it was uploaded")
-    material: Material | None = None
+    name: f.Name | None = None
+    file: f.Name | None = Field(default=None, description="name under which it was uploaded")
+    material: f.Material | None = None
     offset: Placement | None = None
 
     @model_validator(mode="after")
@@ -47,7 +36,7 @@ class SampleSet(Params):
         return self
 
 
-class SampleMesh(Params):
+class SampleMesh(f.Params):
     """A part of the shape of the sample on the stage."""
 
     start: Bytes = Field(default=0, description="first byte")
@@ -56,10 +45,10 @@ class SampleMesh(Params):
     )
 
 
-class SampleUpload(Params):
+class SampleUpload(f.Params):
     """A chunk of a mesh, of voxels or of a scene; the sample exists when all bytes have come."""
 
-    name: Name
+    name: f.Name
     kind: Literal["mesh", "voxels", "scene"] = "mesh"
     format: Literal["stl", "obj", "ply", "glb", "off", "raw", "json", "toml"] = Field(
         description="raw: float32 little-endian voxels [z, y, x] of attenuation [1/mm]; json, "
@@ -67,13 +56,13 @@ class SampleUpload(Params):
     )
     total: Annotated[Bytes, Gt(0)] = Field(description="size of the whole [bytes]")
     start: Bytes = Field(default=0, description="position of this chunk [bytes]")
-    data: Payload
+    data: f.Payload
     unit: LengthUnit | None = Field(
         default=None, description="of mesh coordinates; left out: m for glb, mm for the others"
     )
-    material: Material | None = None
-    shape: VoxelShape | None = Field(default=None, description="(z, y, x) of voxels")
-    voxel_mm: VoxelPitch | None = Field(default=None, description="(x, y, z)")
+    material: f.Material | None = None
+    shape: f.VoxelShape | None = Field(default=None, description="(z, y, x) of voxels")
+    voxel_mm: f.VoxelPitch | None = Field(default=None, description="(x, y, z)")
 
     @model_validator(mode="after")
     def _fits(self) -> SampleUpload:
@@ -87,35 +76,35 @@ class SampleUpload(Params):
         if self.kind == "voxels" and (self.shape is None or self.voxel_mm is None):
             raise ValueError("voxels need shape and voxel_mm")
         if self.shape is not None and self.voxel_mm is not None:
-            require_extent(self.shape, self.voxel_mm)
+            f.require_extent(self.shape, self.voxel_mm)
         return self
 
 
-class SampleResult(Result):
+class SampleResult(f.Result):
     """What stands on the stage now."""
 
     sample: SampleState
     warnings: list[str] = Field(default_factory=list)
 
 
-class SampleInfo(Result):
+class SampleInfo(f.Result):
     """A sample that could be set."""
 
     name: str
     kind: Literal["phantom", "mesh", "voxels", "scene"] = "phantom"
     description: str = ""
-    size_mm: Triple | None = None
+    size_mm: f.Triple | None = None
     uploaded: bool = False
 
 
-class SampleListResult(Result):
+class SampleListResult(f.Result):
     """All samples, and the materials a mesh may be made of."""
 
     samples: list[SampleInfo]
     materials: list[str] = Field(default_factory=list)
 
 
-class UploadResult(Result):
+class UploadResult(f.Result):
     """How much of an upload has come."""
 
     name: str
@@ -125,7 +114,7 @@ class UploadResult(Result):
     warnings: list[str] = Field(default_factory=list)
 
 
-class SampleMeshResult(Result):
+class SampleMeshResult(f.Result):
     """A part of a mesh: binary STL, mm, in the sample's own frame (before its offset)."""
 
     name: str
@@ -133,18 +122,12 @@ class SampleMeshResult(Result):
     format: Literal["stl"] = "stl"
     total: int = Field(description="size of the whole [bytes]")
     start: int = Field(description="position of this part [bytes]")
-    data: Payload
+    data: f.Payload
 
 
 SAMPLE_SET = by_hand("sample.set", SampleSet, SampleResult, "put a sample on the stage")
-SAMPLE_LIST = read("sample.list", Empty, SampleListResult, "the samples there are")
-SAMPLE_MESH = read(
-    "sample.mesh", SampleMesh, SampleMeshResult, "the shape of the sample on the stage"
-)
-SAMPLE_UPLOAD = Method(
-    "sample.upload",
-    SampleUpload,
-    UploadResult,
-    "send a mesh, voxels or a scene in chunks",
-    bulky=True,
-)
+SAMPLE_LIST = read("sample.list", f.Empty, SampleListResult, "the samples there are")
+SAMPLE_MESH = read("sample.mesh", SampleMesh, SampleMeshResult,
+                   "the shape of the sample on the stage")  # fmt: skip
+SAMPLE_UPLOAD = Method("sample.upload", SampleUpload, UploadResult,
+                       "send a mesh, voxels or a scene in chunks", bulky=True)  # fmt: skip

@@ -38,6 +38,5 @@ class CameraSet(Params):
 
 CLOCK_SET = command("clock.set", ClockSet, ClockState, "set how fast the twin's time runs")
 TUBE_SET = by_hand("tube.set", TubeSet, TubeState, "set kV, power and X-rays on or off")
-CAMERA_SET = by_hand(
-    "camera.set", CameraSet, CameraState, "set exposure, mode, ROI, averages, frames"
-)
+CAMERA_SET = by_hand("camera.set", CameraSet, CameraState,
+                     "set exposure, mode, ROI, averages, frames")  # fmt: skip

@@ -11,13 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from flexdt.phantoms import is_shipped, load_phantom, load_phantom_file
-from flexdt.protocol.methods.calibration import (
-    FIT_LIMITS,
-    CalibrationAlign,
-    CalibrationAlignResult,
-    CalibrationFit,
-    CalibrationFitResult,
-)
+from flexdt.protocol.methods import calibration as p
 from flexdt.server.files.dataset_folder import read_text
 from flexdt.server.files.directory import Directory
 from flexdt.server.wire_errors import from_root
@@ -26,12 +20,12 @@ from flexdt.twin.calibration.unknown_markers import UNKNOWN
 from flexdt.twin.dataset.dataset_errors import DatasetMissingError
 from flexdt.twin.dataset.file_names import plain_name
 
-SECONDS: Final = float(FIT_LIMITS["seconds"])
-MEMORY_BYTES: Final = int(FIT_LIMITS["memory_bytes"])
+SECONDS: Final = float(p.FIT_LIMITS["seconds"])
+MEMORY_BYTES: Final = int(p.FIT_LIMITS["memory_bytes"])
 FILES: Final = (".toml", ".json")
 
 
-def fit(root: Directory, asked: CalibrationFit, *_: object) -> CalibrationFitResult:
+def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFitResult:
     """Calibrate; blocks.
 
     Raises:
@@ -65,13 +59,13 @@ def fit(root: Directory, asked: CalibrationFit, *_: object) -> CalibrationFitRes
         ]
     if asked.tracks:
         told["tracks"] = import_module("flexdt.clients.calibration.tracks").tracks_document(found)
-    return CalibrationFitResult.model_validate(from_root(told, root.path))
+    return p.CalibrationFitResult.model_validate(from_root(told, root.path))
 
 
-def align(root: Directory, asked: CalibrationAlign, *_: object) -> CalibrationAlignResult:
+def align(root: Directory, asked: p.CalibrationAlign, *_: object) -> p.CalibrationAlignResult:
     """Align; blocks. Raises as `fit`."""
     found = _face().align(_there(root, asked.name), per_frame=asked.per_frame)
-    return CalibrationAlignResult.model_validate(from_root(found.document, root.path))
+    return p.CalibrationAlignResult.model_validate(from_root(found.document, root.path))
 
 
 def _there(root: Directory, name: str) -> Path:

@@ -24,16 +24,8 @@ from flexdt.protocol import Codec, image
 from flexdt.protocol.connection import MAX_ANSWER, encoded
 from flexdt.protocol.fields import ImageValue, Params
 from flexdt.protocol.messages import Encoded
+from flexdt.protocol.methods import datasets as p
 from flexdt.protocol.methods.calibration import CalibrationAlign, CalibrationFit
-from flexdt.protocol.methods.datasets import (
-    DatasetFrame,
-    DatasetFrameResult,
-    DatasetGet,
-    DatasetInfo,
-    DatasetList,
-    DatasetListResult,
-    DatasetResult,
-)
 from flexdt.protocol.rpc_errors import too_large
 from flexdt.server.files.dataset_folder import (
     Folder,
@@ -270,7 +262,7 @@ def _opened(root: Directory, name: str) -> _Scan:
     return found
 
 
-def _info(path: Path, modified: float, scan: _Scan) -> DatasetInfo:
+def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
     folder, document = scan.folder, scan.document
     kV, power_W = scan.beam
     if document is None:
@@ -285,7 +277,7 @@ def _info(path: Path, modified: float, scan: _Scan) -> DatasetInfo:
                 "exposure_ms": said.exposure_ms, "projections": len(texts), "kV": kV,
                 "power_W": power_W,
             }  # fmt: skip
-        info = DatasetInfo(
+        info = p.DatasetInfo(
             name=path.name, modified=modified, projections=there, present=there,
             problem=scan.problem[:500],
         )  # fmt: skip
@@ -296,7 +288,7 @@ def _info(path: Path, modified: float, scan: _Scan) -> DatasetInfo:
     if lost and document.complete:
         reason = f"{lost[0]} is missing" + (f", and {len(lost) - 1} more" if lost[1:] else "")
     detector, named = document.detector, document.machine.get("name")
-    return DatasetInfo(
+    return p.DatasetInfo(
         name=path.name,
         modified=modified,
         started=document.started.isoformat(),
@@ -319,7 +311,9 @@ def _info(path: Path, modified: float, scan: _Scan) -> DatasetInfo:
 # dataset.list -------------------------------------------------------------------------------------
 
 
-def _list(root: Directory, asked: DatasetList, around: Around, codec: Codec) -> DatasetListResult:
+def _list(
+    root: Directory, asked: p.DatasetList, around: Around, codec: Codec
+) -> p.DatasetListResult:
     folders, left_out = [], 0
     with root.entries() as entries:
         for entry in entries:
@@ -343,7 +337,7 @@ def _list(root: Directory, asked: DatasetList, around: Around, codec: Codec) -> 
         except DatasetError:
             continue  # it has gone meanwhile, or is no data set
         if info is None:
-            info = DatasetInfo(name=name, modified=modified, problem="not read yet")
+            info = p.DatasetInfo(name=name, modified=modified, problem="not read yet")
         elif info == "":
             continue
         if name == around.running:
@@ -358,10 +352,10 @@ def _list(root: Directory, asked: DatasetList, around: Around, codec: Codec) -> 
     shown = found[asked.start : asked.start + asked.count]
     if asked.thumbnail:
         shown = [_with_thumbnail(root, info, asked.thumbnail, until + LIST_S) for info in shown]
-    return DatasetListResult(datasets=shown, total=len(found), unread=unread, left_out=left_out)
+    return p.DatasetListResult(datasets=shown, total=len(found), unread=unread, left_out=left_out)
 
 
-def _listed(path: Path, modified: float) -> DatasetInfo | str:
+def _listed(path: Path, modified: float) -> p.DatasetInfo | str:
     """A data set in a few words; "" for a folder that holds none."""
     folder = list_folder(path)
     if folder.document is None and not folder.projections:
@@ -374,7 +368,7 @@ def _listed(path: Path, modified: float) -> DatasetInfo | str:
     return _info(path, modified, scan)
 
 
-def _with_thumbnail(root: Directory, info: DatasetInfo, side: int, until: float) -> DatasetInfo:
+def _with_thumbnail(root: Directory, info: p.DatasetInfo, side: int, until: float) -> p.DatasetInfo:
     def make() -> ImageValue | str:
         folder = list_folder(path)
         files = list(folder.projections.values())
@@ -404,7 +398,7 @@ def _with_thumbnail(root: Directory, info: DatasetInfo, side: int, until: float)
 # dataset.get --------------------------------------------------------------------------------------
 
 
-def _get(root: Directory, asked: DatasetGet, around: Around, codec: Codec) -> DatasetResult:
+def _get(root: Directory, asked: p.DatasetGet, around: Around, codec: Codec) -> p.DatasetResult:
     scan = _opened(root, asked.name)
     folder, document, images = scan.folder, scan.document, scan.images
     about = root.stat(asked.name)
@@ -422,7 +416,7 @@ def _get(root: Directory, asked: DatasetGet, around: Around, codec: Codec) -> Da
         told = _MEASURED.get(
             key, lambda: _measured(folder, document, chosen), lambda m: None not in m["counts"]
         )
-    return DatasetResult(
+    return p.DatasetResult(
         info=info,
         images=len(images),
         indices=at,
@@ -504,8 +498,8 @@ def _clearances(
 
 
 def _frame(
-    root: Directory, asked: DatasetFrame, around: Around, codec: Codec
-) -> DatasetFrameResult:
+    root: Directory, asked: p.DatasetFrame, around: Around, codec: Codec
+) -> p.DatasetFrameResult:
     scan = _opened(root, asked.name)
     folder, document, images = scan.folder, scan.document, scan.images
     if asked.index >= len(images):
@@ -530,7 +524,7 @@ def _frame(
     size = small.nbytes if codec is Codec.MSGPACK else small.nbytes * 4 // 3
     if size > (most := MAX_ANSWER[codec] - (1 << 16)):  # beside the pixels
         raise too_large("an image (ask for a binned one)", size, most)
-    return DatasetFrameResult(
+    return p.DatasetFrameResult(
         **image.encode(small),  # type: ignore[arg-type]
         name=asked.name,
         index=asked.index,
@@ -575,9 +569,9 @@ def _normal(
 
 
 _ANSWERS: Final[Mapping[type[Params], Callable[..., object]]] = {
-    DatasetList: _list,
-    DatasetGet: _get,
-    DatasetFrame: _frame,
+    p.DatasetList: _list,
+    p.DatasetGet: _get,
+    p.DatasetFrame: _frame,
     CalibrationFit: dataset_fits.fit,
     CalibrationAlign: dataset_fits.align,
 }

@@ -17,7 +17,7 @@ from flexdt.server.twin.handlers import (
     session_methods,
     setting_methods,
 )
-from flexdt.server.twin.handlers.handler import Handler, answered
+from flexdt.server.twin.handlers.handler import Handler
 
 
 def table(*modules: ModuleType) -> Mapping[str, Handler]:
@@ -26,17 +26,12 @@ def table(*modules: ModuleType) -> Mapping[str, Handler]:
     Raises:
         TypeError: a method of the wire has no handler, or two; or a handler's method is not one.
     """
-    pairs = [
-        (method.name, function)
-        for module in modules
-        for function in vars(module).values()
-        for method in answered(function)
-        if function.__module__ == module.__name__
-    ]
-    names = [name for name, _ in pairs]
-    wrong = {name for name in {*names, *METHODS} if names.count(name) != 1 or name not in METHODS}
-    if wrong:
-        raise TypeError(f"not one handler for each method of the wire: {', '.join(sorted(wrong))}")
+    functions = [function for module in modules for function in vars(module).values()]
+    pairs = [(m.name, f) for f in functions for m in getattr(f, "answered", ())]
+    names = sorted(name for name, _ in pairs)
+    if names != sorted(METHODS):
+        odd = {name for name in {*names, *METHODS} if names.count(name) != 1 or name not in METHODS}
+        raise TypeError(f"not one handler for each method of the wire: {', '.join(sorted(odd))}")
     return dict(pairs)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias, TypeVar
 
-from flexdt.protocol import AnyMethod, Method
+from flexdt.protocol import Method
 from flexdt.protocol.connection import encoded
 from flexdt.protocol.fields import Params, Result
 from flexdt.protocol.messages import Encoded
@@ -55,12 +55,6 @@ def answers(*methods: Method[_P, _R]) -> Callable[[_Handler[_P, _R]], _Handler[_
         return handler
 
     return mark
-
-
-def answered(function: object) -> Sequence[AnyMethod]:
-    """The methods of which `function` is the handler; none for any other object."""
-    methods: Sequence[AnyMethod] = getattr(function, "answered", ())
-    return methods
 
 
 def still(twin: TwinServer, client: Client, what: str) -> Callable[[], None]:
