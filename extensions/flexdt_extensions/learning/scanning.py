@@ -16,10 +16,10 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 
-from flexdt.clients.learning.moved_scanner import Lab, choices, require_positive
-from flexdt.clients.learning.rewards import TASKS, Task
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.geometry.poses import Poses
+from flexdt_extensions.learning.moved_scanner import Lab, choices, require_positive
+from flexdt_extensions.learning.rewards import TASKS, Task
 
 Action = npt.NDArray[np.float32] | np.int64
 Observation = npt.NDArray[Any]

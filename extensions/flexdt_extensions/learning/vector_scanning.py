@@ -16,25 +16,28 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from flexdt.clients.learning.moved_scanner import Lab, Taken, choices
-from flexdt.clients.learning.rewards import (
-    ITERATIONS,
-    PHOTONS,
-    QualityTask,
-    blank,
-    column_information,
-    noisy,
-)
-from flexdt.clients.learning.scanning import SECTORS, Action, Observation, ScanEnv
-from flexdt.phantoms.phantom import Phantom
+from flexdt.phantoms import Phantom
 from flexdt.twin.errors import UnknownNameError
+from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.geometry.poses import Poses
-from flexdt.twin.projection import cpu, project_scene
-from flexdt.twin.projection.operators import box_of, layout_data, voxel_rays
-from flexdt.twin.projection.volume import blank_layout
-from flexdt.twin.reconstruction.iterative import SMALLEST
+from flexdt.twin.projection import project_scene
+from flexdt_extensions.learning.moved_scanner import Lab, Taken, choices
+from flexdt_extensions.learning.rewards import (
+    GRID,
+    ITERATIONS,
+    PHOTONS,
+    SIDE_MM,
+    QualityTask,
+    column_information,
+    noisy,
+)
+from flexdt_extensions.learning.scanning import SECTORS, Action, Observation, ScanEnv
+
+VoxelArray = npt.NDArray[np.uint32]
+SMALLEST = 1e-6
+"""Sums of lengths below this part of the largest are not divided by, as in `flexdt.sirt`."""
 
 
 class Turntable:
@@ -115,40 +118,25 @@ class Rays:
     """
 
     def __init__(self, table: Turntable) -> None:
-        from flexdt.twin.projection.kernels import siddon_kernels
-
         lab = table.still
         poses = [table.poses(360.0 * i / SECTORS) for i in range(SECTORS)]
         self.cone = lab.small(Poses.concatenate(poses), NOMINAL)
         self.information = column_information(lab, self.cone)
-        layout, shape = blank_layout(blank()), lab.small_shape
-        box, views, data = box_of(layout), voxel_rays(self.cone, layout, shape), layout_data(layout)
-        slices = cpu.z_slices(box.nz, 1)
-        marks = np.ones((1, 2 * box.nx * box.ny), np.int32)
-        one = np.zeros((1, *shape), np.float32)
-        voxels, lengths = [], []
-        for view in views:
-            for ray in range(one.size):
-                one.flat[ray] = 1.0
-                # One pixel's adjoint is its ray's row of the matrix.
-                siddon_kernels.spread_rays(box, view[None], np.array([0]), one, slices, marks)
-                flat = data.ravel()
-                voxels.append(np.flatnonzero(flat))
-                lengths.append(flat[voxels[-1]])
-                one.flat[ray] = 0.0
-                layout.flat.fill(0.0)
-        ends = np.cumsum([0, *map(len, voxels)])
-        self.first = np.stack([ends[i * one.size : (i + 1) * one.size + 1] for i in range(SECTORS)])
-        self.voxel, self.length = np.concatenate(voxels).astype(np.uint32), np.concatenate(lengths)
-        self.rows = np.array([part.sum() for part in lengths], np.float32).reshape(SECTORS, -1)
-        self.columns = np.zeros((SECTORS, data.size), np.float32)
-        for sector, ends in enumerate(self.first):
-            here = slice(ends[0], ends[-1])
-            np.add.at(self.columns[sector], self.voxel[here], self.length[here])
+        views = [_lengths(self.cone[i], lab.small_shape) for i in range(SECTORS)]
+        rays = len(views[0][0])
+        counts = np.concatenate([(length > 0.0).sum(axis=1) for _, length in views])
+        ends = np.cumsum([0, *counts])
+        self.first = np.stack([ends[i * rays : (i + 1) * rays + 1] for i in range(SECTORS)])
+        self.voxel = np.concatenate([voxel[length > 0.0] for voxel, length in views])
+        self.length = np.concatenate([length[length > 0.0] for _, length in views])
+        self.rows = np.stack([length.sum(axis=1) for _, length in views])
+        self.columns = np.stack(
+            [np.bincount(v.ravel(), n.ravel(), GRID**3).astype(np.float32) for v, n in views]
+        )
 
     def solve(self, tasks: Sequence[SharedQuality]) -> None:
         """What `QualityTask` does with all frames of one object, for many."""
-        from flexdt.clients.learning import sirt_kernels
+        from flexdt_extensions.learning import sirt_kernels
 
         counts = np.array([len(task.sectors) for task in tasks])
         taken = np.zeros((len(tasks), counts.max()), np.int64)
@@ -306,3 +294,25 @@ class ScanVectorEnv(SyncVectorEnv):
 
 def _sector(angle: float) -> int:
     return round(angle * SECTORS / 360.0) % SECTORS
+
+
+def _lengths(cone: ConeVec, shape: tuple[int, int]) -> tuple[VoxelArray, Float32Array]:
+    """Voxels that each ray of one view crosses and its length in them, both (rays, k) [mm].
+
+    A ray is cut at every plane between voxels, in the order in which it meets them; pieces outside
+    the volume have length 0.
+    """
+    rows, cols = ((np.arange(n) - (n - 1) / 2.0) for n in shape)
+    ends = cone.detector + (rows[:, None, None] * cone.v + cols[:, None] * cone.u).reshape(-1, 3)
+    way, edge = ends - cone.source, SIDE_MM / GRID
+    planes = np.arange(GRID + 1) * edge - SIDE_MM / 2.0
+    with np.errstate(divide="ignore", invalid="ignore"):  # a ray along the planes of an axis
+        cuts = (planes - cone.source[:, :, None]) / way[:, :, None]
+    cuts = np.sort(np.nan_to_num(np.clip(cuts, 0.0, 1.0)).reshape(len(way), -1))
+    middle = (cuts[:, 1:] + cuts[:, :-1]) / 2.0
+    points = cone.source + middle[..., None] * way[:, None]
+    cell = np.floor((points + SIDE_MM / 2.0) / edge).astype(np.int64)
+    inside = ((cell >= 0) & (cell < GRID)).all(axis=2)
+    length = np.where(inside, np.diff(cuts) * np.linalg.norm(way, axis=1)[:, None], 0.0)
+    voxel = np.where(inside, (cell[..., 2] * GRID + cell[..., 1]) * GRID + cell[..., 0], 0)
+    return voxel.astype(np.uint32), length.astype(np.float32)

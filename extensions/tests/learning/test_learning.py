@@ -15,15 +15,15 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
-from flexdt.clients.learning import ENVIRONMENTS
-from flexdt.clients.learning.moved_scanner import Lab
-from flexdt.clients.learning.policies import POLICIES, play
-from flexdt.clients.learning.rewards import COARSE, SIDE_MM, QualityTask, column_lengths, noisy
-from flexdt.clients.learning.scanning import ScanEnv
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.projection import Volume, forward
+from flexdt_extensions.learning import ENVIRONMENTS
+from flexdt_extensions.learning.moved_scanner import Lab
+from flexdt_extensions.learning.policies import POLICIES, play
+from flexdt_extensions.learning.rewards import COARSE, SIDE_MM, QualityTask, column_lengths, noisy
+from flexdt_extensions.learning.scanning import ScanEnv
 
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)
@@ -254,7 +254,7 @@ def test_unknown_words_are_refused() -> None:
 
 
 def test_without_gymnasium_one_line_says_what_to_install() -> None:
-    code = "import sys; sys.modules['gymnasium'] = None; import flexdt.clients.learning"
+    code = "import sys; sys.modules['gymnasium'] = None; import flexdt_extensions.learning"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 1
-    assert "pip install 'flexdt[learn]'" in done.stderr
+    assert "pip install 'flexdt-extensions[learn]'" in done.stderr

@@ -1,6 +1,6 @@
 """Baselines of the learning environments: random, equidistant and greedy, side by side.
 
-    python examples/learning_baselines.py --out DIR [--episodes N] [--frames N]
+    python extensions/examples/learning_baselines.py --out DIR [--episodes N] [--frames N]
 
 writes baselines.png, baselines.svg and baselines.json. Needs the extras learn and docs (for
 Matplotlib).
@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from flexdt.clients.learning.policies import POLICIES, play
-from flexdt.clients.learning.scanning import ScanEnv
+from flexdt_extensions.learning.policies import POLICIES, play
+from flexdt_extensions.learning.scanning import ScanEnv
 
 COLOURS = {"random": "#5f6c7b", "equidistant": "#1b6ca8", "greedy": "#c8553d"}
 

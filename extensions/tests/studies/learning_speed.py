@@ -1,6 +1,6 @@
 """Steps a second of the learning environments, one at a time and many at once.
 
-    python tests/studies/learning_speed.py [--envs N] [--seconds S]
+    python extensions/tests/studies/learning_speed.py [--envs N] [--seconds S]
 
 Actions are drawn from a seed; steps that only begin a new episode are timed but not counted.
 """
@@ -14,7 +14,7 @@ import time
 import gymnasium
 import numpy as np
 
-import flexdt.clients.learning  # noqa: F401 - registers the environments
+import flexdt_extensions.learning  # noqa: F401 - registers the environments
 
 NAMES = ("flexdt/NextAngleQuality-v0", "flexdt/NextAngleDiscrete-v0")
 

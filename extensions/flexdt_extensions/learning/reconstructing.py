@@ -15,14 +15,13 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.error import ResetNeeded
 
-from flexdt.clients.learning.moved_scanner import Lab, choices, require_positive
-from flexdt.clients.learning.rewards import GRID, SIDE_MM, blank, noisy, quality, random_object
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.geometry.poses import Poses
-from flexdt.twin.projection import Volume, forward
-from flexdt.twin.projection.analytic import project_scene
+from flexdt.twin.projection import Volume, forward, project_scene
 from flexdt.twin.reconstruction import cgls, fdk, sirt
+from flexdt_extensions.learning.moved_scanner import Lab, choices, require_positive
+from flexdt_extensions.learning.rewards import GRID, SIDE_MM, blank, noisy, quality, random_object
 
 ALGORITHMS: Final = ("fdk", "sirt", "cgls")
 WINDOWS: Final = ("ram-lak", "shepp-logan", "cosine", "hamming", "hann")

@@ -12,24 +12,26 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.clients.learning.moved_scanner import Lab
-from flexdt.phantoms import load_phantom
-from flexdt.phantoms.materials import material
-from flexdt.phantoms.phantom import Phantom
-from flexdt.twin.calibration.bead_model import bead_model, spot_radii
-from flexdt.twin.calibration.fit.identifiability import visible_beads
-from flexdt.twin.calibration.fit.problem import SIX, build_problem, edge_factor
-from flexdt.twin.calibration.fit.weak_directions import tolerance_of
+from flexdt.phantoms import Phantom, load_phantom, material
+from flexdt.twin.calibration import (
+    SIX,
+    bead_model,
+    build_problem,
+    edge_factor,
+    spot_radii,
+    tolerance_of,
+    visible_beads,
+)
 from flexdt.twin.calibration.identify import overlapping
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
-from flexdt.twin.projection import Volume, forward
-from flexdt.twin.projection.analytic import project_scene
-from flexdt.twin.projection.analytic_solids import Box, Ellipsoid, Matrix, Scene, Solid
+from flexdt.twin.projection import Box, Ellipsoid, Scene, Solid, Volume, forward, project_scene
 from flexdt.twin.reconstruction import sirt
+from flexdt_extensions.learning.moved_scanner import Lab
 
+Vector = tuple[float, float, float]
 NOISE_PX: Final = 0.1
 PRIOR: Final = 50.0
 """Standard deviation of every parameter before the first frame, in tolerances (10 mm, 10 deg)."""
@@ -240,7 +242,7 @@ def quality(volume: Volume, truth: Volume) -> float:
     return 1.0 - float(np.sqrt(np.mean(error**2))) / rms
 
 
-def _turned(angle: float) -> Matrix:
+def _turned(angle: float) -> tuple[Vector, Vector, Vector]:
     c, s = math.cos(angle), math.sin(angle)
     return ((c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0))
 

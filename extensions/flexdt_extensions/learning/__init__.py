@@ -1,7 +1,7 @@
 """Gymnasium environments on the twin: plan a scan, or choose how to reconstruct it.
 
     import gymnasium
-    env = gymnasium.make("flexdt.clients.learning:flexdt/NextAngle-v0")
+    env = gymnasium.make("flexdt_extensions.learning:flexdt/NextAngle-v0")
 
 Importing this package registers the environments (Gymnasium's own way; the part before the colon
 makes it import the package). The extra `learn` installs Gymnasium; agents are the user's own.
@@ -15,11 +15,11 @@ try:
     import gymnasium
 except ImportError as error:  # pragma: no cover - tested in a process without the extra
     raise ImportError(
-        "flexdt.clients.learning needs Gymnasium, which is not installed: "
-        "pip install 'flexdt[learn]'"
+        "flexdt_extensions.learning needs Gymnasium, which is not installed: "
+        "pip install 'flexdt-extensions[learn]'"
     ) from error
 
-_HERE: Final = "flexdt.clients.learning"
+_HERE: Final = "flexdt_extensions.learning"
 ENVIRONMENTS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     "flexdt/NextAngle-v0": (f"{_HERE}.scanning:ScanEnv", {"action": "angle"}),
     "flexdt/NextAngleDiscrete-v0": (f"{_HERE}.scanning:ScanEnv", {"action": "discrete"}),

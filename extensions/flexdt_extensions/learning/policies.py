@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from flexdt.clients.learning.scanning import SECTORS, Action, ScanEnv
+from flexdt_extensions.learning.scanning import SECTORS, Action, ScanEnv
 
 Policy = Callable[[ScanEnv, int], Action]
 """Environment and number of the frame (from 0) to action."""

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-import flexdt.clients.learning  # noqa: F401 - registers the environments
-from flexdt.clients.learning.moved_scanner import Lab
-from flexdt.clients.learning.rewards import GRID, SIDE_MM
-from flexdt.clients.learning.vector_scanning import ScanVectorEnv, TurnedLab, Turntable
+import flexdt_extensions.learning  # noqa: F401 - registers the environments
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import NOMINAL
+from flexdt_extensions.learning.moved_scanner import Lab
+from flexdt_extensions.learning.rewards import GRID, SIDE_MM
+from flexdt_extensions.learning.vector_scanning import ScanVectorEnv, TurnedLab, Turntable
 
 QUALITY, INFORMATION = "flexdt/NextAngleQuality-v0", "flexdt/NextAngleDiscrete-v0"
 

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
-
-from flexdt.twin.projection.kernels.compiling import parallel
+from numba import njit, prange
 
 # mypy: disable-error-code="no-untyped-def,untyped-decorator"
 
 
-@parallel
+@njit(cache=True, error_model="numpy", parallel=True, nogil=True)
 def solve(
     first, voxel, length, rows, columns, taken, counts, images, volumes, iterations, smallest
 ):

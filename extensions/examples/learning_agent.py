@@ -1,6 +1,7 @@
 """An agent that learns from which angles to look at plates, beside angles fixed beforehand.
 
-    python examples/learning_agent.py --out DIR [--seeds N] [--rounds N] [--episodes N] [--judged N]
+    python extensions/examples/learning_agent.py --out DIR [--seeds N] [--rounds N]
+        [--episodes N] [--judged N]
 
 Four views of one or two parallel plates at a hidden angle; the score is the quality of their
 reconstruction (1 - RMSE / RMS). The agent is fitted Q iteration with a small network, written out
@@ -21,8 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from flexdt.clients.learning.scanning import SECTORS, ScanEnv
-from flexdt.clients.learning.vector_scanning import ScanVectorEnv
+from flexdt_extensions.learning.scanning import SECTORS, ScanEnv
+from flexdt_extensions.learning.vector_scanning import ScanVectorEnv
 
 FRAMES, GAIN = 4, 20.0
 FEATURES = 4

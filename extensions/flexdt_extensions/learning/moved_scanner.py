@@ -14,9 +14,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.collision.collision_scene import build_scene
-from flexdt.twin.collision.convex_solids import box
-from flexdt.twin.collision.guard import SceneGuard
+from flexdt.twin.collision import SceneGuard, box, build_scene
 from flexdt.twin.errors import CollisionError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
