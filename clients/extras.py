@@ -8,8 +8,10 @@ from typing import Any
 from flexdt.twin.errors import TwinError
 
 
-def package(name: str, what: str = "this format", extra: str = "io") -> Any:
-    """The package or module `name` of an extra, which `what` needs.
+def package(
+    name: str, what: str = "this format", extra: str = "io", distribution: str = "flexdt"
+) -> Any:
+    """The package or module `name` of a distribution's extra, which `what` needs.
 
     Raises:
         TwinError: it is not installed.
@@ -18,6 +20,6 @@ def package(name: str, what: str = "this format", extra: str = "io") -> Any:
         return import_module(name)
     except ImportError:
         raise TwinError(
-            f"{what} needs {name}, which is not installed: pip install 'flexdt[{extra}]'",
+            f"{what} needs {name}, which is not installed: pip install '{distribution}[{extra}]'",
             {"missing": name},
         ) from None

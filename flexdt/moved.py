@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import Final
 
 MOVED: Final = {
+    "flexdt.clients.lab": "flexdt_extensions.bluesky",
     "flexdt.clients.learning": "flexdt_extensions.learning",
 }
 """Old module or package -> its name now."""

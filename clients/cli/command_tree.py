@@ -6,11 +6,12 @@ Command modules import what they need inside their functions, so building the tr
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 import typer
 
+from flexdt.clients.cli import extension_commands
 from flexdt.clients.cli.commands.data_sets import (
     batch_command,
     calibrate_commands,
@@ -101,8 +102,13 @@ NUMBERS_WITH_SIGN: Final = ("jog", "clock")
 """Commands whose arguments may begin with a minus."""
 
 
-def build() -> typer.Typer:
-    """The whole command line."""
+def build(words: Sequence[str] | None = None) -> typer.Typer:
+    """The whole command line.
+
+    Args:
+        words: of the command line, after the program's name: of other distributions' commands the
+            one that is named is loaded, the others are listed. None loads all.
+    """
     app = typer.Typer(
         name="flexdt",
         help="Digital twin of the FleX-ray laboratory X-ray CT scanner.",
@@ -122,12 +128,34 @@ def build() -> typer.Typer:
     for name, command in COMMANDS.items():
         context = {"ignore_unknown_options": name in NUMBERS_WITH_SIGN}
         app.command(name, context_settings=context)(_complete(command))
+    groups = {}
     for name, (about, commands) in GROUPS.items():
-        group = typer.Typer(help=about, no_args_is_help=True, add_completion=False)
+        groups[name] = typer.Typer(help=about, no_args_is_help=True, add_completion=False)
         for one, command in commands.items():
-            group.command(one)(_complete(command))
-        app.add_typer(group, name=name)
+            groups[name].command(one)(_complete(command))
+        app.add_typer(groups[name], name=name)
+    _add_others(app, groups, words)
     return app
+
+
+def _add_others(
+    app: typer.Typer, groups: Mapping[str, typer.Typer], words: Sequence[str] | None
+) -> None:
+    """Add other distributions' commands, which take no name of ours."""
+    ours = {*COMMANDS, *(f"{group} {one}" for group, (_, more) in GROUPS.items() for one in more)}
+    asked = set(extension_commands.wanted(words)) - ours - {*GROUPS}
+    for name in dict.fromkeys([*extension_commands.KNOWN, *sorted(asked)]):
+        command = extension_commands.found(name) if name in asked else None
+        group, _, one = name.rpartition(" ")
+        if group and group not in groups:
+            continue
+        place = groups[group] if group else app
+        if command is not None:
+            place.command(one)(_complete(command))
+        elif name in extension_commands.KNOWN:
+            # Whatever follows the name, the answer is how to install it.
+            bare = {"ignore_unknown_options": True, "help_option_names": list[str]()}
+            place.command(one, context_settings=bare)(extension_commands.listed(name))
 
 
 def _complete(command: Callable[..., Any]) -> Callable[..., object]:

@@ -40,17 +40,13 @@ from ophyd_async.core import (
     soft_signal_r_and_setter,
 )
 
-from flexdt.clients.client.twin_methods import FINAL_STATES
-from flexdt.clients.lab.axes import LimitsExceeded
-from flexdt.clients.lab.camera_device import tiff_stream
-from flexdt.clients.lab.lab_connection import LabConnection
-from flexdt.protocol.results import CheckResult
-from flexdt.protocol.rpc_errors import RpcError
-from flexdt.protocol.state_model import JobStatus
+from flexdt.clients import FINAL_STATES, CheckResult, JobStatus, RpcError
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import Machine, Profile, builtin_machine, profile_of
-from flexdt.twin.script import parse_script, plan_script
-from flexdt.twin.script.compose import ScanRequest, compose_script
+from flexdt.twin.script import ScanRequest, compose_script, parse_script, plan_script
+from flexdt_extensions.bluesky.axes import LimitsExceeded
+from flexdt_extensions.bluesky.camera_device import tiff_stream
+from flexdt_extensions.bluesky.lab_connection import LabConnection
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import bluesky.plan_stubs as bps
 import bluesky.preprocessors as bpp
 from bluesky.utils import MsgGenerator
 
-from flexdt.clients.lab.flyer import FlyScan, TwinFlyer
+from flexdt_extensions.bluesky.flyer import FlyScan, TwinFlyer
 
 STREAM = "primary"
 FRAMES = "frames"

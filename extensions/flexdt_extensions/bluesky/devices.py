@@ -18,11 +18,11 @@ from ophyd_async.core import (
     StandardReadableFormat,
 )
 
-from flexdt.clients.lab.axes import TwinAxis
-from flexdt.clients.lab.camera_device import TwinCamera
-from flexdt.clients.lab.flyer import TwinFlyer
-from flexdt.clients.lab.lab_connection import LabConnection, settable
 from flexdt.twin.machine.description import Machine, builtin_machine
+from flexdt_extensions.bluesky.axes import TwinAxis
+from flexdt_extensions.bluesky.camera_device import TwinCamera
+from flexdt_extensions.bluesky.flyer import TwinFlyer
+from flexdt_extensions.bluesky.lab_connection import LabConnection, settable
 
 
 class TwinTube(StandardReadable):

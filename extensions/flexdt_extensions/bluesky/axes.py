@@ -21,8 +21,8 @@ from ophyd_async.core import (
     TimeoutCalculator,
 )
 
-from flexdt.clients.lab.lab_connection import LabConnection, Put, TwinBackend, settable
-from flexdt.protocol.state_model import AxisState, State
+from flexdt.clients import AxisState, State
+from flexdt_extensions.bluesky.lab_connection import LabConnection, Put, TwinBackend, settable
 
 ARRIVED = 1e-6
 """Distance from the target at which an axis has arrived [mm, deg]."""

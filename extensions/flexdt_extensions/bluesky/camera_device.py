@@ -36,9 +36,8 @@ from ophyd_async.core import (
     soft_signal_r_and_setter,
 )
 
-from flexdt.clients.lab.lab_connection import LabConnection, settable
-from flexdt.clients.whole_files import write_whole
-from flexdt.server.files.image_files import tiff_bytes
+from flexdt.extending import tiff_bytes, write_whole
+from flexdt_extensions.bluesky.lab_connection import LabConnection, settable
 
 MIMETYPE: Final = "multipart/related;type=image/tiff"
 

@@ -1,7 +1,7 @@
 """Bluesky's RunEngine drives the twin: a step scan, a fly scan, and the documents they make.
 
     flexdt up --data my-scans --speed-up max      # in another terminal
-    python examples/bluesky_scans.py 127.0.0.1 55000 --images camera-images
+    python extensions/examples/bluesky_scans.py 127.0.0.1 55000 --images camera-images
 
 Needs the extra `lab`. Prints each document's kind and what matters in it, and the TIFF files that
 the stream documents point at.
@@ -23,10 +23,10 @@ from bluesky.run_engine import call_in_bluesky_event_loop
 from bluesky.simulators import check_limits
 from ophyd_async.core import StaticPathProvider, UUIDFilenameProvider, init_devices
 
-from flexdt.clients.lab import FlyScan, LimitsExceeded, TwinLab
-from flexdt.clients.lab.bluesky_plans import fly_scan
 from flexdt.twin.machine.camera import Roi
-from flexdt.twin.script.compose import ScanRequest
+from flexdt.twin.script import ScanRequest
+from flexdt_extensions.bluesky import FlyScan, LimitsExceeded, TwinLab
+from flexdt_extensions.bluesky.bluesky_plans import fly_scan
 
 SMALL = Roi(800, 620, 1199, 939)
 

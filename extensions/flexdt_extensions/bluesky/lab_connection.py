@@ -20,10 +20,8 @@ from bluesky.protocols import Reading
 from event_model import DataKey, Dtype, Limits
 from ophyd_async.core import NotConnectedError, SignalBackend, SignalRW
 
+from flexdt.clients import ConnectionLost, RpcError, State
 from flexdt.clients.client.async_client import AsyncTwinClient
-from flexdt.clients.client.transport import ConnectionLost
-from flexdt.protocol import RpcError
-from flexdt.protocol.state_model import State
 
 Watcher = Callable[[State], None]
 
@@ -54,7 +52,7 @@ class LabConnection:
         ssl: tls.SSLContext | None = None,
     ) -> None:
         self.address = f"{host}:{port}"
-        self.client = AsyncTwinClient(host, port, token, name="flexdt.clients.lab", ssl=ssl)
+        self.client = AsyncTwinClient(host, port, token, name="flexdt_extensions.bluesky", ssl=ssl)
         self.state: State | None = None
         self._watchers: list[Watcher] = []
         self._news = asyncio.Event()

@@ -34,18 +34,18 @@ from ophyd_async.core import (
 
 from flexdt.clients import TwinClient
 from flexdt.clients.datasets.dataset import load_dataset
-from flexdt.clients.lab import FlyScan, LimitsExceeded, TwinLab
-from flexdt.clients.lab.bluesky_plans import fly_scan
 from flexdt.clients.launch.processes import Servers
 from flexdt.protocol import RpcError
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.script.compose import ScanRequest, compose_script
+from flexdt_extensions.bluesky import FlyScan, LimitsExceeded, TwinLab
+from flexdt_extensions.bluesky.bluesky_plans import fly_scan
 
 pytestmark = pytest.mark.timeout(300)
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 SMALL = Roi(800, 620, 1199, 939)
 TURN = ScanRequest(kind="fly", frames=9, exposure_ms=50.0, averages=10, roi=SMALL, darks=1, flats=1)
 START = {"tra_obj": 0.0, "mag_obj": 600.0, "rot_obj": 0.0, "mag_det": 1000.0}
@@ -212,7 +212,7 @@ def test_five_plans_of_different_kinds_run_in_one_engine(
 
 
 def test_data_keys_are_named_as_the_documentation_says(engine: RunEngine, lab: TwinLab) -> None:
-    text = (Path(__file__).parents[2] / "docs/bluesky.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[3] / "docs/extensions/bluesky.md").read_text(encoding="utf-8")
     told = set(re.findall(r"`(lab-[\w-]+)`", text))
     step = run(engine, bp.scan([lab.camera, lab.tube], lab.axis("rot_obj"), 0.0, 10.0, 2))
     fly = run(engine, fly_scan(lab.scan, FlyScan(TURN, seed=1), flush_s=0.05))
@@ -489,8 +489,8 @@ def test_nobody_there_is_said_device_by_device(engine: RunEngine, tmp_path: Path
 def test_the_example_runs(servers: Servers, twin: TwinClient, tmp_path: Path) -> None:
     host, port = servers.address
     done = subprocess.run(
-        [sys.executable, str(ROOT / "examples" / "bluesky_scans.py"), host, str(port),
-         "--images", str(tmp_path)],
+        [sys.executable, str(ROOT / "extensions" / "examples" / "bluesky_scans.py"), host,
+         str(port), "--images", str(tmp_path)],
         capture_output=True, text=True, timeout=120,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]
@@ -506,17 +506,17 @@ def test_without_the_extra_one_line_says_what_to_install() -> None:
     code = (
         "import sys; sys.modules['ophyd_async'] = sys.modules['ophyd_async.core'] = None\n"
         "from flexdt.twin.errors import TwinError\n"
-        "import flexdt.clients.lab as lab\n"
+        "import flexdt_extensions.bluesky as lab\n"
         "try:\n    lab.TwinLab\nexcept TwinError as error:\n    print(error)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("\n") == 1
-    assert "pip install 'flexdt[lab]'" in done.stdout
+    assert "pip install 'flexdt-extensions[lab]'" in done.stdout
 
 
 def test_the_pages_programme_runs(servers: Servers, twin: TwinClient, tmp_path: Path) -> None:
-    page = (ROOT / "docs" / "bluesky.md").read_text("utf-8")
+    page = (ROOT / "docs" / "extensions" / "bluesky.md").read_text("utf-8")
     (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     host, port = servers.address
     for written, meant in (
