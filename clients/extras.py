@@ -1,11 +1,14 @@
-"""Packages that extras of flexdt install."""
+"""Packages that extras of flexdt install, and what its extensions add."""
 
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any
+from importlib.metadata import entry_points
+from typing import Any, Final
 
 from flexdt.twin.errors import TwinError
+
+DISTRIBUTION: Final = "flexdt-extensions"
 
 
 def package(
@@ -23,3 +26,25 @@ def package(
             f"{what} needs {name}, which is not installed: pip install '{distribution}[{extra}]'",
             {"missing": name},
         ) from None
+
+
+def offered(name: str, group: str) -> Any:
+    """What an installed distribution offers under an entry point, or None."""
+    for point in entry_points(group=group, name=name):
+        return point.load()
+    return None
+
+
+def extension(name: str, what: str, group: str = "flexdt.extensions") -> Any:
+    """What `flexdt-extensions` offers under an entry point, which `what` needs.
+
+    Raises:
+        TwinError: the distribution is not installed.
+    """
+    found = offered(name, group)
+    if found is None:
+        raise TwinError(
+            f"{what} needs {DISTRIBUTION}, which is not installed: pip install {DISTRIBUTION}",
+            {"missing": DISTRIBUTION},
+        )
+    return found

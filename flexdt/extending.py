@@ -9,6 +9,7 @@ once, the document of `--json`. The entry point group `flexdt.commands` gives it
 A dot in the name stands for a group: `phantom.design` is `flexdt phantom design`.
 """
 
+from flexdt.clients.cli.commands.processes.process_commands import become
 from flexdt.clients.cli.console import note, size, table, warn
 from flexdt.clients.cli.option_values import names, numbers, position, triple
 from flexdt.clients.cli.options import (
@@ -25,7 +26,9 @@ from flexdt.clients.cli.options import (
 from flexdt.clients.extras import package
 from flexdt.clients.failure import CommandError
 from flexdt.clients.whole_files import free_bytes, write_whole
+from flexdt.process_settings import OneLine
 from flexdt.server.files.image_files import tiff_bytes
+from flexdt.twin.values import message_of
 
 __all__ = [
     "Answer",
@@ -34,10 +37,13 @@ __all__ = [
     "Jobs",
     "Json",
     "MachineName",
+    "OneLine",
     "ProfileName",
     "Scheduler",
     "argument",
+    "become",
     "free_bytes",
+    "message_of",
     "names",
     "note",
     "numbers",

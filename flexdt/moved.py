@@ -12,6 +12,16 @@ from types import ModuleType
 from typing import Final
 
 MOVED: Final = {
+    "flexdt.clients.batch": "flexdt_extensions.batch",
+    "flexdt.clients.calibration.build_sheet": "flexdt_extensions.phantom_design.build_sheet",
+    "flexdt.clients.calibration.phantom_design": "flexdt_extensions.phantom_design.phantom_design",
+    "flexdt.clients.scenario": "flexdt_extensions.ctsimu.scenario",
+    "flexdt.clients.studies": "flexdt_extensions.studies",
+    "flexdt.server.bench": "flexdt_extensions.bench",
+    "flexdt.twin.calibration.design": "flexdt_extensions.phantom_design",
+    "flexdt.twin.calibration.online": "flexdt_extensions.online",
+    "flexdt.twin.calibration.studies": "flexdt_extensions.studies",
+    "flexdt.twin.exchange.ctsimu_scan": "flexdt_extensions.ctsimu.ctsimu_scan",
     "flexdt.clients.lab": "flexdt_extensions.bluesky",
     "flexdt.clients.learning": "flexdt_extensions.learning",
 }

@@ -13,16 +13,12 @@ import typer
 
 from flexdt.clients.cli import extension_commands
 from flexdt.clients.cli.commands.data_sets import (
-    batch_command,
     calibrate_commands,
     exchange_commands,
     expose_command,
     reconstruct_command,
-    simulate_command,
-    study_command,
 )
 from flexdt.clients.cli.commands.processes import (
-    bench_command,
     demo_command,
     doctor_command,
     process_commands,
@@ -64,14 +60,10 @@ COMMANDS: Final[Mapping[str, Callable[..., object]]] = {
     "align": calibrate_commands.align,
     "compare": calibrate_commands.compare,
     "expose": expose_command.expose,
-    "simulate": simulate_command.simulate,
     "reconstruct": reconstruct_command.reconstruct,
     "export": exchange_commands.export,
     "import": exchange_commands.import_,
-    "study": study_command.study,
-    "batch": batch_command.batch,
     "follow": follow_command.follow,
-    "bench": bench_command.bench,
     "doctor": doctor_command.doctor,
 }
 """Name -> what it runs, in the order of the help page."""
@@ -83,7 +75,6 @@ GROUPS: Final[Mapping[str, tuple[str, Mapping[str, Callable[..., object]]]]] = {
         {
             "list": phantom_command.list_phantoms,
             "make": phantom_command.make,
-            "design": phantom_command.design,
         },
     ),
     "machine": (

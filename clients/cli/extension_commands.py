@@ -8,51 +8,39 @@ looked up when its command is on the command line.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from importlib.metadata import entry_points
 from typing import Any, Final
 
 from flexdt.clients.cli.options import argument
 
 GROUP: Final = "flexdt.commands"
-DISTRIBUTION: Final = "flexdt-extensions"
-KNOWN: Final[Mapping[str, str]] = {}
+KNOWN: Final[Mapping[str, str]] = {
+    "simulate": "Simulate a CTSimU scenario: projections, dark and flat images as TIFF.",
+    "study": "Repeat an experiment of the thesis.",
+    "batch": "Make a batch of scans or calibrations.",
+    "bench": "Measure speed and accuracy, beside the peers that are installed.",
+    "phantom design": "Choose bead places that determine the geometry best.",
+}
 """Command of `flexdt-extensions` -> its line of the help page."""
 
 
 def found(name: str) -> Callable[..., Any] | None:
     """The function of a command, a word or two, that an installed distribution offers."""
-    for point in entry_points(group=GROUP, name=name.replace(" ", ".")):
-        function: Callable[..., Any] = point.load()
-        return function
-    return None
+    from flexdt.clients.extras import offered
+
+    function: Callable[..., Any] | None = offered(name.replace(" ", "."), GROUP)
+    return function
 
 
 def listed(name: str) -> Callable[..., None]:
-    """A command of the help page alone; where it is run, its distribution is missing."""
+    """A command for the help page; where it is run, its distribution is missing."""
 
     def command(words: list[str] | None = argument(None, "...")) -> None:
-        require(name)
+        from flexdt.clients.extras import extension
+
+        extension(name.replace(" ", "."), f"`flexdt {name}`", GROUP)
 
     command.__doc__ = KNOWN[name]
     return command
-
-
-def require(name: str) -> Callable[..., Any]:
-    """The function of a command of `flexdt-extensions`.
-
-    Raises:
-        TwinError: the distribution is not installed.
-    """
-    function = found(name)
-    if function is None:
-        from flexdt.twin.errors import TwinError
-
-        raise TwinError(
-            f"`flexdt {name}` is a command of {DISTRIBUTION}, which is not installed: "
-            f"pip install {DISTRIBUTION}",
-            {"missing": DISTRIBUTION},
-        )
-    return function
 
 
 def wanted(words: Iterable[str] | None) -> list[str]:

@@ -28,7 +28,7 @@ def defined(source: str) -> set[str]:
             case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
                 names.add(node.name)
             case ast.Assign(targets=targets):
-                names |= {t.id for t in targets if isinstance(t, ast.Name)}
+                names |= {t.id for o in targets for t in ast.walk(o) if isinstance(t, ast.Name)}
             case ast.AnnAssign(target=ast.Name(id=name)):
                 names.add(name)
     return {name for name in names if not name.startswith("_")}
