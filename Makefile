@@ -1,5 +1,5 @@
-# make install | demo | quick | test | slow (studies, page) | failed | docs | web | lint | typecheck |
-# lowest | newest. Everything lives in .venv; PYTHON picks another interpreter.
+# make install | demo | quick | test | test-extensions | slow (studies, page) | failed | docs | web |
+# lint | typecheck | lowest | newest. Everything lives in .venv; PYTHON picks another interpreter.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -14,18 +14,19 @@ QUICK := tests/protocol tests/twin/script $(TWIN:%=tests/twin/test_%.py) \
   $(filter-out %_voxels.py %_lego.py,$(wildcard tests/phantoms/test_*.py)) \
   $(filter-out %_rtk.py %_astra.py,$(wildcard tests/twin/exchange/test_*.py))
 
-.PHONY: install demo quick test slow studies page failed docs web lint typecheck lowest newest clean
+.PHONY: install demo quick test test-extensions slow studies page failed docs web lint typecheck lowest newest clean
 
 install: $(STAMP) $(TYPES)
 
-$(STAMP): pyproject.toml constraints.txt
+$(STAMP): pyproject.toml extensions/pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]' -e extensions
 	touch $@
 
 # The third-party packages that tests check flexdt against: nothing a user of the twin needs.
 $(TEST_STAMP): $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]' \
+	  -e 'extensions[test]'
 	touch $@
 
 # TypeScript and eslint for the page. Without npm's registry the tests that need them are skipped.
@@ -47,7 +48,7 @@ lint: install
 	cd .typing && ../$(BIN)/lint-imports --config ../pyproject.toml
 
 typecheck: install $(TEST_STAMP)
-	$(BIN)/mypy -p flexdt
+	$(BIN)/mypy -p flexdt -p flexdt_extensions
 
 quick: lint typecheck
 	$(BIN)/pytest -q -n 2 --dist loadfile -m 'not slow' $(QUICK)
@@ -55,6 +56,10 @@ quick: lint typecheck
 test: lint typecheck $(TEST_STAMP) $(WEB_STAMP)
 	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'not slow and not browser' \
 	  --junitxml=build/durations/test.xml
+
+# The second distribution's own tests, the long ones included.
+test-extensions: lint typecheck $(TEST_STAMP)
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder extensions/tests
 
 slow: studies page
 

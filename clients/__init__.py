@@ -1,4 +1,4 @@
-"""Python client, data set reader and command line.
+"""Python clients of the twin server, with the types of its answers and its errors.
 
 Names are looked up on first use, so that `import flexdt.clients` costs nothing.
 """
@@ -13,15 +13,36 @@ if TYPE_CHECKING:
     from flexdt.clients.client.client import TwinClient
     from flexdt.clients.client.events import Projection
     from flexdt.clients.client.transport import ConnectionLost
+    from flexdt.clients.client.twin_methods import FINAL_STATES
+    from flexdt.protocol.results import CheckResult
+    from flexdt.protocol.rpc_errors import RpcError
+    from flexdt.protocol.state_model import AxisState, JobStatus, State
 
 _HOMES = {
     "AsyncTwinClient": "flexdt.clients.client.async_client",
     "Projection": "flexdt.clients.client.events",
     "TwinClient": "flexdt.clients.client.client",
     "ConnectionLost": "flexdt.clients.client.transport",
+    "FINAL_STATES": "flexdt.clients.client.twin_methods",
+    "CheckResult": "flexdt.protocol.results",
+    "RpcError": "flexdt.protocol.rpc_errors",
+    "AxisState": "flexdt.protocol.state_model",
+    "JobStatus": "flexdt.protocol.state_model",
+    "State": "flexdt.protocol.state_model",
 }
 
-__all__ = ["AsyncTwinClient", "ConnectionLost", "Projection", "TwinClient"]
+__all__ = [
+    "FINAL_STATES",
+    "AsyncTwinClient",
+    "AxisState",
+    "CheckResult",
+    "ConnectionLost",
+    "JobStatus",
+    "Projection",
+    "RpcError",
+    "State",
+    "TwinClient",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,15 +1,20 @@
-"""Packages that extras of flexdt install."""
+"""Packages that extras of flexdt install, and what its extensions add."""
 
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any
+from importlib.metadata import entry_points
+from typing import Any, Final
 
 from flexdt.twin.errors import TwinError
 
+DISTRIBUTION: Final = "flexdt-extensions"
 
-def package(name: str, what: str = "this format", extra: str = "io") -> Any:
-    """The package or module `name` of an extra, which `what` needs.
+
+def package(
+    name: str, what: str = "this format", extra: str = "io", distribution: str = "flexdt"
+) -> Any:
+    """The package or module `name` of a distribution's extra, which `what` needs.
 
     Raises:
         TwinError: it is not installed.
@@ -18,6 +23,28 @@ def package(name: str, what: str = "this format", extra: str = "io") -> Any:
         return import_module(name)
     except ImportError:
         raise TwinError(
-            f"{what} needs {name}, which is not installed: pip install 'flexdt[{extra}]'",
+            f"{what} needs {name}, which is not installed: pip install '{distribution}[{extra}]'",
             {"missing": name},
         ) from None
+
+
+def offered(name: str, group: str) -> Any:
+    """What an installed distribution offers under an entry point, or None."""
+    for point in entry_points(group=group, name=name):
+        return point.load()
+    return None
+
+
+def extension(name: str, what: str, group: str = "flexdt.extensions") -> Any:
+    """What `flexdt-extensions` offers under an entry point, which `what` needs.
+
+    Raises:
+        TwinError: the distribution is not installed.
+    """
+    found = offered(name, group)
+    if found is None:
+        raise TwinError(
+            f"{what} needs {DISTRIBUTION}, which is not installed: pip install {DISTRIBUTION}",
+            {"missing": DISTRIBUTION},
+        )
+    return found

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.clients.datasets.data_set import DataSet
-from flexdt.clients.scenario import ScenarioImages, check_rays, within_pixels
+from flexdt.clients.extras import extension
 from flexdt.machines import machine as machine_of
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import Channel, chain_through, channels, scatter_object
@@ -39,7 +39,7 @@ from flexdt.twin.physics.chain import (
 )
 from flexdt.twin.physics.exposure import Counts, ExposureSettings, frame_rng
 from flexdt.twin.physics.panel import Panel, panel_of
-from flexdt.twin.physics.radiograph import Radiograph, radiographs
+from flexdt.twin.physics.radiograph import Radiograph, check_rays, radiographs, within_pixels
 from flexdt.twin.physics.scatter.simulation import (
     Beam,
     ScanScatter,
@@ -161,7 +161,7 @@ def simulate(
             `voxel_mm`, a mesh, or a list of them; see `flexdt.phantoms.samples.as_phantom`.
         geometry: of the views, in the sample's frame; it gives the pixels' pitch.
             Without one the sample is the path of a CTSimU scenario, which says everything but
-            `noise`; its `truth` then is a `ScenarioImages`.
+            `noise`; `flexdt-extensions` does it.
         tube: default: 90 kV, 50 W; filters and focal spot that it leaves open are the machine's.
         detector: default: the machine's, else the twin's panel with the geometry's pixels.
         noise: seed, >= 0; None for the expectation. Image i has a random generator of its own,
@@ -202,7 +202,9 @@ def simulate(
                 "no geometry; allowed without one: the path of a CTSimU scenario, and noise",
                 {"asked": None},
             )
-        return ScenarioImages(sample, noise, 3 if rays is None else rays).dataset()
+        scenario = extension("scenario", "a CTSimU scenario")
+        made: DataSet = scenario(sample, noise, 3 if rays is None else rays)
+        return made
     rays = 1 if rays is None else rays
     if not isinstance(scatter, ScatterSettings) and scatter not in get_args(Scatter):
         asked = str(scatter)

@@ -12,6 +12,8 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any, Final
 
+from flexdt import moved
+
 if TYPE_CHECKING:
     from flexdt import phantoms as phantoms
     from flexdt.analysis import align as align
@@ -51,6 +53,7 @@ if not os.path.isdir(os.path.join(__path__[0], "twin")):
     # In a clone the other parts lie beside this folder, and Python that is started there finds it
     # before any flexdt that is installed.
     __path__.append(os.path.dirname(__path__[0]))
+moved.watch()
 
 _HOMES: Final = {
     "AsyncTwinClient": "flexdt.clients",

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from flexdt.clients.datasets.data_set import DataSet
-from flexdt.clients.studies.figures import require_plots
+from flexdt.clients.figures import require_plots
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.script import CheckReport, ScanPlan
 

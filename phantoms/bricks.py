@@ -3,7 +3,7 @@
 A seat is a position where a bead can be glued: touching the roof of the cavity anywhere on half the
 stud pitch, or touching a wall at one of three heights. Seats inside a tube, through a wall or where
 a stud of the brick below comes up are left out. Bricks are at least two studs wide. The choice
-among the seats is `flexdt.twin.calibration.design.bead_search`.
+among the seats is `flexdt_extensions.phantom_design.bead_search`.
 
 The LEGO bead phantom of thesis 6.5.1 is five hollow 3 x 2 bricks with one 2 mm bead in each.
 Dimensions come from `data/lego.toml`, which labels each as thesis, literature or assumed; they must

@@ -18,6 +18,8 @@ from types import ModuleType
 import pytest
 import yaml
 
+from flexdt import moved
+
 ROOT = Path(__file__).resolve().parents[1]
 CODE = ("protocol", "twin", "phantoms", "server", "clients")
 FOLDERS = ("flexdt", *CODE)
@@ -61,9 +63,8 @@ def test_all_folders_are_typed() -> None:
     assert all((ROOT / folder / "py.typed").is_file() for folder in FOLDERS)
 
 
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("wheel")
+def built(out: Path, place: str) -> Path:
+    """The wheel of the project in the folder `place` of the repository."""
     # A copy, because setuptools writes build/ and egg-info beside the sources.
     source = out / "source"
     tracked = subprocess.run(
@@ -71,16 +72,21 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
         cwd=ROOT, capture_output=True, check=True,
     ).stdout.decode().split("\0")  # fmt: skip
     for name in filter(None, tracked):
-        if name.split("/")[0] in (*FOLDERS, "pyproject.toml", "README.md", "LICENSE"):
+        if name.split("/")[0] in (*FOLDERS, "extensions", "pyproject.toml", "README.md", "LICENSE"):
             target = source / name
             target.parent.mkdir(parents=True, exist_ok=True)
             if (ROOT / name).is_file():
                 target.write_bytes((ROOT / name).read_bytes())
     subprocess.run(
         [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), "."],
-        cwd=source, check=True, capture_output=True,
+        cwd=source / place, check=True, capture_output=True,
     )  # fmt: skip
     return next(out.glob("*.whl"))
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return built(tmp_path_factory.mktemp("wheel"), ".")
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +132,20 @@ def test_the_wheel_holds_only_flexdt(wheel: Path) -> None:
         next(n.split("/")[0] for n in names if n.endswith(".dist-info/METADATA")),
     }
     assert not [n for n in names if "__pycache__" in n or n.endswith((".nbi", ".nbc", ".ts"))]
+
+
+@pytest.mark.slow
+def test_the_wheel_of_the_extensions_holds_only_them(tmp_path: Path) -> None:
+    files = zipfile.ZipFile(built(tmp_path, "extensions"))
+    names = files.namelist()
+    (about,) = (name.split("/")[0] for name in names if name.endswith(".dist-info/METADATA"))
+    assert {name.split("/")[0] for name in names} == {"flexdt_extensions", about}
+    package = ROOT / "extensions" / "flexdt_extensions"
+    modules = {p.relative_to(package.parent).as_posix() for p in package.rglob("*.py")}
+    assert {name for name in names if name.endswith(".py")} == modules
+    points = files.read(f"{about}/entry_points.txt").decode()
+    assert "[flexdt.commands]" in points
+    assert f"{about}/licenses/LICENSE" in names
 
 
 @pytest.mark.slow
@@ -295,6 +315,8 @@ def test_the_image_is_built_from_every_folder_of_the_package() -> None:
 def test_one_version_everywhere() -> None:
     with (ROOT / "pyproject.toml").open("rb") as file:
         version = tomllib.load(file)["project"]["version"]
+    with (ROOT / "extensions" / "pyproject.toml").open("rb") as file:
+        assert tomllib.load(file)["project"]["version"] == version
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert str(citation["version"]) == version
     changelog = (ROOT / "CHANGELOG.md").read_text()
@@ -339,3 +361,13 @@ def test_code_lines_are_counted_without_blanks_comments_and_docstrings() -> None
         '"""What\nfor."""\n\n# why\nx = [\n    1,\n]\n\ndef f():\n    """Says."""\n    return x\n'
     )
     assert count(source) == len(["x = [", "1,", "]", "def f():", "return x"])
+
+
+@pytest.mark.parametrize("old", moved.MOVED)
+@pytest.mark.parametrize("statement", ["import {old}", "from {package} import {module}"])
+def test_an_import_path_that_moved_names_the_new_one(old: str, statement: str) -> None:
+    package, _, module = old.rpartition(".")
+    with pytest.raises(ModuleNotFoundError) as raised:
+        exec(statement.format(old=old, package=package, module=module), {})
+    assert f"{old} has moved to {moved.MOVED[old]}" in str(raised.value)
+    assert importlib.util.find_spec(moved.MOVED[old]) is not None

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy import stats
 
 from flexdt.clients.calibration.calibrate import Outcome
-from flexdt.clients.studies.figures import (
+from flexdt.clients.figures import (
     Series,
     arrows,
     ellipse_plot,

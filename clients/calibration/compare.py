@@ -147,7 +147,7 @@ def write_comparison(comparison: Comparison, out: Path) -> None:
 
     import tifffile
 
-    from flexdt.clients.studies.figures import Series, image_under, page, plot, table
+    from flexdt.clients.figures import Series, image_under, page, plot, table
 
     out.mkdir(parents=True, exist_ok=True)
     for k, frame in enumerate(comparison.frames):

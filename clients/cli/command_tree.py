@@ -6,22 +6,19 @@ Command modules import what they need inside their functions, so building the tr
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 import typer
 
+from flexdt.clients.cli import extension_commands
 from flexdt.clients.cli.commands.data_sets import (
-    batch_command,
     calibrate_commands,
     exchange_commands,
     expose_command,
     reconstruct_command,
-    simulate_command,
-    study_command,
 )
 from flexdt.clients.cli.commands.processes import (
-    bench_command,
     demo_command,
     doctor_command,
     process_commands,
@@ -63,14 +60,10 @@ COMMANDS: Final[Mapping[str, Callable[..., object]]] = {
     "align": calibrate_commands.align,
     "compare": calibrate_commands.compare,
     "expose": expose_command.expose,
-    "simulate": simulate_command.simulate,
     "reconstruct": reconstruct_command.reconstruct,
     "export": exchange_commands.export,
     "import": exchange_commands.import_,
-    "study": study_command.study,
-    "batch": batch_command.batch,
     "follow": follow_command.follow,
-    "bench": bench_command.bench,
     "doctor": doctor_command.doctor,
 }
 """Name -> what it runs, in the order of the help page."""
@@ -82,7 +75,6 @@ GROUPS: Final[Mapping[str, tuple[str, Mapping[str, Callable[..., object]]]]] = {
         {
             "list": phantom_command.list_phantoms,
             "make": phantom_command.make,
-            "design": phantom_command.design,
         },
     ),
     "machine": (
@@ -101,8 +93,13 @@ NUMBERS_WITH_SIGN: Final = ("jog", "clock")
 """Commands whose arguments may begin with a minus."""
 
 
-def build() -> typer.Typer:
-    """The whole command line."""
+def build(words: Sequence[str] | None = None) -> typer.Typer:
+    """The whole command line.
+
+    Args:
+        words: of the command line, after the program's name: of other distributions' commands the
+            one that is named is loaded, the others are listed. None loads all.
+    """
     app = typer.Typer(
         name="flexdt",
         help="Digital twin of the FleX-ray laboratory X-ray CT scanner.",
@@ -122,12 +119,34 @@ def build() -> typer.Typer:
     for name, command in COMMANDS.items():
         context = {"ignore_unknown_options": name in NUMBERS_WITH_SIGN}
         app.command(name, context_settings=context)(_complete(command))
+    groups = {}
     for name, (about, commands) in GROUPS.items():
-        group = typer.Typer(help=about, no_args_is_help=True, add_completion=False)
+        groups[name] = typer.Typer(help=about, no_args_is_help=True, add_completion=False)
         for one, command in commands.items():
-            group.command(one)(_complete(command))
-        app.add_typer(group, name=name)
+            groups[name].command(one)(_complete(command))
+        app.add_typer(groups[name], name=name)
+    _add_others(app, groups, words)
     return app
+
+
+def _add_others(
+    app: typer.Typer, groups: Mapping[str, typer.Typer], words: Sequence[str] | None
+) -> None:
+    """Add other distributions' commands, which take no name of ours."""
+    ours = {*COMMANDS, *(f"{group} {one}" for group, (_, more) in GROUPS.items() for one in more)}
+    asked = set(extension_commands.wanted(words)) - ours - {*GROUPS}
+    for name in dict.fromkeys([*extension_commands.KNOWN, *sorted(asked)]):
+        command = extension_commands.found(name) if name in asked else None
+        group, _, one = name.rpartition(" ")
+        if group and group not in groups:
+            continue
+        place = groups[group] if group else app
+        if command is not None:
+            place.command(one)(_complete(command))
+        elif name in extension_commands.KNOWN:
+            # Whatever follows the name, the answer is how to install it.
+            bare = {"ignore_unknown_options": True, "help_option_names": list[str]()}
+            place.command(one, context_settings=bare)(extension_commands.listed(name))
 
 
 def _complete(command: Callable[..., Any]) -> Callable[..., object]:

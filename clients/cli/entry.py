@@ -33,8 +33,9 @@ def run(argv: Sequence[str]) -> int:
             "ordinary folder: `tar -cf ARCHIVE.tar DIR` copies it, `tar -xf ARCHIVE.tar` unpacks it"
         )
         return USAGE
-    command = get_command(build())
-    if COMPLETING in os.environ:  # a shell asks what could come next
+    completing = COMPLETING in os.environ  # a shell asks what could come next
+    command = get_command(build(None if completing else argv))
+    if completing:
         command.main(list(argv), prog_name="flexdt")
     try:
         # Not `main`, which takes a reader of our output that has gone for a failure.

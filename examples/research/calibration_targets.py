@@ -227,7 +227,7 @@ QUICK: Final = ("points", "noisy")
 
 def run_missing(folder: Path, found: Mapping[str, Document], images: bool) -> None:
     """Run the studies that are missing, into a folder."""
-    from flexdt.clients.studies.study import run_study
+    from flexdt_extensions.studies.study import run_study
 
     for source in dict.fromkeys(t.source for t in TARGETS if t.command.startswith("flexdt study")):
         experiment, _, fidelity = source.partition("-")

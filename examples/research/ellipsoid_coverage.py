@@ -16,9 +16,9 @@ from flexdt.twin.calibration.fit.priors import exact
 from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import Request, Scan, calibrate
-from flexdt.twin.calibration.studies.experiments import SHAPE
-from flexdt.twin.calibration.studies.rendered_runs import Rendering, exposures, line_integrals
 from flexdt.twin.projection.analytic_solids import Scene
+from flexdt_extensions.studies.experiments import SHAPE
+from flexdt_extensions.studies.rendered_runs import Rendering, exposures, line_integrals
 
 DEMO = Rendering(counts=48_000.0, blur_px=0.0, fine=1)
 """Images as the twin makes them without blur: one ray a pixel, 12 000 counts of 4 photons."""

@@ -35,21 +35,6 @@ import numpy as np
 from numba import njit, prange
 
 from flexdt.phantoms import load_phantom
-from flexdt.server.bench import rtk_peer as rtk
-from flexdt.server.bench.benchmark import Document, line_of, load, machine, to_stderr
-from flexdt.server.bench.cases import (
-    BINNED,
-    C1_SHAPE,
-    FULL,
-    NONE,
-    TILT_DEG,
-    circle,
-    noise,
-    peer_cases,
-    untuned_cases,
-)
-from flexdt.server.bench.measure import Entry, errors, interleaved, plain, timed
-from flexdt.server.bench.peers import absent
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import (
@@ -71,6 +56,21 @@ from flexdt.twin.projection.kernels import fan_kernels
 from flexdt.twin.projection.kernels.fan_types import Box as VoxelBox
 from flexdt.twin.projection.mesh import TriangleMesh
 from flexdt.twin.projection.operators import box_of, voxel_rays
+from flexdt_extensions.bench import rtk_peer as rtk
+from flexdt_extensions.bench.benchmark import Document, line_of, load, machine, to_stderr
+from flexdt_extensions.bench.cases import (
+    BINNED,
+    C1_SHAPE,
+    FULL,
+    NONE,
+    TILT_DEG,
+    circle,
+    noise,
+    peer_cases,
+    untuned_cases,
+)
+from flexdt_extensions.bench.measure import Entry, errors, interleaved, plain, timed
+from flexdt_extensions.bench.peers import absent
 
 ADJOINT = (
     "C1", "C1x36", "C1-tilt", "C2", "C3", "C2-tilt", "C3-tilt", "cone-60", "cone-60-tilt",
@@ -199,7 +199,7 @@ def cold_start() -> list[Entry]:
     """
     code = (
         "import time; t = time.perf_counter(); "
-        "from flexdt.server.bench.cases import BINNED, circle; "
+        "from flexdt_extensions.bench.cases import BINNED, circle; "
         "from flexdt.twin.projection import Volume, forward; import numpy as np; "
         "v = Volume(np.ones((8, 8, 8), np.float32), 0.1); "
         "forward(v, circle(1, BINNED), BINNED); print(time.perf_counter() - t)"

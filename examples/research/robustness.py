@@ -19,9 +19,9 @@ from ellipsoid_coverage import CAMERAS, Draw, draw
 from spoilt_scans import WRONG_SIGMAS, Outcome, corrupt, judge
 from ways_of_spoiling import KINDS
 
-from flexdt.clients.batch.executors import executor
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import bead_model
+from flexdt_extensions.batch.executors import executor
 
 PHANTOMS = ("lego", "normal-5", "normal-4", "square-5")
 """Scanned in turn; with three beads or fewer nobody can say which of them is off."""

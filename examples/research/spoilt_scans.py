@@ -18,12 +18,12 @@ from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.fit.image_quantities import axis_in_image, image_quantities
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import Calibration, Scan, calibrate
-from flexdt.twin.calibration.studies.experiments import SHAPE, scenario
-from flexdt.twin.calibration.studies.rendered_runs import Rendering, exposures, line_integrals
-from flexdt.twin.calibration.studies.runs import errors_of
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection.analytic_solids import Scene
+from flexdt_extensions.studies.experiments import SHAPE, scenario
+from flexdt_extensions.studies.rendered_runs import Rendering, exposures, line_integrals
+from flexdt_extensions.studies.runs import errors_of
 
 WRONG_SIGMAS: Final = 4.0
 

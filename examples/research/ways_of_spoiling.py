@@ -19,13 +19,13 @@ from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.fit.priors import ASSUMED
 from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.pipeline import Request
-from flexdt.twin.calibration.studies.experiment_4_images import moved_beads
-from flexdt.twin.calibration.studies.experiments import SHAPE
-from flexdt.twin.calibration.studies.rendered_runs import Rendering
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection.analytic_solids import Box, Scene, Solid, Sphere
+from flexdt_extensions.studies.experiment_4_images import moved_beads
+from flexdt_extensions.studies.experiments import SHAPE
+from flexdt_extensions.studies.rendered_runs import Rendering
 
 FRAMES: Final = 36
 

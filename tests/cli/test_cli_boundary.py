@@ -76,7 +76,6 @@ def test_positions_of_script_errors_are_printed() -> None:
         ["up", "--tls-cert", "x"],
         ["up", "--log-level", "foo"],
         ["twin", "--projector", "host:1", "--projector-port", "2"],
-        ["study", "real", "--seed", "-1"],
         ["twin", "--projector", "nowhere:port"],
         ["projector", "--memory-limit", "much"],
     ],
@@ -204,7 +203,6 @@ def test_each_process_takes_its_port_by_the_name_that_up_has(
 @pytest.mark.parametrize(
     ("argv", "code", "says"),
     [
-        (["bench", "--only", "foo"], 2, "no case foo; there are: C1, "),
         (["projector", "--port", "0", "--token-file", "nope"], 1, "token file nope: No such file"),
     ],
 )

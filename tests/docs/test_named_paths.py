@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = (
     "protocol", "twin", "phantoms", "server", "clients", "examples", "tests", "docker", "docs",
-    ".ci", ".github",
+    ".ci", ".github", "extensions",
 )  # fmt: skip
 # The changelog names what there was at the time.
 PROSE = sorted(
@@ -53,7 +53,8 @@ def is_module(path: str) -> bool:
 @pytest.mark.parametrize("page", PROSE, ids=lambda p: p.stem)
 def test_named_paths_and_modules_exist(page: Path) -> None:
     text = page.read_text()
-    paths = {p for p in named_paths(text) if not list(ROOT.glob(p.rstrip("/")))}
+    places = ROOT, page.parent
+    paths = {p for p in named_paths(text) if not any(list(o.glob(p.rstrip("/"))) for o in places)}
     assert paths == set(), f"{page.relative_to(ROOT)} names what is not in the repository"
     bare = {name for name in BARE.findall(text) if name not in FILES}
     assert bare == set(), f"{page.relative_to(ROOT)} names files that are nowhere"

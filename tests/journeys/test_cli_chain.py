@@ -110,8 +110,6 @@ def test_compare_is_within_after_and_not_before(flexdt: Run, dataset: Path, tmp_
         (["calibrate", "/nowhere", "--phantom", "normal-5"], 1, "/nowhere"),
         (["calibrate", "{data}"], 2, "--phantom"),
         (["compare", "/nowhere", "--phantom", "normal-5"], 1, "/nowhere"),
-        (["study", "everything"], 2, "everything"),
-        (["study", "beads", "--fidelity", "perfect"], 2, "perfect"),
     ],
 )
 def test_refusals(flexdt: Run, dataset: Path, words: list[str], code: int, says: str) -> None:
@@ -119,26 +117,3 @@ def test_refusals(flexdt: Run, dataset: Path, words: list[str], code: int, says:
     assert found == code, err
     assert says in err
     assert out == "" or code == 5
-
-
-def test_study_in_small(flexdt: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The command's own part: its document is what run_study gives, and summary.json is it."""
-    from flexdt.clients.studies import study as body
-
-    full = body.run_study
-
-    def small(*words: object, **options: object) -> dict[str, object]:
-        return full(*words, counts=(5,), **options)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(body, "run_study", small)
-    code, out, _ = flexdt("study", "damping", "--out", tmp_path, "--jobs", 1, "--json")
-    assert code == 0
-    document = json.loads(out)
-    assert document == json.loads((tmp_path / "summary.json").read_text())
-    assert (document["experiment"], document["fidelity"]) == ("damping", "points")
-    settings = [row["setting"] for row in document["rows"]]
-    assert len(settings) == 4
-    assert all(row["success"] == row["runs"] and row["mae"] < 1e-6 for row in document["rows"])
-    code, out, _ = flexdt("study", "damping", "--jobs", 1)
-    assert code == 0
-    assert "thesis MAE" in out

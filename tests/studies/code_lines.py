@@ -1,4 +1,4 @@
-"""Code lines of the wheel by folder: no blank lines, comments or docstrings.
+"""Code lines by folder, of flexdt, its extensions and the page: no blanks, comments, docstrings.
 
     python tests/studies/code_lines.py [ROOT]
 
@@ -10,12 +10,16 @@ from __future__ import annotations
 
 import ast
 import io
+import re
 import sys
 import tokenize
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 FOLDERS = ("flexdt", "protocol", "twin", "phantoms", "server", "clients")
+EXTENSIONS = ("extensions/flexdt_extensions",)
+PAGE = "clients/viewer/web"
 _LAYOUT = {
     tokenize.COMMENT,
     tokenize.NL,
@@ -42,11 +46,19 @@ def code_lines(source: str) -> int:
     return len(lines)
 
 
-def by_folder(root: Path) -> dict[str, tuple[int, int]]:
+def typescript_lines(source: str) -> int:
+    """Number of lines of TypeScript that are neither blank nor comment alone."""
+    bare = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
+    return sum(
+        bool(line.strip()) and not line.strip().startswith("//") for line in bare.split("\n")
+    )
+
+
+def by_folder(root: Path, folders: Sequence[str] = FOLDERS) -> dict[str, tuple[int, int]]:
     """Folder -> (modules, code lines), relative to `root`, in the order of their names."""
     modules: Counter[str] = Counter()
     lines: Counter[str] = Counter()
-    for folder in FOLDERS:
+    for folder in folders:
         for path in (root / folder).rglob("*.py"):
             name = path.parent.relative_to(root).as_posix()
             modules[name] += 1
@@ -56,11 +68,14 @@ def by_folder(root: Path) -> dict[str, tuple[int, int]]:
 
 def main() -> None:
     root = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).resolve().parents[2]
-    table = by_folder(root)
-    for name, (modules, lines) in table.items():
-        print(f"{name:34}{modules:5}{lines:8}")
-    modules, lines = (sum(column) for column in zip(*table.values(), strict=True))
-    print(f"{'total':34}{modules:5}{lines:8}")
+    for what, folders in (("core", FOLDERS), ("extensions", EXTENSIONS)):
+        table = by_folder(root, folders)
+        for name, (modules, lines) in table.items():
+            print(f"{name:44}{modules:5}{lines:8}")
+        modules, lines = (sum(column) for column in zip(*table.values(), strict=True))
+        print(f"{what:44}{modules:5}{lines:8}\n")
+    page = [path.read_text("utf-8") for path in (root / PAGE).glob("*.ts")]
+    print(f"{'TypeScript':44}{len(page):5}{sum(map(typescript_lines, page)):8}")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Geometric calibration from a bead phantom: detect, identify, fit, certify, predict."""
 
-from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
+from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model, spot_radii
 from flexdt.twin.calibration.detect.detection import Detections, SpotFinder, detect_beads
 from flexdt.twin.calibration.fit.certificate import Certificate, Estimate
 from flexdt.twin.calibration.fit.fit import (
@@ -10,10 +10,17 @@ from flexdt.twin.calibration.fit.fit import (
     require_identifiable,
 )
 from flexdt.twin.calibration.fit.identifiability import Prediction, identifiability, visible_beads
-from flexdt.twin.calibration.fit.problem import EIGHT, SIX, Centre, Reading
+from flexdt.twin.calibration.fit.problem import (
+    EIGHT,
+    SIX,
+    Centre,
+    Reading,
+    build_problem,
+    edge_factor,
+)
 from flexdt.twin.calibration.fit.solver import LEAST_SQUARES, Solver
-from flexdt.twin.calibration.fit.weak_directions import Direction
-from flexdt.twin.calibration.identify import Identification, Search, identify_beads
+from flexdt.twin.calibration.fit.weak_directions import Direction, tolerance_of
+from flexdt.twin.calibration.identify import Identification, Search, identify_beads, overlapping
 
 __all__ = [
     "EIGHT",
@@ -34,11 +41,16 @@ __all__ = [
     "Solver",
     "SpotFinder",
     "bead_model",
+    "build_problem",
     "detect_beads",
+    "edge_factor",
     "estimate_geometry",
     "fit_geometry",
     "identifiability",
     "identify_beads",
+    "overlapping",
     "require_identifiable",
+    "spot_radii",
+    "tolerance_of",
     "visible_beads",
 ]

@@ -4,3 +4,12 @@ Every reader returns a `ScanGeometry` in the project's frame, every writer takes
 the poses and offsets behind it). A geometry that a format cannot represent is an error.
 `flexdt.clients.datasets.exchange` reads and writes the files.
 """
+
+from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
+from flexdt.twin.exchange.geometry_json import read_json
+
+__all__ = [
+    "ExchangeError",
+    "ScanGeometry",
+    "read_json",
+]

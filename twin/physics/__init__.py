@@ -1,1 +1,67 @@
 """From path lengths to counts, as the scanner makes them: tube, materials, panel, image quality."""
+
+from flexdt.twin.physics.chain import (
+    FWHM,
+    Chain,
+    blurred,
+    expected_signal,
+    flux_of,
+    read_out,
+    spot_blur_px,
+    weights_of,
+)
+from flexdt.twin.physics.effective import EffectiveBeam, effective_beam
+from flexdt.twin.physics.exposure import (
+    Counts,
+    ExposureSettings,
+    detector_model,
+    expose,
+    frame_rng,
+    open_beam,
+)
+from flexdt.twin.physics.panel import Panel, panel_of
+from flexdt.twin.physics.radiograph import check_rays, within_pixels
+from flexdt.twin.physics.scatter.simulation import Beam, ScanScatter, ScatterSettings, scan_scatter
+from flexdt.twin.physics.scintillator import deposited
+from flexdt.twin.physics.spectrum import (
+    Filter,
+    Spectrum,
+    TubeModel,
+    monochromatic,
+    tube_of,
+    tube_spectrum,
+)
+
+__all__ = [
+    "FWHM",
+    "Beam",
+    "Chain",
+    "Counts",
+    "EffectiveBeam",
+    "ExposureSettings",
+    "Filter",
+    "Panel",
+    "ScanScatter",
+    "ScatterSettings",
+    "Spectrum",
+    "TubeModel",
+    "blurred",
+    "check_rays",
+    "deposited",
+    "detector_model",
+    "effective_beam",
+    "expected_signal",
+    "expose",
+    "flux_of",
+    "frame_rng",
+    "monochromatic",
+    "open_beam",
+    "panel_of",
+    "read_out",
+    "scan_scatter",
+    "spot_blur_px",
+    "tube_of",
+    "tube_spectrum",
+    "weights_of",
+    "within_pixels",
+]

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
+from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.physics.chain import (
     Chain,
@@ -21,6 +23,8 @@ from flexdt.twin.physics.chain import (
 )
 from flexdt.twin.physics.exposure import ExposureSettings
 from flexdt.twin.physics.scatter.simulation import Scattered
+
+MOST_RAYS: Final = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,3 +86,27 @@ def _as_line_integrals(
     lines = np.log(np.maximum(np.float32(area) * flux_of(view, expected.mean_e.shape), least))
     lines -= np.log(np.maximum(expected.mean_e, least))
     return np.asarray(lines, dtype=np.float32)
+
+
+def check_rays(rays: int) -> None:
+    """Check a number of rays along each side of a pixel.
+
+    Raises:
+        LimitError: says what is allowed.
+    """
+    if not isinstance(rays, int | np.integer) or rays not in range(1, MOST_RAYS + 1):
+        raise LimitError(
+            f"rays is {rays}; allowed: 1 to {MOST_RAYS} along each side of a pixel",
+            {"asked": rays, "allowed": [1, MOST_RAYS]},
+        )
+
+
+def within_pixels(rows: FloatArray, rays: int) -> FloatArray:
+    """Views through a point in each of rays x rays parts of the pixels of each view, (n * rays^2,
+    12): no two in one row or column, so that edges along them come out in rays^2 steps."""
+    j, i = np.divmod(np.arange(rays**2)[:, None], rays)
+    across = (i + (j + 0.5) / rays) / rays - 0.5
+    down = (j + (rays - i - 0.5) / rays) / rays - 0.5
+    out = np.repeat(rows[:, None], rays**2, axis=1)
+    out[:, :, 3:6] += across * rows[:, None, 6:9] + down * rows[:, None, 9:12]
+    return out.reshape(-1, 12)

@@ -5,6 +5,7 @@ with `warm_up`.
 """
 
 from flexdt.twin.projection.analytic import project_materials, project_scene, warm_up
+from flexdt.twin.projection.analytic_solids import Box, Ellipsoid, Scene, Solid, Sphere
 from flexdt.twin.projection.bodies import Body, project_body
 from flexdt.twin.projection.geometry_gradient import geometry_change, geometry_gradient
 from flexdt.twin.projection.linear_operator import Operator
@@ -14,8 +15,13 @@ from flexdt.twin.projection.volume import Grid, Volume, as_volume, room_like
 
 __all__ = [
     "Body",
+    "Box",
+    "Ellipsoid",
     "Grid",
     "Operator",
+    "Scene",
+    "Solid",
+    "Sphere",
     "TriangleMesh",
     "Volume",
     "as_volume",

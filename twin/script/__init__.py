@@ -1,6 +1,7 @@
 """Acquila scan scripts: text to typed commands to a plan, each step plain data."""
 
 from flexdt.twin.script.commands import Script, Wait
+from flexdt.twin.script.compose import ScanRequest, compose_script
 from flexdt.twin.script.parse import parse_script, read_script
 from flexdt.twin.script.planning.dry_run import (
     CheckReport,
@@ -28,6 +29,7 @@ __all__ = [
     "Problem",
     "SampleSize",
     "ScanPlan",
+    "ScanRequest",
     "Script",
     "ScriptError",
     "StartState",
@@ -35,6 +37,7 @@ __all__ = [
     "Wait",
     "check_plan",
     "check_script",
+    "compose_script",
     "html_report",
     "parse_script",
     "plan_poses",

@@ -12,8 +12,8 @@ from flexdt.twin.calibration.detect.detection import Detections, detect_beads
 from flexdt.twin.calibration.detect.refine import measure_beads
 from flexdt.twin.calibration.detect.windows import crop, lattice, plan_windows
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, without_repeats
-from flexdt.twin.calibration.studies.experiments import SHAPE, scenario
-from flexdt.twin.calibration.studies.rendered_runs import Rendering, exposures, line_integrals
+from flexdt_extensions.studies.experiments import SHAPE, scenario
+from flexdt_extensions.studies.rendered_runs import Rendering, exposures, line_integrals
 
 SIDE = 61
 NOISE = 0.01

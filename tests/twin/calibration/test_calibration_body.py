@@ -14,8 +14,8 @@ import pytest
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import Calibration, Scan, calibrate
-from flexdt.twin.calibration.studies.experiments import SHAPE, scenario
 from flexdt.twin.projection.analytic_solids import Box, Scene, Solid, Sphere
+from flexdt_extensions.studies.experiments import SHAPE, scenario
 
 BEADS = np.array(
     [[7.0, 2.0, -16.0], [-6.0, 6.0, -7.0], [-5.0, -7.0, 2.0], [6.0, -6.0, 9.0], [0.0, 7.5, 17.0]]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from calibration_images import radiographs
+from calibration_scenarios import PIXEL, SHAPE, scenario
 
 from flexdt.phantoms import Phantom, bead_phantom, lego_phantom, load_phantom
 from flexdt.twin.calibration.bead_model import bead_model
@@ -15,9 +17,6 @@ from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.poses import Poses
-
-from .images import radiographs
-from .scenarios import PIXEL, SHAPE, scenario
 
 STEP_U, STEP_V = np.array([PIXEL, 0.0, 0.0]), np.array([0.0, 0.0, -PIXEL])
 

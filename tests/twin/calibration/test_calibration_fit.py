@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from calibration_scenarios import SCENARIOS, SHAPE, exact_tracks, scenario, spiral
 from numpy.testing import assert_allclose
 
 from flexdt.twin.calibration import (
@@ -21,8 +22,6 @@ from flexdt.twin.errors import NotIdentifiableError, TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
-
-from .scenarios import SCENARIOS, SHAPE, exact_tracks, scenario, spiral
 
 NORMAL = (20, 40, 60)
 

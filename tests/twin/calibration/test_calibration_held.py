@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from calibration_images import radiographs
+from calibration_scenarios import SHAPE, exact_tracks, scenario, spiral
 from spoilt_scans import careful_scan
 
 from flexdt.phantoms import load_phantom
@@ -16,9 +18,6 @@ from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibra
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
-
-from .images import radiographs
-from .scenarios import SHAPE, exact_tracks, scenario, spiral
 
 TRUTH = {"dO_x": 0.5, "dO_y": -0.2, "dO_z": 0.8, "alpha": 2.0, "tau_x": -0.2, "tau_z": 0.5}
 LEGO = load_phantom("lego")

@@ -6,39 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calibration_scenarios import exact_tracks, scenario, shadows, spiral
 from numpy.testing import assert_array_equal
 
 from flexdt.twin.calibration import BeadModel
-from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.frame_source import nothing
 from flexdt.twin.calibration.identify import assign, identify, identify_beads
 from flexdt.twin.errors import TwinError
-from flexdt.twin.geometry.conventions import FloatArray
-
-from .scenarios import SHAPE, exact_tracks, scenario, spiral
-
-
-def shadows(
-    tracks: FloatArray, seed: int, *, missing: float = 0.0, false: int = 0, noise: float = 0.05
-) -> list[Detections]:
-    """Detections in random order, some left out, some invented."""
-    rng = np.random.default_rng(seed)
-    rows, cols = SHAPE
-    out = []
-    for frame in tracks:
-        inside = ((frame > 10) & (frame < [cols - 11, rows - 11])).all(axis=1)
-        places = frame[inside & (rng.random(len(frame)) >= missing)]
-        places = places + noise * rng.normal(size=places.shape)
-        places = np.concatenate([places, rng.uniform([0, 0], [cols, rows], (false, 2))])
-        rng.shuffle(places)
-        k = len(places)
-        out.append(
-            Detections(
-                places, np.tile(0.01 * np.eye(2), (k, 1, 1)), np.full(k, 15.0), np.full(k, 3.0),
-                np.zeros(k), np.ones(k, dtype=bool), np.ones(k), SHAPE,
-            )
-        )  # fmt: skip
-    return out
 
 
 @pytest.mark.parametrize(

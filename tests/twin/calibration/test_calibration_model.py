@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calibration_scenarios import SHAPE, exact_tracks, scenario, spiral
 from numpy.testing import assert_allclose
 
 from flexdt.twin.calibration import BeadModel, Centre, Reading
@@ -13,8 +14,6 @@ from flexdt.twin.calibration.fit.problem import build_problem, layout, to_printe
 from flexdt.twin.calibration.fit.weak_directions import Direction, advise
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.offsets import NAMES, Offsets
-
-from .scenarios import SHAPE, exact_tracks, scenario, spiral
 
 RNG = np.random.default_rng(7)
 

@@ -8,14 +8,13 @@ from typing import Any
 import motion_during_scan as study
 import numpy as np
 import pytest
+from calibration_scenarios import scenario
 from scipy import linalg
 
 from flexdt.twin.calibration.fit.fitted_motion import _Mixed
 from flexdt.twin.calibration.pipeline import Request
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.motion import MOVABLE, Motion
-
-from .scenarios import scenario
 
 
 @pytest.mark.parametrize("kind", sorted(study.ASKED))

@@ -79,7 +79,7 @@ def calibrate(
     from flexdt.clients.calibration.calibrate import calibrate_datasets
     from flexdt.clients.calibration.calibration_report import write_report
     from flexdt.clients.calibration.markers import Scale
-    from flexdt.clients.studies.figures import require_plots
+    from flexdt.clients.figures import require_plots
 
     request = _request(
         phantom, free, per_scan, per_frame, reading, bead_tolerance, prior, bound, start
@@ -250,7 +250,7 @@ def compare(
     and after the correction that calibration finds. Exit code 1 above the tolerance.
     """
     from flexdt.clients.calibration.compare import compare_folder, write_comparison
-    from flexdt.clients.studies.figures import require_plots
+    from flexdt.clients.figures import require_plots
 
     if out is not None:
         require_plots()

@@ -171,11 +171,13 @@ def scan_of(
 
 
 def _workers(scheduler: str | None, slurm: Path | None) -> AbstractContextManager[Executor] | None:
-    from flexdt.clients.batch.executors import dask_executor, read_slurm, slurm_executor
+    from flexdt.clients.extras import extension
 
-    if slurm is not None:
-        return slurm_executor(read_slurm(slurm))
-    return None if scheduler is None else dask_executor(scheduler)
+    if scheduler is None and slurm is None:
+        return None
+    name, asked = ("slurm", slurm) if scheduler is None else ("scheduler", scheduler)
+    workers: AbstractContextManager[Executor] = extension(name, f"--{name}")(asked)
+    return workers
 
 
 def _shape(text: str) -> tuple[int, int, int]:

@@ -1,4 +1,4 @@
-"""`flexdt phantom {list,make,design}`: the phantoms that ship, and new ones as files.
+"""`flexdt phantom {list,make}`: the phantoms that ship, and new ones as files.
 
 A phantom file is JSON and may be named wherever `--phantom` is.
 """
@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import json as json_text
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import typer
 
-from flexdt import machines
-from flexdt.clients.cli import option_values, options
+from flexdt.clients.cli import option_values
 from flexdt.clients.cli.console import note, table
 from flexdt.clients.cli.options import Answer, argument, option
 from flexdt.clients.failure import CommandError
@@ -72,69 +71,6 @@ def make(
         note(f"assumed: {line}")
     yield {"file": str(file), "stl": stl, **_summary(made.name, made)}
     yield f"{file}: {made.description}"
-
-
-def design(
-    beads: int = option(5, "Beads to place.", metavar="K"),
-    grid: Literal["lego", "free"] = option("lego", "Seats in bricks, or anywhere."),
-    bricks: int = option(5, "lego: bricks in the stack."),
-    studs: str = option("3x2", "lego: of a brick.", metavar="NxM"),
-    per_brick: int | None = option(None, "lego: most beads in one brick.", min=1),
-    size: str = option("20,40,60", "free: width, breadth, height [mm].", metavar="W,B,H"),
-    radius: float = option(1.0, "Bead radius.", metavar="MM"),
-    body: str = option("abs", "free: block.", metavar="MATERIAL"),
-    bead: str = option("steel", metavar="MATERIAL"),
-    position: list[str] | None = option(None, "One for each scan [mm].", metavar="SOD[:LATERAL]"),
-    sdd: float = option(1059.0, metavar="MM"),
-    frames: int = option(360, "Of each scan.", min=1),
-    plan: Path | None = option(None, "A scan script instead of positions.", metavar="SCRIPT"),
-    free: options.Free = None,
-    noise: float = option(0.1, "Of a position.", metavar="PX"),
-    tolerance: float = option(0.0, "How well beads will sit.", "--bead-tolerance", metavar="MM"),
-    criterion: Literal["a", "d", "worst"] = option("a", "What is minimised."),
-    trials: int = option(60, "Fits that check it.", min=0),
-    seed: int = option(1, "Same seed, same design."),
-    out: Path | None = option(None, "Instruction, STL, phantom file.", metavar="DIR"),
-    machine: options.MachineName = None,
-    profile: options.ProfileName = None,
-) -> Answer:
-    """Choose bead places that determine the geometry best, and say how to build it."""
-    from flexdt.clients.calibration import phantom_design as work
-    from flexdt.phantoms.bricks import Brickwork
-    from flexdt.twin.calibration.design.information_table import PlannedScans
-    from flexdt.twin.calibration.fit.problem import SIX
-
-    scanner = machines.machine(machine)
-    if plan is not None:
-        offsets = machines.profile(profile, scanner, machine)
-        poses, shape = work.script_poses(
-            plan.read_bytes().decode("utf-8", "surrogateescape"), scanner, offsets
-        )
-    else:
-        places = [option_values.position(word) for word in position] if position else [(600.0, 0.0)]
-        poses, shape = work.circle_poses(scanner, places, sdd, frames)
-    if not (noise > 0 and tolerance >= 0 and radius > 0):
-        raise typer.BadParameter("--noise and --radius must be positive, --bead-tolerance >= 0")
-    scans = PlannedScans(poses, shape, noise, option_values.names(free) if free else SIX, tolerance)
-    request = work.DesignRequest(
-        beads, radius, bead, per_brick, criterion, seed=seed, trials=trials
-    )
-    if grid == "lego":
-        stack = Brickwork(_studs(studs), bricks)
-        holder = work.BeadHolder(stack, stack.size_mm)
-    else:
-        holder = work.BeadHolder(None, _size(size), body)
-    document = work.run_design(holder, scans, request, out=out, tell=note)
-    yield document
-    yield table(work.table_rows(document), work.HEADER)
-    yield f"\n{work.verdict(document)}"
-    if out is not None:
-        yield (f"building instruction: {out / 'build.html'}; phantom: {out / 'phantom.json'}")
-
-
-def _studs(text: str) -> tuple[int, int]:
-    n, m = map(int, option_values.numbers(text, "studs", "NxM, e.g. 3x2", 2, by="x", whole=True))
-    return n, m
 
 
 def _size(text: str) -> tuple[float, float, float]:

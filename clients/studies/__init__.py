@@ -1,1 +1,0 @@
-"""The thesis's experiments run on several processes, and their reports."""

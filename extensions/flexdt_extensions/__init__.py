@@ -1,0 +1,1 @@
+"""What is built on flexdt's public names: each subpackage is one subject and stands by itself."""

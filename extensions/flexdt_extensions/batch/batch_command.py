@@ -1,0 +1,112 @@
+"""`flexdt batch`: thousands of scans or calibrations from a plan, here or on a cluster."""
+
+from __future__ import annotations
+
+import time
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from flexdt.extending import (
+    Answer,
+    CommandError,
+    Jobs,
+    Scheduler,
+    argument,
+    free_bytes,
+    note,
+    option,
+    size,
+    table,
+)
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+EVERY_S = 2.0
+"""Between lines of progress."""
+
+
+def batch(
+    plan: Path = argument(..., "PLAN.toml"),
+    out: Path | None = option(None, "Of results; the plan's name if left out.", metavar="DIR"),
+    jobs: Jobs = None,
+    scheduler: Scheduler = None,
+    slurm: int | None = option(None, "So many SLURM jobs.", metavar="JOBS", min=1),
+    slurm_script: bool = option(False, "Print the SLURM job's script and leave.", "--slurm-script"),
+    cores: int = option(4, "Of a SLURM job.", "--slurm-cores", min=1),
+    memory: str = option("8GiB", "Of a SLURM job.", "--slurm-memory"),
+    walltime: str = option("01:00:00", "Of a SLURM job.", "--slurm-time", metavar="HH:MM:SS"),
+    queue: str | None = option(None, "Of a SLURM job.", "--slurm-queue", metavar="PARTITION"),
+    account: str | None = option(None, "Of a SLURM job.", "--slurm-account"),
+    extra: list[str] | None = option(
+        None, "Such as --gres=gpu:1; repeat.", "--slurm-extra", metavar="DIRECTIVE"
+    ),
+    setup: list[str] | None = option(
+        None, "Before workers start; repeat.", "--slurm-setup", metavar="COMMAND"
+    ),
+) -> Answer:
+    """Make a batch of scans or calibrations; run again to take up an interrupted one.
+
+    Results are Zarr arrays and a manifest with every item's seed, parameters and checksums; they
+    are the same bytes whatever the number of processes.
+    """
+    from flexdt_extensions.batch.batch_plan import read_plan
+    from flexdt_extensions.batch.batch_run import run_batch
+    from flexdt_extensions.batch.executors import (
+        Slurm,
+        dask_executor,
+        job_script,
+        processes,
+        slurm_executor,
+    )
+    from flexdt_extensions.batch.work import item_bytes
+
+    wanted = read_plan(plan)
+    queued = Slurm(
+        slurm or 1, cores, memory, walltime, queue, account, tuple(extra or ()), tuple(setup or ())
+    )
+    if slurm_script:
+        yield job_script(queued).rstrip()
+        return
+    if scheduler is not None and slurm is not None:
+        raise typer.BadParameter("give --scheduler or --slurm, not both")
+    workers: AbstractContextManager[Executor]
+    if slurm is not None:
+        workers = slurm_executor(queued)
+    else:
+        workers = dask_executor(scheduler) if scheduler is not None else processes(jobs)
+    folder = Path(wanted.batch.name) if out is None else out
+    if folder.exists() and not folder.is_dir():
+        raise CommandError(f"{folder}: is a file")
+    whole, free = wanted.batch.items * item_bytes(wanted), free_bytes(folder)
+    more = f"; {size(free)} are free" if whole > free else ""
+    note(f"{wanted.batch.items} items, {size(whole)} before compression{more}")
+    last = 0.0
+
+    def tell(done: int, items: int, rate: float) -> None:
+        nonlocal last
+        if time.monotonic() - last >= EVERY_S or done == items:
+            last = time.monotonic()
+            left = (items - done) / rate if rate > 0 else 0.0
+            note(f"{done}/{items} items, {rate:.2f} a second, {left:.0f} s left")
+
+    summary = run_batch(wanted, folder, workers, tell=tell)
+    yield summary
+    rate = summary["items_per_s"]
+    pace = "" if rate is None else f", {rate:g} a second"
+    yield (
+        f"{summary['done']} of {summary['items']} items done, {summary['failed']} failed, "
+        f"{summary['resumed']} taken up{pace}"
+    )
+    found = summary["figures"]
+    if found:
+        yield f"{found['identifiable']} of {found['judged']} calibrations are identifiable"
+        rows = [
+            (name, f"{f['mae']:.4g}", f"{f['rms_pull']:.3g}", f"{100 * f['within_95']:.1f} %")
+            for name, f in found["parameters"].items()
+        ]
+        yield table(rows, ("parameter", "MAE", "error/sigma", "within 1.96 sigma"))
+    yield f"{folder / 'manifest.json'}: items {summary['items_sha256'][:16]}"

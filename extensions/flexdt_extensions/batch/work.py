@@ -1,0 +1,421 @@
+"""One item of a batch: plan and index in, arrays and figures out. Any process can do it alone.
+
+An item that fails becomes an outcome that states the reason. No files are read or written.
+
+The plan's draws take their values from the item's own seed: item i draws from
+`SeedSequence(seed).spawn(items)[i]`, which any process can make by itself, so items come out the
+same in any order and with any number of processes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.phantoms import Phantom, bead_phantom, load_phantom, material
+from flexdt.phantoms.channels import chain_through, channels, line_integrals
+from flexdt.phantoms.materials import stated_keV
+from flexdt.twin.calibration import FitResult, bead_model, estimate_geometry
+from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.machine.camera import CameraSettings, Roi
+from flexdt.twin.machine.description import Machine, builtin_machine
+from flexdt.twin.physics import (
+    Chain,
+    ExposureSettings,
+    detector_model,
+    expected_signal,
+    expose,
+    open_beam,
+    panel_of,
+    read_out,
+    tube_of,
+)
+from flexdt.twin.projection import Scene, Solid, Sphere, Volume, project_body
+from flexdt.twin.reconstruction import fdk
+from flexdt_extensions.batch.batch_plan import Cuboid, Plan, Spheres, parse_plan
+
+VALUES, NOISE, SHAPES = 0, 1, 2
+"""Streams of an item's seed: scalar draws in the plan's order, noise, the phantom's parts."""
+TRIES: Final = 2000
+"""How often a sphere is placed anew before a phantom counts as impossible."""
+
+
+def seed_of(plan: Plan, index: int, *stream: int) -> np.random.SeedSequence:
+    """The seed of item `index`, or of one of its streams."""
+    return np.random.SeedSequence(plan.batch.seed, spawn_key=(index, *stream))
+
+
+@dataclass(frozen=True, eq=False)
+class Item:
+    """One item, ready to be computed.
+
+    Attributes:
+        index: which.
+        phantom: what is scanned.
+        poses: nominal.
+        truth: hidden offsets, true minus nominal.
+        shape: detector (rows, cols).
+        machine, camera: None for a made-up detector's camera.
+        exposure: tube and time.
+        noise_px, counts: of calibrations.
+        parameters: everything drawn, JSON-able.
+    """
+
+    index: int
+    phantom: Phantom
+    poses: Poses
+    truth: Offsets
+    shape: tuple[int, int]
+    machine: Machine
+    camera: CameraSettings | None
+    exposure: ExposureSettings
+    noise_px: float
+    counts: float
+    parameters: dict[str, Any]
+
+
+def draw_item(plan: Plan, index: int) -> Item:
+    """What item `index` of a plan is.
+
+    Raises:
+        TwinError: a draw that no phantom or machine can be, e.g. beads that do not fit.
+    """
+    rng = np.random.default_rng(seed_of(plan, index, VALUES))
+    g, images, calibrate = plan.geometry, plan.images, plan.calibrate
+    drawn: dict[str, Any] = {
+        name: getattr(g, name).sample(rng)
+        for name in ("sod_mm", "sdd_mm", "height_mm", "lateral_mm", "start_deg")
+    }
+    drawn |= {name: getattr(images, name).sample(rng) for name in ("kV", "power_W", "exposure_ms")}
+    drawn |= {name: getattr(calibrate, name).sample(rng) for name in ("noise_px", "counts")}
+    errors = {name: float(plan.errors[name].sample(rng)) for name in sorted(plan.errors)}
+    phantom, described = _phantom(plan, index, rng)
+    machine = builtin_machine(plan.camera.machine)
+    camera, shape, pixel, shift = _camera(plan, machine)
+    turn = math.radians(g.turn_deg) * np.arange(g.frames) / g.frames
+    poses = Poses.upright(
+        [0, 0, 0],
+        [drawn["lateral_mm"], drawn["sod_mm"], drawn["height_mm"]],
+        [shift[0], drawn["sdd_mm"], -shift[1]],
+        pixel,
+        math.radians(drawn["start_deg"]) + turn,
+    )
+    exposure = ExposureSettings(
+        drawn["kV"], drawn["power_W"], drawn["exposure_ms"], plan.images.averages
+    )
+    parameters = {"phantom": described, **drawn, "errors": errors}
+    return Item(
+        index, phantom, poses, Offsets.from_edge(errors), shape, machine, camera, exposure,
+        float(drawn["noise_px"]), float(drawn["counts"]), parameters,
+    )  # fmt: skip
+
+
+def detector_shape(plan: Plan) -> tuple[int, int]:
+    """(rows, cols) of every image of a plan.
+
+    Raises:
+        TwinError: no such machine, mode or ROI.
+    """
+    return _camera(plan, builtin_machine(plan.camera.machine))[1]
+
+
+def _camera(
+    plan: Plan, machine: Machine
+) -> tuple[CameraSettings | None, tuple[int, int], float, tuple[float, float]]:
+    wanted = plan.camera
+    if wanted.shape is not None and wanted.pixel_mm is not None:
+        return None, (wanted.shape[0], wanted.shape[1]), wanted.pixel_mm, (0.0, 0.0)
+    standard, sensor = machine.detector.camera, machine.detector.sensor
+    roi = standard.roi if wanted.roi is None else Roi(*wanted.roi)
+    camera = replace(
+        standard, mode=wanted.mode or standard.mode, roi=roi, averages=plan.images.averages
+    )
+    if not (
+        0 <= roi.left <= roi.right < sensor.columns and 0 <= roi.top <= roi.bottom < sensor.rows
+    ):
+        raise TwinError(
+            f"camera.roi {list(roi.edges)} does not lie on the sensor of {sensor.columns} x "
+            f"{sensor.rows} pixels",
+            {"asked": list(roi.edges), "allowed": [0, 0, sensor.columns - 1, sensor.rows - 1]},
+        )
+    return camera, camera.shape, camera.pixel_mm(sensor), camera.roi_shift_mm(sensor)
+
+
+def _phantom(plan: Plan, index: int, rng: np.random.Generator) -> tuple[Phantom, dict[str, Any]]:
+    table = plan.phantom
+    if table.name is not None:
+        name = table.name.sample(rng)
+        return load_phantom(name), {"name": name}
+    if table.cuboid is not None:
+        return _cuboid(table.cuboid, rng)
+    assert table.spheres is not None
+    parts = np.random.default_rng(seed_of(plan, index, SHAPES))
+    return _spheres(table.spheres, rng, parts)
+
+
+def _cuboid(table: Cuboid, rng: np.random.Generator) -> tuple[Phantom, dict[str, Any]]:
+    values = {name: getattr(table, name).sample(rng) for name in type(table).model_fields}
+    size = tuple(float(values[f"{side}_mm"]) for side in ("width", "breadth", "height"))
+    made = bead_phantom(
+        size, int(values["beads"]), bead_radius_mm=float(values["bead_radius_mm"]),
+        body_material=values["body_material"], bead_material=values["bead_material"],
+    )  # fmt: skip
+    return made, {"name": made.name, **values}
+
+
+def _spheres(
+    table: Spheres, rng: np.random.Generator, parts: np.random.Generator
+) -> tuple[Phantom, dict[str, Any]]:
+    wide, high = table.within_radius_mm, table.within_height_mm / 2.0
+    solids: list[Solid] = []
+    listed: list[dict[str, Any]] = []
+    for number in range(int(table.count.sample(rng))):
+        radius = float(table.radius_mm.sample(parts))
+        made_of = material(table.material.sample(parts))
+        center = _place(radius, wide, high, [s.shape for s in solids], parts)
+        if center is None:
+            raise TwinError(
+                f"sphere {number + 1} of {radius:.3g} mm found no free place in a cylinder of "
+                f"{wide:g} mm radius and {2 * high:g} mm height in {TRIES} tries",
+                {"asked": radius, "allowed": [wide, high]},
+            )
+        solids.append(Solid(Sphere(center, radius), made_of.name, made_of.mu_per_mm))
+        listed.append({"center_mm": list(center), "radius_mm": radius, "material": made_of.name})
+    size = (2.0 * wide, 2.0 * wide, 2.0 * high)
+    phantom = Phantom(f"spheres-{len(solids)}", "random spheres", Scene(tuple(solids)), size)
+    return phantom, {"name": phantom.name, "spheres": listed}
+
+
+def _place(
+    radius: float, wide: float, high: float, others: list[Any], rng: np.random.Generator
+) -> tuple[float, float, float] | None:
+    if radius > wide or radius > high:
+        return None
+    for _ in range(TRIES):
+        distance = (wide - radius) * math.sqrt(rng.uniform())
+        turn = rng.uniform(0.0, 2.0 * math.pi)
+        at = (distance * math.cos(turn), distance * math.sin(turn),
+              rng.uniform(-(high - radius), high - radius))  # fmt: skip
+        if all(math.dist(at, o.center) >= radius + o.radius for o in others):
+            return at
+    return None
+
+
+Array = npt.NDArray[Any]
+Counts = npt.NDArray[np.uint16]
+
+
+@dataclass(frozen=True, eq=False)
+class ItemOutcome:
+    """What came of an item.
+
+    Attributes:
+        index: which.
+        record: its line in the manifest: seed, parameters, status, figures, sha256 of each array.
+        arrays: name -> values, as `layout` says.
+    """
+
+    index: int
+    record: dict[str, Any]
+    arrays: Mapping[str, Array] = field(default_factory=dict)
+
+
+def layout(plan: Plan) -> dict[str, tuple[tuple[int, ...], str]]:
+    """Arrays of every item of a plan: name -> (shape, dtype).
+
+    Raises:
+        TwinError: no such machine, mode or ROI.
+    """
+    frames = plan.geometry.frames
+    out: dict[str, tuple[tuple[int, ...], str]] = {
+        "cone_vec_nominal": ((frames, 12), "<f8"),
+        "cone_vec_true": ((frames, 12), "<f8"),
+    }
+    if plan.batch.kind == "projections":
+        dtype = "<u2" if plan.images.values == "counts" else "<f4"
+        out["projections"] = ((frames, *detector_shape(plan)), dtype)
+        if plan.reconstruct is not None:
+            z, y, x = plan.reconstruct.shape
+            out["volumes"] = ((z, y, x), "<f4")
+    return out
+
+
+def item_bytes(plan: Plan) -> int:
+    """Size of one item's arrays before compression."""
+    return sum(
+        math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in layout(plan).values()
+    )
+
+
+@lru_cache(maxsize=4)
+def _plan(text: str) -> Plan:
+    return parse_plan(json.loads(text))
+
+
+def run_item(text: str, index: int) -> ItemOutcome:
+    """Compute one item.
+
+    Args:
+        text: the plan, as `Plan.text`.
+        index: which item.
+    """
+    plan = _plan(text)
+    record: dict[str, Any] = {
+        "index": index,
+        "seed": {"entropy": plan.batch.seed, "spawn_key": [index]},
+    }
+    try:
+        item = draw_item(plan, index)
+        record["parameters"] = item.parameters
+        arrays, figures = _MAKERS[plan.batch.kind](plan, item)
+    except TwinError as error:
+        return ItemOutcome(index, {**record, "status": "failed", "error": str(error)})
+    kept: dict[str, Array] = {
+        "cone_vec_nominal": item.poses.cone_vec().rows,
+        "cone_vec_true": item.poses.cone_vec(item.truth).rows,
+        **arrays,
+    }
+    wanted = layout(plan)
+    kept = {name: np.ascontiguousarray(kept[name], dtype=wanted[name][1]) for name in wanted}
+    sums = {name: hashlib.sha256(values.tobytes()).hexdigest() for name, values in kept.items()}
+    return ItemOutcome(index, {**record, "status": "done", **figures, "sha256": sums}, kept)
+
+
+# -- projections -----------------------------------------------------------------------------------
+
+
+def _projections(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, Any]]:
+    cone = item.poses.cone_vec(item.truth)
+    if plan.images.physics == "ideal":
+        images = _ideal(plan, item, cone)
+    else:
+        images = _physical(plan, item, cone)
+    arrays: dict[str, Array] = {"projections": images}
+    if plan.reconstruct is not None:
+        want = plan.reconstruct
+        z, y, x = want.shape
+        like = Volume(np.zeros((z, y, x), np.float32), want.voxel_mm)
+        geometry = cone if want.geometry == "true" else item.poses.cone_vec()
+        arrays["volumes"] = fdk(images, geometry, like, window=want.window).data
+    return arrays, {}
+
+
+def _rng(plan: Plan, item: Item, frame: int) -> np.random.Generator | None:
+    if not plan.images.noise:
+        return None
+    return np.random.default_rng(seed_of(plan, item.index, NOISE, frame))
+
+
+def _ideal(plan: Plan, item: Item, cone: ConeVec) -> Array:
+    lines = line_integrals(item.phantom, cone, item.shape)
+    if plan.images.values == "line_integrals" and not plan.images.noise:
+        return lines
+    model = detector_model(item.machine)
+    counts = [
+        expose(model, image, item.exposure, _rng(plan, item, i)) for i, image in enumerate(lines)
+    ]
+    if plan.images.values == "counts":
+        return np.stack(counts)
+    bright = np.float32(open_beam(model, item.exposure))
+    return np.stack([_logarithm(c, np.float32(model.dark_counts), bright) for c in counts])
+
+
+def _logarithm(counts: Counts, dark: np.float32, bright: np.float32 | Float32Array) -> Float32Array:
+    """-ln((counts - dark) / open beam); no count above dark is taken as half a one."""
+    above = np.maximum(counts.astype(np.float32) - dark, np.float32(0.5))
+    return np.asarray(-np.log(above / bright), dtype=np.float32)
+
+
+def _physical(plan: Plan, item: Item, cone: ConeVec) -> Array:
+    assert item.camera is not None
+    parts = channels(item.phantom)
+    panel, tube = panel_of(item.machine.detector), tube_of(item.machine.tube)
+    mono_keV = stated_keV() if plan.images.physics == "mono" else None
+    chain = chain_through(parts, panel, tube, mono_keV)
+    paths = np.stack([project_body(part.body, cone, item.shape) for part in parts])
+    nothing = Chain(panel, tube, mono_keV=chain.mono_keV)
+    empty = np.empty((0, *item.shape), dtype=np.float32)
+    dark = np.float32(panel.offset_counts)
+    images: list[Array] = []
+    for i, row in enumerate(cone.rows):
+        expected = expected_signal(chain, paths[:, i], row, item.exposure)
+        counts = read_out(panel, expected, item.camera, item.exposure, _rng(plan, item, i))
+        if plan.images.values == "counts":
+            images.append(counts)
+            continue
+        # As the laboratory does it: an open-beam image of the same pose, free of noise.
+        beam = expected_signal(nothing, empty, row, item.exposure)
+        flat = read_out(panel, beam, item.camera, item.exposure)
+        bright = np.maximum(flat.astype(np.float32) - dark, np.float32(0.5))
+        images.append(_logarithm(counts, dark, bright))
+    return np.stack(images)
+
+
+# -- calibrations ----------------------------------------------------------------------------------
+
+
+def _calibrations(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, Any]]:
+    model = bead_model(item.phantom)
+    free = tuple(plan.calibrate.free)
+    if plan.calibrate.fidelity == "points":
+        tracks = item.poses.cone_vec(item.truth).project_points(model.beads, item.shape)
+        rng = np.random.default_rng(seed_of(plan, item.index, NOISE))
+        noisy = tracks + item.noise_px * rng.normal(size=tracks.shape)
+        fit = estimate_geometry(
+            noisy, model, item.poses, free, shape=item.shape, noise_px=item.noise_px
+        )
+        return {}, _judged(fit, item, free, fit.identifiable, "")
+    from flexdt.twin.calibration.pipeline import Request, Scan, calibrate
+    from flexdt_extensions.studies.rendered_runs import Rendering, render
+
+    camera = Rendering(counts=item.counts, blur_px=plan.calibrate.blur_px)
+    key = [int(v) for v in seed_of(plan, item.index, NOISE).generate_state(4)]
+    frames = render(item.phantom.scene, model, item.poses, item.truth, camera, key, item.shape)
+    result = calibrate(
+        [Scan(frames, item.poses)], model, Request(free=free), scene=item.phantom.scene
+    )
+    note = "; ".join(f.text for f in result.errors)
+    return {}, _judged(result.fit, item, free, result.identifiable, note)
+
+
+def _judged(
+    fit: FitResult | None, item: Item, free: tuple[str, ...], identifiable: bool, note: str
+) -> dict[str, Any]:
+    """Errors against the truth, in edge units, of the parameters that the data determine."""
+    truth = item.truth.to_edge()
+    estimates = {} if fit is None else fit.certificate.estimates
+    values, errors, sigmas = {}, {}, {}
+    for name in free:
+        found = estimates.get(name) if identifiable else None
+        value = None if found is None else _finite(found.value)
+        values[name] = value
+        errors[name] = None if value is None else value - truth[name]
+        sigmas[name] = None if found is None else _finite(found.sigma)
+    return {
+        "identifiable": bool(identifiable),
+        "values": values,
+        "errors": errors,
+        "sigmas": sigmas,
+        "rms_px": None if fit is None else _finite(fit.certificate.rms_px),
+        "iterations": 0 if fit is None else int(fit.iterations),
+        "note": note,
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+_MAKERS = {"projections": _projections, "calibrations": _calibrations}

@@ -1,0 +1,23 @@
+"""`flexdt bench`: runs the project's own benchmarks, which are a separate program."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from flexdt.extending import Json, become, names, option
+
+
+def bench(
+    out: Path | None = option(None, "bench.json.", metavar="DIR"),
+    only: str | None = option(None, "These cases only.", metavar="NAME,NAME,..."),
+    no_peers: bool = option(False, "Do not run other projectors.", "--no-peers"),
+    quick: bool = option(False, "C1 and C1-tilt alone.", "--quick"),
+    list_: bool = option(False, "Name the cases, measure nothing.", "--list"),
+    device: bool = option(False, "A CUDA device and its targets, beside ASTRA.", "--device"),
+    json: Json = False,
+) -> None:
+    """Measure speed and accuracy, beside the peers that are installed."""
+    given = {"out": out, "no-peers": no_peers, "quick": quick, "list": list_, "json": json}
+    given["device"] = device
+    more = [] if only is None else ["--only", *names(only)]
+    become("flexdt_extensions.bench", given, more)

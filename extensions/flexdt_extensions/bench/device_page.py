@@ -1,0 +1,229 @@
+"""`flexdt bench --device`: a CUDA device beside ASTRA on it, the processor and what it could do at
+best, each line of the targets for a GPU. Makes one document and one page; needs a device.
+
+Kernels are timed by the device's own events, with everything there; calls by the clock, from arrays
+of the host to arrays of the host. ASTRA's data are on the device, too. The bound is the larger of
+reading the volume once and of 16 instructions for each voxel that a ray passes.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from flexdt.measuring import box_of, gpu, gpu_astra, voxel_rays
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.projection import Volume, back, forward
+from flexdt_extensions.bench.cases import BINNED, C1_SHAPE, circle, noise
+from flexdt_extensions.bench.measure import errors, exact_images, interleaved
+
+SIZES = {"C1": (C1_SHAPE, 0.1), "512^3": ((512,) * 3, 0.1), "1024^3": ((1024,) * 3, 0.05)}
+COUNTS = (1, 36, 360)
+"""Views a call."""
+PANEL = BINNED
+FDK_VIEWS = 1434
+ROUNDS = 5
+BESIDE_S = 2.0
+"""`back` and the processor's, each at least."""
+INSTRUCTIONS = 16
+"""For a voxel that a ray passes, at best."""
+AGAINST_ASTRA = {"C1": (2, 0.20, 0.15), "512^3": (2, 0.45, 0.30), "1024^3": (1, 0.40, 0.28)}
+"""Which of COUNTS, and the shares of ASTRA's time that are to be accepted and wanted."""
+OF_THE_BOUND = {"C1": (0.25, 0.45), "512^3": (0.30, 0.50), "1024^3": (0.80, 1.00)}
+Document = dict[str, Any]
+
+
+def on_the_clock(work: Callable[[], object], rounds: int = ROUNDS) -> float:
+    """Best of a few calls [ms], the device's work included; the first is not counted."""
+    from numba import cuda
+
+    best = math.inf
+    for i in range(rounds + 1):
+        start = time.perf_counter()
+        work()
+        cuda.synchronize()
+        best = min(best, (time.perf_counter() - start) * 1e3) if i else best
+    return best
+
+
+def by_events(work: Callable[[], object]) -> float:
+    """Best of a few launches [ms], by the device's events; the first is not counted."""
+    from numba import cuda
+
+    best = math.inf
+    for i in range(ROUNDS + 1):
+        start, end = cuda.event(), cuda.event()
+        start.record()
+        work()
+        end.record()
+        end.synchronize()
+        best = min(best, start.elapsed_time(end)) if i else best
+    return best
+
+
+def run_device_bench(tell: Callable[[str], None]) -> Document:
+    """Measure everything on the device that was found: {device, cases, targets}."""
+    lines: list[Document] = []
+
+    def line(what: str, value: float | None, accepted: float, wanted: float, sign: int = 1) -> None:
+        met = "not measured" if value is None else "missed"
+        if value is not None and sign * value <= sign * accepted:
+            met = "wanted" if sign * value <= sign * wanted else "accepted"
+        entry = {"target": what, "accepted": accepted, "wanted": wanted, "measured": value}
+        lines.append({**entry, "met": met})
+        tell(row(lines[-1]))
+
+    cases = {name: case(name, tell) for name in SIZES}
+    most, some = COUNTS[-1], COUNTS[1]
+    for name, seen in cases.items():
+        top, middle = seen[most], seen[some]
+        which, accepted, wanted = AGAINST_ASTRA[name]
+        views, beside = COUNTS[which], seen[COUNTS[which]]
+        astra = beside["astra_ms"]
+        share = None if astra is None else beside["kernel_ms"] / astra
+        line(f"{name}: forward kernel / ASTRA, {views} views", share, accepted, wanted)
+        part = None if top["bound_ms"] is None else top["bound_ms"] / top["kernel_ms"]
+        line(f"{name}: part of the bound, {most} views", part, *OF_THE_BOUND[name], sign=-1)
+        copy, kernel = middle["image_bytes"] / 1e6, middle["kernel_ms"]
+        limits = 1.5 * kernel + copy / 15, max(kernel, copy / 50)
+        line(f"{name}: {some} views end to end [ms]", middle["call_ms"], *limits)
+        line(f"{name}: adjoint / forward kernel", middle["adjoint_ms"] / kernel, 2.0, 1.5)
+        alone = seen[COUNTS[0]]
+        for views, entry in ((COUNTS[0], alone), (some, middle)):
+            ratio = entry["back_call_ms"] / entry["back_processor_ms"]
+            line(f"{name}: back of {views} views / the processor's", ratio, 1.0, 1.0)
+        ratio = middle["back_there_ms"] / middle["adjoint_ms"]
+        line(f"{name}: back on the device / its kernel", ratio, 1.1, 1.1)
+        line(f"{name}: mean error", alone["mean_error"], 3e-7, 2e-7)
+        line(f"{name}: worst error", alone["worst_error"], 3e-6, 2e-6)
+    first = cases[next(iter(SIZES))]
+    line("C1: one view end to end [ms]", first[COUNTS[0]]["call_ms"], 0.4, 0.2)
+    further(line, cases)
+    named = {name: {str(n): e for n, e in seen.items()} for name, seen in cases.items()}
+    return {"device": gpu.availability().reason, "cases": named, "targets": lines}
+
+
+def case(name: str, tell: Callable[[str], None]) -> dict[int, Document]:
+    """One volume, by the number of views a call; times in ms for the whole call."""
+    shape, voxel = SIZES[name]
+    volume = noise((shape[0], shape[1], shape[2]), voxel)
+    there, seen = volume.to("cuda"), {}
+    for views in COUNTS:
+        scan = circle(views, PANEL)
+        images: Any = forward(there, scan, PANEL)
+        out = np.empty((views, *PANEL), np.float32)
+        flat, box = images.reshape(images.size), box_of(there.layout)
+        rays, voxels = voxel_rays(scan, there.layout, PANEL), there.layout.flat
+        ahead = gpu.launcher(box, voxels, rays, flat, PANEL, transposed=False)
+        sums = gpu.zeros(voxels.size)
+        behind = gpu.launcher(box, sums, rays, flat, PANEL, transposed=True)
+        entry: Document = {
+            "kernel_ms": by_events(ahead),
+            "adjoint_ms": by_events(behind),
+            "call_ms": on_the_clock(partial(forward, volume, scan, PANEL, out)),
+            "back_there_ms": on_the_clock(partial(back, images, scan, volume)),
+            "image_bytes": out.nbytes,
+            "bound_ms": bound(volume, scan),
+            "astra_ms": astra_ms(volume, scan, "FP3D_CUDA"),
+        }
+        if views < COUNTS[-1]:  # as the call chooses by itself, and on the processor, in turns
+            work = partial(back, out, scan, volume)
+            both = {"back_call_ms": work, "back_processor_ms": gpu.switched_off()(work)}
+            times = interleaved(both, budget_s=BESIDE_S)
+            entry |= {key: spent.best * 1e3 for key, spent in times.items()}
+        if views == COUNTS[0]:
+            with gpu.switched_off():
+                entry["processor_ms"] = on_the_clock(partial(forward, volume, scan, PANEL, out))
+            exact = exact_images(volume, scan, PANEL)
+            entry["mean_error"], entry["worst_error"] = errors(images.copy_to_host(), exact)
+        seen[views] = entry
+        tell(f"{name} {views} views: {entry}")
+    return seen
+
+
+def further(line: Callable[..., None], cases: dict[str, dict[int, Document]]) -> None:
+    """FDK and SIRT onto the second volume's grid."""
+    from numba import cuda
+
+    from flexdt.measuring import gpu_fdk_kernels, view_table
+    from flexdt.twin.reconstruction import fdk, sirt
+
+    name = list(SIZES)[1]
+    (nz, ny, nx), voxel = SIZES[name]
+    like = Volume(np.zeros((nz, ny, nx), np.float32), voxel)
+    scan, block = circle(COUNTS[-1], PANEL), gpu_fdk_kernels.BLOCK
+    columns = cuda.device_array(len(scan) * PANEL[1] * PANEL[0], np.float32)
+    arrays = (
+        columns,
+        PANEL[1],
+        PANEL[0],
+        *(cuda.to_device(a) for a in (view_table(scan, PANEL), *np.full((2, 3), voxel))),
+    )
+    grid = (-(-nz // (block[0] * gpu_fdk_kernels.RUN)), -(-nx // block[1]), ny)
+    target = cuda.device_array((ny, nx, nz), np.float32)
+    kernel = by_events(lambda: gpu_fdk_kernels.backproject[grid, (*block, 1)](*arrays, target))
+    astra = astra_ms(like, scan, "BP3D_CUDA")
+    share = None if astra is None else kernel / astra
+    line("FDK: backprojection / ASTRA BP3D", share, 1.0, 0.65)
+    scan = circle(FDK_VIEWS, PANEL)
+    images = np.zeros((FDK_VIEWS, *PANEL), np.float32)
+    spent = on_the_clock(lambda: fdk(images, scan, like), 1) / 1e3
+    line(f"FDK of {FDK_VIEWS} views, host to host [s]", spent, 2.0, 1.0)
+    scan, seen = circle(COUNTS[1], PANEL), cases[name][COUNTS[1]]
+    some = images[: COUNTS[1]]
+    times = [on_the_clock(partial(sirt, some, scan, like, iterations=n), 1) for n in (1, 3)]
+    one = (times[1] - times[0]) / 2 / (seen["kernel_ms"] + seen["adjoint_ms"])
+    line(f"SIRT, {COUNTS[1]} views: an iteration / its kernels", one, 2.0, 1.2)
+
+
+def astra_ms(volume: Volume, scan: ConeVec, algorithm: str) -> float | None:
+    """ASTRA's time with its data on the device, or None where it is not installed."""
+    try:
+        prepared = gpu_astra.Resident(volume, scan, PANEL, algorithm)
+    except ImportError:
+        return None
+    try:
+        return on_the_clock(prepared.compute)
+    finally:
+        prepared.close()
+
+
+def bound(volume: Volume, scan: ConeVec) -> float | None:
+    """The least time [ms], or None where the device does not say how fast it is (the simulator)."""
+    from numba import config, cuda
+
+    if config.ENABLE_CUDASIM:
+        return None
+    device = cuda.get_current_device()
+    half = cuda.device_array(2**28, np.float32)
+    read_ms = by_events(lambda: half.copy_to_device(half)) / 2 * volume.data.nbytes / half.nbytes
+    rays = voxel_rays(scan, volume.layout, PANEL)[:1]
+    r, c = np.mgrid[0 : PANEL[0] : 16, 0 : PANEL[1] : 16].reshape(2, -1)
+    d = rays[0, 3:6] + c[:, None] * rays[0, 6:9] + r[:, None] * rays[0, 9:12]
+    cuts = np.sort(np.stack([-rays[0, :3] / d, (volume.layout.counts - rays[0, :3]) / d]), axis=0)
+    inside = np.maximum(cuts[1].min(axis=1) - cuts[0].max(axis=1), 0.0)
+    passed = float((inside * np.abs(d).sum(axis=1)).mean()) * PANEL[0] * PANEL[1] * len(scan)
+    each_ms = device.MULTIPROCESSOR_COUNT * 4 * 32 * device.CLOCK_RATE  # kHz
+    return float(max(read_ms, INSTRUCTIONS * passed / each_ms))
+
+
+def row(line: Document) -> str:
+    """A line of the page's table."""
+    value = "-" if line["measured"] is None else f"{line['measured']:.3g}"
+    limits = f"{line['accepted']:.3g} | {line['wanted']:.3g}"
+    return f"| {line['target']} | {limits} | {value} | {line['met']} |"
+
+
+def page(document: Document) -> str:
+    """The document as one page of Markdown."""
+    head = "| target | to be accepted | wanted | measured | met |\n|---|---|---|---|---|"
+    lines = [f"# {document['device']}", "", head, *map(row, document["targets"]), ""]
+    for name, seen in document["cases"].items():
+        lines += [f"{name}, by views a call; ms for the whole call:", ""]
+        lines += [f"- {views}: {entry}" for views, entry in seen.items()] + [""]
+    return "\n".join(lines)

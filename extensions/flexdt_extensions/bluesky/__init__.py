@@ -1,0 +1,50 @@
+"""The twin as ophyd-async devices for Bluesky: axes, tube, camera, and a flyer for smooth scans.
+
+Needs the extra `lab` (ophyd-async and bluesky); names are looked up on first use, so that importing
+this package never imports them.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from flexdt.twin.errors import TwinError
+
+if TYPE_CHECKING:
+    from flexdt_extensions.bluesky.axes import LimitsExceeded as LimitsExceeded
+    from flexdt_extensions.bluesky.axes import TwinAxis as TwinAxis
+    from flexdt_extensions.bluesky.camera_device import TwinCamera as TwinCamera
+    from flexdt_extensions.bluesky.devices import TwinLab as TwinLab
+    from flexdt_extensions.bluesky.devices import TwinTube as TwinTube
+    from flexdt_extensions.bluesky.flyer import FlyScan as FlyScan
+    from flexdt_extensions.bluesky.flyer import TwinFlyer as TwinFlyer
+    from flexdt_extensions.bluesky.lab_connection import LabConnection as LabConnection
+
+_HOMES = {
+    "FlyScan": "flexdt_extensions.bluesky.flyer",
+    "LabConnection": "flexdt_extensions.bluesky.lab_connection",
+    "LimitsExceeded": "flexdt_extensions.bluesky.axes",
+    "TwinAxis": "flexdt_extensions.bluesky.axes",
+    "TwinCamera": "flexdt_extensions.bluesky.camera_device",
+    "TwinFlyer": "flexdt_extensions.bluesky.flyer",
+    "TwinLab": "flexdt_extensions.bluesky.devices",
+    "TwinTube": "flexdt_extensions.bluesky.devices",
+}
+
+__all__ = list(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        return getattr(import_module(_HOMES[name]), name)
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith("flexdt"):
+            raise
+        raise TwinError(
+            f"flexdt_extensions.bluesky needs {error.name}, which is not installed: "
+            "pip install 'flexdt-extensions[lab]'",
+            {"asked": name, "missing": error.name},
+        ) from None

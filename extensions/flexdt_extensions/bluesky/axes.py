@@ -1,0 +1,161 @@
+"""An axis of the machine: readable, movable, stoppable, and checked before anything moves.
+
+`check_value` judges a target by the machine's limits and by the twin's own plan of the path, so
+`bluesky.simulators.check_limits` and every `set` report what the scanner would reject. Positions
+have the script's sign, in mm and deg.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass
+from functools import cached_property
+
+from ophyd_async.core import (
+    MovableLogic,
+    SignalR,
+    SignalRW,
+    StandardMovable,
+    StandardReadable,
+    StandardReadableFormat,
+    TimeoutCalculator,
+)
+
+from flexdt.clients import AxisState, State
+from flexdt_extensions.bluesky.lab_connection import LabConnection, Put, TwinBackend, settable
+
+ARRIVED = 1e-6
+"""Distance from the target at which an axis has arrived [mm, deg]."""
+
+
+class LimitsExceeded(ValueError):
+    """A target that the machine does not allow: beyond a limit, or in collision on the way.
+
+    Attributes:
+        data: what was asked and what is allowed.
+    """
+
+    def __init__(self, message: str, data: dict[str, object]) -> None:
+        super().__init__(message)
+        self.data = data
+
+
+@dataclass
+class AxisLogic(MovableLogic[float]):
+    """How an axis moves."""
+
+    link: LabConnection
+    axis: str
+    collisions: bool
+
+    async def stop(self) -> None:
+        """Brake this axis."""
+        await self.link.client.jog(self.axis, 0.0)
+
+    async def check_move(self, new_position: float) -> None:
+        """Check a move from the current position to a target; nothing moves.
+
+        Raises:
+            LimitsExceeded: says which limit, or which two parts would touch.
+        """
+        state = await self.link.fresh()
+        axis = state.axes[self.axis]
+        low, high = axis.limits
+        if not low <= new_position <= high:
+            raise LimitsExceeded(
+                f"{self.axis} target {new_position:g} {axis.unit} is outside "
+                f"[{low:g}, {high:g}] {axis.unit}",
+                {"axis": self.axis, "asked": new_position, "allowed": [low, high]},
+            )
+        if not self.collisions or abs(new_position - axis.position) <= ARRIVED:
+            return
+        report = await self.link.client.check_trajectory([{self.axis: new_position}])
+        if report.collisions:
+            first = report.collisions[0]
+            raise LimitsExceeded(
+                f"{self.axis} target {new_position:g} {axis.unit}: {' and '.join(first.pair)} "
+                "would touch on the way",
+                {"axis": self.axis, "asked": new_position, "pair": list(first.pair),
+                 "last_free": dict(first.last_free)},
+            )  # fmt: skip
+
+    async def calculate_timeout(self, old_position: float, new_position: float) -> float | None:
+        """None: the twin's clock may run slowly, and it always ends a motion."""
+        return None
+
+    async def get_units_precision(self) -> tuple[str | None, int | None]:
+        """Unit, and digits for people."""
+        state = self.link.state or await self.link.fresh()
+        return state.axes[self.axis].unit, 4
+
+    async def move(self, new_position: float, timeout: TimeoutCalculator) -> None:
+        """Move there.
+
+        Raises:
+            RpcError: a limit, a collision, a running job, or another controller.
+            RuntimeError: another client stopped the axis on its way.
+        """
+        async with asyncio.timeout(timeout()):
+            await self.link.client.move({self.axis: new_position})
+            async for state in self.link.states():
+                axis = state.axes[self.axis]
+                if not axis.moving:
+                    self._arrived(axis, new_position, state)
+                    return
+
+    def _arrived(self, axis: AxisState, target: float, state: State) -> None:
+        if abs(axis.position - target) > ARRIVED:
+            why = " by the emergency stop" if state.safety.estop else ""
+            raise RuntimeError(
+                f"{self.axis} stopped{why} at {axis.position:g} {axis.unit}, "
+                f"on its way to {target:g}"
+            )
+
+
+class TwinAxis(StandardReadable, StandardMovable[float]):
+    """One motor or virtual axis.
+
+    Args:
+        link: to the twin.
+        axis: as the machine calls it, e.g. `rot_obj`.
+        unit: mm or deg.
+        name: of the device; a plan's data carry it.
+        collisions: whether `check_value` asks the twin about collisions too (some 50 ms each).
+    """
+
+    def __init__(
+        self,
+        link: LabConnection,
+        axis: str,
+        unit: str = "mm",
+        name: str = "",
+        *,
+        collisions: bool = True,
+    ) -> None:
+        self._link, self._axis, self._collisions = link, axis, collisions
+        client = link.client
+
+        def member(name: str, put: Put[float], units: str) -> SignalRW[float]:
+            return settable(link, f"axes.{axis}.{name}", float, put, units)
+
+        with self.add_children_as_readables(StandardReadableFormat.HINTED_SIGNAL):
+            position = TwinBackend(
+                link, f"axes.{axis}.position", float, units=unit,
+                limits=lambda state: state.axes[axis].limits,
+            )  # fmt: skip
+            self.readback = SignalR(position)
+        with self.add_children_as_readables(StandardReadableFormat.CONFIG_SIGNAL):
+            self.speed = member("speed", lambda v: client.set_axis(axis, speed=v), f"{unit}/s")
+            self.acceleration = member(
+                "acceleration", lambda v: client.set_axis(axis, acceleration=v), f"{unit}/s^2"
+            )
+        self.setpoint = member("target", lambda v: client.move({axis: v}), unit)
+        super().__init__(name=name)
+
+    @cached_property
+    def movable_logic(self) -> AxisLogic:
+        """How this axis moves."""
+        return AxisLogic(
+            setpoint=self.setpoint, readback=self.readback, link=self._link, axis=self._axis,
+            collisions=self._collisions,
+        )  # fmt: skip

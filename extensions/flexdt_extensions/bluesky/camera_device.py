@@ -1,0 +1,216 @@
+"""The camera as a detector: each trigger takes an image at the current pose into a TIFF file.
+
+This process writes the files into the folder that an ophyd-async path provider names, and announces
+them as stream resources. For data sets that the twin itself writes, see `flyer`.
+
+One image is in each file, and files are numbered. The documents follow bluesky's own convention for
+image sequences (mimetype `multipart/related;type=image/tiff`, a `template`, one frame in each
+chunk), so its consolidators and Tiled find the files.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from pathlib import Path, PurePath
+from typing import Final
+from urllib.parse import quote
+
+import numpy as np
+import numpy.typing as npt
+from ophyd_async.core import (
+    DetectorAcquireLogic,
+    DetectorDataLogic,
+    DetectorTriggerLogic,
+    PathProvider,
+    ReadableDataProvider,
+    SignalDataProvider,
+    SignalDict,
+    SignalR,
+    SignalRW,
+    StandardDetector,
+    StreamableDataProvider,
+    StreamResourceDataProvider,
+    StreamResourceInfo,
+    TriggerInfo,
+    soft_signal_r_and_setter,
+)
+
+from flexdt.extending import tiff_bytes, write_whole
+from flexdt_extensions.bluesky.lab_connection import LabConnection, settable
+
+MIMETYPE: Final = "multipart/related;type=image/tiff"
+
+
+def folder_uri(folder: PurePath) -> str:
+    """The URI of a folder, with the slash at its end that relative names need."""
+    return f"file://localhost{quote(folder.as_posix())}/"
+
+
+def tiff_stream(
+    data_key: str,
+    folder: PurePath,
+    template: str,
+    shape: tuple[int, int],
+    written: SignalR[int],
+) -> StreamResourceDataProvider:
+    """What announces files as they appear.
+
+    Args:
+        data_key: under which the images stand in a plan's data.
+        folder: that holds them, absolute.
+        template: of their names: `scan_{:06d}.tif`.
+        shape: (rows, columns) of an image.
+        written: counts complete files.
+    """
+    uri = folder_uri(folder)
+    resource = StreamResourceInfo(
+        data_key=data_key,
+        shape=shape,
+        chunk_shape=(1, *shape),
+        dtype_numpy="<u2",
+        parameters={"template": template, "join_method": "concat"},
+        source=uri,
+    )
+    return StreamResourceDataProvider(uri, [resource], MIMETYPE, written)
+
+
+class Roll:
+    """Where images go: a numbered file each, complete before it is counted."""
+
+    def __init__(self) -> None:
+        self.folder: Path | None = None
+        self.template = ""
+        self.written, self._set_written = soft_signal_r_and_setter(int, 0)
+        self.mean, self._set_mean = soft_signal_r_and_setter(float, 0.0)
+        self.count = 0
+
+    def load(self, folder: PurePath, filename: str) -> None:
+        """Begin a new series."""
+        self.folder = Path(folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.template = f"{filename}_{{:06d}}.tif"
+        self.count = 0
+        self._set_written(0)
+
+    async def keep(self, image: npt.NDArray[np.generic]) -> None:
+        """Write an image of counts."""
+        if self.folder is None:
+            raise RuntimeError("the camera was triggered before it was prepared")
+        file = self.folder / self.template.format(self.count)
+        await asyncio.to_thread(write_whole, file, tiff_bytes(np.asarray(image, dtype=np.uint16)))
+        self.count += 1
+        self._set_mean(float(image.mean(dtype=np.float64)))
+        self._set_written(self.count)
+
+
+class _Triggering(DetectorTriggerLogic):
+    """Exposure and number of images."""
+
+    def __init__(self, exposure_ms: SignalRW[float], config: set[SignalR[float]]) -> None:
+        self.exposure_ms, self.config, self.images = exposure_ms, config, 1
+
+    def config_sigs(self) -> set[SignalR[float]]:
+        return self.config
+
+    def get_deadtime(self, config_values: SignalDict) -> float:
+        return 0.0
+
+    async def prepare_internal(self, num: int, livetime: float, deadtime: float) -> None:
+        if livetime > 0:
+            await self.exposure_ms.set(livetime * 1000.0)
+        self.images = num
+
+    async def default_trigger_info(self) -> TriggerInfo:
+        return TriggerInfo()
+
+
+class _Acquiring(DetectorAcquireLogic):
+    """The task that takes the images; its failure reaches whoever triggered."""
+
+    def __init__(self, link: LabConnection, triggering: _Triggering, roll: Roll) -> None:
+        self.link, self.triggering, self.roll = link, triggering, roll
+
+    async def start_acquiring(self) -> None:
+        for _ in range(max(1, self.triggering.images)):
+            taken = await self.link.client.projection("counts")
+            await self.roll.keep(taken.image)
+
+    async def wait_for_idle(self) -> None:
+        pass  # `start_acquiring` returns with the last image
+
+    async def ensure_stopped(self) -> None:
+        pass
+
+
+class _Files(DetectorDataLogic):
+    """The images, as a stream of TIFF files."""
+
+    def __init__(self, link: LabConnection, where: PathProvider, roll: Roll) -> None:
+        self.link, self.where, self.roll = link, where, roll
+
+    async def prepare_unbounded(self, datakey_name: str) -> StreamableDataProvider:
+        info = self.where(datakey_name)
+        self.roll.load(info.directory_path, info.filename)
+        shape = (await self.link.fresh()).camera.shape
+        return tiff_stream(
+            datakey_name, info.directory_path, self.roll.template, shape, self.roll.written
+        )
+
+
+class _Mean(DetectorDataLogic):
+    """The image's mean, a number to plot."""
+
+    datakey_suffix = "-mean"
+
+    def __init__(self, roll: Roll) -> None:
+        self.roll = roll
+
+    async def prepare_single(self, datakey_name: str) -> ReadableDataProvider:
+        self.roll.mean.set_name(datakey_name)
+        return SignalDataProvider(self.roll.mean)
+
+    def get_hinted_fields(self, datakey_name: str) -> Sequence[str]:
+        return [datakey_name]
+
+
+class TwinCamera(StandardDetector):
+    """The camera.
+
+    Counts come as the panel gives them: X-rays off make a dark image.
+
+    Args:
+        link: to the twin.
+        where: names folder and file of each series, e.g. `StaticPathProvider`.
+        name: of the device.
+    """
+
+    def __init__(self, link: LabConnection, where: PathProvider, name: str = "") -> None:
+        client = link.client
+        self.exposure_ms = settable(
+            link, "camera.exposure_ms", float, lambda v: client.set_camera(exposure_ms=v), "ms"
+        )
+        self.averages = settable(
+            link, "camera.averages", int, lambda v: client.set_camera(averages=v)
+        )
+        self.mode = settable(link, "camera.mode", str, lambda v: client.set_camera(mode=v))
+        self.roi = settable(
+            link, "camera.roi", str, lambda v: client.set_camera(roi=_edges(v)),
+            get=lambda state: " ".join(map(str, state.camera.roi)),
+        )  # fmt: skip
+        super().__init__(name=name)
+        roll = Roll()
+        triggering = _Triggering(self.exposure_ms, {self.exposure_ms})
+        self.add_detector_logics(
+            triggering, _Acquiring(link, triggering, roll), _Files(link, where, roll), _Mean(roll)
+        )
+        self.add_config_signals(self.averages, self.mode, self.roi)
+
+
+def _edges(text: str) -> tuple[int, int, int, int]:
+    words = text.replace(",", " ").split()
+    try:
+        left, top, right, bottom = map(int, words)
+    except ValueError:
+        raise ValueError(f"ROI {text!r} is not 'LEFT TOP RIGHT BOTTOM'") from None
+    return left, top, right, bottom

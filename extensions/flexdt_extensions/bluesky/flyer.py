@@ -1,0 +1,384 @@
+"""A flyer for smooth scans: the twin runs a script as a job and writes the data set itself.
+
+`prepare` composes or takes the script and has all of it checked before anything moves; `kickoff`
+submits it; `complete` follows the job; each finished TIFF is announced as a stream datum. The
+script's images must form one series numbered from 0.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import re
+import time
+import weakref
+from collections.abc import AsyncIterator, Iterator
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+from typing import Any
+
+from bluesky.protocols import (
+    Collectable,
+    EventCollectable,
+    Flyable,
+    Pausable,
+    Preparable,
+    Reading,
+    Stoppable,
+    StreamAsset,
+    WritesStreamAssets,
+)
+from event_model import DataKey, PartialEvent
+from ophyd_async.core import (
+    AsyncConfigurable,
+    AsyncStageable,
+    AsyncStatus,
+    Device,
+    StreamResourceDataProvider,
+    WatchableAsyncStatus,
+    WatcherUpdate,
+    soft_signal_r_and_setter,
+)
+
+from flexdt.clients import FINAL_STATES, CheckResult, JobStatus, RpcError
+from flexdt.twin.errors import TwinError
+from flexdt.twin.machine.description import Machine, Profile, builtin_machine, profile_of
+from flexdt.twin.script import ScanRequest, compose_script, parse_script, plan_script
+from flexdt_extensions.bluesky.axes import LimitsExceeded
+from flexdt_extensions.bluesky.camera_device import tiff_stream
+from flexdt_extensions.bluesky.lab_connection import LabConnection
+
+
+@dataclass(frozen=True)
+class FlyScan:
+    """What a flyer is prepared for.
+
+    Attributes:
+        script: a request that the script is composed from, or a script's text or bytes.
+        name: of the data set; made up if left out.
+        speed_up: for this job.
+        seed: of the noise.
+        motion_samples: moments averaged within an exposure.
+    """
+
+    script: ScanRequest | str | bytes
+    name: str | None = None
+    speed_up: float | None = None
+    seed: int | None = None
+    motion_samples: int = 1
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    scan: FlyScan
+    text: bytes
+    report: CheckResult
+    shape: tuple[int, int]
+    template: str
+    angles_deg: tuple[float, ...]
+    times_s: tuple[float, ...]
+    exposure_ms: float
+
+
+class FrameEvents(Device, EventCollectable):
+    """Where each image of a fly scan was taken: an event an image, in the order of the images.
+
+    Streams of images have no events of their own, so `fly_scan` collects these in a stream beside.
+    """
+
+    def __init__(self, flyer: TwinFlyer) -> None:
+        self._flyer = weakref.ref(flyer)  # a device kept as a member would become a child
+        super().__init__()
+
+    async def describe_collect(self) -> dict[str, DataKey]:
+        """Angle of the stage in the middle of the image, and the planned start of its exposure."""
+        flyer = self._of()
+        source = flyer.source("script.check")
+        return {
+            f"{flyer.name}-{key}": DataKey(
+                source=source, shape=[], dtype="number", dtype_numpy="<f8", units=units
+            )
+            for key, units in (("angle_deg", "deg"), ("time_s", "s"))
+        }
+
+    def collect(self) -> Iterator[PartialEvent]:
+        """One event for each image that is complete."""
+        flyer = self._of()
+        name = flyer.name
+        for angle, start in flyer.taken():
+            now = time.time()
+            data = {f"{name}-angle_deg": angle, f"{name}-time_s": start}
+            yield PartialEvent(data=data, timestamps=dict.fromkeys(data, now), time=now)
+
+    def _of(self) -> TwinFlyer:
+        flyer = self._flyer()
+        assert flyer is not None, "a flyer outlives its events"
+        return flyer
+
+
+class TwinFlyer(
+    Device,
+    AsyncStageable,
+    AsyncConfigurable,
+    Preparable,
+    Flyable,
+    Collectable,
+    WritesStreamAssets,
+    Stoppable,
+    Pausable,
+):
+    """Smooth scans.
+
+    Args:
+        link: to the twin.
+        name: of the device; the images stand under it in a plan's data.
+        machine, profile: what scripts are composed and planned for; the server's, if they ship.
+    """
+
+    def __init__(
+        self,
+        link: LabConnection,
+        name: str = "",
+        *,
+        machine: Machine | None = None,
+        profile: Profile | None = None,
+    ) -> None:
+        self._link, self._machine, self._profile = link, machine, profile
+        self._prepared: _Prepared | None = None
+        self._images: StreamResourceDataProvider | None = None
+        self._written, self._set_written = soft_signal_r_and_setter(int, 0)
+        self.job: JobStatus | None = None
+        # A pause or stop in the middle of a submission waits for the job that it is for.
+        self._submitting = asyncio.Lock()
+        self.frames = FrameEvents(self)
+        super().__init__(name=name)
+
+    # -- verbs ---------------------------------------------------------------------------------
+
+    @AsyncStatus.wrap
+    async def stage(self) -> None:
+        """Connect; forget an earlier scan."""
+        await self._link.connect()
+        self._prepared, self._images, self.job = None, None, None
+
+    @AsyncStatus.wrap
+    async def unstage(self) -> None:
+        """Abort a scan that has not ended."""
+        await self.stop()
+
+    @AsyncStatus.wrap
+    async def prepare(self, value: FlyScan) -> None:
+        """Check a scan whole; nothing moves.
+
+        Raises:
+            LimitsExceeded: the twin would not run it; says the lines.
+            TwinError: the request cannot be composed, or the images are not one series.
+        """
+        await self._link.connect()
+        machine, profile = self._scanner()
+        script = value.script
+        if isinstance(script, ScanRequest):
+            script = compose_script(script, machine, profile)
+        text = script.encode("utf-8") if isinstance(script, str) else script
+        report = await self._link.client.check_script(text)
+        if not report.ok:
+            raise _refused(report)
+        self._prepared = _planned(value, text, report, machine, profile)
+        self._images, self.job = None, None
+        self._set_written(0)
+
+    @AsyncStatus.wrap
+    async def kickoff(self) -> None:
+        """Submit the job."""
+        ready = self._ready()
+        client, scan = self._link.client, ready.scan
+        async with self._submitting:
+            submitted = await client.submit_script(
+                ready.text, scan.name, scan.speed_up, seed=scan.seed,
+                motion_samples=scan.motion_samples,
+            )  # fmt: skip
+            self.job = await client.job_status(submitted.job)
+        folder = PurePosixPath(self.job.dataset or submitted.dataset or "/")
+        self._images = tiff_stream(self.name, folder, ready.template, ready.shape, self._written)
+        self._set_written(self.job.frames_done)
+
+    @WatchableAsyncStatus.wrap
+    async def complete(self) -> AsyncIterator[WatcherUpdate[int]]:
+        """Follow the job to its end.
+
+        Raises:
+            RuntimeError: it did not end well; its data set is marked incomplete.
+        """
+        if self.job is None:
+            raise RuntimeError(f"{self.name}: kickoff() must be called before complete()")
+        start, job = time.monotonic(), self.job.job
+        async for _ in self._link.states():
+            self.job = status = await self._link.client.job_status(job)
+            self._set_written(status.frames_done)
+            yield WatcherUpdate(
+                name=self.name, current=status.frames_done, initial=0,
+                target=status.frames_total, unit="frames", precision=0,
+                time_elapsed=time.monotonic() - start, time_remaining=status.remaining_s,
+            )  # fmt: skip
+            if status.state in FINAL_STATES:
+                break
+        if self.job.state != "done":
+            why = (self.job.error or {}).get("message", "")
+            raise RuntimeError(
+                f"{self.name}: the scan {self.job.name} ended {self.job.state} {why}"
+            )
+
+    async def pause(self) -> None:
+        """Pause the job after its current frame; one in the queue as soon as it has begun."""
+        async with self._submitting:
+            waiting = self._running()
+        if not waiting:
+            return
+        async for _ in self._link.states():
+            self.job = await self._link.client.job_status(self._job())
+            if self.job.state != "queued":
+                break
+        if self._running():
+            try:
+                await self._link.client.pause_job(self._job())
+            except RpcError:
+                self.job = await self._link.client.job_status(self._job())
+                if self._running():
+                    raise  # else it has ended meanwhile, and nothing is left to pause
+
+    async def resume(self) -> None:
+        """Let it go on."""
+        if self._running():
+            await self._link.client.resume_job(self._job())
+
+    async def stop(self, success: bool = True) -> None:
+        """Abort a scan that has not ended."""
+        async with self._submitting:
+            if self._running():
+                self.job = await self._link.client.job_status(self._job())
+                if self._running():
+                    self.job = await self._link.client.abort_job(self._job())
+
+    # -- documents -----------------------------------------------------------------------------
+
+    async def describe_collect(self) -> dict[str, DataKey]:
+        """The images."""
+        ready = self._ready()
+        return {
+            self.name: DataKey(
+                source=self.source("script.submit"),
+                shape=[1, *ready.shape], dtype="array", dtype_numpy="<u2", external="STREAM:",
+            )
+        }  # fmt: skip
+
+    def source(self, method: str) -> str:
+        """Where values of a method of the twin come from."""
+        return f"flexdt://{self._link.address}/{method}"
+
+    def taken(self) -> Iterator[tuple[float, float]]:
+        """Angle [deg] and planned start [s of the scan's clock] of the images that are complete."""
+        ready = self._ready()
+        done = 0 if self.job is None else self.job.frames_done
+        yield from list(zip(ready.angles_deg, ready.times_s, strict=True))[:done]
+
+    async def get_index(self) -> int:
+        """Frames that are complete."""
+        written: int = await self._written.get_value()
+        return written
+
+    async def collect_asset_docs(self, index: int | None = None) -> AsyncIterator[StreamAsset]:
+        """Announce the files up to `index`."""
+        if self._images is None:
+            return
+        count = await self.get_index() if index is None else index
+        async for document in self._images.make_stream_docs(count, 1):
+            yield document
+
+    async def describe_configuration(self) -> dict[str, DataKey]:
+        """What `read_configuration` reads."""
+        ready = self._ready()
+        source = self.source("script.check")
+
+        def key(dtype: Any, shape: list[int | None], kind: str, units: str | None) -> DataKey:
+            made = DataKey(dtype=dtype, shape=shape, source=source, dtype_numpy=kind)
+            if units is not None:
+                made["units"] = units
+            return made
+
+        return {
+            f"{self.name}-frames": key("integer", [], "<i8", None),
+            f"{self.name}-exposure_ms": key("number", [], "<f8", "ms"),
+            f"{self.name}-duration_s": key("number", [], "<f8", "s"),
+            f"{self.name}-angles_deg": key("array", [len(ready.angles_deg)], "<f8", "deg"),
+            f"{self.name}-script_sha256": key("string", [], "|S64", None),
+        }
+
+    async def read_configuration(self) -> dict[str, Reading[Any]]:
+        """The scan: frames, exposure, expected duration, angle of each image, script."""
+        ready, now = self._ready(), time.time()
+        values: dict[str, object] = {
+            "frames": ready.report.frames,
+            "exposure_ms": ready.exposure_ms,
+            "duration_s": ready.report.duration_s,
+            "angles_deg": list(ready.angles_deg),
+            "script_sha256": hashlib.sha256(ready.text).hexdigest(),
+        }
+        return {
+            f"{self.name}-{key}": Reading(value=value, timestamp=now)
+            for key, value in values.items()
+        }
+
+    # -- helpers -------------------------------------------------------------------------------
+
+    def _ready(self) -> _Prepared:
+        if self._prepared is None:
+            raise RuntimeError(f"{self.name}: prepare() must be called first")
+        return self._prepared
+
+    def _job(self) -> str:
+        assert self.job is not None
+        return self.job.job
+
+    def _running(self) -> bool:
+        return self.job is not None and self.job.state not in FINAL_STATES
+
+    def _scanner(self) -> tuple[Machine, Profile]:
+        server = self._link.client.server
+        machine = builtin_machine(server.machine) if self._machine is None else self._machine
+        if self._profile is not None:
+            return machine, self._profile
+        return machine, profile_of(machine, server.profile)
+
+
+def _planned(
+    scan: FlyScan, text: bytes, report: CheckResult, machine: Machine, profile: Profile
+) -> _Prepared:
+    plan = plan_script(parse_script(text), machine, profile)
+    images = [e for e in plan.exposures if e.kind == "projection"]
+    names = [e.file for e in images]
+    numbered = re.fullmatch(r"(.*?)(0+)(\.tiff?)", names[0] or "") if names else None
+    if numbered is None:
+        raise TwinError(f"a fly scan has images numbered from 0; this one has {names[:2]}")
+    template = f"{numbered[1]}{{:0{len(numbered[2])}d}}{numbered[3]}"
+    wrong = [n for i, n in enumerate(names) if n != template.format(i)]
+    if wrong:
+        raise TwinError(
+            f"a fly scan's images are one series numbered from 0; {wrong[0]} is not",
+            {"asked": wrong[0], "allowed": template},
+        )
+    shape = images[0].camera.shape
+    turning = machine.geometry["angle"]
+    angles = tuple(sum(f * float(e.positions[n]) for n, f in turning.items()) for e in images)
+    times = tuple(float(e.start_s) for e in images)
+    return _Prepared(scan, text, report, shape, template, angles, times, images[0].exposure_ms)
+
+
+def _refused(report: CheckResult) -> LimitsExceeded:
+    errors = [p for p in report.problems if p.severity == "error"]
+    lines = [f"line {p.line}: {p.message}" for p in errors[:5]]
+    more = f" (and {len(errors) - 5} more)" if len(errors) > 5 else ""
+    return LimitsExceeded(
+        "the scan was refused: " + "; ".join(lines) + more,
+        {"problems": [p.model_dump() for p in errors],
+         "collisions": [c.model_dump() for c in report.collisions]},
+    )  # fmt: skip

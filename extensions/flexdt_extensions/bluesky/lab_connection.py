@@ -1,0 +1,262 @@
+"""One connection to the twin for all of a laboratory's devices, and the newest known state.
+
+Requests go through an `AsyncTwinClient`; one subscription serves all watchers.
+
+The devices' signals are members of the twin's state: a backend reads by asking the twin, receives
+changes from the connection's subscription, and puts through a coroutine. Values are not cached.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ssl as tls
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from typing import Any, Generic, TypeVar, cast
+
+import numpy as np
+from bluesky.protocols import Reading
+from event_model import DataKey, Dtype, Limits
+from ophyd_async.core import NotConnectedError, SignalBackend, SignalRW
+
+from flexdt.clients import ConnectionLost, RpcError, State
+from flexdt.clients.client.async_client import AsyncTwinClient
+
+Watcher = Callable[[State], None]
+
+RATE_HZ = 20.0
+"""At most this many states per second reach a watcher."""
+
+PATIENCE_S = 0.1
+"""How long to wait for an event before the state is requested."""
+
+
+class LabConnection:
+    """The twin, as devices need it; used from the event loop that connects it (RunEngine's).
+
+    Args:
+        host, port, token, ssl: of the twin server.
+
+    Attributes:
+        client: for all methods of the twin.
+        state: the newest known; None before the first connection.
+    """
+
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        port: int = 55000,
+        token: str | None = None,
+        *,
+        ssl: tls.SSLContext | None = None,
+    ) -> None:
+        self.address = f"{host}:{port}"
+        self.client = AsyncTwinClient(host, port, token, name="flexdt_extensions.bluesky", ssl=ssl)
+        self.state: State | None = None
+        self._watchers: list[Watcher] = []
+        self._news = asyncio.Event()
+        self._connecting = asyncio.Lock()
+        self._pump: asyncio.Task[None] | None = None
+
+    async def connect(self) -> None:
+        """Connect, once.
+
+        Raises:
+            ConnectionLost: no server answers.
+            RpcError: the server refuses the client.
+        """
+        async with self._connecting:
+            if self._pump is not None and not self._pump.done():
+                return
+            await self.client.connect()
+            await self.fresh()
+            self._pump = asyncio.create_task(self._listen(), name="flexdt-lab")
+
+    async def close(self) -> None:
+        """End the connection."""
+        if self._pump is not None:
+            self._pump.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._pump
+        await self.client.close()
+
+    async def fresh(self) -> State:
+        """Request the present state."""
+        state = await self.client.state()
+        self._take(state)
+        if self._pump is not None and self._pump.done():  # the twin was gone for too long
+            self._pump = asyncio.create_task(self._listen(), name="flexdt-lab")
+        return state
+
+    def watch(self, watcher: Watcher) -> Callable[[], None]:
+        """Call `watcher` with every new state; the returned function ends that."""
+        self._watchers.append(watcher)
+        if self.state is not None:
+            watcher(self.state)
+
+        def end() -> None:
+            if watcher in self._watchers:
+                self._watchers.remove(watcher)
+
+        return end
+
+    async def states(self) -> AsyncIterator[State]:
+        """Fresh states: one at once, then one after every change of the twin."""
+        while True:
+            self._news.clear()
+            yield await self.fresh()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(PATIENCE_S):
+                    await self._news.wait()
+
+    async def _listen(self) -> None:
+        async with self.client.subscribe("state", "job", max_rate_hz=RATE_HZ) as events:
+            with contextlib.suppress(ConnectionLost):
+                async for event in events:
+                    if isinstance(event.data, State):
+                        self._take(event.data)
+                    self._news.set()
+
+    def _take(self, state: State) -> None:
+        if self.state is not None and state.time < self.state.time:
+            return  # an event that is older than the answer to a request
+        self.state = state
+        for watcher in list(self._watchers):
+            watcher(state)
+
+
+Value = bool | int | float | str
+_T = TypeVar("_T", bound=Value)
+
+Get = Callable[[State], _T]
+Put = Callable[[_T], Awaitable[object]]
+
+DTYPES: Mapping[type[Value], tuple[Dtype, str]] = {
+    bool: ("boolean", np.dtype(bool).str),
+    int: ("integer", np.dtype(int).str),
+    float: ("number", np.dtype(float).str),
+    str: ("string", "|S64"),
+}
+"""Names of a type in documents: JSON's, and NumPy's."""
+
+
+class TwinBackend(SignalBackend[_T], Generic[_T]):
+    """A member of the state.
+
+    Args:
+        link: to the twin.
+        path: the value's place in the state: `axes.rot_obj.position`.
+        datatype: of the value.
+        put: request another value.
+        get: the value, from a state, where it is not what is at `path`.
+        units: of the value.
+        limits: lowest and highest value, from a state.
+    """
+
+    def __init__(
+        self,
+        link: LabConnection,
+        path: str,
+        datatype: type[_T],
+        put: Put[_T] | None = None,
+        units: str | None = None,
+        get: Get[_T] | None = None,
+        limits: Callable[[State], tuple[float, float]] | None = None,
+    ) -> None:
+        super().__init__(datatype)
+        self._link, self._path, self._get = link, path, get or self._member
+        self._put, self._units, self._limits = put, units, limits
+        self._end: Callable[[], None] | None = None
+
+    def _member(self, state: State) -> _T:
+        """What is at `path`; zero where that is not known."""
+        value: Any = state
+        for name in self._path.split("."):
+            value = value[name] if isinstance(value, Mapping) else getattr(value, name)
+        return cast(_T, cast(type[Any], self.datatype)() if value is None else value)
+
+    def source(self, name: str, read: bool) -> str:
+        """Where the value comes from."""
+        return f"flexdt://{self._link.address}/{self._path}"
+
+    async def connect(self, timeout: float) -> None:
+        """Connect the laboratory, if it is not yet.
+
+        Raises:
+            NotConnectedError: no answer, or the server denies access.
+        """
+        try:
+            await self._link.connect()
+        except (ConnectionLost, RpcError) as error:
+            raise NotConnectedError(f"{self.source('', True)}: {error}") from error
+
+    async def put(self, value: _T | None) -> None:
+        """Ask the twin for another value.
+
+        Raises:
+            RpcError: the twin rejects the value.
+        """
+        if self._put is None or value is None:
+            raise RuntimeError(f"{self._path} cannot be set to {value!r}")
+        await self._put(cast(type[Any], self.datatype)(value))
+        await self._link.fresh()
+
+    async def get_datakey(self, source: str) -> DataKey:
+        """Type, unit and limits."""
+        dtype, dtype_numpy = DTYPES[cast(type[Value], self.datatype)]
+        key = DataKey(dtype=dtype, shape=[], source=source, dtype_numpy=dtype_numpy)
+        if self._units is not None:
+            key["units"] = self._units
+        if self._limits is not None:
+            low, high = self._limits(await self._link.fresh())
+            key["limits"] = Limits(control={"low": low, "high": high})
+        return key
+
+    async def get_reading(self) -> Reading[_T]:
+        """The value now."""
+        return _reading(self._get(await self._link.fresh()))
+
+    async def get_value(self) -> _T:
+        """The value now."""
+        return self._get(await self._link.fresh())
+
+    async def get_setpoint(self) -> _T:
+        """The value that was last requested."""
+        return self._get(await self._link.fresh())
+
+    def set_callback(self, callback: Callable[[Reading[_T]], None] | None) -> None:
+        """Subscribe a callback to changes."""
+        if self._end is not None:
+            self._end()
+            self._end = None
+        if callback is not None:
+            self._end = self._link.watch(_changes(self._get, callback))
+
+
+def _changes(get: Get[_T], callback: Callable[[Reading[_T]], None]) -> Callable[[State], None]:
+    last: list[_T] = []
+
+    def notify(state: State) -> None:
+        value = get(state)
+        if not last or last[0] != value:
+            last[:] = [value]
+            callback(_reading(value))
+
+    return notify
+
+
+def _reading(value: _T) -> Reading[_T]:
+    return Reading(value=value, timestamp=time.time(), alarm_severity=0)
+
+
+def settable(
+    link: LabConnection,
+    path: str,
+    datatype: type[_T],
+    put: Put[_T],
+    units: str | None = None,
+    get: Get[_T] | None = None,
+) -> SignalRW[_T]:
+    """A signal to read and set; arguments as those of `TwinBackend`."""
+    return SignalRW(TwinBackend(link, path, datatype, put, units, get))

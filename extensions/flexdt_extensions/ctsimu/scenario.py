@@ -1,0 +1,394 @@
+"""A CTSimU scenario to its images: `flexdt simulate`, and `flexdt.simulate(SCENARIO)` in Python.
+
+`ctsimu_scan` says what is asked; exact paths through the samples' meshes, the
+spectrum, scatter and blur are those of `flexdt.simulate`. Only what a detector makes of the energy
+it collects is stated otherwise: a scenario gives grey values and a signal-to-noise ratio.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import UTC, datetime
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from flexdt import DataSet
+from flexdt.clients.datasets.exchange import text_of
+from flexdt.extending import tiff_bytes
+from flexdt.phantoms import Material
+from flexdt.phantoms.channels import Channel, scatter_object
+from flexdt.phantoms.files.mesh_files import read_mesh
+from flexdt.twin.attenuation import Substance
+from flexdt.twin.errors import LimitError
+from flexdt.twin.exchange import ExchangeError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.physics import (
+    FWHM,
+    Beam,
+    Counts,
+    EffectiveBeam,
+    ScanScatter,
+    ScatterSettings,
+    blurred,
+    check_rays,
+    effective_beam,
+    flux_of,
+    frame_rng,
+    scan_scatter,
+    spot_blur_px,
+    within_pixels,
+)
+from flexdt.twin.projection import TriangleMesh, project_mesh
+from flexdt_extensions.ctsimu.ctsimu_scan import MeshSample, Reference, read_scenario
+
+KEV_J: Final = 1.602176634e-16
+FORMAT: Final = {"major": 1, "minor": 2}
+
+
+class ScenarioImages:
+    """The images of a scenario, each computed when it is asked for.
+
+    Args:
+        path: the scenario; files that it names lie beside it.
+        seed: of the noise, >= 0; None for images without noise.
+        rays: along each side of a pixel; their signals are averaged.
+
+    Raises:
+        ExchangeError, TwinError: what the scenario asks and is not possible, and where.
+        OSError: a file cannot be read.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], seed: int | None = None, rays: int = 3
+    ) -> None:
+        if not 0 <= (seed or 0) <= 2**63:
+            raise LimitError(f"seed is {seed}; allowed: 0 to 2^63", {"asked": seed})
+        check_rays(rays)
+        self.path, self._seed, self._rays = Path(path), seed, rays
+        self.scan = read_scenario(text_of(self.path), str(self.path), self._beside)
+        self._meshes = [self._mesh(sample) for sample in self.scan.samples]
+        found: dict[Substance, float] = {}
+        for sample, mesh in zip(self.scan.samples, self._meshes, strict=True):
+            reach = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+            found[sample.substance] = found.get(sample.substance, 0.0) + reach
+        self._thickest = found
+
+    def _beside(self, name: str) -> str:
+        try:
+            return text_of(self.path.parent / name)
+        except (OSError, ValueError) as error:
+            raise ExchangeError(f"{self.path} names {name!r}: {error}", {"path": name}) from None
+
+    def _mesh(self, sample: MeshSample) -> TriangleMesh:
+        found = read_mesh(self.path.parent / sample.file)
+        corners = np.asarray(found.vertices, dtype=np.float64)
+        middle = (corners.min(axis=0) + corners.max(axis=0)) / 2.0
+        return TriangleMesh((corners - middle) * sample.scale_mm, np.asarray(found.faces))
+
+    # The X-rays
+
+    @cached_property
+    def _beams(self) -> list[EffectiveBeam]:
+        """Of each spectrum."""
+        substances, thick = list(self._thickest), list(self._thickest.values())
+        if self.scan.environment is not None:
+            substances.append(self.scan.environment)
+            thick.append(max(float(self._distance(i).max()) for i in range(len(self))))
+        signals = [spectrum * self.scan.response for spectrum in self.scan.spectra]
+        return [effective_beam(s, s * self.scan.response, substances, thick) for s in signals]
+
+    def _distance(self, frame: int) -> Float32Array:
+        """From the source to each pixel, (rows, cols) [mm]."""
+        row, (rows, cols) = self.scan.views[frame], self.scan.shape
+        v = np.arange(rows)[:, None, None] - (rows - 1) / 2
+        u = np.arange(cols)[None, :, None] - (cols - 1) / 2
+        pixels = row[3:6] - row[0:3] + u * row[6:9] + v * row[9:12]
+        return np.asarray(np.linalg.norm(pixels, axis=2), dtype=np.float32)
+
+    def _paths(self, frame: int, ray: int, samples: bool) -> Float32Array:
+        shape, order = self.scan.shape, {one: i for i, one in enumerate(self._thickest)}
+        air = self.scan.environment is not None
+        out = np.zeros((len(order) + air, *shape), np.float32)
+        for sample, mesh in zip(self.scan.samples, self._meshes, strict=True) if samples else ():
+            rows = within_pixels(sample.views[frame : frame + 1], self._rays)[ray : ray + 1]
+            out[order[sample.substance]] += project_mesh(mesh, ConeVec(rows), shape)[0]
+        if air:
+            out[-1] = np.maximum(self._distance(frame) - out[:-1].sum(axis=0), 0.0)
+        return out
+
+    def _collected(self, frame: int, samples: bool = True) -> tuple[Float32Array, Float32Array]:
+        """Energy in each pixel of one frame [keV], and its variance, before the detector blurs."""
+        scan, n = self.scan, self._rays if samples else 1
+        beam = self._beams[scan.spectrum_of[frame]]
+        # In double precision: rays that meet nothing then average to the open beam's very value.
+        sums: list[Any] = [np.zeros(scan.shape) for _ in range(2)]
+        for k in range(n * n):
+            for total, one in zip(sums, beam.transmit(self._paths(frame, k, samples)), strict=True):
+                total += one
+        mean, spread = ((total / n**2).astype(np.float32) for total in sums)
+        view = scan.views[frame]
+        u, v = (float(np.linalg.norm(view[i : i + 3])) for i in (6, 9))
+        spot = [spot_blur_px(view, one * FWHM) for one in scan.spot_mm]
+        mean, spread = (blurred(one, spot[0], spot[1] * u / v) for one in (mean, spread))
+        if samples and self._scatter is not None:
+            mean = mean + self._scatter[frame].signal * np.float32(beam.signal.sum())
+            spread = spread + self._scatter[frame].variance * np.float32(beam.noise.sum())
+        flux = flux_of(view, scan.shape) * np.float32(scan.mAs[frame])
+        return mean * flux, spread * flux
+
+    @cached_property
+    def _scatter(self) -> ScanScatter | None:
+        scan = self.scan
+        if not scan.scattering or not scan.samples:
+            return None
+        parts, reach = [], np.zeros(3)
+        for sample, mesh in zip(scan.samples, self._meshes, strict=True):
+            assert sample.on_stage is not None
+            center, axes = sample.on_stage
+            there = TriangleMesh(center + mesh.vertices @ axes.T, mesh.faces)
+            reach = np.maximum(reach, np.abs(there.vertices).max(axis=0))
+            parts.append(Channel(_made_of(sample.substance), there, 0.0))
+        x, y, z = (2.0 * reach).tolist()
+        settings = ScatterSettings(collimated=True, seed=self._seed or 0)
+        grid = scatter_object(parts, (x, y, z), settings.voxels)
+        response = scan.response
+        beam = Beam(scan.spectra[0] * response, response, response**2)
+        return scan_scatter(grid, scan.views, scan.shape, beam, settings)
+
+    # The detector
+
+    @cached_property
+    def _open(self) -> tuple[Float32Array, Float32Array]:
+        energy, variance = self._collected(0, samples=False)
+        if not min(energy.max(), variance.max()) > 0.0:
+            raise ExchangeError(
+                f"{self.path}: nothing of the open beam reaches and stays in the detector; "
+                "allowed: thinner windows, filters and environment, a thicker scintillator"
+            )
+        return energy, variance
+
+    @property
+    def brightest(self) -> float:
+        """Grey value of the brightest open pixel in the first frame."""
+        return float(self._grey(self._open[0].max(keepdims=True)).max())
+
+    def _grey(self, energy: Float32Array) -> Float32Array:
+        grey = self.scan.grey
+        if grey.imax is not None:
+            values = grey.imin + (grey.imax - grey.imin) / float(self._open[0].max()) * energy
+        elif grey.table is not None:
+            values = np.interp(energy * KEV_J, grey.table[:, 0], grey.table[:, 1])
+        else:
+            values = grey.offset + (grey.factor or 0.0) * KEV_J * energy
+        return np.asarray(values, dtype=np.float32)
+
+    def _blurred(self, image: Float32Array) -> Float32Array:
+        grey, view = self.scan.grey, self.scan.views[0]
+        u, v = (float(np.linalg.norm(view[i : i + 3])) for i in (6, 9))
+        if grey.mtf is None:
+            # The resolution of a detector is that with its pixels.
+            rest = (np.sqrt(max((grey.blur_mm / one) ** 2 - 1 / 12, 0.0)) for one in (u, v))
+            return blurred(image, *map(float, rest))
+        wide = max(image.shape) // 2
+        padded = np.pad(image, wide, mode="edge")
+        frequency = np.hypot(
+            np.fft.fftfreq(padded.shape[0], v)[:, None], np.fft.rfftfreq(padded.shape[1], u)
+        )
+        curve = np.interp(frequency, grey.mtf[:, 0], grey.mtf[:, 1], right=0.0) / grey.mtf[0, 1]
+        back = np.fft.irfft2(np.fft.rfft2(padded) * curve, padded.shape)
+        return np.asarray(back[wide:-wide, wide:-wide], dtype=np.float32)
+
+    def _read_out(
+        self, energy: Float32Array, variance: Float32Array, averages: int, noise: int | None
+    ) -> FloatArray:
+        """Grey values of the binned pixels; `noise` is the image's number, None for none."""
+        grey = self.scan.grey
+        values = self._grey(self._blurred(energy))
+        if noise is not None and self._seed is not None:
+            if grey.noise is not None:
+                ratio = np.interp(values, grey.noise[:, 0], grey.noise[:, 1])
+                sigma = values / np.maximum(ratio, 1e-9)
+            elif grey.snr is not None:
+                brightest = float(self._open[1].max())
+                sigma = np.sqrt(variance / brightest) * (self.brightest / grey.snr)
+            else:
+                sigma = np.zeros_like(values)
+            draw = frame_rng(self._seed, noise).standard_normal(values.shape, dtype=np.float32)
+            values = values + draw * (sigma / np.sqrt(averages)).astype(np.float32)
+        top, (b, c) = 2.0**grey.bits - 1.0, self.scan.binning
+        rows, cols = (n // k for n, k in zip(self.scan.shape, (b, c), strict=True))
+        blocks = np.clip(values, 0.0, top).reshape(rows, b, cols, c)
+        return np.asarray(blocks.mean(axis=(1, 3), dtype=np.float64))
+
+    def _references(self, asked: Reference, lit: bool, first: int) -> Iterator[FloatArray]:
+        energy, variance = self._open if lit else (np.zeros(self.scan.shape, np.float32),) * 2
+        for k in range(asked.number):
+            number = None if asked.ideal else first + k
+            yield self._read_out(energy, variance, asked.averages, number)
+
+    # The images
+
+    def __len__(self) -> int:
+        return len(self.scan.views)
+
+    def darks(self) -> list[Counts]:
+        """Dark images, uint16 (rows, cols)."""
+        return [self._counts(one) for one in self._references(self.scan.dark, False, 0)]
+
+    def flats(self) -> list[Counts]:
+        """Flat images, uint16 (rows, cols)."""
+        first = self.scan.dark.number
+        return [self._counts(one) for one in self._references(self.scan.flat, True, first)]
+
+    def projections(self) -> Iterator[Counts]:
+        """Projections, uint16 (rows, cols); corrected, if the scenario says so."""
+        scan, lag = self.scan, self.scan.grey.lag
+        dark = np.mean(self.darks(), axis=0) if scan.dark.correction else 0.0
+        gain = None
+        if scan.flat.correction:
+            gain = self.brightest / np.maximum(np.mean(self.flats(), axis=0) - dark, 1e-9)
+        before: Float32Array | None = None
+        first = scan.dark.number + scan.flat.number
+        for i in range(len(self)):
+            energy, variance = self._collected(i)
+            if lag > 0.0:
+                # Each frame keeps the part `lag` of what the last one showed.
+                left = np.zeros_like(energy) if before is None else before - energy
+                n = scan.averages
+                before = energy + left * np.float32(lag**n)
+                energy = energy + left * np.float32(lag * (1 - lag**n) / (1 - lag) / n)
+            values = self._read_out(energy, variance, scan.averages, first + i) - dark
+            yield self._counts(values if gain is None else values * gain)
+
+    def _counts(self, values: FloatArray) -> Counts:
+        return np.clip(np.rint(values), 0.0, 2.0**self.scan.grey.bits - 1.0).astype(np.uint16)
+
+    def dataset(self) -> DataSet:
+        """All images as a data set in memory, with the geometry that reconstruction knows.
+
+        Without dark or flat images in the scenario the data set has none either.
+        """
+        scan, darks, flats = self.scan, self.darks(), self.flats()
+        dark: Any = np.stack(darks) if darks else None
+        flat: Any = np.stack(flats) if flats else None
+        counts = np.stack(list(self.projections()))
+        if scan.dark.correction and dark is not None:
+            dark, flat = (
+                np.zeros_like(dark),
+                None if flat is None else flat - np.mean(darks, axis=0),
+            )
+        if scan.flat.correction:
+            flat = np.full(counts.shape[1:], round(self.brightest), np.uint16)
+        if flat is not None:
+            flat = np.rint(np.maximum(flat, 0.0))
+        made = DataSet.from_arrays(
+            counts, scan.geometry.cone_vec, dark=dark, flat=flat, name=self.path.stem,
+            warnings=scan.notes, truth=self,
+        )  # fmt: skip
+        return replace(made, full_scale=2**scan.grey.bits - 1)
+
+    def write(self, folder: str | os.PathLike[str]) -> Path:
+        """Write all images as TIFF, and CTSimU's metadata, into a new folder.
+
+        Returns:
+            The metadata file. The folder appears only when everything is in it.
+
+        Raises:
+            ExchangeError: the folder exists and is not empty.
+            OSError: it cannot be written.
+        """
+        folder, stem = Path(folder).absolute(), self.path.stem
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise ExchangeError(
+                f"{folder} exists; allowed: a new folder, or an empty one", {"path": str(folder)}
+            )
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        part = folder.with_name(f".{folder.name}.{os.getpid()}.part")
+        part.mkdir()
+        try:
+            names = {}
+            for kind, images in (("dark", self.darks()), ("flat", self.flats())):
+                pattern = f"{stem}_{kind}.tif" if len(images) == 1 else f"{stem}_{kind}_%04d.tif"
+                names[kind] = pattern if images else None
+                for k, image in enumerate(images):
+                    name = pattern % k if "%" in pattern[len(stem) :] else pattern
+                    (part / name).write_bytes(tiff_bytes(image))
+            for i, image in enumerate(self.projections()):
+                (part / f"{stem}_{i:04d}.tif").write_bytes(tiff_bytes(image))
+            about = json.dumps(self._metadata(folder, names), indent=1, ensure_ascii=False)
+            (part / f"{stem}_metadata.json").write_text(about + "\n", encoding="utf-8")
+            if folder.exists():
+                folder.rmdir()
+            part.replace(folder)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+        return folder / f"{stem}_metadata.json"
+
+    def _metadata(self, folder: Path, names: dict[str, str | None]) -> dict[str, Any]:
+        own = Path(os.path.relpath(self.path.absolute(), folder)).as_posix()
+        scan, today = self.scan, datetime.now(UTC).date().isoformat()
+        rows, cols = scan.geometry.shape or (0, 0)
+        pitch = scan.geometry.pitch_mm
+
+        def size(values: tuple[float, float], unit: str) -> dict[str, Any]:
+            return {a: {"value": x, "unit": unit} for a, x in zip("xy", values, strict=True)}
+
+        def images(kind: str, asked: Reference) -> dict[str, Any]:
+            return {
+                "number": asked.number,
+                "frame_average": asked.averages,
+                "filename": names[kind],
+                "projections_corrected": asked.correction,
+            }
+
+        return {
+            "file": {
+                "name": self.path.stem, "description": scan.geometry.name, "contact": "",
+                "date_created": today, "date_changed": today,
+                "file_type": "CTSimU Metadata", "file_format_version": FORMAT,
+            },
+            "output": {
+                "system": f"flexdt {version('flexdt')}",
+                "date_measured": today,
+                "projections": {
+                    "filename": f"{self.path.stem}_%04d.tif",
+                    "number": len(self),
+                    "frame_average": scan.averages,
+                    "max_intensity": self.brightest,
+                    "datatype": "uint16",
+                    "byteorder": "little",
+                    "headersize": {"file": 0, "image": 0},
+                    "dimensions": size((cols, rows), "px"),
+                    "pixelsize": size(pitch, "mm"),
+                    "dark_field": images("dark", scan.dark),
+                    "flat_field": images("flat", scan.flat),
+                    "bad_pixel_map": {"filename": None, "projections_corrected": False},
+                },
+                "tomogram": None,
+            },
+            "acquisition_geometry": {"path_to_CTSimU_JSON": own},
+            "reconstruction": {"software": None, "settings": {}},
+            "simulation": {
+                "flexdt": {"seed": self._seed, "rays": self._rays, "notes": list(scan.notes)},
+                "ctsimu_scenario": {},
+            },
+        }  # fmt: skip
+
+
+def _made_of(substance: Substance) -> Material:
+    """For the scatter's grid, which asks nothing but the substance."""
+    return Material(substance.name, "", substance.density_g_cm3, 0.0, (), "", substance.fractions)
+
+
+def dataset(path: str | os.PathLike[str], seed: int | None, rays: int) -> DataSet:
+    """What `flexdt.simulate` gives of a scenario; see `ScenarioImages`."""
+    return ScenarioImages(path, seed, rays).dataset()

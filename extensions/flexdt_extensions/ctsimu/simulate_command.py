@@ -1,0 +1,38 @@
+"""`flexdt simulate`: the images of a CTSimU scenario.
+
+The work is in `flexdt_extensions.ctsimu.scenario`; this command passes options to it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from flexdt.extending import Answer, argument, option, warn
+
+
+def simulate(
+    scenario: Path = argument(..., "SCENARIO.json"),
+    out: Path | None = option(None, "A new folder; default: the scenario's name.", metavar="DIR"),
+    seed: int = option(0, "Of the noise.", min=0),
+    rays: int = option(3, "Along each side of a pixel.", min=1, max=16),
+) -> Answer:
+    """Simulate a CTSimU scenario: projections, dark and flat images as TIFF, and metadata.
+
+    What the scenario asks and cannot be done is an error; what is left out is a warning.
+    """
+    from flexdt_extensions.ctsimu.scenario import ScenarioImages
+
+    images = ScenarioImages(scenario, seed, rays)
+    warn(images.scan.notes, scenario)
+    metadata = images.write(scenario.stem if out is None else out)
+    scan = images.scan
+    rows, cols = scan.geometry.shape or (0, 0)
+    yield {
+        "scenario": str(scenario), "out": str(metadata.parent), "metadata": str(metadata),
+        "projections": len(images), "darks": scan.dark.number, "flats": scan.flat.number,
+        "shape": [rows, cols], "max_intensity": images.brightest, "warnings": list(scan.notes),
+    }  # fmt: skip
+    yield (
+        f"{metadata.parent}: {len(images)} projections, {scan.dark.number} dark and "
+        f"{scan.flat.number} flat images of {cols} x {rows} pixels; {metadata.name}"
+    )

@@ -1,0 +1,319 @@
+"""The search for bead positions that let a planned scan determine the geometry best.
+
+Beads are exchanged between seats one at a time, from several random starts, until no exchange
+helps. A set that looks like itself turned, or whose spots fit at a second start angle, is
+discarded. Seats are plain points (see `flexdt.phantoms.bricks` for those of a LEGO stack), and
+`information_table` scores a set of them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import linear_sum_assignment
+
+from flexdt.twin.calibration import BeadModel, tolerance_of
+from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt_extensions.phantom_design.information_table import (
+    CRITERIA,
+    Criterion,
+    PlannedScans,
+    SeatTable,
+    inverse,
+    score_of,
+)
+from flexdt_extensions.phantom_design.trials import share_identified
+
+DESIGN_FRAMES: Final = 48
+"""Frames that take part in the search, spread over the plan; the answer is predicted with all."""
+_TRIED: Final = 12
+"""Seats tried for one bead, best first, before it stays where it is."""
+_TURNS: Final = np.radians(np.arange(10.0, 351.0, 5.0))
+
+
+@dataclass(frozen=True, eq=False)
+class BeadForecast:
+    """What the planned scans would determine with some beads.
+
+    Attributes:
+        sigmas: parameter -> predicted standard deviation, edge units; inf if not determined.
+        score: value of the criterion, smaller is better.
+        used: share of all spots that count (in view, touching no other).
+    """
+
+    sigmas: dict[str, float]
+    score: float
+    used: float
+
+    @property
+    def worst(self) -> float:
+        """Largest sigma in units of its tolerance."""
+        return max(s / tolerance_of(n) for n, s in self.sigmas.items())
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """Beads that were chosen.
+
+    Attributes:
+        beads: (k, 3) [mm, object frame], by height.
+        seats: (k,) index of each among the offered seats; -1 where moved off them.
+        forecast: with these beads.
+        discarded: better sets that were ambiguous or did not identify.
+    """
+
+    beads: FloatArray
+    seats: npt.NDArray[np.int64]
+    forecast: BeadForecast
+    discarded: int
+
+
+def forecast(model: BeadModel, planned: PlannedScans, criterion: Criterion = "a") -> BeadForecast:
+    """Predicted uncertainties, touching spots left out.
+
+    Args:
+        model: the beads.
+        planned: the scans.
+        criterion: of the score.
+    """
+    seats = SeatTable.of(model.beads, float(model.bead_radius_mm.max()), planned, 1.0)
+    masks = seats.alone(np.arange(len(model)))
+    information = seats.information(masks)[None]
+    names = seats.names
+    covariance = inverse(information)[0]
+    sigma = np.sqrt(np.diag(covariance)) * seats.tolerances
+    return BeadForecast(
+        dict(zip(names, sigma.tolist(), strict=True)),
+        float(score_of(information, criterion)[0]),
+        float(masks.mean()),
+    )
+
+
+def design(
+    seats: npt.ArrayLike,
+    radius_mm: float,
+    count: int,
+    planned: PlannedScans,
+    *,
+    criterion: Criterion = "a",
+    slots: npt.ArrayLike | None = None,
+    per_slot: int | None = None,
+    gap_mm: float = 0.5,
+    unlike_mm: float = 1.0,
+    starts: int = 8,
+    seed: int = 1,
+    bounds_mm: npt.ArrayLike | None = None,
+    resolution_mm: float = 0.1,
+) -> Design:
+    """Choose `count` of the seats.
+
+    Args:
+        seats: (m, 3) places a bead may take [mm, object frame].
+        radius_mm: of every bead.
+        count: beads to place.
+        planned: the scans to be determined.
+        criterion: what is minimised.
+        slots: (m,) which brick a seat is in; None: all in one.
+        per_slot: most beads in one slot; None: any.
+        gap_mm: least distance between two beads' surfaces.
+        unlike_mm: least `turned_likeness`; symmetric sets have none.
+        starts: random starts.
+        seed: the same seed gives the same design.
+        bounds_mm: (3,) half extents within which centres may afterwards be moved off the seats.
+        resolution_mm: smallest step of those moves.
+
+    Raises:
+        TwinError: too few seats, or every set found is ambiguous.
+    """
+    places = np.asarray(seats, dtype=np.float64).reshape(-1, 3)
+    if criterion not in CRITERIA:
+        raise TwinError(
+            f"no criterion {criterion!r}; there are: {', '.join(CRITERIA)}",
+            {"asked": criterion, "allowed": list(CRITERIA)},
+        )
+    if not 2 <= count <= len(places):
+        raise TwinError(
+            f"{count} beads asked for {len(places)} seats; allowed: 2 to the number of seats "
+            "(one bead determines neither scale nor angle)",
+            {"asked": count, "allowed": [2, len(places)]},
+        )
+    some, weight = planned.thinned(DESIGN_FRAMES)
+    slot = np.zeros(len(places), np.int64) if slots is None else np.asarray(slots, dtype=np.int64)
+    most = count if per_slot is None else per_slot
+    table = SeatTable.of(places, radius_mm, some, weight)
+    rules = _Rules(slot, most, 2.0 * radius_mm + gap_mm, unlike_mm)
+    rng = np.random.default_rng([seed, count])
+    found: dict[tuple[int, ...], float] = {}
+    for _ in range(starts):
+        chosen = _random_set(table, rules, count, rng)
+        chosen, score = _exchanged(table, rules, chosen, criterion)
+        if math.isfinite(score):
+            found.setdefault(tuple(sorted(chosen.tolist())), score)
+    discarded = 0
+    for key, _ in sorted(found.items(), key=lambda item: (item[1], item[0])):
+        index = np.array(key, dtype=np.int64)
+        beads = places[index]
+        if bounds_mm is not None:
+            bounds = np.asarray(bounds_mm, dtype=np.float64)
+            beads, index = _polished(
+                beads, index, radius_mm, some, weight, criterion, rules, bounds, resolution_mm
+            )
+        order = np.lexsort((beads[:, 1], beads[:, 0], beads[:, 2]))
+        beads, index = beads[order], index[order]
+        model = BeadModel(beads, np.array(radius_mm))
+        if share_identified(model, planned, seed=seed) == 1.0:
+            return Design(beads, index, forecast(model, planned, criterion), discarded)
+        discarded += 1
+    raise TwinError(
+        f"all {discarded} bead sets found are ambiguous: their shadows fit at another start angle "
+        "as well; use another number of beads, more bricks or fewer beads in one brick",
+        {"asked": count, "discarded": discarded},
+    )
+
+
+def turned_likeness(beads: FloatArray) -> float:
+    """How far beads are from a turned and shifted copy of themselves, at the best turn [mm].
+
+    Root mean square distance between each bead and the one it would be taken for, over turns about
+    the vertical of 10 to 350 deg in steps of 5; 0 for a set that looks the same after such a turn.
+
+    Args:
+        beads: (k, 3) [mm].
+    """
+    centred = beads - beads.mean(axis=0)
+    cos, sin = np.cos(_TURNS), np.sin(_TURNS)
+    turned = np.empty((len(_TURNS), *centred.shape))
+    turned[..., 0] = cos[:, None] * centred[:, 0] - sin[:, None] * centred[:, 1]
+    turned[..., 1] = sin[:, None] * centred[:, 0] + cos[:, None] * centred[:, 1]
+    turned[..., 2] = centred[:, 2]
+    squares = np.sum((turned[:, :, None] - centred[None, None]) ** 2, axis=3)
+    # No assignment can be better than everyone's nearest: most turns need no assignment.
+    bounds = np.maximum(squares.min(axis=2).sum(axis=1), squares.min(axis=1).sum(axis=1))
+    best = math.inf
+    for t in np.argsort(bounds):
+        if bounds[t] >= best:
+            break
+        rows, cols = linear_sum_assignment(squares[t])
+        best = min(best, float(squares[t][rows, cols].sum()))
+    return math.sqrt(max(best, 0.0) / len(beads))
+
+
+@dataclass(frozen=True, eq=False)
+class _Rules:
+    """Which sets are allowed: beads per slot, distance between centres, and how unlike itself a
+    set must be when turned [mm]."""
+
+    slot: npt.NDArray[np.int64]
+    most: int
+    apart: float
+    unlike: float
+
+
+def _allowed(
+    table: SeatTable, rules: _Rules, others: npt.NDArray[np.int64]
+) -> npt.NDArray[np.bool_]:
+    """(m,) seats that a further bead may take beside `others`."""
+    gaps = np.linalg.norm(table.places[:, None] - table.places[others][None], axis=2)
+    full = np.bincount(rules.slot[others], minlength=int(rules.slot.max()) + 1) >= rules.most
+    seen = table.visible.any(axis=1)
+    return np.asarray((gaps >= rules.apart - 1e-9).all(axis=1) & ~full[rules.slot] & seen)
+
+
+def _random_set(
+    table: SeatTable, rules: _Rules, count: int, rng: np.random.Generator
+) -> npt.NDArray[np.int64]:
+    chosen = np.zeros(0, dtype=np.int64)
+    for _ in range(count):
+        free = np.flatnonzero(_allowed(table, rules, chosen))
+        if len(free) == 0:
+            raise TwinError(
+                f"{count} beads do not fit: after {len(chosen)} no seat is left that is in view, "
+                "far enough from the others and in a brick that may hold more",
+                {"asked": count, "allowed": len(chosen)},
+            )
+        chosen = np.append(chosen, rng.choice(free))
+    return chosen
+
+
+def _exchanged(
+    table: SeatTable, rules: _Rules, chosen: npt.NDArray[np.int64], criterion: Criterion
+) -> tuple[npt.NDArray[np.int64], float]:
+    """Exchange beads one at a time for the best seat until no exchange helps."""
+    masks = table.alone(chosen)
+    summed = np.einsum("kn,knf->kf", masks.astype(np.float64), table.blocks[chosen])
+    best = float(score_of(table.marginal(summed).sum(axis=0)[None], criterion)[0])
+    improved = True
+    if turned_likeness(table.places[chosen]) < rules.unlike:
+        best = math.inf
+    while improved:
+        improved = False
+        for k in range(len(chosen)):
+            others = np.delete(chosen, k)
+            scores = _scores_beside(table, others, criterion)
+            scores[~_allowed(table, rules, others)] = np.inf
+            for seat in np.argsort(scores, kind="stable")[:_TRIED]:
+                if not scores[seat] < best * (1.0 - 1e-9):
+                    break
+                trial = chosen.copy()
+                trial[k] = seat
+                if turned_likeness(table.places[trial]) >= rules.unlike:
+                    chosen, best, improved = trial, float(scores[seat]), True
+                    break
+    return chosen, best
+
+
+def _scores_beside(
+    table: SeatTable, others: npt.NDArray[np.int64], criterion: Criterion
+) -> FloatArray:
+    """(m,) the criterion of `others` with each seat added."""
+    m = len(table.places)
+    touch = table.touching(np.arange(m), others)  # (m, k-1, n)
+    own = (table.visible & ~touch.any(axis=1)).astype(np.float64)
+    mine = np.matmul(own[:, None], table.blocks)[:, 0]
+    kept = (table.alone(others)[None] & ~touch).astype(np.float64)
+    theirs = np.matmul(kept.transpose(1, 0, 2), table.blocks[others])  # (k-1, m, f)
+    information = table.marginal(mine) + table.marginal(theirs).sum(axis=0)
+    return score_of(information, criterion)
+
+
+def _polished(
+    beads: FloatArray,
+    index: npt.NDArray[np.int64],
+    radius: float,
+    planned: PlannedScans,
+    weight: float,
+    criterion: Criterion,
+    rules: _Rules,
+    bounds: FloatArray,
+    resolution: float,
+) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    """Move beads off their seats by ever smaller steps while that helps."""
+    beads, index = beads.copy(), index.copy()
+    steps = np.array([s for s in np.ndindex(3, 3, 3) if s != (1, 1, 1)], dtype=np.float64) - 1.0
+    size = float(bounds.max()) / 8.0
+    while size >= resolution:
+        moved = False
+        for k in range(len(beads)):
+            near = beads[k] + np.concatenate([np.zeros((1, 3)), size * steps])
+            near = np.clip(np.round(near / resolution) * resolution, -bounds, bounds)
+            others = np.delete(beads, k, axis=0)
+            places = np.concatenate([near, others])
+            table = SeatTable.of(places, radius, planned, weight)
+            rest = np.arange(len(near), len(places))
+            scores = _scores_beside(table, rest, criterion)[: len(near)]
+            gaps = np.linalg.norm(near[:, None] - others[None], axis=2)
+            scores[(gaps < rules.apart - 1e-9).any(axis=1)] = np.inf
+            best = int(np.argmin(scores))
+            trial = beads.copy()
+            trial[k] = near[best]
+            if scores[best] < scores[0] * (1.0 - 1e-6) and turned_likeness(trial) >= rules.unlike:
+                beads[k], moved = near[best], True
+                index[k] = -1
+        if not moved:
+            size /= 2.0
+    return beads, index

@@ -1,0 +1,321 @@
+"""`flexdt phantom design`: bead places, beside the spiral's, and how to build them.
+
+The search itself is `bead_search`. This module turns a request into
+poses and seats, checks the forecast by fits to noisy simulated points, and writes the result.
+"""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from flexdt.clients.figures import page, require_plots, table
+from flexdt.extending import CommandError
+from flexdt.phantoms import Phantom, spiral_positions
+from flexdt.phantoms.beads import cuboid_with_beads
+from flexdt.phantoms.bricks import Brickwork, grid_seats, lego_phantom
+from flexdt.twin.calibration import BeadModel
+from flexdt.twin.calibration.fit.weak_directions import BOUND, TOLERANCE, unit_of
+from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.machine.camera import CameraSettings
+from flexdt_extensions.phantom_design.bead_search import Design, design, forecast
+from flexdt_extensions.phantom_design.build_sheet import brick_drawings, level_drawings
+from flexdt_extensions.phantom_design.information_table import CRITERIA, Criterion, PlannedScans
+from flexdt_extensions.phantom_design.trials import measured_spread, share_identified
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from flexdt.twin.machine.description import Machine, Profile
+
+Tell = Callable[[str], None]
+GRID_STEP_MM = 4.0
+"""Step of the seats of a free design, before beads are moved off them."""
+
+
+@dataclass(frozen=True)
+class BeadHolder:
+    """What holds the beads.
+
+    Attributes:
+        bricks: a LEGO stack, or None for a block.
+        size_mm: of the block.
+        material: of the block.
+    """
+
+    bricks: Brickwork | None
+    size_mm: tuple[float, float, float]
+    material: str = "abs"
+
+
+@dataclass(frozen=True)
+class DesignRequest:
+    """Number, kind and criterion of the beads to place; see `design`."""
+
+    beads: int = 5
+    radius_mm: float = 1.0
+    bead_material: str = "steel"
+    per_brick: int | None = None
+    criterion: Criterion = "a"
+    starts: int = 8
+    seed: int = 1
+    trials: int = 60
+
+
+def circle_poses(
+    machine: Machine, placements: Sequence[tuple[float, float]], sdd_mm: float, frames: int
+) -> tuple[Poses, tuple[int, int]]:
+    """One turn per placement (SOD, lateral), beam through the phantom's middle; and the detector.
+
+    Args:
+        machine: its default camera is meant.
+        placements: (SOD, lateral shift) [mm].
+        sdd_mm: source-detector distance.
+        frames: of each turn.
+
+    Raises:
+        CommandError: the phantom would not stand between source and detector.
+    """
+    for sod, lateral in placements:
+        if not (0.0 < sod < sdd_mm < math.inf and math.isfinite(lateral)):
+            raise CommandError(
+                f"SOD {sod:g} mm, lateral {lateral:g} mm and SDD {sdd_mm:g} mm; allowed: finite, "
+                "0 < SOD < SDD"
+            )
+    camera = machine.detector.camera
+    pitch = camera.pixel_mm(machine.detector.sensor)
+    angle = 2.0 * math.pi * np.arange(frames) / frames
+    parts = [
+        Poses.upright([0, 0, 0], [lateral, sod, 0], [0, sdd_mm, 0], pitch, angle)
+        for sod, lateral in placements
+    ]
+    return Poses.concatenate(parts), camera.shape
+
+
+def script_poses(text: str, machine: Machine, profile: Profile) -> tuple[Poses, tuple[int, int]]:
+    """The poses of a script's projections, the phantom's middle at the sample's height.
+
+    Raises:
+        ScriptError: the script does not hold.
+        CommandError: it takes no projection, or changes the camera between them.
+    """
+    from flexdt.twin.machine.kinematics import poses
+    from flexdt.twin.script import parse_script, plan_script
+
+    plan = plan_script(parse_script(text), machine, profile)
+    shots = [e for e in plan.exposures if e.kind == "projection"]
+    cameras: list[CameraSettings] = []
+    for shot in shots:
+        if shot.camera not in cameras:
+            cameras.append(shot.camera)
+    if len(cameras) != 1:
+        raise CommandError(
+            f"the script takes {len(shots)} projections with {len(cameras)} camera settings; a "
+            "design needs projections with one setting"
+        )
+    names = shots[0].positions
+    table = {name: np.array([s.positions[name] for s in shots]) for name in names}
+    return poses(machine, profile, cameras[0], table), cameras[0].shape
+
+
+def run_design(
+    body: BeadHolder,
+    scans: PlannedScans,
+    request: DesignRequest,
+    *,
+    out: Path | None = None,
+    tell: Tell,
+) -> dict[str, Any]:
+    """Design, compare, check, and write `out`; the document of `--json`.
+
+    Raises:
+        TwinError: the beads do not fit, or every set is ambiguous.
+    """
+    if out is not None:
+        require_plots()
+    tell(f"criterion: {CRITERIA[request.criterion]}")
+    found = _search(body, scans, request)
+    phantom = _phantom(body, found, request)
+    spiral, spiral_name = _spiral(body, request)
+    ours = BeadModel(phantom.beads, phantom.bead_radius_mm, name=phantom.name)
+    theirs = BeadModel(spiral, np.array(request.radius_mm), name=spiral_name)
+    tell(f"checking the forecast with {request.trials} fits of each")
+    entries: list[dict[str, Any]] = []
+    for model in (ours, theirs):
+        guess = forecast(model, scans, request.criterion)
+        entries.append(
+            {
+                "name": model.name,
+                "beads": model.beads.tolist(),
+                "score": guess.score,
+                "sigmas": guess.sigmas,
+                "measured": measured_spread(model, scans, trials=request.trials, seed=request.seed)
+                if request.trials >= 2 and math.isfinite(guess.worst)
+                else None,
+                "shadows_used": guess.used,
+                "determined": guess.worst <= BOUND / TOLERANCE["mm"],
+                "identified": share_identified(model, scans, seed=request.seed),
+            }
+        )
+    document: dict[str, Any] = {
+        "criterion": request.criterion,
+        "criterion_text": CRITERIA[request.criterion],
+        "frames": len(scans.poses),
+        "noise_px": scans.noise_px,
+        "bead_tolerance_mm": scans.bead_tolerance_mm,
+        "free": list(scans.free),
+        "trials": request.trials,
+        "seed": request.seed,
+        "discarded": found.discarded,
+        "design": entries[0],
+        "spiral": entries[1],
+        "gain": entries[1]["score"] / entries[0]["score"] if entries[1]["determined"] else None,
+        "assumed": list(phantom.assumed),
+    }
+    if out is not None:
+        document["files"] = write(out, phantom, body, request, document)
+    return document
+
+
+def verdict(document: dict[str, Any]) -> str:
+    """The comparison of the design with the spiral, as a sentence."""
+    name, gain = document["spiral"]["name"], document["gain"]
+    if gain is None:
+        return f"{name} does not determine the geometry in this scan (its shadows hide each other)"
+    return f"score {document['criterion_text']}: {gain:.2f} times better than {name}"
+
+
+def table_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Parameter, unit, then predicted and measured of both, and the ratio of the predictions."""
+    ours, theirs = document["design"], document["spiral"]
+    return [
+        (
+            name,
+            unit_of(name),
+            f"{sigma:.3g}",
+            _of(ours["measured"], name),
+            f"{theirs['sigmas'][name]:.3g}",
+            _of(theirs["measured"], name),
+            "-" if document["gain"] is None else f"{theirs['sigmas'][name] / sigma:.2f}",
+        )
+        for name, sigma in ours["sigmas"].items()
+    ]
+
+
+HEADER = ("parameter", "unit", "design", "measured", "spiral", "measured", "gain")
+
+
+def write(
+    out: Path, phantom: Phantom, body: BeadHolder, request: DesignRequest, document: dict[str, Any]
+) -> list[str]:
+    """Write phantom.json, phantom.stl, build.html, one PNG per picture and design.json; names."""
+    out.mkdir(parents=True, exist_ok=True)
+    names = ["phantom.json", "phantom.stl", "build.html"]
+    (out / "phantom.json").write_text(json.dumps(phantom.to_dict()), encoding="utf-8")
+    _solid(phantom, body).export(out / "phantom.stl", file_type="stl")
+    if body.bricks is None:
+        word, drawings = "level", level_drawings(body.size_mm, phantom.beads, request.radius_mm)
+    else:
+        word, drawings = "brick", brick_drawings(body.bricks, phantom.beads, request.radius_mm)
+    sections = []
+    for k, drawing in enumerate(drawings, 1):
+        names.append(f"{word}-{k}.png")
+        (out / names[-1]).write_bytes(drawing.png())
+        steps = "".join(f"<li>{html.escape(step)}</li>" for step in drawing.steps)
+        sections.append(f"<h2>{drawing.title}</h2>{drawing.svg()}<ul>{steps}</ul>")
+    (out / "build.html").write_text(_page(phantom, sections, document), encoding="utf-8")
+    names.append("design.json")
+    (out / "design.json").write_text(
+        json.dumps({**document, "files": names}, indent=1), encoding="utf-8"
+    )
+    return names
+
+
+def _search(body: BeadHolder, scans: PlannedScans, request: DesignRequest) -> Design:
+    radius, where = request.radius_mm, dict[str, Any]()
+    if body.bricks is not None:
+        seats = body.bricks.seats(radius)
+        places, where = seats.places, {"slots": seats.brick, "per_slot": request.per_brick}
+    else:
+        # A skin of a bead's radius stays round the beads, so that they are held.
+        places = grid_seats(body.size_mm, 2.0 * radius, GRID_STEP_MM)
+        where = {"bounds_mm": np.asarray(body.size_mm) / 2.0 - 2.0 * radius}
+    return design(
+        places, radius, request.beads, scans, criterion=request.criterion,
+        starts=request.starts, seed=request.seed, **where,
+    )  # fmt: skip
+
+
+def _phantom(body: BeadHolder, found: Design, request: DesignRequest) -> Phantom:
+    name = f"designed-{request.beads}"
+    if body.bricks is not None:
+        return body.bricks.phantom(name, found.beads, request.radius_mm, request.bead_material)
+    made = cuboid_with_beads(
+        name,
+        body.size_mm,
+        found.beads,
+        request.radius_mm,
+        body_material=body.material,
+        bead_materials=(request.bead_material,) * request.beads,
+        description=f"{request.beads} {request.bead_material} beads where they determine most in a "
+        f"block of {body.material}",
+    )
+    return replace(made, assumed=(f"body of {body.material}, beads of {request.bead_material}",))
+
+
+def _spiral(body: BeadHolder, request: DesignRequest) -> tuple[np.typing.NDArray[np.float64], str]:
+    """The thesis's beads for the same body and number, to compare with."""
+    if body.bricks == Brickwork() and request.beads == 5:
+        return lego_phantom().beads, "lego (thesis 6.5.1)"
+    size = body.size_mm
+    if body.bricks is not None:
+        wall = body.bricks.measures["wall_mm"]
+        size = (size[0] - 2 * wall, size[1] - 2 * wall, size[2])
+    return spiral_positions(size, request.beads, request.radius_mm), "spiral of the same size"
+
+
+def _solid(phantom: Phantom, body: BeadHolder) -> trimesh.Trimesh:
+    """What the STL holds: bricks and beads as they are, or the block with beads as cavities."""
+    mesh = phantom.mesh()
+    if body.bricks is not None:
+        return mesh
+    import trimesh.util
+
+    block, *balls = (part.mesh for part in phantom.parts())
+    for ball in balls:
+        ball.invert()
+    return cast("trimesh.Trimesh", trimesh.util.concatenate([block, *balls]))
+
+
+def _page(phantom: Phantom, sections: Sequence[str], document: dict[str, Any]) -> str:
+    beads = [
+        f"bead {k + 1}: ({x:+.2f}, {y:+.2f}, {z:+.2f}) mm"
+        for k, (x, y, z) in enumerate(phantom.beads.tolist())
+    ]
+    title = f"How to build {phantom.name}"
+    lead = [
+        phantom.description,
+        f"Predicted and measured standard deviations ({document['trials']} fits to noisy "
+        f"simulated points, {document['noise_px']} px, {document['frames']} frames); gain is "
+        "the spiral's divided by the design's.",
+        verdict(document),
+    ]
+    notes = [
+        f"Beads in the object's frame (x right, y away from the source, z up): {'; '.join(beads)}",
+        f"Chosen by: {document['criterion_text']}",
+        f"Assumed: {'; '.join(phantom.assumed)}",
+    ]
+    first, last = (["<p>" + html.escape(line) + "</p>" for line in part] for part in (lead, notes))
+    heading = f"<h1>{html.escape(title)}</h1>"
+    return page(title, [heading, *first, table(HEADER, table_rows(document)), *sections, *last])
+
+
+def _of(measured: dict[str, float] | None, name: str) -> str:
+    return "-" if measured is None else f"{measured[name]:.3g}"

@@ -1,0 +1,1 @@
+"""The thesis's experiments: plans, runs on several processes, tables and reports."""

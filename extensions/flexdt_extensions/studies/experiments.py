@@ -1,0 +1,161 @@
+"""What the experiments vary: scenarios, phantoms, bead counts, damping, placements, noise.
+
+A `WorkUnit` is one unit of work that can run in any process: one setting in one scenario, for all
+numbers of projections.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration import EIGHT, SIX
+from flexdt.twin.errors import UnknownNameError
+from flexdt.twin.geometry.conventions import FloatArray, from_unity
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.geometry.poses import Poses
+from flexdt_extensions.studies.thesis_tables import (
+    author,
+    placements,
+    projection_counts,
+    thesis,
+)
+
+SHAPE: Final = (760, 956)
+"""Detector (rows, cols) of the thesis's experiments."""
+PIXEL_MM: Final = 0.1496
+FIDELITIES: Final = ("points", "noisy", "clean", "images")
+"""Exact points; points with noise; rendered images without noise; rendered noisy images. In both
+kinds of images the beads' identities are unknown."""
+NOISE_PX: Final = 0.1
+"""Noise of `noisy` points."""
+EXPERIMENTS: Final = ("beads", "phantoms", "damping", "detector")
+VARIANTS: Final = ("printed", "author")
+"""Phantoms and scenarios as the thesis prints them, or as its author's public code has them."""
+DAMPING: Final = {"GN": 0.0, "LM_low": 1e-4, "LM_normal": 1e-2, "LM_high": 1.0}
+
+
+@dataclass(frozen=True)
+class WorkUnit:
+    """One setting in one scenario, all numbers of projections.
+
+    Attributes:
+        experiment: name of the study.
+        setting: bare name: "1" to "7", the phantom's name, the damping's name, G.
+        scenario: G0 to G4.
+        phantom: name of the phantom, with its number of beads.
+        free: parameters to estimate.
+        damping: lambda of Algorithm 2.
+        counts: numbers of projections.
+        fidelity: one of FIDELITIES.
+        seed: of the noise; unused for exact points.
+        limit: MAE below which a run is a success (thesis 6.1.3 and 6.6).
+        variant: one of VARIANTS.
+    """
+
+    experiment: str
+    setting: str
+    scenario: str
+    phantom: str
+    free: tuple[str, ...]
+    damping: float
+    counts: tuple[int, ...]
+    fidelity: str
+    seed: int
+    limit: float
+    variant: str = "printed"
+
+
+def unity_poses(
+    source: npt.ArrayLike, axis: npt.ArrayLike, detector: npt.ArrayLike, angle: FloatArray
+) -> Poses:
+    """Poses of the thesis's detector: places in Unity's axes (3,) [mm], stage angles (n,) [rad]."""
+    source, axis, detector = (from_unity(place) for place in (source, axis, detector))
+    return Poses.upright(source, axis, detector, PIXEL_MM, angle)
+
+
+def scenario(name: str, frames: int, variant: str = "printed") -> tuple[Poses, Offsets]:
+    """Nominal poses (the thesis's "Unity object", angles 360 n / N) and the truth of a scenario.
+
+    Raises:
+        UnknownNameError: lists the scenarios.
+    """
+    table = (author() if variant == "author" else thesis())["scenarios"]
+    if name not in table:
+        raise UnknownNameError.among(f"no scenario {name!r}; there are", name, table)
+    row = table[name]
+    angle = 2.0 * math.pi * np.arange(frames) / frames
+    poses = unity_poses(row["source"], row["object_start"], row["detector"], angle)
+    x, y, z = row["dO"]
+    truth = Offsets.from_edge({"dO_x": x, "dO_y": y, "dO_z": z, "alpha": row["alpha_deg"]})
+    return poses, truth
+
+
+def placement_scenario(setting: str, frames: int) -> tuple[list[Poses], Offsets]:
+    """Poses of each placement of experiment 6.6 for G = 1, 2 or 8, and the truth."""
+    table = placements()
+    poses, _ = scenario(table["scenario"], frames)
+    out = []
+    for name in table["sets"][setting]:
+        x, z = table["placements"][name]
+        out.append(replace(poses, axis=poses.axis + from_unity([x, 0.0, z])))
+    return out, Offsets.from_edge(thesis()["table_6_8_truth"])
+
+
+def tasks(
+    experiment: str,
+    fidelity: str,
+    *,
+    counts: Sequence[int] | None = None,
+    seed: int = 1,
+    variant: str = "printed",
+) -> list[WorkUnit]:
+    """All tasks of an experiment.
+
+    Args:
+        experiment: one of EXPERIMENTS.
+        fidelity: one of FIDELITIES.
+        counts: numbers of projections; None is the thesis's fourteen.
+        seed: of all noise.
+        variant: one of VARIANTS; `detector` is printed in both.
+
+    Raises:
+        UnknownNameError: an experiment, fidelity or variant that does not exist.
+    """
+    for value, allowed, what in (
+        (experiment, EXPERIMENTS, "experiment"),
+        (fidelity, FIDELITIES, "fidelity"),
+        (variant, VARIANTS, "variant"),
+    ):
+        if value not in allowed:
+            raise UnknownNameError.among(f"no {what} {value!r}; there are", value, allowed)
+    n = projection_counts() if counts is None else tuple(counts)
+    scenarios = tuple(thesis()["scenarios"])
+
+    def six(setting: str, phantom: str, damping: float) -> list[WorkUnit]:
+        return [
+            WorkUnit(experiment, setting, g, phantom, SIX, damping, n, fidelity, seed, 0.2, variant)
+            for g in scenarios
+        ]
+
+    match experiment:
+        case "beads":
+            return [t for k in range(1, 8) for t in six(str(k), f"normal-{k}", 1e-2)]
+        case "phantoms":
+            names = thesis()["table_6_4_phantoms"]
+            return [t for name in names for t in six(name, f"{name}-3", 0.0)]
+        case "damping":
+            # Scenario by scenario, so that rendered images serve all dampings.
+            rows = [six(name, "small-3", lam) for name, lam in DAMPING.items()]
+            return [t for same in zip(*rows, strict=True) for t in same]
+        case _:
+            home = placements()["scenario"]
+            return [
+                WorkUnit(experiment, g, home, "normal-3", EIGHT, 1e-2, n, fidelity, seed, 1.0)
+                for g in placements()["sets"]
+            ]

@@ -1,0 +1,289 @@
+"""Rendered radiographs for the studies, and runs of the full pipeline on them, identities unknown.
+
+Pixels integrate the intensity over 4 x 4 points wherever a bead is near, as a real detector does; a
+ball sampled once a pixel moves by 0.006 px. The image is blurred, and photons are counted. The
+pipeline knows the nominal poses and the phantom only.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration import BeadModel
+from flexdt.twin.calibration.detect.detection import SpotFinder
+from flexdt.twin.calibration.detect.windows import (
+    Windows,
+    blur_kernel,
+    crop,
+    overlap,
+    plan_windows,
+    window_intensities,
+)
+from flexdt.twin.calibration.fit.priors import exact
+from flexdt.twin.calibration.frame_source import FrameSpots, look_at
+from flexdt.twin.calibration.pipeline import Request, Scan, calibrate, detector_for
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.projection import Scene, project_scene
+from flexdt_extensions.studies.experiments import SHAPE, WorkUnit
+from flexdt_extensions.studies.runs import Run, geometry_of, run_of
+
+COUNTS = 5000.0
+"""Open-beam photons of a pixel in noisy images (calibration.md)."""
+BLUR_PX = 0.7
+"""Blur of noisy images."""
+FINE = 4
+"""fine x fine points in a pixel near a bead."""
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """How images are made. counts: open-beam photons, None for no noise; blur in pixels."""
+
+    counts: float | None = COUNTS
+    blur_px: float = BLUR_PX
+    fine: int = FINE
+
+
+CLEAN = Rendering(counts=None, blur_px=0.0, fine=1)
+"""Line integrals exactly as the projector makes them: one ray a pixel, no blur, no noise."""
+
+
+def intensities(
+    scene: Scene, model: BeadModel, cone: ConeVec, shape: tuple[int, int], fine: int = FINE
+) -> Float32Array:
+    """Transmitted share of the open beam, (n, rows, cols), integrated over pixels near beads."""
+    out = np.exp(-project_scene(scene, cone, shape))
+    if fine <= 1:
+        return out
+    plan = plan_windows(model, cone, shape)
+    n, k = plan.corner.shape[:2]
+    windows = window_intensities(scene, cone, plan, fine)
+    for f in range(n):
+        for b in range(k):
+            inside, there = overlap(plan, f, b)
+            out[f][there] = windows[f, b][inside]
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedFrames:
+    """Radiographs of one scan, kept small: counts, or clean line integrals round the object.
+
+    Attributes:
+        kept: uint16 counts (rows, cols), or float32 line integrals of the part that is not zero.
+        corner: (row, column) where each kept part lies.
+        looks: what was found in each.
+        shape: (rows, cols).
+        camera: how they were made.
+    """
+
+    kept: tuple[npt.NDArray[np.generic], ...]
+    corner: tuple[tuple[int, int], ...]
+    looks: tuple[FrameSpots, ...]
+    shape: tuple[int, int]
+    camera: Rendering
+
+    def __len__(self) -> int:
+        return len(self.kept)
+
+    def look(self, detector: SpotFinder) -> list[FrameSpots]:
+        """What was found when the frames were made (the detector is the same)."""
+        return list(self.looks)
+
+    def windows(self, plan: Windows) -> Float32Array:
+        """See `Frames`."""
+        n, k = plan.corner.shape[:2]
+        out = np.empty((n, k, plan.side, plan.side), dtype=np.float32)
+        for i in range(n):
+            if self.camera.counts is None:
+                out[i] = crop(self.image(i), plan, i)
+            else:
+                # No photon counts as half of one; beside the image there is nothing.
+                counts = crop(self.kept[i], plan, i)
+                out[i] = line_integrals(counts, self.camera.counts)
+        return out
+
+    def image(self, index: int) -> Float32Array:
+        """Line integrals of one frame, (rows, cols)."""
+        kept, (top, left) = self.kept[index], self.corner[index]
+        if self.camera.counts is not None:
+            return line_integrals(kept, self.camera.counts)
+        full = np.zeros(self.shape, dtype=np.float32)
+        full[top : top + kept.shape[0], left : left + kept.shape[1]] = kept
+        return full
+
+    def take(self, frames: Sequence[int]) -> RenderedFrames:
+        """Some of the frames."""
+        return RenderedFrames(
+            tuple(self.kept[i] for i in frames),
+            tuple(self.corner[i] for i in frames),
+            tuple(self.looks[i] for i in frames),
+            self.shape,
+            self.camera,
+        )
+
+
+def line_integrals(counts: npt.NDArray[np.generic], open_counts: float) -> Float32Array:
+    """-ln(counts / open beam); no photon counts as half of one."""
+    floor = np.maximum(counts.astype(np.float32), np.float32(0.5))
+    return np.asarray(np.float32(np.log(open_counts)) - np.log(floor), dtype=np.float32)
+
+
+def render(
+    scene: Scene,
+    model: BeadModel,
+    poses: Poses,
+    truth: Offsets,
+    camera: Rendering,
+    seed: Sequence[int],
+    shape: tuple[int, int] = SHAPE,
+) -> RenderedFrames:
+    """Make the radiographs of a scan and detect the beads in them.
+
+    Args:
+        scene: the phantom's solids; model: its beads.
+        poses: nominal poses.
+        truth: the hidden geometry the images are made with.
+        camera: noise and blur.
+        seed: key of the noise; frame i uses [*seed, i].
+        shape: (rows, cols).
+    """
+    detector = detector_for(model, poses)
+    kept: list[npt.NDArray[np.generic]] = []
+    corner: list[tuple[int, int]] = []
+    looks: list[FrameSpots] = []
+    for image in exposures(scene, model, poses.cone_vec(truth), camera, seed, shape):
+        if camera.counts is None:
+            rows, cols = np.nonzero(image.any(axis=1))[0], np.nonzero(image.any(axis=0))[0]
+            box = (
+                slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) else slice(0, 1),
+                slice(int(cols[0]), int(cols[-1]) + 1) if len(cols) else slice(0, 1),
+            )
+            kept.append(image[box].astype(np.float32))
+            corner.append((box[0].start, box[1].start))
+            looks.append(look_at(image.astype(np.float32), detector))
+        else:
+            kept.append(image)
+            corner.append((0, 0))
+            looks.append(look_at(line_integrals(image, camera.counts), detector))
+    return RenderedFrames(tuple(kept), tuple(corner), tuple(looks), shape, camera)
+
+
+def exposures(
+    scene: Scene,
+    model: BeadModel,
+    cone: ConeVec,
+    camera: Rendering,
+    seed: Sequence[int],
+    shape: tuple[int, int] = SHAPE,
+) -> Iterator[npt.NDArray[np.generic]]:
+    """The frames of a scan one after the other: uint16 counts, or line integrals without noise.
+
+    Args:
+        scene: solids; model: its beads, near which pixels integrate.
+        cone: true geometry.
+        camera: noise and blur.
+        seed: key of the noise; frame i uses [*seed, i].
+        shape: (rows, cols).
+    """
+    block = 12
+    # Blur brings in what falls just beside the detector.
+    margin = math.ceil(4.0 * camera.blur_px)
+    rows, cols = shape
+    wide = (rows + 2 * margin, cols + 2 * margin)
+    kernel = blur_kernel(camera.blur_px) if camera.blur_px > 0 else None
+    for start in range(0, len(cone), block):
+        part = cone[start : start + block]
+        for i, image in enumerate(intensities(scene, model, part, wide, camera.fine)):
+            if kernel is not None:
+                image = cv2.sepFilter2D(image, -1, kernel, kernel)
+                image = image[margin : margin + rows, margin : margin + cols]
+            if camera.counts is None:
+                yield -np.log(image)
+            else:
+                rng = np.random.default_rng([*seed, start + i])
+                yield photons(np.float32(camera.counts) * image, rng)
+
+
+FEW = 100.0
+"""Expected photons below which a Gaussian is no longer a good Poisson."""
+
+
+def photons(expected: Float32Array, rng: np.random.Generator) -> npt.NDArray[np.uint16]:
+    """Poisson counts, (rows, cols); Gaussian where many photons are expected, which is faster."""
+    noise = rng.standard_normal(expected.shape, dtype=np.float32)
+    noise *= np.sqrt(expected)
+    noise += expected
+    few = np.flatnonzero(expected < FEW)
+    noise.reshape(-1)[few] = rng.poisson(expected.reshape(-1)[few])
+    return np.rint(np.clip(noise, 0.0, 65535.0)).astype(np.uint16)
+
+
+@dataclass(frozen=True, eq=False)
+class _Key:
+    """Arguments that follow from the others, so that a cache need not compare them."""
+
+    values: tuple[BeadModel, Scene, list[Poses], Offsets]
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Key)
+
+    def __hash__(self) -> int:
+        return 0
+
+
+@lru_cache(maxsize=1)
+def _rendered(
+    phantom: str,
+    placements: str | bool,
+    scenario: str,
+    frames: int,
+    camera: Rendering,
+    seed: int,
+    rest: _Key,
+) -> tuple[RenderedFrames, ...]:
+    """The radiographs of a task; tasks that differ in the solver alone share them."""
+    model, scene, everything, truth = rest.values
+    key = [seed, *phantom.encode(), *str(placements).encode(), *scenario.encode()]
+    return tuple(
+        render(scene, model, poses, truth, camera, [*key, g]) for g, poses in enumerate(everything)
+    )
+
+
+def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
+    """All numbers of projections of a task in rendered images, identities unknown.
+
+    The images of the largest N are made once; smaller N take every so many of them, as far as
+    they divide it (the thesis's do), with the same noise.
+    """
+    camera = CLEAN if task.fidelity == "clean" else Rendering()
+    most = max(task.counts)
+    everything, truth = geometry_of(task, most)
+    made = _rendered(task.phantom, task.experiment == "detector" and task.setting, task.scenario,
+                     most, camera, task.seed, _Key((model, scene, everything, truth)))  # fmt: skip
+    out = []
+    for n in task.counts:
+        if most % n:
+            raise ValueError(f"{n} projections are no even part of {most}")
+        chosen = list(range(0, most, most // n))
+        scans = [
+            Scan(frames.take(chosen), poses[np.array(chosen)], f"placement {g + 1}")
+            for g, (frames, poses) in enumerate(zip(made, everything, strict=True))
+        ]
+        result = calibrate(
+            scans, model, Request(free=task.free, priors=exact(task.free)), scene=scene
+        )
+        note = "; ".join(f.text for f in result.errors)
+        problem = None if result.fit is None or note else result.fit.problem
+        out.append(run_of(task, n, result.fit, truth, problem, note))
+    return out

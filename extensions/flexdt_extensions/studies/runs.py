@@ -1,0 +1,288 @@
+"""One run of a study, and the tables made of many runs.
+
+A run is a number of projections in one setting and scenario, solved by our fit and by Algorithm 2.
+Errors are absolute throughout, because signed ones cancel in a mean.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration import BeadModel, FitResult, estimate_geometry
+from flexdt.twin.calibration.fit.problem import Problem
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.geometry.poses import Poses
+from flexdt_extensions.studies.algorithm_2 import algorithm_2
+from flexdt_extensions.studies.experiments import (
+    NOISE_PX,
+    SHAPE,
+    WorkUnit,
+    placement_scenario,
+    scenario,
+)
+from flexdt_extensions.studies.thesis_tables import thesis, thesis_row
+
+OURS = "ours"
+ALGORITHM_2 = "Algorithm 2"
+COMPARED = ("mae", "cost_reduction_pct", "iterations")
+"""Figures of a setting that stand beside the other method's and the thesis's."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One solved calibration; errors are absolute, edge units.
+
+    Attributes:
+        setting, scenario, projections: which.
+        identifiable: ours could determine every parameter, and used the data.
+        errors: parameter -> |estimate - truth|; empty if not identifiable.
+        sigmas: parameter -> stated standard deviation.
+        iterations, cost_reduction_pct: of ours.
+        success: MAE below the thesis's limit.
+        weak: weak and null directions, as text.
+        beside: mae, iterations, cost_reduction_pct, success of the other method on the same tracks,
+            or empty.
+        note: why there is no result.
+        method: whose result this is; the other one is beside it.
+    """
+
+    setting: str
+    scenario: str
+    projections: int
+    identifiable: bool
+    errors: dict[str, float]
+    sigmas: dict[str, float]
+    iterations: int
+    cost_reduction_pct: float
+    success: bool
+    weak: tuple[str, ...] = ()
+    beside: dict[str, float] = field(default_factory=dict)
+    note: str = ""
+    method: str = OURS
+
+    @property
+    def mae(self) -> float:
+        """Mean absolute error over the free parameters; nan without a result."""
+        return _mae(self.errors)
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """What stands beside the other method's result."""
+        return {
+            "mae": self.mae,
+            "iterations": float(self.iterations),
+            "cost_reduction_pct": self.cost_reduction_pct,
+            "success": float(self.success),
+        }
+
+    def to_dict(self) -> dict[str, object]:
+        """JSON-able form; nan becomes null."""
+        return {k: _cleaned(v) for k, v in (asdict(self) | {"mae": self.mae}).items()}
+
+
+def clean(value: float) -> float | None:
+    """A finite float, or None."""
+    return float(value) if math.isfinite(value) else None
+
+
+def _cleaned(value: object) -> object:
+    match value:
+        case float():
+            return clean(value)
+        case dict():
+            return {k: _cleaned(v) for k, v in value.items()}
+        case tuple():
+            return list(value)
+    return value
+
+
+def point_runs(task: WorkUnit, model: BeadModel) -> list[Run]:
+    """All numbers of projections of a task in exact or noisy points (identities known)."""
+    out = []
+    for n in task.counts:
+        parts, truth = geometry_of(task, n)
+        poses = Poses.concatenate(parts)
+        tracks = poses.cone_vec(truth).project_points(model.beads, SHAPE)
+        if task.fidelity == "noisy":
+            # One generator a run, so that runs can be made in any order; solvers share the noise.
+            key = [task.seed, *task.phantom.encode(), *task.scenario.encode(), n, len(parts)]
+            tracks = tracks + NOISE_PX * np.random.default_rng(key).normal(size=tracks.shape)
+        fit = estimate_geometry(tracks, model, poses, task.free, shape=SHAPE, noise_px=NOISE_PX)
+        out.append(run_of(task, n, fit, truth, fit.problem))
+    return out
+
+
+def geometry_of(task: WorkUnit, n: int) -> tuple[list[Poses], Offsets]:
+    """Nominal poses (one set for each placement) and truth of a task."""
+    if task.experiment == "detector":
+        return placement_scenario(task.setting, n)
+    poses, truth = scenario(task.scenario, n, task.variant)
+    return [poses], truth
+
+
+def run_of(
+    task: WorkUnit,
+    n: int,
+    fit: FitResult | None,
+    truth: Offsets,
+    problem: Problem | None,
+    note: str = "",
+) -> Run:
+    """Compare a fit with the truth, and let Algorithm 2 solve the same tracks.
+
+    In the damping experiment Algorithm 2 is what is studied, so its result is the run's, and ours
+    stands beside it; elsewhere it is the other way round.
+    """
+    run = fitted_run(task.setting, task.scenario, n, fit, truth, task.limit, note)
+    other = None if problem is None else _algorithm_2(task, n, problem, truth)
+    if other is None:
+        return run
+    if task.experiment == "damping" and run.identifiable:
+        return replace(other, sigmas=run.sigmas, weak=run.weak, beside=run.figures)
+    return replace(run, beside=other.figures)
+
+
+def fitted_run(
+    setting: str,
+    scenario: str,
+    n: int,
+    fit: FitResult | None,
+    truth: Offsets,
+    limit: float,
+    note: str = "",
+) -> Run:
+    """Compare a fit to n projections with the truth.
+
+    Args:
+        setting, scenario: which.
+        n: number of projections.
+        fit: ours; None if there is none.
+        truth: in the fit's reading.
+        limit: mean absolute error below which it is a success.
+        note: why the fit is not to be used; "" if it is.
+    """
+    weak = () if fit is None else fit.certificate.weak
+    if fit is None or not fit.identifiable or note:
+        iterations, note = 0 if fit is None else fit.iterations, note or "not identifiable"
+        return Run(
+            setting, scenario, n, False, {}, {}, iterations, math.nan, False, weak, note=note
+        )
+    errors = errors_of(fit.values, truth)
+    return Run(
+        setting, scenario, n, True, errors, fit.sigmas, fit.iterations, fit.cost_reduction_pct,
+        _mae(errors) < limit, weak,
+    )  # fmt: skip
+
+
+def _mae(errors: Mapping[str, float]) -> float:
+    return float(np.mean(list(errors.values()))) if errors else math.nan
+
+
+def errors_of(values: dict[str, float], truth: Offsets) -> dict[str, float]:
+    """|value - truth| of each parameter, edge units; whole turns of alpha do not count."""
+    edge = truth.to_edge()
+    return {
+        name: abs(math.remainder(v - edge[name], 360.0) if name == "alpha" else v - edge[name])
+        for name, v in values.items()
+    }
+
+
+def _algorithm_2(task: WorkUnit, n: int, problem: Problem, truth: Offsets) -> Run | None:
+    """What Algorithm 2 makes of the same tracks; nothing if beads are unknowns too."""
+    if problem.layout.bead_column >= 0:
+        return None
+    result = algorithm_2(problem, task.damping)
+    names = problem.layout.names
+    values = {n: v for n, v in result.parameters.to_edge().items() if n in names}
+    errors = errors_of(values, truth)
+    return Run(
+        task.setting, task.scenario, n, True, errors, {}, result.iterations,
+        result.cost_reduction_pct, _mae(errors) < task.limit, method=ALGORITHM_2,
+    )  # fmt: skip
+
+
+def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
+    """One row a setting, in order of first appearance, with the thesis's figures beside ours."""
+    out: list[dict[str, object]] = []
+    for setting in dict.fromkeys(r.setting for r in runs):
+        some = [r for r in runs if r.setting == setting]
+        solved = [r for r in some if r.errors]
+        maes = np.array([r.mae for r in solved])
+        beside = [r.beside for r in some if r.beside]
+        printed = thesis_row(experiment, setting) or {}
+        names = list(solved[0].errors) if solved else []
+        out.append(
+            {
+                "setting": setting,
+                "runs": len(some),
+                "success": sum(r.success for r in some),
+                "unidentifiable": sum(not r.identifiable for r in some),
+                "weak": sum(bool(r.weak) for r in some),
+                "mae": _mean(maes),
+                "mae_max": clean(float(maes.max())) if len(maes) else None,
+                "cost_reduction_pct": _mean([r.cost_reduction_pct for r in solved]),
+                "iterations": _mean([r.iterations for r in solved]),
+                "iterations_max": max((r.iterations for r in solved), default=None),
+                "mean_absolute": {n: _mean([r.errors[n] for r in solved]) for n in names},
+                "mean_sigma": {
+                    n: _mean([r.sigmas[n] for r in solved if n in r.sigmas]) for n in names
+                },
+                "method": some[0].method,
+                "beside": _beside(some[0].method, beside),
+                **{f"thesis_{k}": printed.get(k) for k in COMPARED},
+            }
+        )
+    return out
+
+
+def _beside(method: str, figures: Sequence[dict[str, float]]) -> dict[str, object]:
+    """Means of the other method's figures, or nothing."""
+    if not figures:
+        return {}
+    return {
+        "method": ALGORITHM_2 if method == OURS else OURS,
+        "runs": len(figures),
+        "success": int(sum(f["success"] for f in figures)),
+        **{k: _mean([f[k] for f in figures]) for k in COMPARED},
+    }
+
+
+def _mean(values: Sequence[float] | npt.NDArray[np.float64]) -> float | None:
+    array = np.asarray(values, dtype=np.float64)
+    array = array[np.isfinite(array)]
+    return float(array.mean()) if len(array) else None
+
+
+def summary(experiment: str, fidelity: str, runs: Sequence[Run]) -> dict[str, object]:
+    """The JSON of `flexdt study`."""
+    return {
+        "experiment": experiment,
+        "fidelity": fidelity,
+        "rows": rows_of(experiment, runs),
+        "runs": [r.to_dict() for r in runs],
+        "thesis_source": thesis()["source"],
+        "assumed": {
+            "noise_px": NOISE_PX if fidelity == "noisy" else None,
+            "algorithm_2": "nothing: eta_conv, steps and limit are those of the author's code",
+            "placements": "assumed" if experiment == "detector" else None,
+        },
+    }
+
+
+def grid(runs: Sequence[Run]) -> tuple[list[str], list[int], FloatArray]:
+    """Mean MAE over scenarios: settings, numbers of projections, (settings, counts) or nan."""
+    settings = list(dict.fromkeys(r.setting for r in runs))
+    counts = sorted({r.projections for r in runs})
+    out = np.full((len(settings), len(counts)), np.nan)
+    for i, setting in enumerate(settings):
+        for j, n in enumerate(counts):
+            some = [r.mae for r in runs if r.setting == setting and r.projections == n and r.errors]
+            if some:
+                out[i, j] = float(np.mean(some))
+    return settings, counts, out

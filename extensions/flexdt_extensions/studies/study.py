@@ -1,0 +1,266 @@
+"""`flexdt study` without its command line: distributes the runs of an experiment over processes and
+collects their results in one document. The runs are `flexdt_extensions.studies`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from flexdt.clients.figures import require_plots
+from flexdt.phantoms import Phantom, load_phantom, material
+from flexdt.phantoms.beads import cuboid_with_beads, loop_positions
+from flexdt.twin.calibration import SIX, BeadModel, bead_model
+from flexdt.twin.errors import TwinError, UnknownNameError
+from flexdt.twin.physics import Chain, EffectiveBeam, Panel, effective_beam, weights_of
+from flexdt_extensions.batch.executors import executor
+from flexdt_extensions.studies import experiment_4 as real
+from flexdt_extensions.studies import experiment_4_images as real_images
+from flexdt_extensions.studies.basin import (
+    METHODS,
+    START_DEG,
+    START_MM,
+    Cell,
+    basin_runs,
+    cells,
+    success_grid,
+)
+from flexdt_extensions.studies.experiments import (
+    EXPERIMENTS,
+    NOISE_PX,
+    VARIANTS,
+    WorkUnit,
+    tasks,
+)
+from flexdt_extensions.studies.experiments import FIDELITIES as ALL_FIDELITIES
+from flexdt_extensions.studies.runs import Run, point_runs, summary
+from flexdt_extensions.studies.thesis_tables import author
+
+KILOVOLTS = 90.0
+LOOP_RADIUS_MM, LOOP_INSET_MM = 2.0, 3.0
+"""Beads of the author's code, and how far inside the faces they stand."""
+FIDELITIES: Final[Mapping[str, tuple[str, ...]]] = {
+    **dict.fromkeys(EXPERIMENTS, ALL_FIDELITIES),
+    "real": ("points", "noisy", "images"),
+    "basin": ("noisy", "points"),
+}
+"""What each experiment can be run on, the default first."""
+
+Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+"""`map`, or that of an executor."""
+Tell = Callable[[str], None]
+Document = dict[str, Any]
+
+
+def run_study(
+    experiment: str,
+    fidelity: str | None = None,
+    *,
+    out: Path | None = None,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    counts: Sequence[int] | None = None,
+    seed: int = 1,
+    variant: str = "printed",
+    tell: Tell | None = None,
+) -> Document:
+    """Run one of the thesis's experiments.
+
+    Args:
+        experiment: beads, phantoms, damping, detector, real or basin.
+        fidelity: points, noisy, clean or images; None is the experiment's own (points; basin:
+            noisy).
+        out: folder for summary.json, tables and heat maps; None writes nothing.
+        jobs: processes; None is one for each core.
+        scheduler: address of a dask scheduler to use instead of own processes.
+        counts: numbers of projections; None is the thesis's. basin has one.
+        seed: of all noise.
+        variant: phantoms and scenarios of beads, phantoms and damping as the thesis prints them
+            (printed), or as its author's public code has them (author).
+        tell: called with a line of text after each task.
+
+    Returns:
+        The JSON of `flexdt study`.
+
+    Raises:
+        UnknownNameError: no such experiment, or it has no such fidelity or variant.
+        TwinError: counts were given for basin; dask.distributed is not installed; `out` was given
+            and matplotlib is not installed.
+        CommandError: the scheduler cannot be reached.
+    """
+    _require("no experiment", experiment, FIDELITIES)
+    allowed = FIDELITIES[experiment]
+    fidelity = allowed[0] if fidelity is None else fidelity
+    _require(f"experiment {experiment!r} has no fidelity", fidelity, allowed)
+    variants = VARIANTS if experiment in ("beads", "phantoms", "damping") else VARIANTS[:1]
+    _require(f"no variant of {experiment}", variant, variants)
+    if experiment == "basin" and counts is not None:
+        raise TwinError("basin has one number of projections; counts are not for it")
+    if out is not None:
+        require_plots()
+    say = tell or (lambda _: None)
+    with executor(jobs, scheduler) as pool:
+        spread: Map = map if pool is None else pool.map
+        match experiment, fidelity:
+            case "basin", _:
+                runs, more = _basin(spread, say, fidelity, seed)
+            case "real", "images":
+                runs, more = real_images_runs(spread, say, seed, counts or real_images.COUNTS)
+            case "real", _:
+                runs, more = _real(spread, say, fidelity, seed, counts)
+            case _:
+                work = tasks(experiment, fidelity, counts=counts, seed=seed, variant=variant)
+                names = [f"{task.setting} {task.scenario}" for task in work]
+                runs, more = _collected(spread(run_task, work), names, say), {}
+    document = {**summary(experiment, fidelity, runs), "variant": variant, **more}
+    if out is not None:
+        from flexdt_extensions.studies.study_report import write_study
+
+        write_study(out, document, runs)
+    return document
+
+
+def _require(problem: str, name: str, allowed: Iterable[str]) -> None:
+    if name not in allowed:
+        raise UnknownNameError.among(f"{problem} {name!r}; allowed", name, allowed)
+
+
+def _collected(results: Iterable[list[Run]], names: Sequence[str], say: Tell) -> list[Run]:
+    """The runs of all tasks, with a line of progress for each task."""
+    runs = []
+    for i, (name, some) in enumerate(zip(names, results, strict=True)):
+        runs += some
+        good = sum(run.success for run in some)
+        say(f"{i + 1}/{len(names)} {name}: {good} of {len(some)} runs succeed")
+    return runs
+
+
+def run_task(task: WorkUnit) -> list[Run]:
+    """All runs of one task; a plain function, so that it can be sent to another process."""
+    phantom = load_phantom(task.phantom) if task.variant == "printed" else authors(task.phantom)
+    model = bead_model(phantom)
+    if task.fidelity in ("points", "noisy"):
+        return point_runs(task, model)
+    from flexdt_extensions.studies.rendered_runs import image_runs
+
+    return image_runs(task, model, phantom.scene)
+
+
+def authors(name: str) -> Phantom:
+    """A cuboid with K beads, `NAME-K`, as the author's public code makes it."""
+    cuboid, beads = name.split("-")
+    w, b, h = author()["cuboids"][cuboid]
+    return cuboid_with_beads(
+        name, (w, b, h), loop_positions((w, b, h), int(beads), LOOP_INSET_MM), LOOP_RADIUS_MM,
+        body_material="abs", bead_materials=("steel",) * int(beads), description="author's cuboid",
+    )  # fmt: skip
+
+
+def basin_task(cell: Cell) -> list[Run]:
+    """All methods in one cell of start errors."""
+    return basin_runs(cell, bead_model(load_phantom(cell.phantom)))
+
+
+def _basin(spread: Map, say: Tell, fidelity: str, seed: int) -> tuple[list[Run], Document]:
+    """Success against the start's error, for Algorithm 2, our fit, and unknown identities."""
+    work = cells(seed=seed, noise_px=0.0 if fidelity == "points" else NOISE_PX)
+    runs = _collected(spread(basin_task, work), [cell.name for cell in work], say)
+    shares = {method: success_grid(runs, method).tolist() for method in METHODS}
+    return runs, {
+        "start_mm": list(START_MM), "start_deg": list(START_DEG), "success_share": shares
+    }  # fmt: skip
+
+
+def real_task(
+    task: tuple[str, real.GroupTruth, int, bool, Sequence[int] | None],
+) -> tuple[list[Run], Document]:
+    """One scan of experiment 4: (scan, truth of its group, seed, exact points, counts)."""
+    name, truth, seed, exact, used = task
+    model = bead_model(load_phantom("lego"))
+    return real.real_runs(name, model, truth, seed, exact=exact, used=used)
+
+
+def _real(
+    spread: Map, say: Tell, fidelity: str, seed: int, used: Sequence[int] | None
+) -> tuple[list[Run], Document]:
+    """The author's 242 fits of real scans beside their simulation and ours."""
+    model = bead_model(load_phantom("lego"))
+    truths = [real.physical_truth(group, model) for group in real.GROUPS]
+    names = real.scan_names()
+    curves = []
+
+    def runs_of(results: Iterable[tuple[list[Run], Document]]) -> Iterable[list[Run]]:
+        for some, curve in results:
+            curves.append(curve)
+            yield some
+
+    work = [
+        (name, truth, seed, fidelity == "points", used)
+        for group, truth in zip(real.GROUPS, truths, strict=True)
+        for name in names[group]
+    ]
+    runs = _collected(runs_of(spread(real_task, work)), names, say)
+    return runs, {
+        "assumed": {
+            "beads": "those of the LEGO phantom",
+            "truths": "fitted to the logs at N = 360",
+            "centroids": "of whole pixels" if fidelity == "noisy" else "exact",
+        },
+        "logs_source": author()["source"],
+        "truths": [
+            {
+                "scans": list(names[group]),
+                **dict(zip(SIX, truth.values.tolist(), strict=True)),
+                "noise_px": {f"{sod:g}": noise for sod, noise in truth.noise_px.items()},
+            }
+            for group, truth in zip(real.GROUPS, truths, strict=True)
+        ],
+        "curves": curves,
+        "explained": real.explained(curves),
+    }
+
+
+def lego_beam() -> EffectiveBeam:
+    """Effective energies of the tube's beam behind the LEGO phantom."""
+    names = sorted({solid.material for solid in load_phantom("lego").scene.solids})
+    signal, noise = weights_of(Chain(Panel()), KILOVOLTS)
+    longest = [60.0 if name == "abs" else 2.5 for name in names]
+    return effective_beam(signal, noise, [material(n).substance for n in names], longest)
+
+
+def real_images_task(task: tuple[str, BeadModel, int, int, Sequence[int]]) -> list[Run]:
+    """One scan: (name, beads as found, seed, frames, counts)."""
+    name, found, seed, frames, counts = task
+    phantom = load_phantom("lego")
+    return real_images.image_runs(
+        name, phantom.scene, bead_model(phantom), found, lego_beam(), seed, frames=frames,
+        counts=counts,
+    )  # fmt: skip
+
+
+def real_images_runs(
+    spread: Map,
+    say: Tell,
+    seed: int,
+    counts: Sequence[int],
+    scans: Sequence[str] | None = None,
+    frames: int = real_images.FRAMES,
+) -> tuple[list[Run], Document]:
+    """Experiment 4 on images: the first scan gives the beads, all are calibrated with them.
+
+    Args:
+        spread: `map`, or that of an executor.
+        say: called with a line of text after each scan.
+        seed: of beads and noise.
+        counts: numbers of images to calibrate from.
+        scans: names; None is all eleven.
+        frames: images of a scan.
+    """
+    phantom = load_phantom("lego")
+    model = bead_model(phantom)
+    found, _ = real_images.first_scan("Scan1", phantom.scene, model, lego_beam(), seed, frames)
+    truth = real_images.hidden_phantom(phantom.scene, model, seed)[1]
+    names = real.scan_names() if scans is None else scans
+    work = [(name, found, seed, frames, tuple(counts)) for name in names]
+    runs = _collected(spread(real_images_task, work), names, say)
+    return runs, {"beads_off_truth_mm": real_images.off_truth(found, truth).tolist()}

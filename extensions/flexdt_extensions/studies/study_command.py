@@ -1,0 +1,62 @@
+"""`flexdt study`: repeats the thesis's experiments and prints its figures beside ours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final, Literal
+
+from flexdt.extending import Answer, Jobs, Scheduler, argument, note, option, table
+
+Experiment = Literal["beads", "phantoms", "damping", "detector", "real", "basin"]
+Fidelity = Literal["points", "noisy", "clean", "images"]
+COLUMNS: Final = {
+    "setting": "setting", "runs": "runs", "success": "success", "unidentifiable": "unidentifiable",
+    "mae": "MAE", "mae_max": "largest", "iterations": "iterations", "thesis_mae": "thesis MAE",
+}  # fmt: skip
+"""Member of a row of the document -> head of its column."""
+
+
+def study(
+    experiment: Experiment = argument(..., "EXPERIMENT"),
+    fidelity: Fidelity | None = option(
+        None, "Exact points, noisy points, clean or noisy images. Default: points; basin: noisy."
+    ),
+    variant: Literal["printed", "author"] = option(
+        "printed",
+        "Phantoms and scenarios of beads, phantoms, damping: as the thesis prints them, "
+        "or as its author's public code has them.",
+    ),
+    out: Path | None = option(None, "summary.json, tables, charts.", metavar="DIR"),
+    jobs: Jobs = None,
+    scheduler: Scheduler = None,
+    seed: int = option(1, "Of all noise.", min=0),
+) -> Answer:
+    """Repeat an experiment of the thesis.
+
+    EXPERIMENT: beads, phantoms, damping, detector (6.6), real (experiment 4: the 242 fits of real
+    scans explained, or on synthetic images), basin (sensitivity to the start).
+    """
+    from flexdt_extensions.studies.study import run_study
+    from flexdt_extensions.studies.study_report import open_directions, real_lines
+
+    document = run_study(
+        experiment, fidelity, out=out, jobs=jobs, scheduler=scheduler, seed=seed, variant=variant,
+        tell=note,
+    )  # fmt: skip
+    yield document
+    rows = [[_text(row.get(key)) for key in COLUMNS] for row in document["rows"]]
+    head = [*COLUMNS.values()]
+    weak = open_directions(document["rows"])
+    if weak is not None:
+        rows = [[*row, *more] for row, more in zip(rows, weak, strict=True)]
+        head += ["weak", "largest sigma"]
+    yield table(rows, head)
+    yield from real_lines(document)
+    if out is not None:
+        yield f"report: {out}"
+
+
+def _text(value: object) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,225 @@
+"""Files of a study: summary.json, a table in CSV, heat maps in SVG, and one HTML page with all."""
+
+from __future__ import annotations
+
+import csv
+import html
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flexdt.clients.figures import Series, cell_text, heat_map, page, plot, table
+from flexdt.extending import write_whole
+from flexdt.twin.geometry.offsets import UNITS
+from flexdt_extensions.studies.experiment_4 import ENOUGH
+from flexdt_extensions.studies.runs import Run, grid
+from flexdt_extensions.studies.thesis_tables import thesis
+
+SIGNED = {
+    "beads": "table_A_1_signed_means",
+    "phantoms": "table_A_2_signed_means",
+    "damping": "table_A_3_signed_means",
+}
+"""The thesis's per-parameter means; they are signed, so that errors cancel in them."""
+
+
+def write_study(out: Path, document: Mapping[str, Any], runs: Sequence[Run]) -> None:
+    """Write everything about a study into a folder (made if need be).
+
+    Args:
+        out: the folder.
+        document: the JSON of `flexdt study`.
+        runs: what it was made of.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    write_whole(out / "summary.json", json.dumps(document, indent=1) + "\n")
+    write_whole(out / "rows.csv", rows_csv(document["rows"]))
+    if "success_share" in document:
+        parts = _basin_charts(document)
+    elif "curves" in document:
+        parts = _real_charts(document)
+    else:
+        charts = _error_charts(document, runs)
+        for name, chart in charts.items():
+            write_whole(out / f"{name}.svg", chart)
+        parts = list(charts.values())
+    write_whole(out / "report.html", report(document, *parts))
+
+
+def _error_charts(document: Mapping[str, Any], runs: Sequence[Run]) -> dict[str, str]:
+    """Errors by setting and number of projections, and by setting and parameter."""
+    settings, counts, values = grid(runs)
+    title = f"{document['experiment']}, {document['fidelity']}: MAE"
+    parameters = next((list(run.errors) for run in runs if run.errors), [])
+    by_parameter = [
+        [_mean([r.errors[p] for r in runs if r.setting == s and r.errors]) for p in parameters]
+        for s in settings
+    ]
+    return {
+        "mae": heat_map(
+            values, settings, [str(n) for n in counts], title=title, x_label="projections N",
+            good_below=0.2,
+        ),
+        "parameters": heat_map(
+            np.reshape(by_parameter, (len(settings), len(parameters))), settings, parameters,
+            title="mean absolute error by parameter (mm, deg)", x_label="parameter",
+            good_below=0.2,
+        ),
+    }  # fmt: skip
+
+
+def _basin_charts(document: Mapping[str, Any]) -> list[str]:
+    """One heat map of successes for each method."""
+    rows = [f"{v:g} mm" for v in document["start_mm"]]
+    columns = [f"{v:g} deg" for v in document["start_deg"]]
+    return [
+        heat_map(
+            100.0 * np.asarray(share), rows, columns, title=f"{name}: successes (%)",
+            x_label="error of the start angle", good_from=95.0,
+        )
+        for name, share in document["success_share"].items()
+    ]  # fmt: skip
+
+
+def _real_charts(document: Mapping[str, Any]) -> list[str]:
+    """The logged fits beside their simulation: alpha against N for each scan, tables."""
+    charts = ["".join(f"<p>{html.escape(line)}.</p>" for line in real_lines(document))]
+    for curve in document["curves"]:
+        rows = curve["by_projections"]
+        x = np.log10([float(n) for n in rows])
+        series = {
+            "logged": [r["logged"]["alpha"] for r in rows.values()],
+            "simulated as the author fits": [r["simulated"]["alpha"] for r in rows.values()],
+            "simulated, right angles": [
+                math.nan if r["ours_alpha"] is None else r["ours_alpha"] for r in rows.values()
+            ],
+        }
+        charts.append(
+            plot(
+                [Series(name, x, y) for name, y in series.items()],
+                title=f"{curve['setting']}: alpha against N", x_label="log10 N",
+                y_label="alpha (deg)",
+            )
+        )  # fmt: skip
+        charts.append(curve_table(curve))
+    return charts
+
+
+def open_directions(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]] | None:
+    """For each row: runs with a weak direction, and the largest mean sigma with its parameter; None
+    where no row has a weak run that was solved."""
+    if not any(row["weak"] > row["unidentifiable"] for row in rows):
+        return None
+    out = []
+    for row in rows:
+        sigmas = {n: s for n, s in row["mean_sigma"].items() if s is not None}
+        worst = max(sigmas, key=lambda n: sigmas[n], default=None)
+        text = "-" if worst is None else f"{worst} {sigmas[worst]:.3g} {UNITS[worst]}"
+        out.append((f"{row['weak']} of {row['runs']}", text))
+    return out
+
+
+def real_lines(document: Mapping[str, Any]) -> list[str]:
+    """What explains the logged fits of real scans, in sentences; nothing where not studied."""
+    found = document.get("explained")
+    if not found:
+        return []
+    whole = sum(row["within"] == row["fits"] for row in found)
+    most = sum(r["alpha_rms_deg"] < 1.0 and abs(r["rms_largest_pct"]) < 15.0 for r in found)
+    lines = [
+        f"logged fits of real scans from N = {ENOUGH} up, against their simulation: "
+        f"{sum(r['within'] for r in found)} of {sum(r['fits'] for r in found)} agree within 1 deg "
+        f"of alpha and 15 % of the residual, all of a scan's in {whole} of {len(found)} scans; "
+        f"with the rms of alpha's differences instead of each, {most} of {len(found)}"
+    ]
+    return lines + [
+        f"{r['setting']}: alpha differs by {r['alpha_rms_deg']:.2f} deg (rms; largest "
+        f"{r['alpha_largest_deg']:.2f}), the residual by at most {r['rms_largest_pct']:+.0f} %; "
+        f"{r['iterations'][0]:.0f} iterations logged, {r['iterations'][1]:.0f} simulated; "
+        f"{r['within']} of {r['fits']} within"
+        for r in found
+    ]
+
+
+def curve_table(curve: Mapping[str, Any]) -> str:
+    """One scan against N: logged, simulated as the author fits, simulated with right angles."""
+    names = ("alpha", "dO_z", "tau_x", "tau_z")
+    return table(
+        ["N", *(f"{n}: logged, simulated ({UNITS[n]})" for n in names), "right angles: alpha (deg)",
+         "rms: logged, simulated, right angles (px)", "iterations: logged, simulated"],
+        [[n, *(f"{r['logged'][k]:.2f}, {r['simulated'][k]:.2f}" for k in names), r["ours_alpha"],
+          ", ".join(cell_text(r[f"{k}_rms_px"]) for k in ("logged", "simulated", "ours")),
+          f"{r['logged_iterations']}, {r['simulated_iterations']}"]
+         for n, r in curve["by_projections"].items()],
+    )  # fmt: skip
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values)) if values else float("nan")
+
+
+def rows_csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The rows as CSV."""
+    keys = ["setting", "runs", "success", "unidentifiable", "mae", "mae_max", "iterations",
+            "cost_reduction_pct", "thesis_mae", "thesis_cost_reduction_pct",
+            "thesis_iterations"]  # fmt: skip
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*keys, "method", "other_method", "other_mae", "other_iterations"])
+    for row in rows:
+        beside = row["beside"]
+        others = [row["method"], *(beside.get(k) for k in ("method", "mae", "iterations"))]
+        writer.writerow([*(row.get(k) for k in keys), *others])
+    return text.getvalue()
+
+
+def report(document: Mapping[str, Any], *charts: str) -> str:
+    """One HTML page."""
+    rows = [
+        [
+            r["setting"], r["runs"], r["success"], r["unidentifiable"], r["mae"], r["mae_max"],
+            r["iterations"], r["cost_reduction_pct"],
+            r["beside"].get("mae"), r["beside"].get("iterations"),
+            r["thesis_mae"], r["thesis_iterations"], r["thesis_cost_reduction_pct"],
+        ]
+        for r in document["rows"]
+    ]  # fmt: skip
+    weak = open_directions(document["rows"])
+    others = [r["beside"].get("method") for r in document["rows"] if r["beside"]]
+    other = others[0] if others else "other method"
+    head = ["setting", "runs", "success", "not identifiable", "MAE", "worst MAE", "iterations",
+            "cost red. %", f"{other} MAE", f"{other} iterations", "thesis MAE", "thesis iterations",
+            "thesis cost red. %"]  # fmt: skip
+    if weak is not None:
+        head += ["weak", "largest mean sigma"]
+        rows = [[*row, *more] for row, more in zip(rows, weak, strict=True)]
+    shown = [i for i in range(len(head)) if i < 3 or any(row[i] is not None for row in rows)]
+    head, rows = [head[i] for i in shown], [[row[i] for i in shown] for row in rows]
+    body = [
+        f"<h1>Study: {document['experiment']}, {document['fidelity']}</h1>",
+        table(head, rows),
+        *(f"<figure>{chart}</figure>" for chart in charts),
+    ]
+    signed = thesis().get(SIGNED.get(str(document["experiment"]), ""), None)
+    if signed is not None:
+        names = list(next(iter(signed.values())))
+        ours = {r["setting"]: r["mean_absolute"] for r in document["rows"]}
+        rows = [
+            [s, *(f"{_text(ours.get(s, {}).get(n))} ({values[n]:g})" for n in names)]
+            for s, values in signed.items()
+        ]
+        body.append("<h2>By parameter: our mean absolute error (thesis: signed mean)</h2>")
+        body.append(table(["setting", *names], rows))
+    body.append(f"<p>{document['thesis_source']}.</p>")
+    assumed = [f"{k}: {v}" for k, v in document["assumed"].items() if v is not None]
+    body.append(f"<p>Assumed: {html.escape('; '.join(assumed))}.</p>")
+    return page(f"flexdt study {document['experiment']}", body)
+
+
+def _text(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2g}"

@@ -1,0 +1,5 @@
+"""What every test of the extensions may rely on; see `tests/support/suite.py`."""
+
+from suite import data_dir, pytest_collection_modifyitems, servers
+
+__all__ = ["data_dir", "pytest_collection_modifyitems", "servers"]

@@ -1,0 +1,122 @@
+"""The studies in short: plans, points, one small case in images, basin, experiment 4."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flexdt.phantoms import load_phantom
+from flexdt.twin.calibration.bead_model import bead_model
+from flexdt.twin.errors import UnknownNameError
+from flexdt_extensions.studies.basin import METHODS, Cell
+from flexdt_extensions.studies.experiment_4_images import hidden_phantom, off_truth
+from flexdt_extensions.studies.experiments import (
+    EXPERIMENTS,
+    WorkUnit,
+    placement_scenario,
+    tasks,
+)
+from flexdt_extensions.studies.study import basin_task, real_images_runs, run_study, run_task
+
+
+def test_the_experiments_have_the_theses_numbers_of_runs() -> None:
+    runs = {e: sum(len(t.counts) for t in tasks(e, "points")) for e in EXPERIMENTS}
+    assert runs["beads"] == 490
+    assert runs["phantoms"] == 490
+    assert runs["damping"] == 280
+    assert {t.setting for t in tasks("detector", "points")} == {"1", "2", "8"}
+    poses, truth = placement_scenario("8", 3)
+    assert len(poses) == 8
+    assert len({float(p.sod[0]) for p in poses}) == 2
+    assert truth.to_edge()["dD_y"] == -7.0
+    with pytest.raises(UnknownNameError, match="no fidelity"):
+        tasks("beads", "guesses")
+
+
+def test_exact_points_solve_everything_but_one_bead(tmp_path: Path) -> None:
+    document = run_study("beads", "points", counts=(3, 36), jobs=1, out=tmp_path)
+    rows = {r["setting"]: r for r in document["rows"]}  # type: ignore[attr-defined]
+    assert rows["1"]["unidentifiable"] == rows["1"]["runs"] == 10
+    assert rows["1"]["mae"] is None
+    for k in "234567":
+        assert rows[k]["success"] == rows[k]["runs"] == 10
+        assert rows[k]["mae_max"] < 1e-9
+        assert rows[k]["iterations_max"] <= 8
+        assert rows[k]["thesis_mae"] > 0
+    stored = json.loads((tmp_path / "summary.json").read_text())
+    assert stored["rows"] == json.loads(json.dumps(document["rows"]))
+    assert {"report.html", "mae.svg", "parameters.svg", "rows.csv"} <= {
+        p.name for p in tmp_path.iterdir()
+    }
+    run = stored["runs"][-1]
+    assert set(run["errors"]) == {"dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z"}
+    assert run["projections"] == 36
+
+
+def test_detector_lateral_is_weak_with_one_placement_only() -> None:
+    document = run_study("detector", "noisy", counts=(12, 36), jobs=1)
+    rows = {r["setting"]: r for r in document["rows"]}  # type: ignore[attr-defined]
+    assert rows["1"]["weak"] == 2
+    assert rows["1"]["mean_sigma"]["dD_x"] > 0.5
+    assert rows["2"]["weak"] == rows["8"]["weak"] == 0
+    assert rows["2"]["mae"] < 0.02
+    assert rows["8"]["mae"] < 0.01
+
+
+def test_damping_rows_are_algorithm_2() -> None:
+    document = run_study("damping", "points", counts=(6,), jobs=1)
+    for row in document["rows"]:  # type: ignore[attr-defined]
+        assert row["method"] == "Algorithm 2"
+        assert row["success"] == 5
+        assert row["beside"]["method"] == "ours"
+
+
+def test_rendered_noisy_images_with_unknown_identities() -> None:
+    """One scenario in images: Beer-Lambert, blur, 5000 counts, nobody told which bead is which."""
+    task = next(t for t in tasks("phantoms", "images", counts=(6, 12)) if t.setting == "normal")
+    runs = run_task(task)
+    assert [r.projections for r in runs] == [6, 12]
+    for run in runs:
+        assert run.identifiable
+        assert run.mae < 0.01
+        assert max(run.errors[n] / run.sigmas[n] for n in run.errors) < 6.0
+
+
+def test_cut_beads_solve_the_tall_phantom() -> None:
+    """In G3 one whole bead stays in view: the two at the edge are fitted (calibration.md)."""
+    task = WorkUnit(
+        "phantoms", "tall", "G3", "tall-3", ("dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z"),
+        0.0, (12,), "images", 1, 0.2,
+    )  # fmt: skip
+    (run,) = run_task(task)
+    assert run.success
+    assert run.mae < 0.02
+
+
+def test_basin_of_our_fit_is_not_smaller_than_algorithm_2s() -> None:
+    runs = basin_task(Cell(20.0, 90.0, 5, "normal-5", 3))
+    share = {m: np.mean([r.success for r in runs if r.setting == m]) for m in METHODS}
+    assert share["ours, identities unknown"] == 1.0
+    assert share["ours"] >= max(share["GN"], share["LM_normal"]) - 0.21
+    near = basin_task(Cell(5.0, 30.0, 3, "normal-5", 3))
+    assert all(r.success for r in near)
+
+
+@pytest.mark.slow
+def test_experiment_4_on_images_does_not_depend_on_the_number_of_projections() -> None:
+    """Beam hardening, noise, beads off their model; the first scan's volume gives the model of the
+    others (short: 24 images of two scans)."""
+    runs, document = real_images_runs(map, print, 1, (3, 12), scans=("Scan2",), frames=24)
+    off = document["beads_off_truth_mm"]
+    designed = bead_model(load_phantom("lego"))
+    truth = hidden_phantom(load_phantom("lego").scene, designed, 1)[1]
+    assert max(off) < 0.06  # type: ignore[type-var]
+    assert np.mean(off) < np.mean(off_truth(designed, truth))  # type: ignore[arg-type]
+    few, many = (run.to_dict() for run in runs)
+    for run in (few, many):
+        assert run["identifiable"]
+        assert max(run["errors"][n] / run["sigmas"][n] for n in run["errors"]) < 5.0
+    assert abs(few["errors"]["alpha"] - many["errors"]["alpha"]) < 0.05

@@ -1,0 +1,59 @@
+"""What other distributions write commands and files with; flexdt's own extensions do.
+
+A command is a function whose parameters' defaults are its options; it yields lines for people and,
+once, the document of `--json`. The entry point group `flexdt.commands` gives it a name:
+
+    [project.entry-points."flexdt.commands"]
+    study = "my_package.study_command:study"
+
+A dot in the name stands for a group: `phantom.design` is `flexdt phantom design`.
+"""
+
+from flexdt.clients.cli.commands.processes.process_commands import become
+from flexdt.clients.cli.console import note, size, table, warn
+from flexdt.clients.cli.option_values import names, numbers, position, triple
+from flexdt.clients.cli.options import (
+    Answer,
+    Free,
+    Jobs,
+    Json,
+    MachineName,
+    ProfileName,
+    Scheduler,
+    argument,
+    option,
+)
+from flexdt.clients.extras import package
+from flexdt.clients.failure import CommandError
+from flexdt.clients.whole_files import free_bytes, write_whole
+from flexdt.process_settings import OneLine
+from flexdt.server.files.image_files import tiff_bytes
+from flexdt.twin.values import message_of
+
+__all__ = [
+    "Answer",
+    "CommandError",
+    "Free",
+    "Jobs",
+    "Json",
+    "MachineName",
+    "OneLine",
+    "ProfileName",
+    "Scheduler",
+    "argument",
+    "become",
+    "free_bytes",
+    "message_of",
+    "names",
+    "note",
+    "numbers",
+    "option",
+    "package",
+    "position",
+    "size",
+    "table",
+    "tiff_bytes",
+    "triple",
+    "warn",
+    "write_whole",
+]

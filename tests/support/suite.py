@@ -1,0 +1,65 @@
+"""What every test may rely on, however the suite itself was started."""
+
+from __future__ import annotations
+
+import signal
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+from flexdt.clients.launch.processes import Servers
+
+# A shell that starts the suite in the background ignores SIGINT, and every process started from
+# here would inherit that; the tests of Ctrl-C need it to arrive.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# The same examples every time, and none refused for being slow on a busy machine: what fails here
+# fails everywhere. `pytest --hypothesis-profile=default` looks for new ones.
+settings.register_profile(
+    "same", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("same")
+
+
+def keep_some_daily(items: list[pytest.Item]) -> None:
+    """Of a test marked `daily(n)`, n cases run every day and the others are marked `slow`.
+
+    The n cases lie evenly among all, so that each kind of a table is met.
+    """
+    cases: dict[tuple[Path, str], list[pytest.Item]] = {}
+    for item in items:
+        if item.get_closest_marker("daily") is not None:
+            name = getattr(item, "originalname", None) or item.name
+            cases.setdefault((item.path, name), []).append(item)
+    for every in cases.values():
+        mark = every[0].get_closest_marker("daily")
+        assert mark is not None
+        kept = {len(every) * i // mark.args[0] for i in range(mark.args[0])}
+        for number, item in enumerate(every):
+            if number not in kept:
+                item.add_marker(pytest.mark.slow)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Modules that take long begin first, then those of many tests: no worker is left with one."""
+    keep_some_daily(items)
+    long = {item.path for item in items if item.get_closest_marker("slow") is not None}
+    count = Counter(item.path for item in items)
+    items.sort(key=lambda item: (item.path not in long, -count[item.path]))
+
+
+@pytest.fixture(scope="module")
+def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("data")
+
+
+@pytest.fixture(scope="module")
+def servers(data_dir: Path) -> Iterator[Servers]:
+    """Twin and projector under their supervisor, shared by a module's tests."""
+    options = {"data": data_dir, "speed-up": "max"}
+    with Servers(options, data_dir.parent / "servers.log") as running:
+        yield running

@@ -1,1 +1,0 @@
-"""The thesis's experiments as pure computations: plans, runs, tables. Clients run them."""
