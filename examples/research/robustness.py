@@ -21,7 +21,7 @@ from ways_of_spoiling import KINDS
 
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import bead_model
-from flexdt_extensions.batch.executors import executor
+from flexdt_extensions.executors import executor
 
 PHANTOMS = ("lego", "normal-5", "normal-4", "square-5")
 """Scanned in turn; with three beads or fewer nobody can say which of them is off."""

@@ -218,7 +218,7 @@ def test_what_workers_do_not_do(
     with pytest.raises(TwinError, match=r"a worker has flexdt 0\.2, this is 0\.3"):
         reconstruct_dataset(data, tmp_path / "v.zarr", REQUEST, workers=nullcontext(Here()))
     pytest.importorskip("distributed", reason="the extra `batch`")
-    monkeypatch.setattr("flexdt_extensions.batch.executors.SCHEDULER_S", 0.5)
+    monkeypatch.setattr("flexdt_extensions.executors.SCHEDULER_S", 0.5)
     words = ["reconstruct", str(scan), "--out", str(tmp_path / "v.zarr"), "--json", "--scheduler"]
     for more, code, said in (
         (["tcp://127.0.0.1:1"], 4, "no dask scheduler at tcp://127.0.0.1:1"),

@@ -55,14 +55,14 @@ def batch(
     """
     from flexdt_extensions.batch.batch_plan import read_plan
     from flexdt_extensions.batch.batch_run import run_batch
-    from flexdt_extensions.batch.executors import (
+    from flexdt_extensions.batch.work import item_bytes
+    from flexdt_extensions.executors import (
         Slurm,
         dask_executor,
         job_script,
         processes,
         slurm_executor,
     )
-    from flexdt_extensions.batch.work import item_bytes
 
     wanted = read_plan(plan)
     queued = Slurm(

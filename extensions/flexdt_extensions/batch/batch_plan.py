@@ -7,17 +7,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Gt, Le, Len
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from flexdt.extending import CommandError, message_of
+from flexdt.extending import CommandError
 from flexdt.twin.calibration import SIX
 from flexdt.twin.geometry.offsets import NAMES
 from flexdt_extensions.batch.draws import Count, Draw, Name, Number, Positive
+from flexdt_extensions.toml_files import problems_of, read_toml
 
 
 class _Table(BaseModel):
@@ -224,22 +224,3 @@ def read_plan(path: Path) -> Plan:
         OSError: the file cannot be read.
     """
     return parse_plan(read_toml(path), str(path))
-
-
-def read_toml(path: Path) -> dict[str, Any]:
-    """A TOML file; errors as `read_plan`."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CommandError(f"{path}: no TOML: {error}") from None
-
-
-def problems_of(name: str, error: ValidationError) -> list[str]:
-    """What is wrong in a document, line by line, with key paths."""
-    lines = []
-    for e in error.errors(include_url=False, include_context=False):
-        path = ".".join(str(part) for part in e["loc"]) or "plan"
-        message = message_of(e)
-        shown = "" if isinstance(e["input"], dict | BaseModel) else f" (got {e['input']!r})"
-        lines.append(f"{name}: {path}: {message}{'' if 'got' in message else shown}")
-    return lines

@@ -13,7 +13,7 @@ from flexdt.phantoms.beads import cuboid_with_beads, loop_positions
 from flexdt.twin.calibration import SIX, BeadModel, bead_model
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.physics import Chain, EffectiveBeam, Panel, effective_beam, weights_of
-from flexdt_extensions.batch.executors import executor
+from flexdt_extensions.executors import executor
 from flexdt_extensions.studies import experiment_4 as real
 from flexdt_extensions.studies import experiment_4_images as real_images
 from flexdt_extensions.studies.basin import (

@@ -50,5 +50,5 @@ def thesis_row(experiment: str, setting: str) -> Mapping[str, float] | None:
 
 
 def _text(name: str) -> str:
-    path = resources.files("flexdt.twin.calibration") / "data" / name
+    path = resources.files("flexdt_extensions.studies") / "data" / name
     return path.read_text(encoding="utf-8")

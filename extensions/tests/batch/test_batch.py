@@ -27,8 +27,8 @@ from flexdt.twin.projection import project_scene
 from flexdt_extensions.batch.batch_plan import Plan, parse_plan, read_plan
 from flexdt_extensions.batch.batch_run import figures, run_batch
 from flexdt_extensions.batch.draws import parse
-from flexdt_extensions.batch.executors import Slurm, job_script, read_slurm
 from flexdt_extensions.batch.work import draw_item, item_bytes, layout, run_item, seed_of
+from flexdt_extensions.executors import Slurm, job_script, read_slurm
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -461,7 +461,7 @@ def test_no_scheduler_there_is_said(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("flexdt_extensions.batch.executors.SCHEDULER_S", 1.0)
+    monkeypatch.setattr("flexdt_extensions.executors.SCHEDULER_S", 1.0)
     words = ["batch", str(plan_file()), "--out", str(tmp_path / "out")]
     assert run([*words, "--scheduler", "tcp://127.0.0.1:1"]) == 4
     assert "no dask scheduler at tcp://127.0.0.1:1" in capsys.readouterr().err

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from flexdt.twin.projection import Volume, forward
-from flexdt_extensions.batch.executors import executor
+from flexdt_extensions.executors import executor
 
 ROW = [0.0, -600.0, 0.0, 0.0, 459.0, 0.0, 0.15, 0.0, 0.0, 0.0, 0.0, -0.15]
 

@@ -28,7 +28,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from flexdt.extending import CommandError, package
 from flexdt.twin.errors import TwinError
-from flexdt_extensions.batch.batch_plan import problems_of, read_toml
+from flexdt_extensions.toml_files import problems_of, read_toml
 
 SINGLE: Final[Mapping[str, str]] = dict.fromkeys(
     (
