@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from flexdt.clients.client.events import Projection
     from flexdt.clients.client.transport import ConnectionLost
     from flexdt.clients.client.twin_methods import FINAL_STATES
-    from flexdt.protocol.methods.jobs import CheckResult
+    from flexdt.protocol.methods.job_messages import CheckResult
     from flexdt.protocol.rpc_errors import RpcError
     from flexdt.protocol.state_model import AxisState, JobStatus, State
 
@@ -24,7 +24,7 @@ _HOMES = {
     "TwinClient": "flexdt.clients.client.client",
     "ConnectionLost": "flexdt.clients.client.transport",
     "FINAL_STATES": "flexdt.clients.client.twin_methods",
-    "CheckResult": "flexdt.protocol.methods.jobs",
+    "CheckResult": "flexdt.protocol.methods.job_messages",
     "RpcError": "flexdt.protocol.rpc_errors",
     "AxisState": "flexdt.protocol.state_model",
     "JobStatus": "flexdt.protocol.state_model",

@@ -30,9 +30,9 @@ from flexdt.protocol.fields import (
     require_extent,
 )
 from flexdt.protocol.method import AnyMethod, Method, read
-from flexdt.protocol.methods.documents import Discovery
-from flexdt.protocol.methods.samples import Bytes
-from flexdt.protocol.methods.session import Hello, HelloResult
+from flexdt.protocol.methods.document_messages import Discovery
+from flexdt.protocol.methods.sample_messages import Bytes
+from flexdt.protocol.methods.session_messages import Hello, HelloResult
 from flexdt.protocol.rpc_errors import RpcError
 
 MAX_VIEWS: Final = 100_000

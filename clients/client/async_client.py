@@ -14,7 +14,7 @@ from flexdt.clients.client.policy import Core
 from flexdt.clients.client.shared_methods import SharedMethods
 from flexdt.clients.client.transport import TcpTransport, Transport
 from flexdt.clients.client.twin_methods import Kind, Topic
-from flexdt.protocol.methods.session import HelloResult
+from flexdt.protocol.methods.session_messages import HelloResult
 
 _R = TypeVar("_R")
 

@@ -22,7 +22,7 @@ from flexdt.clients.client.flows import Effect, Flow, Tell, drive, perform
 from flexdt.clients.client.shared_methods import SharedMethods
 from flexdt.clients.client.transport import Transport
 from flexdt.clients.client.twin_methods import Kind, Topic
-from flexdt.protocol.methods.session import HelloResult
+from flexdt.protocol.methods.session_messages import HelloResult
 
 _R = TypeVar("_R")
 

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from pydantic import BaseModel
 
 from flexdt.protocol import image, parse_result
-from flexdt.protocol.methods.images import Projection as WireProjection
+from flexdt.protocol.methods.image_messages import Projection as WireProjection
 from flexdt.protocol.rpc_errors import RpcError
 from flexdt.protocol.state_model import ImageFlags, JobStatus, LogEntry, State
 

@@ -15,7 +15,7 @@ from typing import Final, Protocol
 from flexdt.clients.client.flows import Ask
 from flexdt.clients.client.transport import ConnectionLost, Link, Transport
 from flexdt.protocol import METHODS, RpcError, hello_params, parse_result
-from flexdt.protocol.methods.session import HelloResult
+from flexdt.protocol.methods.session_messages import HelloResult
 
 FIRST_PAUSE_S: Final = 0.05
 LONGEST_PAUSE_S: Final = 1.0

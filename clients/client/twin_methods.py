@@ -21,11 +21,15 @@ from flexdt.clients.client.events import Projection
 from flexdt.clients.client.flows import OWN_PATIENCE, Flow, Sleep, Tell, ask
 from flexdt.protocol import image as wire_image
 from flexdt.protocol import state_model as s
-from flexdt.protocol.methods import calibration as corrections
-from flexdt.protocol.methods import datasets as past_scans
-from flexdt.protocol.methods import documents, images, motion, session, settings
-from flexdt.protocol.methods import jobs as scans
-from flexdt.protocol.methods import samples as stage
+from flexdt.protocol.methods import calibration_messages as corrections
+from flexdt.protocol.methods import dataset_messages as past_scans
+from flexdt.protocol.methods import document_messages as documents
+from flexdt.protocol.methods import image_messages as images
+from flexdt.protocol.methods import job_messages as scans
+from flexdt.protocol.methods import motion_messages as motion
+from flexdt.protocol.methods import sample_messages as stage
+from flexdt.protocol.methods import session_messages as session
+from flexdt.protocol.methods import setting_messages as settings
 
 if TYPE_CHECKING:
     from flexdt.phantoms import Phantom

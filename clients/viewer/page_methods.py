@@ -33,7 +33,7 @@ from flexdt.clients.viewer.viewer import PageMethod, Viewer
 from flexdt.protocol import Code, Method, RpcError, parse_params
 from flexdt.protocol import image as wire_image
 from flexdt.protocol.fields import Nothing, Params
-from flexdt.protocol.methods.calibration import CalibrationAlign, CalibrationFit
+from flexdt.protocol.methods.calibration_messages import CalibrationAlign, CalibrationFit
 from flexdt.protocol.rpc_errors import busy, link_down
 from flexdt.protocol.state_model import State
 from flexdt.server.wire_errors import explain

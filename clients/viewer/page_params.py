@@ -21,8 +21,8 @@ from flexdt.protocol.fields import (
     Voltage,
     few,
 )
-from flexdt.protocol.methods.calibration import CalibrationApply
-from flexdt.protocol.methods.jobs import ScriptText
+from flexdt.protocol.methods.calibration_messages import CalibrationApply
+from flexdt.protocol.methods.job_messages import ScriptText
 from flexdt.twin.script.compose import Kind as KindOfScan
 
 Kind = Literal["line_integral", "counts"]

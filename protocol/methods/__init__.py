@@ -9,17 +9,15 @@ from collections.abc import Mapping
 from typing import Final
 
 from flexdt.protocol.method import AnyMethod, Method
-from flexdt.protocol.methods import (
-    calibration,
-    datasets,
-    documents,
-    images,
-    jobs,
-    motion,
-    samples,
-    session,
-    settings,
-)
+from flexdt.protocol.methods import calibration_messages as calibration
+from flexdt.protocol.methods import dataset_messages as datasets
+from flexdt.protocol.methods import document_messages as documents
+from flexdt.protocol.methods import image_messages as images
+from flexdt.protocol.methods import job_messages as jobs
+from flexdt.protocol.methods import motion_messages as motion
+from flexdt.protocol.methods import sample_messages as samples
+from flexdt.protocol.methods import session_messages as session
+from flexdt.protocol.methods import setting_messages as settings
 from flexdt.protocol.rpc_errors import method_not_found
 
 TOPICS: Final = (

@@ -9,7 +9,7 @@ from flexdt.phantoms import Phantom
 from flexdt.phantoms.exposure_forecast import expose
 from flexdt.protocol import Codec
 from flexdt.protocol.connection import encoded
-from flexdt.protocol.methods.images import PREDICTION_LIMITS, ExposurePrediction
+from flexdt.protocol.methods.image_messages import PREDICTION_LIMITS, ExposurePrediction
 from flexdt.server.runtime.workers import Workers
 from flexdt.twin.machine.description import Machine
 

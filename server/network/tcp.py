@@ -46,7 +46,7 @@ from flexdt.protocol import (
 from flexdt.protocol.connection import MAX_ANSWER, Raw
 from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Id, Single
-from flexdt.protocol.methods.session import Hello
+from flexdt.protocol.methods.session_messages import Hello
 from flexdt.protocol.rpc_errors import (
     ProtocolError,
     busy,

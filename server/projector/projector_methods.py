@@ -19,7 +19,7 @@ from flexdt.phantoms.json_form import scene_from_dict
 from flexdt.protocol import MAX_FRAME, PROTOCOL, image, openrpc
 from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Id
-from flexdt.protocol.methods.session import Hello
+from flexdt.protocol.methods.session_messages import Hello
 from flexdt.protocol.projector import (
     PROJECTOR_METHODS,
     Backproject,

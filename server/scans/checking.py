@@ -20,7 +20,7 @@ from typing import Any, Final, TypeVar
 from flexdt.protocol import Codec
 from flexdt.protocol.codec import write_json, write_msgpack
 from flexdt.protocol.connection import MAX_ANSWER
-from flexdt.protocol.methods.jobs import CHECK_LIMITS
+from flexdt.protocol.methods.job_messages import CHECK_LIMITS
 from flexdt.protocol.rpc_errors import Code, RpcError, too_large
 from flexdt.server.runtime.loop import ServerLoop
 from flexdt.server.runtime.workers import Workers

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from flexdt.phantoms import is_shipped, load_phantom, load_phantom_file
-from flexdt.protocol.methods import calibration as p
+from flexdt.protocol.methods import calibration_messages as p
 from flexdt.server.files.dataset_folder import read_text
 from flexdt.server.files.directory import Directory
 from flexdt.server.wire_errors import from_root

@@ -24,8 +24,8 @@ from flexdt.protocol import Codec, image
 from flexdt.protocol.connection import MAX_ANSWER, encoded
 from flexdt.protocol.fields import ImageValue, Params
 from flexdt.protocol.messages import Encoded
-from flexdt.protocol.methods import datasets as p
-from flexdt.protocol.methods.calibration import CalibrationAlign, CalibrationFit
+from flexdt.protocol.methods import dataset_messages as p
+from flexdt.protocol.methods.calibration_messages import CalibrationAlign, CalibrationFit
 from flexdt.protocol.rpc_errors import too_large
 from flexdt.server.files.dataset_folder import (
     Folder,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from flexdt.protocol import RpcError, image
-from flexdt.protocol.methods.images import Projection
+from flexdt.protocol.methods.image_messages import Projection
 from flexdt.protocol.state_model import ImageFlags
 from flexdt.server.imaging.exposure_flags import flags_of
 from flexdt.server.imaging.radiography import Radiography

@@ -24,7 +24,7 @@ from flexdt.protocol.connection import Raw
 from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Single
 from flexdt.protocol.method import parse_params
-from flexdt.protocol.methods.jobs import TrajectoryInput
+from flexdt.protocol.methods.job_messages import TrajectoryInput
 from flexdt.protocol.rpc_errors import too_large
 from flexdt.server.network.shell_application import Call, Frozen
 from flexdt.server.runtime.workers import Workers

@@ -33,8 +33,8 @@ from flexdt.protocol import (
     parse_params,
 )
 from flexdt.protocol.fields import Empty, Params
-from flexdt.protocol.methods.samples import SampleUpload
-from flexdt.protocol.methods.session import Hello
+from flexdt.protocol.methods.sample_messages import SampleUpload
+from flexdt.protocol.methods.session_messages import Hello
 from flexdt.protocol.rpc_errors import parse_error
 from flexdt.server.network.shell_application import Peer
 from flexdt.server.network.tcp import serve

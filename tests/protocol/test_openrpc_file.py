@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import get_args
 
 from flexdt.protocol import METHODS
-from flexdt.protocol.methods.images import ProjectionGet
-from flexdt.protocol.methods.samples import SampleUpload
+from flexdt.protocol.methods.image_messages import ProjectionGet
+from flexdt.protocol.methods.sample_messages import SampleUpload
 from flexdt.protocol.openrpc import document
 from flexdt.protocol.state_model import JobPhase
 

@@ -16,7 +16,7 @@ from in_process import Lab, M, run
 import flexdt as fx
 from flexdt.phantoms import load_phantom
 from flexdt.protocol import Codec, RpcError
-from flexdt.protocol.methods.calibration import CalibrationFit
+from flexdt.protocol.methods.calibration_messages import CalibrationFit
 from flexdt.server.storage.past_scans import PastScans
 from flexdt.twin.calibration.fit.covariance_steps import covariance_by_step
 from flexdt.twin.machine.description import profile_of

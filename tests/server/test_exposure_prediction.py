@@ -11,7 +11,7 @@ import pytest
 import flexdt as fx
 from flexdt.phantoms.samples import as_phantom
 from flexdt.protocol import METHODS, Codec, RpcError
-from flexdt.protocol.methods.images import ExposurePrediction
+from flexdt.protocol.methods.image_messages import ExposurePrediction
 from flexdt.server.imaging.exposure_prediction import BEST, predict
 from flexdt.twin.errors import LimitError
 

@@ -20,7 +20,7 @@ from lab import Process, fly_script, projector, twin
 from flexdt.clients.client.client import TwinClient
 from flexdt.protocol import Codec, RpcError
 from flexdt.protocol.fields import Params
-from flexdt.protocol.methods.datasets import (
+from flexdt.protocol.methods.dataset_messages import (
     DatasetFrame,
     DatasetFrameResult,
     DatasetGet,

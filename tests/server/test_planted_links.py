@@ -26,8 +26,8 @@ from simulation import Simulation
 from whole_run import voxels
 
 from flexdt.protocol import Codec, RpcError
-from flexdt.protocol.methods.calibration import CalibrationAlign, CalibrationFit
-from flexdt.protocol.methods.datasets import DatasetFrame, DatasetGet, DatasetList
+from flexdt.protocol.methods.calibration_messages import CalibrationAlign, CalibrationFit
+from flexdt.protocol.methods.dataset_messages import DatasetFrame, DatasetGet, DatasetList
 from flexdt.server.files import directory
 from flexdt.server.storage.past_scans import Around, work
 from flexdt.twin.errors import TwinError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from flexdt.protocol.fields import Empty
 from flexdt.protocol.messages import Encoded
-from flexdt.protocol.methods import calibration as p
+from flexdt.protocol.methods import calibration_messages as p
 from flexdt.server.twin.changes import change_stage
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, answers, encoded_apart, in_turns, still

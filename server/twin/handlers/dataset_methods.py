@@ -6,8 +6,8 @@ from pathlib import Path
 
 from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Encoded
-from flexdt.protocol.methods import datasets as p
-from flexdt.protocol.methods.calibration import CALIBRATION_ALIGN, CALIBRATION_FIT
+from flexdt.protocol.methods import dataset_messages as p
+from flexdt.protocol.methods.calibration_messages import CALIBRATION_ALIGN, CALIBRATION_FIT
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, answers
 

@@ -10,7 +10,7 @@ from typing import Any
 from flexdt.protocol import openrpc
 from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty
-from flexdt.protocol.methods import documents as p
+from flexdt.protocol.methods import document_messages as p
 from flexdt.server.storage.scene import require_fit, sample_of, save_scene
 from flexdt.server.twin.changes import change_stage
 from flexdt.server.twin.core import TwinServer

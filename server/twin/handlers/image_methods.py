@@ -12,8 +12,8 @@ from flexdt.protocol import state_model as w
 from flexdt.protocol.connection import MAX_ANSWER, encoded
 from flexdt.protocol.fields import Empty, ImageValue
 from flexdt.protocol.messages import Encoded
-from flexdt.protocol.methods import images as p
-from flexdt.protocol.methods.settings import CameraSet, TubeSet
+from flexdt.protocol.methods import image_messages as p
+from flexdt.protocol.methods.setting_messages import CameraSet, TubeSet
 from flexdt.protocol.rpc_errors import invalid_params, too_large
 from flexdt.server.imaging.exposure_flags import marks_of
 from flexdt.server.imaging.exposure_prediction import predict as forecast

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty
 from flexdt.protocol.messages import Encoded
-from flexdt.protocol.methods import jobs as p
+from flexdt.protocol.methods import job_messages as p
 from flexdt.protocol.rpc_errors import invalid_params, too_large
 from flexdt.server.scans.job import ENDED, Job
 from flexdt.server.scans.scan_record import Wish

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty
-from flexdt.protocol.methods import motion as p
+from flexdt.protocol.methods import motion_messages as p
 from flexdt.server.twin import wire_values as views
 from flexdt.server.twin.changes import change_settings
 from flexdt.server.twin.core import TwinServer

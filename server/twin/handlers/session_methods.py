@@ -5,7 +5,7 @@ from __future__ import annotations
 from flexdt.protocol import PROTOCOL, require_compatible
 from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty, Nothing
-from flexdt.protocol.methods import session as p
+from flexdt.protocol.methods import session_messages as p
 from flexdt.server.scans.job import ENDED
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, answers

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from flexdt.protocol import fields as f
 from flexdt.protocol.method import read
-from flexdt.protocol.methods.settings import CameraSet, TubeSet
+from flexdt.protocol.methods.setting_messages import CameraSet, TubeSet
 from flexdt.protocol.scene_document import Averages, Frames
 from flexdt.protocol.state_model import GeometryResult, ImageFlags
 

@@ -10,7 +10,7 @@ from pydantic import Field, JsonValue
 
 from flexdt.protocol import fields as f
 from flexdt.protocol.method import command, read
-from flexdt.protocol.methods.datasets import DataSetName
+from flexdt.protocol.methods.dataset_messages import DataSetName
 from flexdt.protocol.state_model import Correction
 
 Parameters = Annotated[list[f.AxisName], MaxLen(17)]
