@@ -28,7 +28,7 @@ from flexdt.twin.exchange.geometry_json import read_json
 from flexdt.twin.exchange.number_tables import TOMOSIPO_NAMES, read_tomosipo, tomosipo_arrays
 from flexdt.twin.geometry.cone_vec import ConeVec, Shape2
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.outward import File
+from flexdt.twin.lazy_backend import File
 
 BY_ENDING: Final = {
     ending: format for format in FORMATS for ending in ENDINGS[format] if ending != ".json"

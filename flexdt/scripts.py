@@ -11,8 +11,8 @@ from flexdt.phantoms import Phantom
 from flexdt.phantoms.samples import as_phantom
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.collision.sample_hull import convex_pieces
+from flexdt.twin.lazy_backend import File
 from flexdt.twin.machine.description import Machine, Profile
-from flexdt.twin.outward import File
 from flexdt.twin.script import (
     CheckReport,
     SampleSize,

@@ -27,8 +27,8 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.motion import Motion
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.lazy_backend import File, lazy_backend
 from flexdt.twin.machine.description import Machine, Profile
-from flexdt.twin.outward import File, outward
 from flexdt.twin.scanner.state import Correction
 
 if TYPE_CHECKING:
@@ -417,7 +417,7 @@ class DataSet:
 
         `data.with_correction(data.calibrate("lego").correction)` is the corrected data set.
         """
-        found: Outcome = outward("analysis").calibrate(self, phantom, **options)
+        found: Outcome = lazy_backend("analysis").calibrate(self, phantom, **options)
         return found
 
     def align(self, *, per_frame: bool = False) -> Aligned:
@@ -425,7 +425,7 @@ class DataSet:
 
         `data.with_correction(data.align().correction)` is the corrected data set.
         """
-        found: Aligned = outward("analysis").align(self, per_frame=per_frame)
+        found: Aligned = lazy_backend("analysis").align(self, per_frame=per_frame)
         return found
 
     def reconstruct(self, algorithm: str = "fdk", **options: Any) -> Volume:
@@ -439,7 +439,7 @@ class DataSet:
             >>> data.reconstruct("fdk", voxel=1.0)
             <Volume: 2 x 3 x 3 voxels (z, y, x) of 1 mm about (0, 0, 0) mm>
         """
-        found: Volume = outward("analysis").reconstruct(self, algorithm, **options)
+        found: Volume = lazy_backend("analysis").reconstruct(self, algorithm, **options)
         return found
 
     def save(self, folder: File) -> None:
@@ -471,7 +471,7 @@ class DataSet:
             ...     sorted(file.name for file in Path(folder).iterdir())[:3]
             ['data settings XRE.txt', 'geometry.json', 'io000000.tif']
         """
-        outward("clients.datasets.nxtomo").save_data_set(self, folder)
+        lazy_backend("clients.datasets.nxtomo").save_data_set(self, folder)
 
     def to_nxtomo(self, file: File) -> None:
         """Write NeXus's NXtomo (HDF5), which needs h5py (the extra `io`).
@@ -490,7 +490,7 @@ class DataSet:
             ...     Path(folder, "scan.nx").exists()
             True
         """
-        outward("clients.datasets.nxtomo").save_nxtomo(self, file)
+        lazy_backend("clients.datasets.nxtomo").save_nxtomo(self, file)
 
     def to_xarray(self) -> Any:
         """Line integrals as an xarray DataArray (view, row, column), which needs xarray.
@@ -505,7 +505,7 @@ class DataSet:
             >>> data.to_xarray().dims
             ('view', 'row', 'column')
         """
-        return outward("clients.datasets.nxtomo").to_xarray(self)
+        return lazy_backend("clients.datasets.nxtomo").to_xarray(self)
 
     def plot(self, index: int = 0, axes: Any = None) -> Any:
         """Show one projection's line integrals; needs matplotlib (the extra `plots`).
@@ -524,7 +524,7 @@ class DataSet:
             >>> data.plot(0).get_title()
             'arrays: scan_000000.tif'
         """
-        return outward("plots").plot_projection(self, index, axes)
+        return lazy_backend("plots").plot_projection(self, index, axes)
 
 
 def _several(

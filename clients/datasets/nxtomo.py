@@ -29,7 +29,7 @@ from flexdt.twin.exchange.geometry import ScanGeometry
 from flexdt.twin.exchange.geometry_json import geometry_text
 from flexdt.twin.exchange.number_tables import VECTOR_NAMES
 from flexdt.twin.geometry.poses import Poses
-from flexdt.twin.outward import File
+from flexdt.twin.lazy_backend import File
 
 
 def save_data_set(data: DataSet, folder: File) -> None:

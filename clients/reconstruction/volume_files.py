@@ -22,7 +22,7 @@ from flexdt.clients.datasets.pictures import png
 from flexdt.clients.extras import package
 from flexdt.clients.reconstruction import zarr_volume
 from flexdt.twin.errors import LimitError
-from flexdt.twin.outward import File
+from flexdt.twin.lazy_backend import File
 from flexdt.twin.projection import Grid, Volume
 
 if TYPE_CHECKING:

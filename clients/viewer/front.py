@@ -31,7 +31,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
-from flexdt.clients.viewer.viser_gate import MARK, Doorkeeper, parted
+from flexdt.clients.viewer.viser_gate import MARK, MessageFilter, parted
 from flexdt.server.runtime.access import check_bind, is_loopback, token_matches
 from flexdt.server.runtime.log import log
 from flexdt.server.runtime.loop import one_at_a_time
@@ -100,7 +100,7 @@ class Front:
         max_pages: int = 64,
     ) -> None:
         self._page, self._connect = page, connect
-        self.doorkeeper = Doorkeeper()
+        self.doorkeeper = MessageFilter()
         self._max_scenes, self.scenes = max_scenes, 0
         self._most = max_scenes + max_pages + SPARE
         self._turn, self._relayed_at = asyncio.Lock(), 0.0
@@ -249,7 +249,7 @@ class Front:
                 self.scenes -= 1
 
     async def _relay(self, browser: ServerConnection, path: str) -> None:
-        """Relay messages between a browser and viser; `Doorkeeper` filters those to viser."""
+        """Relay messages between a browser and viser; `MessageFilter` filters those to viser."""
         with contextlib.suppress(OSError, ConnectionClosed, InvalidHandshake):
             async with self._connect(path, browser.subprotocol) as viser:
                 pumps = [

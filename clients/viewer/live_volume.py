@@ -175,7 +175,7 @@ def _wait(path: Path, alive: Callable[[], bool]) -> None:
         time.sleep(LOOK_S)
 
 
-class Grower:
+class LiveReconstruction:
     """The one process of a viewer, for the data set that was asked for last.
 
     Args:

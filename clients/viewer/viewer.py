@@ -25,13 +25,13 @@ from flexdt.clients.client.transport import ConnectionLost
 from flexdt.clients.viewer import scrubbed_plan as plans
 from flexdt.clients.viewer.feed import ImageFeed, ShownImage, grey, packed, window_of
 from flexdt.clients.viewer.front import Download, Front
-from flexdt.clients.viewer.live_volume import Grower, points_of
+from flexdt.clients.viewer.live_volume import LiveReconstruction, points_of
 from flexdt.clients.viewer.page import TRY_AGAIN, Page, watched, without_bytes
 from flexdt.clients.viewer.page_cameras import SceneClients
 from flexdt.clients.viewer.scenes import sample as shapes
 from flexdt.clients.viewer.scenes import standpoints as views
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
-from flexdt.clients.viewer.scenes.sample import NOTHING, SampleLook, Wardrobe
+from flexdt.clients.viewer.scenes.sample import NOTHING, MeshCache, SampleLook
 from flexdt.clients.viewer.scenes.world import World, beads_on, world_of
 from flexdt.clients.viewer.viser_gate import Scenes
 from flexdt.protocol import RpcError
@@ -98,7 +98,7 @@ class Viewer:
         self._machine, self._profile, self.looks = machine, profile, looks
         self.data, self.limits = data, limits or ViewerLimits()
         self.failed = asyncio.Event()
-        self.grower = Grower(self._grown)
+        self.grower = LiveReconstruction(self._grown)
         self.opened = self.drawn = self.sharing = 0
         self.pages: dict[str, Page] = {}
         self.downloads: dict[str, Download] = {}
@@ -107,7 +107,7 @@ class Viewer:
         self.world: World | None = None
         self.look: SampleLook = NOTHING
         self.window: tuple[float, float] | None = None
-        self.wardrobe = Wardrobe()
+        self.wardrobe = MeshCache()
         self.planners = Workers(plans.PLANNERS, plans.PLAN_BYTES, plans.PLAN_S)
         self._local = {name: partial(answer, self) for name, answer in answers.items()}
         self._raw: Mapping[str, Any] | None = None

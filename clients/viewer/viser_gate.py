@@ -287,7 +287,7 @@ def _small_picture(data: bytes) -> bool:
     return all(0 < side <= LARGEST_SIDE for side in struct.unpack(">II", data[16:24]))
 
 
-class Doorkeeper:
+class MessageFilter:
     """Passes pages' messages on to viser; each reason to drop one is logged once.
 
     Attributes:

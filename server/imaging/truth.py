@@ -39,9 +39,9 @@ class TrueGeometry:
 
     __slots__ = ("__parameters", "__unrest")
 
-    def __init__(self, parameters: Offsets = NOMINAL, unrest: Unrest | None = None) -> None:
+    def __init__(self, parameters: Offsets = NOMINAL, unrest: HiddenMotion | None = None) -> None:
         self.__parameters = parameters
-        self.__unrest = Unrest() if unrest is None else unrest
+        self.__unrest = HiddenMotion() if unrest is None else unrest
 
     def __repr__(self) -> str:
         return "TrueGeometry(hidden)"
@@ -60,7 +60,7 @@ class TrueGeometry:
 
 
 @dataclass(frozen=True)
-class Unrest:
+class HiddenMotion:
     """Uncommanded motion: part of the hidden truth and never of a data set's report.
 
     Attributes:
@@ -99,11 +99,11 @@ class Unrest:
         return np.asarray(self.vibration_mm * rng.standard_normal(2))
 
 
-_UNREST: Final = TypeAdapter(Unrest)
+_UNREST: Final = TypeAdapter(HiddenMotion)
 
 
 def load_truth(path: Path, data: Path) -> TrueGeometry:
-    """Read a truth file: TOML, parameter = value [mm, deg], and a table `unrest` (see `Unrest`).
+    """Read a truth file: TOML, parameter = value [mm, deg], and a table `unrest` of `HiddenMotion`.
 
     Args:
         path: the file.
@@ -140,7 +140,7 @@ def load_truth(path: Path, data: Path) -> TrueGeometry:
     return TrueGeometry(parameters, unrest)
 
 
-def _unrest(table: object, path: Path) -> Unrest:
+def _unrest(table: object, path: Path) -> HiddenMotion:
     """The table `unrest` of a truth file."""
     try:
         return _UNREST.validate_python(table)
@@ -148,5 +148,5 @@ def _unrest(table: object, path: Path) -> Unrest:
         raise MachineFileError(
             f"{path}: unrest: allowed are vibration_mm >= 0, spot_drift_mm = [right, up], "
             f"spot_drift_s > 0 (all below {LARGEST:g}) and seed >= 0",
-            {"file": str(path), "path": "unrest", "allowed": list(Unrest.__annotations__)},
+            {"file": str(path), "path": "unrest", "allowed": list(HiddenMotion.__annotations__)},
         ) from None

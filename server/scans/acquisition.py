@@ -35,7 +35,7 @@ from flexdt.twin.script import Exposure, ScanPlan
 Put = Callable[[str, npt.NDArray[np.uint16]], object]
 """Stores one image under a name; called from worker threads."""
 
-Shown = Callable[[Exposure, Radiograph], None]
+FrameListener = Callable[[Exposure, Radiograph], None]
 """Told of the last projection of each batch: the frame and its image."""
 
 REMEMBERED = 2
@@ -64,7 +64,7 @@ class Acquisition:
     seed: int | None
     put: Put
     moments: int = 1
-    shown: Shown | None = None
+    shown: FrameListener | None = None
     _recent: dict[int, Radiograph] = field(default_factory=dict, init=False)
     """Images by index that later frames may ask for."""
     _trapped: dict[int, Float32Array] = field(default_factory=dict, init=False)

@@ -24,7 +24,7 @@ from flexdt.protocol.methods.job_messages import CHECK_LIMITS
 from flexdt.protocol.rpc_errors import Code, RpcError, too_large
 from flexdt.server.runtime.loop import ServerLoop
 from flexdt.server.runtime.workers import Workers
-from flexdt.server.scans.scan_record import PoseList, Wish
+from flexdt.server.scans.scan_record import PoseList, ScanSource
 from flexdt.twin.collision.convex_solids import Polytope
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.geometry.offsets import Offsets
@@ -58,7 +58,7 @@ _T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
-class Matter:
+class CheckInput:
     """What is checked, on what.
 
     Attributes:
@@ -68,7 +68,7 @@ class Matter:
         pieces, parameters: what may collide, and the correction in force.
     """
 
-    wish: Wish
+    wish: ScanSource
     machine: Machine
     profile: Profile
     start: StartState
@@ -117,7 +117,7 @@ class Checked:
         warnings: in words.
     """
 
-    matter: Matter
+    matter: CheckInput
     plan: ScanPlan
     warnings: list[str]
 
@@ -133,7 +133,7 @@ class Checks:
         self._light = 0
         self._starting: asyncio.Task[None] | None = None
 
-    async def report(self, matter: Matter, codec: Codec) -> Sequence[bytes]:
+    async def report(self, matter: CheckInput, codec: Codec) -> Sequence[bytes]:
         """The dry-run report, encoded.
 
         Raises:
@@ -143,7 +143,7 @@ class Checks:
             return await self._threaded(lambda: _encoded(matter, codec))
         return await self._workers.ask(_encoded, _bare(matter), codec)
 
-    async def sound(self, matter: Matter) -> Checked:
+    async def sound(self, matter: CheckInput) -> Checked:
         """A scan parsed, planned and swept, if it may run.
 
         The last one is kept until it is asked for again: when a job begins where it was submitted,
@@ -167,7 +167,7 @@ class Checks:
         self._last = Checked(matter, plan, warnings)
         return self._last
 
-    def _here(self, matter: Matter) -> bool:
+    def _here(self, matter: CheckInput) -> bool:
         """Whether to check in a thread: what is light, while there is no process for it.
 
         Who checks often gets one, which is started meanwhile.
@@ -179,7 +179,7 @@ class Checks:
             self._starting = asyncio.create_task(self._start(matter))
         return True
 
-    async def _start(self, matter: Matter) -> None:
+    async def _start(self, matter: CheckInput) -> None:
         with suppress(RpcError):
             await self._workers.ask(in_pieces, _bare(matter))
         self._starting = None
@@ -195,7 +195,7 @@ class Checks:
         self._workers.close()
 
 
-def planned(matter: Matter) -> tuple[ScanPlan, list[str]]:
+def planned(matter: CheckInput) -> tuple[ScanPlan, list[str]]:
     """The plan of a scan and its warnings in words; blocks.
 
     Raises:
@@ -207,13 +207,13 @@ def planned(matter: Matter) -> tuple[ScanPlan, list[str]]:
     return report.plan, warnings + _more(report.warnings)
 
 
-def in_pieces(matter: Matter) -> list[bytes]:
+def in_pieces(matter: CheckInput) -> list[bytes]:
     """In the worker: the warnings as JSON, then the plan in pieces."""
     plan, warnings = planned(matter)
     return [json.dumps(warnings).encode(), *_pieces_of(plan)]
 
 
-def _bare(matter: Matter) -> Matter:
+def _bare(matter: CheckInput) -> CheckInput:
     """Without the listing of poses, which only people read."""
     wish = matter.wish
     if wish.poses is None:
@@ -221,7 +221,7 @@ def _bare(matter: Matter) -> Matter:
     return replace(matter, wish=replace(wish, script=b"", poses=PoseList(wish.poses.text, b"")))
 
 
-def _encoded(matter: Matter, codec: Codec) -> list[bytes]:
+def _encoded(matter: CheckInput, codec: Codec) -> list[bytes]:
     most = MAX_ANSWER[codec]
     report = matter.report(most).to_dict()
     data = write_json(report) if codec is Codec.JSON else write_msgpack(report)

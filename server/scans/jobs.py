@@ -127,7 +127,7 @@ class Jobs:
             )
 
     @contextmanager
-    def hands_on(self) -> Iterator[None]:
+    def manual_control(self) -> Iterator[None]:
         """Somebody moves or sets things while the job is paused: it no longer goes on by itself,
         unless that is refused and nothing was set in motion."""
         by_hand, programmes = self._by_hand, self._scanner.programmes

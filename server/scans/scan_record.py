@@ -58,7 +58,7 @@ MAX_MOMENTS = 64
 
 
 @dataclass(frozen=True)
-class Wish:
+class ScanSource:
     """What somebody wants scanned: a script's bytes, or poses.
 
     Attributes:
@@ -82,7 +82,7 @@ class Wish:
         exposure_ms: float | None,
         moments: int = 1,
         seed: int | None = None,
-    ) -> Wish:
+    ) -> ScanSource:
         """A trajectory; its `script.txt` is a comment for each pose."""
         poses = poses if isinstance(poses, PoseList) else PoseList.of(poses)
         head = f"# trajectory, exposure_ms {exposure_ms}\r\n".encode()
@@ -90,7 +90,7 @@ class Wish:
 
 
 @dataclass(frozen=True)
-class Beginning:
+class StartConditions:
     """What a scan starts from, kept so that it can be resumed."""
 
     start: StartState
@@ -101,13 +101,13 @@ class Beginning:
     scatter: Scatter = "off"
 
 
-BEGINNING: Final = TypeAdapter(Beginning)
+BEGINNING: Final = TypeAdapter(StartConditions)
 """Reads what `asdict` of a beginning made; raises ValueError if it did not."""
 _EXPOSURE: TypeAdapter[float | None] = TypeAdapter(float | None)
 
 
 @dataclass(frozen=True)
-class Sidecar:
+class JobRecord:
     """Everything that is kept beside a data set.
 
     Attributes:
@@ -117,8 +117,8 @@ class Sidecar:
         operator: the program that asked.
     """
 
-    wish: Wish
-    begin: Beginning
+    wish: ScanSource
+    begin: StartConditions
     speed_up: SpeedUp | None = None
     operator: str = ""
 
@@ -148,7 +148,7 @@ class Sidecar:
         changes.put_json(root.folder(FOLDER), f"{file_stem(name)}.json", document)
 
     @classmethod
-    def read(cls, root: Directory, name: str) -> Sidecar:
+    def read(cls, root: Directory, name: str) -> JobRecord:
         """The one of the data set `name`; one that is damaged is set aside.
 
         Raises:
@@ -162,7 +162,7 @@ class Sidecar:
         return found
 
     @classmethod
-    def _of(cls, data: bytes) -> Sidecar:
+    def _of(cls, data: bytes) -> JobRecord:
         document: Any = read_json(data)
         if document["schema"] != SCHEMA:
             raise ValueError(f"it has schema {document['schema']}, not {SCHEMA}")
@@ -172,7 +172,7 @@ class Sidecar:
         if isinstance(poses, list):  # as servers before wrote it
             poses = json.dumps(poses)
         return cls(
-            Wish(
+            ScanSource(
                 base64.b64decode(wish["script"], validate=True),
                 None if poses is None else PoseList(poses.encode("ascii"), b""),
                 _EXPOSURE.validate_python(wish["exposure_ms"]),

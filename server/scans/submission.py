@@ -22,15 +22,15 @@ from flexdt.server.files.directory import Directory, free_bytes
 from flexdt.server.files.image_files import dated_name
 from flexdt.server.files.own_documents import used_bytes
 from flexdt.server.imaging.radiography import Radiography
-from flexdt.server.scans.acquisition import Acquisition, Shown
-from flexdt.server.scans.checking import Checks, Matter
+from flexdt.server.scans.acquisition import Acquisition, FrameListener
+from flexdt.server.scans.checking import CheckInput, Checks
 from flexdt.server.scans.job import Job, JobInputs, Prepare
 from flexdt.server.scans.jobs import Jobs
-from flexdt.server.scans.scan_record import FOLDER, Beginning, Sidecar, Wish
+from flexdt.server.scans.scan_record import FOLDER, JobRecord, ScanSource, StartConditions
 from flexdt.server.scans.stage import Stage
 from flexdt.server.scans.twin_clock import SpeedUp
 from flexdt.server.storage.dataset_writer import RESERVE_BYTES, DatasetWriter
-from flexdt.server.storage.memory import Keeper, Memory, with_job
+from flexdt.server.storage.memory import Memory, StateStore, with_job
 from flexdt.twin.dataset.dataset_errors import DatasetError, DiskFullError
 from flexdt.twin.dataset.file_names import DOCUMENT, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS, plain_name
 from flexdt.twin.dataset.flexdt_json import parse_document
@@ -65,15 +65,15 @@ class Submissions:
     radiography: Radiography
     stage: Stage
     root: Directory
-    keeper: Keeper
+    keeper: StateStore
     now: Callable[[], datetime]
-    shown: Shown
+    shown: FrameListener
     seed: Callable[[], int | None]
     version: str
     quota: int | None
     _checks: Checks = field(default_factory=Checks)
 
-    async def check(self, wish: Wish, codec: Codec) -> Encoded:
+    async def check(self, wish: ScanSource, codec: Codec) -> Encoded:
         """The dry-run report from where the scanner stands; nothing moves.
 
         Raises:
@@ -88,11 +88,11 @@ class Submissions:
 
     async def submit(
         self,
-        wish: Wish,
+        wish: ScanSource,
         name: str | None,
         speed_up: SpeedUp | None,
         operator: str = "",
-        still: Callable[[], None] = lambda: None,
+        ensure_allowed: Callable[[], None] = lambda: None,
     ) -> Job:
         """Put a scan in the queue; `still` raises if who asked may not any more.
 
@@ -105,7 +105,7 @@ class Submissions:
             begin = resumed
         else:
             seed = self.seed() if wish.seed is None else wish.seed
-            begin = Beginning(
+            begin = StartConditions(
                 self._start(),
                 self.scanner.sample,
                 seed,
@@ -114,15 +114,17 @@ class Submissions:
                 self.radiography.scatter,
             )
         chosen = name if name is not None else self._free_name()
-        sidecar = Sidecar(wish, begin, speed_up, operator)
-        plan, prepare, warnings = await self._ready(sidecar, chosen, resumed is not None, still)
+        sidecar = JobRecord(wish, begin, speed_up, operator)
+        plan, prepare, warnings = await self._ready(
+            sidecar, chosen, resumed is not None, ensure_allowed
+        )
         folder = str(self.root.path / chosen)
         return await self._queued(
-            sidecar, chosen, still,
+            sidecar, chosen, ensure_allowed,
             lambda: self.jobs.draft(chosen, folder, plan, prepare, speed_up, warnings),
         )  # fmt: skip
 
-    async def again(self, job: Job, still: Callable[[], None] = lambda: None) -> None:
+    async def again(self, job: Job, ensure_allowed: Callable[[], None] = lambda: None) -> None:
         """Put a job that ended early in the queue once more; only missing images are made.
 
         Raises:
@@ -130,24 +132,30 @@ class Submissions:
         """
         name = job.name
         if self.jobs.uses(job.folder):
-            raise taken(name, "a job is writing it")
+            raise name_conflict(name, "a job is writing it")
         try:
-            sidecar = await asyncio.to_thread(Sidecar.read, self.root, name)
+            sidecar = await asyncio.to_thread(JobRecord.read, self.root, name)
         except (OSError, KeyError, TypeError, ValueError) as error:
-            raise taken(name, f"what it started from is not known any more ({error})") from None
+            raise name_conflict(
+                name, f"what it started from is not known any more ({error})"
+            ) from None
         begun = self.root.stat(name) is not None
         if begun:
             begin = self._resumable(name, sidecar.wish)
             assert begin is not None
             sidecar = replace(sidecar, begin=begin)
-        plan, prepare, warnings = await self._ready(sidecar, name, begun, still)
+        plan, prepare, warnings = await self._ready(sidecar, name, begun, ensure_allowed)
         await self._queued(
-            sidecar, name, still,
+            sidecar, name, ensure_allowed,
             lambda: self.jobs.draft_again(job, plan, prepare, sidecar.speed_up, warnings),
         )  # fmt: skip
 
     async def _queued(
-        self, asked: Sidecar, name: str, still: Callable[[], None], make: Callable[[], Job]
+        self,
+        asked: JobRecord,
+        name: str,
+        ensure_allowed: Callable[[], None],
+        make: Callable[[], Job],
     ) -> Job:
         """Write a job down, with what it must repeat, and then put it into the queue.
 
@@ -161,10 +169,10 @@ class Submissions:
             return with_job(memory, drafts[0].memory())
 
         def take() -> Job:
-            still()
+            ensure_allowed()
             [draft] = drafts
             if self.jobs.uses(draft.folder):
-                raise taken(name, "a job is writing it")
+                raise name_conflict(name, "a job is writing it")
             return self.jobs.enqueue(draft)
 
         return await self.keeper.keep(
@@ -172,7 +180,7 @@ class Submissions:
         )
 
     async def _ready(
-        self, asked: Sidecar, name: str, resume: bool, still: Callable[[], None]
+        self, asked: JobRecord, name: str, resume: bool, ensure_allowed: Callable[[], None]
     ) -> tuple[ScanPlan, Prepare, list[str]]:
         """Check all of a scan, and say how it is begun."""
         begin = asked.begin
@@ -188,7 +196,7 @@ class Submissions:
             if shown != stands:
                 a, b = shown.name or "nothing", stands.name or "nothing"
                 warnings.insert(1, f"its images go on showing {a}, although {b} is on the stage")
-        still()
+        ensure_allowed()
 
         async def prepare() -> JobInputs:
             begun = asked
@@ -203,16 +211,16 @@ class Submissions:
 
         return checked.plan, prepare, warnings
 
-    async def _matter(self, wish: Wish, start: StartState, shown: Sample) -> Matter:
+    async def _matter(self, wish: ScanSource, start: StartState, shown: Sample) -> CheckInput:
         """What may collide stands on the stage; what the beam sees is `shown`."""
         scanner, stage, stands = self.scanner, self.stage, self.scanner.sample
         parameters = scanner.parameters
 
-        def work() -> Matter:
+        def work() -> CheckInput:
             pieces = stage.pieces(stands) if scanner.machine.components else ()
             size = stage.size(shown)
             machine, profile = scanner.machine, scanner.profile
-            return Matter(wish, machine, profile, start, size, pieces, parameters)
+            return CheckInput(wish, machine, profile, start, size, pieces, parameters)
 
         return await asyncio.to_thread(work)
 
@@ -229,7 +237,7 @@ class Submissions:
             xrays_on=s.tube.on,
         )
 
-    def _open(self, asked: Sidecar, plan: ScanPlan, name: str, resume: bool) -> JobInputs:
+    def _open(self, asked: JobRecord, plan: ScanPlan, name: str, resume: bool) -> JobInputs:
         """Make (or take up) the data set and all that runs the plan; in a worker thread."""
         begin = asked.begin
         radiography = replace(self.radiography, physics=begin.physics, scatter=begin.scatter)
@@ -260,7 +268,7 @@ class Submissions:
         )
         return JobInputs(plan, writer, acquisition.produce)
 
-    def _resumable(self, name: str, wish: Wish) -> Beginning | None:
+    def _resumable(self, name: str, wish: ScanSource) -> StartConditions | None:
         """What an interrupted data set of that name started from; None if there is none.
 
         Raises:
@@ -269,16 +277,16 @@ class Submissions:
         """
         plain_name(name, "data set")
         if name in RESERVED:
-            raise taken(name, "it is reserved")
+            raise name_conflict(name, "it is reserved")
         folder = self.root.folder(name)
         if self.jobs.uses(str(folder.path)):
-            raise taken(name, "a job is writing it")
+            raise name_conflict(name, "a job is writing it")
         if self.root.stat(name) is None:
             return None
         try:
             if not self.root.is_directory(name):
                 raise ValueError("it is no folder")
-            kept = Sidecar.read(self.root, name)
+            kept = JobRecord.read(self.root, name)
             with folder.entries() as entries:
                 there = {e.name for e in entries if not e.name.startswith(".")}
             # A server killed while it made the folder leaves no document, and no image either.
@@ -287,17 +295,21 @@ class Submissions:
                 document = parse_document(folder.read(DOCUMENT).decode())
                 complete = document.complete
         except FileNotFoundError:
-            raise taken(name, "there is something that no scan of this twin has begun") from None
+            raise name_conflict(
+                name, "there is something that no scan of this twin has begun"
+            ) from None
         except (OSError, DatasetError, ValueError, KeyError, TypeError) as error:
-            raise taken(name, f"it holds something that cannot be resumed ({error})") from None
+            raise name_conflict(
+                name, f"it holds something that cannot be resumed ({error})"
+            ) from None
         if complete:
-            raise taken(name, "that data set is complete")
+            raise name_conflict(name, "that data set is complete")
         asked, known = (
             (w.script, w.poses, w.exposure_ms if w.poses is not None else None)
             for w in (wish, kept.wish)
         )
         if asked != known:
-            raise taken(name, "its script is another one")
+            raise name_conflict(name, "its script is another one")
         return kept.begin
 
     def _free_name(self) -> str:
@@ -323,7 +335,7 @@ class Submissions:
             )
 
 
-def taken(name: str, why: str) -> RpcError:
+def name_conflict(name: str, why: str) -> RpcError:
     """The error for a data set's name that cannot be used."""
     return invalid_params(
         f"the data set name {name!r} cannot be used: {why}",

@@ -2,11 +2,11 @@
 
 Positions, settings, tube, camera, sample, an E-stop in force, the list of jobs and the corrections
 in force are one document, so that a change of several of them is written whole or not at all. A
-client's change that must survive is written first and takes effect afterwards (see `Keeper.keep`):
-if it cannot be written, nothing has changed. Positions and the progress of a scan are written as
-they change, at most a few times a second, and when the server stops. After a restart X-rays are
-off, motors are where they were last recorded, and interrupted scans are marked so and can be
-resumed. A damaged document is set aside, and the server starts without it.
+client's change that must survive is written first and takes effect afterwards (see
+`StateStore.keep`): if it cannot be written, nothing has changed. Positions and the progress of a
+scan are written as they change, at most a few times a second, and when the server stops. After a
+restart X-rays are off, motors are where they were last recorded, and interrupted scans are marked
+so and can be resumed. A damaged document is set aside, and the server starts without it.
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
     return None if known is None else sample_of(known)
 
 
-class Keeper:
+class StateStore:
     """Writes the memory while the server runs.
 
     Args:

@@ -65,7 +65,7 @@ MAX_SCRIPT: Final = 4 << 20
 
 
 @dataclass(frozen=True)
-class Around:
+class TwinContext:
     """What the twin knows and a data set does not say.
 
     Attributes:
@@ -105,7 +105,7 @@ class PastScans:
             RpcError: -32602, there is no such data set or image, or it is damaged; -32008, it is
                 larger, or takes longer to read, than is allowed.
         """
-        around = Around(running, self._machine, self._profile)
+        around = TwinContext(running, self._machine, self._profile)
         slow = isinstance(params, CalibrationFit | CalibrationAlign)
         workers = self._fitters if slow else self._workers
         return Encoded(tuple(await workers.ask(work, self._root, params, around, codec)))
@@ -116,7 +116,7 @@ class PastScans:
         self._fitters.close()
 
 
-def work(root: Path, asked: Params, around: Around, codec: Codec) -> list[bytes]:
+def work(root: Path, asked: Params, around: TwinContext, codec: Codec) -> list[bytes]:
     """In the worker: the encoded answer."""
     try:
         directory = Directory(root)
@@ -128,7 +128,7 @@ def work(root: Path, asked: Params, around: Around, codec: Codec) -> list[bytes]
     return list(encoded(result, codec).pieces)
 
 
-class _Kept:
+class _LruCache:
     """Results by key, the last `most` of them."""
 
     def __init__(self, most: int) -> None:
@@ -149,15 +149,15 @@ class _Kept:
         return value
 
 
-_INFOS, _THUMBNAILS, _MEASURED = _Kept(MAX_SETS), _Kept(1000), _Kept(16)
-_DOCUMENTS, _NORMALS = _Kept(4), _Kept(4)
+_INFOS, _THUMBNAILS, _MEASURED = _LruCache(MAX_SETS), _LruCache(1000), _LruCache(16)
+_DOCUMENTS, _NORMALS = _LruCache(4), _LruCache(4)
 
 
 # A data set's folder ------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class _Bare:
+class _UndocumentedFrame:
     """An image of which its file is known, and perhaps what the scanner's texts say."""
 
     file: str
@@ -172,7 +172,7 @@ class _Bare:
     positions: Mapping[str, float] = field(default_factory=dict)
 
 
-_Images = tuple[FrameEntry | _Bare, ...]
+_Images = tuple[FrameEntry | _UndocumentedFrame, ...]
 
 
 @dataclass(frozen=True)
@@ -224,10 +224,10 @@ def _scan(folder: Folder, most: int) -> _Scan:
         if not folder.projections:
             raise
         texts, problem = _texts(folder), error.message
-    bare = [_Bare(f, "dark", xrays_on=False) for f in folder.darks]
-    bare += [_Bare(f, "flat") for f in folder.flats]
+    bare = [_UndocumentedFrame(f, "dark", xrays_on=False) for f in folder.darks]
+    bare += [_UndocumentedFrame(f, "flat") for f in folder.flats]
     if texts is None:
-        bare += [_Bare(f, "projection") for f in folder.projections.values()]
+        bare += [_UndocumentedFrame(f, "projection") for f in folder.projections.values()]
         return _Scan(folder, tuple(bare), problem=problem)
     s = texts.settings
     shown = {} if s is None else {"exposure_ms": s.exposure_ms, "mode": s.mode}
@@ -236,7 +236,7 @@ def _scan(folder: Folder, most: int) -> _Scan:
     if s is not None and s.roi is not None:
         shown["roi"] = s.roi.edges
     bare += [
-        _Bare(
+        _UndocumentedFrame(
             frame.file, "projection", **shown, cone_vec=row,
             positions={name: float(at[frame.index]) for name, at in texts.positions.items()},
         )
@@ -312,7 +312,7 @@ def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
 
 
 def _list(
-    root: Directory, asked: p.DatasetList, around: Around, codec: Codec
+    root: Directory, asked: p.DatasetList, around: TwinContext, codec: Codec
 ) -> p.DatasetListResult:
     folders, left_out = [], 0
     with root.entries() as entries:
@@ -398,7 +398,9 @@ def _with_thumbnail(root: Directory, info: p.DatasetInfo, side: int, until: floa
 # dataset.get --------------------------------------------------------------------------------------
 
 
-def _get(root: Directory, asked: p.DatasetGet, around: Around, codec: Codec) -> p.DatasetResult:
+def _get(
+    root: Directory, asked: p.DatasetGet, around: TwinContext, codec: Codec
+) -> p.DatasetResult:
     scan = _opened(root, asked.name)
     folder, document, images = scan.folder, scan.document, scan.images
     about = root.stat(asked.name)
@@ -431,7 +433,7 @@ def _get(root: Directory, asked: p.DatasetGet, around: Around, codec: Codec) -> 
     )
 
 
-def _same(scan: _Scan, around: Around) -> bool:
+def _same(scan: _Scan, around: TwinContext) -> bool:
     said, texts = scan.document, scan.texts
     machine, profile = (said.machine, said.profile) if said else ({}, None)
     if texts is not None and texts.profile is not None and texts.positions:
@@ -452,7 +454,7 @@ def _script(folder: Folder) -> str:
 
 
 def _measured(
-    folder: Folder, document: DatasetDocument | None, chosen: list[FrameEntry | _Bare]
+    folder: Folder, document: DatasetDocument | None, chosen: list[FrameEntry | _UndocumentedFrame]
 ) -> dict[str, Any]:
     """Mean counts and clearances of images."""
     until = time.monotonic() + MEASURE_S
@@ -498,7 +500,7 @@ def _clearances(
 
 
 def _frame(
-    root: Directory, asked: p.DatasetFrame, around: Around, codec: Codec
+    root: Directory, asked: p.DatasetFrame, around: TwinContext, codec: Codec
 ) -> p.DatasetFrameResult:
     scan = _opened(root, asked.name)
     folder, document, images = scan.folder, scan.document, scan.images

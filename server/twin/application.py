@@ -39,7 +39,7 @@ class TwinSession:
             by_hand: AbstractContextManager[None] = nullcontext()
             if method.by_hand:
                 twin.jobs.require_free(method.name)
-                by_hand = twin.jobs.hands_on()
+                by_hand = twin.jobs.manual_control()
             with by_hand:
                 result = HANDLERS[method.name](twin, client, params)
                 return await result if inspect.isawaitable(result) else result

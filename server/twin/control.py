@@ -47,7 +47,7 @@ class Control:
         if self.holder != who:
             raise self._taken(what)
 
-    def still(self, who: str, what: str) -> None:
+    def ensure_allowed(self, who: str, what: str) -> None:
         """Let `who` go on after a wait: nobody else has become the controller meanwhile.
 
         Raises:

@@ -33,14 +33,14 @@ from flexdt.server.scans.stage import Stage
 from flexdt.server.scans.submission import RESERVED, Submissions
 from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
 from flexdt.server.storage.corrections import Corrections
-from flexdt.server.storage.memory import Keeper, Memory, read_memory, remember, restore
+from flexdt.server.storage.memory import Memory, StateStore, read_memory, remember, restore
 from flexdt.server.storage.past_scans import PastScans
 from flexdt.server.storage.stored_samples import SampleStore, sample_material
 from flexdt.server.twin import wire_values as views
 from flexdt.server.twin.control import Control
 from flexdt.server.twin.hub import Hub
 from flexdt.server.twin.live import LiveView, Shot, StateFeed
-from flexdt.server.twin.obstacle_move import Detours
+from flexdt.server.twin.obstacle_move import ObstacleMoves
 from flexdt.server.twin.sample_mesh import Shapes
 from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.scene_search import NearestPair, clearance
@@ -122,7 +122,7 @@ class TwinServer:
         self.stage_turn = asyncio.Lock()
         """Held while the stage is changed: such changes come one after the other."""
         self.stage = Stage(machine, profile, self.samples)
-        self.detours = Detours(self.scanner, self.clock, self.stage, self.changed)
+        self.detours = ObstacleMoves(self.scanner, self.clock, self.stage, self.changed)
         self.imaging = Imaging(
             projector, truth or TrueGeometry(), self.samples, machine.detector.sensor
         )
@@ -139,7 +139,7 @@ class TwinServer:
         self.feed = StateFeed(
             self.scanner, self.clock, self.hub, self.state, lambda: self.jobs.running
         )
-        self.keeper = Keeper(root, self._memory)
+        self.keeper = StateStore(root, self._memory)
         self.submissions = Submissions(
             self.scanner,
             self.jobs,

@@ -30,7 +30,7 @@ class Way:
 
 
 @dataclass(eq=False, repr=False)
-class Detours:
+class ObstacleMoves:
     """Plans and executes ways around obstacles, one at a time.
 
     Attributes:

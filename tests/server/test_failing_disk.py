@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from whole_run import PARTS, WAYS, Part
 
-from flexdt.server.storage.memory import Keeper
+from flexdt.server.storage.memory import StateStore
 
 Right = dict[str, tuple[Path | None, Part]]
 
@@ -49,13 +49,13 @@ def test_a_change_that_comes_before_its_writing_is_found(
     right: Right, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The test's own test: change, then store, as it was once."""
-    keep = Keeper.keep
+    keep = StateStore.keep
 
     async def hasty(keeper, take, after=None, files=None):  # type: ignore[no-untyped-def]
         done = take()
         return await keep(keeper, lambda: done, after, files)
 
-    monkeypatch.setattr(Keeper, "keep", hasty)
+    monkeypatch.setattr(StateStore, "keep", hasty)
     before, undisturbed = right["settings"]
     part = Part("settings", tmp_path, before)
     with part.sim, pytest.raises(AssertionError):

@@ -14,7 +14,7 @@ from simulated_disk import Disk, Fault
 
 from flexdt.server.files.directory import Directory
 from flexdt.server.files.own_documents import Changes
-from flexdt.server.storage.memory import FILE, Keeper, Memory, remember
+from flexdt.server.storage.memory import FILE, Memory, StateStore, remember
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.scanner.scanner import ScannerTwin
@@ -41,7 +41,7 @@ def test_a_write_that_is_under_way_does_not_undo_the_last(
             return super().model_dump_json(by_alias=True)
 
     first = Late.model_construct(**dict(make(False)))
-    keeper = Keeper(Directory(tmp_path), lambda last: make(True) if last else first)
+    keeper = StateStore(Directory(tmp_path), lambda last: make(True) if last else first)
     written: list[str] = []
     keep = Directory.keep
 

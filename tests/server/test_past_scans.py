@@ -27,7 +27,7 @@ from flexdt.protocol.methods.dataset_messages import (
     DatasetList,
 )
 from flexdt.server.storage import past_scans
-from flexdt.server.storage.past_scans import Around, PastScans, work
+from flexdt.server.storage.past_scans import PastScans, TwinContext, work
 from flexdt.server.wire_errors import explain, from_root, is_user_error
 from flexdt.twin.machine.description import builtin_machine, profile_of
 
@@ -56,7 +56,7 @@ def server(data: Path) -> Iterator[Process]:
 def asked(root: Path, params: Params, running: str = "") -> Any:
     """In this process, what a worker does; the wire's error where it is one for a user."""
     machine = MACHINE.model_dump(mode="json", by_alias=True)
-    around = Around(running, machine, PROFILE.model_dump(mode="json"))
+    around = TwinContext(running, machine, PROFILE.model_dump(mode="json"))
     try:
         return json.loads(b"".join(work(root, params, around, Codec.JSON)))
     except Exception as error:

@@ -29,7 +29,7 @@ from flexdt.protocol import Codec, RpcError
 from flexdt.protocol.methods.calibration_messages import CalibrationAlign, CalibrationFit
 from flexdt.protocol.methods.dataset_messages import DatasetFrame, DatasetGet, DatasetList
 from flexdt.server.files import directory
-from flexdt.server.storage.past_scans import Around, work
+from flexdt.server.storage.past_scans import TwinContext, work
 from flexdt.twin.errors import TwinError
 
 SECRET = "nobody is to see this"
@@ -152,7 +152,9 @@ class Life:
 
     def past(self) -> None:
         """What worker processes do, here."""
-        around = Around("", M.model_dump(mode="json", by_alias=True), P.model_dump(mode="json"))
+        around = TwinContext(
+            "", M.model_dump(mode="json", by_alias=True), P.model_dump(mode="json")
+        )
         asked: list[Any] = [DatasetList(thumbnail=32)]
         for name in ("first", "second"):
             asked.append(DatasetGet(name=name, measure=True, script=True))

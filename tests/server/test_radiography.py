@@ -30,7 +30,7 @@ from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.radiography import Radiography, with_spectra
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.scans.acquisition import Acquisition
-from flexdt.server.scans.scan_record import BEGINNING, Beginning, Wish
+from flexdt.server.scans.scan_record import BEGINNING, ScanSource, StartConditions
 from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.setting_methods import set_tube
@@ -447,7 +447,7 @@ def test_responses_that_no_detector_has(curve: str, said: str) -> None:
 def test_a_resumed_scan_keeps_its_physics() -> None:
     from flexdt.twin.script import StartState
 
-    begin = Beginning(StartState(positions={}, speeds={}, accelerations={}, camera=MIDDLE,
+    begin = StartConditions(StartState(positions={}, speeds={}, accelerations={}, camera=MIDDLE,
                                  kV=90.0, power_W=50.0, xrays_on=False),
                       Sample("lego"), 3, 1, "poly", "mc")  # fmt: skip
     again = BEGINNING.validate_python(asdict(begin))
@@ -553,7 +553,7 @@ def test_a_twin_started_with_poly_physics_scans_with_it(tmp_path: Path) -> None:
         )
         await twin.start(Sample("lego"))
         try:
-            job = await twin.submissions.submit(Wish(FLY.encode()), "made", None)
+            job = await twin.submissions.submit(ScanSource(FLY.encode()), "made", None)
             for _ in range(2000):
                 if twin.jobs.status(job).state in ("done", "failed", "aborted"):
                     break
@@ -585,19 +585,19 @@ def test_a_voltage_without_a_spectrum_is_refused_before_there_is_a_job(
         twin = TwinServer(
             M, P, DirectProjector(), open_data(tmp_path), speed_up="max", physics="poly"
         )
-        report = _document(await twin.submissions.check(Wish(text), Codec.JSON))
+        report = _document(await twin.submissions.check(ScanSource(text), Codec.JSON))
         (problem,) = [p for p in report["problems"] if p["severity"] == "error"]
         assert problem["line"] == 1
         assert "[20, 90] kV" in problem["message"]
         with pytest.raises(RpcError) as refused:
-            await twin.submissions.submit(Wish(text), "low", None)
+            await twin.submissions.submit(ScanSource(text), "low", None)
         assert refused.value.code == Code.SCRIPT_INVALID
         assert not twin.jobs.all()
         with pytest.raises(LimitError, match=r"\[20, 90\]"):
             await set_tube(twin, None, TubeSet(kV=max(kV, 1.0)))  # type: ignore[arg-type]
         assert twin.scanner.tube.kV == 90.0
         plain = TwinServer(M, P, DirectProjector(), open_data(tmp_path / "ideal"), speed_up="max")
-        assert _document(await plain.submissions.check(Wish(text), Codec.JSON))["ok"]
+        assert _document(await plain.submissions.check(ScanSource(text), Codec.JSON))["ok"]
 
     asyncio.run(body())
 
@@ -642,9 +642,9 @@ def test_a_scan_whose_images_cannot_be_made_fails_and_the_next_one_runs(tmp_path
         honest = twin.submissions.radiography
         try:
             twin.submissions.radiography = replace(honest, physics="poly")
-            bad = await twin.submissions.submit(Wish(low), "bad", None)
+            bad = await twin.submissions.submit(ScanSource(low), "bad", None)
             twin.submissions.radiography = honest
-            good = await twin.submissions.submit(Wish(FLY.encode()), "good", None)
+            good = await twin.submissions.submit(ScanSource(FLY.encode()), "good", None)
             for _ in range(6000):
                 if good.phase == "done":
                     break

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexdt.server.imaging.truth import TrueGeometry, Unrest, load_truth
+from flexdt.server.imaging.truth import HiddenMotion, TrueGeometry, load_truth
 from flexdt.twin.errors import MachineFileError
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
@@ -30,9 +30,9 @@ def shadow(truth: TrueGeometry, n: int, times: object = None) -> np.ndarray:
 
 
 def test_vibration_has_the_size_asked_for_and_repeats() -> None:
-    still = shadow(TrueGeometry(), 2000)
-    truth = TrueGeometry(NOMINAL, Unrest(vibration_mm=0.01, seed=3))
-    off = shadow(truth, 2000) - still
+    ensure_allowed = shadow(TrueGeometry(), 2000)
+    truth = TrueGeometry(NOMINAL, HiddenMotion(vibration_mm=0.01, seed=3))
+    off = shadow(truth, 2000) - ensure_allowed
     cone = turn(1).cone_vec()
     magnified = (
         0.01 * float(cone.source_detector_distance[0]) / float(np.linalg.norm(cone.source[0, :2]))
@@ -40,13 +40,13 @@ def test_vibration_has_the_size_asked_for_and_repeats() -> None:
     pixels = magnified / M.detector.camera.pixel_mm(M.detector.sensor)
     np.testing.assert_allclose(off.std(axis=0), pixels, rtol=0.07)
     np.testing.assert_allclose(off.mean(axis=0), 0.0, atol=0.1 * pixels)
-    np.testing.assert_array_equal(shadow(truth, 2000) - still, off)
-    other = TrueGeometry(NOMINAL, Unrest(vibration_mm=0.01, seed=4))
-    assert not np.allclose(shadow(other, 2000) - still, off)
+    np.testing.assert_array_equal(shadow(truth, 2000) - ensure_allowed, off)
+    other = TrueGeometry(NOMINAL, HiddenMotion(vibration_mm=0.01, seed=4))
+    assert not np.allclose(shadow(other, 2000) - ensure_allowed, off)
 
 
 def test_the_spot_wanders_while_the_tube_warms_up() -> None:
-    unrest = Unrest(spot_drift_mm=(0.02, -0.01), spot_drift_s=100.0)
+    unrest = HiddenMotion(spot_drift_mm=(0.02, -0.01), spot_drift_s=100.0)
     truth = TrueGeometry(NOMINAL, unrest)
     nominal = turn(3).cone_vec()
     moved = truth.cone_vec(turn(3), Placement(), [0.0, 100.0, 1e6])

@@ -22,8 +22,8 @@ from flexdt.server.files.directory import open_data
 from flexdt.server.runtime import processor_time
 from flexdt.server.runtime.workers import Workers
 from flexdt.server.scans import checking
-from flexdt.server.scans.checking import Checks, Matter
-from flexdt.server.scans.scan_record import PoseList, Sidecar, Wish
+from flexdt.server.scans.checking import CheckInput, Checks
+from flexdt.server.scans.scan_record import JobRecord, PoseList, ScanSource
 from flexdt.server.twin import message_reading
 from flexdt.server.twin.message_reading import MAX_PARAMS, Reader
 from flexdt.twin.collision.convex_solids import hull
@@ -36,8 +36,8 @@ M = builtin_machine()
 P = builtin_profile(M.default_profile)
 
 
-def matter(wish: Wish) -> Matter:
-    return Matter(wish, M, P, StartState.of(M), None, (), NOMINAL)
+def matter(wish: ScanSource) -> CheckInput:
+    return CheckInput(wish, M, P, StartState.of(M), None, (), NOMINAL)
 
 
 def long_script(lines: int) -> bytes:
@@ -64,10 +64,10 @@ def same(a: ScanPlan, b: ScanPlan) -> bool:
 
 
 @pytest.mark.parametrize("wish", [
-    Wish(script(2500).encode() + long_script(600)),
-    Wish.of_poses([{"rot_obj": i * 0.1, "mag_obj": 500.0} for i in range(700)], 50.0),
+    ScanSource(script(2500).encode() + long_script(600)),
+    ScanSource.of_poses([{"rot_obj": i * 0.1, "mag_obj": 500.0} for i in range(700)], 50.0),
 ], ids=["script", "poses"])  # fmt: skip
-def test_a_plan_made_apart_is_the_plan_made_here(wish: Wish) -> None:
+def test_a_plan_made_apart_is_the_plan_made_here(wish: ScanSource) -> None:
     async def body(checks: Checks) -> None:
         there = matter(wish)
         assert not there.light
@@ -86,8 +86,8 @@ def test_a_plan_made_apart_is_the_plan_made_here(wish: Wish) -> None:
     checked(body)
 
 
-OTHERS: dict[str, Callable[[Matter], Any]] = {
-    "wish": lambda m: Wish(long_script(2)),
+OTHERS: dict[str, Callable[[CheckInput], Any]] = {
+    "wish": lambda m: ScanSource(long_script(2)),
     "machine": lambda m: M.model_copy(update={"safety_margin_mm": 3.0}),
     "profile": lambda m: P.model_copy(update={"name": "another"}),
     "start": lambda m: replace(m.start, xrays_on=True),
@@ -98,10 +98,10 @@ OTHERS: dict[str, Callable[[Matter], Any]] = {
 
 
 def test_a_plan_is_made_once_and_anew_where_anything_it_depends_on_is_another() -> None:
-    assert set(OTHERS) == {field.name for field in fields(Matter)}
+    assert set(OTHERS) == {field.name for field in fields(CheckInput)}
 
     async def body(checks: Checks) -> None:
-        first = matter(Wish(long_script(1)))
+        first = matter(ScanSource(long_script(1)))
         for name, other in OTHERS.items():
             made = await checks.sound(first)
             assert await checks.sound(replace(first)) is made, "equal matter, the same certificate"
@@ -125,7 +125,7 @@ def test_what_is_wrong_is_said_with_a_number_of_problems_and_the_rest_counted() 
 
     async def body(checks: Checks) -> None:
         with pytest.raises(RpcError) as refused:
-            await checks.sound(matter(Wish(text)))
+            await checks.sound(matter(ScanSource(text)))
         assert refused.value.code == Code.SCRIPT_INVALID
         assert isinstance(refused.value.data, list)
         assert len(refused.value.data) == checking.MAX_PROBLEMS
@@ -142,7 +142,7 @@ def test_a_report_too_large_is_refused_before_it_is_swept(monkeypatch: pytest.Mo
     monkeypatch.setattr(checking, "MAX_ANSWER", {Codec.JSON: 50_000})
     monkeypatch.setattr(checking, "collision_check", lambda *_: _unwanted)
     with pytest.raises(RpcError) as refused:
-        checking._encoded(matter(Wish(long_script(600))), Codec.JSON)
+        checking._encoded(matter(ScanSource(long_script(600))), Codec.JSON)
     assert refused.value.code == Code.TOO_LARGE
     assert refused.value.data["allowed"] == 50_000  # type: ignore[index, call-overload]
 
@@ -158,13 +158,13 @@ def worked(body: Callable[[Workers], Awaitable[None]], **limits: Any) -> None:
     asyncio.run(main())
 
 
-def heavy() -> Matter:
+def heavy() -> CheckInput:
     """A check of some seconds."""
-    return matter(Wish(long_script(60_000)))
+    return matter(ScanSource(long_script(60_000)))
 
 
-def light() -> Matter:
-    return matter(Wish(long_script(1)))
+def light() -> CheckInput:
+    return matter(ScanSource(long_script(1)))
 
 
 def test_work_beyond_its_time_is_ended_and_says_what_is_allowed() -> None:
@@ -191,7 +191,7 @@ def test_work_on_a_busy_machine_has_the_time_that_it_has_alone() -> None:
             os.kill(pid, signal.SIGCONT)
             await asyncio.sleep(0.05)
 
-    some = matter(Wish(long_script(10_000)))
+    some = matter(ScanSource(long_script(10_000)))
 
     async def body(workers: Workers) -> None:
         await workers.ask(checking.in_pieces, light())
@@ -302,25 +302,27 @@ def test_a_batch_read_apart_keeps_its_order_and_each_method() -> None:
 
 
 def test_poses_of_a_beginning_come_back(tmp_path: Path) -> None:
-    wish = Wish.of_poses([{"rot_obj": 1.0}, {"mag_obj": 2.5}], 10.0)
+    wish = ScanSource.of_poses([{"rot_obj": 1.0}, {"mag_obj": 2.5}], 10.0)
     text = wish.script.decode()
     assert text.splitlines() == [
         "# trajectory, exposure_ms 10.0", '# pose 0: {"rot_obj": 1.0}', '# pose 1: {"mag_obj": 2.5}'
     ]  # fmt: skip
-    from flexdt.server.scans.scan_record import Beginning
+    from flexdt.server.scans.scan_record import StartConditions
     from flexdt.twin.scanner.state import Sample
 
-    Sidecar(wish, Beginning(StartState.of(M), Sample(), 1, 1)).write(open_data(tmp_path), "a")
-    assert Sidecar.read(open_data(tmp_path), "a").wish.poses == wish.poses
+    JobRecord(wish, StartConditions(StartState.of(M), Sample(), 1, 1)).write(
+        open_data(tmp_path), "a"
+    )
+    assert JobRecord.read(open_data(tmp_path), "a").wish.poses == wish.poses
     file = tmp_path / "jobs" / "a.json"
     document = json.loads(file.read_text())
     document["wish"]["poses"] = json.loads(document["wish"]["poses"])  # as it was before
     file.write_text(json.dumps(document))
-    assert Sidecar.read(open_data(tmp_path), "a").wish.poses == wish.poses
+    assert JobRecord.read(open_data(tmp_path), "a").wish.poses == wish.poses
 
 
 def test_a_plan_comes_in_pieces_that_are_read_at_once() -> None:
-    plan = matter(Wish(script(60_000))).report().plan
+    plan = matter(ScanSource(script(60_000))).report().plan
     pieces = checking._pieces_of(plan)
     first = pieces.index(b"files") + 2
     lists = [pickle.loads(p) for p in pieces[first : first + int(pieces[first - 1])]]

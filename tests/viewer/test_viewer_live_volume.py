@@ -16,7 +16,13 @@ import numpy.typing as npt
 import pytest
 import tifffile
 
-from flexdt.clients.viewer.live_volume import MOST_POINTS, Grower, grow, points_of, surface
+from flexdt.clients.viewer.live_volume import (
+    MOST_POINTS,
+    LiveReconstruction,
+    grow,
+    points_of,
+    surface,
+)
 from flexdt.server.files.directory import open_data
 from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.twin.dataset.flexdt_json import parse_document
@@ -202,7 +208,7 @@ def test_a_process_that_has_ended_is_not_killed(monkeypatch: pytest.MonkeyPatch)
 
     async def body() -> None:
         monkeypatch.setattr("asyncio.create_subprocess_exec", start)
-        Grower(told.append).grow(Path("none"), 128)
+        LiveReconstruction(told.append).grow(Path("none"), 128)
         while process.returncode is None:
             await asyncio.sleep(0)
 

@@ -28,7 +28,7 @@ from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.beam_shade import MOST, fans
 from flexdt.clients.viewer.scenes.gizmos import Gizmos
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
-from flexdt.clients.viewer.scenes.sample import Wardrobe
+from flexdt.clients.viewer.scenes.sample import MeshCache
 from flexdt.clients.viewer.scenes.standpoints import beam_view
 from flexdt.clients.viewer.scenes.world import World, beads_on, placed, quaternion
 from flexdt.clients.viewer.scrubbed_plan import (
@@ -159,7 +159,7 @@ def test_every_component_has_a_look_in_metres(name: str) -> None:
 @pytest.mark.parametrize("name", phantom_names())
 def test_samples_look_as_large_as_they_are(name: str) -> None:
     phantom = load_phantom(name)
-    look = Wardrobe().look(SampleState(name=name, size_mm=phantom.size_mm))
+    look = MeshCache().look(SampleState(name=name, size_mm=phantom.size_mm))
     assert look.exact
     points = np.concatenate([skin.vertices for skin in look.skins]) * 1000.0
     size = points.max(axis=0) - points.min(axis=0)
@@ -167,7 +167,7 @@ def test_samples_look_as_large_as_they_are(name: str) -> None:
 
 
 def test_an_unknown_upload_is_a_box_of_its_size() -> None:
-    look = Wardrobe().look(SampleState(name="somebody's", size_mm=(10.0, 20.0, 30.0)))
+    look = MeshCache().look(SampleState(name="somebody's", size_mm=(10.0, 20.0, 30.0)))
     assert not look.exact
     np.testing.assert_allclose(np.ptp(look.skins[0].vertices, axis=0), [0.01, 0.02, 0.03])
 
@@ -176,7 +176,7 @@ def test_an_upload_looks_as_the_twin_says_once_its_shape_has_come() -> None:
     mesh = trimesh.creation.annulus(3.0, 5.0, 8.0)
     mesh.apply_translation([0.5, 0.0, 0.0])
     sample = SampleState(name="ring", revision="1", material="pmma", size_mm=(10.0, 10.0, 8.0))
-    wardrobe = Wardrobe()
+    wardrobe = MeshCache()
     assert not wardrobe.look(sample).exact
     assert wardrobe.lacks(sample)
     wardrobe.add(sample, mesh.export(file_type="stl"))

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.trajectories import FULL_TURN, Bench, stage_angles
-from flexdt.twin.outward import File, outward
+from flexdt.twin.lazy_backend import File, lazy_backend
 
 ROW_LENGTH = 12
 DEGENERATE = 1e-12
@@ -484,7 +484,7 @@ class ConeVec:
             >>> type(scan.plot()).__name__
             'Axes3D'
         """
-        return outward("plots").plot_geometry(self, axes)
+        return lazy_backend("plots").plot_geometry(self, axes)
 
     @property
     def source(self) -> FloatArray:
@@ -666,7 +666,7 @@ def check_shape(shape: object) -> Shape2:
 
 
 def _formats() -> Any:
-    return outward("geometry_formats")
+    return lazy_backend("geometry_formats")
 
 
 def _span(values: FloatArray) -> str:

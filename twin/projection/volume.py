@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from flexdt.twin.errors import GeometryError, NotBuiltError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
-from flexdt.twin.outward import File, outward
+from flexdt.twin.lazy_backend import File, lazy_backend
 
 Vector3 = tuple[float, float, float]
 IntArray = npt.NDArray[np.int32]
@@ -244,7 +244,7 @@ class Volume:
             ...     Volume.load(f"{folder}/volume.nrrd")
             <Volume: 6 x 4 x 4 voxels (z, y, x) of 0.5 mm about (0, 0, 0) mm>
         """
-        outward("clients.reconstruction.volume_files").save_volume(self, file)
+        lazy_backend("clients.reconstruction.volume_files").save_volume(self, file)
 
     @classmethod
     def load(cls, file: File) -> Volume:
@@ -262,7 +262,7 @@ class Volume:
             ...     Volume.load(f"{folder}/volume.tif").voxel_mm
             0.5
         """
-        volume: Volume = outward("clients.reconstruction.volume_files").read_volume(file)
+        volume: Volume = lazy_backend("clients.reconstruction.volume_files").read_volume(file)
         return volume
 
     @property

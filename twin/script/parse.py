@@ -11,7 +11,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from flexdt.twin.outward import PathLike, outward
+from flexdt.twin.lazy_backend import PathLike, lazy_backend
 from flexdt.twin.script import commands as c
 from flexdt.twin.script import grammar
 from flexdt.twin.script.grammar import ArgumentError, Spec, shorten
@@ -86,7 +86,7 @@ def content(text: Source) -> str | bytes:
     """The text or bytes of a script; those of the file where a path is given."""
     if isinstance(text, str | bytes):
         return text
-    read: bytes = outward("scripts").read(text)
+    read: bytes = lazy_backend("scripts").read(text)
     return read
 
 

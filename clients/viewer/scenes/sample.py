@@ -239,7 +239,7 @@ def _key(sample: SampleState) -> Key:
     return sample.name, sample.revision, sample.material
 
 
-class Wardrobe:
+class MeshCache:
     """Looks of samples, made once each."""
 
     def __init__(self) -> None:

@@ -7,7 +7,13 @@ from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import calibration_messages as p
 from flexdt.server.twin.changes import change_stage
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, answers, encoded_apart, in_turns, still
+from flexdt.server.twin.handlers.handler import (
+    Client,
+    answers,
+    encoded_apart,
+    ensure_allowed,
+    in_turns,
+)
 
 
 @answers(p.CALIBRATION_APPLY)
@@ -16,7 +22,7 @@ async def apply(twin: TwinServer, client: Client, params: p.CalibrationApply) ->
     async with twin.stage_turn:
         correction = twin.corrections.make(params.parameters, params.name, params.comment)
         history = twin.corrections.after(correction)
-        ready = still(twin, client, "calibration.apply")
+        ready = ensure_allowed(twin, client, "calibration.apply")
         warnings = await change_stage(
             twin, twin.scanner.sample, correction, ready, history=history, source=params.source
         )
@@ -51,7 +57,7 @@ async def revert(twin: TwinServer, client: Client, params: Empty) -> p.Correctio
     async with twin.stage_turn:
         history = twin.corrections.history[:-1]
         before = twin.corrections.last(history)
-        ready = still(twin, client, "calibration.revert")
+        ready = ensure_allowed(twin, client, "calibration.revert")
         warnings = await change_stage(twin, twin.scanner.sample, before, ready, history=history)
     return _in_force(twin, "the correction was reverted", warnings)
 

@@ -47,7 +47,7 @@ async def load(twin: TwinServer, client: Client, params: p.SceneLoad) -> w.State
                 "the scene is not loaded: motion was stopped meanwhile",
                 {"asked": "scene.load", "allowed": "asking again"},
             )
-        twin.control.still(client.name, "scene.load")
+        twin.control.ensure_allowed(client.name, "scene.load")
         twin.jobs.require_free("a scene")
 
     ready()

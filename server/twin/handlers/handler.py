@@ -57,16 +57,16 @@ def answers(*methods: Method[_P, _R]) -> Callable[[_Handler[_P, _R]], _Handler[_
     return mark
 
 
-def still(twin: TwinServer, client: Client, what: str) -> Callable[[], None]:
+def ensure_allowed(twin: TwinServer, client: Client, what: str) -> Callable[[], None]:
     """Checks that control has not changed hands since the request."""
-    return lambda: twin.control.still(client.name, what)
+    return lambda: twin.control.ensure_allowed(client.name, what)
 
 
 def free(twin: TwinServer, client: Client, method: str, what: str) -> Callable[[], None]:
     """Checks that neither control has changed hands nor a job begun since the request."""
 
     def check() -> None:
-        twin.control.still(client.name, method)
+        twin.control.ensure_allowed(client.name, method)
         twin.jobs.require_free(what)
 
     return check

@@ -14,9 +14,15 @@ from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import job_messages as p
 from flexdt.protocol.rpc_errors import invalid_params, too_large
 from flexdt.server.scans.job import ENDED, Job
-from flexdt.server.scans.scan_record import Wish
+from flexdt.server.scans.scan_record import ScanSource
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, answers, encoded_apart, in_turns, still
+from flexdt.server.twin.handlers.handler import (
+    Client,
+    answers,
+    encoded_apart,
+    ensure_allowed,
+    in_turns,
+)
 from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.errors import CollisionError
 
@@ -40,7 +46,7 @@ async def submit_script(twin: TwinServer, client: Client, params: p.ScriptInput)
 @answers(p.TRAJECTORY_CHECK)
 async def check_trajectory(twin: TwinServer, client: Client, params: p.TrajectoryInput) -> Encoded:
     """The dry-run report; nothing moves."""
-    wish = Wish.of_poses(params.poses, params.exposure_ms)
+    wish = ScanSource.of_poses(params.poses, params.exposure_ms)
     return await twin.submissions.check(wish, client.peer.codec)
 
 
@@ -49,15 +55,15 @@ async def submit_trajectory(
     twin: TwinServer, client: Client, params: p.TrajectoryInput
 ) -> p.SubmitResult:
     """Poses as a job, one image each."""
-    wish = Wish.of_poses(params.poses, params.exposure_ms, params.motion_samples, params.seed)
+    wish = ScanSource.of_poses(params.poses, params.exposure_ms, params.motion_samples, params.seed)
     return await _submitted(twin, client, params, wish)
 
 
 async def _submitted(
-    twin: TwinServer, client: Client, params: p.ScriptInput | p.TrajectoryInput, wish: Wish
+    twin: TwinServer, client: Client, params: p.ScriptInput | p.TrajectoryInput, wish: ScanSource
 ) -> p.SubmitResult:
     job = await twin.submissions.submit(
-        wish, params.name, params.speed_up, client.program, still(twin, client, "a scan")
+        wish, params.name, params.speed_up, client.program, ensure_allowed(twin, client, "a scan")
     )
     return p.SubmitResult(job=job.id, dataset=job.folder, warnings=job.warnings)
 
@@ -85,7 +91,7 @@ async def resume(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobSta
     """
     job = twin.jobs.get(params.job)
     if job.phase in ENDED and job.phase != "done":
-        await twin.submissions.again(job, still(twin, client, "a scan"))
+        await twin.submissions.again(job, ensure_allowed(twin, client, "a scan"))
         return twin.jobs.status(job)
     twin.jobs.resume(job)
     status = await _when(twin, job, lambda: job.phase != "paused" or job.error is not None)
@@ -135,7 +141,7 @@ def _free(job: Job, status: w.JobStatus) -> w.JobStatus:
     return status
 
 
-def _script(params: p.ScriptInput) -> Wish:
+def _script(params: p.ScriptInput) -> ScanSource:
     if params.text is not None:
         script = params.text.encode("utf-8")
     else:
@@ -147,4 +153,4 @@ def _script(params: p.ScriptInput) -> Wish:
             ) from None
     if len(script) > MAX_SCRIPT_BYTES:
         raise too_large("a script", len(script), MAX_SCRIPT_BYTES)
-    return Wish(script, moments=params.motion_samples, seed=params.seed)
+    return ScanSource(script, moments=params.motion_samples, seed=params.seed)

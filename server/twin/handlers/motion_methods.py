@@ -21,22 +21,22 @@ from flexdt.twin.scanner.scanner import ScannerTwin
 async def move(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult:
     """The answer goes at once, or with `wait` when the motors rest."""
     if params.plan:
-        return await _around(twin, client, params)
+        return await _move_around_obstacles(twin, client, params)
     now = twin.clock.now()
-    with _instead(twin):
+    with _cancelling_detour(twin):
         durations = twin.scanner.move(
             params.targets, now, relative=params.relative, shortest=params.shortest
         )
     warnings, arrived = [], None
     if params.wait:
         wanted = {m: t for m, t in twin.scanner.targets(now).items() if m in durations}
-        warnings = await _elsewhere(twin, wanted)
+        warnings = await _unreached_targets(twin, wanted)
         arrived = not warnings
     seconds = max(durations.values(), default=0.0)
     return p.MoveResult(duration_s=seconds, warnings=warnings, moves=None, arrived=arrived)
 
 
-async def _elsewhere(twin: TwinServer, wanted: Mapping[str, float]) -> list[str]:
+async def _unreached_targets(twin: TwinServer, wanted: Mapping[str, float]) -> list[str]:
     """Wait until the motors rest; warnings: those that do not rest where they were to go."""
     await twin.motion_ended(wanted)
     reached = twin.scanner.positions(twin.clock.now())
@@ -48,7 +48,7 @@ async def _elsewhere(twin: TwinServer, wanted: Mapping[str, float]) -> list[str]
 
 
 @contextmanager
-def _instead(twin: TwinServer) -> Iterator[None]:
+def _cancelling_detour(twin: TwinServer) -> Iterator[None]:
     """What is accepted or halts the motors ends a way around; a refusal lets it go on."""
     before = twin.scanner.programmes
     refused = True
@@ -61,13 +61,13 @@ def _instead(twin: TwinServer) -> Iterator[None]:
         twin.changed()
 
 
-async def _around(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult:
+async def _move_around_obstacles(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult:
     """One free move after the other; an earlier way ends with its present leg."""
     twin.detours.cancel()
     way = await twin.detours.plan(
         params.targets, relative=params.relative, shortest=params.shortest
     )
-    twin.control.still(client.name, "axes.move")
+    twin.control.ensure_allowed(client.name, "axes.move")
     task = twin.detours.go(way)
 
     def report(task: asyncio.Task[None]) -> None:
@@ -79,7 +79,7 @@ async def _around(twin: TwinServer, client: Client, params: p.Move) -> p.MoveRes
     moves = [dict(leg) for leg in way.legs]
     if params.wait:
         short = await finished(task)
-        short += await _elsewhere(twin, {m: t for leg in moves for m, t in leg.items()})
+        short += await _unreached_targets(twin, {m: t for leg in moves for m, t in leg.items()})
         warnings, arrived = warnings + short, not short
     return p.MoveResult(duration_s=way.duration_s, warnings=warnings, moves=moves, arrived=arrived)
 
@@ -87,7 +87,7 @@ async def _around(twin: TwinServer, client: Client, params: p.Move) -> p.MoveRes
 @answers(p.AXES_JOG)
 def jog(twin: TwinServer, client: Client, params: p.Jog) -> p.MoveResult:
     """Run until the lease ends (`twin.motion.drives.plan_jog`), or as far as it is free."""
-    with _instead(twin):
+    with _cancelling_detour(twin):
         jogged = twin.scanner.jog(params.axis, params.velocity, params.lease_s, twin.clock.now())
     return p.MoveResult(duration_s=jogged.duration_s, warnings=jogged.warnings, moves=None)
 

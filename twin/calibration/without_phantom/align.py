@@ -79,7 +79,7 @@ STEP_OF_ROW: Final = 10.0
 """A step of the images may move the row so many times as far (assumed)."""
 
 
-class Told(NamedTuple):
+class AlignEstimate(NamedTuple):
     """A value with its standard deviation."""
 
     value: float
@@ -102,7 +102,7 @@ class Alignment:
     """
 
     offsets: Offsets | None
-    parameters: Mapping[str, Told]
+    parameters: Mapping[str, AlignEstimate]
     refused: Mapping[str, str]
     warnings: tuple[str, ...]
     frames: int
@@ -212,13 +212,13 @@ def _align(
         f"{MOST_COLUMN:g} px and {MOST_ROLL:g} deg (more views or light help)",
     )
     parameters = {
-        "axis_column_px": Told(seen(found.values), sigma, "px"),
-        "det_roll": Told(math.degrees(found.values[1]), roll, "deg"),
+        "axis_column_px": AlignEstimate(seen(found.values), sigma, "px"),
+        "det_roll": AlignEstimate(math.degrees(found.values[1]), roll, "deg"),
     }
     refused = dict(UNTOLD)
     if found.images[2] < yaw / 2:
         aside = math.hypot(turned, math.degrees(sideways))
-        parameters["det_yaw"] = Told(math.degrees(found.values[2]), aside, "deg")
+        parameters["det_yaw"] = AlignEstimate(math.degrees(found.values[2]), aside, "deg")
     else:
         refused["det_yaw"] = (
             f"the images tell it to +- {math.degrees(found.images[2]):.2g} deg, its prior to +- "
@@ -290,7 +290,7 @@ class _Planes:
 
         return PlanePairs(stack, self.turn.mean, coarser * self.factor, views, np.zeros(6))
 
-    def row(self, random: np.random.Generator) -> tuple[Offsets, Told]:
+    def row(self, random: np.random.Generator) -> tuple[Offsets, AlignEstimate]:
         """Offsets with the panel's height, and the row of the source's plane.
 
         Raises:
@@ -314,7 +314,7 @@ class _Planes:
         cone_vec = _about_axis(self.poses[self.sorted[:1]], self._of(at))
         level = [[0.0, 0.0, float(cone_vec.source[0, 2])]]
         row = cone_vec.project_points(level, self.turn.mean.shape)[0, 0, 1]
-        return self._of(at), Told(float(row), sigma, "px")
+        return self._of(at), AlignEstimate(float(row), sigma, "px")
 
     def motion(self, corrected: Offsets, random: np.random.Generator) -> Motion:
         """Shifts of single frames as shifts of the sample, dO_x and dO_y.

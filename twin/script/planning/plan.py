@@ -23,11 +23,11 @@ import numpy.typing as npt
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.lazy_backend import lazy_backend
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine, Profile, Timing
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.motion.profiles import AxisPath, Trajectory
-from flexdt.twin.outward import outward
 from flexdt.twin.scanner.state import Placement
 from flexdt.twin.script.commands import AnyCommand
 from flexdt.twin.script.problems import Problem, WithProblems
@@ -329,7 +329,7 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
             `ok` is False with an error or a collision, and
             `to_dict()` is the JSON.
         """
-        report: CheckReport = outward("scripts").check(self, sample)
+        report: CheckReport = lazy_backend("scripts").check(self, sample)
         return report
 
     def plot(self, report: CheckReport | None = None) -> Any:
@@ -341,7 +341,7 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
         Returns:
             matplotlib's figure.
         """
-        return outward("plots").plot_plan(self, self.check() if report is None else report)
+        return lazy_backend("plots").plot_plan(self, self.check() if report is None else report)
 
     @cached_property
     def paths(self) -> Mapping[str, AxisPath]:

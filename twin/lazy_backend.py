@@ -21,6 +21,6 @@ File = str | PathLike
 """A path, as text or as an object of `pathlib`."""
 
 
-def outward(module: str) -> Any:
+def lazy_backend(module: str) -> Any:
     """The module `flexdt.<module>`."""
     return import_module(f"flexdt.{module}")
