@@ -133,13 +133,16 @@ def _add_others(
     app: typer.Typer, groups: Mapping[str, typer.Typer], words: Sequence[str] | None
 ) -> None:
     """Add other distributions' commands, which take no name of ours."""
+    if words is None:
+        asked = [*extension_commands.KNOWN]
+    else:
+        first, second = [*words, "", ""][:2]
+        asked = [f"{first} {second}" if first in GROUPS else first]
     ours = {*COMMANDS, *(f"{group} {one}" for group, (_, more) in GROUPS.items() for one in more)}
-    asked = set(extension_commands.wanted(words)) - ours - {*GROUPS}
-    for name in dict.fromkeys([*extension_commands.KNOWN, *sorted(asked)]):
+    asked = [name for name in asked if name not in ours and name and name.split()[-1][0] != "-"]
+    for name in dict.fromkeys([*extension_commands.KNOWN, *asked]):
         command = extension_commands.found(name) if name in asked else None
         group, _, one = name.rpartition(" ")
-        if group and group not in groups:
-            continue
         place = groups[group] if group else app
         if command is not None:
             place.command(one)(_complete(command))

@@ -7,7 +7,7 @@ looked up when its command is on the command line.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from flexdt.clients.cli.options import argument
@@ -41,15 +41,3 @@ def listed(name: str) -> Callable[..., None]:
 
     command.__doc__ = KNOWN[name]
     return command
-
-
-def wanted(words: Iterable[str] | None) -> list[str]:
-    """The commands of other distributions to load for a command line, by its first two words.
-
-    Args:
-        words: after the program's name; None for every command of `flexdt-extensions`.
-    """
-    if words is None:
-        return list(KNOWN)
-    first = list(words)[:2]
-    return [" ".join(first[:count]) for count in range(1, len(first) + 1)]
