@@ -1,9 +1,8 @@
-"""A minimal HTTP server for monitoring: `/healthz` and `/metrics`.
+"""Pages for monitoring, `/healthz` and `/metrics`, by the threads of prometheus_client's server.
 
-Each connection serves one small GET or HEAD request within a few seconds. Beyond the loopback,
-pages other than `/healthz` need the server's token (`Authorization: Bearer ...`).
-
-Twin, projector and viewer supply the figures; this module puts them into the pages.
+Beyond the loopback, pages other than `/healthz` need the server's token (`Authorization: Bearer
+...`). Twin, projector and viewer supply the figures; this module puts them into the pages. A page
+is made in a turn of the event loop, to which the figures belong.
 """
 
 from __future__ import annotations
@@ -11,20 +10,26 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import socket
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass
 from http import HTTPStatus
+from threading import Thread
+from typing import Any, Final
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 from flexdt.process_settings import LOOPBACK, ServerSettings
 from flexdt.server.runtime.access import check_bind, is_loopback, read_token, token_matches
 from flexdt.server.runtime.log import dropped
-from flexdt.server.runtime.loop import Holds, ListeningServer, ServerLoop
+from flexdt.server.runtime.loop import Holds, ServerLoop
 from flexdt.server.runtime.metrics import CONTENT_TYPE, Figure, Requests, counter, gauge, render
 
-MAX_HEAD = 8192
-TIMEOUT_S = 5.0
-MAX_CLIENTS = 32
-OPEN_PAGES = ("/healthz",)
+SILENT_S: Final = 5.0
+"""A client that sends nothing for so long is left."""
+HELD_S: Final = 60.0
+"""An event loop that gives no page for so long is told as failed (503)."""
+OPEN_PAGES: Final = ("/healthz",)
 
 
 @dataclass(frozen=True)
@@ -37,83 +42,63 @@ class HttpResponse:
 
 
 Pages = Mapping[str, Callable[[], HttpResponse]]
+"""Path -> function that makes the page."""
 
 
-class HttpServer(ListeningServer):
-    """A listening server; made by `serve_http`."""
+class _Handler(WSGIRequestHandler):
+    """One connection: a request, and nothing in the log, which holds lines of JSON."""
 
-    def __init__(self, pages: Pages, token: str | None) -> None:
-        self._pages, self._token = pages, token
-        self._clients: set[asyncio.Task[None]] = set()
+    timeout = SILENT_S
 
-    async def close(self) -> None:
-        """Stop listening and end the open connections."""
-        if self.server is not None:
-            self.server.close()
-        for task in list(self._clients):
-            task.cancel()
-        await asyncio.gather(*self._clients, return_exceptions=True)
+    def log_message(self, format: str, *args: object) -> None:
+        """Log nothing."""
 
-    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Serve one connection."""
-        task = asyncio.current_task()
-        assert task is not None
-        self._clients.add(task)
+
+def _application(pages: Pages, token: str | None) -> Callable[..., list[bytes]]:
+    """The pages as a WSGI application, made by the loop that runs now."""
+    loop = asyncio.get_running_loop()
+
+    def response(asked: Mapping[str, str]) -> HttpResponse:
+        path, given = asked["PATH_INFO"], asked.get("HTTP_AUTHORIZATION", "")
+        if asked["REQUEST_METHOD"] not in ("GET", "HEAD"):
+            return HttpResponse("{}", HTTPStatus.METHOD_NOT_ALLOWED)
+        if path not in pages:
+            return HttpResponse("{}", HTTPStatus.NOT_FOUND)
+        said = given.removeprefix("Bearer ")
+        if token is not None and path not in OPEN_PAGES and not token_matches(said, token):
+            return HttpResponse("{}", HTTPStatus.UNAUTHORIZED)
+        made: Future[HttpResponse] = Future()
+
+        def make() -> None:
+            try:
+                made.set_result(pages[path]())
+            except Exception as error:
+                made.set_exception(error)
+
         try:
-            async with asyncio.timeout(TIMEOUT_S):
-                if len(self._clients) > MAX_CLIENTS:
-                    page, head = HttpResponse("{}", HTTPStatus.SERVICE_UNAVAILABLE), False
-                else:
-                    page, head = await self._answer(reader)
-                body = page.text.encode()
-                lines = [
-                    f"HTTP/1.1 {page.status.value} {page.status.phrase}",
-                    f"Content-Type: {page.content_type}",
-                    f"Content-Length: {len(body)}",
-                    "Cache-Control: no-store",
-                    "Connection: close",
-                ]
-                writer.write("\r\n".join([*lines, "", ""]).encode() + (b"" if head else body))
-                await writer.drain()
-        except (TimeoutError, ConnectionError):
-            pass
-        finally:
-            self._clients.discard(task)
-            writer.close()
-            with contextlib.suppress(ConnectionError, TimeoutError):
-                await writer.wait_closed()
+            loop.call_soon_threadsafe(make)
+            return made.result(HELD_S)
+        except (TimeoutError, RuntimeError):  # the loop is held, or closed
+            return HttpResponse("{}", HTTPStatus.SERVICE_UNAVAILABLE)
 
-    async def _answer(self, reader: asyncio.StreamReader) -> tuple[HttpResponse, bool]:
-        try:
-            text = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1")
-        except asyncio.LimitOverrunError:
-            return HttpResponse("{}", HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE), False
-        except asyncio.IncompleteReadError:
-            return HttpResponse("{}", HTTPStatus.BAD_REQUEST), False
-        first, *fields = text.split("\r\n")
-        words = first.split(" ")
-        if len(words) != 3 or not words[2].startswith("HTTP/1."):
-            return HttpResponse("{}", HTTPStatus.BAD_REQUEST), False
-        if words[0] not in ("GET", "HEAD"):
-            return HttpResponse("{}", HTTPStatus.METHOD_NOT_ALLOWED), False
-        path = words[1].split("?", 1)[0]
-        if path not in self._pages:
-            return HttpResponse("{}", HTTPStatus.NOT_FOUND), words[0] == "HEAD"
-        if self._token is not None and path not in OPEN_PAGES:
-            given = [f.partition(":")[2].strip() for f in fields if f.lower().startswith("auth")]
-            bearer = given[0].removeprefix("Bearer ") if given else None
-            if not token_matches(bearer, self._token):
-                return HttpResponse("{}", HTTPStatus.UNAUTHORIZED), False
-        return self._pages[path](), words[0] == "HEAD"
+    def application(asked: dict[str, Any], start: Callable[..., object]) -> list[bytes]:
+        page = response(asked)
+        body = page.text.encode()
+        head = {"Content-Type": page.content_type, "Content-Length": str(len(body)),
+                "Cache-Control": "no-store"}  # fmt: skip
+        start(f"{page.status.value} {page.status.phrase}", list(head.items()))
+        return [] if asked["REQUEST_METHOD"] == "HEAD" else [body]
+
+    return application
 
 
 async def serve_http(
     pages: Pages, host: str = LOOPBACK, port: int = 0, *, token: str | None = None
-) -> HttpServer:
-    """Serve `pages` by path on `host`:`port`.
+) -> WSGIServer:
+    """Serve `pages` on `host`:`port`, in daemon threads, until `shutdown` and `server_close`.
 
     Args:
-        pages: path -> function that makes the page.
+        pages: path -> function that makes the page, called in the loop that runs now.
         host, port: where; beyond the loopback only with a token.
         token: of the server.
 
@@ -121,13 +106,16 @@ async def serve_http(
         AccessError: the address can be reached by others and there is no token.
         OSError: the address is taken or not ours.
     """
+    from prometheus_client.exposition import ThreadingWSGIServer
+
     check_bind(host, token)
-    made = HttpServer(pages, None if is_loopback(host) else token)
 
-    def protocol() -> asyncio.StreamReaderProtocol:
-        return asyncio.StreamReaderProtocol(asyncio.StreamReader(limit=MAX_HEAD), made.serve)
+    class Server(ThreadingWSGIServer):
+        address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
 
-    await made.listen(protocol, host, port)
+    application = _application(pages, None if is_loopback(host) else token)
+    made = await asyncio.to_thread(make_server, host, port, application, Server, _Handler)
+    Thread(target=made.serve_forever, name="http pages", daemon=True).start()
     return made
 
 
@@ -147,9 +135,10 @@ async def served_pages(pages: Pages, settings: ServerSettings) -> AsyncIterator[
     token = read_token(settings.token_file)
     server = await serve_http(pages, settings.http_host, settings.http_port, token=token)
     try:
-        yield {"http_port": server.port}
+        yield {"http_port": server.server_port}
     finally:
-        await server.close()
+        await asyncio.to_thread(server.shutdown)
+        server.server_close()
 
 
 def watching_pages(
