@@ -16,8 +16,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from flexdt.clients.calibration.calibrate import calibrate_datasets, find_phantom
-from flexdt.clients.calibration.detected_frames import DatasetFrames
+from flexdt.clients.calibration.calibrate import DatasetFrames, calibrate_datasets, find_phantom
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.twin.calibration.fit.solver import solve
 from flexdt.twin.calibration.pipeline import Scan, calibrate

@@ -14,15 +14,120 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from flexdt.server.scans.acquisition import FramePipeline
-from flexdt.server.scans.resume_motion import rejoin
 from flexdt.server.scans.retry import hopeless
-from flexdt.server.scans.script_settings import apply_command
 from flexdt.server.scans.twin_clock import TwinClock
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.motion import profiles as motion
+from flexdt.twin.motion.profiles import Piece, Trajectory
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import TubeState
 from flexdt.twin.script import Exposure, ScanPlan, Step
+from flexdt.twin.script import commands as c
+
+# How a scanner gets back onto a plan: the pose to return to, and the programme from there on.
+#
+# A plan may be left while an axis moves (a fly scan). To rejoin it at plan time tau, each moving
+# axis goes back to where its run-up would begin, speeds up, and passes the plan's position with the
+# plan's velocity at one moment common to all; from there the plan's own trajectories continue. All
+# of it is plain calculation.
+
+
+@dataclass(frozen=True)
+class Rejoin:
+    """What it takes to be on `plan` at plan time `tau`.
+
+    Attributes:
+        start: axis -> position at rest from which to begin [mm, deg].
+        run_up_s: from that rest to being on the plan.
+    """
+
+    plan: ScanPlan
+    tau: float
+    start: Mapping[str, float]
+    run_up_s: float
+    _motion: Mapping[str, tuple[float, float, float]]
+
+    def programme(self) -> dict[str, tuple[Trajectory, ...]]:
+        """Trajectories on a clock that shows 0 when a scanner at rest at `start` sets off."""
+        join = self.run_up_s
+        out = {}
+        for axis, (position, velocity, acceleration) in self._motion.items():
+            run_up: tuple[Trajectory, ...] = ()
+            if velocity != 0.0:
+                begin = join - abs(velocity) / acceleration
+                rate = acceleration if velocity > 0 else -acceleration
+                piece = Piece(begin, self.start[axis], 0.0, rate)
+                run_up = (Trajectory((piece,), join, position),)
+            rest = _remaining(self.plan.trajectories.get(axis, ()), self.tau)
+            if run_up or rest:
+                out[axis] = run_up + tuple(t.shifted(join - self.tau) for t in rest)
+        return out
+
+
+def rejoin(plan: ScanPlan, tau: float, accelerations: Mapping[str, float]) -> Rejoin:
+    """How to be on `plan` at plan time `tau` [s].
+
+    Args:
+        plan: the scan.
+        tau: when, on the plan's clock.
+        accelerations: of each axis's run-up.
+    """
+    start, moving, run_up = {}, {}, 0.0
+    for axis, path in plan.paths.items():
+        position, velocity = float(path.positions(tau)), float(path.velocities(tau))
+        acceleration = accelerations[axis]
+        start[axis] = position - velocity * abs(velocity) / (2.0 * acceleration)
+        moving[axis] = (position, velocity, acceleration)
+        run_up = max(run_up, abs(velocity) / acceleration)
+    return Rejoin(plan, tau, start, run_up, moving)
+
+
+def _remaining(
+    trajectories: tuple[tuple[float, Trajectory], ...], tau: float
+) -> tuple[Trajectory, ...]:
+    """What is still to come of one axis's trajectories, the one in force at `tau` cut."""
+    begun = [t for time, t in trajectories if time <= tau]
+    later = tuple(t for time, t in trajectories if time > tau)
+    if not begun or tau >= begun[-1].end:
+        return later
+    return (motion.continued(begun[-1], tau), *later)
+
+
+# What a script's commands set on the scanner, one case for each type that sets something.
+#
+# Moves and images are the plan's business and have no effect here.
+
+
+def apply_command(scanner: ScannerTwin, command: c.Command, now: float) -> None:
+    """Set what `command` sets at `now`; the plan has checked that it may.
+
+    Raises:
+        SafetyError: X-rays on during an E-stop.
+    """
+    match command:
+        case c.XrayOn():
+            scanner.set_tube(on=True, now=now, warm=True)
+        case c.XrayOff():
+            scanner.set_tube(on=False, now=now)
+        case c.TubeSetting():
+            scanner.set_tube(**command.arguments)
+        case c.CameraSetting():
+            scanner.set_camera(**command.arguments)
+        case c.MotorCommand(component=axis) if not scanner.machine.has(axis):
+            pass  # a component of somebody else's
+        case c.SetSpeed(component=axis, speed=speed):
+            scanner.set_axis(axis, speed=_allowed(scanner, axis, speed, "max_speed"))
+        case c.SetAcceleration(component=axis, acceleration=rate):
+            scanner.set_axis(axis, acceleration=_allowed(scanner, axis, rate, "max_acceleration"))
+
+
+def _allowed(scanner: ScannerTwin, axis: str, value: float, limit: str) -> float:
+    """A rate above the limit is clamped, as the plan did (it has warned, or refused the script)."""
+    moves = scanner.machine.moves(axis)
+    limits = [getattr(scanner.machine.axes[m], limit) / abs(f) for m, f in moves.items()]
+    return min([value, *map(float, limits)])
+
 
 BATCH = 4
 WORKERS = 2

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from flexdt.protocol import Codec, Connection, Message, Prepared, RpcError
-from flexdt.server.twin.control import Control
+from flexdt.server.twin.core import Control
 from flexdt.server.twin.hub import Hub, ImageWish
 from tests.support.simulated_loop import SimulatedLoop
 

@@ -30,7 +30,7 @@ from flexdt.server.runtime.access import (
 )
 from flexdt.server.scans import retry as retry_module
 from flexdt.server.scans.retry import Retry, transient
-from flexdt.server.twin.control import Control
+from flexdt.server.twin.core import Control
 from flexdt.server.wire_errors import ProjectorUnavailable
 from flexdt.twin.dataset.dataset_errors import DiskFullError
 from flexdt.twin.errors import LimitError

@@ -8,8 +8,7 @@ from collections.abc import Awaitable, Callable, Sequence
 import numpy as np
 import pytest
 
-from flexdt.server.scans.resume_motion import rejoin
-from flexdt.server.scans.runner import JobAborted, ScanRunner
+from flexdt.server.scans.runner import JobAborted, ScanRunner, rejoin
 from flexdt.server.scans.twin_clock import TwinClock
 from flexdt.twin.errors import CollisionError, LimitError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile

@@ -18,7 +18,7 @@ from flexdt.phantoms.files import phantom_files
 from flexdt.phantoms.samples import as_phantom
 from flexdt.server.files.directory import open_data
 from flexdt.server.scans.stage import Stage
-from flexdt.server.storage import mesh_reading
+from flexdt.server.storage import stored_samples as mesh_reading
 from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.server.storage.unfinished_uploads import UploadHead
 from flexdt.twin.collision.convex_solids import Polytope

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +20,6 @@ import numpy.typing as npt
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect import spot_kernels as kernels
 from flexdt.twin.calibration.detect.background import Background, survey
-from flexdt.twin.calibration.detect.body import NO_BODY, SeenBody, see_body
 from flexdt.twin.calibration.detect.detection import BLUR_PX, MISFIT, covariances_of
 from flexdt.twin.calibration.detect.patches import (
     Patches,
@@ -30,15 +30,6 @@ from flexdt.twin.calibration.detect.patches import (
     take,
     usable,
 )
-from flexdt.twin.calibration.detect.sharpness import (
-    BODY_BLUR_PX,
-    SAMPLE,
-    Sharp,
-    balls_of,
-    rest_of_blur,
-    seen_sharpness,
-    sharpness,
-)
 from flexdt.twin.calibration.detect.windows import (
     Windows,
     blurred_windows,
@@ -48,7 +39,279 @@ from flexdt.twin.calibration.detect.windows import (
 )
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
-from flexdt.twin.projection.analytic_solids import Scene
+from flexdt.twin.projection.analytic_solids import ConvexPolyhedron, Scene, Shape, Solid, Sphere
+
+# The phantom's body as the images have it: how much it attenuates, and where it stands.
+#
+# A body is printed or glued together, and its description says neither its attenuation in this beam
+# nor to a hundredth of a millimetre where it stands round the beads. Both are estimated from the
+# surroundings of some beads, by least squares with rendered bodies, before the body is subtracted.
+
+SAMPLE = 24
+"""Windows that are looked at."""
+LEAST = 0.3
+"""Attenuation of a seen body over the described one below which the body is not this one: one that
+is absent, turned or elsewhere has 0.01 to 0.03, one of half the attenuation 0.5."""
+PRIOR_MM = 0.5
+"""How far a body may stand from its description; holds a direction that no edge shows."""
+FAR_MM = 2.0
+"""A body found further away than that is another body."""
+ROUNDS = 4
+STILL_MM = 0.01
+"""A step of the shift after which no further one is taken; what it leaves is of second order."""
+
+
+@dataclass(frozen=True)
+class SeenBody:
+    """A body as the images have it.
+
+    Attributes:
+        factor: attenuation over the described one; 0 where the images do not show the body, nan
+            where none is described.
+        shift_mm: where it stands from where it is described, in the phantom's frame.
+    """
+
+    factor: float
+    shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def scene(self, described: Scene) -> Scene:
+        """The body's solids as they are seen."""
+        return Scene(
+            tuple(
+                Solid(_shifted(s.shape, self.shift_mm), s.material, self.factor * s.mu_per_mm)
+                for s in described.solids
+            )
+        )
+
+
+NO_BODY = SeenBody(math.nan)
+"""None is described."""
+
+
+def see_body(
+    images: npt.NDArray[np.float32],
+    described: Scene,
+    cone: ConeVec,
+    model: BeadModel,
+    windows: Windows,
+    blur: float = 0.0,
+) -> SeenBody:
+    """Find the body in the rings round the beads.
+
+    A body that is moved a little moves in each window as its bead would: the slope of the rendered
+    body along rows and columns, times that shift of the bead, is what the images have more.
+
+    Args:
+        images: (n, k, side, side) line integrals.
+        described: the body's solids.
+        cone: geometry of the n frames.
+        model: the k beads.
+        windows: where the images were cut out.
+        blur: of the images [px].
+
+    Returns:
+        The body; the described one if no ring has anything of it.
+    """
+    frames, beads = np.nonzero(~windows.crowded)
+    some = np.linspace(0, len(frames) - 1, min(SAMPLE, len(frames))).astype(np.intp)
+    frames, beads = frames[some], beads[some]
+    if len(frames) == 0:
+        return SeenBody(1.0)
+    few, near = windows.pick(frames, beads), cone[frames]
+    ring = _rings(few) & np.isfinite(images[frames, beads])
+    seen = _levelled(images[frames, beads], ring)
+    dof = np.maximum(ring.sum(axis=(1, 2)), 1)
+    along = _shift_of_beads(near, model, beads, windows.shape)
+    body, shift = SeenBody(1.0), np.zeros(3)
+    for turn in range(ROUNDS):
+        moved = SeenBody(1.0, body.shift_mm).scene(described)
+        image = render_windows(moved, near, few)
+        image = (blurred_windows(image, blur) if blur > 0 else image)[:, 0]
+        here = _levelled(np.asarray(image), ring)
+        if turn == 0:
+            power, push = np.einsum("mp,mp->m", here, here), np.einsum("mp,mp->m", here, seen)
+            telling = power > 1e-6 * dof
+            if not telling.any():
+                return SeenBody(1.0)
+            # One foreign object in a ring must not decide, so the median over the windows is taken.
+            factor = _middle(push[telling] / power[telling], power[telling])
+            if factor < LEAST:
+                return SeenBody(0.0)
+        down, right = (np.asarray(slope) for slope in np.gradient(image, axis=(1, 2)))
+        slopes = -np.stack([_levelled(right, ring), _levelled(down, ring)], axis=-1)
+        design = np.concatenate([here[..., None], slopes @ along], axis=2)
+        rest = ((seen - factor * here) ** 2).sum(axis=1) / dof
+        typical = max(float(np.median(rest)), 1e-8)
+        weight = np.minimum(1.0, 2.0 * typical / np.maximum(rest, 1e-12))
+        normal = np.einsum("m,mpi,mpj->ij", weight, design, design)
+        hold = typical / (factor * PRIOR_MM) ** 2 + 1e-12
+        normal[1:, 1:] += hold * np.eye(3)
+        pull = np.einsum("m,mpi,mp->i", weight, design, seen)
+        pull[1:] -= hold * factor * shift
+        found = np.linalg.solve(normal, pull)
+        factor, step = float(found[0]), found[1:] / float(found[0])
+        shift = shift + step
+        if factor < LEAST or float(np.linalg.norm(shift)) > FAR_MM:
+            return SeenBody(0.0)
+        body = SeenBody(factor, (float(shift[0]), float(shift[1]), float(shift[2])))
+        if float(np.linalg.norm(step)) < STILL_MM:
+            break
+    return body
+
+
+def _shift_of_beads(
+    cone: ConeVec, model: BeadModel, beads: npt.NDArray[np.intp], shape: tuple[int, int]
+) -> FloatArray:
+    """How the spot of a bead moves with the bead: (m, 2, 3) pixels (column, row) a millimetre."""
+    one = np.arange(len(beads))
+    there = cone.project_points(model.beads, shape)[one, beads]
+    moved = [cone.project_points(model.beads + e, shape)[one, beads] for e in np.eye(3)]
+    return np.stack([each - there for each in moved], axis=-1)
+
+
+def _rings(windows: Windows) -> npt.NDArray[np.bool_]:
+    """Pixels round the beads that no bead touches, (m, side, side)."""
+    i = np.arange(windows.side)
+    x, y = np.moveaxis((windows.predicted - windows.corner)[:, 0], -1, 0)[..., None, None]
+    d2 = (i[None, None, :] - x) ** 2 + (i[None, :, None] - y) ** 2
+    radii = windows.radii[:, 0, None, None]
+    return np.asarray((d2 > (1.15 * radii + 2.0) ** 2) & (d2 < (1.6 * radii + 4.0) ** 2))
+
+
+def _levelled(values: npt.NDArray[Any], ring: npt.NDArray[np.bool_]) -> FloatArray:
+    """The values in each ring less their mean, 0 elsewhere, (m, side * side)."""
+    inside = np.where(ring, values, 0.0).astype(np.float64)
+    mean = inside.sum(axis=(1, 2)) / np.maximum(ring.sum(axis=(1, 2)), 1)
+    return np.asarray(np.where(ring, inside - mean[:, None, None], 0.0).reshape(len(ring), -1))
+
+
+def _middle(values: FloatArray, weights: FloatArray) -> float:
+    """Weighted median."""
+    order = np.argsort(values)
+    heap = np.cumsum(weights[order])
+    return float(values[order][int(np.searchsorted(heap, 0.5 * heap[-1]))])
+
+
+def _shifted(shape: Shape, shift: tuple[float, float, float]) -> Shape:
+    if isinstance(shape, ConvexPolyhedron):
+        offsets = np.asarray(shape.offsets) + np.asarray(shape.normals) @ np.asarray(shift)
+        return replace(shape, offsets=tuple(offsets.tolist()))
+    x, y, z = (math.fsum(pair) for pair in zip(shape.center, shift, strict=True))
+    return replace(shape, center=(x, y, z))
+
+
+# Blur of the images and apparent size of the beads, estimated from the spots themselves.
+#
+# The profile that is fitted is an approximation, so the estimate is corrected by the same estimate
+# from rendered beads. Without whole spots the assumed values are returned, marked as not seen.
+
+SAMPLE = 24
+"""Spots from which blur and size are estimated, about."""
+CHECK_FINE = 3
+"""Rays along a pixel's side where that estimate is checked on rendered beads."""
+BODY_BLUR_PX = 0.18
+"""Blur of the images below which the rendered body is subtracted as it is."""
+
+
+def balls_of(model: BeadModel, contrast: FloatArray, size: float = 1.0) -> Scene:
+    """The beads alone, as balls with the contrast (k,) and the size they are seen with."""
+    return Scene(
+        tuple(
+            Solid(Sphere((x, y, z), r * size), "bead", max(peak, 1e-3) / (2.0 * r * size))
+            for (x, y, z), r, peak in zip(
+                model.beads.tolist(), model.bead_radius_mm.tolist(), contrast.tolist(), strict=True
+            )
+        )
+    )
+
+
+def rest_of_blur(blur: float, fine: int) -> float:
+    """Blur left to apply when fine x fine rays of a pixel have been averaged already."""
+    return math.sqrt(max(blur**2 - (1.0 - 1.0 / fine**4) / 12.0, 0.01))
+
+
+@dataclass(frozen=True)
+class Sharp:
+    """Blur of the images [px] and size of the beads.
+
+    Attributes:
+        blur, scale: blur and factor from expected to apparent radius with which a fit leaves least.
+        seen: they were seen, not assumed.
+        true: the blur with which rendered beads look the same.
+        size: likewise the factor on the beads' radii.
+    """
+
+    blur: float
+    scale: float
+    seen: bool
+    true: float
+    size: float
+
+
+def seen_sharpness(
+    sharp: Sharp,
+    patches: Patches,
+    sample: npt.NDArray[np.intp],
+    cone: ConeVec,
+    model: BeadModel,
+) -> Sharp:
+    """Blur and size corrected by what the same estimate makes of rendered beads: the fit's profile
+    is an approximation, and where a spot is cut by the edge its radius decides its place."""
+    if not sharp.seen or sharp.blur < BODY_BLUR_PX:
+        return sharp
+    k = patches.windows.corner.shape[1]
+    frames, beads = np.divmod(sample, k)
+    few = patches.windows.pick(frames, beads)
+    balls = balls_of(model, patches.peaks[:k])
+    rays = render_windows(balls, cone[frames], few, CHECK_FINE)
+    seen = blurred_windows(rays, rest_of_blur(sharp.blur, CHECK_FINE))
+    side = few.side
+    rendered = replace(
+        patches, flat=seen.reshape(-1, side, side), offsets=patches.offsets[sample],
+        radii=patches.radii[sample], stretch=patches.stretch[sample], peaks=patches.peaks[sample],
+        windows=few,
+    )  # fmt: skip
+    found = sharpness(rendered, np.arange(len(sample)), sharp.blur)
+    if not found.seen:
+        return sharp
+    true = 2.0 * sharp.blur - found.blur
+    if not abs(true - sharp.blur) < 0.2 * sharp.blur:
+        return sharp
+    return replace(sharp, true=true, size=sharp.scale / found.scale)
+
+
+def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sharp:
+    """Blur and apparent size from some whole spots, by the fit that leaves least.
+
+    A bead that is not as made shows here too; a spot cut by the edge has its centre where its
+    radius puts it. Without whole spots: the assumed blur, and the expected size.
+    """
+    if len(sample) < 3:
+        return Sharp(blur, 1.0, False, blur, 1.0)
+    blurs = np.array([0.12, 0.25, 0.45, 0.7, 1.1, 1.7, 2.5, 3.6])
+    masks = usable(patches, sample)
+    misfit, scale = np.full(len(blurs), np.inf), np.ones(len(blurs))
+    for i, trial in enumerate(blurs):
+        results = fits(patches, sample, trial, True, masks)
+        good = sample[results[sample, kernels.OK] > 0]
+        if len(good) >= 3:
+            misfit[i] = float(np.median(results[good, kernels.NOISE]))
+            scale[i] = float(np.median(results[good, kernels.RADIUS] / patches.radii[good]))
+        if i > 0 and misfit[i] > 1.5 * misfit[i - 1]:
+            break
+    i = int(np.argmin(misfit))
+    if not np.isfinite(misfit[i]):
+        return Sharp(blur, 1.0, False, blur, 1.0)
+    best = float(blurs[i])
+    if 0 < i < len(blurs) - 1 and np.isfinite(misfit[i - 1 : i + 2]).all():
+        # Misfit is a hyperbola about the right blur, so its square is a parabola.
+        near = slice(i - 1, i + 2)
+        a, b, _ = np.polyfit(blurs[near], np.square(misfit[near]), 2)
+        if a > 0:
+            best = float(np.clip(-b / (2.0 * a), blurs[i - 1], blurs[i + 1]))
+    apparent = float(np.interp(best, blurs, scale))
+    return Sharp(best, apparent, True, best, apparent)
+
 
 MISS_PX = 4.0
 """A measurement further than this from its prediction is not that bead."""
