@@ -5,7 +5,13 @@ Example:
     (7, 3)
 """
 
-from flexdt.phantoms.beads import bead_phantom, chiral_phantom, spiral_positions
+from flexdt.phantoms.beads import (
+    bead_phantom,
+    chiral_phantom,
+    cuboid_with_beads,
+    loop_positions,
+    spiral_positions,
+)
 from flexdt.phantoms.beads import bead_phantom as beads
 from flexdt.phantoms.bricks import lego_phantom
 from flexdt.phantoms.bricks import lego_phantom as lego
@@ -15,7 +21,7 @@ from flexdt.phantoms.files.mesh_files import mesh_phantom, voxel_phantom
 from flexdt.phantoms.files.mesh_files import mesh_phantom as from_mesh
 from flexdt.phantoms.files.phantom_files import load_phantom_file
 from flexdt.phantoms.json_form import scene_from_dict, scene_to_dict
-from flexdt.phantoms.materials import Material, material, materials
+from flexdt.phantoms.materials import Material, material, materials, stated_keV
 from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.pieces import Surface, Voxels
 from flexdt.phantoms.samples import as_phantom
@@ -30,12 +36,14 @@ __all__ = [
     "bead_phantom",
     "beads",
     "chiral_phantom",
+    "cuboid_with_beads",
     "from_mesh",
     "is_shipped",
     "lego",
     "lego_phantom",
     "load_phantom",
     "load_phantom_file",
+    "loop_positions",
     "material",
     "materials",
     "mesh_phantom",
@@ -44,6 +52,7 @@ __all__ = [
     "scene_to_dict",
     "shepp_logan",
     "spiral_positions",
+    "stated_keV",
     "voxel_phantom",
 ]
 

@@ -20,9 +20,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.phantoms import Phantom, bead_phantom, load_phantom, material
+from flexdt.phantoms import Phantom, bead_phantom, load_phantom, material, stated_keV
 from flexdt.phantoms.channels import chain_through, channels, line_integrals
-from flexdt.phantoms.materials import stated_keV
 from flexdt.twin.calibration import FitResult, bead_model, estimate_geometry
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec

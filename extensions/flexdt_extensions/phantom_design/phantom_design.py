@@ -18,8 +18,7 @@ import numpy as np
 
 from flexdt.clients.figures import page, require_plots, table
 from flexdt.extending import CommandError
-from flexdt.phantoms import Phantom, spiral_positions
-from flexdt.phantoms.beads import cuboid_with_beads
+from flexdt.phantoms import Phantom, cuboid_with_beads, spiral_positions
 from flexdt.phantoms.bricks import Brickwork, grid_seats, lego_phantom
 from flexdt.twin.calibration import BeadModel
 from flexdt.twin.calibration.fit.weak_directions import BOUND, TOLERANCE, unit_of

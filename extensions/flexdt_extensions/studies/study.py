@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from flexdt.clients.figures import require_plots
-from flexdt.phantoms import Phantom, load_phantom, material
-from flexdt.phantoms.beads import cuboid_with_beads, loop_positions
+from flexdt.phantoms import Phantom, cuboid_with_beads, load_phantom, loop_positions, material
 from flexdt.twin.calibration import SIX, BeadModel, bead_model
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.physics import Chain, EffectiveBeam, Panel, effective_beam, weights_of
