@@ -6,7 +6,8 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 TEST_STAMP := $(VENV)/.installed-test
 TYPES := .typing/.linked
-WEB_STAMP := node_modules/.installed
+WEB := clients/viewer/web
+WEB_STAMP := $(WEB)/node_modules/.installed
 
 # Tests of the pure core for `make quick`: those that take at most a second or two each.
 TWIN := frames frames_astra frames_off_centre values machine exposure physics_source scanner_tube
@@ -30,8 +31,8 @@ $(TEST_STAMP): $(STAMP)
 	touch $@
 
 # TypeScript and eslint for the page. Without npm's registry the tests that need them are skipped.
-$(WEB_STAMP): $(TEST_STAMP) package-lock.json
-	@(PATH="$(CURDIR)/$(BIN):$$PATH" npm ci --no-audit --no-fund --silent --fetch-retries=1 && touch $@) \
+$(WEB_STAMP): $(TEST_STAMP) $(WEB)/package-lock.json
+	@(PATH="$(CURDIR)/$(BIN):$$PATH" npm ci --prefix $(WEB) --no-audit --no-fund --silent --fetch-retries=1 && touch $@) \
 	  || echo "npm could not install TypeScript and eslint: the page's source is not checked"
 
 # Type checkers and import-linter need to see the folders as the one package that they install as.

