@@ -40,9 +40,14 @@ def test_every_package_is_listed_and_every_listed_package_is_there() -> None:
     assert sorted(listed()["packages"]) == sorted(present())
 
 
+def sources(folder: str) -> list[Path]:
+    """The Python files of a folder, but for those of the page's tools."""
+    return [p for p in (ROOT / folder).rglob("*.py") if "node_modules" not in p.parts]
+
+
 def test_a_file_name_means_one_thing_and_no_room_is_crowded() -> None:
     """Only the entry points of the processes share their names."""
-    modules = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")]
+    modules = [path for folder in FOLDERS for path in sources(folder)]
     own = [p for p in modules if p.stem not in ("__init__", "__main__", "main")]
     assert sorted({p.name for p in own if sum(q.name == p.name for q in own) > 1}) == []
     rooms = Counter(path.parent for path in modules)
@@ -53,7 +58,7 @@ def test_every_folder_with_modules_is_a_package() -> None:
     folders = {
         path.parent
         for folder in FOLDERS
-        for path in (ROOT / folder).rglob("*.py")
+        for path in sources(folder)
         if "data" not in path.relative_to(ROOT).parts
     }
     assert [str(f) for f in sorted(folders) if not (f / "__init__.py").is_file()] == []

@@ -60,6 +60,8 @@ def by_folder(root: Path, folders: Sequence[str] = FOLDERS) -> dict[str, tuple[i
     lines: Counter[str] = Counter()
     for folder in folders:
         for path in (root / folder).rglob("*.py"):
+            if "node_modules" in path.parts:
+                continue
             name = path.parent.relative_to(root).as_posix()
             modules[name] += 1
             lines[name] += code_lines(path.read_text(encoding="utf-8"))
