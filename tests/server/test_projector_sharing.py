@@ -98,7 +98,7 @@ def test_equal_contents_are_one_thing() -> None:
 @pytest.mark.parametrize("through_pool", [False, True])
 def test_two_versions_of_a_sample_stay_and_older_ones_go(through_pool: bool) -> None:
     async def work(server: ProjectorServer, one: Any, other: Any, pool: ProjectorPool) -> None:
-        shelf = Shelf(thing=block(0.01), ensure_allowed=block(0.09))
+        shelf = Shelf(thing=block(0.01), still=block(0.09))
         imaging = imaging_of(pool if through_pool else other, shelf)
         await brightest(imaging, "still")
         seen: list[set[str]] = []

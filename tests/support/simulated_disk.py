@@ -13,6 +13,7 @@ import errno
 import itertools
 import os
 import random
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -22,6 +23,8 @@ from typing import Any, Literal
 from unittest import mock
 
 Kind = Literal["open", "write", "fsync", "replace", "link", "unlink", "mkdir"]
+NUMBERED = re.compile(r"(\.(?:part|before)-)([\d-]+)")
+"""Temporary names of `server/files/directory.py`."""
 TAKES_ROOM: tuple[Kind, ...] = ("open", "write", "link", "mkdir")
 """What a full disk refuses."""
 REAL: dict[str, Callable[..., Any]] = {
@@ -69,6 +72,7 @@ class Disk:
         """Changes that failed so far."""
         self._from = 0
         self._rng = rng
+        self._ordinals: dict[str, int] = {}
         self._paths: dict[int, Path] = {}
         self._bytes: set[int] = set()
         """Inodes of files whose bytes are not safe."""
@@ -244,12 +248,17 @@ class Disk:
         REAL["link"](file, kept, follow_symlinks=False)
         return kept
 
+    def _ordinal(self, temporary: re.Match[str]) -> str:
+        """The numbers of temporary names go on from run to run; in `ops` they count from 0."""
+        number = self._ordinals.setdefault(temporary[0], len(self._ordinals))
+        return f"{temporary[1]}{number}"
+
     def _change(self, kind: Kind, path: Path) -> bool:
         """Count a change, or fail; whether a write is to be short."""
         if self.off:
             raise OSError(errno.EIO, "the power is cut")
         number = len(self.ops) - self._from
-        self.ops.append((kind, str(path.relative_to(self.root))))
+        self.ops.append((kind, NUMBERED.sub(self._ordinal, str(path.relative_to(self.root)))))
         fault = self.fault
         if fault is None or number < fault.at or (number > fault.at and not fault.lasting):
             return False
