@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 import typer
+from typer.core import TyperGroup
 
 from flexdt.clients.cli import extension_commands
 from flexdt.clients.cli.commands.data_sets import (
@@ -66,7 +67,7 @@ COMMANDS: Final[Mapping[str, Callable[..., object]]] = {
     "follow": follow_command.follow,
     "doctor": doctor_command.doctor,
 }
-"""Name -> what it runs, in the order of the help page."""
+"""Name -> what it runs."""
 GROUPS: Final[Mapping[str, tuple[str, Mapping[str, Callable[..., object]]]]] = {
     "script": ("Scan scripts.", {"new": script_commands.new}),
     "job": ("Jobs: scripts and trajectories being run.", job_command.COMMANDS),
@@ -89,8 +90,37 @@ GROUPS: Final[Mapping[str, tuple[str, Mapping[str, Callable[..., object]]]]] = {
     ),
 }
 """Name -> what its commands are about, and the commands."""
+SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
+    "Scanner": ("state", "move", "jog", "stop", "estop", "reset", "tube", "camera", "clock",
+                "sample", "snap"),
+    "Scans": ("script", "check", "expose", "run", "job", "follow"),
+    "Data": ("calibrate", "align", "compare", "reconstruct", "export", "import", "simulate"),
+    "Analysis": ("phantom", "machine", "study", "batch", "bench"),
+    "Processes": ("up", "twin", "projector", "viewer", "gateway", "demo", "doctor"),
+}  # fmt: skip
+"""Sections of the help page; commands in none of them are those of other distributions."""
 NUMBERS_WITH_SIGN: Final = ("jog", "clock")
 """Commands whose arguments may begin with a minus."""
+
+
+class InSections(TyperGroup):
+    """Lists its commands in `SECTIONS`."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the sections of the help page."""
+        found = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
+        named = {name for names in SECTIONS.values() for name in names}
+        others = tuple(name for name in found if name not in named)
+        room = formatter.width - 6 - max(map(len, found))
+        for title, names in {**SECTIONS, "Other distributions": others}.items():
+            rows = [
+                (name, command.get_short_help_str(room))
+                for name in names
+                if (command := found.get(name)) is not None
+            ]
+            if rows:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
 
 
 def build(words: Sequence[str] | None = None) -> typer.Typer:
@@ -106,12 +136,14 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
+        cls=InSections,
+        context_settings={"help_option_names": ["-h", "--help"]},
     )
 
     @app.callback()
     def root(
         version: bool = option(
-            False, "Print the version and leave.", "--version", callback=_version, is_eager=True
+            False, "Print the version and exit.", "--version", callback=_version, is_eager=True
         ),
     ) -> None:
         pass

@@ -43,7 +43,9 @@ def calibrate(
     per_scan: str = option("", "Those with a value of their own in each scan.", metavar="P,P,..."),
     per_frame: str = option("", "Those that may move during the scan.", metavar="P,P,..."),
     reading: ReadingName = option("axis", "Of eq. 5.4: the axis at O + tau, or R (b - tau) + O."),
-    report: Path | None = option(None, "As a file.", metavar="FILE.{html,json}"),
+    report: Path | None = option(
+        None, "Write the report to this file.", metavar="FILE.{html,json}"
+    ),
     tracks: Path | None = option(None, "Beads of every frame, before, after.", metavar="FILE.json"),
     geometry: list[Path] | None = option(
         None, "Nominal geometry; once a data set, in order.", metavar="FILE"
