@@ -526,7 +526,10 @@ def _fdk(
     sharing = Sharing.of(circle, panels, shape, like) if circle.rise else None
     if sharing is not None:
         table = np.hstack([table, sharing.columns()])
-    responses: dict[float, Float32Array] = {}
+    # Pitches may change from view to view: one filter, and factors for what it scales with.
+    pitch = np.linalg.norm(level.u, axis=1)
+    response = ramp(wide, float(pitch[0]), window)
+    weights = weights * (pitch[0] / pitch)[:, None]
     done = 0
     for part in parts:
         views = slice(done, done + len(part))
@@ -543,15 +546,12 @@ def _fdk(
         if truncation is not None:
             panel = slice(before, before + shape[1])
             truncation.continue_rows(images, level[views], first, panel)
-        pitch = float(np.linalg.norm(level.u[views.start]))
-        if pitch not in responses:
-            responses[pitch] = ramp(wide, pitch, window)
         shape_needed = last - first, wide
         weighing = _weighing(shape_needed, level[views], circle, views, weights[views])
         shares = np.zeros((len(part), 0, 0), np.float32)
         if sharing is not None:
             shares = sharing.table(views, (first, last))
-        target.add(Views(images, top, *weighing, responses[pitch], kept, shares, table[views]))
+        target.add(Views(images, top, *weighing, response, kept, shares, table[views]))
         done = views.stop
         if progress is not None:
             progress(done / len(cone_vec))

@@ -644,6 +644,19 @@ def test_a_panel_that_goes_sideways_between_the_views_is_refused(seed: int) -> N
         fdk(np.zeros((180, *shape), np.float32), tiled, like)
 
 
+@pytest.mark.parametrize(
+    "pitch", [np.tile([1.0, 1.1], 90), np.linspace(1.0, 1.3, 180)], ids=["alternating", "growing"]
+)
+def test_pitch_may_change_from_view_to_view(pitch: np.ndarray) -> None:
+    """The first of 32 views stood for all: +5.0 and +1.7 %."""
+    rows = circle(180, sod=300.0, sdd=600.0).rows.copy()
+    rows[:, 6:] *= pitch[:, None]
+    scan = ConeVec(rows)
+    data = ellipses([(3.0, -2.0, 10.0, 8.0, 0.4, 0.02)], scan, (4, 130))
+    found = fdk(data, scan, Grid((1, 9, 9), 1.0, (3.0, -2.0, 0.0)).blank())
+    assert found.data.mean() == pytest.approx(0.02, rel=0.002)
+
+
 @pytest.mark.parametrize(("degrees", "told"), [
     (352.0, True), pytest.param(220.0, True, marks=pytest.mark.slow), (360.0, False),
 ])  # fmt: skip
