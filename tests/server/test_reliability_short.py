@@ -46,6 +46,10 @@ def test_attacks_get_nothing() -> None:
     assert f"{len(QUICK)} of {len(QUICK)} attacks failed; 0 unhandled exceptions" in out
 
 
+def test_new_clients_are_answered_beside_a_flood_of_connections() -> None:
+    run("floods.py", "--connections", "40")  # it fails without an answer, or with a long log
+
+
 def test_many_clients_keep_their_order() -> None:
     out = run("load.py", "--clients", "30", "--seconds", "3")
     assert out.count("0 out of order, 0 cut off") == 2

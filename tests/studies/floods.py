@@ -301,11 +301,10 @@ SETTLED_S = 5.0
 """After this the flood has as many connections as it gets, and the log has had its first lines."""
 
 
-def strangers(port: int, seed: int, made: Any) -> None:
+def strangers(port: int, seed: int, made: Any, alone: bool) -> None:
     """In a process of its own: connections at an even rate, counted, until it is killed."""
-    os.nice(10)  # its own cost apart
-    with contextlib.suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    if alone:
+        real_time(0)  # else a busy machine makes the flood a small one
 
     async def work() -> None:
         rng, open_ = random.Random(seed), set[asyncio.Task[bytes]]()
@@ -375,7 +374,7 @@ async def part(count: int, folder: Path, *, flood: bool, full: bool, alone: bool
     limit = f"max_clients={PLACES}"
     server = twin(9, folder / "data", "--token-file", secret, "--limit", limit, log=folder / "log")
     made = PROCESSES.Value("l", 0)
-    attacker = PROCESSES.Process(target=strangers, args=(server.port, 1, made), daemon=True)
+    attacker = PROCESSES.Process(target=strangers, args=(server.port, 1, made, alone), daemon=True)
     try:
         held = await holders(server.port) if full else []
         await newcomers(server.port, 8)  # what the first answers need is loaded now
@@ -442,7 +441,9 @@ def main() -> int:
     options.add_argument("--seconds", type=float, default=8.0, help="of each flood")
     options.add_argument("--connections", type=int, metavar="CLIENTS", help="see above")
     options.add_argument(
-        "--real-time", action="store_true", help="give the clients and the twin's loop priority"
+        "--real-time",
+        action="store_true",
+        help="give the flood, the clients and the twin's loop priority",
     )
     chosen = options.parse_args()
     if chosen.connections:
