@@ -205,7 +205,7 @@ def simulate(
         return ScenarioImages(sample, noise, 3 if rays is None else rays).dataset()
     rays = 1 if rays is None else rays
     if not isinstance(scatter, ScatterSettings) and scatter not in get_args(Scatter):
-        gone = "; 'first' has been removed, use 'mc'" if scatter == "first" else ""
+        gone = "; 'first' has been removed, use 'mc'" if str(scatter) == "first" else ""
         raise LimitError(
             f"scatter is {scatter!r}; allowed: {', '.join(get_args(Scatter))}{gone}",
             {"asked": scatter, "allowed": list(get_args(Scatter))},
@@ -231,8 +231,7 @@ def simulate(
     exposure = settings.exposure(camera.exposure_ms, camera.averages)
     scattered = None
     if scatter != "off":
-        given = isinstance(scatter, ScatterSettings)
-        how = scatter if given else ScatterSettings(seed=noise or 0)
+        how = ScatterSettings(seed=noise or 0) if scatter == "mc" else scatter
         grid = scatter_object(parts, phantom.size_mm, how.voxels)
         scattered = scan_scatter(grid, cone.rows, size, Beam.of(chain, exposure.kV), how)
     truth = Truth(

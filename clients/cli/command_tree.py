@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import typer
+from typer.core import TyperGroup
 
 from flexdt.clients.cli.commands.data_sets import (
     batch_command,
@@ -99,6 +100,34 @@ GROUPS: Final[Mapping[str, tuple[str, Mapping[str, Callable[..., object]]]]] = {
 """Name -> what its commands are about, and the commands."""
 NUMBERS_WITH_SIGN: Final = ("jog", "clock")
 """Commands whose arguments may begin with a minus."""
+ALONE: Final = ("twin", "projector", "viewer", "gateway")
+"""Commands that pass their words on to a process, `--help` among them."""
+SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
+    "Scanner": ("state", "move", "jog", "stop", "estop", "reset", "tube", "camera", "clock",
+                "sample", "snap"),
+    "Scans": ("script", "check", "expose", "run", "job", "follow"),
+    "Data": ("calibrate", "align", "compare", "reconstruct", "export", "import", "simulate"),
+    "Analysis": ("phantom", "machine", "study", "batch", "bench"),
+    "Processes": ("up", *ALONE, "demo", "doctor"),
+}  # fmt: skip
+"""The help page's sections; a command that none names stands under Extensions."""
+
+
+class InSections(TyperGroup):
+    """Lists its commands in `SECTIONS`."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the sections of the help page."""
+        found = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
+        named = {name for names in SECTIONS.values() for name in names}
+        others = tuple(name for name in found if name not in named)
+        room = formatter.width - 6 - max(map(len, found))
+        for title, names in {**SECTIONS, "Extensions": others}.items():
+            rows = [(name, command.get_short_help_str(room))
+                    for name in names if (command := found.get(name)) is not None]  # fmt: skip
+            if rows:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
 
 
 def build() -> typer.Typer:
@@ -109,18 +138,26 @@ def build() -> typer.Typer:
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
+        cls=InSections,
+        context_settings={"help_option_names": ["-h", "--help"]},
     )
 
     @app.callback()
     def root(
         version: bool = option(
-            False, "Print the version and leave.", "--version", callback=_version, is_eager=True
+            False, "Print the version and exit.", "--version", callback=_version, is_eager=True
         ),
     ) -> None:
         pass
 
     for name, command in COMMANDS.items():
-        context = {"ignore_unknown_options": name in NUMBERS_WITH_SIGN}
+        passes = name == "up" or name in ALONE
+        context: dict[str, Any] = {
+            "ignore_unknown_options": name in NUMBERS_WITH_SIGN or passes,
+            "allow_extra_args": passes,
+        }
+        if name in ALONE:
+            context["help_option_names"] = []
         app.command(name, context_settings=context)(_complete(command))
     for name, (about, commands) in GROUPS.items():
         group = typer.Typer(help=about, no_args_is_help=True, add_completion=False)
