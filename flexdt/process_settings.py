@@ -1,8 +1,9 @@
 """The options of each server process, declared once.
 
-Each process has a frozen dataclass of settings. The options of `python -m flexdt....main`, those of
-`flexdt twin` and its like, and the words that `flexdt up` starts its processes with are all derived
-from it. Command line and servers both import this module, so it stands above their two packages.
+Each process has a frozen dataclass of settings. The options of `python -m flexdt....main`, the keys
+of its table in the settings file, and the words that `flexdt up` starts its processes with are all
+derived from it. Command line and servers both import this module, so it stands above their two
+packages.
 """
 
 # ruff: noqa: RUF009  (the calls make fields; they are not values shared by all instances)
@@ -102,34 +103,39 @@ def option(default: object, help: str, *flags: str, public: bool = True, **detai
         default: where the option is left out.
         help: one line.
         flags: as typed; they follow from the field's name.
-        public: whether the `flexdt` command offers it too.
+        public: whether `flexdt up` lists it in its help.
         details: of `typer.Option`, such as metavar, min, max and parser.
     """
     return field(default=default, metadata={"public": public, "flags": flags,
                                             "details": {"help": help, **details}})  # fmt: skip
 
 
-def tcp_port(default: int | None, help: str, *flags: str, most: int = LARGEST_PORT) -> Any:
+def tcp_port(
+    default: int | None, help: str, *flags: str, most: int = LARGEST_PORT, public: bool = True
+) -> Any:
     """A field for a TCP port."""
-    return option(default, help, *flags, min=0, max=most)
+    return option(default, help, *flags, public=public, min=0, max=most)
 
 
-def some_file(help: str) -> Any:
+def some_file(help: str, *, public: bool = True) -> Any:
     """A field for a file that may be left out."""
-    return option(None, help, metavar="FILE")
+    return option(None, help, public=public, metavar="FILE")
 
 
 def further_projectors() -> Any:
     """A field for projectors beside the first."""
     return option(
-        None, "Further ones; views are dealt among all.", metavar="HOST:PORT,...", parser=several
+        None,
+        "Deal the views among these projectors, too.",
+        metavar="HOST:PORT,...",
+        parser=several,
     )
 
 
 def where_the_twin_is() -> Any:
     """A field for the twin's address."""
     twin = Address(LOOPBACK, 55000)
-    return option(twin, "Where the twin listens.", metavar="HOST:PORT", parser=address)
+    return option(twin, "Connect to the twin there.", metavar="HOST:PORT", parser=address)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,21 +147,31 @@ class ProcessSettings:
     """
 
     command: ClassVar[str]
-    host: str = option(LOOPBACK, "Address to listen on.")
-    port: int = tcp_port(0, "0 is any free.")
+    host: str = option(LOOPBACK, "Listen on this address.")
+    port: int = tcp_port(0, "Listen on this port; 0 is any free one.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ServerSettings(ProcessSettings):
     """What twin, projector and viewer share."""
 
-    token_file: Path | None = some_file("Clients must show this file's token.")
-    tls_cert: Path | None = some_file("Certificate.")
-    tls_key: Path | None = some_file("Private key.")
-    limit: tuple[str, ...] = option((), "May be given several times.", metavar="NAME=VALUE")
-    http_port: int | None = tcp_port(None, "Serve /healthz and /metrics there.")
-    http_host: str = option(LOOPBACK, "Of these pages; beyond the loopback with a token only.")
-    log_level: LogLevel = option("info", "debug: every request.")
+    token_file: Path | None = some_file("Require the token in this file of every client.")
+    tls_cert: Path | None = some_file("Speak TLS with this certificate.")
+    tls_key: Path | None = some_file("Use the private key of the certificate in this file.")
+    limit: tuple[str, ...] = option(
+        (), "Set a limit of docs/twin-server.md; may be repeated.", public=False,
+        metavar="NAME=VALUE",
+    )  # fmt: skip
+    http_port: int | None = tcp_port(
+        None, "Serve the pages /healthz and /metrics on this port.", public=False
+    )
+    http_host: str = option(
+        LOOPBACK, "Serve these pages on this address; beyond the loopback they need the token.",
+        public=False,
+    )  # fmt: skip
+    log_level: LogLevel = option(
+        "info", "Log from this level on; debug logs every request.", public=False
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,10 +179,15 @@ class ProjectorSettings(ServerSettings):
     """`flexdt projector`."""
 
     command = "projector"
-    port: int = tcp_port(55001, "0 is any free.", "--port", "--projector-port")
-    threads: int | None = option(None, "Of the kernels; all cores if left out.", min=1)
+    port: int = tcp_port(
+        55001, "Listen on this port; 0 is any free one.", "--port", "--projector-port"
+    )
+    threads: int | None = option(None, "Compute with so many threads; default: all cores.", min=1)
     memory_limit: int | None = option(
-        None, "E.g. 4GiB; half of the memory if left out.", metavar="SIZE", parser=memory_size
+        None,
+        "Hold volumes of at most this size, e.g. 4GiB; default: half of the memory.",
+        metavar="SIZE",
+        parser=memory_size,
     )
 
 
@@ -174,19 +195,31 @@ class ProjectorSettings(ServerSettings):
 class ScannerSettings(ServerSettings):
     """What `flexdt twin` and `flexdt up` share; None leaves the choice to the twin."""
 
-    port: int = tcp_port(55000, "Of the twin; 0 is any free.")
-    data: Path | None = option(None, "Data directory: all that is written.", metavar="DIR")
-    machine: str | None = option(None, "Machine description (TOML).", metavar="FILE or NAME")
-    profile: str | None = option(None, "Calibration profile: zero offsets.", metavar="NAME")
-    truth: Path | None = some_file("Hidden misalignment (TOML, parameter = value).")
-    sample: str | None = option(None, "On the stage at start, or 'empty'.", metavar="NAME")
-    speed_up: str = option("1", "Twin seconds per second of yours.", metavar="X or max")
-    physics: Physics = option("ideal", "How images are made, see docs/physics.md.")
+    port: int = tcp_port(55000, "Listen on this port as the twin; 0 is any free one.")
+    data: Path | None = option(
+        None,
+        "Write all to this data directory; default: data, or configured.",
+        metavar="DIR",
+    )
+    machine: str | None = option(
+        None, "Simulate this machine: a shipped name or a TOML file.", metavar="FILE or NAME"
+    )
+    profile: str | None = option(
+        None, "Use the zero offsets of this calibration profile.", metavar="NAME"
+    )
+    truth: Path | None = some_file("Hide this misalignment in the images (TOML).")
+    sample: str | None = option(
+        None, "Put this sample on the stage at the start, or 'empty'.", metavar="NAME"
+    )
+    speed_up: str = option(
+        "1", "Let the twin's time run X times as fast as yours.", metavar="X or max"
+    )
+    physics: Physics = option("ideal", "Make images this way (docs/physics.md).")
     scatter: Scatter = option(
-        "off", "Scattered radiation, for physics mono and poly.", metavar="off or mc",
+        "off", "Simulate scattered radiation, with physics mono and poly.", metavar="off or mc",
         parser=scatter_method,
     )  # fmt: skip
-    fresh: bool = option(False, "Forget where the last twin left off.")
+    fresh: bool = option(False, "Start anew instead of where the last twin left off.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,29 +227,46 @@ class TwinSettings(ScannerSettings):
     """`flexdt twin`."""
 
     command = "twin"
-    data: Path = option(Path("data"), "Data directory: all that is written.", metavar="DIR")
-    machine: str = option("flexray", "Machine description (TOML).", metavar="FILE or NAME")
-    projector: Address = option(
-        Address(LOOPBACK, 55001),
-        "Where the projector listens.",
-        metavar="HOST:PORT",
-        parser=address,
+    data: Path = option(Path("data"), "Write everything to this directory.", metavar="DIR")
+    machine: str = option(
+        "flexray", "Simulate this machine: a shipped name or a TOML file.", metavar="FILE or NAME"
+    )
+    projector: Address | None = option(
+        None, "Connect to the projector that listens there; default: 127.0.0.1:55001.",
+        metavar="HOST:PORT", parser=address,
+    )  # fmt: skip
+    projector_port: int | None = tcp_port(
+        None, "Connect to the projector on this port of 127.0.0.1 instead."
     )
     projectors: str | None = further_projectors()
-    projector_token_file: Path | None = some_file("Shown to the projectors.")
-    projector_tls_ca: Path | None = some_file("Speak TLS with it; trust this.")
-    no_noise: bool = option(False, "Counts are expectations.", public=False)
+    projector_token_file: Path | None = some_file("Show this file's token to the projectors.")
+    projector_tls_ca: Path | None = some_file(
+        "Speak TLS with the projectors and trust this certificate."
+    )
+    no_noise: bool = option(False, "Make images of expected counts, without noise.", public=False)
+
+    @property
+    def places(self) -> tuple[Address, ...]:
+        """Where the projectors listen, each once."""
+        port = None if self.projector_port is None else Address(LOOPBACK, self.projector_port)
+        named = [place for place in (self.projector or port,) if place is not None]
+        found = tuple(dict.fromkeys((*named, *addresses(self.projectors))))
+        return found or (Address(LOOPBACK, 55001),)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TwinClientSettings(ProcessSettings):
     """What viewer and gateway share: where the twin is and what they know of it."""
 
-    data: Path | None = option(None, "The twin's data directory.", metavar="DIR")
-    machine: Path | None = option(None, "The twin's, where it is a file.", metavar="FILE or NAME")
-    profile: Path | None = option(None, "The twin's, where it is a file.", metavar="NAME")
-    token_file: Path | None = some_file("Shown to the twin.")
-    twin_cert: Path | None = some_file("Trust it as the twin's.")
+    data: Path | None = option(None, "Read the twin's data directory here.", metavar="DIR")
+    machine: Path | None = option(
+        None, "Read the twin's machine from this file, where it is one.", metavar="FILE or NAME"
+    )
+    profile: Path | None = option(
+        None, "Read the twin's profile from this file, where it is one.", metavar="NAME"
+    )
+    token_file: Path | None = some_file("Show this file's token to the twin.")
+    twin_cert: Path | None = some_file("Speak TLS with the twin and trust this certificate.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,9 +274,11 @@ class ViewerSettings(TwinClientSettings, ServerSettings):
     """`flexdt viewer`."""
 
     command = "viewer"
-    port: int = tcp_port(8080, "0 is any free.", "--port", "--viewer-port")
+    port: int = tcp_port(8080, "Listen on this port; 0: any free one.", "--port", "--viewer-port")
     twin: Address = where_the_twin_is()
-    token_file: Path | None = some_file("Shown to the twin; browsers must show its token.")
+    token_file: Path | None = some_file(
+        "Show this file's token to the twin; browsers must show it here."
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,12 +287,16 @@ class GatewaySettings(TwinClientSettings):
 
     command = "gateway"
     host: str = option(
-        LOOPBACK, "Loopback only; else use a tunnel.", "--bind", "--host", metavar="HOST"
+        LOOPBACK,
+        "Listen on this address of the loopback; use a tunnel beyond.",
+        "--bind",
+        "--host",
+        metavar="HOST",
     )
-    port: int = tcp_port(50000, "Events go out there; 0 is any free.")
-    inbound_port: int | None = tcp_port(None, "Events come in; default: the next.")
+    port: int = tcp_port(50000, "Publish events on this port; 0 is any free one.")
+    inbound_port: int | None = tcp_port(None, "Take events on this port; default: the next.")
     server: Address = where_the_twin_is()
-    data: Path = option(Path("data"), "Images are saved there.", metavar="DIR")
+    data: Path = option(Path("data"), "Save images in this directory.", metavar="DIR")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,16 +304,21 @@ class UpSettings(ScannerSettings):
     """`flexdt up`: those of the twin, and what the other processes need."""
 
     command = "up"
-    projector_port: int = tcp_port(55001, "0 is any free.")
+    projector_port: int = tcp_port(55001, "Give the projector this port; 0 is any free one.")
     projector_memory: str | None = option(
-        None, "Of the projector's volumes; e.g. 4GiB.", metavar="SIZE"
-    )
+        None, "Let the projector hold volumes of this size, e.g. 4GiB.", public=False,
+        metavar="SIZE",
+    )  # fmt: skip
     projectors: str | None = further_projectors()
-    projector_token_file: Path | None = some_file("Shown to the projectors.")
-    viewer_port: int = tcp_port(8080, "0 is any free.")
-    no_viewer: bool = option(False, "Without the browser.")
+    projector_token_file: Path | None = some_file(
+        "Show this file's token to the projectors.", public=False
+    )
+    viewer_port: int = tcp_port(8080, "Give the viewer this port; 0 is any free one.")
+    no_viewer: bool = option(False, "Start no viewer.")
     gateway_port: int | None = tcp_port(
-        None, "Acquila's interface there and on the next; see gateway.", most=LARGEST_PORT - 1
+        None,
+        "Serve Acquila's interface on this port and the next (see gateway).",
+        most=LARGEST_PORT - 1,
     )
 
 
@@ -286,12 +347,15 @@ def has_parameters(command: Callable[..., Any], shown: Iterable[inspect.Paramete
     command.__annotations__ = {p.name: p.annotation for p in named}
 
 
-def parse(settings: type[S], words: Sequence[str] | None = None) -> S:
-    """The settings that a process was started with; exits with code 2 where they are wrong.
+def read(settings: type[S], words: Sequence[str] | None = None) -> S | None:
+    """The settings that words say; None where they asked for the help, which is shown.
 
     Args:
         settings: class of the process.
         words: of the command line, `sys.argv`'s where left out.
+
+    Raises:
+        Exception: typer's usage errors, of any version; they have a `format_message`.
     """
     found: dict[str, Any] = {}
 
@@ -300,18 +364,23 @@ def parse(settings: type[S], words: Sequence[str] | None = None) -> S:
 
     has_parameters(take, parameters(settings).values())
     app = typer.Typer(add_completion=False, rich_markup_mode=None)
-    app.command()(take)
-    prog = f"flexdt {settings.command}"
+    app.command(context_settings={"help_option_names": ["-h", "--help"]})(take)
+    get_command(app).main(words, f"flexdt {settings.command}", standalone_mode=False)
+    return settings(**found) if found else None
+
+
+def parse(settings: type[S], words: Sequence[str] | None = None) -> S:
+    """As `read`, in a process of its own: exits with code 2 where the words are wrong."""
     try:
-        get_command(app).main(words, prog, standalone_mode=False)
+        found = read(settings, words)
     except Exception as error:
-        if not hasattr(error, "format_message"):  # that of typer's usage errors, any version
+        if not hasattr(error, "format_message"):
             raise
-        print(f"{prog}: {error.format_message()}", file=sys.stderr)
+        print(f"flexdt {settings.command}: {error.format_message()}", file=sys.stderr)
         sys.exit(2)
-    if not found:  # the help was shown
+    if found is None:
         sys.exit(0)
-    return settings(**found)
+    return found
 
 
 def words(given: Mapping[str, object]) -> list[str]:

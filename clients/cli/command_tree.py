@@ -90,17 +90,19 @@ GROUPS: Final[Mapping[str, tuple[str, Mapping[str, Callable[..., object]]]]] = {
     ),
 }
 """Name -> what its commands are about, and the commands."""
+NUMBERS_WITH_SIGN: Final = ("jog", "clock")
+"""Commands whose arguments may begin with a minus."""
+ALONE: Final = ("twin", "projector", "viewer", "gateway")
+"""Commands that pass their words on to a process, `--help` among them."""
 SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "Scanner": ("state", "move", "jog", "stop", "estop", "reset", "tube", "camera", "clock",
                 "sample", "snap"),
     "Scans": ("script", "check", "expose", "run", "job", "follow"),
     "Data": ("calibrate", "align", "compare", "reconstruct", "export", "import", "simulate"),
     "Analysis": ("phantom", "machine", "study", "batch", "bench"),
-    "Processes": ("up", "twin", "projector", "viewer", "gateway", "demo", "doctor"),
+    "Processes": ("up", *ALONE, "demo", "doctor"),
 }  # fmt: skip
-"""Sections of the help page; commands in none of them are those of other distributions."""
-NUMBERS_WITH_SIGN: Final = ("jog", "clock")
-"""Commands whose arguments may begin with a minus."""
+"""Sections of the help page; commands in none of them are listed under Extensions."""
 
 
 class InSections(TyperGroup):
@@ -112,12 +114,9 @@ class InSections(TyperGroup):
         named = {name for names in SECTIONS.values() for name in names}
         others = tuple(name for name in found if name not in named)
         room = formatter.width - 6 - max(map(len, found))
-        for title, names in {**SECTIONS, "Other distributions": others}.items():
-            rows = [
-                (name, command.get_short_help_str(room))
-                for name in names
-                if (command := found.get(name)) is not None
-            ]
+        for title, names in {**SECTIONS, "Extensions": others}.items():
+            rows = [(name, command.get_short_help_str(room))
+                    for name in names if (command := found.get(name)) is not None]  # fmt: skip
             if rows:
                 with formatter.section(title):
                     formatter.write_dl(rows)
@@ -149,7 +148,13 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
         pass
 
     for name, command in COMMANDS.items():
-        context = {"ignore_unknown_options": name in NUMBERS_WITH_SIGN}
+        passes = name == "up" or name in ALONE
+        context: dict[str, Any] = {
+            "ignore_unknown_options": name in NUMBERS_WITH_SIGN or passes,
+            "allow_extra_args": passes,
+        }
+        if name in ALONE:
+            context["help_option_names"] = []
         app.command(name, context_settings=context)(_complete(command))
     groups = {}
     for name, (about, commands) in GROUPS.items():

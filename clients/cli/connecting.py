@@ -8,6 +8,9 @@ variable is not set, or the one that FLEXDT_CONFIG names. Options of commands ov
     token_file = "~/.flexdt-token"    # FLEXDT_TOKEN_FILE; or token = "...", FLEXDT_TOKEN
     tls_ca = "~/scanner-room.pem"     # FLEXDT_TLS_CA
     data = "~/scans"                  # FLEXDT_DATA: of `flexdt up` and `flexdt twin`
+
+    [twin]                            # also [up], [projector], [viewer], [gateway]
+    http_port = 9101                  # any option of `flexdt twin --help`
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ import inspect
 import os
 import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
@@ -25,7 +28,14 @@ import typer
 
 from flexdt.clients.cli import option_values
 from flexdt.clients.failure import CommandError
-from flexdt.process_settings import has_parameters
+from flexdt.process_settings import (
+    GatewaySettings,
+    ProjectorSettings,
+    TwinSettings,
+    UpSettings,
+    ViewerSettings,
+    has_parameters,
+)
 
 if TYPE_CHECKING:
     import ssl
@@ -48,6 +58,7 @@ class Configuration:
         token_file: file whose first line is the token.
         tls_ca: certificates (PEM) to trust; speaks TLS.
         data: directory that a twin started here writes to.
+        processes: options of processes started here, by the names of their settings.
     """
 
     server: str | None = None
@@ -55,9 +66,15 @@ class Configuration:
     token_file: str | None = None
     tls_ca: str | None = None
     data: str | None = None
+    processes: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
 
 
-KEYS: Final = tuple(f.name for f in fields(Configuration))
+TABLES: Final = {
+    kind.command: kind
+    for kind in (UpSettings, TwinSettings, ProjectorSettings, ViewerSettings, GatewaySettings)
+}
+"""Tables of the file, and what their keys are."""
+KEYS: Final = tuple(f.name for f in fields(Configuration) if f.name != "processes")
 
 
 def config_file(environ: Mapping[str, str]) -> Path:
@@ -89,14 +106,15 @@ def configuration(environ: Mapping[str, str] | None = None) -> Configuration:
     if "token" in found and "token_file" in found:
         where = "FLEXDT_TOKEN and FLEXDT_TOKEN_FILE" if own else f"{path}: token and token_file"
         raise CommandError(f"{where} are both set; allowed: one of them")
+    processes = {name: found.pop(name) for name in TABLES if name in found}
     given = {key: value for key, value in found.items() if value}
     for key in PATHS:
         if key in given:
             given[key] = str(Path(given[key]).expanduser())
-    return Configuration(**given)
+    return Configuration(**given, processes=processes)
 
 
-def _of_file(path: Path, *, required: bool) -> dict[str, str]:
+def _of_file(path: Path, *, required: bool) -> dict[str, Any]:
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -109,8 +127,16 @@ def _of_file(path: Path, *, required: bool) -> dict[str, str]:
     except tomllib.TOMLDecodeError as error:
         raise CommandError(f"{path}: not valid TOML: {error}") from None
     for key, value in document.items():
+        if key in TABLES and isinstance(value, dict):
+            allowed = [f.name for f in fields(TABLES[key])]
+            for name in value:
+                if name not in allowed:
+                    what = f"{path}: [{key}] unknown key {name!r}; allowed"
+                    raise CommandError(f"{what}: {', '.join(allowed)}")
+            continue
         if key not in KEYS:
-            raise CommandError(f"{path}: unknown key {key!r}; allowed: {', '.join(KEYS)}")
+            allowed = [*KEYS, *(f"[{name}]" for name in TABLES)]
+            raise CommandError(f"{path}: unknown key {key!r}; allowed: {', '.join(allowed)}")
         if not isinstance(value, str) or not value:
             raise CommandError(f"{path}: {key} is {value!r}; allowed: a text that is not empty")
     return dict(document)
@@ -122,18 +148,15 @@ Server = Annotated[
     str | None,
     typer.Option(
         metavar="HOST:PORT",
-        help=f"Where the twin listens; default: {option_values.DEFAULT_SERVER}, or configured.",
+        help=f"Talk to the twin there; default: {option_values.DEFAULT_SERVER}, or configured.",
     ),
 ]
 TokenFile = Annotated[
-    str | None, typer.Option(metavar="FILE", help="File with the session's token.")
-]
-TlsCa = Annotated[
-    str | None, typer.Option(metavar="FILE", help="Speak TLS; trust this certificate.")
+    str | None, typer.Option(metavar="FILE", help="Show the twin the token in this file.")
 ]
 CONNECTION: Final = tuple(
     inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kind)
-    for name, kind in (("server", Server), ("token_file", TokenFile), ("tls_ca", TlsCa))
+    for name, kind in (("server", Server), ("token_file", TokenFile))
 )
 """Arguments of `connect` as options."""
 
@@ -155,9 +178,7 @@ def on_twin(command: Callable[..., _R]) -> Callable[..., _R]:
     return with_connection
 
 
-def connect(
-    server: str | None = None, token_file: str | None = None, tls_ca: str | None = None
-) -> TwinClient:
+def connect(server: str | None = None, token_file: str | None = None) -> TwinClient:
     """A client for a twin, to be used as a context manager.
 
     What is None is taken from the user's configuration, see `configuration`.
@@ -165,7 +186,6 @@ def connect(
     Args:
         server: HOST:PORT, see `option_values.server`; 127.0.0.1:55000 if nothing says otherwise.
         token_file: file whose first line is the session's token; shows none by default.
-        tls_ca: file of the certificates (PEM) to trust; speaks without TLS by default.
 
     Raises:
         typer.BadParameter: the address has another form.
@@ -176,8 +196,7 @@ def connect(
     host, port = option_values.server(server or own.server or option_values.DEFAULT_SERVER)
     shown = token_file or own.token_file
     token = own.token if shown is None else _first_line(Path(shown))
-    trusted = tls_ca or own.tls_ca
-    context = None if trusted is None else _trusting(Path(trusted))
+    context = None if own.tls_ca is None else _trusting(Path(own.tls_ca))
 
     from flexdt.clients.client.client import TwinClient
 

@@ -36,9 +36,7 @@ def argument(default: object, metavar: str, help: str = "") -> Any:
     return typer.Argument(default, metavar=metavar, help=help or None)
 
 
-Json = Annotated[
-    bool, typer.Option("--json", help="One JSON document on standard output, nothing else.")
-]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
 
 
 def answering(command: Callable[..., Answer]) -> Callable[..., None]:
@@ -61,31 +59,43 @@ def answering(command: Callable[..., Answer]) -> Callable[..., None]:
 
 MachineName = Annotated[
     str | None,
-    typer.Option("--machine", metavar="FILE or NAME", help="Machine description (TOML)."),
+    typer.Option(
+        "--machine", metavar="FILE or NAME", help="Use this machine: a shipped name or a TOML file."
+    ),
 ]
 ProfileName = Annotated[
     str | None,
-    typer.Option("--profile", metavar="NAME", help="Calibration profile: zero offsets."),
+    typer.Option(
+        "--profile", metavar="NAME", help="Use the zero offsets of this calibration profile."
+    ),
 ]
 Free = Annotated[
     str | None,
-    typer.Option("--free", metavar="P,P,...", help="Parameters to estimate; default: six."),
+    typer.Option("--free", metavar="P,P,...", help="Estimate these parameters; default: six."),
 ]
 Roi = Annotated[
     tuple[int, int, int, int] | None,
-    typer.Option("--roi", metavar="L T R B", help="Unbinned pixels, inclusive."),
+    typer.Option("--roi", metavar="L T R B", help="Read these unbinned pixels, bounds included."),
 ]
 Geometry = Annotated[
     Path | None,
     typer.Option(
-        "--geometry", metavar="FILE", help="Instead of the data set's: see flexdt import."
+        "--geometry",
+        metavar="FILE",
+        help="Use this geometry (flexdt import) instead of the data set's.",
     ),
 ]
-Jobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Processes; one for each core.")]
+Jobs = Annotated[
+    int | None,
+    typer.Option("--jobs", min=1, help="Use so many processes; default: one for each core."),
+]
 Scheduler = Annotated[
-    str | None, typer.Option("--scheduler", metavar="ADDRESS", help="A dask scheduler.")
+    str | None,
+    typer.Option(
+        "--scheduler", metavar="ADDRESS", help="Let the workers of this Dask scheduler do the work."
+    ),
 ]
 Texts = Annotated[
-    bool, typer.Option("--texts", help="Geometry from the scanner's two texts alone.")
+    bool, typer.Option("--texts", help="Take the geometry from the scanner's two texts alone.")
 ]
 Push = Annotated[bool, typer.Option("--push", help="Put the correction in force on the twin.")]

@@ -52,7 +52,7 @@ def services(options: UpSettings) -> tuple[Service, ...]:
 
     def twin(known: Addresses) -> Sequence[str]:
         own = {"port": port_of("twin", options.port, known), "projector": known["projector"],
-               "limit": for_twin}  # fmt: skip
+               "projector_port": None, "limit": for_twin}  # fmt: skip
         # Started again it goes on from where it was, whatever the first one was told.
         again = {"fresh": False} if "twin" in known else {}
         return ("flexdt.server.twin.main", *words(shared(options, TwinSettings) | own | again))

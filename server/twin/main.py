@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 
 from flexdt import machines
-from flexdt.process_settings import TwinSettings, addresses, parse
+from flexdt.process_settings import TwinSettings, parse
 from flexdt.server.runtime.access import (
     ConnectionLimits,
     TwinLimits,
@@ -72,7 +72,7 @@ async def run(options: TwinSettings) -> int:
     truth = None if options.truth is None else load_truth(options.truth, root)
     token = read_token(options.projector_token_file)
     secure = client_tls(options.projector_tls_ca)
-    places = tuple(dict.fromkeys((options.projector, *addresses(options.projectors))))
+    places = options.places
     clients = [
         ProjectorClient(
             place.host, place.port, token=token, ssl=secure,

@@ -36,26 +36,28 @@ def state(server: str, *words: str) -> int:
 
 
 def test_with_token_and_certificate(
-    locked: tuple[str, Path], capsys: pytest.CaptureFixture[str]
+    locked: tuple[str, Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server, token = locked
-    certificate = str(CERTIFICATE)
-    assert state(server, "--token-file", str(token), "--tls-ca", certificate) == 0
+    monkeypatch.setenv("FLEXDT_TLS_CA", str(CERTIFICATE))
+    assert state(server, "--token-file", str(token)) == 0
     assert "rot_obj" in capsys.readouterr().out
 
 
 def test_without_either_it_is_refused(
-    locked: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    locked: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
     server, token = locked
-    certificate = str(CERTIFICATE)
     wrong = tmp_path / "wrong"
     wrong.write_text("another token of many letters")
-    assert state(server, "--tls-ca", certificate) == 4
-    assert state(server, "--tls-ca", certificate, "--token-file", str(wrong)) == 4
     assert state(server, "--token-file", str(token)) == 4
     assert state(server, "--token-file", "missing") == 1
-    assert state(server, "--tls-ca", str(token)) == 1
+    monkeypatch.setenv("FLEXDT_TLS_CA", str(CERTIFICATE))
+    assert state(server) == 4
+    assert state(server, "--token-file", str(wrong)) == 4
+    monkeypatch.setenv("FLEXDT_TLS_CA", str(token))
+    assert state(server) == 1
     captured = capsys.readouterr()
     assert captured.out == ""
     assert TOKEN not in captured.err

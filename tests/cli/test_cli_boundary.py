@@ -180,8 +180,8 @@ def test_what_the_terminal_cannot_write_is_escaped(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("argv", "word"),
     [
-        (["twin", "--projector-port", "4321"], "--projector 127.0.0.1:4321"),
-        (["twin"], "--projector 127.0.0.1:55001"),
+        (["twin", "--projector-port", "4321"], "--projector-port 4321"),
+        (["up", "--only", "projector", "--port", "4321"], "--port 4321"),
         (["projector", "--projector-port", "4321"], "--port 4321"),
         (["viewer", "--viewer-port", "4321"], "--port 4321"),
         (["viewer", "--limit", "max_pages=3", "--http-port", "0"], "--limit max_pages=3"),

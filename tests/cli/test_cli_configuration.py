@@ -93,7 +93,34 @@ def test_the_file_the_environment_and_the_option_in_this_order(
     (tmp_path / "other.toml").write_text("")
     assert run(["up"]) == 0
     home = str(Path("~/scans").expanduser())
-    assert [given["data"] for _, given in begun] == [home, home, "here", "data"]
+    assert [str(given["data"]) for _, given in begun] == [home, home, "here", "data"]
+
+
+def test_a_table_of_the_file_holds_the_options_of_a_process(
+    no_configuration: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begun: list[tuple[str, dict[str, object]]] = []
+    monkeypatch.setattr(process_commands, "become", lambda *given: begun.append(given))
+    no_configuration.write_text(
+        '[twin]\nhttp_port = 9101\nlimit = ["max_views=3"]\nphysics = "mono"\n[up]\nhttp_port = 7\n'
+    )
+    for words in (
+        ["twin"],
+        ["up", "--only", "twin", "--http-port", "9102"],
+        ["up"],
+        ["up", "--http-port", "8"],
+        ["projector"],
+    ):
+        assert run(words) == 0
+    asked = [(module.split(".")[-2], given["http_port"]) for module, given in begun]
+    assert asked == [
+        ("twin", 9101), ("twin", 9102), ("launch", 7), ("launch", 8), ("projector", None)
+    ]  # fmt: skip
+    assert begun[0][1]["limit"] == ("max_views=3",)
+    assert begun[0][1]["physics"] == "mono"
+    no_configuration.write_text("[twin]\nhttp_prot = 9101\n")
+    assert run(["twin"]) == 1
+    assert "[twin] unknown key 'http_prot'; allowed: host, port" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

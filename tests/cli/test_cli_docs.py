@@ -1,15 +1,22 @@
-"""docs/command-line.md names every command there is, and none that is not."""
+"""docs/command-line.md names every command there is; options have help, and are not too many."""
 
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from typer.main import get_command
 
-from flexdt.clients.cli.command_tree import build
+from flexdt.clients.cli.command_tree import SECTIONS, build
+from flexdt.clients.cli.connecting import TABLES
 
+MOST_OPTIONS = 311
+THEIRS = ("flexdt study", "flexdt batch", "flexdt bench", "flexdt phantom design")
 PAGE = Path(__file__).parents[2] / "docs" / "command-line.md"
 
 
@@ -47,3 +54,53 @@ def test_every_command_says_what_it_does() -> None:
                 walk(command)
 
     walk(get_command(build()))
+
+
+def parts() -> Iterator[tuple[str, Any]]:
+    """Every command and group with its path."""
+
+    def walk(command: Any, path: str) -> Iterator[tuple[str, Any]]:
+        yield path, command
+        for name, inner in getattr(command, "commands", {}).items():
+            yield from walk(inner, f"{path} {name}")
+
+    return walk(get_command(build()), "flexdt")
+
+
+def options(command: Any) -> list[Any]:
+    return [p for p in command.params if p.param_type_name == "option"]
+
+
+def test_there_are_no_more_options_than_a_person_can_read() -> None:
+    """The ceiling may only fall; what nobody sets belongs into the settings file."""
+    assert sum(len(options(command)) for _, command in parts()) <= MOST_OPTIONS
+
+
+def test_h_is_help_and_every_section_names_commands() -> None:
+    for words in (["-h"], ["move", "-h"], ["job", "-h"], ["job", "list", "-h"], ["twin", "-h"]):
+        done = subprocess.run(
+            [sys.executable, "-m", "flexdt.clients.cli", *words],
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        assert done.stdout.startswith("Usage: flexdt"), words
+        assert "-h, --help" in done.stdout
+    there = set(get_command(build()).commands)
+    named = [name for names in SECTIONS.values() for name in names]
+    assert len(set(named)) == len(named)
+    assert there <= set(named)
+
+
+def test_every_option_has_a_sentence_of_help() -> None:
+    """A capital, at least three words and a full stop; the extensions' commands are theirs."""
+    wrong = [
+        (path, option.opts[0], option.help)
+        for path, command in parts()
+        if path not in THEIRS
+        for option in [*options(command)]
+        if option.name not in ("install_completion", "show_completion")
+        if not re.fullmatch(r"[A-Z]\S*( \S+){2,}\.", option.help or "")
+    ]
+    assert not wrong
+    for kind in TABLES.values():
+        for field in fields(kind):
+            assert re.fullmatch(r"[A-Z]\S*( \S+){2,}\.", field.metadata["details"]["help"]), field

@@ -85,6 +85,16 @@ def test_a_removed_method_of_scatter_names_its_successor(
     assert "'first' has been removed, use 'mc'" in capsys.readouterr().err
 
 
+def test_a_twin_has_one_projector_at_least_and_each_once() -> None:
+    def places(*words: str) -> list[str]:
+        return [str(place) for place in parse(TwinSettings, words).places]
+
+    assert places() == ["127.0.0.1:55001"]
+    assert places("--projector-port", "7") == ["127.0.0.1:7"]
+    assert places("--projectors", "a:1,b:2,a:1") == ["a:1", "b:2"]
+    assert places("--projector", "b:2", "--projectors", "a:1,b:2") == ["b:2", "a:1"]
+
+
 def test_up_leaves_the_data_directory_of_the_viewer_open() -> None:
     """Without --data the twin has its default, and the viewer has none to calibrate from."""
     assert shared(UpSettings(), TwinSettings)["data"] is None

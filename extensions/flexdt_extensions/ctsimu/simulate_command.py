@@ -12,9 +12,11 @@ from flexdt.extending import Answer, argument, option, warn
 
 def simulate(
     scenario: Path = argument(..., "SCENARIO.json"),
-    out: Path | None = option(None, "A new folder; default: the scenario's name.", metavar="DIR"),
-    seed: int = option(0, "Of the noise.", min=0),
-    rays: int = option(3, "Along each side of a pixel.", min=1, max=16),
+    out: Path | None = option(
+        None, "Write to this new folder; default: the scenario's name.", metavar="DIR"
+    ),
+    seed: int = option(0, "Draw the noise from this seed.", min=0),
+    rays: int = option(3, "Trace so many rays along each side of a pixel.", min=1, max=16),
 ) -> Answer:
     """Simulate a CTSimU scenario: projections, dark and flat images as TIFF, and metadata.
 

@@ -37,37 +37,53 @@ def calibrate(
     twin: Twin,
     datasets: list[Path] | None = argument(None, "[DATASET...]"),
     phantom: str | None = option(
-        None, "unknown: markers anywhere.", metavar="NAME, FILE or unknown"
+        None,
+        "Use this phantom's beads; unknown: markers anywhere.",
+        metavar="NAME, FILE or unknown",
     ),
     free: options.Free = None,
-    per_scan: str = option("", "Those with a value of their own in each scan.", metavar="P,P,..."),
-    per_frame: str = option("", "Those that may move during the scan.", metavar="P,P,..."),
-    reading: ReadingName = option("axis", "Of eq. 5.4: the axis at O + tau, or R (b - tau) + O."),
+    per_scan: str = option("", "Give these parameters a value in each scan.", metavar="P,P,..."),
+    per_frame: str = option("", "Let these parameters move during the scan.", metavar="P,P,..."),
+    reading: ReadingName = option(
+        "axis", "Read eq. 5.4 as the axis at O + tau, or as R (b - tau) + O."
+    ),
     report: Path | None = option(
-        None, "Write the report to this file.", metavar="FILE.{html,json}"
+        None, "Write the report to FILE (HTML or JSON).", metavar="FILE.{html,json}"
     ),
-    tracks: Path | None = option(None, "Beads of every frame, before, after.", metavar="FILE.json"),
+    tracks: Path | None = option(
+        None, "Write the beads of every frame, seen, before and after.", metavar="FILE.json"
+    ),
     geometry: list[Path] | None = option(
-        None, "Nominal geometry; once a data set, in order.", metavar="FILE"
+        None, "Start from this geometry; once for each data set, in order.", metavar="FILE"
     ),
-    bead_tolerance: float | None = option(None, "Estimate the beads' places, too.", metavar="MM"),
+    bead_tolerance: float | None = option(
+        None, "Estimate the beads' places, too, known to this tolerance.", metavar="MM"
+    ),
     prior: list[str] | None = option(
         None,
-        "How well offsets are known, in place of the machine's; none: all exactly.",
+        "Know offsets so well, not as the machine says; none: all exactly.",
         metavar="P=SIGMA,...",
     ),
-    bound: float | None = option(None, "Largest sigma (mm, deg); default 5.", metavar="MM"),
-    frames: Path | None = option(None, "Anybody's TIFFs, with --geometry.", metavar="DIR"),
+    bound: float | None = option(
+        None, "Refuse a sigma above this (mm, deg); default: 5.", metavar="MM"
+    ),
+    frames: Path | None = option(
+        None, "Read any scanner's TIFFs here, with --geometry.", metavar="DIR"
+    ),
     shape: str | None = option(
-        None, "Of their detector, if FILE does not say.", metavar="ROWS,COLS"
+        None, "Take this detector shape where FILE does not say it.", metavar="ROWS,COLS"
     ),
-    pixel: str | None = option(None, "Their pitch, the same (RTK).", metavar="MM or U,V"),
+    pixel: str | None = option(
+        None, "Take this pixel pitch where FILE does not say it (RTK).", metavar="MM or U,V"
+    ),
     markers: Path | None = option(
-        None, "Where markers were seen: CSV or npy, in pixels.", metavar="FILE"
+        None, "Read where markers were seen, in pixels (CSV or npy).", metavar="FILE"
     ),
-    scale: str | None = option(None, "Distance of two unknown markers.", metavar="A-B=MM"),
-    radius: float | None = option(None, "Of the beads' spots.", metavar="PX"),
-    start: list[str] | None = option(None, "Offsets to begin with (mm, deg).", metavar="P=V,..."),
+    scale: str | None = option(None, "Set the distance of two unknown markers.", metavar="A-B=MM"),
+    radius: float | None = option(None, "Look for bead spots of this radius.", metavar="PX"),
+    start: list[str] | None = option(
+        None, "Begin with these offsets (mm, deg).", metavar="P=V,..."
+    ),
     push: options.Push = False,
 ) -> Answer:
     """Calibrate the geometry from scans of a bead phantom or of unknown markers.
@@ -200,7 +216,9 @@ def _opened(folders: list[Path], geometries: list[Path] | None) -> list[DataSet]
 def align(
     twin: Twin,
     dataset: Path = argument(..., "DATASET"),
-    out: Path | None = option(None, "For flexdt reconstruct --correction.", metavar="FILE.json"),
+    out: Path | None = option(
+        None, "Write the report, for flexdt reconstruct --correction.", metavar="FILE.json"
+    ),
     per_frame: bool = option(False, "Find shifts of single frames (jitter) too."),
     push: options.Push = False,
     geometry: options.Geometry = None,
@@ -242,9 +260,15 @@ def align(
 
 def compare(
     dataset: Path = argument(..., "DATASET"),
-    phantom: str | None = option(None, "What was scanned.", metavar="NAME or FILE"),
-    tolerance: float = option(0.5, "Largest rms of the beads.", metavar="PX", min=0.0),
-    out: Path | None = option(None, "Report and difference images.", metavar="DIR"),
+    phantom: str | None = option(
+        None, "Compare with this phantom, the one that was scanned.", metavar="NAME or FILE"
+    ),
+    tolerance: float = option(
+        0.5, "Exit with 1 where the beads' rms is above this.", metavar="PX", min=0.0
+    ),
+    out: Path | None = option(
+        None, "Write a report and difference images to this folder.", metavar="DIR"
+    ),
 ) -> Answer:
     """Lay virtual projections beside a data set's radiographs.
 

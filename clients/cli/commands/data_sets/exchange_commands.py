@@ -24,21 +24,23 @@ Rows = Literal["down", "up"]
 
 def export(
     dataset: Path = argument(..., "DATASET"),
-    format: Exported = option(..., "Whose format."),
-    out: Path = option(..., metavar="FILE"),
+    format: Exported = option(..., "Write this program's format."),
+    out: Path = option(..., "Write the geometry to this file.", metavar="FILE"),
     corrected: bool = option(
-        True, "With the correction in force, or without.", "--corrected/--nominal"
+        True, "Apply the correction in force, or leave it out.", "--corrected/--nominal"
     ),
-    correction: Path | None = option(None, "Instead: a calibration's report.", metavar="FILE"),
+    correction: Path | None = option(
+        None, "Apply the correction of this calibration report instead.", metavar="FILE"
+    ),
     unknown: Path | None = option(
         None,
-        "CTSimU: what is so and reconstruction does not know (TOML, parameter = value).",
+        "State, for CTSimU, what reconstruction does not know (TOML).",
         metavar="FILE",
     ),
-    rows: Rows = option("down", "up: for images turned upside down, v upwards."),
+    rows: Rows = option("down", "Count rows down or up; up: for images turned upside down."),
     tolerance: float = option(
         1e-9,
-        "flexDATA: how far a view may lie beside what the format can state.",
+        "Let a view lie so far from what flexDATA can state.",
         metavar="MM",
         min=0.0,
     ),
@@ -80,15 +82,21 @@ def export(
 
 def import_(
     file: Path = argument(..., "FILE"),
-    format: Format = option(..., "Whose format."),
-    out: Path = option(..., "The geometry file.", metavar="FILE.{json,npy}"),
-    like: Path | None = option(None, "Takes from it what FILE does not say.", metavar="DATASET"),
-    shape: str | None = option(None, "Of the detector.", metavar="ROWS,COLS"),
-    pixel: str | None = option(None, "Pixel pitch (RTK).", metavar="MM or U,V"),
-    views: int | None = option(None, "Number of projections (flexDATA).", min=1),
-    rows: Rows = option("down", "up: the file counts rows upwards; v is negated."),
+    format: Format = option(..., "Read this program's format."),
+    out: Path = option(..., "Write the geometry to this file.", metavar="FILE.{json,npy}"),
+    like: Path | None = option(
+        None, "Take what FILE does not say from this data set.", metavar="DATASET"
+    ),
+    shape: str | None = option(
+        None, "Set the detector's shape where FILE does not say it.", metavar="ROWS,COLS"
+    ),
+    pixel: str | None = option(
+        None, "Set the pixel pitch where FILE does not say it (RTK).", metavar="MM or U,V"
+    ),
+    views: int | None = option(None, "Set the number of projections (flexDATA).", min=1),
+    rows: Rows = option("down", "Count rows down or up; up: v is negated."),
     real: bool = option(
-        False, "CTSimU: what is so, or what reconstruction knows.", "--real/--known"
+        False, "Take, of a CTSimU file, what is so, or what reconstruction knows.", "--real/--known"
     ),
 ) -> Answer:
     """Read a geometry in another program's format and write it as a geometry file.

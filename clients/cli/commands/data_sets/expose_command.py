@@ -20,19 +20,21 @@ BEST = 5
 
 def expose(
     dataset: Path | None = argument(None, "[DATASET]", "Measure a scan's radiographs instead."),
-    sample: str = option("lego", "What is to be scanned.", metavar="NAME or FILE"),
-    material: str | None = option(None, "Of a mesh file.", metavar="M"),
+    sample: str = option("lego", "Predict the scan of this sample.", metavar="NAME or FILE"),
+    material: str | None = option(None, "Fill a mesh file with this material.", metavar="M"),
     kV: list[float] | None = option(
-        None, "Again for more; the best is chosen among them.", "--kV", "--kv"
+        None, "Try this voltage; repeat it for more, and the best is chosen.", "--kV", "--kv"
     ),
-    power: float | None = option(None, metavar="W"),
-    filter: str = option("", "Beside the machine's own.", metavar="MATERIAL:MM"),
-    exposure: float | None = option(None, metavar="MS"),
-    averages: int = option(1),
-    frames: int = option(361, "Images of the scan."),
-    sod: float = option(600.0, metavar="MM"),
-    sdd: float = option(1059.0, metavar="MM"),
-    detail: str = option("void:0.5", "What is to be seen; void:MM.", metavar="MATERIAL:MM"),
+    power: float | None = option(None, "Set the tube's power.", metavar="W"),
+    filter: str = option("", "Put this filter beside the machine's own.", metavar="MATERIAL:MM"),
+    exposure: float | None = option(None, "Expose each image so long.", metavar="MS"),
+    averages: int = option(1, "Average so many read-outs in an image."),
+    frames: int = option(361, "Take so many images of the scan."),
+    sod: float = option(600.0, "Set the distance from source to axis.", metavar="MM"),
+    sdd: float = option(1059.0, "Set the distance from source to panel.", metavar="MM"),
+    detail: str = option(
+        "void:0.5", "See this detail; void:MM for less of the sample.", metavar="MATERIAL:MM"
+    ),
     machine: options.MachineName = None,
 ) -> Answer:
     """Predict transmission, contrast to noise, dose and the best voltage and filter."""

@@ -30,39 +30,51 @@ Algorithm = Literal["fdk", "sirt", "sart", "cgls", "em", "tv"]
 def reconstruct(
     twin: Twin,
     dataset: Path = argument(..., "DATASET"),
-    out: Path = option(..., ".tif .nrrd .mha .nii.gz .h5 .zarr", metavar="FILE"),
-    algorithm: Algorithm | None = option(None, "Default: fdk."),
-    voxel: float | None = option(None, "Default: a pixel at the axis.", metavar="MM"),
-    shape: str | None = option(None, "Default: the field of view.", metavar="Z,Y,X"),
-    binning: int | None = option(None, "Pixels a side first.", min=1),
+    out: Path = option(
+        ..., "Write the volume: .tif, .nrrd, .mha, .nii.gz, .h5 or .zarr.", metavar="FILE"
+    ),
+    algorithm: Algorithm | None = option(None, "Use this algorithm; default: fdk."),
+    voxel: float | None = option(
+        None, "Set the voxels' edge; default: a pixel's size at the axis.", metavar="MM"
+    ),
+    shape: str | None = option(
+        None, "Set the number of voxels; default: the field of view.", metavar="Z,Y,X"
+    ),
+    binning: int | None = option(None, "Average so many pixels a side first.", min=1),
     every: int | None = option(None, "Use every n-th frame.", min=1),
-    iterations: int | None = option(None, min=1),
-    weight: float | None = option(None, "Of tv's total variation.", min=0.0),
-    window: str | None = option(None, "FDK's filter: ram-lak, shepp-logan, cosine, hann ..."),
+    iterations: int | None = option(None, "Iterate so often; default: the algorithm's.", min=1),
+    weight: float | None = option(None, "Weigh the total variation of tv by this.", min=0.0),
+    window: str | None = option(
+        None, "Filter FDK with ram-lak, shepp-logan, cosine, hamming or hann."
+    ),
     correction: str | None = option(
         None,
-        "A calibration's report, or the one in force on the twin; default: the scan's.",
+        "Apply a report's correction, or the twin's; default: the scan's.",
         metavar="FILE, twin or none",
     ),
-    center: str | None = option(None, "Of the volume [mm].", metavar="X,Y,Z"),
+    center: str | None = option(None, "Put the volume's centre there [mm].", metavar="X,Y,Z"),
     texts: options.Texts = False,
-    rings: bool = option(False, "Correct for rings.", "--rings"),
-    material: str | None = option(None, "The object is this alone: correct beam hardening."),
+    rings: bool = option(False, "Correct the images for rings.", "--rings"),
+    material: str | None = option(
+        None, "Correct beam hardening of an object of this material alone."
+    ),
     scatter_correction: str | None = option(
         None,
-        "The object is of these, e.g. pmma,aluminium: subtract their scatter.",
+        "Subtract the scatter of an object of these, e.g. pmma,aluminium.",
         metavar="MATERIALS",
     ),
-    kv: float | None = option(None, "Of the tube; default: what the data set says."),
-    png: bool = option(False, "Three slices beside it.", "--png"),
+    kv: float | None = option(None, "Take this tube voltage; default: the data set's."),
+    png: bool = option(False, "Write three slices beside the volume.", "--png"),
     preview: bool = option(
         False,
-        "Quick and coarse, by FDK, with slices as PNG; chooses voxels and frames itself.",
+        "Make a quick, coarse volume by FDK, and slices as PNG.",
         "--preview",
     ),
     geometry: options.Geometry = None,
     scheduler: options.Scheduler = None,
-    slurm: Path | None = option(None, "Submit workers to SLURM: a TOML file.", metavar="FILE"),
+    slurm: Path | None = option(
+        None, "Submit workers to SLURM as this TOML file says.", metavar="FILE"
+    ),
 ) -> Answer:
     """Reconstruct a volume from a data set.
 

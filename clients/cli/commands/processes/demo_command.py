@@ -11,9 +11,11 @@ from flexdt.clients.cli.options import option
 
 
 def demo(
-    out: Path = option(Path("flexdt-demo"), "Where everything is written.", metavar="DIR"),
-    no_viewer: bool = option(False, "Leave when the work is done.", "--no-viewer"),
-    truth: Path | None = option(None, "Hidden misalignment; random if left out.", metavar="FILE"),
+    out: Path = option(Path("flexdt-demo"), "Write everything to this folder.", metavar="DIR"),
+    no_viewer: bool = option(False, "Exit when the work is done, without a viewer.", "--no-viewer"),
+    truth: Path | None = option(
+        None, "Hide this misalignment; default: a random one.", metavar="FILE"
+    ),
     json: options.Json = False,
 ) -> None:
     """Do the main job: script, scan, data set, calibration.

@@ -12,10 +12,10 @@ MARKS = {"ok": "ok     ", "warning": "warning", "error": "ERROR  "}
 
 
 def doctor(
-    data: Path = option(Path("data"), "Where data sets are to go.", metavar="DIR"),
-    port: int = option(55000, "The twin's."),
-    projector_port: int = option(55001),
-    viewer_port: int = option(8080),
+    data: Path = option(Path("data"), "Check the directory of data sets.", metavar="DIR"),
+    port: int = option(55000, "Check the twin's port."),
+    projector_port: int = option(55001, "Check the projector's port."),
+    viewer_port: int = option(8080, "Check the viewer's port."),
 ) -> Answer:
     """Check this installation: Python, packages, compiled kernels, threads, GPU, ports, disk.
 

@@ -28,19 +28,27 @@ def follow(
     address: str = argument(..., "ADDRESS", "tcp://HOST[:PORT] of its outgoing events."),
     machine: options.MachineName = None,
     profile: options.ProfileName = None,
-    script: Path | None = option(None, "The script that it will run.", metavar="FILE"),
-    sample: str | None = option(None, "Phantom on the stage.", metavar="NAME or FILE"),
-    record: Path | None = option(None, "Executed script, for flexdt machine fit.", metavar="FILE"),
-    frames: Path | None = option(None, "Where its images appear; needs --sample.", metavar="DIR"),
-    out: Path = option(Path(), "For beside.png and beside.json of --frames.", metavar="DIR"),
+    script: Path | None = option(
+        None, "Predict this script, which the scanner will run.", metavar="FILE"
+    ),
+    sample: str | None = option(None, "Put this phantom on the stage.", metavar="NAME or FILE"),
+    record: Path | None = option(
+        None, "Record the executed script, for flexdt machine fit.", metavar="FILE"
+    ),
+    frames: Path | None = option(
+        None, "Compare the images that appear here; needs --sample.", metavar="DIR"
+    ),
+    out: Path = option(Path(), "Write beside.png and beside.json of --frames here.", metavar="DIR"),
     port: int | None = option(
         None,
-        "Show the machine to clients and viewer as a twin that cannot be commanded.",
+        "Show the machine to clients on this port, as a twin without control.",
         metavar="PORT",
         min=0,
         max=65535,
     ),
-    seconds: float | None = option(None, "End after S seconds.", "--for", metavar="S", min=0.0),
+    seconds: float | None = option(
+        None, "End after so many seconds.", "--for", metavar="S", min=0.0
+    ),
     json: options.Json = False,
 ) -> None:
     """Follow a real scanner: hear its messages, compare, and say what leaves the prediction.

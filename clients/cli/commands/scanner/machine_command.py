@@ -61,18 +61,26 @@ def check(name: NameOrFile) -> None:
 
 def new(
     name: str = argument(..., "NAME", "One word."),
-    out: Path = option(..., "The file to write.", metavar="FILE"),
-    base: str | None = option(None, "What it is most like.", metavar="NAME"),
-    scanner: str | None = option(None, "Its name in data sets.", metavar="TEXT"),
-    detector: str | None = option(None, "Unbinned.", metavar="COLUMNSxROWS"),
-    pitch: str | None = option(None, "Column to column, row to row.", metavar="MM[xMM]"),
-    bits: int | None = option(None, "Of a pixel."),
-    sod: str | None = option(None, "One, or least:greatest.", metavar="MM or MM:MM"),
-    sdd: str | None = option(None, "One, or least:greatest.", metavar="MM or MM:MM"),
-    kv: str | None = option(None, "At most, or least:most.", metavar="KV or KV:KV"),
-    power: float | None = option(None, "At most.", metavar="W"),
-    limit: list[str] | None = option(None, "Travel.", metavar="AXIS=LOWER:UPPER"),
-    without: list[str] | None = option(None, "There is none.", metavar="AXIS"),
+    out: Path = option(..., "Write the machine to this file.", metavar="FILE"),
+    base: str | None = option(
+        None, "Begin with this machine, the one it is most like.", metavar="NAME"
+    ),
+    scanner: str | None = option(None, "Name it so in data sets.", metavar="TEXT"),
+    detector: str | None = option(
+        None, "Set the detector's unbinned columns and rows.", metavar="COLUMNSxROWS"
+    ),
+    pitch: str | None = option(None, "Set the pitch of columns, and of rows.", metavar="MM[xMM]"),
+    bits: int | None = option(None, "Set the bits of a pixel."),
+    sod: str | None = option(None, "Set source to axis, or least:greatest.", metavar="MM or MM:MM"),
+    sdd: str | None = option(
+        None, "Set source to panel, or least:greatest.", metavar="MM or MM:MM"
+    ),
+    kv: str | None = option(None, "Set the largest voltage, or least:most.", metavar="KV or KV:KV"),
+    power: float | None = option(None, "Set the largest power.", metavar="W"),
+    limit: list[str] | None = option(
+        None, "Set the travel of an axis.", metavar="AXIS=LOWER:UPPER"
+    ),
+    without: list[str] | None = option(None, "Leave out this axis.", metavar="AXIS"),
 ) -> None:
     """Write a short file for a machine of your own; asks for what is not said, on a terminal."""
     from flexdt.twin.collision.home_check import check_home
@@ -135,9 +143,11 @@ def _pair(word: str, what: str, *, whole: bool = False) -> tuple[float, float]:
 
 def fit(
     logs: list[Path] = argument(..., "LOG...", "Logs, oldest first."),
-    out: Path = option(..., "The machine file to write.", metavar="FILE"),
+    out: Path = option(..., "Write the machine to this file.", metavar="FILE"),
     base: str = option(
-        machines.DEFAULT_MACHINE, "What the logs do not tell.", metavar="FILE or NAME"
+        machines.DEFAULT_MACHINE,
+        "Take what the logs do not tell from this machine.",
+        metavar="FILE or NAME",
     ),
 ) -> Answer:
     """Fit a machine to executed scripts: limits, rates and the times of its commands."""

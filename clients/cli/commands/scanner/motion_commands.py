@@ -35,10 +35,10 @@ JOG_POLL_S = 0.002
 def move(
     twin: Twin,
     targets: list[str] = argument(..., "AXIS=VALUE...", "mm or deg, script's sign."),
-    relative: bool = option(False, "By so much, not to.", "--relative"),
-    plan: bool = option(False, "Go around obstacles.", "--plan"),
-    shortest: bool = option(False, "rot_obj by the shortest way.", "--shortest"),
-    no_wait: bool = option(False, "Do not wait for arrival.", "--no-wait"),
+    relative: bool = option(False, "Move by these values instead of to them.", "--relative"),
+    plan: bool = option(False, "Plan a path around obstacles.", "--plan"),
+    shortest: bool = option(False, "Turn rot_obj by the shortest way.", "--shortest"),
+    no_wait: bool = option(False, "Return without waiting for the arrival.", "--no-wait"),
 ) -> Answer:
     """Move axes; several start together."""
     wanted = option_values.assignments(targets)
@@ -64,7 +64,7 @@ def jog(
     axis: str = argument(..., "AXIS"),
     velocity: str = argument(..., "VELOCITY", "mm/s or deg/s, signed."),
     seconds: str | None = option(
-        None, "Stop after so long on the twin's clock.", "--for", metavar="SECONDS"
+        None, "Stop after so many seconds of the twin's clock.", "--for", metavar="SECONDS"
     ),
 ) -> None:
     """Move an axis at a velocity until Ctrl-C, or for a time."""

@@ -36,15 +36,15 @@ def list_phantoms() -> Answer:
 
 def make(
     file: Path = argument(..., "FILE.json", "Where to write it."),
-    like: str | None = option(None, "A cuboid of `phantom list`.", metavar="NAME"),
-    size: str | None = option(None, "Width, breadth, height [mm].", metavar="W,B,H"),
-    beads: int = option(5, "Beads on a spiral.", metavar="K"),
-    radius: float = option(2.0, "Bead radius.", metavar="MM"),
-    body: str = option("abs", metavar="MATERIAL"),
-    bead: str = option("steel", metavar="MATERIAL"),
-    mesh: Path | None = option(None, "STL, OBJ, PLY, GLB or OFF.", metavar="FILE"),
-    unit: str | None = option(None, "Of the mesh's coordinates; default: mm, for GLB m."),
-    stl: Path | None = option(None, "Its surfaces, to print it.", metavar="FILE.stl"),
+    like: str | None = option(None, "Begin with this cuboid of `phantom list`.", metavar="NAME"),
+    size: str | None = option(None, "Set width, breadth and height [mm].", metavar="W,B,H"),
+    beads: int = option(5, "Put so many beads on a spiral.", metavar="K"),
+    radius: float = option(2.0, "Set the beads' radius.", metavar="MM"),
+    body: str = option("abs", "Make the body of this material.", metavar="MATERIAL"),
+    bead: str = option("steel", "Make the beads of this material.", metavar="MATERIAL"),
+    mesh: Path | None = option(None, "Fill this mesh: STL, OBJ, PLY, GLB or OFF.", metavar="FILE"),
+    unit: str | None = option(None, "Read the mesh in this unit; default: mm, for GLB m."),
+    stl: Path | None = option(None, "Write its surfaces, too, to print it.", metavar="FILE.stl"),
 ) -> Answer:
     """Write a new phantom: a bead cuboid of your own size, or a mesh."""
     if sum(given is not None for given in (like, size, mesh)) != 1:

@@ -21,9 +21,9 @@ def sample(
         "A mesh, phantom or scene file is sent first. Lists what there is if left out.",
     ),
     unit: Literal["um", "mm", "cm", "m", "inch"] | None = option(
-        None, "Of a mesh's coordinates; default: mm, for GLB m."
+        None, "Read a mesh in this unit; default: mm, for GLB m."
     ),
-    material: str | None = option(None, "A mesh is made of; default: abs."),
+    material: str | None = option(None, "Fill a mesh with this material; default: abs."),
 ) -> Answer:
     """Put a sample on the stage, or list what there is."""
     from flexdt.clients.client.uploads import MESH_FORMATS, SCENE_FORMATS

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 ScriptFile = Annotated[Path, typer.Argument(metavar="SCRIPT", help="Acquila scan script.")]
 
-USUAL = "Default: 600 and 1059, or the machine's own."
+USUAL = "Set this distance; default: 600 and 1059, or the machine's."
 
 
 def check(
@@ -47,11 +47,11 @@ def check(
     machine: options.MachineName = None,
     profile: options.ProfileName = None,
     sample: str | None = option(
-        None, "For truncation, collisions and exposure.", metavar="NAME or FILE"
+        None, "Check truncation, collisions and exposure of this sample.", metavar="NAME or FILE"
     ),
-    html: Path | None = option(None, "The report as one page.", metavar="FILE"),
+    html: Path | None = option(None, "Write the report to this file as one page.", metavar="FILE"),
     against: Path | None = option(
-        None, "Predicted beside executed: the log of this script.", metavar="LOG"
+        None, "Compare with the log of this script, line by line.", metavar="LOG"
     ),
     json: options.Json = False,
 ) -> None:
@@ -170,10 +170,12 @@ def show(report: CheckReport, file: str) -> None:
 def run(
     twin: Twin,
     script: ScriptFile,
-    out: str | None = option(None, "Name of the data set.", metavar="NAME"),
-    sample: str | None = option(None, "Put this on the stage first.", metavar="NAME"),
-    speed_up: str | None = option(None, "Twin seconds per second of yours.", metavar="X or max"),
-    detach: bool = option(False, "Submit and leave.", "--detach"),
+    out: str | None = option(None, "Give the data set this name.", metavar="NAME"),
+    sample: str | None = option(None, "Put this sample on the stage first.", metavar="NAME"),
+    speed_up: str | None = option(
+        None, "Let the twin's time run X times as fast as yours.", metavar="X or max"
+    ),
+    detach: bool = option(False, "Return once the script is submitted.", "--detach"),
 ) -> Answer:
     """Run a script on the twin and wait for the data set.
 
@@ -260,23 +262,27 @@ Kind = Literal["fly", "step", "tiled", "helical", "calibration"]
 
 
 def new(
-    kind: Kind = option(..., "What kind of scan."),
-    file: Path | None = option(None, "Default: standard output.", "--out", metavar="FILE"),
+    kind: Kind = option(..., "Write a script of this kind."),
+    file: Path | None = option(
+        None, "Write to this file; default: standard output.", "--out", metavar="FILE"
+    ),
     sod: float | None = option(None, USUAL, metavar="MM"),
     sdd: float | None = option(None, USUAL, metavar="MM"),
-    height: float | None = option(None, "Of source and detector centre.", metavar="MM"),
-    frames: int = option(361, "Images of one turn, or of all."),
-    exposure: float = option(100.0, metavar="MS"),
-    averages: int = option(1),
-    position: list[str] | None = option(
-        None, "calibration: one for each scan.", metavar="SOD[:LATERAL]"
+    height: float | None = option(
+        None, "Set the height of source and detector centre.", metavar="MM"
     ),
-    tiles: int | None = option(None, "tiled: side by side; 2 if left out."),
-    turns: float | None = option(None, "helical: in total; 3 if left out."),
-    rise: float | None = option(None, "helical: in total; 20 if left out.", metavar="MM"),
-    kv: float | None = option(None, metavar="KV"),
-    power: float | None = option(None, metavar="W"),
-    mode: str | None = option(None, metavar="NAME"),
+    frames: int = option(361, "Take so many images in a turn, or in all."),
+    exposure: float = option(100.0, "Expose each image so long.", metavar="MS"),
+    averages: int = option(1, "Average so many read-outs in an image."),
+    position: list[str] | None = option(
+        None, "Put a calibration scan there; once for each scan.", metavar="SOD[:LATERAL]"
+    ),
+    tiles: int | None = option(None, "Put so many tiles side by side; default: 2."),
+    turns: float | None = option(None, "Make so many turns of a helix; default: 3."),
+    rise: float | None = option(None, "Let a helix rise by so much; default: 20.", metavar="MM"),
+    kv: float | None = option(None, "Set the tube's voltage.", metavar="KV"),
+    power: float | None = option(None, "Set the tube's power.", metavar="W"),
+    mode: str | None = option(None, "Set the camera's mode.", metavar="NAME"),
     roi: options.Roi = None,
     machine: options.MachineName = None,
     profile: options.ProfileName = None,

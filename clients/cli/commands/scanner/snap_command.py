@@ -25,12 +25,10 @@ def snap(
     twin: Twin,
     file: Path = argument(..., "FILE.{tif,png}"),
     kind: Literal["counts", "line_integral"] | None = option(
-        None, "What the pixels are: counts in a TIFF, line_integral in a PNG unless said."
+        None, "Write this kind; default: counts in a TIFF, integrals in a PNG."
     ),
-    binning: int = option(1, min=1, max=32),
-    marks: bool = option(
-        True, "Saturated and starved pixels and edges that cut off, in a PNG's colour."
-    ),
+    binning: int = option(1, "Average so many pixels a side.", min=1, max=32),
+    marks: bool = option(True, "Colour saturated, starved and cut-off pixels of a PNG."),
 ) -> Answer:
     """Take a projection at the current pose.
 

@@ -67,9 +67,9 @@ def _facts(state: State) -> list[tuple[str, str]]:
 @on_twin
 def tube(
     twin: Twin,
-    kV: float | None = option(None, "Voltage.", "--kv"),
-    power_W: float | None = option(None, "Power.", "--power", metavar="W"),
-    on: bool | None = option(None, "X-rays.", "--on/--off"),
+    kV: float | None = option(None, "Set the tube's voltage.", "--kv"),
+    power_W: float | None = option(None, "Set the tube's power.", "--power", metavar="W"),
+    on: bool | None = option(None, "Switch X-rays on or off.", "--on/--off"),
 ) -> Answer:
     """Set the X-ray tube, or show it; what is left out stays."""
     with twin() as client:
@@ -91,10 +91,10 @@ def xrays(tube: TubeState) -> str:
 @on_twin
 def camera(
     twin: Twin,
-    exposure_ms: float | None = option(None, "", "--exposure", metavar="MS"),
-    mode: str | None = option(None, "HWaSWbHigh or HWaSWbLow."),
+    exposure_ms: float | None = option(None, "Set the exposure time.", "--exposure", metavar="MS"),
+    mode: str | None = option(None, "Set the mode: HWaSWbHigh or HWaSWbLow."),
     roi: options.Roi = None,
-    averages: int | None = option(None),
+    averages: int | None = option(None, "Average so many read-outs in an image."),
 ) -> Answer:
     """Set the camera, or show it; what is left out stays."""
     with twin() as client:
