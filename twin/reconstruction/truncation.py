@@ -231,13 +231,15 @@ def _fitted(
     seen = seen.astype(np.float64)
     prisms: list[Prism | None] = [None] * len(middles)
     cut_off, off, known, why = np.zeros(len(middles), dtype=bool), 0.0, None, ""
+    # Bands above and below the object hold nothing that could be off.
+    least = 0.1 * ACCURACY * float(np.abs(seen).mean())
+    met = seen[seen > max(0.1 * float(seen.mean()), least)]
+    usual = float(np.median(met)) if met.size else 0.0  # of the rays that meet the object
     for k in np.argsort(-seen.sum(axis=(0, 2))).tolist():
         band = seen[:, k]
-        least = 0.1 * ACCURACY * float(np.abs(band).mean())
         cut_off[k] = (_cut_off(band, least) & edges_that_count).any()
         if not cut_off[k]:
             continue
-        usual = float(np.median(band[band > least]))
         even = max(float(np.ptp(band.mean(axis=axis))) for axis in (0, 1)) < ACCURACY * usual
         if not helix and not even:
             prisms[k] = _fit(source, rays, band, usual, known)
@@ -292,6 +294,9 @@ def _fit(
     """
     from scipy.optimize import least_squares
 
+    hit = seen > 0.1 * ACCURACY * usual  # of dead columns a prism elsewhere is right
+    if not hit.any():
+        return None
     ends = rays[:, [0, -1]]
     aside = source[..., 0] * ends[..., 1] - source[..., 1] * ends[..., 0]
     field = float(np.abs(aside / np.sqrt((ends**2).sum(axis=-1))).max())
@@ -323,7 +328,6 @@ def _fit(
     scale = 5.0 * ACCURACY * usual
     _, x = min((fit(start, scale) for start in starts), key=lambda one: one[0])
     # Narrower and narrower: what deviates by more than the best quarter does then hardly counts.
-    hit = seen > 0.1 * usual  # of dead columns a prism elsewhere is right
     while (best := float(np.percentile(np.abs(rest(x)[hit]), 25.0))) < 0.8 * scale:
         scale = max(best, 0.1 * ACCURACY * usual)
         _, x = fit(x, scale)
