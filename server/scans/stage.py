@@ -52,11 +52,15 @@ class Stage:
 
     def pieces(self, sample: Sample) -> tuple[Polytope, ...]:
         """Convex pieces that hold the sample, object frame; it may take a second."""
-        pieces = self._pieces.get(self._content(sample))
+        before = self._content(sample)
+        pieces = self._pieces.get(before)
         if pieces is None:
             phantom = self.phantom(sample)
             pieces = () if phantom is None else _pieces(phantom, sample.offset)
-            self._pieces[self._content(sample)] = pieces  # known once an upload has been read
+            now = self._content(sample)  # the revision is known once an upload has been read
+            if before[1] not in (None, now[1]):
+                return pieces  # another file came under the name meanwhile
+            self._pieces[now] = pieces
             while len(self._pieces) > KEPT:
                 self._pieces.popitem(last=False)
         return pieces

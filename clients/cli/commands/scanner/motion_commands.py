@@ -142,7 +142,8 @@ def _rest(state: Stopped) -> str:
 def reset(twin: Twin) -> Answer:
     """Leave the emergency stop."""
     with twin() as client:
-        current = client.reset()
+        seen = client.state().safety  # what is released; a twin of before has no number for it
+        current = client.reset(seen.stop or None)
     why = f": {current.safety.message}" if current.safety.message else ""
     yield current
     yield f"safety: {current.safety.state}{why}"
