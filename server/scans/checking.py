@@ -111,8 +111,8 @@ class Checked:
     """A scan that was found sound: the certificate of its plan.
 
     Attributes:
-        matter: what was checked, on what. Nothing else enters a plan, so that a scan whose matter
-            is equal has this plan and needs no other check.
+        matter: what was checked. Nothing else enters a plan, so a scan with an equal input has this
+            plan and needs no other check.
         plan: of the scan.
         warnings: in words.
     """
