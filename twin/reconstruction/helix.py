@@ -59,12 +59,12 @@ class Sharing:
         axis = ((circle.centre - cone_vec.source[:, :2]) * away[:, :2]).sum(axis=1)
         # The voxels nearest to the source move farthest on the panel.
         most = float(((rows - 1) * (axis - wide) / scale).min())
-        if abs(circle.rise) > most:
+        if circle.rise > most:
             raise GeometryError(
-                f"the helix rises by {abs(circle.rise):.4g} mm a turn; FDK needs every voxel in "
+                f"the helix rises by {circle.rise:.4g} mm a turn; FDK needs every voxel in "
                 f"every direction: at most {most:.4g} mm a turn for this panel and a grid as wide "
                 "as this; the iterative methods (sirt, sart, cgls, em) take any trajectory",
-                {"asked": abs(circle.rise), "allowed": most},
+                {"asked": circle.rise, "allowed": most},
             )
         return cls(circle, rows, scale, axis[:, None] + wide * np.array([-1.0, 1.0]))
 
@@ -78,10 +78,11 @@ class Sharing:
         first, last = self.depth[views].T[..., None]
         depth = first + (last - first) * np.linspace(0.0, 1.0, DEPTHS)
         turn = self.circle.rise * self.scale[views, None] / depth  # rows that a voxel sinks
-        since = (self.circle.progress + 0.5 * self.circle.step)[views]
-        until = self.circle.span - since
+        span = float(self.circle.step.sum())
+        since = (self.circle.angle + 0.5 * self.circle.step)[views]
+        until = span - since
         row = (np.arange(*rows) - (self.rows - 1) / 2).astype(np.float32)
-        most = int(min(self.circle.span / (2 * np.pi), self.rows / np.abs(turn).min())) + 1
+        most = int(min(span / (2 * np.pi), self.rows / np.abs(turn).min())) + 1
         own = total = np.zeros((len(since), DEPTHS, len(row)), np.float32)
         for k in range(-most, most + 1):
             end = np.minimum(since + 2 * np.pi * k, until - 2 * np.pi * k)

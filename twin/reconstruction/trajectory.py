@@ -1,8 +1,12 @@
 """What FDK must know of a scan: its circle, the angle each view stands for, and its redundancy.
 
-Any flat panel on a circle about an axis parallel to z: full turns (the last view may repeat the
-first), short scans with Parker's weights, a detector moved to one side, and helices of a turn or
-more. Other trajectories are an error; iterative methods take those.
+Any flat panel on a circle about an axis parallel to z: any number of turns and parts of turns with
+any gaps, as long as the views see every line through the object, a detector moved to one side, and
+helices of a turn or more. Other trajectories are an error; iterative methods take those.
+
+What the views cover decides, not the order in which they are listed. Those of a circle are sorted
+by their angle on it, whatever the turn, and each stands for the arc to halfway to its neighbours. A
+step much wider than the usual one is a gap, which the opposite views make up for.
 """
 
 from __future__ import annotations
@@ -10,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -19,18 +24,22 @@ FLATNESS = 0.03
 """Largest deviation of the sources from a horizontal circle, relative to its radius."""
 TAPER = 4.0
 """Width of the weights' transition, over how much further the detector reaches to one side."""
-UNSEEN = 3e-3
-"""Parker's weight of an opposite ray below which it counts as not seen; see `redundancy`."""
 NARROWEST = 24
 """Least width of that transition [columns]."""
+LEAST = 3e-3
+"""Confidence in the rays at the panel's near edge, relative to that in their opposites. It decides
+only where an opposite ray was hardly seen: next to a gap of the angles."""
 MOST_COLUMNS = 8
 """A panel moved to one side is continued to at most so many times its columns."""
 LEVEL = 1e-3
 """Rise over a scan, relative to the radius, up to which it is a circle."""
 UNSTEADY = 0.05
 """Largest deviation of a helix from a steady rise, relative to the rise in a turn."""
-MOST_UNEVEN = 4.0
-"""Largest step between neighbouring views, relative to the usual one, within a full turn."""
+MOST_UNEVEN = 8.0
+"""Largest step between neighbouring views, relative to the usual one, that is not a gap."""
+RAMP = 0.35
+"""Angle over which the confidence in views falls towards a gap [rad]."""
+TURN = 2 * np.pi
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,28 +49,40 @@ class Circle:
     Attributes:
         centre: (x, y) of the rotation axis [mm].
         radius: from the axis to the source [mm].
-        azimuth: (n,) unwrapped angle of the source about the axis, growing with the scan [rad].
-        sense: +1 when the sources run counter-clockwise seen from above, else -1.
-        step: (n,) angle each view stands for [rad]; they add up to the span, or to whole turns.
-        span: angle covered [rad].
-        full: whether the views close whole turns, or are a helix.
-        rise: of a helix in a turn, negative downwards [mm]; 0 for a circle.
+        angle: (n,) along it [rad]: on a circle the azimuth of the source about the axis, from 0 to
+            2 pi; on a helix since its lowest view.
+        step: (n,) angle each view stands for [rad].
+        gaps: (k, 2) first and last angle of the arcs that no view stands for [rad]; the last may
+            lie beyond 2 pi. None for a helix.
+        rise: of a helix in a turn [mm]; 0 for a circle.
     """
 
     centre: FloatArray
     radius: float
-    azimuth: FloatArray
-    sense: float
+    angle: FloatArray
     step: FloatArray
-    span: float
-    full: bool
+    gaps: FloatArray
     rise: float = 0.0
 
     @property
-    def progress(self) -> FloatArray:
-        """(n,) angle since the scan's first view [rad]."""
-        run = self.sense * self.azimuth
-        return np.asarray(run - run.min())
+    def full(self) -> bool:
+        """Whether the views see the object from all around."""
+        return not len(self.gaps)
+
+    @property
+    def order(self) -> npt.NDArray[np.intp]:
+        """(n,) views along the circle or the helix, whatever their order in the list."""
+        return np.argsort(self.angle, kind="stable")
+
+    def from_gap(self, angle: FloatArray) -> FloatArray:
+        """Angles from places on the circle to the nearest gap, zero within, else infinite [rad]."""
+        if self.full:
+            return np.full_like(angle, np.inf)
+        first, last = self.gaps.T
+        arc = np.append(first[1:], first[0] + TURN) - last  # that the views cover behind each gap
+        at = np.concatenate([first, last, last + arc / 2])
+        value = np.concatenate([np.zeros(2 * len(arc)), arc / 2])
+        return np.asarray(np.interp(angle, at, value, period=TURN))
 
 
 def circle_of(cone_vec: ConeVec) -> Circle:
@@ -80,13 +101,11 @@ def circle_of(cone_vec: ConeVec) -> Circle:
     (a, b, c), _, rank, _ = np.linalg.lstsq(rows, (s[:, :2] ** 2).sum(axis=1), rcond=None)
     if rank < 3:
         raise GeometryError("the sources of all views lie on a line; FDK needs a circle")
-    radius = float(np.sqrt(c + a * a + b * b))
-    out = np.linalg.norm(s[:, :2] - (a, b), axis=1) - radius
-    azimuth = _unwrapped(np.arctan2(s[:, 1] - b, s[:, 0] - a))
-    sense = 1.0 if azimuth[-1] >= azimuth[0] else -1.0
-    rise = _rise(sense * azimuth, s[:, 2], radius)
-    worst = float(np.abs(out).max())
-    if not rise:
+    centre, radius = np.array([a, b]), float(np.sqrt(c + a * a + b * b))
+    azimuth = np.arctan2(s[:, 1] - b, s[:, 0] - a)
+    helix = _helix(azimuth, s[:, 2], centre, radius)
+    worst = float(np.abs(np.linalg.norm(s[:, :2] - centre, axis=1) - radius).max())
+    if helix is None:
         worst = max(worst, float(np.abs(s[:, 2] - s[:, 2].mean()).max()))
     if worst > FLATNESS * radius:
         raise GeometryError(
@@ -95,71 +114,62 @@ def circle_of(cone_vec: ConeVec) -> Circle:
             "methods (sirt, sart, cgls, em) take any trajectory",
             {"asked": worst, "allowed": FLATNESS * radius},
         )
-    order = np.argsort(sense * azimuth, kind="stable")
-    run = (sense * azimuth)[order]
-    gaps = np.diff(run)
-    usual = float(np.median(gaps[gaps > 1e-9])) if (gaps > 1e-9).any() else 0.0
-    span = float(run[-1] - run[0])
-    turns = round(span / (2 * np.pi)) if span > np.pi else 0
-    # The ends of a helix need not meet: the first and the last view stand for whole steps.
-    closing = usual if rise else _closing_gap(span, turns, usual)
-    inner = np.zeros(len(run))
-    inner[:-1] += gaps / 2
-    inner[1:] += gaps / 2
-    full = closing is not None
-    if closing is not None:
-        inner[[0, -1]] += closing / 2
-        span += closing
-    step = np.empty(len(run))
-    step[order] = inner
-    return Circle(np.array([a, b]), radius, azimuth, sense, step, span, full, rise)
+    return helix or _turn(azimuth % TURN, centre, radius)
 
 
-def _rise(run: FloatArray, height: FloatArray, radius: float) -> float:
-    """Of the sources in a turn, where they rise steadily for a turn or more; else 0 [mm]."""
+def _turn(azimuth: FloatArray, centre: FloatArray, radius: float) -> Circle:
+    """A circle with its sources at angles from 0 to 2 pi."""
+    at, same = np.unique(azimuth.round(9) % TURN, return_inverse=True)
+    # From each place to the next one; views at one place share what it stands for.
+    ahead = np.diff(at, append=at[0] + TURN)
+    by_width = np.sort(ahead)
+    # Without the widest, which may be the gap of a short scan: a quarter of what the steps cover
+    # together lies in narrower ones, however many turns lie beside each other.
+    covered = np.cumsum(by_width[:-1])
+    usual = by_width[int(np.searchsorted(covered, covered[-1] / 4))] if len(covered) else TURN
+    # No step of a circle of three views or more is a third of it, but a gap may be.
+    open_ = (ahead > MOST_UNEVEN * usual) | (ahead > TURN / 3 + 1e-6)
+    ahead_half = np.where(open_, 0.0, ahead / 2)
+    step = (ahead_half + np.roll(ahead_half, 1)) / np.bincount(same)
+    gaps = np.column_stack([at, at + ahead])[open_]
+    return Circle(centre, radius, azimuth, step[same], gaps)
+
+
+def _helix(
+    azimuth: FloatArray, height: FloatArray, centre: FloatArray, radius: float
+) -> Circle | None:
+    """The helix of sources that rise steadily for a turn or more; None for others."""
+    order = np.argsort(height, kind="stable")
+    run = np.empty(len(order))
+    run[order] = np.unwrap(azimuth[order])
     span = float(np.ptp(run))
-    if span * len(run) / (len(run) - 1) < 2 * np.pi - 1e-6:
-        return 0.0
+    if np.ptp(height) <= LEVEL * radius or span * len(run) / (len(run) - 1) < TURN - 1e-6:
+        return None
     slope, level = np.polyfit(run, height, 1)
-    uneven = float(np.abs(height - level - slope * run).max())
-    steady = uneven <= UNSTEADY * 2 * np.pi * abs(slope)
-    return 2 * np.pi * float(slope) if steady and abs(slope) * span > LEVEL * radius else 0.0
-
-
-def _unwrapped(azimuth: FloatArray) -> FloatArray:
-    """Angles without jumps [rad]; those of views in no order lie within one turn."""
-    run = np.unwrap(azimuth)
-    steps = np.diff(run)
-    if (steps >= -1e-9).all() or (steps <= 1e-9).all():
-        return np.asarray(run)
-    around = np.sort(azimuth % (2 * np.pi))
-    gaps = np.diff(around, append=around[0] + 2 * np.pi)
-    first = around[(int(gaps.argmax()) + 1) % len(around)]  # behind the widest gap
-    return np.asarray((azimuth - first + 1e-12) % (2 * np.pi))
-
-
-def _closing_gap(span: float, turns: int, usual: float) -> float | None:
-    """From the last view on to the first, if the views close whole turns, else None.
-
-    Zero when the last view repeats the first.
-    """
-    for whole in {turns, turns + 1} - {0}:
-        gap = whole * 2 * np.pi - span
-        if -0.25 * usual <= gap <= MOST_UNEVEN * usual:
-            return max(gap, 0.0)
-    return None
+    if np.abs(height - level - slope * run).max() > UNSTEADY * TURN * abs(slope):
+        return None
+    # The ends of a helix need not meet: the first and the last view stand for whole steps.
+    run *= np.sign(slope)
+    order = np.argsort(run, kind="stable")
+    gaps = np.diff(run[order])
+    usual = float(np.median(gaps[gaps > 1e-9]))
+    ahead = np.concatenate([[usual], gaps, [usual]]) / 2
+    step = np.empty(len(run))
+    step[order] = ahead[:-1] + ahead[1:]
+    rise = TURN * abs(float(slope))
+    return Circle(centre, radius, run - run.min(), step, np.zeros((0, 2)), rise)
 
 
 def redundancy(circle: Circle, cone_vec: ConeVec, cols: int, *, beyond: bool = False) -> FloatArray:
     """Weights (n, cols) of rays so that every line counts once, with its opposite or alone.
 
-    Over whole turns every ray and its opposite share (1/2 each); with a detector moved to one
-    side the rays near its near edge hand over smoothly to their opposites, and those beyond count
-    alone. Turns beyond the first divide it further. Short scans get Parker's weights, widened to
-    the span there is, and the handing over where an object lies `beyond` the near edge.
+    A ray and its opposite share by the confidence in each (Noo et al., Phys. Med. Biol. 47 (2002)
+    2525), which falls smoothly to nothing towards a gap of the angles, and towards the near edge
+    of a panel moved to one side; with gaps that is where an object lies `beyond` the near edge.
+    Around a whole turn of a panel in the middle each counts 1/2.
 
     Raises:
-        GeometryError: less than half a turn plus the fan's opening.
+        GeometryError: some lines are not seen from either side.
     """
     fan = fan_angles(circle, cone_vec, cols)
     low, high = reach(fan)
@@ -168,33 +178,48 @@ def redundancy(circle: Circle, cone_vec: ConeVec, cols: int, *, beyond: bool = F
             "the shadow of the rotation axis does not fall on the detector; FDK needs it to",
             {"fan_deg": np.rad2deg([-low, high]).tolist()},
         )
-    turns, shared, widest = 1.0, np.full_like(fan, 0.5), float(np.abs(fan).max())
-    if circle.full:
-        # The turns of a helix share each voxel in the backprojection.
-        turns = 1.0 if circle.rise else circle.span / (2 * np.pi)
-    elif circle.span < np.pi + 2 * widest - 1e-6 or circle.span > 2 * np.pi:
-        raise GeometryError(
-            f"the views span {np.rad2deg(circle.span):.4g} deg; FDK needs whole turns, or between "
-            f"{np.rad2deg(np.pi + 2 * widest):.4g} (half a turn and the fan) and 360 deg",
-            {
-                "asked": float(np.rad2deg(circle.span)),
-                "allowed": [float(np.rad2deg(np.pi + 2 * widest)), 360.0],
-            },
+    _check_covered(circle, float(np.abs(fan).max()))
+    column, overlap = (low + high) / cols, min(low, high)
+    least = 0.0 if circle.full else LEAST
+    alone = np.zeros_like(fan)  # +1 where only the ray itself falls on the panel, -1 its opposite
+    if abs(high - low) > column and (circle.full or beyond):
+        taper = min(overlap, max(TAPER * abs(high - low), NARROWEST * column))
+        side = fan if high > low else -fan
+        past = np.clip((np.abs(side) - (overlap - taper)) / taper, 0.0, 1.0)
+        alone = np.sign(side) * (1 - least) * np.sin(np.pi / 2 * past) ** 2
+    angle = circle.angle[:, None]
+    own = (1.0 + alone) * _confidence(circle, angle)
+    other = (1.0 - alone) * _confidence(circle, angle + np.pi + 2 * fan)
+    return np.asarray(own / (own + other))
+
+
+def _confidence(circle: Circle, angle: FloatArray) -> FloatArray:
+    """From 0 to 1, in views at angles from a gap."""
+    from_gap = circle.from_gap(angle)
+    return np.asarray(np.sin(np.pi / 2 * np.minimum(from_gap / RAMP, 1.0)) ** 2 + 1e-12)
+
+
+def _check_covered(circle: Circle, widest: float) -> None:
+    """Check that the lines which gaps leave out, up to an angle of the fan, are seen from behind.
+
+    Raises:
+        GeometryError: some are not.
+    """
+    width, middle = np.diff(circle.gaps)[:, 0], circle.gaps.mean(axis=1)
+    apart = np.abs((middle[:, None] - middle) % TURN - np.pi)  # of a gap and what is behind another
+    unseen = (width[:, None] + width) / 2 + 2 * widest - apart
+    if unseen.size and unseen.max() > 1e-6:
+        span, need = np.rad2deg([TURN - width.sum(), np.pi + 2 * widest])
+        listed = ", ".join(
+            f"{first:.4g} to {last:.4g}" for first, last in np.rad2deg(circle.gaps[:3])
         )
-    else:
-        shared = parker(circle.progress[:, None], circle.sense * fan, circle.span)
-    column = (low + high) / cols
-    if abs(high - low) <= column or not (circle.full or beyond):
-        return shared / turns
-    overlap = min(low, high)
-    taper = min(overlap, max(TAPER * abs(high - low), NARROWEST * column))
-    side = fan if high > low else -fan
-    alone = np.sin(np.pi / 2 * np.clip((np.abs(side) - (overlap - taper)) / taper, 0.0, 1.0)) ** 2
-    # Off the near edge a ray counts, as what continues the panel, where its opposite was not seen.
-    opposite = np.where(side > 0, shared, 1.0 - shared)
-    seen = np.clip(opposite / UNSEEN, 0.0, 1.0)
-    weight = np.where(side > 0, seen, 1.0 - seen)
-    return np.asarray(((1.0 - alone) * shared + alone * weight) / turns)
+        raise GeometryError(
+            f"the views span {span:.4g} deg of the circle, and with the gap at {listed} deg they "
+            f"do not see every line: FDK needs {need:.4g} deg (half a turn and the fan) without a "
+            "gap, or gaps that have views on the other side; the iterative methods (sirt, sart, "
+            "cgls, em) take any trajectory",
+            {"asked": float(span), "allowed": [float(need), 360.0]},
+        )
 
 
 def reach(fan: FloatArray) -> tuple[float, float]:
@@ -223,25 +248,6 @@ def columns_beyond(circle: Circle, cone_vec: ConeVec, cols: int) -> tuple[int, i
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-
-
-def parker(progress: FloatArray, fan: FloatArray, span: float) -> FloatArray:
-    """Parker's weights (1982) for a span of at least pi plus the fan (Silver 2000).
-
-    A ray (progress b, fan angle g) and its opposite (b + pi + 2 g, -g) add up to 1.
-
-    Args:
-        progress: angle since the first view [rad].
-        fan: angle of the ray from the central one, in the sense of the progress [rad].
-        span: angle covered [rad].
-    """
-    half = (span - np.pi) / 2.0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        rising = np.sin(np.pi / 4 * progress / (half - fan)) ** 2
-        falling = np.sin(np.pi / 4 * (span - progress) / (half + fan)) ** 2
-    weight = np.where(progress < 2 * (half - fan), rising, 1.0)
-    weight = np.where(progress > np.pi - 2 * fan, falling, weight)
-    return np.asarray(np.clip(np.nan_to_num(weight), 0.0, 1.0))
 
 
 def fan_angles(circle: Circle, cone_vec: ConeVec, cols: int) -> FloatArray:

@@ -162,6 +162,7 @@ def truncation_of(
     views = len(cone_vec)
     circle = circle_of(cone_vec)  # of all: fewer may seem to close a turn that is open
     chosen = np.unique(np.linspace(0, views - 1, min(views, SAMPLES)).round().astype(np.intp))
+    chosen = circle.order[chosen]
     images = [np.asarray(image(i), dtype=np.float32) for i in chosen.tolist()]
     cone_vec = cone_vec[chosen]
     if on_its_side(cone_vec):
@@ -334,6 +335,8 @@ def _fit(
         if scale > best:
             break
     by_noise = 0.319 * _noise(rest(x))  # a quarter of normal noise is below so many deviations
+    # Both are estimates; the ratio of their squares varies by 4.9 over the root of their number.
+    by_noise *= np.sqrt(1.0 + 0.5 * SIGNIFICANT * 4.9 / np.sqrt(seen.size))
     if np.sqrt(max(best**2 - by_noise**2, 0.0)) <= 0.5 * ACCURACY * usual:
         return Prism.of(x, field)
     return None if near is None else _fit(source, rays, seen, usual, None)

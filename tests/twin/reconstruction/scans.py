@@ -32,17 +32,21 @@ def circle(
     axis: float = 0.0,
     sod: float = 600.0,
     sdd: float = 1059.0,
+    angles: np.ndarray | None = None,
 ) -> ConeVec:
     """Source on a circle of radius `sod` about z; lengths in mm, `yaw` and `tilt` in rad.
 
     aside: detector's shift along u; tilt: its roll and its pitch; axis: lateral shift of source
-    and detector against the rotation axis; repeat: the last view has the angle `span_deg`.
+    and detector against the rotation axis; repeat: the last view has the angle `span_deg`;
+    angles: of the views [rad], instead of even ones over the span.
     """
     roll = np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
     pitch = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
     panel = turn(yaw) @ pitch @ roll * pixel
     parts = [[axis, -sod, 0], [axis + aside, sdd - sod, 0], panel[:, 0], -panel[:, 2]]
-    angles = np.deg2rad(np.linspace(0, span_deg, n, endpoint=repeat)) * sense
+    if angles is None:
+        angles = np.deg2rad(np.linspace(0, span_deg, n, endpoint=repeat))
+    angles = angles * sense
     return ConeVec(np.array([np.concatenate([turn(a) @ p for p in parts]) for a in angles]))
 
 

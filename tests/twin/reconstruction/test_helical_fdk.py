@@ -74,6 +74,8 @@ def test_long_objects_come_back_from_any_helix() -> None:
         scan = helix(part, **more)
         if case >= 3:  # the same turns the other way
             scan = ConeVec(scan.rows * np.tile([-1.0, 1.0, 1.0], 4) * np.repeat([1, 1, -1, 1], 3))
+        if case % 2:  # listed in any order
+            scan = scan[rng.permutation(len(scan))]
         circle = ConeVec.circular(
             sod=SOD, sdd=SDD, angles=180, pixel=PITCH, shape=SHAPE, height=z, **more
         )  # type: ignore[arg-type]
