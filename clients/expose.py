@@ -6,12 +6,15 @@ from dataclasses import dataclass
 from os import PathLike
 
 import numpy as np
+import numpy.typing as npt
 
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.phantoms.exposure_forecast import VIEWS, Forecast, Transmission, expose
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
-from flexdt.twin.physics.exposure import FEW_COUNTS
+from flexdt.twin.physics.exposure import FEW_COUNTS, NOTICED, Counts
+
+DARK = "no pixel of the flat images is brighter than the dark ones: was the tube off?"
 
 __all__ = ["Forecast", "Measured", "Transmission", "expose", "exposure_of"]
 
@@ -39,14 +42,9 @@ def exposure_of(data: DataSet | str | PathLike[str]) -> Measured:
         DatasetFormatError: no pixel of its flat image is brighter than the dark one.
     """
     scan = data if isinstance(data, DataSet) else load_dataset(data)
-    wanted = np.unique(np.linspace(0, len(scan) - 1, VIEWS).astype(int))
-    counts = np.stack([scan.counts(int(i)) for i in wanted])
-    alive = scan.flat > scan.dark
+    counts, alive = _some(scan)
     if not alive.any():
-        raise DatasetFormatError(
-            "no pixel of the flat images is brighter than the dark ones: was the tube off?",
-            {"asked": 0, "allowed": "> 0 pixels"},
-        )
+        raise DatasetFormatError(DARK, {"asked": 0, "allowed": "> 0 pixels"})
     signal = (counts - scan.dark)[:, alive]
     return Measured(
         Transmission.of(signal / (scan.flat - scan.dark)[alive]),
@@ -54,3 +52,49 @@ def exposure_of(data: DataSet | str | PathLike[str]) -> Measured:
         float((signal < FEW_COUNTS).mean()),
         len(scan),
     )
+
+
+def image_doubts(scan: DataSet, *, needed: bool = False) -> list[str]:
+    """What in the exposure of a scan's images makes its line integrals doubtful.
+
+    Saturated pixels are those with the panel's largest count, or, where that is not known, with the
+    largest one among the images; `VIEWS` radiographs and the flat image are looked at.
+
+    Raises:
+        DatasetFormatError: line integrals are `needed`, and the images hold none: no pixel of the
+            flat image is brighter than the dark one, or all are saturated.
+    """
+    counts, alive = _some(scan)
+    flat, doubts = scan.flat, []
+    if not alive.any():
+        doubts = [DARK]
+    else:
+        top = float(max(counts.max(), flat.max())) if scan.full_scale is None else scan.full_scale
+        images = {"radiographs": counts[:, alive] >= top, "flat image": flat[alive] >= top}
+        shares = {what: float(there.mean()) for what, there in images.items()}
+        doubts = [
+            f"{100.0 * share:.3g} % of the pixels of the {what} are saturated, where attenuation "
+            "comes out wrong: lower the tube's power or the exposure"
+            for what, share in shares.items()
+            if share >= NOTICED
+        ]
+        starved = float(((counts - scan.dark)[:, alive] < FEW_COUNTS).mean())
+        if starved >= NOTICED:
+            doubts.append(
+                f"{100.0 * starved:.3g} % of the pixels of the radiographs are starved (fewer than "
+                f"{FEW_COUNTS:g} counts of signal), where attenuation is mostly noise: raise the "
+                "tube's power, its voltage or the exposure"
+            )
+    if needed and (not alive.any() or min(shares.values()) > 1.0 - NOTICED):
+        raise DatasetFormatError(
+            f"{scan.where}: the images hold no line integrals. {' '.join(doubts)}",
+            {"path": scan.where},
+        )
+    return doubts
+
+
+def _some(scan: DataSet) -> tuple[Counts, npt.NDArray[np.bool_]]:
+    """Radiographs of a scan, `VIEWS` at most, and the pixels that the open beam reaches."""
+    wanted = np.unique(np.linspace(0, len(scan.present) - 1, VIEWS).astype(int))
+    counts = np.stack([scan.counts(scan.present[i]) for i in wanted])
+    return counts, scan.flat > scan.dark

@@ -8,7 +8,8 @@ motors. Views are computed a few at a time, so memory holds the counts and littl
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Final, get_args
 
@@ -16,12 +17,13 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.clients.datasets.data_set import DataSet
+from flexdt.clients.expose import image_doubts
 from flexdt.clients.extras import extension
 from flexdt.machines import machine as machine_of
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import Channel, chain_through, channels, scatter_object
 from flexdt.phantoms.samples import as_phantom
-from flexdt.twin.errors import GeometryError, LimitError
+from flexdt.twin.errors import GeometryError, LimitError, require_within
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.camera import CameraSettings, Roi
@@ -55,6 +57,10 @@ from flexdt.twin.projection.operators import as_cone_vec
 BATCH_BYTES: Final = 64 << 20
 """Path lengths in memory at a time."""
 MOST_POINTS: Final = 1024
+FILLED: Final = 0.8
+"""Part of the panel's range that the open beam fills where the exposure is chosen."""
+EXPOSURES_MS: Final = (1e-6, 1e7)
+"""Exposures that a detector may have [ms]."""
 DOUBTED_PX: Final = 0.25
 """Difference of the spot's blur over a sample from which it is worth a warning [pixels]."""
 SAME_PITCH: Final = 1e-6
@@ -90,7 +96,11 @@ class Truth:
     spot_points: int = 1
 
     def __repr__(self) -> str:
-        return f"<Truth: {self.sample.name!r}, {len(self.geometry)} views>"
+        lit = self.exposure
+        return (
+            f"<Truth: {self.sample.name!r}, {len(self.geometry)} views of {lit.averages} x "
+            f"{lit.exposure_ms:.4g} ms at {lit.kV:g} kV, {lit.power_W:g} W>"
+        )
 
     def of_views(self, chosen: npt.NDArray[np.intp]) -> Truth:
         """That of some of the views."""
@@ -146,6 +156,7 @@ def simulate(
     tube: Tube | None = None,
     detector: Detector | None = None,
     noise: int | None = None,
+    exposure_ms: float | None = None,
     scatter: Scatter | ScatterSettings = "off",
     machine: Machine | str | None = None,
     shape: tuple[int, int] | None = None,
@@ -153,6 +164,7 @@ def simulate(
     voxel_mm: float | Vector | None = None,
     rays: int | None = None,
     spot_points: int = 1,
+    progress: Callable[[float], None] | None = None,
 ) -> DataSet:
     """Simulate a scan: counts, dark and flat images of a sample.
 
@@ -166,6 +178,9 @@ def simulate(
         detector: default: the machine's, else the twin's panel with the geometry's pixels.
         noise: seed, >= 0; None for the expectation. Image i has a random generator of its own,
             counting the dark image (0), the flat image (1) and the projections.
+        exposure_ms: of one read-out; None: the detector's or the machine's, or, where neither
+            states one, so long that the brightest pixel of the open beam reaches 80 % of the
+            largest count. `truth` says it.
         scatter: "mc" adds the radiation that the sample scatters, by Monte Carlo with the seed of
             `noise`. `ScatterSettings` state more. It is in the data set's `truth.scatter`.
         machine: a machine, its name or file, whose tube and detector are taken where `tube` and
@@ -180,12 +195,17 @@ def simulate(
             and each depth of the sample is blurred as it is. With 1 all are blurred as the rotation
             axis is, and the data set warns where that matters. Ghosts of edges stay where the blur
             [pixels] is more than about a quarter of the points.
+        progress: called with the fraction done.
 
     Returns:
         The data set in memory; its `truth` is what lies behind it.
 
     Raises:
         TwinError: a sample, geometry, tube or detector that does not hold; says what is allowed.
+
+    Warns:
+        UserWarning: what is doubtful about the images, such as saturated pixels; it is in the data
+            set's `warnings` too.
 
     Example:
         >>> geometry = ConeVec.from_vectors([0, -400, 0], [0, 400, 0], [0.5, 0, 0], [0, 0, -0.5])
@@ -195,8 +215,8 @@ def simulate(
         ((1, 40, 40), True)
     """
     if geometry is None:
-        given = (tube, detector, machine, shape, material, voxel_mm)
-        other = scatter != "off" or spot_points != 1 or given != (None,) * 6
+        given = (tube, detector, machine, shape, material, voxel_mm, exposure_ms)
+        other = scatter != "off" or spot_points != 1 or given != (None,) * 7
         if not isinstance(sample, str | os.PathLike) or other:
             raise GeometryError(
                 "no geometry; allowed without one: the path of a CTSimU scenario, and noise",
@@ -226,11 +246,23 @@ def simulate(
     size = cone.of_shape(shape)
     scanner = machine_of(machine) if isinstance(machine, str) else machine
     settings = Tube() if tube is None else tube
+    if detector is None and scanner is None:
+        detector = Detector()
     panel, camera = _panel(detector, scanner, size, *_pitch(cone))
     design = settings.model(None if scanner is None else tube_of(scanner.tube))
     phantom = as_phantom(sample, material=material, voxel_mm=voxel_mm)
     parts = channels(phantom)
     chain = chain_through(parts, panel, design, settings.mono_keV)
+    nothing = np.zeros(size, np.float32)
+    open_paths = np.zeros((len(parts), *size), np.float32)
+    if exposure_ms is not None:
+        require_within("exposure_ms", exposure_ms, *EXPOSURES_MS, "ms")
+        camera = replace(camera, exposure_ms=float(exposure_ms))
+    elif detector is not None and detector.exposure_ms is None:
+        unit = settings.exposure(1.0)
+        brightest = max(_different(cone), key=lambda row: float(flux_of(row, size).max()))
+        beam = expected_signal(chain, open_paths, brightest, unit).mean_e
+        camera = replace(camera, exposure_ms=_chosen_ms(panel, camera, float(beam.max())))
     exposure = settings.exposure(camera.exposure_ms, camera.averages)
     scattered = None
     if scatter != "off":
@@ -247,19 +279,28 @@ def simulate(
         rng = None if noise is None else frame_rng(noise, number)
         return read_out(panel, expected, camera, lit, rng)
 
-    nothing = np.zeros(size, np.float32)
     dark = read(0, Expected(nothing, nothing), replace(exposure, xrays_on=False))
-    open_paths = np.zeros((len(parts), *size), np.float32)
     flat = read(1, expected_signal(chain, open_paths, cone.rows[0], exposure))
     counts = np.empty((len(cone), *size), np.uint16)
     for i, image in enumerate(truth.radiographs()):
         assert image.expected is not None
         counts[i] = read(2 + i, image.expected)
-    warnings = (*truth.assumed, *_flat_doubts(flat, panel, cone), *_spot_doubt(truth))
-    made = DataSet.from_arrays(
-        counts, cone, dark=dark, flat=flat, name=phantom.name, warnings=warnings, truth=truth
-    )
-    return replace(made, full_scale=panel.full_scale)
+        if progress is not None:
+            progress((i + 1) / len(cone))
+    made = DataSet.from_arrays(counts, cone, dark=dark, flat=flat, name=phantom.name, truth=truth)
+    made = replace(made, full_scale=panel.full_scale)
+    told = *image_doubts(made), *_flat_doubt(size, cone), *_spot_doubt(truth)
+    for doubt in told:
+        warnings.warn(doubt, stacklevel=2)
+    return replace(made, warnings=(*truth.assumed, *told))
+
+
+def _chosen_ms(panel: Panel, camera: CameraSettings, beam_e_per_ms: float) -> float:
+    """Exposure that fills `FILLED` of the panel's range with the open beam [ms]."""
+    dark_e_per_ms = panel.dark_e_per_s * camera.binning**2 / 1000.0
+    range_e = (FILLED * panel.full_scale - panel.offset_counts) * panel.electrons_per_count(camera)
+    low, high = EXPOSURES_MS
+    return min(max(range_e / (beam_e_per_ms + dark_e_per_ms), low), high)
 
 
 def _pitch(cone: ConeVec) -> tuple[float, float]:
@@ -282,11 +323,10 @@ def _panel(
     detector: Detector | None, machine: Machine | None, shape: tuple[int, int], pitch: float,
     row_pitch: float,
 ) -> tuple[Panel, CameraSettings]:  # fmt: skip
-    if detector is not None or machine is None:
-        given = Detector() if detector is None else detector
-        return given.panel(shape, pitch, None if row_pitch == pitch else row_pitch), given.camera(
-            shape
-        )
+    if detector is not None:
+        row_mm = None if row_pitch == pitch else row_pitch
+        return detector.panel(shape, pitch, row_mm), detector.camera(shape)
+    assert machine is not None
     spec = machine.detector
     binning = max(1, round(pitch / spec.pitch_mm))
     edges = spec.pitch_mm, spec.pitch_mm if spec.row_pitch_mm is None else spec.row_pitch_mm
@@ -313,15 +353,8 @@ def _panel(
     return replace(panel_of(spec), lag_fraction=0.0), camera
 
 
-def _flat_doubts(flat: Counts, panel: Panel, cone: ConeVec) -> Iterator[str]:
-    """A flat image must not be saturated, and it holds for views of one distance."""
-    share = float((flat >= panel.full_scale).mean())
-    if share > 0.0:
-        yield (
-            f"{100.0 * share:.3g} % of the flat image are saturated: lower power_W or exposure_ms, "
-            "or raise electrons_per_count"
-        )
-    shape = (int(flat.shape[0]), int(flat.shape[1]))
+def _flat_doubt(shape: tuple[int, int], cone: ConeVec) -> Iterator[str]:
+    """The flat image holds for views of one distance."""
     first = flux_of(cone.rows[0], shape)
     worst = max(
         (float(np.abs(flux_of(row, shape) / first - 1.0).max()) for row in _different(cone)),

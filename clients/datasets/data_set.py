@@ -85,7 +85,7 @@ class DataSet:
         >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
         >>> data = DataSet.from_arrays(np.full((3, 4, 5), 500), scan, flat=np.full((4, 5), 1000))
         >>> data
-        <DataSet 'arrays': 3 projections of 4 x 5, complete>
+        <DataSet 'arrays': 3 projections of 4 x 5, complete, 1 warning>
         >>> round(float(data[0][0, 0]), 4), len(data[1:])
         (0.6931, 2)
     """
@@ -140,7 +140,7 @@ class DataSet:
         Example:
             >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
             >>> DataSet.from_arrays(np.full((3, 4, 5), 500), scan, name="mine")
-            <DataSet 'mine': 3 projections of 4 x 5, complete>
+            <DataSet 'mine': 3 projections of 4 x 5, complete, 1 warning>
         """
         values = np.asarray(counts)
         if values.ndim != 3 or 0 in values.shape:
@@ -173,7 +173,11 @@ class DataSet:
     def __repr__(self) -> str:
         rows, cols = self.shape
         state = "complete" if self.complete else "incomplete"
-        return f"<DataSet {self.name!r}: {len(self)} projections of {rows} x {cols}, {state}>"
+        many = len(self.warnings)
+        doubts = f", {many} warning{'s' if many > 1 else ''}" if many else ""
+        return (
+            f"<DataSet {self.name!r}: {len(self)} projections of {rows} x {cols}, {state}{doubts}>"
+        )
 
     @overload
     def __getitem__(self, index: int) -> Float32Array: ...

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from flexdt.clients.datasets.data_set import DataSet
+from flexdt.clients.expose import image_doubts
 from flexdt.clients.reconstruction.volume_files import (
     check_name,
     read_volume,
@@ -131,7 +132,7 @@ class ScanFrames:
         rings: (rows, cols) to subtract from the line integrals, or None.
         harden: straightens line integrals of one material, or None.
         scatter: of each of the m frames, to subtract, or None.
-        doubts: what is doubtful about the corrections.
+        doubts: what is doubtful about the images and the corrections.
     """
 
     dataset: DataSet
@@ -366,6 +367,7 @@ def _task(
     if name not in ALGORITHMS:
         raise UnknownNameError.among(f"unknown algorithm {name!r}; allowed", name, ALGORITHMS)
     views = views_of(dataset, parameters, binning=wanted.binning, every=wanted.every)
+    views = replace(views, doubts=tuple(image_doubts(dataset, needed=True)))
     return wanted, views, grid_of(views, wanted)
 
 
@@ -439,7 +441,7 @@ def _without_scatter(
     found = scatterer_of(stack, geometry, chain, kV)
     beam = Beam.of(chain, kV)
     scatter = scan_scatter(found.thing, views.cone_vec.rows, views.shape, beam)
-    return replace(views, scatter=scatter, doubts=found.doubts)
+    return replace(views, scatter=scatter, doubts=(*views.doubts, *found.doubts))
 
 
 def _source(dataset: DataSet, request: VolumeRequest) -> tuple[float, TubeModel, float | None]:

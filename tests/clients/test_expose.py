@@ -77,9 +77,8 @@ def test_saturation_is_known_of_a_saved_scan_and_else_unknown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], bits: int
 ) -> None:
     geometry = fx.ConeVec.circular(sod=600, sdd=700, angles=3, shape=(20, 30), pixel=1.0)
-    scan = fx.simulate(
-        rod(2.0), geometry, tube=fx.Tube(power_W=100), detector=fx.Detector(bits=bits)
-    )
+    with pytest.warns(UserWarning, match="are saturated"):
+        scan = fx.simulate(rod(2.0), geometry, detector=fx.Detector(bits=bits), exposure_ms=200.0)
     share = float((scan.counts() == 2**bits - 1).mean())
     assert share > 0.5
     scan.save(tmp_path / "whole")
@@ -180,3 +179,28 @@ def test_the_command_says_the_same(forecast: Any, capsys: pytest.CaptureFixture[
     out = capsys.readouterr().out
     assert "transmission: least" in out
     assert "best of" in out
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_choice_of_tube_and_detector_saturates_unless_the_exposure_is_given(seed: int) -> None:
+    """An ordinary geometry and the default tube saturated all pixels, and the volume was zero."""
+    rng = np.random.default_rng(seed)
+    sod = float(rng.uniform(60, 300))
+    cone = fx.ConeVec.circular(
+        sod=sod, sdd=sod * float(rng.uniform(1.2, 4)), angles=24, shape=(24, 40),
+        pixel=float(rng.uniform(0.3, 1.0)),
+    )  # fmt: skip
+    tube = fx.Tube(kV=float(rng.uniform(40, 200)), power_W=float(rng.uniform(2, 90)), spot_mm=0.0)
+    panel = fx.Detector(bits=int(rng.integers(10, 17)), dead_fraction=0.0)
+    ball = {"kind": "sphere", "center": [0, 0, 0], "radius": 2.0, "material": "pmma"}
+    scan = fx.simulate(ball, cone, tube=tube, detector=panel, noise=seed)
+    assert not scan.warnings
+    assert 0.7 < scan.flat.max() / panel.panel((24, 40), 1.0).full_scale < 0.95
+    steps: list[float] = []
+    longer = {"exposure_ms": 30.0 * scan.truth.exposure.exposure_ms, "progress": steps.append}
+    with pytest.warns(UserWarning, match="100 % of the pixels of the .* saturated"):
+        bright = fx.simulate(ball, cone, tube=tube, detector=panel, noise=seed, **longer)
+    assert steps == pytest.approx(np.arange(1, 25) / 24)
+    assert "2 warnings" in repr(bright)
+    with pytest.raises(fx.TwinError, match="hold no line integrals"):
+        bright.reconstruct("fdk", voxel=1.0)

@@ -18,6 +18,8 @@ from flexdt.twin.physics.spectrum import Filter, TubeModel, monochromatic, volta
 
 CAMERA_MODE = "HW1SW1High"
 """Of a `Detector`: its pixels are those of the image."""
+USUAL_MS = 100.0
+"""Exposure of a `Detector` that states none, where no tube says how bright its images are [ms]."""
 TWINS_PIXEL_MM = 2 * Panel.pitch_mm
 """The twin's pixels as it is usually read out, binned 2 x."""
 TWINS_GAIN = Panel.full_well_e[0] / 2**Panel.bits
@@ -102,7 +104,8 @@ class Detector:
     Args:
         pixel_mm: pitch of the pixels [mm]; None for the geometry's. Another pitch than the
             geometry's is an error.
-        exposure_ms: of one read-out [ms].
+        exposure_ms: of one read-out [ms]; None: `flexdt.simulate` chooses it so that the brightest
+            pixel of the open beam reaches 80 % of the largest count.
         averages: read-outs averaged into an image.
         bits: depth, 1 to 16; counts end at 2^bits - 1.
         electrons_per_count: conversion gain; a pixel saturates at 2^bits times that. None: so that
@@ -130,7 +133,7 @@ class Detector:
     """
 
     pixel_mm: float | None = None
-    exposure_ms: float = 100.0
+    exposure_ms: float | None = None
     averages: int = 1
     bits: int = Panel.bits
     electrons_per_count: float | None = None
@@ -162,7 +165,7 @@ class Detector:
                 )
 
     @classmethod
-    def ideal(cls, *, exposure_ms: float = 100.0, **figures: float) -> Detector:
+    def ideal(cls, **figures: float) -> Detector:
         """A detector whose only noise is that of the X-rays: no blur, pattern, dark charge,
         dead pixels or read noise; `figures` replace fields.
 
@@ -181,8 +184,7 @@ class Detector:
                 f"a Detector has no {', '.join(unknown)}; allowed: {', '.join(sorted(known))}",
                 {"asked": unknown, "allowed": sorted(known)},
             )
-        given: dict[str, float] = {**nothing, "exposure_ms": exposure_ms, **figures}
-        return cls(**given)  # type: ignore[arg-type]
+        return cls(**{**nothing, **figures})  # type: ignore[arg-type]
 
     def panel(self, shape: tuple[int, int], pixel_mm: float, row_mm: float | None = None) -> Panel:
         """This detector as a panel of (rows, cols) pixels of `pixel_mm`, read out whole; `row_mm`
@@ -228,7 +230,8 @@ class Detector:
             Roi(left=0, top=0, right=199, bottom=99)
         """
         roi = Roi(0, 0, shape[1] - 1, shape[0] - 1)
-        return CameraSettings(CAMERA_MODE, roi, float(self.exposure_ms), int(self.averages))
+        time = USUAL_MS if self.exposure_ms is None else float(self.exposure_ms)
+        return CameraSettings(CAMERA_MODE, roi, time, int(self.averages))
 
 
 _OF_PANEL = ("scintillator", "scintillator_mm", "packing", "swank", "electrons_per_keV",
