@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.clients.datasets.data_set import DataSet
-from flexdt.server.files.dataset_folder import (
+from flexdt.runtime.files.dataset_folder import (
     Folder,
     list_folder,
     read_image,

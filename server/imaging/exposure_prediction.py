@@ -10,7 +10,7 @@ from flexdt.phantoms.exposure_forecast import expose
 from flexdt.protocol import Codec
 from flexdt.protocol.connection import encoded
 from flexdt.protocol.methods.image_messages import PREDICTION_LIMITS, ExposurePrediction
-from flexdt.server.runtime.workers import Workers
+from flexdt.runtime.workers import Workers
 from flexdt.twin.machine.description import Machine
 
 BEST: Final = 10

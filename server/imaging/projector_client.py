@@ -19,8 +19,8 @@ import numpy.typing as npt
 from flexdt.phantoms.json_form import scene_to_dict
 from flexdt.protocol import Code, RpcError, hello_params, image, parse_result
 from flexdt.protocol.projector import Health, VolumeList
+from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.projector.wire import LinkLost, ProjectorLink
-from flexdt.server.wire_errors import ProjectorUnavailable
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Body, TriangleMesh, Volume
 from flexdt.twin.projection.analytic_solids import Scene

@@ -24,9 +24,9 @@ from typing import Protocol
 
 from flexdt.protocol import Connection, Failure, Response, RpcError
 from flexdt.protocol.rpc_errors import not_authorised
+from flexdt.runtime.access import token_matches
+from flexdt.runtime.log import LOGGER, Sparing, log, traced
 from flexdt.server.network.shell_application import Observe
-from flexdt.server.runtime.access import token_matches
-from flexdt.server.runtime.log import LOGGER, Sparing, log, traced
 
 WRONG_TOKENS = 3
 """Wrong tokens after which a connection is closed."""

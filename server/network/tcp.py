@@ -56,6 +56,9 @@ from flexdt.protocol.rpc_errors import (
     parse_error,
     too_large,
 )
+from flexdt.runtime.access import ConnectionLimits, check_bind
+from flexdt.runtime.log import Sparing
+from flexdt.runtime.loop import ListeningServer, tune
 from flexdt.server.network.outbox import Outbox
 from flexdt.server.network.shell_application import (
     App,
@@ -77,9 +80,6 @@ from flexdt.server.network.shell_parts import (
     neighbourhood,
 )
 from flexdt.server.network.turns import FIRST, ORDINARY, URGENT, LoopTurns
-from flexdt.server.runtime.access import ConnectionLimits, check_bind
-from flexdt.server.runtime.log import Sparing
-from flexdt.server.runtime.loop import ListeningServer, tune
 
 READ_AHEAD = 512 << 10
 """Bytes of whole messages that one connection may have waiting; then it is read no further."""

@@ -19,11 +19,11 @@ import numpy.typing as npt
 from flexdt.protocol import MAX_FRAME, Correlation, Notification, Role, image
 from flexdt.protocol.messages import Id
 from flexdt.protocol.rpc_errors import superseded
+from flexdt.runtime.log import Sparing
 from flexdt.server.network.shell_parts import TokenCheck
 from flexdt.server.projector.compute import ComputeJob, ComputeThread, Customer
 from flexdt.server.projector.volumes import VolumeStore
 from flexdt.server.projector.wire import FrameLink
-from flexdt.server.runtime.log import Sparing
 
 PART_BYTES: Final = 8 * 2**20
 """Payload of a part of what does not fit into one frame."""

@@ -40,6 +40,11 @@ from flexdt.protocol.rpc_errors import (
     invalid_request,
     not_authorised,
 )
+from flexdt.runtime.access import ConnectionLimits, check_bind
+from flexdt.runtime.http_pages import Pages, watching_pages
+from flexdt.runtime.log import current, log
+from flexdt.runtime.loop import ListeningServer
+from flexdt.runtime.metrics import Figure, Requests, counter, gauge
 from flexdt.server.network.shell_application import Observe, unobserved
 from flexdt.server.network.shell_parts import answered
 from flexdt.server.projector.compute import ComputeThread
@@ -47,11 +52,6 @@ from flexdt.server.projector.context import Context, JobClient
 from flexdt.server.projector.projector_methods import ANSWERS
 from flexdt.server.projector.volumes import VolumeStore
 from flexdt.server.projector.wire import FrameLink
-from flexdt.server.runtime.access import ConnectionLimits, check_bind
-from flexdt.server.runtime.http_pages import Pages, watching_pages
-from flexdt.server.runtime.log import current, log
-from flexdt.server.runtime.loop import ListeningServer
-from flexdt.server.runtime.metrics import Figure, Requests, counter, gauge
 from flexdt.twin.errors import TwinError
 
 MAX_PENDING_BYTES: Final = 64 * 2**20

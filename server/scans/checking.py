@@ -22,8 +22,8 @@ from flexdt.protocol.codec import write_json, write_msgpack
 from flexdt.protocol.connection import MAX_ANSWER
 from flexdt.protocol.methods.job_messages import CHECK_LIMITS
 from flexdt.protocol.rpc_errors import Code, RpcError, too_large
-from flexdt.server.runtime.loop import ServerLoop
-from flexdt.server.runtime.workers import Workers
+from flexdt.runtime.loop import ServerLoop
+from flexdt.runtime.workers import Workers
 from flexdt.server.scans.scan_record import PoseList, ScanSource
 from flexdt.twin.collision.convex_solids import Polytope
 from flexdt.twin.collision.plan_report import collision_check

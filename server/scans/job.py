@@ -11,7 +11,7 @@ from pathlib import Path
 
 from flexdt.protocol.rpc_errors import Code
 from flexdt.protocol.state_model import JobPhase
-from flexdt.server.files.directory import Directory
+from flexdt.runtime.files.directory import Directory
 from flexdt.server.scans.runner import Produce, Progress, ScanRunner
 from flexdt.server.scans.twin_clock import SpeedUp
 from flexdt.server.storage.dataset_writer import DatasetWriter

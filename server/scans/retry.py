@@ -11,8 +11,8 @@ import asyncio
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from flexdt.server.files.directory import free_bytes
-from flexdt.server.wire_errors import ProjectorUnavailable
+from flexdt.runtime.files.directory import free_bytes
+from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.twin.dataset.dataset_errors import DiskFullError
 from flexdt.twin.errors import GeometryError, LimitError, TwinError
 

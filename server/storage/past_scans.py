@@ -27,7 +27,7 @@ from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import dataset_messages as p
 from flexdt.protocol.methods.calibration_messages import CalibrationAlign, CalibrationFit
 from flexdt.protocol.rpc_errors import too_large
-from flexdt.server.files.dataset_folder import (
+from flexdt.runtime.files.dataset_folder import (
     Folder,
     confined,
     list_folder,
@@ -36,10 +36,10 @@ from flexdt.server.files.dataset_folder import (
     read_image,
     read_text,
 )
-from flexdt.server.files.directory import Directory
-from flexdt.server.runtime.workers import Workers
+from flexdt.runtime.files.directory import Directory
+from flexdt.runtime.wire_errors import from_root
+from flexdt.runtime.workers import Workers
 from flexdt.server.storage import dataset_fits
-from flexdt.server.wire_errors import from_root
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetMissingError, DatasetNameError
 from flexdt.twin.dataset.file_names import DOCUMENT, SCRIPT, plain_name
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, FrameEntry, parse_document

@@ -33,8 +33,8 @@ from flexdt.phantoms import (
 from flexdt.phantoms import material as material_of
 from flexdt.phantoms.files.phantom_files import sent_scene
 from flexdt.protocol.rpc_errors import RpcError, too_large
-from flexdt.server.files.directory import TEMPORARY, Directory
-from flexdt.server.files.own_documents import (
+from flexdt.runtime.files.directory import TEMPORARY, Directory
+from flexdt.runtime.files.own_documents import (
     ASIDE,
     Changes,
     file_stem,
@@ -43,8 +43,8 @@ from flexdt.server.files.own_documents import (
     read_or_set_aside,
     set_aside,
 )
-from flexdt.server.runtime.worker import limit
-from flexdt.server.runtime.workers import Worker
+from flexdt.runtime.worker import limit
+from flexdt.runtime.workers import Worker
 from flexdt.server.storage.unfinished_uploads import Incoming, UploadHead
 from flexdt.twin.errors import LimitError, TwinError, UnknownNameError
 

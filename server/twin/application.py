@@ -11,11 +11,11 @@ from contextlib import AbstractContextManager, nullcontext
 
 from flexdt.protocol import AnyMethod
 from flexdt.protocol.fields import Params
+from flexdt.runtime.wire_errors import explain, is_user_error
 from flexdt.server.network.shell_application import Peer
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers import HANDLERS
 from flexdt.server.twin.handlers.handler import Client
-from flexdt.server.wire_errors import explain, is_user_error
 
 
 class TwinSession:

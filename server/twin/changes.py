@@ -10,7 +10,7 @@ import copy
 from collections.abc import Callable
 
 from flexdt.protocol.scene_document import Scene
-from flexdt.server.files.own_documents import Changes
+from flexdt.runtime.files.own_documents import Changes
 from flexdt.server.storage.corrections import History
 from flexdt.server.storage.memory import Memory, as_of
 from flexdt.server.storage.scene import apply_settings, paces_of

@@ -21,14 +21,14 @@ from typing import Any, Literal
 
 from flexdt.protocol import state_model as w
 from flexdt.protocol.rpc_errors import RpcError, busy
-from flexdt.server.files.directory import Directory
-from flexdt.server.files.own_documents import settle
+from flexdt.runtime.access import TwinLimits
+from flexdt.runtime.files.directory import Directory
+from flexdt.runtime.files.own_documents import settle
+from flexdt.runtime.log import LEVELS, log
 from flexdt.server.imaging.exposure_prediction import predictors
 from flexdt.server.imaging.projections import Imaging, Projector
 from flexdt.server.imaging.radiography import Physics, Radiography, with_spectra
 from flexdt.server.imaging.truth import TrueGeometry
-from flexdt.server.runtime.access import TwinLimits
-from flexdt.server.runtime.log import LEVELS, log
 from flexdt.server.scans.job import Job
 from flexdt.server.scans.jobs import Jobs, fresh_seed
 from flexdt.server.scans.stage import Stage

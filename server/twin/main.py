@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 from flexdt import machines
 from flexdt.process_settings import TwinSettings, parse
-from flexdt.server.runtime.access import (
+from flexdt.runtime.access import (
     ConnectionLimits,
     TwinLimits,
     check_bind,
@@ -22,8 +22,8 @@ from flexdt.server.runtime.access import (
     server_tls,
     with_limits,
 )
-from flexdt.server.runtime.log import LEVELS, set_up
-from flexdt.server.runtime.process import FAILED, OK, announce, first_of, run_process, stop_signal
+from flexdt.runtime.log import LEVELS, set_up
+from flexdt.runtime.process import FAILED, OK, announce, first_of, run_process, stop_signal
 from flexdt.server.scans.twin_clock import SpeedUp, check_speed_up
 
 DEFAULT_SAMPLE = "lego"
@@ -47,14 +47,14 @@ def speed_up_of(text: str) -> SpeedUp:
 
 async def run(options: TwinSettings) -> int:
     """Serve until SIGTERM or SIGINT; returns the exit code."""
-    from flexdt.server.files.directory import open_data
-    from flexdt.server.files.directory_lock import FolderLock
+    from flexdt.runtime.files.directory import open_data
+    from flexdt.runtime.files.directory_lock import FolderLock
+    from flexdt.runtime.http_pages import served_pages
+    from flexdt.runtime.metrics import Requests
     from flexdt.server.imaging.projector_client import ProjectorClient
     from flexdt.server.imaging.projector_pool import ProjectorPool
     from flexdt.server.imaging.truth import load_truth
     from flexdt.server.network.tcp import serve
-    from flexdt.server.runtime.http_pages import served_pages
-    from flexdt.server.runtime.metrics import Requests
     from flexdt.server.scans.jobs import fresh_seed
     from flexdt.server.twin.application import TwinApp
     from flexdt.server.twin.core import TwinServer

@@ -9,12 +9,12 @@ from collections import Counter
 from typing import get_args
 
 from flexdt.protocol.state_model import JobPhase
-from flexdt.server.files.directory import free_bytes
+from flexdt.runtime.files.directory import free_bytes
+from flexdt.runtime.http_pages import Pages, watching_pages
+from flexdt.runtime.metrics import Figure, Requests, counter, gauge
 from flexdt.server.imaging.projector_client import ProjectorClient
 from flexdt.server.imaging.projector_pool import ProjectorPool
 from flexdt.server.network.tcp import TcpServer
-from flexdt.server.runtime.http_pages import Pages, watching_pages
-from flexdt.server.runtime.metrics import Figure, Requests, counter, gauge
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.hub import Topic
 

@@ -15,7 +15,7 @@ import numpy as np
 from in_process import Lab, M, P, run
 
 import flexdt as fx
-from flexdt.server.files.directory import open_data
+from flexdt.runtime.files.directory import open_data
 from flexdt.server.twin.application import TwinApp
 from flexdt.server.twin.core import TwinServer
 

@@ -20,7 +20,7 @@ from direct_projector import DirectProjector
 
 import flexdt
 from flexdt.protocol.image import decode
-from flexdt.server.files.directory import open_data
+from flexdt.runtime.files.directory import open_data
 from flexdt.server.network.tcp import serve
 from flexdt.server.twin.application import TwinApp
 from flexdt.server.twin.core import TwinServer

@@ -16,11 +16,7 @@ from lab import Process, Wire, twin
 from flexdt.clients import ConnectionLost, TwinClient
 from flexdt.protocol import Method, RpcError
 from flexdt.protocol.fields import Params
-from flexdt.server.imaging.projector_client import ProjectorClient
-from flexdt.server.network.shell_application import Peer
-from flexdt.server.network.tcp import serve
-from flexdt.server.projector.service import serve_projector
-from flexdt.server.runtime.access import (
+from flexdt.runtime.access import (
     AccessError,
     ConnectionLimits,
     check_bind,
@@ -30,7 +26,11 @@ from flexdt.server.runtime.access import (
     server_tls,
     token_matches,
 )
-from flexdt.server.wire_errors import ProjectorUnavailable
+from flexdt.runtime.wire_errors import ProjectorUnavailable
+from flexdt.server.imaging.projector_client import ProjectorClient
+from flexdt.server.network.shell_application import Peer
+from flexdt.server.network.tcp import serve
+from flexdt.server.projector.service import serve_projector
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 
 TLS = Path(__file__).parents[1] / "data" / "tls"

@@ -19,19 +19,19 @@ from flexdt.clients.client.async_client import AsyncTwinClient
 from flexdt.clients.client.client import TwinClient
 from flexdt.protocol import METHODS, Connection, Failure, RpcError
 from flexdt.protocol.method import compatible
-from flexdt.server.files.directory import open_data
-from flexdt.server.files.own_documents import used_bytes
-from flexdt.server.runtime.access import (
+from flexdt.runtime.access import (
     AccessError,
     ConnectionLimits,
     TwinLimits,
     limit_names,
     with_limits,
 )
+from flexdt.runtime.files.directory import open_data
+from flexdt.runtime.files.own_documents import used_bytes
+from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.scans import retry as retry_module
 from flexdt.server.scans.retry import Retry, transient
 from flexdt.server.twin.core import Control
-from flexdt.server.wire_errors import ProjectorUnavailable
 from flexdt.twin.dataset.dataset_errors import DiskFullError
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile

@@ -23,11 +23,11 @@ from flexdt.process_settings import (
     shared,
     words,
 )
-from flexdt.server.files.directory import Directory
-from flexdt.server.files.directory_lock import FolderLock
+from flexdt.runtime import process
+from flexdt.runtime.files.directory import Directory
+from flexdt.runtime.files.directory_lock import FolderLock
+from flexdt.runtime.loop import ServerLoop
 from flexdt.server.projector import main as projector_main
-from flexdt.server.runtime import process
-from flexdt.server.runtime.loop import ServerLoop
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 
 PROCESSES = (UpSettings, TwinSettings, ProjectorSettings, ViewerSettings, GatewaySettings)

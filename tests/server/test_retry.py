@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
+from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.scans import retry
 from flexdt.server.scans.retry import Retry, hopeless, transient
-from flexdt.server.wire_errors import ProjectorUnavailable
 from flexdt.twin.dataset.dataset_errors import DiskFullError
 from flexdt.twin.errors import GeometryError, LimitError, TwinError
 from tests.support.simulated_loop import SimulatedLoop

@@ -17,12 +17,12 @@ from strangers import draw, hello, play, request
 
 from flexdt.protocol import Method
 from flexdt.protocol.fields import Params
+from flexdt.runtime.access import ConnectionLimits
+from flexdt.runtime.log import JsonLines, Sparing
 from flexdt.server.network import tcp
 from flexdt.server.network.shell_application import Peer
 from flexdt.server.network.shell_parts import Room, neighbourhood
 from flexdt.server.network.tcp import TcpServer, serve
-from flexdt.server.runtime.access import ConnectionLimits
-from flexdt.server.runtime.log import JsonLines, Sparing
 
 TOKEN = "sixteen letters or more"
 PEER, OTHER = "127.0.0.2", "127.0.0.3"

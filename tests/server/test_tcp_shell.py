@@ -27,10 +27,10 @@ from flexdt.protocol import (
     event,
 )
 from flexdt.protocol.fields import Params
+from flexdt.runtime.access import AccessError, ConnectionLimits
 from flexdt.server.network import tcp
 from flexdt.server.network.shell_application import Peer
 from flexdt.server.network.tcp import TcpServer, serve
-from flexdt.server.runtime.access import AccessError, ConnectionLimits
 
 TOKEN = "0123456789abcdef"
 

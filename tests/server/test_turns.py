@@ -11,11 +11,11 @@ import pytest
 
 from flexdt.protocol import METHODS, Codec, Connection, Method, Request
 from flexdt.protocol.fields import Params
+from flexdt.runtime.access import ConnectionLimits
 from flexdt.server.network import tcp
 from flexdt.server.network.shell_application import Peer
 from flexdt.server.network.tcp import READ_AHEAD, TcpServer, _Link
 from flexdt.server.network.turns import FIRST, ORDINARY, URGENT, LoopTurns
-from flexdt.server.runtime.access import ConnectionLimits
 
 
 class Transport(asyncio.Transport):

@@ -18,9 +18,9 @@ from in_process import script
 
 from flexdt.protocol import Codec, Connection, RpcError
 from flexdt.protocol.rpc_errors import Code
-from flexdt.server.files.directory import open_data
-from flexdt.server.runtime import processor_time
-from flexdt.server.runtime.workers import Workers
+from flexdt.runtime import processor_time
+from flexdt.runtime.files.directory import open_data
+from flexdt.runtime.workers import Workers
 from flexdt.server.scans import checking
 from flexdt.server.scans.checking import CheckInput, Checks
 from flexdt.server.scans.scan_record import JobRecord, PoseList, ScanSource

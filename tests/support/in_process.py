@@ -14,10 +14,10 @@ import pytest
 
 from flexdt.protocol import METHODS, Codec, Connection, Message, Prepared, RpcError, parse_params
 from flexdt.protocol.messages import Encoded
-from flexdt.server.files.directory import open_data
+from flexdt.runtime.files.directory import open_data
+from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.twin.application import TwinApp
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.wire_errors import ProjectorUnavailable
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.description import builtin_machine, builtin_profile

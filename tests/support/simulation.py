@@ -37,8 +37,8 @@ from in_process import Client, M, P, PointProjector
 from simulated_disk import Disk, Fault
 from simulated_loop import SimulatedLoop
 
-from flexdt.server.files.directory import open_data
-from flexdt.server.files.directory_lock import FolderLock
+from flexdt.runtime.files.directory import open_data
+from flexdt.runtime.files.directory_lock import FolderLock
 from flexdt.server.twin.application import TwinApp
 from flexdt.server.twin.core import TwinServer
 from flexdt.twin.machine.description import Machine, Profile

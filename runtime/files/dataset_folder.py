@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.server.files.directory import Directory
+from flexdt.runtime.files.directory import Directory
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
 from flexdt.twin.dataset.file_names import DOCUMENT, GEOMETRY, SCAN_SETTINGS, XRE_SETTINGS
 from flexdt.twin.geometry.conventions import Float32Array

@@ -19,8 +19,8 @@ from collections.abc import Callable
 from time import perf_counter
 from typing import Any, Final
 
-from flexdt.server.runtime.log import Sparing
-from flexdt.server.runtime.metrics import Histogram
+from flexdt.runtime.log import Sparing
+from flexdt.runtime.metrics import Histogram
 
 BACKLOG = 1024
 """Connections that the system keeps until they are accepted. Beyond them it drops a client's first

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TextIO, TypeVar
 
 from flexdt.process_settings import ProcessSettings
-from flexdt.server.runtime.access import AccessError, AccessFileError
-from flexdt.server.runtime.loop import ServerLoop
+from flexdt.runtime.access import AccessError, AccessFileError
+from flexdt.runtime.loop import ServerLoop
 from flexdt.twin.errors import TwinError
 
 OK = 0

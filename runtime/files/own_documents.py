@@ -17,8 +17,8 @@ from contextlib import suppress
 from typing import TypeVar
 
 from flexdt.protocol.fields import MAX_STEM, encoded
-from flexdt.server.files.directory import BEFORE, Directory, writing
-from flexdt.server.runtime.log import log
+from flexdt.runtime.files.directory import BEFORE, Directory, writing
+from flexdt.runtime.log import log
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.errors import LimitError
 

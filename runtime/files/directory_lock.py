@@ -7,7 +7,7 @@ however that happens.
 
 from __future__ import annotations
 
-from flexdt.server.files.directory import Directory
+from flexdt.runtime.files.directory import Directory
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 
 

@@ -9,7 +9,7 @@ from datetime import datetime
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.server.files.directory import Directory
+from flexdt.runtime.files.directory import Directory
 from flexdt.twin.dataset.file_names import plain_name
 
 

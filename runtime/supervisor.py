@@ -23,8 +23,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from flexdt.process_settings import Address
-from flexdt.server.runtime import processor_time
-from flexdt.server.runtime.process import stop_signal
+from flexdt.runtime import processor_time
+from flexdt.runtime.process import stop_signal
 
 STALLED_S = 300.0
 """A service that is not ready and has used no processor time for so long waits for something that
@@ -188,7 +188,7 @@ class Supervisor:
                 sys.executable,
                 "-P",  # the installed package, not what the current folder has of that name
                 "-m",
-                "flexdt.server.runtime.child",
+                "flexdt.runtime.child",
                 *service.command(dict(self.addresses)),
                 stdin=PIPE,
                 stdout=PIPE,

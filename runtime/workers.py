@@ -21,8 +21,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 from flexdt.protocol.rpc_errors import Code, RpcError, busy, too_large
-from flexdt.server.runtime import processor_time
-from flexdt.server.runtime.worker import Parts, Work, receive_parts, send_parts
+from flexdt.runtime import processor_time
+from flexdt.runtime.worker import Parts, Work, receive_parts, send_parts
 
 KEPT_BYTES = 400 << 20
 """A process that has taken more is replaced, so that the memory is given back."""
@@ -46,7 +46,7 @@ class Worker:
         environment = {k: v for k, v in os.environ.items() if k != "FLEXDT_TOKEN"}
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "flexdt.server.runtime.worker",
+                [sys.executable, "-P", "-m", "flexdt.runtime.worker",
                  str(theirs.fileno()), str(memory_bytes)],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
