@@ -23,8 +23,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from flexdt.process_settings import Address
-from flexdt.runtime import processor_time
-from flexdt.runtime.process import stop_signal
+from flexdt.runtime.process import session_seconds, stop_signal
 
 STALLED_S = 300.0
 """A service that is not ready and has used no processor time for so long waits for something that
@@ -228,7 +227,7 @@ class Supervisor:
         self.note(f"waiting for the {service.name}" + (service.slow and f": {service.slow}"))
         while True:
             await asyncio.sleep(STILL_S)
-            used_s = processor_time.of_session(process.pid)
+            used_s = session_seconds(process.pid)
             if used_s is not None:
                 self.note(f"the {service.name} is still starting: {used_s:.0f} s of work so far")
 
@@ -307,10 +306,10 @@ async def _ended(process: Process) -> int:
 async def _stalled(process: Process) -> None:
     """Return once a process and what it started have used no processor time for `STALLED_S`."""
     clock = asyncio.get_running_loop().time
-    used_s, since = processor_time.of_session(process.pid), clock()
+    used_s, since = session_seconds(process.pid), clock()
     while used_s is None or clock() - since < STALLED_S:
         await asyncio.sleep(LOOK_S)
-        if (now_s := processor_time.of_session(process.pid)) != used_s:
+        if (now_s := session_seconds(process.pid)) != used_s:
             used_s, since = now_s, clock()
 
 

@@ -21,7 +21,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 from flexdt.protocol.rpc_errors import Code, RpcError, busy, too_large
-from flexdt.runtime import processor_time
+from flexdt.runtime.process import process_seconds
 from flexdt.runtime.worker import Parts, Work, receive_parts, send_parts
 
 KEPT_BYTES = 400 << 20
@@ -111,12 +111,12 @@ class Worker:
         Raises:
             TimeoutError: the work has used, or done nothing for, so much time.
         """
-        begun = used = processor_time.of_process(self.pid)
+        begun = used = process_seconds(self.pid)
         since = time.monotonic()
         with selectors.DefaultSelector() as answer:
             answer.register(self._channel, selectors.EVENT_READ)
             while not answer.select(min(LOOK_S, seconds)):
-                now = processor_time.of_process(self.pid)
+                now = process_seconds(self.pid)
                 if now != used:
                     used, since = now, time.monotonic()
                 worked = 0.0 if now is None or begun is None else now - begun

@@ -22,8 +22,8 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.protocol.state_model import State
+from flexdt.runtime.files.dataset_folder import free_name, tiff_bytes
 from flexdt.runtime.files.directory import Directory, open_data
-from flexdt.runtime.files.image_files import free_name, tiff_bytes
 from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.dataset.file_names import DOCUMENT, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, FrameEntry, parse_document

@@ -48,8 +48,7 @@ from flexdt.runtime.metrics import Figure, Requests, counter, gauge
 from flexdt.server.network.shell_application import Observe, unobserved
 from flexdt.server.network.shell_parts import answered
 from flexdt.server.projector.compute import ComputeThread
-from flexdt.server.projector.context import Context, JobClient
-from flexdt.server.projector.projector_methods import ANSWERS
+from flexdt.server.projector.projector_methods import ANSWERS, Context, JobClient
 from flexdt.server.projector.volumes import VolumeStore
 from flexdt.server.projector.wire import FrameLink
 from flexdt.twin.errors import TwinError

@@ -1,14 +1,18 @@
-"""What stands on the stage, for everyone who must know its shape: collisions, checks, states.
+"""What stands on the stage, for everyone who must know its shape: collisions, checks, drawings.
 
 Convex pieces and sizes of samples follow from the phantoms and are worked out once. A guard is
-made for one sample and one correction; another of either is another guard.
+made for one sample and one correction; another of either is another guard. Clients that draw get
+binary STL in mm, in the sample's own frame.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Any, Final
 
 from flexdt.phantoms import Phantom
+from flexdt.protocol.rpc_errors import too_large
 from flexdt.server.storage.stored_samples import Phantoms
 from flexdt.twin.collision.collision_scene import Scene, build_scene
 from flexdt.twin.collision.convex_solids import Polytope
@@ -21,6 +25,9 @@ from flexdt.twin.scanner.state import Placement, Sample
 from flexdt.twin.script.planning.plan import SampleSize
 
 KEPT = 8
+MAX_BYTES: Final = 64 << 20
+HEADER, FACE = 84, 50
+"""Bytes of binary STL: before the faces, and of each."""
 
 
 class Stage:
@@ -113,3 +120,38 @@ def _pieces(phantom: Phantom, offset: Placement) -> tuple[Polytope, ...]:
     return convex_pieces(
         phantom.mesh(around=True), rotation=offset.rotation, offset=(offset.x, offset.y, offset.z)
     )
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The mesh of a sample as binary STL, and the revision of the upload that it was made of."""
+
+    name: str
+    revision: str | None
+    stl: bytes
+
+
+class Shapes:
+    """The last shape asked for; kept until another sample's is."""
+
+    def __init__(self, limit: int = MAX_BYTES) -> None:
+        self._limit = limit
+        self._kept: Shape | None = None
+
+    def known(self, name: str, revision: str | None) -> Shape | None:
+        """A shape that was made already."""
+        kept = self._kept
+        return kept if kept is not None and (kept.name, kept.revision) == (name, revision) else None
+
+    def make(self, name: str, revision: str | None, phantom: Phantom) -> Shape:
+        """The shape of `phantom`; it may take a second.
+
+        Raises:
+            RpcError: -32008, more triangles than are sent.
+        """
+        mesh: Any = phantom.mesh()
+        size = HEADER + FACE * len(mesh.faces)
+        if size > self._limit:
+            raise too_large("the sample's mesh", size, self._limit)
+        self._kept = Shape(name, revision, mesh.export(file_type="stl"))
+        return self._kept

@@ -18,8 +18,8 @@ from datetime import datetime
 from flexdt.protocol import Codec
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.rpc_errors import RpcError, invalid_params
+from flexdt.runtime.files.dataset_folder import dated_name
 from flexdt.runtime.files.directory import Directory, free_bytes
-from flexdt.runtime.files.image_files import dated_name
 from flexdt.runtime.files.own_documents import used_bytes
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.scans.acquisition import Acquisition, FrameListener

@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 import tifffile
 
+from flexdt.runtime.files.dataset_folder import tiff_bytes
 from flexdt.runtime.files.directory import Directory, Write, free_bytes, write_some
-from flexdt.runtime.files.image_files import tiff_bytes
 from flexdt.twin.dataset.dataset_errors import (
     DatasetError,
     DatasetExistsError,

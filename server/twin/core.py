@@ -25,13 +25,13 @@ from flexdt.runtime.access import TwinLimits
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.own_documents import settle
 from flexdt.runtime.log import LEVELS, log
-from flexdt.server.imaging.exposure_prediction import predictors
+from flexdt.server.imaging.exposure_quality import predictors
 from flexdt.server.imaging.projections import Imaging, Projector
 from flexdt.server.imaging.radiography import Physics, Radiography, with_spectra
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.scans.job import Job
 from flexdt.server.scans.jobs import Jobs, fresh_seed
-from flexdt.server.scans.stage import Stage
+from flexdt.server.scans.stage import Shapes, Stage
 from flexdt.server.scans.submission import RESERVED, Submissions
 from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
 from flexdt.server.storage.corrections import Corrections
@@ -42,7 +42,6 @@ from flexdt.server.twin import wire_values as views
 from flexdt.server.twin.hub import Hub
 from flexdt.server.twin.live import LiveView, Shot, StateFeed
 from flexdt.server.twin.obstacle_move import ObstacleMoves
-from flexdt.server.twin.sample_mesh import Shapes
 from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.scene_search import NearestPair, clearance
 from flexdt.twin.errors import GeometryError, SafetyError

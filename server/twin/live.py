@@ -19,7 +19,7 @@ from flexdt.protocol import RpcError, image
 from flexdt.protocol.methods.image_messages import Projection
 from flexdt.protocol.state_model import ImageFlags
 from flexdt.runtime.log import log
-from flexdt.server.imaging.exposure_flags import flags_of
+from flexdt.server.imaging.exposure_quality import flags_of
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.scans.twin_clock import TwinClock

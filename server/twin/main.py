@@ -48,7 +48,7 @@ def speed_up_of(text: str) -> SpeedUp:
 async def run(options: TwinSettings) -> int:
     """Serve until SIGTERM or SIGINT; returns the exit code."""
     from flexdt.runtime.files.directory import open_data
-    from flexdt.runtime.files.directory_lock import FolderLock
+    from flexdt.runtime.files.own_documents import lock_folder
     from flexdt.runtime.http_pages import served_pages
     from flexdt.runtime.metrics import Requests
     from flexdt.server.imaging.projector_client import ProjectorClient
@@ -56,11 +56,10 @@ async def run(options: TwinSettings) -> int:
     from flexdt.server.imaging.truth import load_truth
     from flexdt.server.network.tcp import serve
     from flexdt.server.scans.jobs import fresh_seed
-    from flexdt.server.twin.application import TwinApp
+    from flexdt.server.twin.application import TwinApp, twin_pages
     from flexdt.server.twin.core import TwinServer
     from flexdt.server.twin.handlers.document_methods import document
     from flexdt.server.twin.message_reading import Reader
-    from flexdt.server.twin.twin_health import twin_pages
     from flexdt.twin.scanner.state import Sample
 
     machine = machines.machine(options.machine)
@@ -68,7 +67,7 @@ async def run(options: TwinSettings) -> int:
     root = options.data.absolute()
     check_bind(options.host, read_token(options.token_file))
     directory = open_data(root)
-    lock = FolderLock(directory)
+    release = lock_folder(directory)
     truth = None if options.truth is None else load_truth(options.truth, root)
     token = read_token(options.projector_token_file)
     secure = client_tls(options.projector_tls_ca)
@@ -123,7 +122,7 @@ async def run(options: TwinSettings) -> int:
     reader.close()
     await twin.stop()
     await projector.close()
-    lock.release()
+    release()
     return FAILED if twin.failed.is_set() else OK
 
 

@@ -24,8 +24,8 @@ import tifffile
 from hypothesis import given
 from hypothesis import strategies as st
 
+from flexdt.runtime.files.dataset_folder import free_name
 from flexdt.runtime.files.directory import Directory, open_data
-from flexdt.runtime.files.image_files import free_name
 from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.twin.dataset.dataset_errors import (
     DatasetExistsError,

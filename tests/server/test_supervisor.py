@@ -22,7 +22,7 @@ import pytest
 from flexdt.clients.launch.up import main as up_main
 from flexdt.clients.launch.up import port_problem, services
 from flexdt.process_settings import Address, UpSettings, parse
-from flexdt.runtime import processor_time
+from flexdt.runtime import process as processes
 from flexdt.runtime import supervisor as module
 from flexdt.runtime.supervisor import Addresses, Service, ServiceError, Supervisor
 
@@ -315,13 +315,13 @@ def test_processor_time_is_that_of_all_processes_of_a_session() -> None:
     )
     assert process.stdout is not None
     process.stdout.readline()
-    used_s = processor_time.of_session(process.pid)
+    used_s = processes.session_seconds(process.pid)
     process.kill()
     process.wait()
     process.stdout.close()
     assert used_s is not None
     assert 1.0 <= used_s < 5.0
-    assert processor_time.of_session(process.pid) is None
+    assert processes.session_seconds(process.pid) is None
 
 
 def test_lines_that_are_no_ready_line_harm_nobody(fake: Callable[..., Service]) -> None:

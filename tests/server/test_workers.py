@@ -18,8 +18,8 @@ from in_process import script
 
 from flexdt.protocol import Codec, Connection, RpcError
 from flexdt.protocol.rpc_errors import Code
-from flexdt.runtime import processor_time
 from flexdt.runtime.files.directory import open_data
+from flexdt.runtime.process import process_seconds
 from flexdt.runtime.workers import Workers
 from flexdt.server.scans import checking
 from flexdt.server.scans.checking import CheckInput, Checks
@@ -196,9 +196,9 @@ def test_work_on_a_busy_machine_has_the_time_that_it_has_alone() -> None:
     async def body(workers: Workers) -> None:
         await workers.ask(checking.in_pieces, light())
         pid = workers._idle[-1].pid
-        before = processor_time.of_process(pid)
+        before = process_seconds(pid)
         await workers.ask(checking.in_pieces, some)
-        after = processor_time.of_process(pid)
+        after = process_seconds(pid)
         assert before is not None
         assert after is not None
         workers.seconds = 3.0 * (after - before)

@@ -30,7 +30,7 @@ def received() -> int:
 
 def at_work(pool: ProcessPoolExecutor, pid: int) -> Future[object]:
     """Killed while it works."""
-    future: Future[object] = pool.submit(time.sleep, 60.0)  # type: ignore[arg-type]
+    future: Future[object] = pool.submit(time.sleep, 60.0)
     time.sleep(0.5)
     os.kill(pid, signal.SIGKILL)
     return future

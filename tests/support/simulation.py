@@ -29,7 +29,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import random
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -38,7 +38,7 @@ from simulated_disk import Disk, Fault
 from simulated_loop import SimulatedLoop
 
 from flexdt.runtime.files.directory import open_data
-from flexdt.runtime.files.directory_lock import FolderLock
+from flexdt.runtime.files.own_documents import lock_folder
 from flexdt.server.twin.application import TwinApp
 from flexdt.server.twin.core import TwinServer
 from flexdt.twin.machine.description import Machine, Profile
@@ -91,7 +91,7 @@ class Simulation:
         """What the servers logged."""
         self._loop: SimulatedLoop | None = None
         self._time = 0.0
-        self._lock: FolderLock | None = None
+        self._lock: Callable[[], None] | None = None
         self._clients = 0
         self._handler = _Kept(self.log)
         self._watched = self.disk.watched()
@@ -141,7 +141,7 @@ class Simulation:
     async def _start(self) -> None:
         """As `flexdt.server.twin.main` does."""
         root = open_data(self.data)
-        self._lock = FolderLock(root)
+        self._lock = lock_folder(root)
         assert self._loop is not None
         self._twin = TwinServer(
             self.machine, self.profile, self.projector, root, wall=self._loop.time,
@@ -171,7 +171,7 @@ class Simulation:
 
     def _end(self) -> None:
         if self._lock is not None:
-            self._lock.release()
+            self._lock()
             self._lock = None
         if self._loop is None:
             return
