@@ -99,8 +99,5 @@ class Peer(Protocol):
         """End the connection after what is queued has gone out."""
 
 
-class App(Protocol):
-    """An application served over TCP."""
-
-    def open(self, peer: Peer) -> Session:
-        """A connection has been made (and let in)."""
+Open = Callable[[Peer], Session]
+"""Opens the application's state of a connection that has been made (and let in)."""

@@ -61,10 +61,10 @@ from flexdt.runtime.log import Sparing
 from flexdt.runtime.loop import ListeningServer, tune
 from flexdt.server.network.outbox import Outbox
 from flexdt.server.network.shell_application import (
-    App,
     Call,
     Frozen,
     Observe,
+    Open,
     Read,
     Session,
     unobserved,
@@ -106,7 +106,7 @@ HELLO = "session.hello"
 class TcpServer(ListeningServer):
     """A listening server; made by `serve`."""
 
-    app: App
+    open: Open
     limits: ConnectionLimits
     token: str | None
     methods: Mapping[str, AnyMethod]
@@ -155,7 +155,7 @@ class TcpServer(ListeningServer):
 
 
 async def serve(
-    app: App,
+    open: Open,
     host: str = "127.0.0.1",
     port: int = 0,
     *,
@@ -166,10 +166,10 @@ async def serve(
     observe: Observe = unobserved,
     read: Read | None = None,
 ) -> TcpServer:
-    """Listen on `host`:`port` (0: any free port) and serve `app`.
+    """Listen on `host`:`port` (0: any free port) and serve an application.
 
     Args:
-        app: behind it.
+        open: begins a session of the application with a connection.
         host, port: where.
         limits: of connections.
         token: that clients must bring.
@@ -184,7 +184,7 @@ async def serve(
     """
     check_bind(host, token)
     limits = limits or ConnectionLimits()
-    server = TcpServer(app, limits, token, methods, observe, read)
+    server = TcpServer(open, limits, token, methods, observe, read)
     await server.listen(lambda: _Link(server), host, port, ssl)
     return server
 
@@ -381,7 +381,7 @@ class _Link(asyncio.Protocol):
         if not self._seat():
             self.server.reserved.enter(self)
         try:
-            self.session = self.server.app.open(self)
+            self.session = self.server.open(self)
         except Exception:
             self.log("open failed", logging.ERROR, error=True)
             self.abort("the application did not open a session")

@@ -74,21 +74,6 @@ class TwinSession:
             self._twin.feed.changed()
 
 
-class TwinApp:
-    """The application that `tcp.serve` serves.
-
-    Args:
-        twin: started.
-    """
-
-    def __init__(self, twin: TwinServer) -> None:
-        self._twin = twin
-
-    def open(self, peer: Peer) -> TwinSession:
-        """A connection has been let in."""
-        return TwinSession(self._twin, peer)
-
-
 def twin_pages(
     twin: TwinServer,
     server: TcpServer,

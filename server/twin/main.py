@@ -56,7 +56,7 @@ async def run(options: TwinSettings) -> int:
     from flexdt.server.imaging.truth import load_truth
     from flexdt.server.network.tcp import serve
     from flexdt.server.scans.jobs import fresh_seed
-    from flexdt.server.twin.application import TwinApp, twin_pages
+    from flexdt.server.twin.application import TwinSession, twin_pages
     from flexdt.server.twin.core import TwinServer
     from flexdt.server.twin.handlers.document_methods import document
     from flexdt.server.twin.message_reading import Reader
@@ -100,7 +100,7 @@ async def run(options: TwinSettings) -> int:
         sample = Sample("" if name == "empty" else name)
     await twin.start(sample)
     server = await serve(
-        TwinApp(twin),
+        lambda peer: TwinSession(twin, peer),
         options.host,
         options.port,
         token=read_token(options.token_file),

@@ -434,7 +434,7 @@ class _Served:
         self.app.moved = asyncio.Event()
         self.loop = asyncio.get_running_loop()
         self.over = asyncio.Event()
-        server = await serve(self.app, port=self.port, token=self.token)
+        server = await serve(self.app.open, port=self.port, token=self.token)
         self.port = server.port
         self.started.set()
         await self.over.wait()

@@ -115,7 +115,7 @@ def trusting() -> ssl.SSLContext:
 
 def test_the_twin_server_speaks_tls_and_only_tls() -> None:
     async def main() -> None:
-        server = await serve(_Echo(), ssl=server_tls(CERTIFICATE, KEY))
+        server = await serve(_Echo().open, ssl=server_tls(CERTIFICATE, KEY))
         port = server.port
 
         def talk() -> None:
@@ -135,7 +135,7 @@ def test_the_twin_server_speaks_tls_and_only_tls() -> None:
 def test_one_too_many_is_told_so_over_tls() -> None:
     async def main() -> None:
         limits = ConnectionLimits(max_clients=1)
-        server = await serve(_Echo(), ssl=server_tls(CERTIFICATE, KEY), limits=limits)
+        server = await serve(_Echo().open, ssl=server_tls(CERTIFICATE, KEY), limits=limits)
 
         def talk() -> None:
             with TwinClient(port=server.port, ssl=trusting()) as client:

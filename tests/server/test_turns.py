@@ -87,7 +87,7 @@ class Bench:
 
     def __init__(self, **limits: Any) -> None:
         self.app = App()
-        self.server = TcpServer(self.app, ConnectionLimits(**limits), None, METHODS)
+        self.server = TcpServer(self.app.open, ConnectionLimits(**limits), None, METHODS)
 
     def dial(self) -> tuple[_Link, Transport]:
         link, transport = _Link(self.server), Transport()

@@ -89,7 +89,7 @@ def shell(port: Any) -> None:
     async def main() -> None:
         limits = ConnectionLimits(requests_per_s=None)
         app: Any = Answers()
-        made = await tcp.serve(app, limits=limits, methods=PROJECTOR_METHODS)
+        made = await tcp.serve(app.open, limits=limits, methods=PROJECTOR_METHODS)
         port.put(made.port)
         await asyncio.Event().wait()
 

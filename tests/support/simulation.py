@@ -39,7 +39,6 @@ from simulated_loop import SimulatedLoop
 
 from flexdt.runtime.files.directory import open_data
 from flexdt.runtime.files.own_documents import lock_folder
-from flexdt.server.twin.application import TwinApp
 from flexdt.server.twin.core import TwinServer
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.scanner.state import Sample
@@ -148,7 +147,6 @@ class Simulation:
             **self.options,
         )  # fmt: skip
         sample = self._twin.recall()
-        self.app = TwinApp(self._twin)
         await self._twin.start(Sample(self.sample) if sample is None else sample)
 
     def stop(self) -> None:
@@ -191,7 +189,7 @@ class Simulation:
     def client(self) -> Client:
         """A connection of its own to the server that runs."""
         self._clients += 1
-        return Client(self.app, f"client-{self._clients}")
+        return Client(self.twin, f"client-{self._clients}")
 
     def call(self, client: Client, method: str, /, **params: Any) -> Any:
         """Ask, and let time pass until the answer is there; see `answer`."""
