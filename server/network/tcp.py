@@ -60,26 +60,27 @@ from flexdt.runtime.access import ConnectionLimits, check_bind
 from flexdt.runtime.log import Sparing
 from flexdt.runtime.loop import ListeningServer, tune
 from flexdt.server.network.outbox import Outbox
-from flexdt.server.network.shell_application import (
+from flexdt.server.network.shell_parts import (
+    FIRST,
+    ORDINARY,
+    URGENT,
+    WAITING,
     Call,
+    Deadlines,
     Frozen,
+    Guest,
+    LoopTurns,
     Observe,
     Open,
     Read,
-    Session,
-    unobserved,
-)
-from flexdt.server.network.shell_parts import (
-    WAITING,
-    Deadlines,
-    Guest,
     Room,
+    Session,
     TokenCheck,
     TurnedAway,
     answered,
     neighbourhood,
+    unobserved,
 )
-from flexdt.server.network.turns import FIRST, ORDINARY, URGENT, LoopTurns
 
 READ_AHEAD = 512 << 10
 """Bytes of whole messages that one connection may have waiting; then it is read no further."""

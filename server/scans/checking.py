@@ -320,7 +320,7 @@ def _joined(pieces: list[bytes], machine: Machine, profile: Profile) -> ScanPlan
         for piece in pieces[1:]:
             name, parts = pickle.loads(piece)
             long.setdefault(name, []).extend(parts)
-        whole = {name: tuple(parts) for name, parts in long.items()}
+        whole: dict[str, Any] = {name: tuple(parts) for name, parts in long.items()}
         axes = {name[5:]: whole.pop(name) for name in long if name.startswith("axis ")}
         files = [whole.pop(name) for name in long if name.startswith("files ")]
         groups = zip(whole.pop("groups"), files, strict=True)

@@ -21,7 +21,7 @@ from flexdt.runtime.metrics import Figure, Requests, counter, gauge
 from flexdt.runtime.wire_errors import explain, is_user_error
 from flexdt.server.imaging.projector_client import ProjectorClient
 from flexdt.server.imaging.projector_pool import ProjectorPool
-from flexdt.server.network.shell_application import Peer
+from flexdt.server.network.shell_parts import Peer
 from flexdt.server.network.tcp import TcpServer
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers import HANDLERS

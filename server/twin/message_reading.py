@@ -27,7 +27,7 @@ from flexdt.protocol.method import parse_params
 from flexdt.protocol.methods.job_messages import TrajectoryInput
 from flexdt.protocol.rpc_errors import too_large
 from flexdt.runtime.workers import Workers
-from flexdt.server.network.shell_application import Call, Frozen
+from flexdt.server.network.shell_parts import Call, Frozen
 from flexdt.server.scans.scan_record import PoseList
 
 MAX_PARAMS: Final = 1 << 20

@@ -36,7 +36,7 @@ from flexdt.protocol.fields import Empty, Params
 from flexdt.protocol.methods.sample_messages import SampleUpload
 from flexdt.protocol.methods.session_messages import Hello
 from flexdt.protocol.rpc_errors import parse_error
-from flexdt.server.network.shell_application import Peer
+from flexdt.server.network.shell_parts import Peer
 from flexdt.server.network.tcp import serve
 
 AXIS = {"position": 1.0, "target": 1.0, "velocity": 0.0, "limits": [0, 2], "moving": False}

@@ -28,7 +28,7 @@ from flexdt.runtime.access import (
 )
 from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.imaging.projector_client import ProjectorClient
-from flexdt.server.network.shell_application import Peer
+from flexdt.server.network.shell_parts import Peer
 from flexdt.server.network.tcp import serve
 from flexdt.server.projector.service import serve_projector
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere

@@ -20,8 +20,7 @@ from flexdt.protocol.fields import Params
 from flexdt.runtime.access import ConnectionLimits
 from flexdt.runtime.log import JsonLines, Sparing
 from flexdt.server.network import tcp
-from flexdt.server.network.shell_application import Peer
-from flexdt.server.network.shell_parts import Room, neighbourhood
+from flexdt.server.network.shell_parts import Peer, Room, neighbourhood
 from flexdt.server.network.tcp import TcpServer, serve
 
 TOKEN = "sixteen letters or more"

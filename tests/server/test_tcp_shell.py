@@ -29,7 +29,7 @@ from flexdt.protocol import (
 from flexdt.protocol.fields import Params
 from flexdt.runtime.access import AccessError, ConnectionLimits
 from flexdt.server.network import tcp
-from flexdt.server.network.shell_application import Peer
+from flexdt.server.network.shell_parts import Peer
 from flexdt.server.network.tcp import TcpServer, serve
 
 TOKEN = "0123456789abcdef"

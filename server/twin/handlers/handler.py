@@ -18,7 +18,7 @@ from flexdt.protocol.fields import Params, Result
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.scene_document import Scene
 from flexdt.runtime.files.own_documents import Changes
-from flexdt.server.network.shell_application import Peer
+from flexdt.server.network.shell_parts import Peer
 from flexdt.server.storage.corrections import History
 from flexdt.server.storage.memory import Memory, as_of
 from flexdt.server.storage.scene import apply_settings, paces_of
