@@ -66,20 +66,16 @@ def work(codec: Codec | None, most: int, *pieces: bytes) -> list[bytes]:
     items = message.items if isinstance(message, Batch) else (message,)
     parts = [b"batch" if batch else b"single"]
     for item in items:
-        parts += [_method(item), _frozen(item)]
+        name = item.method if isinstance(item, Request | Notification) else ""
+        parts += [name.encode() if name in METHODS else b"", _frozen(item)]
     return parts
 
 
-def _method(message: Single) -> bytes:
-    name = message.method if isinstance(message, (Request, Notification)) else ""
-    return name.encode() if name in METHODS else b""
-
-
 def _frozen(message: Single) -> bytes:
-    if not isinstance(message, (Request, Notification)):
+    if not isinstance(message, Request | Notification):
         return pickle.dumps(message)
-    id = message.id if isinstance(message, Request) else None
     answered = isinstance(message, Request)
+    id = message.id if isinstance(message, Request) else None
     call = Call(id, message.method, _params(message), answered)
     data = pickle.dumps(call)
     method = METHODS.get(message.method)
