@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from flexdt.phantoms import Phantom
 from flexdt.protocol.rpc_errors import too_large
-from flexdt.server.storage.stored_samples import Phantoms
+from flexdt.server.storage.stored_samples import SampleStore, Upload
 from flexdt.twin.collision.collision_scene import Scene, build_scene
 from flexdt.twin.collision.convex_solids import Polytope
 from flexdt.twin.collision.guard import SceneGuard
@@ -38,16 +38,10 @@ class Stage:
         samples: what may stand on it.
     """
 
-    def __init__(self, machine: Machine, profile: Profile, samples: Phantoms) -> None:
+    def __init__(self, machine: Machine, profile: Profile, samples: SampleStore) -> None:
         self._machine, self._profile, self._samples = machine, profile, samples
         self._scenes: OrderedDict[tuple[_Content, Offsets], Scene] = OrderedDict()
         self._pieces: OrderedDict[_Content, tuple[Polytope, ...]] = OrderedDict()
-
-    def beside(self, samples: Phantoms) -> Stage:
-        """The same stage with other samples; what is worked out is shared, by their revisions."""
-        other = Stage(self._machine, self._profile, samples)
-        other._scenes, other._pieces = self._scenes, self._pieces
-        return other
 
     def phantom(self, sample: Sample) -> Phantom | None:
         """The phantom behind a sample; None for an empty stage.
@@ -57,14 +51,21 @@ class Stage:
         """
         return self._samples.load(sample.name, sample.material) if sample.name else None
 
-    def pieces(self, sample: Sample) -> tuple[Polytope, ...]:
-        """Convex pieces that hold the sample, object frame; it may take a second."""
-        before = self._content(sample)
+    def pieces(self, sample: Sample, upload: Upload | None = None) -> tuple[Polytope, ...]:
+        """Convex pieces that hold the sample, object frame; it may take a second.
+
+        Args:
+            sample: on the stage.
+            upload: to come under the sample's name; None for what is there.
+        """
+        before = self._content(sample, upload)
         pieces = self._pieces.get(before)
         if pieces is None:
-            phantom = self.phantom(sample)
+            phantom = self.phantom(sample) if upload is None else upload.standing
             pieces = () if phantom is None else _pieces(phantom, sample.offset)
-            now = self._content(sample)  # the revision is known once an upload has been read
+            now = self._content(
+                sample, upload
+            )  # the revision is known once an upload has been read
             if before[1] not in (None, now[1]):
                 return pieces  # another file came under the name meanwhile
             self._pieces[now] = pieces
@@ -79,17 +80,20 @@ class Stage:
             return None
         return SampleSize.around(phantom.size_mm, f"sample {sample.name}", sample.offset)
 
-    def scene(self, sample: Sample, parameters: Offsets = NOMINAL) -> Scene | None:
+    def scene(
+        self, sample: Sample, parameters: Offsets = NOMINAL, upload: Upload | None = None
+    ) -> Scene | None:
         """What may touch what with this sample; None where the machine has no components.
 
         Args:
             sample: what stands there.
             parameters: the correction in force; bodies sit where it says they are.
+            upload: as for `pieces`.
         """
         if not self._machine.components:
             return None
-        pieces = self.pieces(sample)
-        key = (self._content(sample), parameters)
+        pieces = self.pieces(sample, upload)
+        key = (self._content(sample, upload), parameters)
         scene = self._scenes.get(key)
         if scene is None:
             scene = build_scene(self._machine, self._profile, pieces, parameters)
@@ -98,18 +102,21 @@ class Stage:
                 self._scenes.popitem(last=False)
         return scene
 
-    def guard(self, sample: Sample, parameters: Offsets = NOMINAL) -> Guard | None:
+    def guard(
+        self, sample: Sample, parameters: Offsets = NOMINAL, upload: Upload | None = None
+    ) -> Guard | None:
         """What sweeps every motion with this sample; None where the machine has no components.
 
         Args:
             sample: what stands there.
             parameters: the correction in force.
+            upload: as for `pieces`.
         """
-        scene = self.scene(sample, parameters)
+        scene = self.scene(sample, parameters, upload)
         return None if scene is None else SceneGuard(scene)
 
-    def _content(self, sample: Sample) -> _Content:
-        return sample, self._samples.revision(sample.name)
+    def _content(self, sample: Sample, upload: Upload | None) -> _Content:
+        return sample, upload.revision if upload else self._samples.revision(sample.name)
 
 
 _Content = tuple[Sample, str | None]

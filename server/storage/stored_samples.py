@@ -17,7 +17,6 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -126,34 +125,10 @@ class Upload:
     revision: str
     worn: tuple[str, Phantom] | None = None
 
-
-class Phantoms(Protocol):
-    """Where the phantoms of samples come from."""
-
-    def load(self, name: str, material: str | None = None) -> Phantom:
-        """The phantom called `name`."""
-
-    def revision(self, name: str) -> str | None:
-        """Names the content of an upload that has been read."""
-
-
-@dataclass(frozen=True)
-class _With:
-    """The samples there are, and an upload under its name."""
-
-    store: SampleStore
-    upload: Upload
-
-    def load(self, name: str, material: str | None = None) -> Phantom:
-        if name != self.upload.head.name:
-            return self.store.load(name, material)
-        worn = self.upload.worn
-        return worn[1] if worn is not None and worn[0] == material else self.upload.phantom
-
-    def revision(self, name: str) -> str | None:
-        if name != self.upload.head.name:
-            return self.store.revision(name)
-        return self.upload.revision
+    @property
+    def standing(self) -> Phantom:
+        """The phantom that it will be on the stage."""
+        return self.phantom if self.worn is None else self.worn[1]
 
 
 class SampleStore:
@@ -270,10 +245,6 @@ class SampleStore:
         phantom = _parse(head, raw, head.material)
         worn = None if material is None else (material, _parse(head, raw, material))
         return Upload(head, raw, phantom, _revision(head, raw), worn)
-
-    def with_upload(self, upload: Upload) -> Phantoms:
-        """The samples there are, as if an upload was among them already."""
-        return _With(self, upload)
 
     def store(self, changes: Changes, upload: Upload) -> None:
         """Write an upload; the previous one of that name stays beside it until `know`.

@@ -37,7 +37,7 @@ from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
 from flexdt.server.storage.corrections import Corrections
 from flexdt.server.storage.memory import Memory, StateStore, read_memory, remember, restore
 from flexdt.server.storage.past_scans import PastScans
-from flexdt.server.storage.stored_samples import SampleStore, sample_material
+from flexdt.server.storage.stored_samples import SampleStore, Upload, sample_material
 from flexdt.server.twin import wire_values as views
 from flexdt.server.twin.hub import Hub
 from flexdt.server.twin.live import LiveView, Shot, StateFeed
@@ -406,7 +406,7 @@ class TwinServer:
         sample: Sample,
         correction: Correction | None,
         *,
-        stage: Stage | None = None,
+        upload: Upload | None = None,
         targets: Mapping[str, float] | None = None,
         paces: Mapping[str, tuple[float, float]] | None = None,
     ) -> StageChange:
@@ -414,7 +414,7 @@ class TwinServer:
 
         Args:
             sample, correction: what is to stand there, and what is to be in force.
-            stage: knows the shape of what is to stand there; None for `self.stage`.
+            upload: to come under the sample's name.
             targets: where motors are sent together with the change [mm, deg].
             paces: motor -> (speed, acceleration) that are set before.
 
@@ -424,7 +424,7 @@ class TwinServer:
             CollisionError: what is under way, or stands, is not free of it; nothing changes.
         """
         self.scanner.require_applicable(correction)  # before anything is built of it
-        guard = await self._guard(sample, correction, stage)
+        guard = await self._guard(sample, correction, upload)
         change = self.scanner.stage_change(
             sample, correction, guard, self.clock.now(), targets=targets, paces=paces
         )
@@ -448,11 +448,10 @@ class TwinServer:
         return [] if halted is None else [halted.message]
 
     async def _guard(
-        self, sample: Sample, correction: Correction | None, stage: Stage | None = None
+        self, sample: Sample, correction: Correction | None, upload: Upload | None = None
     ) -> Guard | None:
         parameters = NOMINAL if correction is None else correction.parameters
-        used = self.stage if stage is None else stage
-        return await asyncio.to_thread(used.guard, sample, parameters)
+        return await asyncio.to_thread(self.stage.guard, sample, parameters, upload)
 
     async def motion_ended(self, motors: Collection[str]) -> None:
         """Wait until `motors` have come to rest, wherever that is."""

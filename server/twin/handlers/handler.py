@@ -163,7 +163,7 @@ async def change_stage(
     change = await twin.certified_stage(
         sample,
         correction,
-        stage=None if upload is None else twin.stage.beside(twin.samples.with_upload(upload)),
+        upload=upload,
         targets=None if scene is None else scene.positions,
         paces=None if scene is None else paces_of(scene, twin.scanner),
     )
