@@ -30,6 +30,7 @@ from flexdt.twin.dataset.file_names import (
     XRE_SETTINGS,
     plain_name,
 )
+from flexdt.twin.dataset.flexdt_json import DatasetDocument, parse_document
 from flexdt.twin.geometry.conventions import Float32Array
 
 Shape = tuple[int, int]
@@ -112,6 +113,14 @@ class Folder:
     def paths(self, files: Sequence[str]) -> tuple[Path, ...]:
         """Paths of those of `files` that are there."""
         return tuple(self.path / name for name in files if name in self.names)
+
+    def lost(self, files: Sequence[str]) -> str:
+        """Which of `files` are not there, in words; "" if all are."""
+        lost = [name for name in files if name not in self.names]
+        if not lost:
+            return ""
+        more = f" and {len(lost) - 5} more" if len(lost) > 5 else ""
+        return f"{', '.join(lost[:5])}{more} {'is' if len(lost) == 1 else 'are'} missing"
 
     def _find(self, wanted: str) -> str | None:
         return next((n for n in sorted(self.names) if n.lower() == wanted.lower()), None)
@@ -201,6 +210,23 @@ def read_text(path: Path, most: int = MAX_TEXT_BYTES) -> str:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError:
         return raw.decode("cp1252", errors="replace")
+
+
+def read_document(folder: Directory) -> DatasetDocument:
+    """The flexdt.json of a data set in a data directory.
+
+    Raises:
+        FileNotFoundError: there is none.
+        DatasetFormatError: it cannot be read, or is no such document.
+    """
+    path = folder.path / DOCUMENT
+    try:
+        text = folder.read(DOCUMENT).decode()
+    except FileNotFoundError:
+        raise
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetFormatError(f"cannot read {path}: {error}", {"path": str(path)}) from None
+    return parse_document(text, str(path))
 
 
 def read_image(path: Path, shape: tuple[int, int] | None = None) -> npt.NDArray[np.uint16]:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from flexdt.protocol.rpc_errors import Code
 from flexdt.protocol.state_model import JobPhase
+from flexdt.runtime.files.dataset_folder import read_document
 from flexdt.runtime.files.directory import Directory, free_bytes
 from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.scans.runner import Produce, Progress, ScanRunner
@@ -22,8 +23,6 @@ from flexdt.server.scans.twin_clock import SpeedUp
 from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.server.storage.memory import JobMemory
 from flexdt.twin.dataset.dataset_errors import DatasetError, DiskFullError
-from flexdt.twin.dataset.file_names import DOCUMENT
-from flexdt.twin.dataset.flexdt_json import parse_document
 from flexdt.twin.script import ScanPlan
 
 FIRST_S, LONGEST_S = 1.0, 30.0
@@ -121,8 +120,8 @@ def recalled(memory: JobMemory, root: Directory) -> Job:
 def _complete(folder: Directory) -> bool:
     """Whether a data set lies there that says that it is complete."""
     try:
-        return parse_document(folder.read(DOCUMENT).decode()).complete
-    except (OSError, ValueError, DatasetError):
+        return read_document(folder).complete
+    except (OSError, DatasetError):
         return False
 
 

@@ -284,11 +284,8 @@ def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
             problem=scan.problem[:500],
         )  # fmt: skip
         return info.model_copy(update=told)
-    lost = [f.file for f in document.frames if f.file not in folder.names]
+    lost = folder.lost([f.file for f in document.frames])
     files = document.files("projection")
-    reason = document.reason
-    if lost and document.complete:
-        reason = f"{lost[0]} is missing" + (f", and {len(lost) - 1} more" if lost[1:] else "")
     detector, named = document.detector, document.machine.get("name")
     return p.DatasetInfo(
         name=path.name,
@@ -296,7 +293,7 @@ def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
         started=document.started.isoformat(),
         duration_s=document.duration_s,
         state="complete" if document.complete and not lost else "incomplete",
-        reason=reason,
+        reason=(document.complete and lost) or document.reason,
         projections=len(files),
         present=sum(f in folder.names for f in files),
         machine=str(named)[:100],
