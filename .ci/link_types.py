@@ -17,13 +17,13 @@ import sysconfig
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDERS = ("protocol", "twin", "phantoms", "server", "clients")
+FOLDERS = ("protocol", "twin", "phantoms", "runtime", "server", "clients")
 EXTENSIONS = Path("extensions", "flexdt_extensions")
 PATH_FILE = "flexdt-types.pth"
 
 
 def lay_out(root: Path = ROOT) -> Path:
-    """Make `.typing/flexdt` hold links to the five folders and to each file of `flexdt/`.
+    """Make `.typing/flexdt` hold links to the six folders and to each file of `flexdt/`.
 
     `.typing/flexdt_extensions` is a link to the second package.
     """

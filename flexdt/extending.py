@@ -27,7 +27,7 @@ from flexdt.clients.extras import package
 from flexdt.clients.failure import CommandError
 from flexdt.clients.whole_files import free_bytes, write_whole
 from flexdt.process_settings import OneLine
-from flexdt.server.files.image_files import tiff_bytes
+from flexdt.runtime.files.dataset_folder import tiff_bytes
 from flexdt.twin.values import message_of
 
 __all__ = [

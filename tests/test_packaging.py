@@ -21,7 +21,7 @@ import yaml
 from flexdt import moved
 
 ROOT = Path(__file__).resolve().parents[1]
-CODE = ("protocol", "twin", "phantoms", "server", "clients")
+CODE = ("protocol", "twin", "phantoms", "runtime", "server", "clients")
 FOLDERS = ("flexdt", *CODE)
 
 

@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.phantoms import Phantom
-from flexdt.server.files.dataset_folder import Frame, read_text
+from flexdt.runtime.files.dataset_folder import Frame, read_text
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections, SpotFinder
 from flexdt.twin.calibration.diagnose.finding import error

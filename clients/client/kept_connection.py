@@ -19,7 +19,7 @@ from flexdt.clients.client.policy import back_off
 from flexdt.clients.client.transport import ConnectionLost
 from flexdt.protocol import Code, RpcError
 from flexdt.protocol.methods.session_messages import HelloResult
-from flexdt.server.runtime.log import log
+from flexdt.runtime.log import log
 
 FIRST_PAUSE_S: Final = 0.1
 HELLO_S: Final = 10.0

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.server.files.dataset_folder import Frame, mean_image, read_image
+from flexdt.runtime.files.dataset_folder import Frame, mean_image, read_image
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
 from flexdt.twin.dataset.flexdt_json import DatasetDocument
 from flexdt.twin.dataset.normalise import LineIntegrals

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.clients.datasets.data_set import DataSet
-from flexdt.server.files.dataset_folder import (
+from flexdt.runtime.files.dataset_folder import (
     Folder,
     list_folder,
     read_image,
@@ -210,7 +210,7 @@ def _from_document(content: Folder, machine: Machine | None, profile: Profile | 
     settings = _settings(content, warnings)
     if np.abs(found.cone_vec().rows - cone_vec.rows).max() > AGREE_MM:
         warnings.append(f"{path}: cone_vec does not follow from its motor positions")
-    lost = _lost(content, (*doc.files("dark"), *doc.files("flat"), *files))
+    lost = content.lost((*doc.files("dark"), *doc.files("flat"), *files))
     unfinished = "" if doc.complete else doc.reason or "the scan did not finish"
     return DataSet(
         doc.name,
@@ -272,7 +272,7 @@ def listed(
         )
     rows, cols = read_image(content.path / there[0]).shape
     geometry = geometry.with_shape(geometry.of_shape((rows, cols)))
-    lost = _lost(content, names)
+    lost = content.lost(names)
     return DataSet(
         name or content.path.name,
         content.frames(names, [(rows, cols)] * len(names)),
@@ -313,7 +313,7 @@ def _from_texts(content: Folder, machine: Machine | None, profile: Profile | Non
     rebuilt = rebuild(settings, count, shape, machines, profiles, file=said_in)
     names = [content.projection_name(i) for i in range(count)]
     reasons = ["the text says SCRIPT CANCELLED!"] if settings.cancelled else []
-    reasons += filter(None, [_lost(content, names)])
+    reasons += filter(None, [content.lost(names)])
     if settings.projections is not None and count > settings.projections:
         warnings.append(
             f"{count} projections are there, the text says {settings.projections}; angles follow "
@@ -387,12 +387,3 @@ def _require_one_circle(content: Folder) -> None:
 
 def _doubts(darks: Sequence[str]) -> list[str]:
     return [] if darks else [f"{NO_DARK} (di000000.tif): zero is taken"]
-
-
-def _lost(content: Folder, names: Sequence[str]) -> str:
-    """Which of these files are not in the folder, in words; "" if all are."""
-    lost = [name for name in names if name not in content.names]
-    if not lost:
-        return ""
-    more = f" and {len(lost) - 5} more" if len(lost) > 5 else ""
-    return f"{', '.join(lost[:5])}{more} {'is' if len(lost) == 1 else 'are'} missing"

@@ -14,9 +14,8 @@ import numpy as np
 
 from flexdt.clients.datasets.data_set import Counts, DataSet
 from flexdt.clients.extras import package
-from flexdt.server.files.dataset_folder import read_image
-from flexdt.server.files.directory import Directory
-from flexdt.server.files.image_files import tiff_bytes
+from flexdt.runtime.files.dataset_folder import read_image, tiff_bytes
+from flexdt.runtime.files.directory import Directory
 from flexdt.twin.dataset.dataset_errors import DatasetExistsError, DatasetFormatError
 from flexdt.twin.dataset.file_names import DOCUMENT, GEOMETRY, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS
 from flexdt.twin.dataset.flexdt_json import CorrectionEntry

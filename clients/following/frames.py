@@ -20,7 +20,7 @@ from flexdt.clients.datasets.pictures import png
 from flexdt.clients.whole_files import write_whole
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import line_integrals as projected
-from flexdt.server.files.dataset_folder import list_folder, mean_image, read_image
+from flexdt.runtime.files.dataset_folder import list_folder, mean_image, read_image
 from flexdt.twin.dataset.normalise import LineIntegrals
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Mirror

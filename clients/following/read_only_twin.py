@@ -27,7 +27,7 @@ from flexdt.protocol import (
 )
 from flexdt.protocol import state_model as w
 from flexdt.protocol.rpc_errors import Code
-from flexdt.server.runtime.access import check_bind
+from flexdt.runtime.access import check_bind
 from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.collision.scene_search import NearestPair, clearance
 from flexdt.twin.errors import GeometryError, TwinError

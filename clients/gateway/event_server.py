@@ -35,8 +35,8 @@ from flexdt.protocol.acquila import (
     format_event,
     parse_event,
 )
-from flexdt.server.runtime.access import AccessError, is_loopback
-from flexdt.server.runtime.log import log
+from flexdt.runtime.access import AccessError, is_loopback
+from flexdt.runtime.log import log
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.grammar import own_name
 

@@ -16,9 +16,9 @@ from flexdt import machines
 from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress
 from flexdt.clients.gateway.connected_twin import ConnectedTwin
 from flexdt.process_settings import GatewaySettings, parse
-from flexdt.server.runtime.access import client_tls, read_token
-from flexdt.server.runtime.log import set_up
-from flexdt.server.runtime.process import (
+from flexdt.runtime.access import client_tls, read_token
+from flexdt.runtime.log import set_up
+from flexdt.runtime.process import (
     INVALID,
     OK,
     announce,

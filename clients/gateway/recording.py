@@ -22,11 +22,11 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.protocol.state_model import State
-from flexdt.server.files.directory import Directory, open_data
-from flexdt.server.files.image_files import free_name, tiff_bytes
+from flexdt.runtime.files.dataset_folder import free_name, read_document, tiff_bytes
+from flexdt.runtime.files.directory import Directory, open_data
 from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.dataset.file_names import DOCUMENT, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS
-from flexdt.twin.dataset.flexdt_json import DatasetDocument, FrameEntry, parse_document
+from flexdt.twin.dataset.flexdt_json import DatasetDocument, FrameEntry
 from flexdt.twin.dataset.record import FrameBlock, FrameKind, ScanRecord
 from flexdt.twin.dataset.scan_settings_text import format_scan_settings
 from flexdt.twin.dataset.xre import format_xre
@@ -124,7 +124,7 @@ class Recording:
             DatasetError, OSError: the data set cannot be read, a name is taken, or no room.
         """
         source = Directory(folder.parent).folder(folder.name)
-        document = parse_document(source.read(DOCUMENT).decode(), str(folder / DOCUMENT))
+        document = read_document(source)
         with self._turn:
             files = self._files([f.file for f in document.frames])
             there = source.names()

@@ -1,7 +1,7 @@
 """The servers of a demonstration or a test: started on free ports, stopped for certain.
 
 The servers are programs of their own (`python -m flexdt.clients.launch.up`), started under
-`flexdt.server.runtime.child`, so that they end with this process however it ends.
+`flexdt.runtime.child`, so that they end with this process however it ends.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Servers:
                 sys.executable,
                 "-P",
                 "-m",
-                "flexdt.server.runtime.child",
+                "flexdt.runtime.child",
                 "flexdt.clients.launch.up",
                 *self._words,
             ],

@@ -26,9 +26,9 @@ from flexdt.process_settings import (
     shared,
     words,
 )
-from flexdt.server.runtime.access import ViewerLimits, limit_names
-from flexdt.server.runtime.process import REFUSED
-from flexdt.server.runtime.supervisor import (
+from flexdt.runtime.access import ViewerLimits, limit_names
+from flexdt.runtime.process import REFUSED
+from flexdt.runtime.supervisor import (
     Addresses,
     Service,
     ServiceError,

@@ -26,7 +26,7 @@ import numpy.typing as npt
 from flexdt.clients.client.events import Event, Projection
 from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress
 from flexdt.clients.viewer.page import watched
-from flexdt.server.runtime.log import log
+from flexdt.runtime.log import log
 from flexdt.twin.geometry.conventions import Float32Array
 
 MAGIC = b"FXI2"

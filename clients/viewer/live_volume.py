@@ -28,8 +28,8 @@ import numpy as np
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.viewer.feed import base64_grey
 from flexdt.clients.viewer.page import watched
-from flexdt.server.files.dataset_folder import read_image
-from flexdt.server.runtime.workers import ENVIRONMENT
+from flexdt.runtime.files.dataset_folder import read_image
+from flexdt.runtime.workers import ENVIRONMENT
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray

@@ -16,17 +16,17 @@ from typing import TYPE_CHECKING, TextIO
 from flexdt import machines
 from flexdt.clients.client.kept_connection import TwinAddress
 from flexdt.process_settings import Address, ViewerSettings, parse
-from flexdt.server.runtime.access import (
+from flexdt.runtime.access import (
     ViewerLimits,
     client_tls,
     read_token,
     server_tls,
     with_limits,
 )
-from flexdt.server.runtime.http_pages import Pages, served_pages, watching_pages
-from flexdt.server.runtime.log import LEVELS, set_up
-from flexdt.server.runtime.metrics import Figure, counter, gauge
-from flexdt.server.runtime.process import (
+from flexdt.runtime.http_pages import Pages, served_pages, watching_pages
+from flexdt.runtime.log import LEVELS, set_up
+from flexdt.runtime.metrics import Figure, counter, gauge
+from flexdt.runtime.process import (
     FAILED,
     OK,
     announce,

@@ -30,7 +30,7 @@ from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress, U
 from flexdt.clients.client.transport import ConnectionLost
 from flexdt.protocol import METHODS, Code, RpcError, parse_params
 from flexdt.protocol.rpc_errors import busy, clip, internal, link_down
-from flexdt.server.runtime.log import log, traced
+from flexdt.runtime.log import log, traced
 
 
 def watched(

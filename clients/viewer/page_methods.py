@@ -41,7 +41,7 @@ from flexdt.protocol.fields import Nothing, Params
 from flexdt.protocol.methods.calibration_messages import CalibrationAlign, CalibrationFit
 from flexdt.protocol.rpc_errors import busy, link_down
 from flexdt.protocol.state_model import State
-from flexdt.server.wire_errors import explain
+from flexdt.runtime.wire_errors import explain
 from flexdt.twin.dataset.file_names import plain_name
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.camera import Roi

@@ -18,7 +18,7 @@ import numpy as np
 from flexdt.clients.viewer.scenes.world import camera_of, motors, parameters_of
 from flexdt.protocol.rpc_errors import too_large
 from flexdt.protocol.state_model import State
-from flexdt.server.runtime.workers import Workers
+from flexdt.runtime.workers import Workers
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses

@@ -36,9 +36,9 @@ from flexdt.clients.viewer.scenes.world import World, beads_on, world_of
 from flexdt.clients.viewer.viser_gate import Scenes
 from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SafetyState, SampleState, State
-from flexdt.server.runtime.access import ViewerLimits
-from flexdt.server.runtime.log import log
-from flexdt.server.runtime.workers import Workers
+from flexdt.runtime.access import ViewerLimits
+from flexdt.runtime.log import log
+from flexdt.runtime.workers import Workers
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import Machine, Profile, builtin_machine, profile_of
 

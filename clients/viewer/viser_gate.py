@@ -41,7 +41,7 @@ from websockets.typing import Subprotocol
 
 from flexdt.clients.viewer.scenes.standpoints import Standpoint
 from flexdt.protocol.fields import Params
-from flexdt.server.runtime.log import log
+from flexdt.runtime.log import log
 
 MAX_OF_VISER: Final = 256 << 20
 LARGEST_SIDE: Final = 4096

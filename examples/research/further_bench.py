@@ -221,7 +221,7 @@ def cold_start() -> list[Entry]:
 
 def through_server() -> list[Entry]:
     """C1 asked for over TCP beside the same projection in this process."""
-    command = [sys.executable, "-P", "-m", "flexdt.server.runtime.child"]
+    command = [sys.executable, "-P", "-m", "flexdt.runtime.child"]
     with subprocess.Popen(
         [*command, "flexdt.server.projector.main", "--port", "0"],
         stdin=subprocess.PIPE,

@@ -24,9 +24,9 @@ from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import Channel, attenuating, channels, scatter_object
 from flexdt.phantoms.json_form import scene_to_dict
 from flexdt.protocol import Code, RpcError
+from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.storage.stored_samples import SampleStore
-from flexdt.server.wire_errors import ProjectorUnavailable
 from flexdt.twin.geometry.cone_vec import ConeVec, check_cone_vec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.poses import Poses

@@ -11,7 +11,7 @@ import asyncio
 import ssl as tls
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import KW_ONLY, dataclass
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -19,10 +19,10 @@ import numpy.typing as npt
 from flexdt.phantoms.json_form import scene_to_dict
 from flexdt.protocol import Code, RpcError, hello_params, image, parse_result
 from flexdt.protocol.projector import Health, VolumeList
+from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.projector.wire import LinkLost, ProjectorLink
-from flexdt.server.wire_errors import ProjectorUnavailable
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.projection import Body, TriangleMesh, Volume
+from flexdt.twin.projection import Body, TriangleMesh
 from flexdt.twin.projection.analytic_solids import Scene
 
 _T = TypeVar("_T")
@@ -119,18 +119,19 @@ class ProjectorClient:
             RpcError: invalid parameters, or an unknown volume.
             ProjectorUnavailable: the server does not answer.
         """
-        rows = _rows(cone_vec)
+        rows = cone_vec.rows if isinstance(cone_vec, ConeVec) else np.asarray(cone_vec, np.float64)
+        rows = np.atleast_2d(rows)
         params: dict[str, object] = {
             "volume": name, "cone_vec": image.encode(rows), "detector": list(shape),
         }  # fmt: skip
         whole = (len(rows), *shape)
         try:
-            return await self._array("project", params, whole)
+            return await self._persist("project", lambda c: c.ask_array("project", params, whole))
         except RpcError as error:
             if not self._lacks_volume(error, name):
                 raise
         await self.put(name, self._volumes[name])  # another client removed it
-        return await self._array("project", params, whole)
+        return await self._persist("project", lambda c: c.ask_array("project", params, whole))
 
     async def volumes(self) -> VolumeList:
         """The volumes that the server holds, and its memory."""
@@ -144,11 +145,6 @@ class ProjectorClient:
 
     async def _ask(self, method: str, params: Mapping[str, object]) -> object:
         return await self._persist(method, lambda channel: channel.ask(method, params))
-
-    async def _array(
-        self, method: str, params: Mapping[str, object], shape: tuple[int, ...]
-    ) -> npt.NDArray[np.float32]:
-        return await self._persist(method, lambda channel: channel.ask_array(method, params, shape))
 
     async def _persist(self, method: str, work: Callable[[ProjectorLink], Awaitable[_T]]) -> _T:
         """Do `work`; after a lost connection repeat it.
@@ -227,21 +223,10 @@ async def _send(channel: ProjectorLink, name: str, value: Body) -> None:
         corners, faces = value.vertices.astype("<f8"), value.faces.astype("<i4")
         flat = np.frombuffer(corners.tobytes() + faces.tobytes(), np.uint8)
     else:
-        what = {"grid": _grid(value)}
+        center = [float(c) for c in value.center_mm]
+        shape, voxel = list(value.shape), list(value.voxel_xyz)
+        what = {"grid": {"shape": shape, "voxel_mm": voxel, "center_mm": center}}
         flat = np.ascontiguousarray(value.data, dtype="<f4").reshape(-1).view(np.uint8)
     for start in range(0, flat.size, CHUNK):
         data = flat[start : start + CHUNK].data.toreadonly()
         await channel.ask("volume.put", {"name": name, **what, "start": start, "data": data})
-
-
-def _rows(cone_vec: ConeVec | npt.ArrayLike) -> npt.NDArray[np.float64]:
-    rows = cone_vec.rows if isinstance(cone_vec, ConeVec) else np.asarray(cone_vec, np.float64)
-    return np.atleast_2d(rows)
-
-
-def _grid(volume: Volume) -> dict[str, Any]:
-    return {
-        "shape": list(volume.shape),
-        "voxel_mm": list(volume.voxel_xyz),
-        "center_mm": [float(c) for c in volume.center_mm],
-    }

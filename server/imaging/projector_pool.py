@@ -16,9 +16,9 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from flexdt.protocol import Code, RpcError
+from flexdt.runtime.log import log
+from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.imaging.projector_client import ProjectorClient
-from flexdt.server.runtime.log import log
-from flexdt.server.wire_errors import ProjectorUnavailable
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import Body

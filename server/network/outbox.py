@@ -19,7 +19,7 @@ from pydantic import BaseModel
 from flexdt.protocol import Connection, Failure, Message, Prepared, Response, RpcError
 from flexdt.protocol.messages import to_plain
 from flexdt.protocol.rpc_errors import internal
-from flexdt.server.runtime.access import ConnectionLimits
+from flexdt.runtime.access import ConnectionLimits
 
 A_WRITE = 1 << 18
 """Bytes given to the transport at a time, since it copies what it cannot send at once."""

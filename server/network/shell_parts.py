@@ -1,4 +1,4 @@
-"""What the TCP shells of twin and projector share: timeouts, tokens, the request log.
+"""What the TCP shells of twin and projector are made of, and their interface to an application.
 
 The shells differ in how they read and write: lines or frames in order for the twin, frames side by
 side and without copies for the projector.
@@ -18,15 +18,30 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import logging
-from collections import Counter
+import pickle
+from collections import Counter, OrderedDict, deque
 from collections.abc import Awaitable, Callable, Collection
+from dataclasses import dataclass
 from typing import Protocol
 
-from flexdt.protocol import Connection, Failure, Response, RpcError
+from flexdt.protocol import (
+    AnyMethod,
+    Codec,
+    Connection,
+    Failure,
+    Message,
+    Notification,
+    Prepared,
+    Request,
+    Response,
+    RpcError,
+)
+from flexdt.protocol.connection import Raw
+from flexdt.protocol.fields import Params
+from flexdt.protocol.messages import Id, Single
 from flexdt.protocol.rpc_errors import not_authorised
-from flexdt.server.network.shell_application import Observe
-from flexdt.server.runtime.access import token_matches
-from flexdt.server.runtime.log import LOGGER, Sparing, log, traced
+from flexdt.runtime.access import token_matches
+from flexdt.runtime.log import LOGGER, Sparing, log, traced
 
 WRONG_TOKENS = 3
 """Wrong tokens after which a connection is closed."""
@@ -234,3 +249,129 @@ class TurnedAway(asyncio.Protocol):
     def _forget(self) -> None:
         self._timer.cancel()
         self._others.leave(self)
+
+
+Observe = Callable[[str, float, int | None], None]
+"""Called for every answered request: method, seconds, error code or None."""
+
+
+def unobserved(method: str, seconds: float, code: int | None) -> None:
+    """An `Observe` that takes no notice."""
+
+
+@dataclass(frozen=True)
+class Call:
+    """A request that another process has read: its validated parameters, or the error in them.
+
+    Attributes:
+        answered: whether it wants an answer (a notification does not).
+    """
+
+    id: Id
+    method: str
+    params: Params | RpcError
+    answered: bool
+
+    @property
+    def message(self) -> Request | Notification:
+        """The message as it concerns the order of requests and answers: without parameters."""
+        return Request(self.id, self.method) if self.answered else Notification(self.method)
+
+
+@dataclass(frozen=True)
+class Frozen:
+    """One message that another process has read, pickled by it.
+
+    Attributes:
+        data: to be thawed when its turn comes.
+        method: that it calls; empty where it calls none.
+    """
+
+    data: bytes
+    method: str
+
+    def thawed(self) -> Single | Call:
+        """The message."""
+        message: Single | Call = pickle.loads(self.data)
+        return message
+
+
+Read = Callable[[Raw, Connection], Awaitable[Frozen | tuple[Frozen, ...]]]
+"""Reads a large message of a connection apart from the loop: one message, or those of a batch.
+
+Raises `RpcError` where that takes too much.
+"""
+
+
+class Session(Protocol):
+    """The application's state of one connection."""
+
+    async def handle(self, method: AnyMethod, params: Params) -> object:
+        """Answer a call: a result model or plain data, or raise `RpcError`."""
+
+    def close(self) -> None:
+        """Called once when the connection has ended."""
+
+
+class Peer(Protocol):
+    """A connection as the application sees it."""
+
+    name: str
+
+    @property
+    def codec(self) -> Codec:
+        """The codec of the connection."""
+
+    def post(self, message: Message | Prepared, slot: str | None = None) -> None:
+        """Send an event: the newest of its `slot`, or (None) in order with all others."""
+
+    def close(self, reason: str) -> None:
+        """End the connection after what is queued has gone out."""
+
+
+Open = Callable[[Peer], Session]
+"""Opens the application's state of a connection that has been made (and let in)."""
+
+
+FIRST, URGENT, ORDINARY = range(3)
+"""Lanes by priority: E-stop; stop, abort and ping; everything else."""
+
+
+class LoopTurns:
+    """One turn is given in each turn of the loop; within a lane, connections alternate.
+
+    Between two requests the loop polls its sockets, so an E-stop is received after at most one
+    request of another connection, however many are queued.
+    """
+
+    def __init__(self) -> None:
+        self._lanes: tuple[_Lane, ...] = (OrderedDict(), OrderedDict(), OrderedDict())
+        self._due = False
+
+    async def take(self, who: object, lane: int) -> None:
+        """Wait for a turn of the connection `who` in a lane; lower lanes go first."""
+        loop = asyncio.get_running_loop()
+        turn = loop.create_future()
+        self._lanes[lane].setdefault(who, deque()).append(turn)
+        if not self._due:
+            self._due = True
+            loop.call_soon(self._give)
+        await turn
+
+    def _give(self) -> None:
+        self._due = False
+        for lane in self._lanes:
+            while lane:
+                who, waiting = lane.popitem(last=False)
+                turn = waiting.popleft()
+                if waiting:
+                    lane[who] = waiting
+                if not turn.done():  # cancelled: its connection is gone
+                    turn.set_result(None)
+                    if any(self._lanes):
+                        self._due = True
+                        asyncio.get_running_loop().call_soon(self._give)
+                    return
+
+
+_Lane = OrderedDict[object, deque[asyncio.Future[None]]]

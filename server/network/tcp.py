@@ -56,30 +56,31 @@ from flexdt.protocol.rpc_errors import (
     parse_error,
     too_large,
 )
+from flexdt.runtime.access import ConnectionLimits, check_bind
+from flexdt.runtime.log import Sparing
+from flexdt.runtime.loop import ListeningServer, tune
 from flexdt.server.network.outbox import Outbox
-from flexdt.server.network.shell_application import (
-    App,
-    Call,
-    Frozen,
-    Observe,
-    Read,
-    Session,
-    unobserved,
-)
 from flexdt.server.network.shell_parts import (
+    FIRST,
+    ORDINARY,
+    URGENT,
     WAITING,
+    Call,
     Deadlines,
+    Frozen,
     Guest,
+    LoopTurns,
+    Observe,
+    Open,
+    Read,
     Room,
+    Session,
     TokenCheck,
     TurnedAway,
     answered,
     neighbourhood,
+    unobserved,
 )
-from flexdt.server.network.turns import FIRST, ORDINARY, URGENT, LoopTurns
-from flexdt.server.runtime.access import ConnectionLimits, check_bind
-from flexdt.server.runtime.log import Sparing
-from flexdt.server.runtime.loop import ListeningServer, tune
 
 READ_AHEAD = 512 << 10
 """Bytes of whole messages that one connection may have waiting; then it is read no further."""
@@ -106,7 +107,7 @@ HELLO = "session.hello"
 class TcpServer(ListeningServer):
     """A listening server; made by `serve`."""
 
-    app: App
+    open: Open
     limits: ConnectionLimits
     token: str | None
     methods: Mapping[str, AnyMethod]
@@ -155,7 +156,7 @@ class TcpServer(ListeningServer):
 
 
 async def serve(
-    app: App,
+    open: Open,
     host: str = "127.0.0.1",
     port: int = 0,
     *,
@@ -166,10 +167,10 @@ async def serve(
     observe: Observe = unobserved,
     read: Read | None = None,
 ) -> TcpServer:
-    """Listen on `host`:`port` (0: any free port) and serve `app`.
+    """Listen on `host`:`port` (0: any free port) and serve an application.
 
     Args:
-        app: behind it.
+        open: begins a session of the application with a connection.
         host, port: where.
         limits: of connections.
         token: that clients must bring.
@@ -184,7 +185,7 @@ async def serve(
     """
     check_bind(host, token)
     limits = limits or ConnectionLimits()
-    server = TcpServer(app, limits, token, methods, observe, read)
+    server = TcpServer(open, limits, token, methods, observe, read)
     await server.listen(lambda: _Link(server), host, port, ssl)
     return server
 
@@ -381,7 +382,7 @@ class _Link(asyncio.Protocol):
         if not self._seat():
             self.server.reserved.enter(self)
         try:
-            self.session = self.server.app.open(self)
+            self.session = self.server.open(self)
         except Exception:
             self.log("open failed", logging.ERROR, error=True)
             self.abort("the application did not open a session")

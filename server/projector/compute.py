@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.protocol.rpc_errors import RpcError, internal, invalid_params, too_large
-from flexdt.server.runtime.log import log
+from flexdt.runtime.log import log
 from flexdt.twin.errors import TwinError
 from flexdt.twin.projection import Body, gpu, project_body, warm_up
 

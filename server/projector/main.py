@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from flexdt.process_settings import ProjectorSettings, parse
-from flexdt.server.runtime.access import ConnectionLimits, read_token, server_tls, with_limits
-from flexdt.server.runtime.log import LEVELS, set_up
-from flexdt.server.runtime.metrics import Requests
-from flexdt.server.runtime.process import OK, announce, run_process, stop_signal
+from flexdt.runtime.access import ConnectionLimits, read_token, server_tls, with_limits
+from flexdt.runtime.log import LEVELS, set_up
+from flexdt.runtime.metrics import Requests
+from flexdt.runtime.process import OK, announce, run_process, stop_signal
 
 CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 FALLBACK_MEMORY = 4 << 30
@@ -35,9 +35,9 @@ def default_memory() -> int:
 
 async def run(options: ProjectorSettings) -> int:
     """Serve until SIGTERM or SIGINT; returns the exit code."""
+    from flexdt.runtime.http_pages import served_pages
     from flexdt.server.projector.compute import backend, begin
     from flexdt.server.projector.service import projector_pages, serve_projector
-    from flexdt.server.runtime.http_pages import served_pages
     from flexdt.twin.projection.cpu import threads as all_threads
 
     threads = options.threads or all_threads()

@@ -40,22 +40,22 @@ from flexdt.protocol.rpc_errors import (
     invalid_request,
     not_authorised,
 )
-from flexdt.server.network.shell_application import Observe, unobserved
-from flexdt.server.network.shell_parts import answered
+from flexdt.runtime.access import ConnectionLimits, check_bind
+from flexdt.runtime.http_pages import Pages, watching_pages
+from flexdt.runtime.log import current, log
+from flexdt.runtime.loop import ListeningServer
+from flexdt.runtime.metrics import Figure, Requests, counter, gauge
+from flexdt.server.network.shell_parts import Observe, answered, unobserved
 from flexdt.server.projector.compute import ComputeThread
-from flexdt.server.projector.context import Context, JobClient
-from flexdt.server.projector.projector_methods import ANSWERS
+from flexdt.server.projector.projector_methods import ANSWERS, Context, JobClient
 from flexdt.server.projector.volumes import VolumeStore
 from flexdt.server.projector.wire import FrameLink
-from flexdt.server.runtime.access import ConnectionLimits, check_bind
-from flexdt.server.runtime.http_pages import Pages, watching_pages
-from flexdt.server.runtime.log import current, log
-from flexdt.server.runtime.loop import ListeningServer
-from flexdt.server.runtime.metrics import Figure, Requests, counter, gauge
 from flexdt.twin.errors import TwinError
 
 MAX_PENDING_BYTES: Final = 64 * 2**20
 """Bytes of unanswered requests of one client above which it is not read any more."""
+Given = Mapping[str, object] | list[object] | None
+"""Parameters of a call as they came."""
 
 
 @dataclass(eq=False, repr=False)
@@ -156,25 +156,13 @@ class ProjectorServer(ListeningServer):
             if client.pending_bytes <= MAX_PENDING_BYTES and not client.link.lost:
                 client.link.transport.resume_reading()
 
-    async def _call(
-        self,
-        client: JobClient,
-        id: Id,
-        name: str,
-        given: Mapping[str, object] | list[object] | None,
-    ) -> Response | Failure:
+    async def _call(self, client: JobClient, id: Id, name: str, given: Given) -> Response | Failure:
         return await answered(
             self._try(client, id, name, given), name, trace=str(id), client=client.link.peer,
             known=PROJECTOR_METHODS, observe=self.observe,
         )  # fmt: skip
 
-    async def _try(
-        self,
-        client: JobClient,
-        id: Id,
-        name: str,
-        given: Mapping[str, object] | list[object] | None,
-    ) -> Response | Failure:
+    async def _try(self, client: JobClient, id: Id, name: str, given: Given) -> Response | Failure:
         try:
             if not client.let_in and name != "session.hello":
                 raise not_authorised()

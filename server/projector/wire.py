@@ -41,9 +41,9 @@ from flexdt.protocol import msgpack_frames as frames
 from flexdt.protocol.msgpack_frames import pack
 from flexdt.protocol.projector import Array
 from flexdt.protocol.rpc_errors import parse_error, too_large
+from flexdt.runtime.log import current, log
+from flexdt.runtime.loop import tune
 from flexdt.server.network.shell_parts import Deadlines
-from flexdt.server.runtime.log import current, log
-from flexdt.server.runtime.loop import tune
 
 SILENT_S: Final = 10.0
 """A projector that sends nothing for so long, while it is asked something, has gone."""

@@ -14,7 +14,6 @@ import pickle
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, replace
-from itertools import chain
 from typing import Any, Final, TypeVar
 
 from flexdt.protocol import Codec
@@ -22,8 +21,8 @@ from flexdt.protocol.codec import write_json, write_msgpack
 from flexdt.protocol.connection import MAX_ANSWER
 from flexdt.protocol.methods.job_messages import CHECK_LIMITS
 from flexdt.protocol.rpc_errors import Code, RpcError, too_large
-from flexdt.server.runtime.loop import ServerLoop
-from flexdt.server.runtime.workers import Workers
+from flexdt.runtime.loop import ServerLoop
+from flexdt.runtime.workers import Workers
 from flexdt.server.scans.scan_record import PoseList, ScanSource
 from flexdt.twin.collision.convex_solids import Polytope
 from flexdt.twin.collision.plan_report import collision_check
@@ -293,52 +292,43 @@ def _worst(problems: list[Problem]) -> Sequence[Problem]:
 
 
 def _pieces_of(plan: ScanPlan) -> list[bytes]:
-    """A plan without its machine and profile, each piece small enough to be unpickled at once."""
-    long: dict[str, Sequence[Any]] = {
-        "steps": plan.steps,
-        "groups": [replace(g, files=()) for g in plan.groups],
-        "files": [
-            (i, g.files[at : at + 20 * A_PIECE])
-            for i, g in enumerate(plan.groups)
-            for at in range(0, len(g.files), 20 * A_PIECE)
-        ],
-        "beam": plan.beam,
-        "problems": plan.problems,
-        "fly_scans": plan.fly_scans,
-        **{f"axis {axis}": each for axis, each in plan.trajectories.items()},
-    }
-    short = {
-        f.name: getattr(plan, f.name)
-        for f in fields(plan)
-        if f.name not in ("machine", "profile", "trajectories", *long)
-    }
-    out = [pickle.dumps(short)]
-    for name, values in long.items():
-        size = 1 if name == "files" else A_PIECE  # one of them has thousands of names
-        pieces = [values[i : i + size] for i in range(0, len(values), size)]
-        out += [name.encode(), str(len(pieces)).encode(), *map(pickle.dumps, pieces)]
-    return out
+    """A plan without its machine and profile, each piece small enough to be unpickled at once.
+
+    Each piece is (field or axis, some of its parts); files are apart from their groups.
+    """
+    rest = {f.name: getattr(plan, f.name) for f in fields(plan)}
+    for name in ("machine", "profile"):
+        del rest[name]
+    axes = {f"axis {axis}": parts for axis, parts in rest.pop("trajectories").items()}
+    files = {f"files {i}": group.files for i, group in enumerate(plan.groups)}
+    rest["groups"] = tuple(replace(group, files=()) for group in plan.groups)
+    long = {name: parts for name, parts in rest.items() if isinstance(parts, tuple)} | axes | files
+    short = {name: value for name, value in rest.items() if name not in long}
+    pieces = [
+        (name, parts[at : at + A_PIECE])
+        for name, parts in long.items()
+        for at in range(0, max(len(parts), 1), A_PIECE)
+    ]
+    return [pickle.dumps(short), *map(pickle.dumps, pieces)]
 
 
-def _joined(parts: list[bytes], machine: Machine, profile: Profile) -> ScanPlan:
+def _joined(pieces: list[bytes], machine: Machine, profile: Profile) -> ScanPlan:
     """The plan of `_pieces_of`; in a thread, that others come to work between the pieces."""
     with _no_collection():
-        left = iter(parts)
-        short: dict[str, Any] = pickle.loads(next(left))
+        short = pickle.loads(pieces[0])
         long: dict[str, list[Any]] = {}
-        for name in left:
-            count = int(next(left))
-            long[name.decode()] = list(
-                chain.from_iterable(pickle.loads(next(left)) for _ in range(count))
-            )
-        files: dict[int, list[str]] = {}
-        for i, some in long.pop("files"):
-            files.setdefault(i, []).extend(some)
-        groups = [replace(g, files=tuple(files.get(i, ()))) for i, g in enumerate(long["groups"])]
-        axes = {name[5:]: tuple(long.pop(name)) for name in list(long) if name.startswith("axis ")}
-        rest: dict[str, Any] = {name: tuple(values) for name, values in long.items()}
-        rest["groups"] = tuple(groups)
-        return ScanPlan(machine=machine, profile=profile, trajectories=axes, **short, **rest)
+        for piece in pieces[1:]:
+            name, parts = pickle.loads(piece)
+            long.setdefault(name, []).extend(parts)
+        whole: dict[str, Any] = {name: tuple(parts) for name, parts in long.items()}
+        axes = {name[5:]: whole.pop(name) for name in long if name.startswith("axis ")}
+        files = [whole.pop(name) for name in long if name.startswith("files ")]
+        groups = zip(whole.pop("groups"), files, strict=True)
+        return ScanPlan(
+            machine=machine, profile=profile, trajectories=axes,
+            groups=tuple(replace(group, files=names) for group, names in groups),
+            **short, **whole,
+        )  # fmt: skip
 
 
 @contextmanager

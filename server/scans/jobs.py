@@ -18,14 +18,13 @@ from pathlib import Path
 
 from flexdt.protocol.rpc_errors import RpcError, busy
 from flexdt.protocol.state_model import JobPhase, JobStatus
-from flexdt.server.files.directory import Directory
-from flexdt.server.runtime.log import log, traced
-from flexdt.server.scans.job import ENDED, Job, JobInputs, Prepare, recalled
-from flexdt.server.scans.retry import Retry, transient
+from flexdt.runtime.files.directory import Directory
+from flexdt.runtime.log import log, traced
+from flexdt.runtime.wire_errors import explain, is_user_error
+from flexdt.server.scans.job import ENDED, Job, JobInputs, Prepare, Retry, recalled, transient
 from flexdt.server.scans.runner import JobAborted, Produce, ScanRunner
 from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
 from flexdt.server.storage.memory import JobMemory
-from flexdt.server.wire_errors import explain, is_user_error
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.script import Exposure, ScanPlan

@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from flexdt.server.scans.acquisition import FramePipeline
-from flexdt.server.scans.retry import hopeless
 from flexdt.server.scans.twin_clock import TwinClock
-from flexdt.twin.errors import TwinError
+from flexdt.twin.errors import GeometryError, LimitError, TwinError
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.motion import profiles as motion
 from flexdt.twin.motion.profiles import Piece, Trajectory
@@ -137,6 +136,11 @@ ROOM = 16
 
 Produce = Callable[[Sequence[Exposure]], Awaitable[None]]
 Phase = Literal["running", "paused", "done"]
+
+
+def hopeless(error: Exception) -> bool:
+    """Whether the same work would meet it again, whoever tries: a limit of what is computed."""
+    return isinstance(error, (LimitError, GeometryError)) or type(error) is TwinError
 
 
 class JobAborted(Exception):

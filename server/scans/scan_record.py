@@ -16,8 +16,8 @@ from typing import Annotated, Any, Final
 
 from pydantic import Field, TypeAdapter
 
-from flexdt.server.files.directory import Directory
-from flexdt.server.files.own_documents import Changes, file_stem, read_json, read_or_set_aside
+from flexdt.runtime.files.directory import Directory
+from flexdt.runtime.files.own_documents import Changes, file_stem, read_json, read_or_set_aside
 from flexdt.server.imaging.radiography import Physics
 from flexdt.server.scans.twin_clock import SpeedUp, check_speed_up
 from flexdt.twin.physics.scatter.simulation import Scatter

@@ -1,15 +1,19 @@
-"""What stands on the stage, for everyone who must know its shape: collisions, checks, states.
+"""What stands on the stage, for everyone who must know its shape: collisions, checks, drawings.
 
 Convex pieces and sizes of samples follow from the phantoms and are worked out once. A guard is
-made for one sample and one correction; another of either is another guard.
+made for one sample and one correction; another of either is another guard. Clients that draw get
+binary STL in mm, in the sample's own frame.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Any, Final
 
 from flexdt.phantoms import Phantom
-from flexdt.server.storage.stored_samples import Phantoms
+from flexdt.protocol.rpc_errors import too_large
+from flexdt.server.storage.stored_samples import SampleStore, Upload
 from flexdt.twin.collision.collision_scene import Scene, build_scene
 from flexdt.twin.collision.convex_solids import Polytope
 from flexdt.twin.collision.guard import SceneGuard
@@ -21,6 +25,9 @@ from flexdt.twin.scanner.state import Placement, Sample
 from flexdt.twin.script.planning.plan import SampleSize
 
 KEPT = 8
+MAX_BYTES: Final = 64 << 20
+HEADER, FACE = 84, 50
+"""Bytes of binary STL: before the faces, and of each."""
 
 
 class Stage:
@@ -31,16 +38,10 @@ class Stage:
         samples: what may stand on it.
     """
 
-    def __init__(self, machine: Machine, profile: Profile, samples: Phantoms) -> None:
+    def __init__(self, machine: Machine, profile: Profile, samples: SampleStore) -> None:
         self._machine, self._profile, self._samples = machine, profile, samples
         self._scenes: OrderedDict[tuple[_Content, Offsets], Scene] = OrderedDict()
         self._pieces: OrderedDict[_Content, tuple[Polytope, ...]] = OrderedDict()
-
-    def beside(self, samples: Phantoms) -> Stage:
-        """The same stage with other samples; what is worked out is shared, by their revisions."""
-        other = Stage(self._machine, self._profile, samples)
-        other._scenes, other._pieces = self._scenes, self._pieces
-        return other
 
     def phantom(self, sample: Sample) -> Phantom | None:
         """The phantom behind a sample; None for an empty stage.
@@ -50,14 +51,21 @@ class Stage:
         """
         return self._samples.load(sample.name, sample.material) if sample.name else None
 
-    def pieces(self, sample: Sample) -> tuple[Polytope, ...]:
-        """Convex pieces that hold the sample, object frame; it may take a second."""
-        before = self._content(sample)
+    def pieces(self, sample: Sample, upload: Upload | None = None) -> tuple[Polytope, ...]:
+        """Convex pieces that hold the sample, object frame; it may take a second.
+
+        Args:
+            sample: on the stage.
+            upload: to come under the sample's name; None for what is there.
+        """
+        before = self._content(sample, upload)
         pieces = self._pieces.get(before)
         if pieces is None:
-            phantom = self.phantom(sample)
+            phantom = self.phantom(sample) if upload is None else upload.standing
             pieces = () if phantom is None else _pieces(phantom, sample.offset)
-            now = self._content(sample)  # the revision is known once an upload has been read
+            now = self._content(
+                sample, upload
+            )  # the revision is known once an upload has been read
             if before[1] not in (None, now[1]):
                 return pieces  # another file came under the name meanwhile
             self._pieces[now] = pieces
@@ -72,17 +80,20 @@ class Stage:
             return None
         return SampleSize.around(phantom.size_mm, f"sample {sample.name}", sample.offset)
 
-    def scene(self, sample: Sample, parameters: Offsets = NOMINAL) -> Scene | None:
+    def scene(
+        self, sample: Sample, parameters: Offsets = NOMINAL, upload: Upload | None = None
+    ) -> Scene | None:
         """What may touch what with this sample; None where the machine has no components.
 
         Args:
             sample: what stands there.
             parameters: the correction in force; bodies sit where it says they are.
+            upload: as for `pieces`.
         """
         if not self._machine.components:
             return None
-        pieces = self.pieces(sample)
-        key = (self._content(sample), parameters)
+        pieces = self.pieces(sample, upload)
+        key = (self._content(sample, upload), parameters)
         scene = self._scenes.get(key)
         if scene is None:
             scene = build_scene(self._machine, self._profile, pieces, parameters)
@@ -91,18 +102,21 @@ class Stage:
                 self._scenes.popitem(last=False)
         return scene
 
-    def guard(self, sample: Sample, parameters: Offsets = NOMINAL) -> Guard | None:
+    def guard(
+        self, sample: Sample, parameters: Offsets = NOMINAL, upload: Upload | None = None
+    ) -> Guard | None:
         """What sweeps every motion with this sample; None where the machine has no components.
 
         Args:
             sample: what stands there.
             parameters: the correction in force.
+            upload: as for `pieces`.
         """
-        scene = self.scene(sample, parameters)
+        scene = self.scene(sample, parameters, upload)
         return None if scene is None else SceneGuard(scene)
 
-    def _content(self, sample: Sample) -> _Content:
-        return sample, self._samples.revision(sample.name)
+    def _content(self, sample: Sample, upload: Upload | None) -> _Content:
+        return sample, upload.revision if upload else self._samples.revision(sample.name)
 
 
 _Content = tuple[Sample, str | None]
@@ -113,3 +127,38 @@ def _pieces(phantom: Phantom, offset: Placement) -> tuple[Polytope, ...]:
     return convex_pieces(
         phantom.mesh(around=True), rotation=offset.rotation, offset=(offset.x, offset.y, offset.z)
     )
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The mesh of a sample as binary STL, and the revision of the upload that it was made of."""
+
+    name: str
+    revision: str | None
+    stl: bytes
+
+
+class Shapes:
+    """The last shape asked for; kept until another sample's is."""
+
+    def __init__(self, limit: int = MAX_BYTES) -> None:
+        self._limit = limit
+        self._kept: Shape | None = None
+
+    def known(self, name: str, revision: str | None) -> Shape | None:
+        """A shape that was made already."""
+        kept = self._kept
+        return kept if kept is not None and (kept.name, kept.revision) == (name, revision) else None
+
+    def make(self, name: str, revision: str | None, phantom: Phantom) -> Shape:
+        """The shape of `phantom`; it may take a second.
+
+        Raises:
+            RpcError: -32008, more triangles than are sent.
+        """
+        mesh: Any = phantom.mesh()
+        size = HEADER + FACE * len(mesh.faces)
+        if size > self._limit:
+            raise too_large("the sample's mesh", size, self._limit)
+        self._kept = Shape(name, revision, mesh.export(file_type="stl"))
+        return self._kept

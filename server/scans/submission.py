@@ -18,9 +18,9 @@ from datetime import datetime
 from flexdt.protocol import Codec
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.rpc_errors import RpcError, invalid_params
-from flexdt.server.files.directory import Directory, free_bytes
-from flexdt.server.files.image_files import dated_name
-from flexdt.server.files.own_documents import used_bytes
+from flexdt.runtime.files.dataset_folder import dated_name, read_document
+from flexdt.runtime.files.directory import Directory, free_bytes
+from flexdt.runtime.files.own_documents import used_bytes
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.scans.acquisition import Acquisition, FrameListener
 from flexdt.server.scans.checking import CheckInput, Checks
@@ -33,7 +33,6 @@ from flexdt.server.storage.dataset_writer import RESERVE_BYTES, DatasetWriter
 from flexdt.server.storage.memory import Memory, StateStore, with_job
 from flexdt.twin.dataset.dataset_errors import DatasetError, DiskFullError
 from flexdt.twin.dataset.file_names import DOCUMENT, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS, plain_name
-from flexdt.twin.dataset.flexdt_json import parse_document
 from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.geometry.cone_vec import check_cone_vec
 from flexdt.twin.scanner.scanner import ScannerTwin
@@ -292,8 +291,7 @@ class Submissions:
             # A server killed while it made the folder leaves no document, and no image either.
             complete = False
             if DOCUMENT in there or there - {SCRIPT, SCAN_SETTINGS, XRE_SETTINGS}:
-                document = parse_document(folder.read(DOCUMENT).decode())
-                complete = document.complete
+                complete = read_document(folder).complete
         except FileNotFoundError:
             raise name_conflict(
                 name, "there is something that no scan of this twin has begun"

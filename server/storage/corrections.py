@@ -18,8 +18,8 @@ from pydantic import Field
 from flexdt.protocol.fields import ShortText
 from flexdt.protocol.rpc_errors import invalid_params
 from flexdt.protocol.scene_document import CorrectionPart
-from flexdt.server.files.directory import Directory
-from flexdt.server.files.own_documents import (
+from flexdt.runtime.files.directory import Directory
+from flexdt.runtime.files.own_documents import (
     Changes,
     file_stem,
     ours,

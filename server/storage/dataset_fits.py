@@ -12,9 +12,9 @@ from typing import Any, Final
 
 from flexdt.phantoms import is_shipped, load_phantom, load_phantom_file
 from flexdt.protocol.methods import calibration_messages as p
-from flexdt.server.files.dataset_folder import read_text
-from flexdt.server.files.directory import Directory
-from flexdt.server.wire_errors import from_root
+from flexdt.runtime.files.dataset_folder import read_text
+from flexdt.runtime.files.directory import Directory
+from flexdt.runtime.wire_errors import from_root
 from flexdt.twin.calibration.fit.covariance_steps import covariance_by_step
 from flexdt.twin.calibration.unknown_markers import UNKNOWN
 from flexdt.twin.dataset.dataset_errors import DatasetMissingError

@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 import tifffile
 
-from flexdt.server.files.directory import Directory, Write, free_bytes, write_some
-from flexdt.server.files.image_files import tiff_bytes
+from flexdt.runtime.files.dataset_folder import read_document, tiff_bytes
+from flexdt.runtime.files.directory import Directory, Write, free_bytes, write_some
 from flexdt.twin.dataset.dataset_errors import (
     DatasetError,
     DatasetExistsError,
@@ -28,7 +28,7 @@ from flexdt.twin.dataset.dataset_errors import (
     DiskFullError,
 )
 from flexdt.twin.dataset.file_names import DOCUMENT, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS, plain_name
-from flexdt.twin.dataset.flexdt_json import DatasetDocument, parse_document
+from flexdt.twin.dataset.flexdt_json import DatasetDocument
 from flexdt.twin.dataset.record import ScanRecord
 from flexdt.twin.dataset.scan_settings_text import format_scan_settings
 from flexdt.twin.dataset.xre import format_xre
@@ -180,8 +180,8 @@ class DatasetWriter:
     def _check_same(self) -> None:
         path = self.folder / DOCUMENT
         try:
-            found = parse_document(self._files.read(DOCUMENT).decode(), str(path))
-        except (DatasetError, OSError, UnicodeDecodeError) as error:
+            found = read_document(self._files)
+        except (DatasetError, OSError) as error:
             raise DatasetExistsError(
                 f"{path} cannot be read, so the scan cannot be resumed: {error}",
                 {"path": str(path)},

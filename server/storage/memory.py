@@ -25,9 +25,9 @@ from flexdt.protocol.fields import SpeedUp
 from flexdt.protocol.rpc_errors import RpcError
 from flexdt.protocol.scene_document import Scene
 from flexdt.protocol.state_model import JobPhase
-from flexdt.server.files.directory import Directory
-from flexdt.server.files.own_documents import Changes, read_json, read_or_set_aside
-from flexdt.server.runtime.log import log
+from flexdt.runtime.files.directory import Directory
+from flexdt.runtime.files.own_documents import Changes, read_json, read_or_set_aside
+from flexdt.runtime.log import log
 from flexdt.server.storage.scene import apply_settings, require_fit, sample_of, save_scene
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetWriteError
 from flexdt.twin.dataset.file_names import plain_name

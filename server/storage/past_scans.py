@@ -12,7 +12,8 @@ import os
 import stat
 import time
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
@@ -27,7 +28,7 @@ from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import dataset_messages as p
 from flexdt.protocol.methods.calibration_messages import CalibrationAlign, CalibrationFit
 from flexdt.protocol.rpc_errors import too_large
-from flexdt.server.files.dataset_folder import (
+from flexdt.runtime.files.dataset_folder import (
     Folder,
     confined,
     list_folder,
@@ -36,10 +37,10 @@ from flexdt.server.files.dataset_folder import (
     read_image,
     read_text,
 )
-from flexdt.server.files.directory import Directory
-from flexdt.server.runtime.workers import Workers
+from flexdt.runtime.files.directory import Directory
+from flexdt.runtime.wire_errors import from_root
+from flexdt.runtime.workers import Workers
 from flexdt.server.storage import dataset_fits
-from flexdt.server.wire_errors import from_root
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetMissingError, DatasetNameError
 from flexdt.twin.dataset.file_names import DOCUMENT, SCRIPT, plain_name
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, FrameEntry, parse_document
@@ -137,20 +138,16 @@ class _LruCache:
     def __contains__(self, key: Hashable) -> bool:
         return key in self._made
 
-    def get(
-        self, key: Hashable, make: Callable[[], Any], sound: Callable[[Any], bool] = lambda _: True
-    ) -> Any:
-        """What was made for `key`, or is made now; only what is `sound` is kept."""
-        value = self._made.pop(key) if key in self._made else make()
-        if sound(value):
-            self._made[key] = value
+    def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
+        """What was made for `key`, or is made now."""
+        value = self._made[key] = self._made.pop(key) if key in self._made else make()
         if len(self._made) > self._most:
             del self._made[next(iter(self._made))]
         return value
 
 
-_INFOS, _THUMBNAILS, _MEASURED = _LruCache(MAX_SETS), _LruCache(1000), _LruCache(16)
-_DOCUMENTS, _NORMALS = _LruCache(4), _LruCache(4)
+_INFOS, _THUMBNAILS = _LruCache(MAX_SETS), _LruCache(1000)
+"""Unlike those of `lru_cache`, they tell what is known: a list has `LIST_S` to read the rest."""
 
 
 # A data set's folder ------------------------------------------------------------------------------
@@ -175,9 +172,9 @@ class _UndocumentedFrame:
 _Images = tuple[FrameEntry | _UndocumentedFrame, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Scan:
-    """A data set's folder as it was read.
+    """A data set's folder as it was read; the last few are kept, and what is made of them.
 
     Attributes:
         folder: its files.
@@ -185,6 +182,7 @@ class _Scan:
         document: flexdt.json; None where there is none, or none of use.
         texts: where there is none, the data set that the scanner's texts tell (a `DataSet`).
         problem: why there is no document.
+        key: changes with the folder.
     """
 
     folder: Folder
@@ -192,6 +190,7 @@ class _Scan:
     document: DatasetDocument | None = None
     texts: Any = None
     problem: str = ""
+    key: tuple[object, ...] = ()
 
     @property
     def beam(self) -> tuple[float | None, float | None]:
@@ -256,10 +255,13 @@ def _texts(folder: Folder) -> Any:
 
 
 def _opened(root: Directory, name: str) -> _Scan:
-    """A data set; kept."""
-    path, key = _place(root, name)
-    found: _Scan = _DOCUMENTS.get(key, lambda: _scan(list_folder(path), MAX_DOCUMENT))
-    return found
+    """A data set."""
+    return _kept_scan(*_place(root, name))
+
+
+@lru_cache(4)
+def _kept_scan(path: Path, key: tuple[object, ...]) -> _Scan:
+    return replace(_scan(list_folder(path), MAX_DOCUMENT), key=key)
 
 
 def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
@@ -282,11 +284,8 @@ def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
             problem=scan.problem[:500],
         )  # fmt: skip
         return info.model_copy(update=told)
-    lost = [f.file for f in document.frames if f.file not in folder.names]
+    lost = folder.lost([f.file for f in document.frames])
     files = document.files("projection")
-    reason = document.reason
-    if lost and document.complete:
-        reason = f"{lost[0]} is missing" + (f", and {len(lost) - 1} more" if lost[1:] else "")
     detector, named = document.detector, document.machine.get("name")
     return p.DatasetInfo(
         name=path.name,
@@ -294,7 +293,7 @@ def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
         started=document.started.isoformat(),
         duration_s=document.duration_s,
         state="complete" if document.complete and not lost else "incomplete",
-        reason=reason,
+        reason=(document.complete and lost) or document.reason,
         projections=len(files),
         present=sum(f in folder.names for f in files),
         machine=str(named)[:100],
@@ -340,8 +339,7 @@ def _list(
             info = p.DatasetInfo(name=name, modified=modified, problem="not read yet")
         elif info == "":
             continue
-        if name == around.running:
-            info = info.model_copy(update={"state": "running", "reason": ""})
+        info = _as_it_runs(info, around)
         said = (
             info.name, info.state, info.sample, info.operator, info.machine, info.mode,
             info.started, f"{info.kV or 0:g}kV {info.exposure_ms or 0:g}ms {info.power_W or 0:g}W",
@@ -353,6 +351,12 @@ def _list(
     if asked.thumbnail:
         shown = [_with_thumbnail(root, info, asked.thumbnail, until + LIST_S) for info in shown]
     return p.DatasetListResult(datasets=shown, total=len(found), unread=unread, left_out=left_out)
+
+
+def _as_it_runs(info: p.DatasetInfo, around: TwinContext) -> p.DatasetInfo:
+    """With the state of a data set that is being written."""
+    running = info.name == around.running
+    return info.model_copy(update={"state": "running", "reason": ""}) if running else info
 
 
 def _listed(path: Path, modified: float) -> p.DatasetInfo | str:
@@ -389,7 +393,7 @@ def _with_thumbnail(root: Directory, info: p.DatasetInfo, side: int, until: floa
         path, key = _place(root, info.name)
         if (side, key) not in _THUMBNAILS and time.monotonic() > until:
             return info
-        made = _THUMBNAILS.get((side, key), make, bool)
+        made = _THUMBNAILS.get((side, key), make)
     except DatasetError:
         return info
     return info.model_copy(update={"thumbnail": made or None})
@@ -402,22 +406,15 @@ def _get(
     root: Directory, asked: p.DatasetGet, around: TwinContext, codec: Codec
 ) -> p.DatasetResult:
     scan = _opened(root, asked.name)
-    folder, document, images = scan.folder, scan.document, scan.images
+    folder, images = scan.folder, scan.images
     about = root.stat(asked.name)
     info = _info(folder.path, 0.0 if about is None else about.st_mtime, scan)
-    if asked.name == around.running:
-        info = info.model_copy(update={"state": "running", "reason": ""})
+    info = _as_it_runs(info, around)
     last = len(images) - 1
     at = np.unique(np.linspace(0, last, min(asked.points, last + 1)).round().astype(int)).tolist()
     chosen = [images[i] for i in at]
     motors = list(chosen[-1].positions if chosen else ())
     times = [frame.time_s for frame in chosen if frame.time_s is not None]
-    told: dict[str, Any] = {}
-    if asked.measure:
-        key = (_place(root, asked.name)[1], asked.points)
-        told = _MEASURED.get(
-            key, lambda: _measured(folder, document, chosen), lambda m: None not in m["counts"]
-        )
     return p.DatasetResult(
         info=info,
         images=len(images),
@@ -429,7 +426,7 @@ def _get(
         positions={name: [frame.positions.get(name) for frame in chosen] for name in motors},
         same_machine=_same(scan, around),
         script=_script(folder) if asked.script else None,
-        **told,
+        **(_measured(scan, tuple(at)) if asked.measure else {}),
     )
 
 
@@ -453,35 +450,38 @@ def _script(folder: Folder) -> str:
         return file.read().decode("utf-8", "replace")
 
 
-def _measured(
-    folder: Folder, document: DatasetDocument | None, chosen: list[FrameEntry | _UndocumentedFrame]
-) -> dict[str, Any]:
-    """Mean counts and clearances of images."""
+def _measured(scan: _Scan, at: tuple[int, ...]) -> dict[str, Any]:
+    """Mean counts and clearances of images; means are kept, so what is late comes the next time."""
     until = time.monotonic() + MEASURE_S
     counts: list[float | None] = []
-    for frame in chosen:
+    for i in at:
         try:
-            late = time.monotonic() > until
-            path = folder.path / _there(folder, frame.file)
-            counts.append(None if late else float(read_image(path).mean()))
+            path = scan.folder.path / _there(scan.folder, scan.images[i].file)
+            counts.append(None if time.monotonic() > until else _mean(path, scan.key))
         except DatasetError:
             counts.append(None)
-    if document is None:
+    if scan.document is None:
         return {"counts": counts}
     try:
-        near, what = _clearances(document, [frame.positions for frame in chosen])
+        near, what = _clearances(scan, at)
     except (TwinError, ValueError, KeyError) as error:
         near, what = None, f"not known: {error}"[:300]
     return {"counts": counts, "clearance_mm": near, "clearance_of": what}
 
 
-def _clearances(
-    document: DatasetDocument, positions: list[Mapping[str, float]]
-) -> tuple[list[float | None], str]:
+@lru_cache(16 * 2000)
+def _mean(path: Path, key: tuple[object, ...]) -> float:
+    return float(read_image(path).mean())
+
+
+@lru_cache(4)
+def _clearances(scan: _Scan, at: tuple[int, ...]) -> tuple[list[float | None], str]:
     from flexdt.twin.collision.collision_scene import build_scene
     from flexdt.twin.collision.convex_solids import Cylinder
     from flexdt.twin.collision.scene_search import clearance
 
+    document = scan.document
+    assert document is not None
     machine, sample = document.machine_of(), document.sample
     pieces: tuple[Cylinder, ...] = ()
     what = "the machine without a sample, whose size is not known"
@@ -492,7 +492,7 @@ def _clearances(
     correction = document.correction_in_force()
     offsets = NOMINAL if correction is None else correction.parameters
     scene = build_scene(machine, document.profile_of(), pieces, offsets)
-    found = [clearance(scene, at).mm for at in positions]
+    found = [clearance(scene, scan.images[i].positions).mm for i in at]
     return [mm if math.isfinite(mm) else None for mm in found], what
 
 
@@ -518,7 +518,8 @@ def _frame(
     if asked.kind == "line_integral":
         if frame.kind != "projection":
             raise LimitError(f"{frame.file} is a {frame.kind} image: it has no line integrals")
-        pixels = _normal(root, asked.name, folder, images, counts.shape)(counts)
+        rows, cols = counts.shape
+        pixels = _normal(scan, (rows, cols))(counts)
     small = binned_mean(pixels.astype(np.float32), asked.binning)
     small = np.rint(small).astype(np.uint16) if asked.kind == "counts" else small
     before = sum(f.kind == "projection" for f in images[: asked.index])
@@ -552,22 +553,18 @@ def _there(folder: Folder, file: str) -> str:
     return file
 
 
-def _normal(
-    root: Directory, name: str, folder: Folder, images: _Images, shape: tuple[int, ...]
-) -> LineIntegrals:
-    def make() -> LineIntegrals:
-        dark, flat = (
-            folder.paths([f.file for f in images if f.kind == kind]) for kind in ("dark", "flat")
-        )
-        if not flat:
-            raise DatasetMissingError(f"{name} has no flat image: there are no line integrals")
-        rows, cols = shape
-        opened = mean_image(flat, (rows, cols))
-        lost = mean_image(dark, (rows, cols)) if dark else np.zeros_like(opened)
-        return LineIntegrals.of(lost, opened)
-
-    made: LineIntegrals = _NORMALS.get((_place(root, name)[1], shape), make)
-    return made
+@lru_cache(4)
+def _normal(scan: _Scan, shape: tuple[int, int]) -> LineIntegrals:
+    folder = scan.folder
+    dark, flat = (
+        folder.paths([f.file for f in scan.images if f.kind == kind]) for kind in ("dark", "flat")
+    )
+    if not flat:
+        name = folder.path.name
+        raise DatasetMissingError(f"{name} has no flat image: there are no line integrals")
+    opened = mean_image(flat, shape)
+    lost = mean_image(dark, shape) if dark else np.zeros_like(opened)
+    return LineIntegrals.of(lost, opened)
 
 
 _ANSWERS: Final[Mapping[type[Params], Callable[..., object]]] = {

@@ -17,7 +17,6 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -32,9 +31,9 @@ from flexdt.phantoms import (
 )
 from flexdt.phantoms import material as material_of
 from flexdt.phantoms.files.phantom_files import sent_scene
-from flexdt.protocol.rpc_errors import RpcError, too_large
-from flexdt.server.files.directory import TEMPORARY, Directory
-from flexdt.server.files.own_documents import (
+from flexdt.protocol.rpc_errors import Code, RpcError, too_large
+from flexdt.runtime.files.directory import TEMPORARY, Directory
+from flexdt.runtime.files.own_documents import (
     ASIDE,
     Changes,
     file_stem,
@@ -43,10 +42,10 @@ from flexdt.server.files.own_documents import (
     read_or_set_aside,
     set_aside,
 )
-from flexdt.server.runtime.worker import limit
-from flexdt.server.runtime.workers import Worker
+from flexdt.runtime.worker import limit
+from flexdt.runtime.workers import Worker
 from flexdt.server.storage.unfinished_uploads import Incoming, UploadHead
-from flexdt.twin.errors import LimitError, TwinError, UnknownNameError
+from flexdt.twin.errors import LimitError, UnknownNameError
 
 # Parsing of uploaded meshes and scenes in a process of their own (`worker`).
 #
@@ -64,8 +63,7 @@ def mesh_apart(
     """`flexdt.phantoms.mesh_phantom` of a stranger's bytes; blocks, so call it from a thread.
 
     Raises:
-        PhantomError: as there, or reading it takes too much time or memory.
-        UnknownNameError: unknown material.
+        PhantomError: as there, unknown material, or reading it takes too much time or memory.
     """
     how = {"unit": unit, "material": material, "file_type": file_type, "name": name}
     return _apart(mesh_phantom, how, raw, timeout_s)
@@ -84,29 +82,21 @@ def scene_apart(raw: bytes, *, name: str, timeout_s: float = TIMEOUT_S) -> Phant
 def _apart(
     read: Callable[..., Phantom], how: dict[str, str], raw: bytes, timeout_s: float
 ) -> Phantom:
-    name = how["name"]
     worker = Worker(MEMORY_BYTES)
     try:
-        [answer] = worker.ask(_answered, (read, how), [raw], timeout_s)
+        [document] = worker.ask(_document, (read, how), [raw], timeout_s)
     except RpcError as error:
+        prefix = f"{how['name']!r} cannot be read: " if error.code == Code.TOO_LARGE else ""
         data = error.data if isinstance(error.data, dict) else None
-        raise PhantomError(f"{name!r} cannot be read: {error.message}", data) from None
+        raise PhantomError(prefix + error.message, data) from None
     finally:
         worker.kill()
-    document = json.loads(answer)
-    if "error" in document:
-        kind = UnknownNameError if document["error"] == "UnknownNameError" else PhantomError
-        raise kind(str(document["message"]), document.get("data"))
-    return Phantom.from_dict(document)
+    return Phantom.from_dict(json.loads(document))
 
 
-def _answered(read: Callable[..., Phantom], how: dict[str, str], raw: bytes) -> list[bytes]:
+def _document(read: Callable[..., Phantom], how: dict[str, str], raw: bytes) -> list[bytes]:
     limit("RLIMIT_FSIZE", 0)
-    try:
-        document: dict[str, object] = read(raw, **how).to_dict()
-    except TwinError as error:
-        document = {"error": type(error).__name__, "message": error.message, "data": error.data}
-    return [json.dumps(document, default=repr).encode()]
+    return [json.dumps(read(raw, **how).to_dict()).encode()]
 
 
 MAX_UPLOAD_BYTES = 512 << 20
@@ -135,34 +125,10 @@ class Upload:
     revision: str
     worn: tuple[str, Phantom] | None = None
 
-
-class Phantoms(Protocol):
-    """Where the phantoms of samples come from."""
-
-    def load(self, name: str, material: str | None = None) -> Phantom:
-        """The phantom called `name`."""
-
-    def revision(self, name: str) -> str | None:
-        """Names the content of an upload that has been read."""
-
-
-@dataclass(frozen=True)
-class _With:
-    """The samples there are, and an upload under its name."""
-
-    store: SampleStore
-    upload: Upload
-
-    def load(self, name: str, material: str | None = None) -> Phantom:
-        if name != self.upload.head.name:
-            return self.store.load(name, material)
-        worn = self.upload.worn
-        return worn[1] if worn is not None and worn[0] == material else self.upload.phantom
-
-    def revision(self, name: str) -> str | None:
-        if name != self.upload.head.name:
-            return self.store.revision(name)
-        return self.upload.revision
+    @property
+    def standing(self) -> Phantom:
+        """The phantom that it will be on the stage."""
+        return self.phantom if self.worn is None else self.worn[1]
 
 
 class SampleStore:
@@ -279,10 +245,6 @@ class SampleStore:
         phantom = _parse(head, raw, head.material)
         worn = None if material is None else (material, _parse(head, raw, material))
         return Upload(head, raw, phantom, _revision(head, raw), worn)
-
-    def with_upload(self, upload: Upload) -> Phantoms:
-        """The samples there are, as if an upload was among them already."""
-        return _With(self, upload)
 
     def store(self, changes: Changes, upload: Upload) -> None:
         """Write an upload; the previous one of that name stays beside it until `know`.

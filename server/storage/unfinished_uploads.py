@@ -19,8 +19,8 @@ from pydantic import Field, StringConstraints
 from flexdt.phantoms.files.mesh_files import default_unit
 from flexdt.protocol.fields import Payload
 from flexdt.protocol.methods.sample_messages import LengthUnit, SampleUpload
-from flexdt.server.files.directory import Directory, writing
-from flexdt.server.runtime.log import log
+from flexdt.runtime.files.directory import Directory, writing
+from flexdt.runtime.log import log
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.errors import LimitError
 

@@ -21,28 +21,27 @@ from typing import Any, Literal
 
 from flexdt.protocol import state_model as w
 from flexdt.protocol.rpc_errors import RpcError, busy
-from flexdt.server.files.directory import Directory
-from flexdt.server.files.own_documents import settle
-from flexdt.server.imaging.exposure_prediction import predictors
+from flexdt.runtime.access import TwinLimits
+from flexdt.runtime.files.directory import Directory
+from flexdt.runtime.files.own_documents import settle
+from flexdt.runtime.log import LEVELS, log
+from flexdt.server.imaging.exposure_quality import predictors
 from flexdt.server.imaging.projections import Imaging, Projector
 from flexdt.server.imaging.radiography import Physics, Radiography, with_spectra
 from flexdt.server.imaging.truth import TrueGeometry
-from flexdt.server.runtime.access import TwinLimits
-from flexdt.server.runtime.log import LEVELS, log
 from flexdt.server.scans.job import Job
 from flexdt.server.scans.jobs import Jobs, fresh_seed
-from flexdt.server.scans.stage import Stage
+from flexdt.server.scans.stage import Shapes, Stage
 from flexdt.server.scans.submission import RESERVED, Submissions
 from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
 from flexdt.server.storage.corrections import Corrections
 from flexdt.server.storage.memory import Memory, StateStore, read_memory, remember, restore
 from flexdt.server.storage.past_scans import PastScans
-from flexdt.server.storage.stored_samples import SampleStore, sample_material
+from flexdt.server.storage.stored_samples import SampleStore, Upload, sample_material
 from flexdt.server.twin import wire_values as views
 from flexdt.server.twin.hub import Hub
 from flexdt.server.twin.live import LiveView, Shot, StateFeed
 from flexdt.server.twin.obstacle_move import ObstacleMoves
-from flexdt.server.twin.sample_mesh import Shapes
 from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.scene_search import NearestPair, clearance
 from flexdt.twin.errors import GeometryError, SafetyError
@@ -407,7 +406,7 @@ class TwinServer:
         sample: Sample,
         correction: Correction | None,
         *,
-        stage: Stage | None = None,
+        upload: Upload | None = None,
         targets: Mapping[str, float] | None = None,
         paces: Mapping[str, tuple[float, float]] | None = None,
     ) -> StageChange:
@@ -415,7 +414,7 @@ class TwinServer:
 
         Args:
             sample, correction: what is to stand there, and what is to be in force.
-            stage: knows the shape of what is to stand there; None for `self.stage`.
+            upload: to come under the sample's name.
             targets: where motors are sent together with the change [mm, deg].
             paces: motor -> (speed, acceleration) that are set before.
 
@@ -425,7 +424,7 @@ class TwinServer:
             CollisionError: what is under way, or stands, is not free of it; nothing changes.
         """
         self.scanner.require_applicable(correction)  # before anything is built of it
-        guard = await self._guard(sample, correction, stage)
+        guard = await self._guard(sample, correction, upload)
         change = self.scanner.stage_change(
             sample, correction, guard, self.clock.now(), targets=targets, paces=paces
         )
@@ -449,11 +448,10 @@ class TwinServer:
         return [] if halted is None else [halted.message]
 
     async def _guard(
-        self, sample: Sample, correction: Correction | None, stage: Stage | None = None
+        self, sample: Sample, correction: Correction | None, upload: Upload | None = None
     ) -> Guard | None:
         parameters = NOMINAL if correction is None else correction.parameters
-        used = self.stage if stage is None else stage
-        return await asyncio.to_thread(used.guard, sample, parameters)
+        return await asyncio.to_thread(self.stage.guard, sample, parameters, upload)
 
     async def motion_ended(self, motors: Collection[str]) -> None:
         """Wait until `motors` have come to rest, wherever that is."""

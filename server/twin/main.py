@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 from flexdt import machines
 from flexdt.process_settings import TwinSettings, parse
-from flexdt.server.runtime.access import (
+from flexdt.runtime.access import (
     ConnectionLimits,
     TwinLimits,
     check_bind,
@@ -22,8 +22,8 @@ from flexdt.server.runtime.access import (
     server_tls,
     with_limits,
 )
-from flexdt.server.runtime.log import LEVELS, set_up
-from flexdt.server.runtime.process import FAILED, OK, announce, first_of, run_process, stop_signal
+from flexdt.runtime.log import LEVELS, set_up
+from flexdt.runtime.process import FAILED, OK, announce, first_of, run_process, stop_signal
 from flexdt.server.scans.twin_clock import SpeedUp, check_speed_up
 
 DEFAULT_SAMPLE = "lego"
@@ -47,20 +47,19 @@ def speed_up_of(text: str) -> SpeedUp:
 
 async def run(options: TwinSettings) -> int:
     """Serve until SIGTERM or SIGINT; returns the exit code."""
-    from flexdt.server.files.directory import open_data
-    from flexdt.server.files.directory_lock import FolderLock
+    from flexdt.runtime.files.directory import open_data
+    from flexdt.runtime.files.own_documents import lock_folder
+    from flexdt.runtime.http_pages import served_pages
+    from flexdt.runtime.metrics import Requests
     from flexdt.server.imaging.projector_client import ProjectorClient
     from flexdt.server.imaging.projector_pool import ProjectorPool
     from flexdt.server.imaging.truth import load_truth
     from flexdt.server.network.tcp import serve
-    from flexdt.server.runtime.http_pages import served_pages
-    from flexdt.server.runtime.metrics import Requests
     from flexdt.server.scans.jobs import fresh_seed
-    from flexdt.server.twin.application import TwinApp
+    from flexdt.server.twin.application import TwinSession, twin_pages
     from flexdt.server.twin.core import TwinServer
     from flexdt.server.twin.handlers.document_methods import document
     from flexdt.server.twin.message_reading import Reader
-    from flexdt.server.twin.twin_health import twin_pages
     from flexdt.twin.scanner.state import Sample
 
     machine = machines.machine(options.machine)
@@ -68,7 +67,7 @@ async def run(options: TwinSettings) -> int:
     root = options.data.absolute()
     check_bind(options.host, read_token(options.token_file))
     directory = open_data(root)
-    lock = FolderLock(directory)
+    release = lock_folder(directory)
     truth = None if options.truth is None else load_truth(options.truth, root)
     token = read_token(options.projector_token_file)
     secure = client_tls(options.projector_tls_ca)
@@ -101,7 +100,7 @@ async def run(options: TwinSettings) -> int:
         sample = Sample("" if name == "empty" else name)
     await twin.start(sample)
     server = await serve(
-        TwinApp(twin),
+        lambda peer: TwinSession(twin, peer),
         options.host,
         options.port,
         token=read_token(options.token_file),
@@ -123,7 +122,7 @@ async def run(options: TwinSettings) -> int:
     reader.close()
     await twin.stop()
     await projector.close()
-    lock.release()
+    release()
     return FAILED if twin.failed.is_set() else OK
 
 

@@ -26,8 +26,8 @@ from flexdt.protocol.messages import Single
 from flexdt.protocol.method import parse_params
 from flexdt.protocol.methods.job_messages import TrajectoryInput
 from flexdt.protocol.rpc_errors import too_large
-from flexdt.server.network.shell_application import Call, Frozen
-from flexdt.server.runtime.workers import Workers
+from flexdt.runtime.workers import Workers
+from flexdt.server.network.shell_parts import Call, Frozen
 from flexdt.server.scans.scan_record import PoseList
 
 MAX_PARAMS: Final = 1 << 20
@@ -66,20 +66,16 @@ def work(codec: Codec | None, most: int, *pieces: bytes) -> list[bytes]:
     items = message.items if isinstance(message, Batch) else (message,)
     parts = [b"batch" if batch else b"single"]
     for item in items:
-        parts += [_method(item), _frozen(item)]
+        name = item.method if isinstance(item, Request | Notification) else ""
+        parts += [name.encode() if name in METHODS else b"", _frozen(item)]
     return parts
 
 
-def _method(message: Single) -> bytes:
-    name = message.method if isinstance(message, (Request, Notification)) else ""
-    return name.encode() if name in METHODS else b""
-
-
 def _frozen(message: Single) -> bytes:
-    if not isinstance(message, (Request, Notification)):
+    if not isinstance(message, Request | Notification):
         return pickle.dumps(message)
-    id = message.id if isinstance(message, Request) else None
     answered = isinstance(message, Request)
+    id = message.id if isinstance(message, Request) else None
     call = Call(id, message.method, _params(message), answered)
     data = pickle.dumps(call)
     method = METHODS.get(message.method)

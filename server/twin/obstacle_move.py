@@ -8,7 +8,7 @@ again. Any other command to the motors ends it. The search is
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from flexdt.server.scans.stage import Stage
@@ -78,12 +78,11 @@ class ObstacleMoves:
         start = scanner.final_positions()
         scene = await asyncio.to_thread(self.stage.scene, scanner.sample, scanner.parameters)
         if scene is None:
-            return Way((goal,), self._seconds(start, goal), ())
+            return self._way(start, [goal])
         paces = scanner.paces
         found = await asyncio.to_thread(free_moves, scene, scanner.machine, start, goal, paces)
         if found is not None and len(found) <= 1:
-            legs = tuple(found)
-            return Way(legs, sum(self._seconds(start, leg) for leg in legs), ())
+            return self._way(start, found)
         contact = await asyncio.to_thread(
             direct_contact, scene, scanner.machine, start, goal, paces
         )
@@ -99,13 +98,9 @@ class ObstacleMoves:
                     "allowed": "a target or an order of moves without contact",
                 },
             )
-        seconds, here = 0.0, dict(start)
-        for leg in found:
-            seconds += self._seconds(here, leg)
-            here.update(leg)
         order = "; then ".join(_text(leg) for leg in found)
         warning = f"{' and '.join(pair)} would collide on the direct way; going {order}"
-        return Way(tuple(found), seconds, (warning,))
+        return self._way(start, found, warning)
 
     def go(self, way: Way) -> asyncio.Task[None]:
         """Set off; the task is done when the last leg has ended, or fails where one cannot go."""
@@ -129,13 +124,16 @@ class ObstacleMoves:
             self.changed()
         await clock.at_rest(scanner.rest_time)
 
-    def _seconds(self, start: Mapping[str, float], leg: Mapping[str, float]) -> float:
-        """How long one leg takes."""
-        ends = [
-            motion.move(start[axis], 0.0, value, *self.scanner.settings(axis), 0.0).end
-            for axis, value in leg.items()
-        ]
-        return max(ends, default=0.0)
+    def _way(
+        self, start: Mapping[str, float], legs: Sequence[Mapping[str, float]], *warnings: str
+    ) -> Way:
+        seconds, here = 0.0, dict(start)
+        for leg in legs:
+            moves = {axis: (here[axis], 0.0, value) for axis, value in leg.items()}
+            ends = [motion.move(*m, *self.scanner.settings(a), 0.0).end for a, m in moves.items()]
+            seconds += max(ends, default=0.0)
+            here.update(leg)
+        return Way(tuple(legs), seconds, warnings)
 
 
 async def finished(task: asyncio.Task[None]) -> list[str]:

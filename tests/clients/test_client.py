@@ -36,7 +36,7 @@ from flexdt.protocol.fields import Empty, Params
 from flexdt.protocol.methods.sample_messages import SampleUpload
 from flexdt.protocol.methods.session_messages import Hello
 from flexdt.protocol.rpc_errors import parse_error
-from flexdt.server.network.shell_application import Peer
+from flexdt.server.network.shell_parts import Peer
 from flexdt.server.network.tcp import serve
 
 AXIS = {"position": 1.0, "target": 1.0, "velocity": 0.0, "limits": [0, 2], "moving": False}
@@ -434,7 +434,7 @@ class _Served:
         self.app.moved = asyncio.Event()
         self.loop = asyncio.get_running_loop()
         self.over = asyncio.Event()
-        server = await serve(self.app, port=self.port, token=self.token)
+        server = await serve(self.app.open, port=self.port, token=self.token)
         self.port = server.port
         self.started.set()
         await self.over.wait()

@@ -25,7 +25,7 @@ from flexdt.clients.following.scanner_link import endpoint
 from flexdt.clients.following.session import Session
 from flexdt.phantoms import load_phantom
 from flexdt.protocol import RpcError
-from flexdt.server.runtime.access import AccessError
+from flexdt.runtime.access import AccessError
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Alarm
 from flexdt.twin.machine.description import builtin_machine, builtin_profile

@@ -24,7 +24,7 @@ from flexdt.clients.reconstruction.reconstruct import (
 )
 from flexdt.clients.reconstruction.volume_files import middle_slices, read_volume
 from flexdt.phantoms import lego_phantom
-from flexdt.server.files.directory import open_data
+from flexdt.runtime.files.directory import open_data
 from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.imaging.truth import TrueGeometry

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from flexdt.server.files.dataset_folder import read_image
-from flexdt.server.files.image_files import tiff_bytes
+from flexdt.runtime.files.dataset_folder import read_image, tiff_bytes
 from flexdt.twin.dataset.dataset_errors import (
     DatasetError,
     DatasetFormatError,

@@ -94,7 +94,7 @@ def written(tmp_path: Path) -> Callable[..., Path]:
     """A finished data set on the disk."""
 
     def make(record: ScanRecord | None = None) -> Path:
-        from flexdt.server.files.directory import open_data
+        from flexdt.runtime.files.directory import open_data
         from flexdt.server.storage.dataset_writer import DatasetWriter
 
         chosen = record if record is not None else make_record()

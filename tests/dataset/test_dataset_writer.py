@@ -24,8 +24,8 @@ import tifffile
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flexdt.server.files.directory import Directory, open_data
-from flexdt.server.files.image_files import free_name
+from flexdt.runtime.files.dataset_folder import free_name
+from flexdt.runtime.files.directory import Directory, open_data
 from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.twin.dataset.dataset_errors import (
     DatasetExistsError,
@@ -200,7 +200,7 @@ import numpy as np
 spec = importlib.util.spec_from_file_location("made", sys.argv[1])
 made = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(made)
-from flexdt.server.files.directory import open_data
+from flexdt.runtime.files.directory import open_data
 from flexdt.server.storage.dataset_writer import DatasetWriter
 record = made.make_record(frames=2000)
 images = made.make_images(record)

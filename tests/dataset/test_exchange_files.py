@@ -164,7 +164,7 @@ def _two_shapes(made: ScanRecord) -> ScanRecord:
 def test_a_geometry_has_one_shape(
     record: Callable[..., ScanRecord], tmp_path: Path
 ) -> None:  # fmt: skip
-    from flexdt.server.files.directory import open_data
+    from flexdt.runtime.files.directory import open_data
     from flexdt.server.storage.dataset_writer import DatasetWriter
 
     made = _two_shapes(record())

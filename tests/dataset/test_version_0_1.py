@@ -15,8 +15,7 @@ import numpy as np
 from in_process import Lab, M, P, run
 
 import flexdt as fx
-from flexdt.server.files.directory import open_data
-from flexdt.server.twin.application import TwinApp
+from flexdt.runtime.files.directory import open_data
 from flexdt.server.twin.core import TwinServer
 
 OLD = Path(__file__).parents[1] / "data" / "v0.1"
@@ -52,7 +51,6 @@ def test_a_twin_goes_on_where_one_of_version_0_1_stopped(tmp_path: Path) -> None
         )  # as `flexdt.server.twin.main` begins
         sample = lab.twin.recall()
         assert sample is not None
-        lab.app = TwinApp(lab.twin)
         await lab.twin.start(sample)
         client = lab.client()
         state = await client.call("state.get")

@@ -20,9 +20,9 @@ from direct_projector import DirectProjector
 
 import flexdt
 from flexdt.protocol.image import decode
-from flexdt.server.files.directory import open_data
+from flexdt.runtime.files.directory import open_data
 from flexdt.server.network.tcp import serve
-from flexdt.server.twin.application import TwinApp
+from flexdt.server.twin.application import TwinSession
 from flexdt.server.twin.core import TwinServer
 from flexdt.twin.machine.description import builtin_machine, profile_of
 from flexdt.twin.scanner.state import Sample
@@ -44,7 +44,7 @@ async def answers(root: Path, asked: list[str]) -> list[bytes]:
         machine, profile_of(machine), DirectProjector(), open_data(root), speed_up="max"
     )
     await twin.start(Sample("lego"))
-    server = await serve(TwinApp(twin))
+    server = await serve(lambda peer: TwinSession(twin, peer))
     reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
     out = []
     for line in asked:

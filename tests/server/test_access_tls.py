@@ -16,11 +16,7 @@ from lab import Process, Wire, twin
 from flexdt.clients import ConnectionLost, TwinClient
 from flexdt.protocol import Method, RpcError
 from flexdt.protocol.fields import Params
-from flexdt.server.imaging.projector_client import ProjectorClient
-from flexdt.server.network.shell_application import Peer
-from flexdt.server.network.tcp import serve
-from flexdt.server.projector.service import serve_projector
-from flexdt.server.runtime.access import (
+from flexdt.runtime.access import (
     AccessError,
     ConnectionLimits,
     check_bind,
@@ -30,7 +26,11 @@ from flexdt.server.runtime.access import (
     server_tls,
     token_matches,
 )
-from flexdt.server.wire_errors import ProjectorUnavailable
+from flexdt.runtime.wire_errors import ProjectorUnavailable
+from flexdt.server.imaging.projector_client import ProjectorClient
+from flexdt.server.network.shell_parts import Peer
+from flexdt.server.network.tcp import serve
+from flexdt.server.projector.service import serve_projector
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 
 TLS = Path(__file__).parents[1] / "data" / "tls"
@@ -115,7 +115,7 @@ def trusting() -> ssl.SSLContext:
 
 def test_the_twin_server_speaks_tls_and_only_tls() -> None:
     async def main() -> None:
-        server = await serve(_Echo(), ssl=server_tls(CERTIFICATE, KEY))
+        server = await serve(_Echo().open, ssl=server_tls(CERTIFICATE, KEY))
         port = server.port
 
         def talk() -> None:
@@ -135,7 +135,7 @@ def test_the_twin_server_speaks_tls_and_only_tls() -> None:
 def test_one_too_many_is_told_so_over_tls() -> None:
     async def main() -> None:
         limits = ConnectionLimits(max_clients=1)
-        server = await serve(_Echo(), ssl=server_tls(CERTIFICATE, KEY), limits=limits)
+        server = await serve(_Echo().open, ssl=server_tls(CERTIFICATE, KEY), limits=limits)
 
         def talk() -> None:
             with TwinClient(port=server.port, ssl=trusting()) as client:

@@ -258,7 +258,7 @@ def _working() -> set[int]:
                 parent = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
             except (OSError, ValueError, IndexError):
                 continue
-            if parent == os.getpid() and b"flexdt.server.runtime.worker" in words:
+            if parent == os.getpid() and b"flexdt.runtime.worker" in words:
                 ours.add(int(entry.name))
     return ours
 

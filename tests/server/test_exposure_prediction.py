@@ -12,7 +12,7 @@ import flexdt as fx
 from flexdt.phantoms.samples import as_phantom
 from flexdt.protocol import METHODS, Codec, RpcError
 from flexdt.protocol.methods.image_messages import ExposurePrediction
-from flexdt.server.imaging.exposure_prediction import BEST, predict
+from flexdt.server.imaging.exposure_quality import BEST, predict
 from flexdt.twin.errors import LimitError
 
 ROD = {"kind": "cylinder", "center": [0, 0, 0], "radius": 12.0, "height": 60, "material": "pmma"}

@@ -15,7 +15,7 @@ from flexdt.clients.gateway.vocabulary import (
     read_command,
 )
 from flexdt.protocol.acquila import Event
-from flexdt.server.runtime.access import AccessError
+from flexdt.runtime.access import AccessError
 from flexdt.twin.machine.description import builtin_machine, builtin_machines
 from flexdt.twin.script import commands as c
 from flexdt.twin.script import grammar, parse_script

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from simulated_disk import Disk, Fault
 
-from flexdt.server.files.directory import Directory
-from flexdt.server.files.own_documents import Changes
+from flexdt.runtime.files.directory import Directory
+from flexdt.runtime.files.own_documents import Changes
 from flexdt.server.storage.memory import FILE, Memory, StateStore, remember
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile

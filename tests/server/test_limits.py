@@ -19,19 +19,19 @@ from flexdt.clients.client.async_client import AsyncTwinClient
 from flexdt.clients.client.client import TwinClient
 from flexdt.protocol import METHODS, Connection, Failure, RpcError
 from flexdt.protocol.method import compatible
-from flexdt.server.files.directory import open_data
-from flexdt.server.files.own_documents import used_bytes
-from flexdt.server.runtime.access import (
+from flexdt.runtime.access import (
     AccessError,
     ConnectionLimits,
     TwinLimits,
     limit_names,
     with_limits,
 )
-from flexdt.server.scans import retry as retry_module
-from flexdt.server.scans.retry import Retry, transient
+from flexdt.runtime.files.directory import open_data
+from flexdt.runtime.files.own_documents import used_bytes
+from flexdt.runtime.wire_errors import ProjectorUnavailable
+from flexdt.server.scans import job as job_module
+from flexdt.server.scans.job import Retry, transient
 from flexdt.server.twin.core import Control
-from flexdt.server.wire_errors import ProjectorUnavailable
 from flexdt.twin.dataset.dataset_errors import DiskFullError
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
@@ -150,7 +150,7 @@ def test_retries_wait_longer_each_time_and_forget_after_progress(
         await asyncio.sleep(0)
 
     own = {"create_task": asyncio.create_task, "get_running_loop": asyncio.get_running_loop}
-    monkeypatch.setattr(retry_module, "asyncio", SimpleNamespace(sleep=sleep, **own))
+    monkeypatch.setattr(job_module, "asyncio", SimpleNamespace(sleep=sleep, **own))
 
     async def body() -> None:
         retry = Retry(10.0, 50.0)
@@ -188,7 +188,7 @@ def test_a_full_disk_is_retried_when_there_is_room(
         looked[0] += 1
         return free[0]
 
-    monkeypatch.setattr(retry_module, "free_bytes", free_bytes)
+    monkeypatch.setattr(job_module, "free_bytes", free_bytes)
 
     async def body() -> None:
         retry, done = Retry(0.01), asyncio.Event()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from flexdt.server.runtime.log import LOGGER, log, set_up
+from flexdt.runtime.log import LOGGER, log, set_up
 
 
 @pytest.fixture

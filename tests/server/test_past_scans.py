@@ -26,9 +26,9 @@ from flexdt.protocol.methods.dataset_messages import (
     DatasetGet,
     DatasetList,
 )
+from flexdt.runtime.wire_errors import explain, from_root, is_user_error
 from flexdt.server.storage import past_scans
 from flexdt.server.storage.past_scans import PastScans, TwinContext, work
-from flexdt.server.wire_errors import explain, from_root, is_user_error
 from flexdt.twin.machine.description import builtin_machine, profile_of
 
 FRAMES = 7

@@ -23,11 +23,11 @@ from flexdt.process_settings import (
     shared,
     words,
 )
-from flexdt.server.files.directory import Directory
-from flexdt.server.files.directory_lock import FolderLock
+from flexdt.runtime import process
+from flexdt.runtime.files.directory import Directory
+from flexdt.runtime.files.own_documents import lock_folder
+from flexdt.runtime.loop import ServerLoop
 from flexdt.server.projector import main as projector_main
-from flexdt.server.runtime import process
-from flexdt.server.runtime.loop import ServerLoop
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 
 PROCESSES = (UpSettings, TwinSettings, ProjectorSettings, ViewerSettings, GatewaySettings)
@@ -175,17 +175,17 @@ def test_a_data_directory_is_locked_without_a_file_in_it(tmp_path: Path) -> None
     data.mkdir()
     victim.write_text("somebody's")
     (data / ".lock").symlink_to(victim)
-    lock = FolderLock(Directory(data))
+    release = lock_folder(Directory(data))
     (data / ".lock").unlink()
     by_another_way = tmp_path / "link"
     by_another_way.symlink_to(data)
     for path in (data, by_another_way):
         with pytest.raises(DatasetWriteError, match="used by another twin server"):
-            FolderLock(Directory(path))
+            lock_folder(Directory(path))
     assert victim.read_text() == "somebody's"
     assert list(data.iterdir()) == []
-    lock.release()
-    FolderLock(Directory(data)).release()
+    release()
+    lock_folder(Directory(data))()
 
 
 def test_a_system_that_does_not_say_its_memory_is_taken_to_have_some(

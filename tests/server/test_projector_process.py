@@ -18,10 +18,10 @@ import pytest
 import typer
 
 from flexdt.process_settings import memory_size
+from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.imaging.projector_client import ProjectorClient
 from flexdt.server.projector import compute, wire
 from flexdt.server.projector.service import serve_projector
-from flexdt.server.wire_errors import ProjectorUnavailable
 from flexdt.twin.projection import Volume, forward
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 

@@ -14,14 +14,14 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from flexdt.protocol import Code, Codec, Connection, Response, RpcError, image
+from flexdt.runtime.access import AccessError, ConnectionLimits
+from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.imaging.projector_client import ProjectorClient
 from flexdt.server.projector import compute
 from flexdt.server.projector import compute as kernels
 from flexdt.server.projector import projector_methods as answers
 from flexdt.server.projector.service import ProjectorServer, serve_projector
 from flexdt.server.projector.wire import LinkLost, ProjectorLink
-from flexdt.server.runtime.access import AccessError, ConnectionLimits
-from flexdt.server.wire_errors import ProjectorUnavailable
 from flexdt.twin.projection import Volume, back, forward, gpu, project_scene
 from flexdt.twin.projection.analytic_solids import (
     Box,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from flexdt.phantoms import Phantom, load_phantom, voxel_phantom
-from flexdt.server.files.directory import open_data
+from flexdt.runtime.files.directory import open_data
 from flexdt.server.imaging.projections import Imaging, digest_of
 from flexdt.server.imaging.projector_client import ProjectorClient
 from flexdt.server.imaging.projector_pool import ProjectorPool

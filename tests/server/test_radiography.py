@@ -24,8 +24,8 @@ from flexdt.protocol import Codec
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods.setting_messages import TubeSet
 from flexdt.protocol.rpc_errors import Code, RpcError
-from flexdt.server.files.directory import open_data
-from flexdt.server.imaging.exposure_flags import CUT_OFF, SATURATED, STARVED, flags_of, marks_of
+from flexdt.runtime.files.directory import open_data
+from flexdt.server.imaging.exposure_quality import CUT_OFF, SATURATED, STARVED, flags_of, marks_of
 from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.radiography import Radiography, with_spectra
 from flexdt.server.imaging.truth import TrueGeometry

@@ -16,7 +16,7 @@ from flexdt.clients.client.client import TwinClient
 from flexdt.clients.client.uploads import MESH_FORMATS
 from flexdt.phantoms import load_phantom
 from flexdt.protocol import RpcError
-from flexdt.server.twin.sample_mesh import Shapes
+from flexdt.server.scans.stage import Shapes
 
 
 @pytest.fixture(scope="module")

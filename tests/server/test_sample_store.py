@@ -10,7 +10,7 @@ import pytest
 from stored_upload import completed
 
 from flexdt.phantoms import Phantom, load_phantom
-from flexdt.server.files.directory import open_data
+from flexdt.runtime.files.directory import open_data
 from flexdt.server.storage import stored_samples as samples
 from flexdt.server.storage.stored_samples import EMPTY, KEPT, SampleStore
 from flexdt.server.storage.unfinished_uploads import UploadHead

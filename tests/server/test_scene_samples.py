@@ -16,7 +16,7 @@ from flexdt.clients.client.uploads import scene as to_upload
 from flexdt.phantoms import Phantom, PhantomError, Surface, bead_phantom, load_phantom
 from flexdt.phantoms.files import phantom_files
 from flexdt.phantoms.samples import as_phantom
-from flexdt.server.files.directory import open_data
+from flexdt.runtime.files.directory import open_data
 from flexdt.server.scans.stage import Stage
 from flexdt.server.storage import stored_samples as mesh_reading
 from flexdt.server.storage.stored_samples import SampleStore

@@ -15,7 +15,7 @@ from simulated_disk import Disk
 from simulation import Crashed, Fault, Simulation
 
 from flexdt.protocol import RpcError
-from flexdt.server.files.directory import Directory
+from flexdt.runtime.files.directory import Directory
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError, DiskFullError
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from in_process import Lab, run
 
-from flexdt.server.files.directory import open_data
+from flexdt.runtime.files.directory import open_data
 from flexdt.server.scans import stage as stages
 from flexdt.server.scans.stage import Stage
 from flexdt.server.storage import stored_samples as samples

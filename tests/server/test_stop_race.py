@@ -56,7 +56,7 @@ class Person(Client):
     """Sees states and presses buttons, both late."""
 
     def __init__(self, room: Room, name: str, delays: tuple[float, float]) -> None:
-        super().__init__(room.sim.app, name)
+        super().__init__(room.sim.twin, name)
         self.room, self.loop = room, asyncio.get_running_loop()
         self.seen: dict[str, Any] | None = None
         self._delays = delays

@@ -17,12 +17,11 @@ from strangers import draw, hello, play, request
 
 from flexdt.protocol import Method
 from flexdt.protocol.fields import Params
+from flexdt.runtime.access import ConnectionLimits
+from flexdt.runtime.log import JsonLines, Sparing
 from flexdt.server.network import tcp
-from flexdt.server.network.shell_application import Peer
-from flexdt.server.network.shell_parts import Room, neighbourhood
+from flexdt.server.network.shell_parts import Peer, Room, neighbourhood
 from flexdt.server.network.tcp import TcpServer, serve
-from flexdt.server.runtime.access import ConnectionLimits
-from flexdt.server.runtime.log import JsonLines, Sparing
 
 TOKEN = "sixteen letters or more"
 PEER, OTHER = "127.0.0.2", "127.0.0.3"
@@ -94,7 +93,7 @@ def test_new_clients_are_served_whatever_peers_without_the_token_do(
 
     async def main() -> list[bytes]:
         app, playing = App(), list[asyncio.Task[bytes]]()
-        server = await serve(app, token=TOKEN, limits=ConnectionLimits(max_clients=2))
+        server = await serve(app.open, token=TOKEN, limits=ConnectionLimits(max_clients=2))
         holders = [await Client.dial(server, OTHER) for _ in range(2)]
         for holder in holders:  # these have all the places
             await served(holder, "session.hello", "state.get")
@@ -132,7 +131,7 @@ def test_new_clients_are_served_whatever_peers_without_the_token_do(
 def test_a_client_with_the_token_has_no_place_but_is_served_what_is_urgent() -> None:
     async def main() -> None:
         app = App()
-        server = await serve(app, token=TOKEN, limits=ConnectionLimits(max_clients=1))
+        server = await serve(app.open, token=TOKEN, limits=ConnectionLimits(max_clients=1))
         first, second = await Client.dial(server), await Client.dial(server)
         silent = await Client.dial(server)
         await served(first, "session.hello", "state.get")
@@ -161,7 +160,7 @@ def test_clients_beyond_the_reserved_places_displace_the_oldest(
     monkeypatch.setattr(tcp, "RESERVED", 3)
 
     async def main() -> None:
-        server = await serve(App(), token=TOKEN, limits=ConnectionLimits(max_clients=1))
+        server = await serve(App().open, token=TOKEN, limits=ConnectionLimits(max_clients=1))
         clients = [await Client.dial(server) for _ in range(10)]
         for client in clients:
             await served(client, *NEW)
@@ -180,7 +179,7 @@ def test_clients_beyond_the_reserved_places_displace_the_oldest(
 def test_without_a_token_an_estop_that_comes_first_is_served_beyond_the_limit() -> None:
     async def main() -> None:
         app = App()
-        server = await serve(app, limits=ConnectionLimits(max_clients=1))
+        server = await serve(app.open, limits=ConnectionLimits(max_clients=1))
         first, second, third = [await Client.dial(server) for _ in range(3)]
         await served(first, "state.get")
         await served(second, "safety.estop", "session.ping")
@@ -206,7 +205,7 @@ def test_what_is_kept_of_a_peer_without_the_token_is_little() -> None:
 
     async def main() -> None:
         app, limits = App(), ConnectionLimits(hello_timeout_s=0.5)
-        server = await serve(app, token=TOKEN, limits=limits, read=unread)
+        server = await serve(app.open, token=TOKEN, limits=limits, read=unread)
         endless, long, many = [await Client.dial(server) for _ in range(3)]
         assert (await long.ask(b'{"x":"' + b"x" * 40_000 + b'"}\n'))["error"]["code"] == -32004
         endless.writer.write(b"x" * 5_000_000)

@@ -22,9 +22,9 @@ import pytest
 from flexdt.clients.launch.up import main as up_main
 from flexdt.clients.launch.up import port_problem, services
 from flexdt.process_settings import Address, UpSettings, parse
-from flexdt.server.runtime import processor_time
-from flexdt.server.runtime import supervisor as module
-from flexdt.server.runtime.supervisor import Addresses, Service, ServiceError, Supervisor
+from flexdt.runtime import process as processes
+from flexdt.runtime import supervisor as module
+from flexdt.runtime.supervisor import Addresses, Service, ServiceError, Supervisor
 
 FAKE = """
 import json, os, signal, socket, sys, time
@@ -315,13 +315,13 @@ def test_processor_time_is_that_of_all_processes_of_a_session() -> None:
     )
     assert process.stdout is not None
     process.stdout.readline()
-    used_s = processor_time.of_session(process.pid)
+    used_s = processes.session_seconds(process.pid)
     process.kill()
     process.wait()
     process.stdout.close()
     assert used_s is not None
     assert 1.0 <= used_s < 5.0
-    assert processor_time.of_session(process.pid) is None
+    assert processes.session_seconds(process.pid) is None
 
 
 def test_lines_that_are_no_ready_line_harm_nobody(fake: Callable[..., Service]) -> None:
@@ -375,7 +375,7 @@ def test_children_stop_when_the_parent_is_killed_outright(
     fake("one")
     script = (
         "import asyncio, sys\n"
-        "from flexdt.server.runtime.supervisor import Service, Supervisor\n"
+        "from flexdt.runtime.supervisor import Service, Supervisor\n"
         f"s = Service('one', lambda known: ('fake_service', 'one', {str(tmp_path)!r}, '0'))\n"
         "asyncio.run(Supervisor([s], lambda a: print('ready', flush=True), print)"
         ".run(asyncio.Event()))\n"

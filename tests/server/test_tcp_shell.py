@@ -27,10 +27,10 @@ from flexdt.protocol import (
     event,
 )
 from flexdt.protocol.fields import Params
+from flexdt.runtime.access import AccessError, ConnectionLimits
 from flexdt.server.network import tcp
-from flexdt.server.network.shell_application import Peer
+from flexdt.server.network.shell_parts import Peer
 from flexdt.server.network.tcp import TcpServer, serve
-from flexdt.server.runtime.access import AccessError, ConnectionLimits
 
 TOKEN = "0123456789abcdef"
 
@@ -83,7 +83,7 @@ Body = Callable[[TcpServer, FakeApp], Awaitable[None]]
 def run(body: Body, **options: Any) -> None:
     async def main() -> None:
         app = FakeApp()
-        server = await serve(app, **options)
+        server = await serve(app.open, **options)
         try:
             await asyncio.wait_for(body(server, app), 120)
         finally:
@@ -660,9 +660,9 @@ def test_fuzzed_lines_never_cause_an_internal_error_of_ours(sent: list[bytes]) -
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "", "192.0.2.1", "example.org"])
 def test_others_can_reach_it_only_with_a_token(host: str) -> None:
     with pytest.raises(AccessError, match="token"):
-        asyncio.run(serve(FakeApp(), host))
+        asyncio.run(serve(FakeApp().open, host))
 
 
 def test_a_token_of_a_few_letters_is_refused() -> None:
     with pytest.raises(AccessError, match="at least 16"):
-        asyncio.run(serve(FakeApp(), token="short"))
+        asyncio.run(serve(FakeApp().open, token="short"))

@@ -11,11 +11,10 @@ import pytest
 
 from flexdt.protocol import METHODS, Codec, Connection, Method, Request
 from flexdt.protocol.fields import Params
+from flexdt.runtime.access import ConnectionLimits
 from flexdt.server.network import tcp
-from flexdt.server.network.shell_application import Peer
+from flexdt.server.network.shell_parts import FIRST, ORDINARY, URGENT, LoopTurns, Peer
 from flexdt.server.network.tcp import READ_AHEAD, TcpServer, _Link
-from flexdt.server.network.turns import FIRST, ORDINARY, URGENT, LoopTurns
-from flexdt.server.runtime.access import ConnectionLimits
 
 
 class Transport(asyncio.Transport):
@@ -87,7 +86,7 @@ class Bench:
 
     def __init__(self, **limits: Any) -> None:
         self.app = App()
-        self.server = TcpServer(self.app, ConnectionLimits(**limits), None, METHODS)
+        self.server = TcpServer(self.app.open, ConnectionLimits(**limits), None, METHODS)
 
     def dial(self) -> tuple[_Link, Transport]:
         link, transport = _Link(self.server), Transport()

@@ -19,8 +19,8 @@ from pathlib import Path
 import pytest
 from lab import Process, Wire, fly_script, projector, twin
 
-from flexdt.server.runtime.log import Apart, JsonLines
-from flexdt.server.runtime.metrics import Figure, Requests, render
+from flexdt.runtime.log import Apart, JsonLines
+from flexdt.runtime.metrics import Figure, Requests, render
 
 pytestmark = pytest.mark.timeout(240)
 WATCHED = ("--http-port", "0", "--log-level", "debug")

@@ -557,7 +557,7 @@ def hostile_tiff(g: Ground) -> str:
 
     import tifffile
 
-    from flexdt.server.files.dataset_folder import read_image
+    from flexdt.runtime.files.dataset_folder import read_image
     from flexdt.twin.dataset.dataset_errors import DatasetError
 
     honest = io.BytesIO()

@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-FOLDERS = ("flexdt", "protocol", "twin", "phantoms", "server", "clients")
+FOLDERS = ("flexdt", "protocol", "twin", "phantoms", "runtime", "server", "clients")
 EXTENSIONS = ("extensions/flexdt_extensions",)
 PAGE = "clients/viewer/web"
 _LAYOUT = {

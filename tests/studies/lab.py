@@ -40,7 +40,7 @@ class Process:
         with self.log.open("ab") as err:
             self.child = subprocess.Popen(
                 # `child` ends it should this program be killed: a study leaves no orphans.
-                [sys.executable, "-m", "flexdt.server.runtime.child", module, *map(str, options)],
+                [sys.executable, "-m", "flexdt.runtime.child", module, *map(str, options)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=err,

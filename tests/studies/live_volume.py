@@ -19,7 +19,7 @@ import time
 from pathlib import Path
 
 import flexdt as fx
-from flexdt.server.runtime.workers import ENVIRONMENT
+from flexdt.runtime.workers import ENVIRONMENT
 from flexdt.twin.machine.description import builtin_machine, profile_of
 from flexdt.twin.script.compose import ScanRequest, compose_script
 

@@ -39,7 +39,7 @@ import pytest
 from mutants import Mutant, draw, mutants_of, mutated
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("protocol", "twin", "phantoms", "server", "clients")
+PACKAGES = ("protocol", "twin", "phantoms", "runtime", "server", "clients")
 EQUIVALENT = Path(__file__).with_name("mutants_equivalent.toml")
 UNDER = ("protocol", "twin/geometry", "twin/machine", "twin/motion", "twin/script", "twin/dataset",
          "twin/collision")  # fmt: skip

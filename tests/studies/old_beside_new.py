@@ -26,7 +26,7 @@ SAFE = {**os.environ, "PYTHONSAFEPATH": "1"}
 """Older code starts processes that would find the flexdt of the current folder."""
 BENCH = ("-m", "flexdt.clients.cli", "bench")
 FURTHER = Path("examples", "research", "further_bench.py")
-FOLDERS = ("protocol", "twin", "phantoms", "server", "clients")
+FOLDERS = ("protocol", "twin", "phantoms", "runtime", "server", "clients")
 
 
 @dataclass(frozen=True)

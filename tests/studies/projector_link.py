@@ -20,9 +20,9 @@ from flexdt.clients.client.transport import Link, TcpTransport
 from flexdt.protocol import Response, image
 from flexdt.protocol import msgpack_frames as frames
 from flexdt.protocol.projector import PROJECTOR_METHODS
+from flexdt.runtime.access import ConnectionLimits
 from flexdt.server.network import tcp
 from flexdt.server.projector.wire import FrameLink, ProjectorLink
-from flexdt.server.runtime.access import ConnectionLimits
 
 VIEWS = {"one image": 1, "five images": 5}
 ARRAYS = {
@@ -89,7 +89,7 @@ def shell(port: Any) -> None:
     async def main() -> None:
         limits = ConnectionLimits(requests_per_s=None)
         app: Any = Answers()
-        made = await tcp.serve(app, limits=limits, methods=PROJECTOR_METHODS)
+        made = await tcp.serve(app.open, limits=limits, methods=PROJECTOR_METHODS)
         port.put(made.port)
         await asyncio.Event().wait()
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from direct_projector import DirectProjector
 
-from flexdt.server.files.directory import open_data
+from flexdt.runtime.files.directory import open_data
 from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.imaging.truth import TrueGeometry

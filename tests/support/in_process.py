@@ -14,10 +14,10 @@ import pytest
 
 from flexdt.protocol import METHODS, Codec, Connection, Message, Prepared, RpcError, parse_params
 from flexdt.protocol.messages import Encoded
-from flexdt.server.files.directory import open_data
-from flexdt.server.twin.application import TwinApp
+from flexdt.runtime.files.directory import open_data
+from flexdt.runtime.wire_errors import ProjectorUnavailable
+from flexdt.server.twin.application import TwinSession
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.wire_errors import ProjectorUnavailable
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
@@ -70,10 +70,10 @@ class PointProjector:
 class Client:
     """A session with its events."""
 
-    def __init__(self, app: TwinApp, name: str) -> None:
+    def __init__(self, twin: TwinServer, name: str) -> None:
         self.name = name
         self.events: list[dict[str, Any]] = []
-        self.session = app.open(self)
+        self.session = TwinSession(twin, self)
         self._wire = Connection(Codec.JSON)
 
     @property
@@ -115,7 +115,6 @@ class Lab:
 
     async def __aenter__(self) -> Lab:
         self.twin = TwinServer(M, P, self.projector, open_data(self.root), **self.options)
-        self.app = TwinApp(self.twin)
         await self.twin.start(Sample("chiral"))
         self.count = 0
         return self
@@ -125,7 +124,7 @@ class Lab:
 
     def client(self) -> Client:
         self.count += 1
-        return Client(self.app, f"client-{self.count}")
+        return Client(self.twin, f"client-{self.count}")
 
     async def until(self, condition: Callable[[], bool], what: str = "") -> None:
         until = asyncio.get_running_loop().time() + PATIENCE_S

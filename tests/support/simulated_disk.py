@@ -24,7 +24,7 @@ from unittest import mock
 
 Kind = Literal["open", "write", "fsync", "replace", "link", "unlink", "mkdir"]
 NUMBERED = re.compile(r"(\.(?:part|before)-)([\d-]+)")
-"""Temporary names of `server/files/directory.py`."""
+"""Temporary names of `runtime/files/directory.py`."""
 TAKES_ROOM: tuple[Kind, ...] = ("open", "write", "link", "mkdir")
 """What a full disk refuses."""
 REAL: dict[str, Callable[..., Any]] = {

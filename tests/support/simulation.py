@@ -29,7 +29,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import random
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -37,9 +37,8 @@ from in_process import Client, M, P, PointProjector
 from simulated_disk import Disk, Fault
 from simulated_loop import SimulatedLoop
 
-from flexdt.server.files.directory import open_data
-from flexdt.server.files.directory_lock import FolderLock
-from flexdt.server.twin.application import TwinApp
+from flexdt.runtime.files.directory import open_data
+from flexdt.runtime.files.own_documents import lock_folder
 from flexdt.server.twin.core import TwinServer
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.scanner.state import Sample
@@ -91,7 +90,7 @@ class Simulation:
         """What the servers logged."""
         self._loop: SimulatedLoop | None = None
         self._time = 0.0
-        self._lock: FolderLock | None = None
+        self._lock: Callable[[], None] | None = None
         self._clients = 0
         self._handler = _Kept(self.log)
         self._watched = self.disk.watched()
@@ -141,14 +140,13 @@ class Simulation:
     async def _start(self) -> None:
         """As `flexdt.server.twin.main` does."""
         root = open_data(self.data)
-        self._lock = FolderLock(root)
+        self._lock = lock_folder(root)
         assert self._loop is not None
         self._twin = TwinServer(
             self.machine, self.profile, self.projector, root, wall=self._loop.time,
             **self.options,
         )  # fmt: skip
         sample = self._twin.recall()
-        self.app = TwinApp(self._twin)
         await self._twin.start(Sample(self.sample) if sample is None else sample)
 
     def stop(self) -> None:
@@ -171,7 +169,7 @@ class Simulation:
 
     def _end(self) -> None:
         if self._lock is not None:
-            self._lock.release()
+            self._lock()
             self._lock = None
         if self._loop is None:
             return
@@ -191,7 +189,7 @@ class Simulation:
     def client(self) -> Client:
         """A connection of its own to the server that runs."""
         self._clients += 1
-        return Client(self.app, f"client-{self._clients}")
+        return Client(self.twin, f"client-{self._clients}")
 
     def call(self, client: Client, method: str, /, **params: Any) -> Any:
         """Ask, and let time pass until the answer is there; see `answer`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from flexdt.phantoms import Phantom
-from flexdt.server.files.own_documents import Changes
+from flexdt.runtime.files.own_documents import Changes
 from flexdt.server.storage.stored_samples import SampleStore
 
 

@@ -21,7 +21,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from flexdt.clients.viewer import front as module
 from flexdt.clients.viewer.front import Download, Front
 from flexdt.clients.viewer.page import ON_THE_WAY
-from flexdt.server.runtime.access import AccessError, client_tls, server_tls
+from flexdt.runtime.access import AccessError, client_tls, server_tls
 
 TOKEN = "a-token-of-sixteen-or-more"
 TLS = Path(__file__).parents[1] / "data" / "tls"

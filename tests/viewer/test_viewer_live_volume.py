@@ -23,7 +23,7 @@ from flexdt.clients.viewer.live_volume import (
     points_of,
     surface,
 )
-from flexdt.server.files.directory import open_data
+from flexdt.runtime.files.directory import open_data
 from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.twin.dataset.flexdt_json import parse_document
 from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord

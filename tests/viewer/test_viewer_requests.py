@@ -393,7 +393,7 @@ def test_a_page_that_takes_nothing_is_closed() -> None:
 
 
 def test_an_internal_error_is_in_the_log_under_its_id(capsys: pytest.CaptureFixture[str]) -> None:
-    from flexdt.server.runtime.log import LOGGER, set_up
+    from flexdt.runtime.log import LOGGER, set_up
 
     async def broken(page: Page, params: object) -> object:
         raise RuntimeError("quite a secret")

@@ -1,15 +1,18 @@
-"""calibration.*: applying, listing and reverting corrections."""
+"""calibration.* and dataset.*: corrections, and scans that were made, as their folders say."""
 
 from __future__ import annotations
 
-from flexdt.protocol.fields import Empty
+from pathlib import Path
+
+from flexdt.protocol.fields import Empty, Params
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import calibration_messages as p
-from flexdt.server.twin.changes import change_stage
+from flexdt.protocol.methods.dataset_messages import DATASET_FRAME, DATASET_GET, DATASET_LIST
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import (
     Client,
     answers,
+    change_stage,
     encoded_apart,
     ensure_allowed,
     in_turns,
@@ -69,3 +72,11 @@ def _in_force(twin: TwinServer, message: str, warnings: list[str]) -> p.Correcti
         twin.tell("warning", f"{message}: {warning}")
     correction = twin.correction_state(twin.scanner.correction)
     return p.CorrectionResult(correction=correction, warnings=warnings)
+
+
+@answers(DATASET_LIST, DATASET_GET, DATASET_FRAME, p.CALIBRATION_FIT, p.CALIBRATION_ALIGN)
+async def from_data_sets(twin: TwinServer, client: Client, params: Params) -> Encoded:
+    """What a worker process reads of the data directory."""
+    job = twin.jobs.current
+    running = "" if job is None else Path(job.folder).name
+    return await twin.past_scans.ask(params, running, client.peer.codec)

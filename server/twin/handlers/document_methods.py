@@ -12,9 +12,8 @@ from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty
 from flexdt.protocol.methods import document_messages as p
 from flexdt.server.storage.scene import require_fit, sample_of, save_scene
-from flexdt.server.twin.changes import change_stage
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, answers
+from flexdt.server.twin.handlers.handler import Client, answers, change_stage
 from flexdt.twin.errors import SafetyError
 
 

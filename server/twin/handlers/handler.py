@@ -1,8 +1,13 @@
-"""The type of a handler, and the connection that it answers."""
+"""What handlers have in common: their type, the connection that they answer, changes that last.
+
+A change of the scanner that survives a restart is checked, certified, written, and only then made.
+One that is refused or cannot be written leaves everything as it is, in the scanner and on the disk.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import copy
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias, TypeVar
@@ -11,8 +16,16 @@ from flexdt.protocol import Method
 from flexdt.protocol.connection import encoded
 from flexdt.protocol.fields import Params, Result
 from flexdt.protocol.messages import Encoded
-from flexdt.server.network.shell_application import Peer
+from flexdt.protocol.scene_document import Scene
+from flexdt.runtime.files.own_documents import Changes
+from flexdt.server.network.shell_parts import Peer
+from flexdt.server.storage.corrections import History
+from flexdt.server.storage.memory import Memory, as_of
+from flexdt.server.storage.scene import apply_settings, paces_of
+from flexdt.server.storage.stored_samples import Upload
 from flexdt.server.twin.core import TwinServer
+from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.scanner.state import Correction, Sample
 
 Item = TypeVar("Item")
 View = TypeVar("View")
@@ -87,3 +100,99 @@ async def encoded_apart(client: Client, result: _R, count: int) -> _R | Encoded:
     if count <= A_TURN:
         return result
     return await asyncio.to_thread(encoded, result, client.peer.codec)
+
+
+async def change_settings(
+    twin: TwinServer, change: Callable[[ScannerTwin], None], ready: Callable[[], None]
+) -> None:
+    """Change what the scanner is set to.
+
+    Args:
+        twin: whose scanner.
+        change: sets it; it is tried on a copy first.
+        ready: raises if who asked may not any more.
+
+    Raises:
+        DatasetWriteError: it cannot be written; nothing has changed.
+    """
+
+    def after(memory: Memory) -> Memory:
+        trial = copy.copy(twin.scanner)
+        change(trial)
+        return as_of(memory, trial)
+
+    def take() -> None:
+        ready()
+        change(twin.scanner)
+
+    await twin.keeper.keep(take, after)
+    twin.changed()
+
+
+async def change_stage(
+    twin: TwinServer,
+    sample: Sample,
+    correction: Correction | None,
+    ready: Callable[[], None],
+    *,
+    history: History | None = None,
+    source: str | None = None,
+    upload: Upload | None = None,
+    scene: Scene | None = None,
+) -> list[str]:
+    """Put a sample on the stage and a correction in force; hold `stage_turn` meanwhile.
+
+    Args:
+        twin: whose stage.
+        sample, correction: what is to be there; either may be what is there already.
+        ready: raises if who asked may not any more.
+        history: of corrections, with this one; None leaves it.
+        source: what a new correction came from.
+        upload: what is to stand under the sample's name from now on.
+        scene: settings and positions that come with it.
+
+    Returns:
+        Warnings: motion that was halted.
+
+    Raises:
+        UnknownNameError, LimitError, PhantomError: there is no such sample.
+        GeometryError, CollisionError: see `TwinServer.certified_stage`; nothing has changed.
+        DatasetWriteError: it cannot be written; nothing has changed.
+    """
+    names = twin.corrections.history if history is None else history
+    change = await twin.certified_stage(
+        sample,
+        correction,
+        upload=upload,
+        targets=None if scene is None else scene.positions,
+        paces=None if scene is None else paces_of(scene, twin.scanner),
+    )
+
+    def files(changes: Changes) -> None:
+        if upload is not None:
+            twin.samples.store(changes, upload)
+        if correction is not None:
+            twin.corrections.store(changes, correction, source)
+
+    def after(memory: Memory) -> Memory:
+        trial = copy.copy(twin.scanner)
+        trial.sample, trial.correction = sample, correction
+        if scene is not None:
+            apply_settings(scene, trial)
+        return as_of(memory, trial, names)
+
+    def take() -> list[str]:
+        ready()
+        warnings = twin.take_stage(change)
+        if upload is not None:
+            twin.samples.know(upload)
+        if correction is not None:
+            twin.corrections.know(correction, source)
+        twin.corrections.history = names
+        if scene is not None:
+            apply_settings(scene, twin.scanner)
+        return warnings
+
+    warnings = await twin.keeper.keep(take, after, files)
+    twin.changed()
+    return warnings

@@ -7,7 +7,9 @@ import base64
 import binascii
 import contextlib
 from collections.abc import Callable
+from typing import TypeAlias
 
+from flexdt.protocol import Method
 from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty
 from flexdt.protocol.messages import Encoded
@@ -29,41 +31,23 @@ from flexdt.twin.errors import CollisionError
 MAX_SCRIPT_BYTES = 8 << 20
 PATIENCE_S = 2.0
 """How long an answer waits for a job to reach the requested state."""
+ScanInput: TypeAlias = p.ScriptInput | p.TrajectoryInput
+CHECK: tuple[Method[ScanInput, p.CheckResult], ...] = (p.SCRIPT_CHECK, p.TRAJECTORY_CHECK)
+SUBMIT: tuple[Method[ScanInput, p.SubmitResult], ...] = (p.SCRIPT_SUBMIT, p.TRAJECTORY_SUBMIT)
 
 
-@answers(p.SCRIPT_CHECK)
-async def check_script(twin: TwinServer, client: Client, params: p.ScriptInput) -> Encoded:
+@answers(*CHECK)
+async def check(twin: TwinServer, client: Client, params: ScanInput) -> Encoded:
     """The dry-run report; nothing moves."""
-    return await twin.submissions.check(_script(params), client.peer.codec)
+    return await twin.submissions.check(_source(params), client.peer.codec)
 
 
-@answers(p.SCRIPT_SUBMIT)
-async def submit_script(twin: TwinServer, client: Client, params: p.ScriptInput) -> p.SubmitResult:
-    """A script as a job."""
-    return await _submitted(twin, client, params, _script(params))
-
-
-@answers(p.TRAJECTORY_CHECK)
-async def check_trajectory(twin: TwinServer, client: Client, params: p.TrajectoryInput) -> Encoded:
-    """The dry-run report; nothing moves."""
-    wish = ScanSource.of_poses(params.poses, params.exposure_ms)
-    return await twin.submissions.check(wish, client.peer.codec)
-
-
-@answers(p.TRAJECTORY_SUBMIT)
-async def submit_trajectory(
-    twin: TwinServer, client: Client, params: p.TrajectoryInput
-) -> p.SubmitResult:
-    """Poses as a job, one image each."""
-    wish = ScanSource.of_poses(params.poses, params.exposure_ms, params.motion_samples, params.seed)
-    return await _submitted(twin, client, params, wish)
-
-
-async def _submitted(
-    twin: TwinServer, client: Client, params: p.ScriptInput | p.TrajectoryInput, wish: ScanSource
-) -> p.SubmitResult:
+@answers(*SUBMIT)
+async def submit(twin: TwinServer, client: Client, params: ScanInput) -> p.SubmitResult:
+    """A script as a job, or poses, one image each."""
+    ready = ensure_allowed(twin, client, "a scan")
     job = await twin.submissions.submit(
-        wish, params.name, params.speed_up, client.program, ensure_allowed(twin, client, "a scan")
+        _source(params), params.name, params.speed_up, client.program, ready
     )
     return p.SubmitResult(job=job.id, dataset=job.folder, warnings=job.warnings)
 
@@ -141,7 +125,11 @@ def _free(job: Job, status: w.JobStatus) -> w.JobStatus:
     return status
 
 
-def _script(params: p.ScriptInput) -> ScanSource:
+def _source(params: ScanInput) -> ScanSource:
+    if isinstance(params, p.TrajectoryInput):
+        return ScanSource.of_poses(
+            params.poses, params.exposure_ms, params.motion_samples, params.seed
+        )
     if params.text is not None:
         script = params.text.encode("utf-8")
     else:

@@ -10,9 +10,8 @@ from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty
 from flexdt.protocol.methods import motion_messages as p
 from flexdt.server.twin import wire_values as views
-from flexdt.server.twin.changes import change_settings
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, answers, free
+from flexdt.server.twin.handlers.handler import Client, answers, change_settings, free
 from flexdt.server.twin.obstacle_move import finished
 from flexdt.twin.scanner.scanner import ScannerTwin
 

@@ -11,9 +11,15 @@ from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import sample_messages as p
 from flexdt.server.storage.stored_samples import EMPTY
 from flexdt.server.storage.unfinished_uploads import UploadHead
-from flexdt.server.twin.changes import change_stage
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, answers, encoded_apart, free, in_turns
+from flexdt.server.twin.handlers.handler import (
+    Client,
+    answers,
+    change_stage,
+    encoded_apart,
+    free,
+    in_turns,
+)
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.scanner.state import Placement, Sample
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from flexdt.protocol import state_model as w
 from flexdt.protocol.methods import setting_messages as p
 from flexdt.server.twin import wire_values as views
-from flexdt.server.twin.changes import change_settings
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, answers, free
+from flexdt.server.twin.handlers.handler import Client, answers, change_settings, free
 from flexdt.twin.errors import SafetyError
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.scanner.scanner import ScannerTwin

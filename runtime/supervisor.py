@@ -18,13 +18,13 @@ import json
 import os
 import signal
 import sys
+from asyncio import FIRST_COMPLETED
 from asyncio.subprocess import PIPE, Process
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from flexdt.process_settings import Address
-from flexdt.server.runtime import processor_time
-from flexdt.server.runtime.process import stop_signal
+from flexdt.runtime.process import session_seconds, stop_signal
 
 STALLED_S = 300.0
 """A service that is not ready and has used no processor time for so long waits for something that
@@ -122,7 +122,7 @@ class Supervisor:
         work = asyncio.create_task(self._look_after())
         stopping = asyncio.create_task(stop.wait())
         try:
-            await asyncio.wait({work, stopping}, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait({work, stopping}, return_when=FIRST_COMPLETED)
             if work.done():
                 work.result()
         finally:
@@ -139,7 +139,7 @@ class Supervisor:
                 ready = asyncio.Event()
                 keepers.append(asyncio.create_task(self._keep(service, ready)))
                 first = asyncio.create_task(ready.wait())
-                await asyncio.wait({first, *keepers}, return_when=asyncio.FIRST_COMPLETED)
+                await asyncio.wait({first, *keepers}, return_when=FIRST_COMPLETED)
                 first.cancel()
                 for keeper in keepers:
                     if keeper.done():
@@ -188,7 +188,7 @@ class Supervisor:
                 sys.executable,
                 "-P",  # the installed package, not what the current folder has of that name
                 "-m",
-                "flexdt.server.runtime.child",
+                "flexdt.runtime.child",
                 *service.command(dict(self.addresses)),
                 stdin=PIPE,
                 stdout=PIPE,
@@ -200,37 +200,37 @@ class Supervisor:
         return process
 
     async def _ready(self, process: Process, service: Service) -> Address:
-        """Where it listens.
+        """Where it listens; says what is waited for, and later how far it has come.
 
         Raises:
             _Ended: before it said so, or it no longer does anything.
         """
+        clock = asyncio.get_running_loop().time
         address = asyncio.create_task(_address(process, service.name))
         end = asyncio.create_task(_ended(process))
-        telling = asyncio.create_task(self._tell(process, service))
-        stalled = asyncio.create_task(_stalled(process))
-        tasks = (address, end, telling, stalled)
+        used_s, since, note_at = session_seconds(process.pid), clock(), clock() + SILENT_S
+        note = f"waiting for the {service.name}" + (service.slow and f": {service.slow}")
         try:
-            await asyncio.wait({address, end, stalled}, return_when=asyncio.FIRST_COMPLETED)
+            while not (address.done() or end.done()):
+                now_s = session_seconds(process.pid)
+                if now_s is None or now_s != used_s:
+                    used_s, since = now_s, clock()
+                if clock() - since >= STALLED_S:
+                    raise _Ended(f"it did nothing for {STALLED_S:g} s")
+                if clock() >= note_at and (note or used_s is not None):
+                    work = (
+                        f"the {service.name} is still starting: {used_s or 0:.0f} s of work so far"
+                    )
+                    self.note(note or work)
+                    note, note_at = "", clock() + STILL_S
+                await asyncio.wait({address, end}, timeout=LOOK_S, return_when=FIRST_COMPLETED)
             if address.done():
                 return address.result()
-            if end.done():
-                raise _Ended(_how(end.result()), end.result())
-            raise _Ended(f"it did nothing for {STALLED_S:g} s")
+            raise _Ended(_how(end.result()), end.result())
         finally:
-            for task in tasks:
+            for task in (address, end):
                 task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
-
-    async def _tell(self, process: Process, service: Service) -> None:
-        """Say what is waited for, and later how far it has come."""
-        await asyncio.sleep(SILENT_S)
-        self.note(f"waiting for the {service.name}" + (service.slow and f": {service.slow}"))
-        while True:
-            await asyncio.sleep(STILL_S)
-            used_s = processor_time.of_session(process.pid)
-            if used_s is not None:
-                self.note(f"the {service.name} is still starting: {used_s:.0f} s of work so far")
+            await asyncio.gather(address, end, return_exceptions=True)
 
     def _bury(self, service: Service) -> None:
         """End what is left of a service: processes it started may hold its port or its files."""
@@ -302,16 +302,6 @@ async def _ended(process: Process) -> int:
     finally:
         end.cancel()
     return process.returncode
-
-
-async def _stalled(process: Process) -> None:
-    """Return once a process and what it started have used no processor time for `STALLED_S`."""
-    clock = asyncio.get_running_loop().time
-    used_s, since = processor_time.of_session(process.pid), clock()
-    while used_s is None or clock() - since < STALLED_S:
-        await asyncio.sleep(LOOK_S)
-        if (now_s := processor_time.of_session(process.pid)) != used_s:
-            used_s, since = now_s, clock()
 
 
 def _how(code: int) -> str:

@@ -1,4 +1,4 @@
-"""`python -m flexdt.server.runtime.child MODULE ARGS...`: a module that ends with its parent.
+"""`python -m flexdt.runtime.child MODULE ARGS...`: a module that ends with its parent.
 
 The parent keeps the child's standard input open as a pipe. When the parent goes away, for whatever
 reason, even killed outright, the pipe closes and the child receives SIGTERM, its normal way to
@@ -22,7 +22,7 @@ GRACE_S = 15.0
 def main() -> None:
     """Watch standard input from a thread and run the named module as `__main__`."""
     if len(sys.argv) < 2:
-        sys.exit("usage: python -m flexdt.server.runtime.child MODULE [ARGUMENT...]")
+        sys.exit("usage: python -m flexdt.runtime.child MODULE [ARGUMENT...]")
     threading.Thread(target=_watch, name="parent-watch", daemon=True).start()
     module = sys.argv[1]
     sys.argv = [module, *sys.argv[2:]]

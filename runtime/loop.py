@@ -19,8 +19,8 @@ from collections.abc import Callable
 from time import perf_counter
 from typing import Any, Final
 
-from flexdt.server.runtime.log import Sparing
-from flexdt.server.runtime.metrics import Histogram
+from flexdt.runtime.log import Sparing
+from flexdt.runtime.metrics import Histogram
 
 BACKLOG = 1024
 """Connections that the system keeps until they are accepted. Beyond them it drops a client's first
@@ -74,36 +74,30 @@ class _Watched(selectors.DefaultSelector):
 
 
 class ServerLoop(asyncio.SelectorEventLoop):
-    """asyncio's loop with its turns measured."""
-
-    def __init__(self) -> None:
-        self.holds = Holds()
-        super().__init__(_Watched(self.holds))
-        self.set_exception_handler(Complaints())
-
-
-class Complaints:
-    """Logs the errors passed to the loop's exception handler, each kind at a limited rate.
+    """asyncio's loop with its turns measured; its complaints go to the log at a limited rate.
 
     Without the limit a process that has run out of descriptors would flood its log, since every
     connection that cannot be accepted is an error.
     """
 
     def __init__(self) -> None:
-        self._sparing = Sparing(burst=1)
+        self.holds = Holds()
+        super().__init__(_Watched(self.holds))
+        lines = Sparing(burst=1)
 
-    def __call__(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """Handle one error."""
-        what, error = str(context.get("message")), context.get("exception")
-        kind = f"{what} {type(error).__name__}"
-        if error is None or isinstance(error, OSError):
-            self._sparing.log("event loop", logging.WARNING, kind=kind,
-                              message=what, reason=str(error))  # fmt: skip
-            return
-        try:
-            raise error
-        except BaseException:
-            self._sparing.log("event loop", logging.ERROR, kind=kind, error=True, message=what)
+        def complain(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+            what, error = str(context.get("message")), context.get("exception")
+            kind = f"{what} {type(error).__name__}"
+            if error is None or isinstance(error, OSError):
+                lines.log("event loop", logging.WARNING, kind=kind,
+                          message=what, reason=str(error))  # fmt: skip
+                return
+            try:
+                raise error
+            except BaseException:
+                lines.log("event loop", logging.ERROR, kind=kind, error=True, message=what)
+
+        self.set_exception_handler(complain)
 
 
 class ListeningServer:

@@ -21,8 +21,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 from flexdt.protocol.rpc_errors import Code, RpcError, busy, too_large
-from flexdt.server.runtime import processor_time
-from flexdt.server.runtime.worker import Parts, Work, receive_parts, send_parts
+from flexdt.runtime.process import process_seconds
+from flexdt.runtime.worker import Parts, Work, receive_parts, send_parts
 
 KEPT_BYTES = 400 << 20
 """A process that has taken more is replaced, so that the memory is given back."""
@@ -46,7 +46,7 @@ class Worker:
         environment = {k: v for k, v in os.environ.items() if k != "FLEXDT_TOKEN"}
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "flexdt.server.runtime.worker",
+                [sys.executable, "-P", "-m", "flexdt.runtime.worker",
                  str(theirs.fileno()), str(memory_bytes)],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
@@ -60,7 +60,8 @@ class Worker:
         finally:
             theirs.close()
         self._channel = ours
-        self.peak_bytes = 0
+        self.kept = True
+        """Whether it may have further work."""
 
     @property
     def pid(self) -> int:
@@ -70,7 +71,7 @@ class Worker:
     def ask(
         self, work: Work, arguments: Sequence[object], raw: Parts, seconds: float
     ) -> list[bytes]:
-        """Have one piece of work done; after any error but -32602 and the like, `kill` it.
+        """Have one piece of work done; work that fails, or took much memory, ends the process.
 
         Args:
             work: called there.
@@ -83,17 +84,21 @@ class Worker:
                 ends its process.
             RuntimeError: a fault of ours, with its traceback.
         """
+        sound = False
         try:
             self._channel.settimeout(seconds)
             call = pickle.dumps((work, arguments))
             send_parts(self._channel, [f"{seconds}".encode(), call, *raw])
             self._wait(seconds)
             how, peak, *answer = receive_parts(self._channel)
+            sound = how in (b"done", b"refused") and int(peak) <= KEPT_BYTES
         except TimeoutError:
             raise too_large(_label(work), f"more than {seconds:g}", seconds, "s") from None
         except (OSError, EOFError, ValueError):
             raise self._died(work, seconds) from None
-        self.peak_bytes = int(peak)
+        finally:
+            if not sound:
+                self.kill()
         match how:
             case b"done":
                 return answer
@@ -101,7 +106,6 @@ class Worker:
                 raise RpcError(*json.loads(answer[0]))
             case b"memory":
                 most = self._memory >> 20
-                self.peak_bytes = self._memory
                 raise too_large(_label(work), f"more than {most}", most, "MiB of memory")
         raise RuntimeError(answer[0].decode("utf-8", "replace"))
 
@@ -111,12 +115,12 @@ class Worker:
         Raises:
             TimeoutError: the work has used, or done nothing for, so much time.
         """
-        begun = used = processor_time.of_process(self.pid)
+        begun = used = process_seconds(self.pid)
         since = time.monotonic()
         with selectors.DefaultSelector() as answer:
             answer.register(self._channel, selectors.EVENT_READ)
             while not answer.select(min(LOOK_S, seconds)):
-                now = processor_time.of_process(self.pid)
+                now = process_seconds(self.pid)
                 if now != used:
                     used, since = now, time.monotonic()
                 worked = 0.0 if now is None or begun is None else now - begun
@@ -125,7 +129,6 @@ class Worker:
 
     def _died(self, work: Work, seconds: float) -> RpcError:
         self.kill()
-        self.peak_bytes = self._memory
         return RpcError(
             Code.TOO_LARGE,
             f"the process of {_label(work)} ended with code {self._process.returncode}",
@@ -134,12 +137,13 @@ class Worker:
 
     def stop(self) -> None:
         """End the process without waiting for it; whoever awaits its answer gets an error."""
+        self.kept = False
         self._process.kill()
 
     def kill(self) -> None:
         """End the process and wait for its end."""
         with suppress(OSError):
-            self._process.kill()
+            self.stop()
         self._process.wait()
         self._channel.close()
 
@@ -176,18 +180,17 @@ class Workers:
             worker = self._idle.pop() if self._idle else None
             if worker is None:
                 worker = await loop.run_in_executor(self._threads, self._new)
-            asked = loop.run_in_executor(self._threads, self._ask, worker, work, arguments, raw)
+            asked = loop.run_in_executor(
+                self._threads, worker.ask, work, arguments, raw, self.seconds
+            )
             try:
-                answer = await asyncio.shield(asked)
+                return await asyncio.shield(asked)
             except asyncio.CancelledError:
                 worker.stop()
-                asked.add_done_callback(_heard)
+                asked.add_done_callback(lambda asked: asked.exception())  # nobody else will hear it
                 raise
-            except RpcError:
+            finally:
                 self._keep(worker)
-                raise
-            self._keep(worker)
-            return answer
 
     def _new(self) -> Worker:
         try:
@@ -196,25 +199,8 @@ class Workers:
             data = {"allowed": "try again later"}
             raise busy(f"no process could be started: {error.strerror}", data) from None
 
-    def _ask(
-        self, worker: Worker, work: Work, arguments: Sequence[object], raw: Parts
-    ) -> list[bytes]:
-        """In a thread: ask, and end a process that is not to be kept."""
-        sound = False
-        try:
-            answer = worker.ask(work, arguments, raw, self.seconds)
-            sound = True
-            return answer
-        except RpcError as error:
-            sound = error.code != Code.TOO_LARGE
-            raise
-        finally:
-            if not sound or worker.peak_bytes > KEPT_BYTES:
-                worker.kill()
-                worker.peak_bytes = self.memory_bytes
-
     def _keep(self, worker: Worker) -> None:
-        if worker.peak_bytes <= KEPT_BYTES:
+        if worker.kept:
             self._idle.append(worker)
         if self._timer is not None:
             self._timer.cancel()
@@ -236,7 +222,3 @@ class Workers:
 
 def _label(work: Work) -> str:
     return "the work of " + work.__module__.rsplit(".", 1)[-1].replace("_", " ")
-
-
-def _heard(asked: asyncio.Future[list[bytes]]) -> None:
-    asked.exception()  # nobody else will

@@ -1,14 +1,19 @@
-"""The files of a data set's folder: a listing, and readers with typed errors for its contents."""
+"""The files of a data set's folder: their names, a listing, and readers with typed errors.
+
+Images are written as TIFF bytes by `tiff_bytes`.
+"""
 
 from __future__ import annotations
 
 import math
 import os
 import re
+import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO, Final
@@ -16,9 +21,16 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.server.files.directory import Directory
+from flexdt.runtime.files.directory import Directory
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
-from flexdt.twin.dataset.file_names import DOCUMENT, GEOMETRY, SCAN_SETTINGS, XRE_SETTINGS
+from flexdt.twin.dataset.file_names import (
+    DOCUMENT,
+    GEOMETRY,
+    SCAN_SETTINGS,
+    XRE_SETTINGS,
+    plain_name,
+)
+from flexdt.twin.dataset.flexdt_json import DatasetDocument, parse_document
 from flexdt.twin.geometry.conventions import Float32Array
 
 Shape = tuple[int, int]
@@ -101,6 +113,14 @@ class Folder:
     def paths(self, files: Sequence[str]) -> tuple[Path, ...]:
         """Paths of those of `files` that are there."""
         return tuple(self.path / name for name in files if name in self.names)
+
+    def lost(self, files: Sequence[str]) -> str:
+        """Which of `files` are not there, in words; "" if all are."""
+        lost = [name for name in files if name not in self.names]
+        if not lost:
+            return ""
+        more = f" and {len(lost) - 5} more" if len(lost) > 5 else ""
+        return f"{', '.join(lost[:5])}{more} {'is' if len(lost) == 1 else 'are'} missing"
 
     def _find(self, wanted: str) -> str | None:
         return next((n for n in sorted(self.names) if n.lower() == wanted.lower()), None)
@@ -190,6 +210,23 @@ def read_text(path: Path, most: int = MAX_TEXT_BYTES) -> str:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError:
         return raw.decode("cp1252", errors="replace")
+
+
+def read_document(folder: Directory) -> DatasetDocument:
+    """The flexdt.json of a data set in a data directory.
+
+    Raises:
+        FileNotFoundError: there is none.
+        DatasetFormatError: it cannot be read, or is no such document.
+    """
+    path = folder.path / DOCUMENT
+    try:
+        text = folder.read(DOCUMENT).decode()
+    except FileNotFoundError:
+        raise
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetFormatError(f"cannot read {path}: {error}", {"path": str(path)}) from None
+    return parse_document(text, str(path))
 
 
 def read_image(path: Path, shape: tuple[int, int] | None = None) -> npt.NDArray[np.uint16]:
@@ -283,3 +320,51 @@ def mean_image(paths: Sequence[Path], shape: tuple[int, int]) -> Float32Array:
     for path in paths:
         total += read_image(path, shape)
     return (total / len(paths)).astype(np.float32)
+
+
+def tiff_bytes(image: npt.NDArray[np.uint16]) -> bytes:
+    """One uint16 image (rows, cols) as a baseline TIFF: little-endian, one strip, no metadata.
+
+    The pixels begin at byte 8 and the tags follow them, as the scanner writes its files: some of
+    its readers look for pixels there without reading the tags.
+    """
+    rows, cols = image.shape
+    pixels = image.astype("<u2", copy=False).tobytes()
+    at = 8 + len(pixels)
+    software = b"flexdt\0\0"
+    short, long, rational, text = 3, 4, 5, 2
+    tags = (
+        (256, long, 1, cols),
+        (257, long, 1, rows),
+        (258, short, 1, 16),  # bits
+        (259, short, 1, 1),  # not compressed
+        (262, short, 1, 1),  # black is zero
+        (273, long, 1, 8),  # where the pixels begin
+        (277, short, 1, 1),  # one sample a pixel
+        (278, long, 1, rows),  # in one strip
+        (279, long, 1, len(pixels)),
+        (282, rational, 1, at + len(software)),
+        (283, rational, 1, at + len(software)),
+        (296, short, 1, 1),  # no unit
+        (305, text, 7, at),
+    )
+    entries = b"".join(struct.pack("<HHII", *tag) for tag in tags)
+    beside = software + struct.pack("<II", 1, 1)
+    head = struct.pack("<2sHI", b"II", 42, at + len(beside))
+    return b"".join((head, pixels, beside, struct.pack("<H", len(tags)), entries, bytes(4)))
+
+
+def free_name(root: Directory, wish: str) -> str:
+    """`wish`, or `wish-2`, `wish-3`... whichever nothing in `root` has yet.
+
+    Raises:
+        DatasetNameError: `wish` is not plain.
+    """
+    plain_name(wish, "data set")
+    candidates: Iterable[str] = (wish if n == 1 else f"{wish}-{n}" for n in range(1, 1_000_000))
+    return next(n for n in candidates if root.stat(n) is None)
+
+
+def dated_name(moment: datetime, number: int = 1) -> str:
+    """A name as the scanner gives them: 201106_001."""
+    return f"{moment:%y%m%d}_{number:03d}"

@@ -1,4 +1,4 @@
-"""Signals, `ready` line and exit codes of every server process.
+"""Signals, `ready` line, exit codes and processor time of every server process.
 
 The `main` modules of the processes say what they serve and with which options.
 """
@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TextIO, TypeVar
 
 from flexdt.process_settings import ProcessSettings
-from flexdt.server.runtime.access import AccessError, AccessFileError
-from flexdt.server.runtime.loop import ServerLoop
+from flexdt.runtime.access import AccessError, AccessFileError
+from flexdt.runtime.loop import ServerLoop
 from flexdt.twin.errors import TwinError
 
 OK = 0
@@ -106,3 +106,40 @@ def read_if_there(file: Path | None, parse: Callable[[str, str], T]) -> T | None
     if file is None or not file.exists():
         return None
     return parse(file.read_text(encoding="utf-8"), str(file))
+
+
+def process_seconds(pid: int) -> float | None:
+    """Processor time of a process so far, with the children that it has seen end [s].
+
+    A busy machine gives a process less of its processors, not less to do: what bounds work is the
+    time that the work itself has used. None where the system does not tell.
+    """
+    words = _words(str(pid))
+    return _seconds(words) if words else None
+
+
+def session_seconds(session: int) -> float | None:
+    """Processor time of the processes of a session so far [s]; None as `process_seconds`.
+
+    Args:
+        session: its number, which is the process id of its first process.
+    """
+    try:
+        names = [name for name in os.listdir("/proc") if name.isdigit()]
+    except OSError:
+        return None
+    found = [words for words in map(_words, names) if words and int(words[3]) == session]
+    return sum(map(_seconds, found)) if found else None
+
+
+def _words(pid: str) -> list[str]:
+    """The words of a process's line after its name; none of one that has ended meanwhile."""
+    try:
+        with open(f"/proc/{pid}/stat", encoding="utf-8", errors="replace") as file:
+            return file.read().rpartition(")")[2].split()
+    except OSError:
+        return []
+
+
+def _seconds(words: list[str]) -> float:
+    return sum(int(word) for word in words[11:15]) / os.sysconf("SC_CLK_TCK")

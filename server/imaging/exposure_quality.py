@@ -1,22 +1,34 @@
-"""What is wrong with an image at first sight: too bright, too dark, cut off.
+"""What is wrong with an image at first sight, and how good the images of a scan will be.
 
-All three are judged on the image without noise and as though X-rays were on, so that users are
-warned before a scan.
+Too bright, too dark, cut off: all three are judged on the image without noise and as though X-rays
+were on, so that users are warned before a scan. The forecast is made in a worker process with
+limits.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.phantoms import Phantom
+from flexdt.phantoms.exposure_forecast import expose
+from flexdt.protocol import Codec
+from flexdt.protocol.connection import encoded
+from flexdt.protocol.methods.image_messages import PREDICTION_LIMITS, ExposurePrediction
 from flexdt.protocol.state_model import ImageFlags
+from flexdt.runtime.workers import Workers
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.machine.description import Machine
 from flexdt.twin.physics.exposure import FEW_COUNTS, ExposureSettings
 from flexdt.twin.physics.radiograph import Radiograph
 
+BEST: Final = 10
+"""Settings that are proposed."""
 EVERY = 3
 """Pixels are judged on a grid with this step, edges on all their pixels."""
 SHADOW = 0.05
@@ -84,3 +96,24 @@ def flags_of(
         good_counts=(radiography.offset + FEW_COUNTS, radiography.full_scale),
         good_lines=(round(beam - math.log(top), 2), round(beam - math.log(FEW_COUNTS), 2)),
     )
+
+
+def predictors() -> Workers:
+    """The process that predicts; to be closed in the end."""
+    limits = PREDICTION_LIMITS
+    return Workers(1, int(limits["memory_bytes"]), float(limits["seconds"]))
+
+
+def predict(
+    phantom: Phantom, machine: Machine, settings: dict[str, Any], codec: Codec
+) -> list[bytes]:
+    """In the worker: the answer to `exposure.predict`, encoded; `settings` are `expose`'s.
+
+    Raises:
+        RpcError: an argument that the machine does not allow.
+    """
+    told = asdict(expose(phantom, machine=machine, **settings))
+    told["transmission"]["edges"] = told["transmission"]["edges"][:-1]  # no infinity in JSON
+    told |= {"sample": phantom.name, "best": told["best"][:BEST], "frames": told.pop("images")}
+    result = ExposurePrediction.model_validate(told, strict=False)
+    return list(encoded(result, codec).pieces)

@@ -1,4 +1,4 @@
-"""`python -m flexdt.server.runtime.worker SOCKET MEMORY`: heavy work, in a process of its own.
+"""`python -m flexdt.runtime.worker SOCKET MEMORY`: heavy work, in a process of its own.
 
 Requests and answers are lists of byte strings over a socket that the parent handed down. The
 process has a limit on memory, one on processor time for each request, a low priority, and ends when
@@ -96,7 +96,7 @@ def answer(request: Sequence[bytes]) -> list[bytes]:
     except MemoryError:
         return [b"memory"]
     except Exception as error:
-        from flexdt.server.wire_errors import explain, is_user_error
+        from flexdt.runtime.wire_errors import explain, is_user_error
 
         if is_user_error(error):
             e = explain(error)

@@ -20,10 +20,10 @@ from typing import Any, Final
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 from flexdt.process_settings import LOOPBACK, ServerSettings
-from flexdt.server.runtime.access import check_bind, is_loopback, read_token, token_matches
-from flexdt.server.runtime.log import dropped
-from flexdt.server.runtime.loop import Holds, ServerLoop
-from flexdt.server.runtime.metrics import CONTENT_TYPE, Figure, Requests, counter, gauge, render
+from flexdt.runtime.access import check_bind, is_loopback, read_token, token_matches
+from flexdt.runtime.log import dropped
+from flexdt.runtime.loop import Holds, ServerLoop
+from flexdt.runtime.metrics import CONTENT_TYPE, Figure, Requests, counter, gauge, render
 
 SILENT_S: Final = 5.0
 """A client that sends nothing for so long is left."""

@@ -17,8 +17,8 @@ from contextlib import suppress
 from typing import TypeVar
 
 from flexdt.protocol.fields import MAX_STEM, encoded
-from flexdt.server.files.directory import BEFORE, Directory, writing
-from flexdt.server.runtime.log import log
+from flexdt.runtime.files.directory import BEFORE, Directory, writing
+from flexdt.runtime.log import log
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.errors import LimitError
 
@@ -198,3 +198,34 @@ def _finite(text: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{text} is no finite number")
     return value
+
+
+def lock_folder(root: Directory) -> Callable[[], None]:
+    """Lock a data directory until the end of the process, or a call of what is returned.
+
+    The lock is on the directory itself, not on a file in it: there is nothing that somebody could
+    delete while a twin runs, or replace by a link beforehand. The system releases it when its
+    holder dies. Without effect where a directory cannot be opened (Windows) or locked.
+
+    Raises:
+        DatasetWriteError: another process holds the lock.
+    """
+    fd = root.fileno()
+    if fd is None:
+        return lambda: None
+    import fcntl
+
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise DatasetWriteError(
+            f"the data directory {root.path} is used by another twin server",
+            {"path": str(root.path), "allowed": "another --data"},
+        ) from None
+    except OSError:
+        return lambda: None
+
+    def release(held: Directory = root) -> None:  # as long as it is referred to, it stays open
+        fcntl.flock(fd, fcntl.LOCK_UN)
+
+    return release

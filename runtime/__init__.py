@@ -1,0 +1,1 @@
+"""What every process needs: event loop, access, log, metrics, workers, supervisor."""

@@ -1,1 +1,0 @@
-"""What every server process needs: event loop, access, log, metrics, workers, supervisor."""
