@@ -167,7 +167,10 @@ class _Overlap:
         turn with either body. How far that body reaches across them does not change, so that one
         of many corners costs no more than another.
         """
-        turned = tuple(np.eye(3) if turn is None else turn for turn in (turn_a, turn_b))
+        turned = (
+            np.eye(3) if turn_a is None else turn_a,
+            np.eye(3) if turn_b is None else turn_b,
+        )
         off = (np.abs(now - then).max() for now, then in zip(turned, self.turned, strict=True))
         turns = max(off) > STANDING
         widest, across = -math.inf, self.directions[0]
