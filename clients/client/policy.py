@@ -215,7 +215,7 @@ class Core:
         except BaseException as error:
             await link.close()
             if isinstance(error, ConnectionLost) and link.calls.reason is not None:
-                # E.g. too many clients: trying again is no help.
+                # The server said why it ends the connection: trying again is no help.
                 raise link.calls.reason from None
             raise
         self.hello = hello

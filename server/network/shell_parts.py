@@ -3,14 +3,9 @@
 The shells differ in how they read and write: lines or frames in order for the twin, frames side by
 side and without copies for the projector.
 
-Connections without a place wait in a `Room`: those that have not shown the token yet, those that
-came when all places were taken, and clients with the token who came then. A newcomer always gets
-in, so that it can say hello or stop the scanner; what it displaces belongs to the address that has
-most there.
-
-A client beyond the limit is told so. The error has to be in the client's codec, which follows from
-the client's first byte. An excess connection therefore waits for that byte for a limited time, at
-the cost of a socket and a timer. It has no session and no worker and does not count as a client.
+Connections without a place wait in a `Room`: those that have not shown the token yet, and clients
+that came when all places were taken. A newcomer always gets in, so that it can say hello or stop
+the scanner; what it displaces belongs to the address that has most there.
 """
 
 from __future__ import annotations
@@ -46,8 +41,8 @@ from flexdt.runtime.log import LOGGER, Sparing, log, traced
 WRONG_TOKENS = 3
 """Wrong tokens after which a connection is closed."""
 WAITING = 512
-"""Connections that may wait for a hello or an error: where one address opens 167 a second, each of
-them still has 3 s for it."""
+"""Connections that may wait for a hello: where one address opens 167 a second, each of them still
+has 3 s for it."""
 
 
 class Guest(Protocol):
@@ -190,65 +185,6 @@ async def answered(
         log("request", logging.DEBUG, trace=trace, client=client, method=method[:100],
             ms=round(1000 * taken, 3), code=code)  # fmt: skip
     return answer
-
-
-class TurnedAway(asyncio.Protocol):
-    """An excess connection; takes over the transport from the protocol that accepted it.
-
-    Args:
-        transport: of the connection.
-        address: where it comes from.
-        error: that it gets.
-        timeout_s: within which it must send a byte, read the error and disconnect [s].
-        others: all excess connections; this one is among them until it ends.
-        urgent: told of the first bytes; true where it serves them after all, and takes over.
-    """
-
-    def __init__(
-        self,
-        transport: asyncio.Transport,
-        address: str,
-        error: RpcError,
-        timeout_s: float,
-        others: Room,
-        urgent: Callable[[bytes], bool],
-    ) -> None:
-        self._transport, self._error, self._others = transport, error, others
-        self.address, self._urgent = address, urgent
-        self.gone = asyncio.Event()
-        self._told = False
-        self._timer = asyncio.get_running_loop().call_later(timeout_s, transport.abort)
-        transport.set_protocol(self)
-        others.enter(self)
-
-    def end(self) -> None:
-        """Cut the connection off."""
-        self._transport.abort()
-
-    def data_received(self, data: bytes) -> None:
-        """Send the error in the codec that the first byte selects."""
-        if self._told or self._transport.is_closing():
-            return  # read and discard: closing with bytes unread would lose the answer
-        self._told = True
-        if self._urgent(data):
-            self._forget()
-            return
-        wire = Connection()
-        wire.receive_data(data[:1])
-        self._transport.write(wire.send(Failure(None, self._error)))
-        if self._transport.can_write_eof():
-            self._transport.write_eof()
-        else:  # TLS says goodbye by itself
-            self._transport.close()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """The connection has ended."""
-        self._forget()
-        self.gone.set()
-
-    def _forget(self) -> None:
-        self._timer.cancel()
-        self._others.leave(self)
 
 
 Observe = Callable[[str, float, int | None], None]

@@ -10,7 +10,7 @@ what methods mean, except that `session.hello` brings the token and that an E-st
 
 A client takes one of `max_clients` places when it has shown the token (at once where there is
 none). Until then, and while all places are taken, it is in a `Room`: there it is answered to hello,
-and to what is urgent once it has shown the token, but to nothing else.
+and to what is urgent once it has shown the token where there is one, but to nothing else.
 """
 
 from __future__ import annotations
@@ -76,7 +76,6 @@ from flexdt.server.network.shell_parts import (
     Room,
     Session,
     TokenCheck,
-    TurnedAway,
     answered,
     neighbourhood,
     unobserved,
@@ -229,17 +228,6 @@ class _Link(asyncio.Protocol):
         self.transport.set_write_buffer_limits(high=64 * 1024)
         tune(self.transport.get_extra_info("socket"))
         self.address = neighbourhood(str(peer[0]))
-        if self.let_in and not self._seat():
-            self.log("refused", logging.WARNING, reason="too many clients")
-            timeout_s, others = self.limits.hello_timeout_s, self.server.waiting
-            error = self._no_place()
-            TurnedAway(
-                self.transport, self.address, error, timeout_s, others, self._urgent_after_all
-            )
-            return  # it takes over from here
-        self._begin()
-
-    def _begin(self) -> None:
         if self.let_in:
             self._open()
         else:
@@ -247,15 +235,6 @@ class _Link(asyncio.Protocol):
             self.deadlines.start("hello", self.limits.hello_timeout_s)
         self.worker = self.loop.create_task(self._work())
         self.worker.add_done_callback(self._crashed)
-
-    def _urgent_after_all(self, data: bytes) -> bool:
-        """Serve a connection that was turned away, if its first bytes name an urgent method."""
-        if not any(name in data for name in self.server.urgent):
-            return False
-        self.transport.set_protocol(self)
-        self._begin()
-        self.data_received(data)
-        return True
 
     def _seat(self) -> bool:
         """Take a place if there is one; whether it has one."""
@@ -535,7 +514,7 @@ class _Link(asyncio.Protocol):
             method = find(name, self.server.methods)
             if not method.urgent:
                 self._check_rate()
-                if not (self._seat() if self.let_in else name == HELLO):
+                if not (self.let_in and self._seat()) and name != HELLO:
                     raise self._no_place()
             if isinstance(given, RpcError):
                 raise given

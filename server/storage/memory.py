@@ -4,7 +4,8 @@ Positions, settings, tube, camera, sample, an E-stop in force, the list of jobs 
 in force are one document, so that a change of several of them is written whole or not at all. A
 client's change that must survive is written first and takes effect afterwards (see
 `StateStore.keep`): if it cannot be written, nothing has changed. Positions and the progress of a
-scan are written as they change, at most a few times a second, and when the server stops. After a
+scan are written as they change, at most a few times a second, and when the server stops. An E-stop
+waits for no disk, but it is written at once, whatever was written a moment ago or failed. After a
 restart X-rays are off, motors are where they were last recorded, and interrupted scans are marked
 so and can be resumed. A damaged document is set aside, and the server starts without it.
 """
@@ -15,6 +16,7 @@ import asyncio
 import logging
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Annotated, Literal, TypeVar
 
@@ -179,14 +181,16 @@ class StateStore:
 
     def __init__(self, root: Directory, make: Callable[[bool], Memory]) -> None:
         self._root, self._make = root, make
-        self._changed = asyncio.Event()
+        self._changed, self._at_once = asyncio.Event(), asyncio.Event()
         self._writing = asyncio.Lock()
         self._file = threading.Lock()
         self._ended = False
 
-    def changed(self) -> None:
-        """Something worth remembering has changed."""
+    def changed(self, *, at_once: bool = False) -> None:
+        """Something worth remembering has changed; `at_once` is for what no pause may hold back."""
         self._changed.set()
+        if at_once:
+            self._at_once.set()
 
     async def run(self, moving: Callable[[], bool]) -> None:
         """Write until cancelled; `moving` returns whether positions are changing."""
@@ -194,6 +198,7 @@ class StateStore:
             if not moving():
                 await self._changed.wait()
             self._changed.clear()
+            self._at_once.clear()
             pause = INTERVAL_S
             try:
                 await self.flush()
@@ -201,7 +206,8 @@ class StateStore:
                 log("the state was not written", logging.ERROR, reason=str(error))
                 self._changed.set()  # the change is still pending
                 pause = FAR_S
-            await asyncio.sleep(pause)
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._at_once.wait(), pause)
 
     async def flush(self) -> None:
         """Write now, so that everything answered later survives a kill.

@@ -140,8 +140,10 @@ def test_one_too_many_is_told_so_over_tls() -> None:
         def talk() -> None:
             with TwinClient(port=server.port, ssl=trusting()) as client:
                 for _ in range(3):
-                    with pytest.raises(RpcError, match="too many clients"):
-                        TwinClient(port=server.port, ssl=trusting())
+                    with TwinClient(port=server.port, ssl=trusting()) as late:
+                        assert late.ping() == 1.0
+                        with pytest.raises(RpcError, match="too many clients"):
+                            late.state()
                 assert client.ping() == 1.0
 
         await asyncio.to_thread(talk)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from simulated_disk import Disk, Fault
+from simulation import Simulation
 
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.own_documents import Changes
@@ -88,3 +89,32 @@ def test_a_change_is_undone_on_a_disk_that_stays_full(tmp_path: Path, at: int) -
         changes.put(folder, "a", b"newer")
         changes.put(folder, "a", b"newest")
     assert {f.name: f.read_bytes() for f in root.iterdir()} == {"a": b"newest", "b": b"b"}
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("full", [False, True])
+def test_an_estop_survives_a_kill_a_moment_after_its_answer(
+    tmp_path: Path, seed: int, full: bool
+) -> None:
+    """Also right after another change, or after one that could not be written."""
+    rng = random.Random(seed)
+    with Simulation(tmp_path, seed) as sim:
+        sim.start()
+        client = sim.client()
+        sim.advance(5.0)
+        if full:
+            sim.disk.set(Fault(0, errno.ENOSPC, lasting=True))
+        sim.call(client, "axes.move", targets={"rot_obj": 5.0})
+        sim.advance(rng.uniform(0.01, 3.0))
+        if full:
+            assert sim.disk.failed
+            sim.disk.set(None)
+        assert sim.call(client, "safety.estop")["safety"]["estop"]
+        sim.advance(0.07)  # a thread under way, and the next one: 0.03 s each at most
+        before = len(sim.disk.ops)
+        for _ in range(20):  # it is in force: no more news for the disk
+            sim.call(client, "safety.estop")
+        assert len(sim.disk.ops) == before
+        sim.kill()
+        sim.start()
+        assert sim.call(sim.client(), "state.get")["safety"]["state"] == "estop"

@@ -104,14 +104,21 @@ def test_limits_hold_in_a_process(tmp_path: Path, capsys: pytest.CaptureFixture[
         assert refused
         three, four = Wire(server.port), Wire(server.port)
         three.call("session.ping")
-        # One too many is told why, in either codec, by every client.
-        four.socket.sendall(b"{}\n")
-        assert four.read()["error"]["code"] == -32003
-        with pytest.raises(RpcError, match="too many clients") as refused_:
-            TwinClient(port=server.port)
+        # One too many is told why, by every client, and stops the scanner nevertheless.
+        assert four.ask("state.get")["error"]["code"] == -32003
+        with TwinClient(port=server.port) as late:
+            with pytest.raises(RpcError, match="too many clients") as refused_:
+                late.state()
+            assert late.estop().safety.estop
         assert (refused_.value.code, refused_.value.data) == (-32003, {"allowed": 3})
-        with pytest.raises(RpcError, match="too many clients"):
-            asyncio.run(AsyncTwinClient(port=server.port).connect())
+
+        async def later() -> None:
+            async with AsyncTwinClient(port=server.port) as late:
+                with pytest.raises(RpcError, match="too many clients"):
+                    await late.state()
+                assert (await late.estop()).safety.estop
+
+        asyncio.run(later())
         assert run(["state", "--server", f"127.0.0.1:{server.port}"]) == 4
         assert "too many clients" in capsys.readouterr().err
     finally:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import io
+import itertools
 import json
 import logging
 import random
 from collections import Counter
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -15,7 +17,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strangers import draw, hello, play, request
 
-from flexdt.protocol import Method
+from flexdt.protocol import (
+    PROTOCOL,
+    Codec,
+    Connection,
+    Failure,
+    Method,
+    Request,
+    Response,
+)
 from flexdt.protocol.fields import Params
 from flexdt.runtime.access import ConnectionLimits
 from flexdt.runtime.log import JsonLines, Sparing
@@ -79,6 +89,8 @@ async def served(client: Client, *methods: str) -> None:
         assert (await client.ask(line))["result"] == {"method": method}
 
 
+HELLO = Request(0, "session.hello", {"protocol": PROTOCOL, "client": "test"})
+STATE = Request(0, "state.get", {})
 NEW = ("session.hello", "session.ping", "safety.estop")
 """What a new client asks to stop the scanner."""
 
@@ -176,18 +188,77 @@ def test_clients_beyond_the_reserved_places_displace_the_oldest(
     asyncio.run(asyncio.wait_for(main(), 60))
 
 
-def test_without_a_token_an_estop_that_comes_first_is_served_beyond_the_limit() -> None:
+@settings(max_examples=25, deadline=None)
+@given(
+    codec=st.sampled_from(list(Codec)),
+    before=st.lists(st.sampled_from([HELLO, STATE]), max_size=3),
+    cuts=st.lists(st.integers(1, 400), max_size=4),
+)
+def test_without_a_token_a_full_server_serves_estops_however_they_come(
+    codec: Codec, before: list[Request], cuts: list[int]
+) -> None:
+    """In either codec, after a hello or a request that is refused, in any pieces."""
+
     async def main() -> None:
         app = App()
         server = await serve(app.open, limits=ConnectionLimits(max_clients=1))
-        first, second, third = [await Client.dial(server) for _ in range(3)]
+        first, late = await Client.dial(server), await Client.dial(server)
         await served(first, "state.get")
-        await served(second, "safety.estop", "session.ping")
-        assert (await second.ask(request("state.get")))["error"]["code"] == -32003
-        error = json.loads(await (await _said(third, hello(None))).end())
-        assert (error["id"], error["error"]["code"]) == (None, -32003)
+        wire, asked = Connection(codec), [*before, Request(0, "safety.estop", {})]
+        data = b"".join(wire.send(replace(r, id=i)) for i, r in enumerate(asked))
+        ends = [0, *sorted(cut for cut in set(cuts) if cut < len(data)), len(data)]
+        for begin, end in itertools.pairwise(ends):
+            late.writer.write(data[begin:end])
+            await late.writer.drain()
+            for _ in range(5):
+                await asyncio.sleep(0)
+        answers = dict[Any, Response | Failure]()
+        while len(answers) < len(asked):
+            for answer in wire.receive_data(await late.reader.read(65536)):
+                assert isinstance(answer, Response | Failure)
+                answers[answer.id] = answer
+        for i, request_ in enumerate(asked):
+            answer = answers[i]
+            if request_.method == "state.get":
+                assert isinstance(answer, Failure)
+                assert (answer.error.code, answer.error.data) == (-32003, {"allowed": 1})
+            else:
+                assert isinstance(answer, Response)
+        assert [method for _, method in app.calls].count("safety.estop") == 1
         assert len(server.links) == 1
-        for client in (first, second, third):
+        for client in (first, late):
+            client.writer.close()
+        await server.close()
+
+    asyncio.run(asyncio.wait_for(main(), 60))
+
+
+def test_without_a_token_a_crowd_at_a_full_server_displaces_only_its_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(tcp, "RESERVED", 8)
+
+    async def main() -> None:
+        app = App()
+        server = await serve(app.open, limits=ConnectionLimits(max_clients=2))
+        holders = [await Client.dial(server, OTHER) for _ in range(2)]
+        crowd = [await Client.dial(server, PEER) for _ in range(30)]
+        while server.opened < 32:
+            await asyncio.sleep(0)
+        assert len(server.reserved.guests) == 8
+
+        late = await Client.dial(server)
+        for count in range(1, 4):
+            crowd += [await Client.dial(server, PEER) for _ in range(20)]
+            assert (await late.ask(hello(None)))["result"] == {"method": "session.hello"}
+            assert (await late.ask(request("state.get")))["error"]["code"] == -32003
+            await served(late, "safety.estop", "session.ping")
+            assert app.calls.count(("127.0.0.1", "safety.estop")) == count
+        holders[0].writer.close()
+        while len(server.links) == 2:
+            await asyncio.sleep(0)
+        await served(late, "state.get")  # it has waited, and has the place now
+        for client in (*holders, *crowd, late):
             client.writer.close()
         await server.close()
 

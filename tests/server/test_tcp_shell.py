@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import logging
 from collections.abc import Awaitable, Callable
@@ -510,68 +509,51 @@ def test_limits_on_clients_rate_and_broken_messages() -> None:
     run(body, limits=ConnectionLimits(max_clients=1, requests_per_s=20.0, malformed=5))
 
 
-def test_one_too_many_is_told_in_its_own_codec() -> None:
+def test_one_too_many_is_told_in_its_own_codec_until_there_is_a_place() -> None:
     async def body(server: TcpServer, app: FakeApp) -> None:
         _, first = await dial(server)
         while not app.peers:
             await asyncio.sleep(0)
-        silent, waits = await dial(server)
+        _, silent = await dial(server)
+        late = []
         for codec in Codec:
             reader, writer = await dial(server)
             wire = Connection(codec)
             writer.write(wire.send(Request(1, "state.get", {})) + wire.send(Request(2, "x", {})))
-            [told] = wire.receive_data(await reader.read())  # one answer, then the end
-            assert isinstance(told, Failure)
-            assert told.id is None
-            assert (told.error.code, told.error.data) == (-32003, {"allowed": 1})
-            writer.close()
-        assert len(app.peers) == 1
+            told: list[Any] = []
+            while len(told) < 2:
+                told += wire.receive_data(await reader.read(65536))
+            assert [(t.id, t.error.code) for t in told] == [(1, -32003), (2, -32601)]
+            assert told[0].error.data == {"allowed": 1}
+            late.append((wire, reader, writer))
         assert app.calls == []
         first.close()
         while server.links:
             await asyncio.sleep(0)
-        # The one that waits to be told holds no place.
-        reader, writer = await dial(server)
-        [reply] = await ask(reader, writer, call("state.get"))
-        assert "result" in reply
-        waits.write(b"x")
-        assert json.loads(await silent.read())["error"]["code"] == -32003
-        waits.close()
-        writer.close()
+        # The ones that wait hold no place: the first that asks has it.
+        for (wire, reader, writer), kind in zip(late, (Response, Failure), strict=True):
+            writer.write(wire.send(Request(3, "state.get", {})))
+            [answer] = wire.receive_data(await reader.read(65536))
+            assert isinstance(answer, kind)
+        for _, _, writer in late:
+            writer.close()
+        silent.close()
 
     run(body, limits=ConnectionLimits(max_clients=1))
 
 
-def test_one_too_many_that_says_nothing_or_does_not_go_is_cut_off() -> None:
-    async def body(server: TcpServer, app: FakeApp) -> None:
-        _, first = await dial(server)
-        while not app.peers:
-            await asyncio.sleep(0)
-        mute, one = await dial(server)
-        stays, two = await dial(server)
-        two.write(b"{}")
-        assert json.loads(await stays.read())["error"]["code"] == -32003
-        with contextlib.suppress(ConnectionError):  # cut off, not said goodbye to
-            assert await mute.read() == b""
-        while server.waiting.guests:  # `two` has not closed its side
-            await asyncio.sleep(0.01)
-        for writer in (first, one, two):
-            writer.close()
-
-    run(body, limits=ConnectionLimits(max_clients=1, hello_timeout_s=2.0))
-
-
 def test_many_too_many_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tcp, "WAITING", 3)
+    monkeypatch.setattr(tcp, "RESERVED", 3)
 
     async def body(server: TcpServer, app: FakeApp) -> None:
         links = [await dial(server) for _ in range(9)]
         ends = [asyncio.create_task(reader.read()) for reader, _ in links]
         while sum(end.done() for end in ends) < 5:  # one is served and three wait
             await asyncio.sleep(0.01)
-        assert len(server.waiting.guests) == 3
+        assert len(server.reserved.guests) == 3
         await asyncio.wait(ends, timeout=0.05)
         assert sum(end.done() for end in ends) == 5
+        assert app.closed == 5
         for _, writer in links:
             writer.close()
         await asyncio.gather(*ends, return_exceptions=True)

@@ -39,6 +39,8 @@ AXES = ("x", "y", "turn")
 MARGIN, TOLERANCE = 1.0, 0.01
 KEPT = 0.0049
 """What is free keeps so much more than the margin: one rung of the floors less rounding [mm]."""
+RUNG = 0.0052
+"""What all that is accepted may take from a gap within the margin [mm]."""
 
 
 def one_against(
@@ -546,6 +548,102 @@ def test_depth_of_an_overlap_and_what_is_left_of_it_on_the_way_out(seed: int) ->
             assert overlap.separation(q) <= truth(q) + 1e-6
             if turn == 0.0 and truth(q) < 0.0:
                 assert overlap.separation(q) >= truth(q) - polygon - (1.0 if polygon else 1e-6)
+
+
+def flat_gaps(a: FloatArray, b: FloatArray) -> FloatArray:
+    """How far convex polygons (n, k, 2) are from the polygon (m, 2), both counter-clockwise; an
+    overlap is negative, the least shift that parts them."""
+    b = np.broadcast_to(b, (len(a), *b.shape))
+    slabs, squared = [], []
+    for p, q in ((a, b), (b, a)):
+        along = np.roll(p, -1, axis=1) - p
+        outward = np.stack([along[..., 1], -along[..., 0]], axis=-1)
+        outward /= np.linalg.norm(outward, axis=-1)[..., None]
+        from_edge = q[:, None] - p[:, :, None]
+        slabs.append(np.einsum("nekc,nec->nek", from_edge, outward).min(axis=2).max(axis=1))
+        share = np.einsum("nekc,nec->nek", from_edge, along) / (along**2).sum(axis=2)[..., None]
+        to = from_edge - np.clip(share, 0.0, 1.0)[..., None] * along[:, :, None]
+        squared.append((to**2).sum(axis=3).min(axis=(1, 2)))
+    widest = np.maximum(*slabs)
+    return np.where(widest < 0.0, widest, np.sqrt(np.minimum(*squared)))
+
+
+def regular(corners: int, radius: float) -> FloatArray:
+    """The corners of a regular polygon (corners, 2), counter-clockwise."""
+    angle = 2.0 * math.pi * np.arange(corners) / corners
+    return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def upright(outline: FloatArray) -> Polytope:
+    return hull(np.vstack([np.column_stack([outline, np.full(len(outline), z)])
+                           for z in (-50.0, 50.0)]))  # fmt: skip
+
+
+WALL = np.array([[0.0, -300.0], [400.0, -300.0], [400.0, 300.0], [0.0, 300.0]])
+
+
+def gaps_along(
+    outline: FloatArray, ways: Mapping[str, Trajectory], times: FloatArray
+) -> FloatArray:
+    """Of a polygon on x, y and turn from `WALL`, at each of `times`."""
+    x, y, turn = (np.array([ways[n].position(t) for t in times.tolist()]) for n in AXES)
+    c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+    turned = np.einsum("nij,kj->nki", np.array([[c, -s], [s, c]]).transpose(2, 0, 1), outline)
+    return flat_gaps(turned + np.stack([x, y], axis=1)[:, None], WALL)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    corners=st.integers(3, 12),
+    off=st.floats(0.0, 20.0),
+    depth=st.floats(1e-3, 3.0),
+    turn=st.sampled_from([0.0, 1.0, 10.0, 300.0, 7000.0]),
+    slide=st.sampled_from([-3.0, 0.0, 0.5, 3.0, 30.0]),
+    seed=st.integers(0, 2**31),
+)
+def test_an_overlap_never_deepens_and_once_free_keeps_the_margin(
+    corners: int, off: float, depth: float, turn: float, slide: float, seed: int
+) -> None:
+    """Whatever the motion: edges and corners of polygons, looked at 4 000 times, say the same."""
+    rng = np.random.default_rng(seed)
+    outline = regular(corners, float(rng.uniform(5.0, 60.0))) + (off, 0.0)
+    begin = {"x": 0.0, "y": float(rng.uniform(-9, 9)), "turn": float(rng.uniform(-360, 360))}
+    toward = [math.cos(math.radians(begin["turn"])), -math.sin(math.radians(begin["turn"]))]
+    begin["x"] = depth - float((outline @ toward).max())
+    ways = {}
+    for name, reach in (("x", -slide), ("y", slide), ("turn", turn)):
+        far = begin[name] + reach * float(rng.uniform(0.5, 1.0))
+        speed, pace = 10.0 ** rng.uniform(0.0, 2.0, 2)
+        first = motion.move(begin[name], 0.0, far, float(speed), float(pace), 0.0)
+        now = float(rng.uniform(0.0, 1.0)) * first.end
+        back = motion.move(first.position(now), first.velocity(now), begin[name], float(speed),
+                           float(pace), now)  # fmt: skip
+        ways[name] = motion.joined([first, back]) if rng.random() < 0.5 else first
+    times = np.linspace(0.0, max(way.end for way in ways.values()), 4_000)
+    gaps = gaps_along(outline, ways, times)
+    found = SceneGuard(one_against(upright(outline), [upright(WALL)]))(ways, 0.0)
+    end = math.inf if found is None else found.time
+    free = int(np.argmax(gaps > MARGIN + 2.0 * TOLERANCE)) or len(gaps)
+    assert gaps[0] == pytest.approx(-depth, abs=1e-6)
+    assert gaps[:free][times[:free] <= end].min() >= gaps[0] - RUNG
+    assert gaps[free:][times[free:] <= end].min(initial=math.inf) >= MARGIN - 1e-6
+    if found is not None:  # and nothing else is refused
+        at = float(gaps_along(outline, ways, np.array([found.time]))[0])
+        assert at <= (gaps[0] if times[free - 1] >= end else MARGIN + TOLERANCE) + 1e-4
+
+
+def test_a_turn_of_one_corner_a_look_is_no_way_past_the_corners() -> None:
+    """At 400 even moments of it no corner of a decagon seems nearer to the wall than at first."""
+    outline, begin = regular(10, 125.0), -8.9995
+    x = 0.3 - 125.0 * math.cos(math.radians(begin))
+    way = motion.move(begin, 0.0, begin + 398 * 36.0, 45.0, 45.0**2 / 36.0, 0.0)
+    ways = {"x": motion.at_rest(x), "y": motion.at_rest(0.0), "turn": way}
+    every, densely = (np.linspace(0.0, way.end, n) for n in (400, 20_000))
+    assert gaps_along(outline, ways, every).min() > -0.3 - RUNG
+    assert gaps_along(outline, ways, densely).min() < -1.8
+    found = SceneGuard(one_against(upright(outline), [upright(WALL)]))(ways, 0.0)
+    assert found is not None
+    assert gaps_along(outline, ways, np.array([found.time]))[0] == pytest.approx(-0.3, abs=RUNG)
 
 
 @pytest.mark.parametrize("corners", [np.zeros(3), np.zeros((4, 2)), np.full((4, 3), np.nan)])

@@ -10,6 +10,10 @@ motion begins it is exact, from the faces of the bodies' Minkowski difference; l
 directions are looked at, standing and turning with either body, which can only make the separation
 seem less than it is. As long as it keeps to its floor the motion is a retreat, and from the moment
 the pair is free the usual margin applies to it again. All other pairs keep the margin throughout.
+
+Both moments are found by conservative advancement, so that none is stepped over: the separation is
+looked at again where it may have fallen to the floor, the distance where it may have grown to what
+counts as free.
 """
 
 from __future__ import annotations
@@ -23,22 +27,20 @@ import numpy as np
 
 from flexdt.twin.collision.collision_scene import Scene
 from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid
+from flexdt.twin.collision.nearest import Separation
 from flexdt.twin.collision.paths import Path
-from flexdt.twin.collision.scene_search import (
-    Pair,
-    bodies_touching,
-    first_contact,
-    separation_at,
-)
+from flexdt.twin.collision.relative import START, Moment, RelativeMotion, Separate
+from flexdt.twin.collision.scene_search import Pair, bodies_touching, first_contact
 from flexdt.twin.collision.stages import Body
+from flexdt.twin.collision.sweep import Limits
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.motion.profiles import Trajectory
-from flexdt.twin.scanner.safety import Contact, floor
+from flexdt.twin.scanner.safety import ROUNDING_MM, Contact, floor
 
-STEPS = 400
-"""Moments looked at along the motion, besides the ends of its segments."""
 GRAZING_MM = 1e-3
 """Pairs this near are judged as overlapping ones: their direction is rounding in a sweep."""
+STANDING = 1e-12
+"""What rounding makes of an orientation that has not changed."""
 MANY = 100
 """Corners of a body beyond which not all of their directions are looked at (a mesh has thousands,
 and the directions of a pair grow with the product): some, and the best one, refined."""
@@ -63,20 +65,47 @@ def leaving(scene: Scene, path: Path) -> Contact | None:
 def _of_pair(scene: Scene, path: Path, pair: Pair) -> Contact | None:
     """What stops one overlapping pair: coming closer, or touching again once free."""
     a, b = (scene.bodies[i] for i in pair)
-    overlap = _Overlap.at(a, b, path.q[0])
-    steps = np.linspace(path.times[0], path.times[-1], STEPS)
-    times = np.unique(np.concatenate([path.times, steps]))
-    limit = scene.limits.margin + scene.limits.tolerance
-    least, last = -np.inf, float(times[0])
-    for time, q in zip(times.tolist(), path.vectors(times), strict=True):
-        apart = overlap.separation(q)
-        if apart < least:
-            here = path.positions(last)
-            return Contact(scene.names(pair), time, here, here, last, 0.0, free_before=False)
-        least, last = max(least, floor(apart, scene.limits.margin)), time
-        if separation_at(scene, pair, q) > limit and time < float(path.times[-1]):
-            alone = replace(scene, pairs=(pair,), distant=())
-            return first_contact(alone, path.after(time))
+    motion, overlap = RelativeMotion(a, b, path), _Overlap.at(a, b, path.q[0])
+    deeper = _deeper(motion, overlap, scene.limits.margin)
+    until = math.inf if deeper is None else motion.time(deeper[1])
+    free = _free_from(motion, scene.separation(pair), scene.limits, until)
+    if free is not None:
+        alone = replace(scene, pairs=(pair,), distant=())
+        return first_contact(alone, path.after(free))
+    if deeper is None:
+        return None
+    last = motion.time(deeper[0])
+    here = path.positions(last)
+    return Contact(scene.names(pair), until, here, here, last, 0.0, free_before=False)
+
+
+def _deeper(
+    motion: RelativeMotion, overlap: _Overlap, margin: float
+) -> tuple[Moment, Moment] | None:
+    """When the separation comes down to its floor, after the last look before; None for never."""
+    look = motion.look(START, overlap.separate)
+    level = floor(look.gap, margin)
+    while (at := motion.next_at(look, level)) is not None:
+        before, look = look.at, motion.look(at, overlap.separate)
+        if look.gap <= level + 0.5 * ROUNDING_MM:
+            return before, at
+    return None
+
+
+def _free_from(
+    motion: RelativeMotion, separate: Separate, limits: Limits, until: float
+) -> float | None:
+    """When the two are clear of the margin by twice the tolerance, before `until`; else None [s].
+
+    Where they are not clear by one tolerance, the other one has yet to be travelled, so that every
+    look is that far from the one before.
+    """
+    at: Moment | None = START
+    while at is not None and motion.time(at) < until:
+        gap = motion.look(at, separate).gap
+        if gap > limits.margin + limits.tolerance:
+            return motion.time(at)
+        at = motion.after_travel(at, limits.margin + 2.0 * limits.tolerance - gap)
     return None
 
 
@@ -129,24 +158,37 @@ class _Overlap:
         towards = directions if i else -directions
         return self.bodies[i].solid.support(towards @ turned[i])
 
-    def separation(self, q: FloatArray) -> float:
-        """Width of the widest slab between them [mm]; negative for an overlap, never too large.
+    def separate(
+        self, offset: FloatArray, turn_a: FloatArray | None, turn_b: FloatArray | None
+    ) -> Separation:
+        """Width of the widest slab between them [mm] and its direction, as `nearest.Separate`.
 
-        Looked at are directions that turn with either body. How far that body reaches across them
-        does not change, so that one of many corners costs no more than another.
+        The width is negative for an overlap, and never too large. Looked at are directions that
+        turn with either body. How far that body reaches across them does not change, so that one
+        of many corners costs no more than another.
         """
-        (turn_a, at_a), (turn_b, at_b) = (_pose(body, q) for body in self.bodies)
-        turned = turn_a, turn_b
-        turns = not all(map(np.array_equal, turned, self.turned))
-        widest = -np.inf
+        turned = (
+            np.eye(3) if turn_a is None else turn_a,
+            np.eye(3) if turn_b is None else turn_b,
+        )
+        off = (np.abs(now - then).max() for now, then in zip(turned, self.turned, strict=True))
+        turns = max(off) > STANDING
+        widest, across = -math.inf, self.directions[0]
         for i in (0, 1) if turns else (0,):
             if turns and _many(self.bodies[1 - i].solid):
                 continue
             now = self.directions @ (turned[i] @ self.turned[i].T).T
             other = self._reach_of(1 - i, now, turned) if turns else self._reach[1 - i]
-            gaps = now @ (at_a - at_b) - self._reach[i] - other
-            widest = max(widest, float(gaps.max()))
-        return widest
+            gaps = now @ offset - self._reach[i] - other
+            best = int(np.argmax(gaps))
+            if gaps[best] > widest:
+                widest, across = float(gaps[best]), now[best]
+        return widest, across
+
+    def separation(self, q: FloatArray) -> float:
+        """That width with the motors at `q` (axes,) [mm]."""
+        (turn_a, at_a), (turn_b, at_b) = (_pose(body, q) for body in self.bodies)
+        return self.separate(at_a - at_b, turn_a, turn_b)[0]
 
     def _refined(self, q: FloatArray) -> FloatArray:
         """(1, 3): the direction of the widest gap, where no faces tell it exactly."""

@@ -241,6 +241,27 @@ class RelativeMotion:
             (f for f in found if f is not None), key=lambda f: (f.segment, f.dt), default=None
         )
 
+    def after_travel(self, at: Moment, distance: float) -> Moment | None:
+        """The first moment after `at` by which a gap may have grown by `distance` [mm].
+
+        Two points of the bodies move apart no faster than the origins slide and the farthest
+        points turn. None if they travel less to the end.
+        """
+        return self._travel.first_fall(at, self.lengths, distance, 0.0)
+
+    @cached_property
+    def _travel(self) -> _Bound:
+        """Travel that is used up. Speeds are convex in a segment: the chord is a bound."""
+        lengths = self.lengths[:, None]
+        begin = np.linalg.norm(self._velocity, axis=1)
+        end = np.linalg.norm(self._velocity + self._acceleration * lengths, axis=1)
+        for _, turn in self._turning:
+            begin = begin + turn.body.reach * np.abs(turn.rate)
+            last = turn.rate + turn.acceleration * self.lengths
+            end = end + turn.body.reach * np.abs(last)
+        growth = (end - begin) / np.where(self.lengths > 0.0, self.lengths, 1.0)
+        return _Bound(-begin, -growth)
+
     def nearest_end(self, look: Look) -> Moment:
         """The segment end after a look that lies farthest towards b along its normal, unturned."""
         i = look.at.segment

@@ -118,9 +118,11 @@ def estop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
     """Stop as the machine's E-stop does, X-rays off; a running scan pauses."""
     twin.detours.cancel()
     twin.interrupt("E-stop")
+    in_force = twin.scanner.safety.state == "estopped"
     stopping = twin.scanner.estop(twin.clock.now(), client.name)
     twin.tell("warning", f"E-stop by {client.name}")
     twin.changed()
+    twin.keeper.changed(at_once=not in_force)  # a flood of them is one write
     return views.stopped_view(twin.state(), stopping, twin.clock.now())
 
 
