@@ -24,9 +24,8 @@ from flexdt.phantoms.samples import as_phantom
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.machine.camera import CameraSettings, Roi
+from flexdt.twin.machine.camera import CameraSettings, PixelGrid, Roi
 from flexdt.twin.machine.description import Machine
-from flexdt.twin.physics.apparatus import Detector, Tube
 from flexdt.twin.physics.chain import (
     Chain,
     Expected,
@@ -37,8 +36,8 @@ from flexdt.twin.physics.chain import (
     spot_views,
     without_spot,
 )
+from flexdt.twin.physics.detector import Detector, detector_of
 from flexdt.twin.physics.exposure import Counts, ExposureSettings, frame_rng
-from flexdt.twin.physics.panel import Panel, panel_of
 from flexdt.twin.physics.radiograph import Radiograph, check_rays, radiographs, within_pixels
 from flexdt.twin.physics.scatter.simulation import (
     Beam,
@@ -48,6 +47,7 @@ from flexdt.twin.physics.scatter.simulation import (
     scan_scatter,
 )
 from flexdt.twin.physics.spectrum import tube_of
+from flexdt.twin.physics.tube import Tube
 from flexdt.twin.projection import project_body
 from flexdt.twin.projection.analytic_solids import Vector
 from flexdt.twin.projection.operators import as_cone_vec
@@ -281,15 +281,14 @@ def _pitch(cone: ConeVec) -> tuple[float, float]:
 def _panel(
     detector: Detector | None, machine: Machine | None, shape: tuple[int, int], pitch: float,
     row_pitch: float,
-) -> tuple[Panel, CameraSettings]:  # fmt: skip
+) -> tuple[Detector, CameraSettings]:  # fmt: skip
     if detector is not None or machine is None:
         given = Detector() if detector is None else detector
-        return given.panel(shape, pitch, None if row_pitch == pitch else row_pitch), given.camera(
-            shape
-        )
+        grid = PixelGrid(shape[1], shape[0], pitch, None if row_pitch == pitch else row_pitch)
+        return given.of_pixels(grid), given.camera(shape)
     spec = machine.detector
     binning = max(1, round(pitch / spec.pitch_mm))
-    edges = spec.pitch_mm, spec.pitch_mm if spec.row_pitch_mm is None else spec.row_pitch_mm
+    edges = spec.pixels.edges_mm
     if np.abs(binning * np.array(edges) / (pitch, row_pitch) - 1.0).max() > SAME_PITCH:
         raise LimitError(
             f"the geometry's pixels are {pitch:g} x {row_pitch:g} mm; allowed with {spec.model}: "
@@ -310,10 +309,10 @@ def _panel(
         roi = Roi(left, top, left + cols - 1, top + rows - 1)
         mode = spec.mode if camera.binning == binning else f"HW{binning}SW1High"
         camera = replace(camera, mode=mode, roi=roi)
-    return replace(panel_of(spec), lag_fraction=0.0), camera
+    return detector_of(spec), camera
 
 
-def _flat_doubts(flat: Counts, panel: Panel, cone: ConeVec) -> Iterator[str]:
+def _flat_doubts(flat: Counts, panel: Detector, cone: ConeVec) -> Iterator[str]:
     """A flat image must not be saturated, and it holds for views of one distance."""
     share = float((flat >= panel.full_scale).mean())
     if share > 0.0:
