@@ -26,9 +26,8 @@ from flexdt.phantoms.samples import as_phantom
 from flexdt.twin.errors import GeometryError, LimitError, require_within
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.machine.camera import CameraSettings, Roi
+from flexdt.twin.machine.camera import CameraSettings, PixelGrid, Roi
 from flexdt.twin.machine.description import Machine
-from flexdt.twin.physics.apparatus import Detector, Tube
 from flexdt.twin.physics.chain import (
     Chain,
     Expected,
@@ -39,8 +38,8 @@ from flexdt.twin.physics.chain import (
     spot_views,
     without_spot,
 )
+from flexdt.twin.physics.detector import Detector, detector_of
 from flexdt.twin.physics.exposure import Counts, ExposureSettings, frame_rng
-from flexdt.twin.physics.panel import Panel, panel_of
 from flexdt.twin.physics.radiograph import Radiograph, check_rays, radiographs, within_pixels
 from flexdt.twin.physics.scatter.simulation import (
     Beam,
@@ -50,6 +49,7 @@ from flexdt.twin.physics.scatter.simulation import (
     scan_scatter,
 )
 from flexdt.twin.physics.spectrum import tube_of
+from flexdt.twin.physics.tube import Tube
 from flexdt.twin.projection import project_body
 from flexdt.twin.projection.analytic_solids import Vector
 from flexdt.twin.projection.operators import as_cone_vec
@@ -295,10 +295,10 @@ def simulate(
     return replace(made, warnings=(*truth.assumed, *told))
 
 
-def _chosen_ms(panel: Panel, camera: CameraSettings, beam_e_per_ms: float) -> float:
+def _chosen_ms(panel: Detector, camera: CameraSettings, beam_e_per_ms: float) -> float:
     """Exposure that fills `FILLED` of the panel's range with the open beam [ms]."""
-    dark_e_per_ms = panel.dark_e_per_s * camera.binning**2 / 1000.0
-    range_e = (FILLED * panel.full_scale - panel.offset_counts) * panel.electrons_per_count(camera)
+    dark_e_per_ms = panel.dark_charge(camera) / 1000.0
+    range_e = (FILLED * panel.full_scale - panel.offset_counts) * panel.gain(camera)
     low, high = EXPOSURES_MS
     return min(max(range_e / (beam_e_per_ms + dark_e_per_ms), low), high)
 
@@ -322,14 +322,14 @@ def _pitch(cone: ConeVec) -> tuple[float, float]:
 def _panel(
     detector: Detector | None, machine: Machine | None, shape: tuple[int, int], pitch: float,
     row_pitch: float,
-) -> tuple[Panel, CameraSettings]:  # fmt: skip
+) -> tuple[Detector, CameraSettings]:  # fmt: skip
     if detector is not None:
-        row_mm = None if row_pitch == pitch else row_pitch
-        return detector.panel(shape, pitch, row_mm), detector.camera(shape)
+        grid = PixelGrid(shape[1], shape[0], pitch, None if row_pitch == pitch else row_pitch)
+        return detector.of_pixels(grid), detector.camera(shape)
     assert machine is not None
     spec = machine.detector
     binning = max(1, round(pitch / spec.pitch_mm))
-    edges = spec.pitch_mm, spec.pitch_mm if spec.row_pitch_mm is None else spec.row_pitch_mm
+    edges = spec.pixels.edges_mm
     if np.abs(binning * np.array(edges) / (pitch, row_pitch) - 1.0).max() > SAME_PITCH:
         raise LimitError(
             f"the geometry's pixels are {pitch:g} x {row_pitch:g} mm; allowed with {spec.model}: "
@@ -350,7 +350,7 @@ def _panel(
         roi = Roi(left, top, left + cols - 1, top + rows - 1)
         mode = spec.mode if camera.binning == binning else f"HW{binning}SW1High"
         camera = replace(camera, mode=mode, roi=roi)
-    return replace(panel_of(spec), lag_fraction=0.0), camera
+    return detector_of(spec), camera
 
 
 def _flat_doubt(shape: tuple[int, int], cone: ConeVec) -> Iterator[str]:

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from flexdt.twin.errors import TwinError as TwinError
     from flexdt.twin.geometry.cone_vec import ConeVec as ConeVec
     from flexdt.twin.geometry.rigid import Rigid as Rigid
-    from flexdt.twin.physics.apparatus import Detector as Detector
-    from flexdt.twin.physics.apparatus import Tube as Tube
+    from flexdt.twin.physics.detector import Detector as Detector
+    from flexdt.twin.physics.tube import Tube as Tube
     from flexdt.twin.projection.linear_operator import Operator as Operator
     from flexdt.twin.projection.operators import back as back
     from flexdt.twin.projection.operators import forward as forward
@@ -59,13 +59,13 @@ _HOMES: Final = {
     "AsyncTwinClient": "flexdt.clients",
     "ConeVec": "flexdt.twin.geometry.cone_vec",
     "DataSet": "flexdt.clients.datasets.data_set",
-    "Detector": "flexdt.twin.physics.apparatus",
+    "Detector": "flexdt.twin.physics.detector",
     "Grid": "flexdt.twin.projection.volume",
     "LocalTwin": "flexdt.clients.launch.local_twin",
     "NotBuiltError": "flexdt.twin.errors",
     "Operator": "flexdt.twin.projection.linear_operator",
     "Rigid": "flexdt.twin.geometry.rigid",
-    "Tube": "flexdt.twin.physics.apparatus",
+    "Tube": "flexdt.twin.physics.tube",
     "TwinClient": "flexdt.clients",
     "TwinError": "flexdt.twin.errors",
     "Volume": "flexdt.twin.projection.volume",

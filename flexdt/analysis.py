@@ -25,7 +25,7 @@ from flexdt.twin.errors import TwinError
 from flexdt.twin.exchange.geometry import ScanGeometry
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
-from flexdt.twin.physics.apparatus import Tube
+from flexdt.twin.physics.tube import Tube
 from flexdt.twin.projection import Volume
 
 Data = DataSet | str | PathLike[str]

@@ -25,6 +25,7 @@ from flexdt.clients.cli.options import (
 )
 from flexdt.clients.extras import package
 from flexdt.clients.failure import CommandError
+from flexdt.clients.reconstruction.volume_files import volume_writer
 from flexdt.clients.whole_files import free_bytes, write_whole
 from flexdt.process_settings import OneLine
 from flexdt.runtime.files.dataset_folder import tiff_bytes
@@ -54,6 +55,7 @@ __all__ = [
     "table",
     "tiff_bytes",
     "triple",
+    "volume_writer",
     "warn",
     "write_whole",
 ]

@@ -15,6 +15,8 @@ MOVED: Final = {
     "flexdt.clients.batch": "flexdt_extensions.batch",
     "flexdt.clients.calibration.build_sheet": "flexdt_extensions.phantom_design.build_sheet",
     "flexdt.clients.calibration.phantom_design": "flexdt_extensions.phantom_design.phantom_design",
+    "flexdt.clients.reconstruction.on_workers": "flexdt_extensions.volumes.on_workers",
+    "flexdt.clients.reconstruction.zarr_volume": "flexdt_extensions.volumes.zarr_volume",
     "flexdt.clients.scenario": "flexdt_extensions.ctsimu.scenario",
     "flexdt.clients.studies": "flexdt_extensions.studies",
     "flexdt.server.files": "flexdt.runtime.files",
@@ -25,6 +27,8 @@ MOVED: Final = {
     "flexdt.twin.calibration.online": "flexdt_extensions.online",
     "flexdt.twin.calibration.studies": "flexdt_extensions.studies",
     "flexdt.twin.exchange.ctsimu_scan": "flexdt_extensions.ctsimu.ctsimu_scan",
+    "flexdt.twin.physics.apparatus": "flexdt.twin.physics.detector",
+    "flexdt.twin.physics.panel": "flexdt.twin.physics.detector",
     "flexdt.clients.lab": "flexdt_extensions.bluesky",
     "flexdt.clients.learning": "flexdt_extensions.learning",
 }

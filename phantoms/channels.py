@@ -27,7 +27,7 @@ from flexdt.twin.errors import GeometryError, UnknownNameError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.physics.chain import Chain
-from flexdt.twin.physics.panel import Panel
+from flexdt.twin.physics.detector import Detector
 from flexdt.twin.physics.scatter.simulation import Object
 from flexdt.twin.physics.spectrum import TubeModel
 from flexdt.twin.projection import Body, TriangleMesh, Volume, project_body
@@ -96,7 +96,7 @@ def channels(phantom: Phantom) -> tuple[Channel, ...]:
 
 
 def chain_through(
-    parts: Sequence[Channel], panel: Panel, tube: TubeModel, mono_keV: float | None = None
+    parts: Sequence[Channel], panel: Detector, tube: TubeModel, mono_keV: float | None = None
 ) -> Chain:
     """The chain from the paths through these materials to counts, see `flexdt.twin.physics`."""
     return Chain(

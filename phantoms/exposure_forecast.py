@@ -26,8 +26,8 @@ from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine, builtin_machine
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.physics.chain import Chain, flux_of
+from flexdt.twin.physics.detector import detector_of
 from flexdt.twin.physics.exposure import FEW_COUNTS, NOTICED, ExposureSettings
-from flexdt.twin.physics.panel import panel_of
 from flexdt.twin.physics.prediction import air_kerma_mGy, contrast_to_noise, pixel_reading
 from flexdt.twin.physics.radiograph import radiographs
 from flexdt.twin.physics.spectrum import Filter, tube_of, voltages
@@ -215,10 +215,10 @@ def expose(
     parts = channels(phantom)
     camera = replace(spec.camera, exposure_ms=time_ms, averages=averages)
     cone = ConeVec.circular(
-        sod=sod, sdd=sdd, angles=VIEWS, shape=camera.shape, pixel=camera.pixel_mm(spec.sensor)
+        sod=sod, sdd=sdd, angles=VIEWS, shape=camera.shape, pixel=camera.pixel_mm(spec.pixels)
     )
     lit = ExposureSettings(tried[0], power, camera.exposure_ms, averages)
-    panel, tube = panel_of(spec), tube_of(scanner.tube)
+    panel, tube = detector_of(spec), tube_of(scanner.tube)
 
     def chain(layer: str) -> Chain:
         name, thickness = _layer("filter", layer) if layer else ("", 0.0)
@@ -274,7 +274,7 @@ def exposure_problems(plan: ScanPlan, phantom: Phantom) -> tuple[Problem, ...]:
     A few views of each setting of tube and camera are made without noise.
     """
     parts, scanner = channels(phantom), plan.machine
-    chain = chain_through(parts, panel_of(scanner.detector), tube_of(scanner.tube))
+    chain = chain_through(parts, detector_of(scanner.detector), tube_of(scanner.tube))
     found: dict[tuple[ExposureSettings, CameraSettings], tuple[int, list[int]]] = {}
     first = 0
     for group in plan.groups:
@@ -311,7 +311,7 @@ def _views(
     through = np.exp(-np.stack([image.integrals for image in images]))
     signal = np.stack([image.expected.mean_e for image in images if image.expected])
     panel = chain.panel
-    signal /= panel.electrons_per_count(camera)
+    signal /= panel.gain(camera)
     saturated = float((signal >= panel.full_scale - panel.offset_counts).mean())
     return paths, through, saturated, float((signal < FEW_COUNTS).mean())
 

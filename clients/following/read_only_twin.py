@@ -167,7 +167,7 @@ class ReadOnlyTwin:
                 on=bool(mirror.xrays_on), kV=mirror.kV, power_W=mirror.power_W,
                 ready=bool(mirror.xrays_on) and now >= mirror.ready_s,
             ),
-            camera=w.CameraState(**mirror.camera.facts(machine.detector.sensor)),
+            camera=w.CameraState(**mirror.camera.facts(machine.detector.pixels)),
             sample=w.SampleState(name=None),
             geometry=self._geometry(mirror, positions),
             safety=w.SafetyState(
@@ -207,7 +207,7 @@ class ReadOnlyTwin:
     def _geometry(self, mirror: Mirror, positions: Mapping[str, float]) -> w.GeometryState:
         f = self._follower
         poses = motor_poses(f.machine, f.profile, mirror.camera, positions)
-        found = readout(poses, mirror.camera, f.machine.detector.sensor)
+        found = readout(poses, mirror.camera, f.machine.detector.pixels)
         if found is None:
             raise GeometryError("the axis or the detector is not in front of the source", {})
         return w.GeometryState(**vars(found))

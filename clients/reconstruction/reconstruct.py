@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -22,6 +22,7 @@ import numpy as np
 
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.expose import image_doubts
+from flexdt.clients.extras import extension
 from flexdt.clients.reconstruction.volume_files import (
     check_name,
     read_volume,
@@ -52,9 +53,9 @@ from flexdt.twin.reconstruction import (
 from flexdt.twin.reconstruction.scatter_correction import scatterer_of, subtracted
 
 if TYPE_CHECKING:
-    from flexdt.twin.physics.apparatus import Tube
     from flexdt.twin.physics.scatter.simulation import ScanScatter
     from flexdt.twin.physics.spectrum import TubeModel
+    from flexdt.twin.physics.tube import Tube
     from flexdt.twin.reconstruction import Hardening
 
 Progress = Callable[[float, float], None]
@@ -261,7 +262,8 @@ def reconstruct_dataset(
         if pool is None:
             doubts = _here(views, grid, wanted, out, tell)
         else:
-            doubts = _by_workers(views, grid, wanted, out, pool, tell)
+            by_workers = extension("slabs", "a reconstruction by workers")
+            doubts = by_workers(views, grid, wanted, out, pool, tell)
     doubts = [*views.doubts, *doubts]
     slices = write_slices(out, read_volume(out).data) if wanted.png else []
     in_force = dataset.correction
@@ -309,32 +311,6 @@ def _here(
 
 def _doubts(truncation: Truncation | None) -> list[str]:
     return [truncation.doubt] if truncation is not None and truncation.doubt else []
-
-
-def _by_workers(
-    views: ScanFrames, grid: Grid, request: VolumeRequest, out: Path, pool: Executor, tell: Progress
-) -> list[str]:
-    """As `_here`, by workers."""
-    from flexdt.clients.reconstruction.on_workers import SlabWork, fdk_on_workers
-
-    data = views.dataset
-    if request.algorithm != "fdk" or data.folder is None:
-        raise LimitError(
-            f"workers reconstruct data sets in folders, by fdk; not {data.where} by "
-            f"{request.algorithm}",
-            {"asked": request.algorithm, "allowed": ["fdk"]},
-        )
-    files = [path for i in views.indices if (path := data.frames[i].path) is not None]
-    stats = [(str(file), file.stat()) for file in (*files, *data.darks, *data.flats)]
-    identity = (
-        asdict(replace(request, png=False)), asdict(grid), views.cone_vec.rows.tolist(),
-        [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats],
-    )  # fmt: skip
-    # Workers compute for themselves what this process has computed of the data set.
-    sent = replace(views, dataset=replace(data))
-    truncation = views.truncation()
-    work = SlabWork(sent.parts, views.cone_vec, views.shape, grid, request.window, truncation)
-    return _doubts(truncation) + fdk_on_workers(work, out, identity, pool, tell)
 
 
 def reconstruct_volume(
@@ -421,7 +397,7 @@ def _without_scatter(
     """
     from flexdt.phantoms import material
     from flexdt.twin.physics.chain import Chain
-    from flexdt.twin.physics.panel import Panel
+    from flexdt.twin.physics.detector import Detector
     from flexdt.twin.physics.scatter.simulation import Beam, scan_scatter
 
     figures = {} if views.dataset.document is None else views.dataset.document.noise.model
@@ -432,7 +408,7 @@ def _without_scatter(
         )
     substances = tuple(material(name).substance for name in names)
     kV, tube, mono_keV = _source(views.dataset, request)
-    chain = Chain(Panel(), tube, substances, mono_keV=mono_keV)
+    chain = Chain(Detector(), tube, substances, mono_keV=mono_keV)
     factor = max(1, min(max(views.shape) // SCATTER_PIXELS, min(views.shape) // 2))
     each = max(1, len(views.indices) // SCATTER_VIEWS)
     geometry = views.cone_vec[::each].binned(factor, views.shape)

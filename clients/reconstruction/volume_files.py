@@ -1,4 +1,6 @@
-"""Volumes to files, slab by slab: TIFF, NRRD, MetaImage, NIfTI, HDF5, Zarr; slices as PNG.
+"""Volumes to files, slab by slab: TIFF, NRRD, MetaImage, NIfTI, HDF5; slices as PNG.
+
+`flexdt-extensions` writes and reads Zarr.
 
 A file appears under its final name only when whole. Values are float32 [1/mm], index order z, y, x;
 voxel size and position go into the file where its format has a place for them.
@@ -19,8 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.clients.datasets.pictures import png
-from flexdt.clients.extras import package
-from flexdt.clients.reconstruction import zarr_volume
+from flexdt.clients.extras import extension, package
 from flexdt.twin.errors import LimitError
 from flexdt.twin.lazy_backend import File
 from flexdt.twin.projection import Grid, Volume
@@ -29,9 +30,8 @@ if TYPE_CHECKING:
     from flexdt.twin.geometry.conventions import Float32Array
 
 SUFFIXES: Final = (".tif", ".tiff", ".nrrd", ".mha", ".nii.gz", ".h5", ".zarr")
-PACKAGES: Final = {".nii.gz": "nibabel", ".h5": "h5py", ".zarr": "zarr"}
+PACKAGES: Final = {".nii.gz": "nibabel", ".h5": "h5py"}
 """What writes these formats; the others need nothing more."""
-ZARR_MARK: Final = "zarr.json"
 NO_PLACE: Final = (
     "NumPy's files have no room for the voxel size; write with numpy.save(FILE, volume.data) and "
     "read with Volume(numpy.load(FILE), voxel_mm)"
@@ -58,9 +58,8 @@ def volume_writer(path: Path, grid: Grid) -> Iterator[Sink]:
             case ".h5":
                 yield from _hdf5(part, grid)
             case ".zarr":
-                yield from _zarr(part, grid)
-                if (path / ZARR_MARK).is_file():
-                    shutil.rmtree(path)
+                yield from _zarr().write(part, path, grid)
+                return
             case ".nii.gz":
                 header = _nifti_header(grid)
                 with gzip.open(part, "wb", compresslevel=1) as file:
@@ -88,21 +87,26 @@ def ending(path: Path) -> str:
 
 def check_name(path: Path) -> None:
     """Check, before any work, that a file of this name can be written."""
-    _check_ending(path)
+    _check_format(path)
     if not path.absolute().parent.is_dir():
         raise LimitError(f"{path}: the folder does not exist", {"asked": str(path.parent)})
-    needed = PACKAGES.get(ending(path))
-    if needed is not None:
-        package(needed)
 
 
-def _check_ending(path: Path) -> None:
+def _check_format(path: Path) -> None:
     if ending(path) not in SUFFIXES:
         why = f". {NO_PLACE}" if ending(path) == ".npy" else ""
         raise LimitError(
             f"{path}: the ending must be one of {', '.join(SUFFIXES)}{why}",
             {"asked": path.suffix, "allowed": list(SUFFIXES)},
         )
+    if ending(path) in PACKAGES:
+        package(PACKAGES[ending(path)])
+    elif ending(path) == ".zarr":
+        _zarr()
+
+
+def _zarr() -> Any:
+    return extension("zarr", "a volume in .zarr")
 
 
 def save_volume(volume: Volume, file: File) -> None:
@@ -240,23 +244,6 @@ def _hdf5(part: Path, grid: Grid) -> Iterator[Sink]:
         yield _filling(values)
 
 
-def _zarr(part: Path, grid: Grid) -> Iterator[Sink]:
-    """OME-NGFF, in the slabs of `zarr_volume`, whatever comes."""
-    group = zarr_volume.create(part, grid)
-    todo = list(enumerate(zarr_volume.slabs(grid)))
-    held: list[Float32Array] = []
-
-    def write(slab: Float32Array) -> None:
-        held.append(slab)
-        while todo and sum(map(len, held)) >= todo[0][1][1] - todo[0][1][0]:
-            number, (first, last) = todo.pop(0)
-            whole = held[0] if len(held) == 1 else np.concatenate(held)
-            zarr_volume.put(group, grid, number, whole[: last - first])
-            held[:] = [whole[last - first :]]
-
-    yield write
-
-
 def _filling(values: Any) -> Sink:
     """Writes slabs one after the other into something that is indexed like an array."""
     done = 0
@@ -277,7 +264,7 @@ def read_volume(file: File) -> Volume:
         LimitError: it is not such a file.
     """
     path = Path(file)
-    _check_ending(path)
+    _check_format(path)
     try:
         values, voxel, place, first = READERS[ending(path)](path)
         if first:  # the place is that of the first voxel
@@ -344,13 +331,6 @@ def _read_hdf5(path: Path) -> Read:
         return values[:], float(about["voxel_mm"]), about["center_mm"], False
 
 
-def _read_zarr(path: Path) -> Read:
-    group = package("zarr").open_group(path, mode="r")
-    (scale,) = group.attrs["ome"]["multiscales"]
-    size, place = scale["datasets"][0]["coordinateTransformations"]
-    return group["0"][:], float(size["scale"][0]), place["translation"][::-1], True
-
-
 READERS: Final[Mapping[str, Callable[[Path], Read]]] = {
     ".tif": _read_tiff,
     ".tiff": _read_tiff,
@@ -358,7 +338,7 @@ READERS: Final[Mapping[str, Callable[[Path], Read]]] = {
     ".mha": _read_mha,
     ".nii.gz": _read_nifti,
     ".h5": _read_hdf5,
-    ".zarr": _read_zarr,
+    ".zarr": lambda path: _zarr().read(path),
 }
 
 

@@ -22,7 +22,7 @@ from image_quality import edge_mtf
 import flexdt as fx
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.attenuation.tables import tables
-from flexdt.twin.physics.panel import Panel
+from flexdt.twin.physics.detector import FULL_WELL_E, Detector
 from flexdt.twin.physics.scintillator import deposited
 from flexdt.twin.physics.spectrum import Filter, TubeModel, tube_spectrum
 
@@ -75,7 +75,7 @@ class Theory:
 
     @classmethod
     def of(cls, pixel_mm: float, ms: float) -> Theory:
-        panel = Panel()
+        panel = Detector()
         fluence = tube_spectrum(KV, TubeModel()).fluence * POWER_W / KV * ms / 1000.0  # cm2, 1 m
         fluence = fluence * (1000.0 / FAR_MM) ** 2 * pixel_mm**2 / 100.0
         layer = Substance.of("", "CsI", 4.51 * panel.packing)
@@ -83,9 +83,9 @@ class Theory:
         charge = tables().energy_keV * panel.electrons_per_keV
         mean = float(fluence @ (kept.mean * charge))
         variance = float(fluence @ (kept.square * charge**2)) / panel.swank + mean
-        well = panel.full_well_e[0] * (pixel_mm / (2 * panel.pitch_mm)) ** 2
+        well = FULL_WELL_E[0] * (pixel_mm / (2 * panel.pixels.pitch_mm)) ** 2
         return cls(pixel_mm, panel.blur_mm / pixel_mm, float(fluence.sum()), mean, variance,
-                   panel.read_noise_e[0], well / 2.0**panel.bits)  # fmt: skip
+                   panel.read_noise_e, well / 2.0**panel.bits)  # fmt: skip
 
     def shared(self, apart: int) -> float:
         """Part of the noise's covariance that pixels so far apart have along one axis: the light's

@@ -14,9 +14,9 @@ from flexdt.phantoms import material
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.physics.chain import Chain, expected_signal, read_out, weights_of
+from flexdt.twin.physics.detector import Detector
 from flexdt.twin.physics.effective import effective_beam
 from flexdt.twin.physics.exposure import ExposureSettings, frame_rng
-from flexdt.twin.physics.panel import Panel
 from flexdt.twin.projection import project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 from flexdt.twin.reconstruction import Grid, fdk, sirt
@@ -37,7 +37,7 @@ def transmission(chain: Chain, *lengths: float) -> float:
 def slabs() -> float:
     """Largest relative error of Beer-Lambert's law, one energy, plastic and steel."""
     two = tuple(material(n).substance for n in ("abs", "steel"))
-    chain = Chain(Panel(), substances=two, thickest_mm=(50.0, 5.0), mono_keV=50.25)
+    chain = Chain(Detector(), substances=two, thickest_mm=(50.0, 5.0), mono_keV=50.25)
     mu = [s.attenuation()[90] for s in two]  # the bin about 50.25 keV
     grid = [(a, b) for a in (0.0, 1.0, 20.0, 50.0) for b in (0.0, 1.0, 4.0)]
     return max(abs(transmission(chain, a, b) / np.exp(-a * mu[0] - b * mu[1]) - 1) for a, b in grid)
@@ -46,7 +46,7 @@ def slabs() -> float:
 def wedge() -> dict[str, float]:
     """Aluminium from 0 to 40 mm at 90 kV against the sum over the whole spectrum."""
     aluminium = material("aluminium").substance
-    chain = Chain(Panel(), substances=(aluminium,), thickest_mm=(40.0,))
+    chain = Chain(Detector(), substances=(aluminium,), thickest_mm=(40.0,))
     signal, noise = weights_of(chain, 90.0)
     thick = np.linspace(0.0, 40.0, 81)
     full = np.exp(-np.outer(thick, aluminium.attenuation())) @ signal / signal.sum()
@@ -63,7 +63,7 @@ def wedge() -> dict[str, float]:
 
 def detector() -> dict[str, object]:
     """Photon transfer, flat correction, saturation, sharpness of the simulated panel."""
-    panel = Panel(dead_fraction=0.0)
+    panel = Detector(dead_fraction=0.0)
     chain = Chain(panel)
     camera = CameraSettings("HW2SW1High", Roi(0, 0, 1199, 999))
 
@@ -79,7 +79,7 @@ def detector() -> dict[str, object]:
     off = ExposureSettings(90.0, 50.0, 10.0, xrays_on=False)
     curve = photon_transfer(pairs, [(flat(off, 90), flat(off, 91))])
     signal, noise = weights_of(chain, 90.0)
-    per_count = panel.electrons_per_count(camera)
+    per_count = panel.gain(camera)
     many = ExposureSettings(90.0, 50.0, 100.0, 100)
     dark, white, air = (
         flat(e, n).astype(float)
@@ -98,16 +98,16 @@ def detector() -> dict[str, object]:
     }
 
 
-def _edge(panel: Panel) -> float:
+def _edge(panel: Detector) -> float:
     """Line pairs a mm at which the panel's own blur (no noise, unbinned) leaves half."""
     camera = CameraSettings("HW1SW1High", Roi(0, 0, 199, 199))
     y, x = np.mgrid[:200, :200]
     sharp = np.mean([(x + o > 100.3 + 0.06 * (y - 100)) for o in np.linspace(-0.5, 0.5, 17)], 0)
-    chain = Chain(Panel(**{**panel.__dict__, "gain_sigma": 0.0, "offset_sigma_counts": 0.0}))
+    chain = Chain(Detector(**{**panel.__dict__, "gain_sigma": 0.0, "offset_sigma_counts": 0.0}))
     expected = expected_signal(chain, np.zeros((0, 200, 200), np.float32), VIEW, LISTING_1)
     image = type(expected)(expected.mean_e * sharp.astype(np.float32), expected.variance_e)
     counts = read_out(chain.panel, image, camera, LISTING_1)
-    return float(edge_mtf(counts.astype(float)).at(0.5) / panel.pitch_mm)
+    return float(edge_mtf(counts.astype(float)).at(0.5) / panel.pixels.pitch_mm)
 
 
 def circle(n: int, span: float = 360.0, *, aside: float = 0.0, repeat: bool = True) -> ConeVec:

@@ -30,7 +30,7 @@ from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.twin.geometry.cone_vec import ConeVec, check_cone_vec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.poses import Poses
-from flexdt.twin.machine.camera import CameraSettings, Sensor
+from flexdt.twin.machine.camera import CameraSettings, PixelGrid
 from flexdt.twin.physics.chain import spot_views
 from flexdt.twin.physics.scatter.simulation import Object
 from flexdt.twin.projection import Body, TriangleMesh
@@ -68,7 +68,7 @@ class Imaging:
     projector: Projector
     truth: TrueGeometry
     samples: SampleStore
-    sensor: Sensor
+    sensor: PixelGrid
 
     def __post_init__(self) -> None:
         self._known: dict[tuple[str, str], tuple[Phantom, Any, list[str]]] = {}

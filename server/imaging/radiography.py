@@ -25,8 +25,15 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.physics.chain import Chain, Expected, read_out, without_spot
-from flexdt.twin.physics.exposure import Counts, DetectorModel, ExposureSettings, expose, open_beam
-from flexdt.twin.physics.panel import Panel, panel_of
+from flexdt.twin.physics.detector import Detector, detector_of
+from flexdt.twin.physics.exposure import (
+    Counts,
+    ExposureSettings,
+    IdealResponse,
+    expose,
+    ideal_response,
+    open_beam,
+)
 from flexdt.twin.physics.radiograph import Radiograph, radiographs
 from flexdt.twin.physics.scatter.simulation import (
     Beam,
@@ -73,16 +80,16 @@ class Radiography:
 
     Attributes:
         imaging: projects.
-        model: the ideal detector.
+        model: of tube and detector, of the first.
         physics: ideal, mono or poly.
         panel, tube: of the other two.
         scatter: what the sample scatters onto the panel, of the other two: off or mc.
     """
 
     imaging: Imaging
-    model: DetectorModel
+    model: IdealResponse
     physics: Physics = "ideal"
-    panel: Panel = field(default_factory=Panel)
+    panel: Detector = field(default_factory=Detector)
     tube: TubeModel = field(default_factory=TubeModel)
     scatter: Scatter = "off"
 
@@ -90,7 +97,6 @@ class Radiography:
     def of(
         cls,
         imaging: Imaging,
-        model: DetectorModel,
         machine: Machine,
         physics: Physics = "ideal",
         scatter: Scatter = "off",
@@ -105,8 +111,8 @@ class Radiography:
                 f"scatter {scatter} needs physics mono or poly, not ideal",
                 {"asked": scatter, "allowed": ["off"]},
             )
-        panel, tube = panel_of(machine.detector), tube_of(machine.tube)
-        return cls(imaging, model, physics, panel, tube, scatter)
+        panel, tube = detector_of(machine.detector), tube_of(machine.tube)
+        return cls(imaging, ideal_response(machine), physics, panel, tube, scatter)
 
     @property
     def remembers(self) -> bool:
@@ -126,20 +132,7 @@ class Radiography:
                 for name in self.model.__dataclass_fields__
                 if name != "reference"
             }
-        figures: dict[str, float] = {f"physics_{self.physics}": 1.0}
-        for name in self.panel.__dataclass_fields__:
-            value = getattr(self.panel, name)
-            if name.startswith("long_lag") and not self.traps:
-                continue  # as before there was any, so that older scans go on
-            if name == "response":
-                figures |= {f"response_{energy:g}_keV": float(left) for energy, left in value}
-            elif isinstance(value, tuple):
-                high, low = value
-                figures |= {f"{name}_high": float(high), f"{name}_low": float(low)}
-            elif isinstance(value, str):
-                figures[f"{name}_{value}"] = 1.0
-            elif value is not None:  # rows are as far apart as columns
-                figures[name] = float(value)
+        figures = {f"physics_{self.physics}": 1.0, **self.panel.figures()}
         if self.scatter != "off":
             figures |= {f"scatter_{self.scatter}": 1.0, "scatter_error": self._settings.error}
         return figures | self.tube.figures()
@@ -243,7 +236,7 @@ class Radiography:
     ) -> Float32Array:
         """Expected counts above dark as though X-rays were on, not clipped, (rows, cols)."""
         if radiograph.expected is not None:
-            return radiograph.expected.mean_e / np.float32(self.panel.electrons_per_count(camera))
+            return radiograph.expected.mean_e / np.float32(self.panel.gain(camera))
         lit = replace(exposure, xrays_on=True)
         return np.exp(-radiograph.shown) * np.float32(open_beam(self.model, lit))
 

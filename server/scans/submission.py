@@ -257,7 +257,7 @@ class Submissions:
             version=self.version,
         )
         for block in record.blocks:
-            pixel = block.camera.pixels_mm(plan.machine.detector.sensor)
+            pixel = block.camera.pixels_mm(plan.machine.detector.pixels)
             check_cone_vec(record.cone_vec([block]), pixel)
         # First what a resume must repeat, then the folder: killed in between, nothing is lost.
         asked.write(self.root, name)

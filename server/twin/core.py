@@ -47,7 +47,6 @@ from flexdt.twin.collision.scene_search import NearestPair, clearance
 from flexdt.twin.errors import GeometryError, SafetyError
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.description import Machine, Profile
-from flexdt.twin.physics.exposure import detector_model
 from flexdt.twin.physics.radiograph import Radiograph
 from flexdt.twin.physics.scatter.simulation import Scatter
 from flexdt.twin.scanner.safety import Guard
@@ -193,15 +192,13 @@ class TwinServer:
         self.stage = Stage(machine, profile, self.samples)
         self.detours = ObstacleMoves(self.scanner, self.clock, self.stage, self.changed)
         self.imaging = Imaging(
-            projector, truth or TrueGeometry(), self.samples, machine.detector.sensor
+            projector, truth or TrueGeometry(), self.samples, machine.detector.pixels
         )
         self.jobs = Jobs(
             self.scanner, self.clock, self._job_changed, max_waiting=self.limits.max_jobs,
             projectors=projectors, root=self.root,
         )  # fmt: skip
-        self.radiography = Radiography.of(
-            self.imaging, detector_model(machine), machine, physics, scatter
-        )
+        self.radiography = Radiography.of(self.imaging, machine, physics, scatter)
         self.live = LiveView(
             self.scanner, self.clock, self.hub, self.radiography, lambda: self.jobs.busy
         )

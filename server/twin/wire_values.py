@@ -31,7 +31,7 @@ def tube_view(tube: TubeState, now: float) -> w.TubeState:
 
 def camera_view(camera: CameraSettings, machine: Machine) -> w.CameraState:
     """The camera."""
-    return w.CameraState(**camera.facts(machine.detector.sensor))
+    return w.CameraState(**camera.facts(machine.detector.pixels))
 
 
 def geometry_view(readout: Readout | None) -> w.GeometryState:

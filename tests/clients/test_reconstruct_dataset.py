@@ -36,7 +36,6 @@ from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.errors import GeometryError, LimitError, TwinError, UnknownNameError
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
-from flexdt.twin.physics.exposure import DetectorModel
 from flexdt.twin.physics.spectrum import Filter, TubeModel
 from flexdt.twin.projection import Volume
 from flexdt.twin.scanner.state import Correction, Sample
@@ -60,7 +59,7 @@ def scan(root: Path, name: str, truth: Offsets, *, corrected: bool, physics: str
         DirectProjector(),
         TrueGeometry(truth),
         SampleStore(open_data(root / "s")),
-        M.detector.sensor,
+        M.detector.pixels,
     )
     correction = Correction("found", "2026-01-02", truth) if corrected else None
     record = ScanRecord.from_plan(
@@ -68,7 +67,7 @@ def scan(root: Path, name: str, truth: Offsets, *, corrected: bool, physics: str
         noise=NoiseRecord(3, {}), correction=correction,
     )  # fmt: skip
     writer = DatasetWriter(open_data(root), record, script=script, sync=False)
-    way = Radiography.of(imaging, DetectorModel(), M, physics)  # type: ignore[arg-type]
+    way = Radiography.of(imaging, M, physics)  # type: ignore[arg-type]
     acquisition = Acquisition(plan, way, Sample("lego"), 3, writer.put)
     for exposure in plan.exposures:
         asyncio.run(acquisition.produce([exposure]))

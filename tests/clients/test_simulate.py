@@ -34,12 +34,12 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.machine.kinematics import poses
-from flexdt.twin.physics.apparatus import Detector, Tube
-from flexdt.twin.physics.exposure import DetectorModel, ExposureSettings, frame_rng
-from flexdt.twin.physics.panel import Panel
+from flexdt.twin.physics.detector import Detector
+from flexdt.twin.physics.exposure import ExposureSettings, frame_rng
 from flexdt.twin.physics.scatter.simulation import ScatterSettings
 from flexdt.twin.physics.scintillator import deposited
 from flexdt.twin.physics.spectrum import Filter
+from flexdt.twin.physics.tube import Tube
 from flexdt.twin.projection import Volume
 from flexdt.twin.scanner.state import Sample
 from tests.support.phantom_texts import SCENE_FILE
@@ -163,7 +163,7 @@ def test_a_spectrum_is_the_sum_over_its_energies_and_the_counts_are_absolute() -
     low, high = (int(np.flatnonzero(table.kV == kV)[0]) for kV in (80, 80))
     assert low == high
     layers = 0.5 * mu("Al", 2.70) + 0.1 * mu("Cu", 8.96)
-    weight = table.fluence[low] * np.exp(-layers) * Panel().charge_of_photons()[0]
+    weight = table.fluence[low] * np.exp(-layers) * Detector().charge_of_photons()[0]
     d = directions(cone.rows[0])
     pmma = 2 * np.sqrt(np.maximum(36.0 * (d[..., 0] ** 2 + d[..., 1] ** 2) - (300 * d[..., 0]) ** 2,
                                   0.0)) / (d[..., 0] ** 2 + d[..., 1] ** 2)  # fmt: skip
@@ -318,9 +318,9 @@ def test_the_twin_makes_the_same_counts(tmp_path: Path, physics: str) -> None:
     places = poses(machine, builtin_profile(machine.default_profile), camera,
                    {"rot_obj": [0.0, 25.0]})  # fmt: skip
     imaging = Imaging(
-        DirectProjector(), TrueGeometry(), SampleStore(open_data(tmp_path)), machine.detector.sensor
+        DirectProjector(), TrueGeometry(), SampleStore(open_data(tmp_path)), machine.detector.pixels
     )
-    twin = Radiography.of(imaging, DetectorModel(), machine, physics)  # type: ignore[arg-type]
+    twin = Radiography.of(imaging, machine, physics)  # type: ignore[arg-type]
     exposure = ExposureSettings(70.0, 20.0, 80.0)
     images = asyncio.run(twin.take(Sample("lego"), places, camera, [exposure] * 2))
     theirs = [twin.counts(image, camera, exposure, frame_rng(9, 2 + i))

@@ -19,8 +19,8 @@ from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile, parse_machine
 from flexdt.twin.machine.kinematics import poses
 from flexdt.twin.physics.chain import Expected, read_out
+from flexdt.twin.physics.detector import detector_of
 from flexdt.twin.physics.exposure import ExposureSettings
-from flexdt.twin.physics.panel import panel_of
 from flexdt.twin.script import ScanPlan
 
 SCAN = fx.ConeVec.circular(sod=60, sdd=100, angles=16, shape=(16, 16), pixel=1.0)
@@ -72,7 +72,10 @@ def test_a_signal_of_another_panel_is_not_read_out() -> None:
     exposure = ExposureSettings(90.0, 50.0, 100.0)
     with pytest.raises(LimitError, match=r"\(40, 50\) pixels and a camera of \(760, 956\)"):
         read_out(
-            panel_of(machine.detector), Expected(signal, signal), machine.detector.camera, exposure
+            detector_of(machine.detector),
+            Expected(signal, signal),
+            machine.detector.camera,
+            exposure,
         )
 
 

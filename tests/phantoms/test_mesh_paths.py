@@ -164,7 +164,7 @@ def test_the_twins_images_of_a_mesh_are_exact() -> None:
     machine = builtin_machine()
     profile = builtin_profile(machine.default_profile)
     camera = CameraSettings("HW2SW1High", Roi(572, 568, 1371, 967))
-    imaging = Imaging(DirectProjector(), TrueGeometry(), store, machine.detector.sensor)
+    imaging = Imaging(DirectProjector(), TrueGeometry(), store, machine.detector.pixels)
     pose = poses(machine, profile, camera, {"rot_obj": [35.0]})
     lines = asyncio.run(imaging.line_integrals(Sample("rough"), pose, camera))[0].ravel()
     found, paths, rows = asyncio.run(imaging.path_lengths(Sample("rough"), pose, camera))

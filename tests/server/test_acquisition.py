@@ -21,7 +21,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
-from flexdt.twin.physics.exposure import DetectorModel, ExposureSettings, expose, frame_rng
+from flexdt.twin.physics.exposure import ExposureSettings, IdealResponse, expose, frame_rng
 from flexdt.twin.scanner.state import Placement, Sample
 from flexdt.twin.script.parse import parse_script
 from flexdt.twin.script.planning.planner import plan_script
@@ -72,9 +72,9 @@ def scan(
     assert not plan.errors
     projector = AngleProjector()
     store = SampleStore(open_data(tmp_path))
-    imaging = Imaging(projector, TrueGeometry(Offsets(dO_x=0.5405)), store, M.detector.sensor)
+    imaging = Imaging(projector, TrueGeometry(Offsets(dO_x=0.5405)), store, M.detector.pixels)
     made: dict[str, npt.NDArray[np.uint16]] = {}
-    way = Radiography(imaging, DetectorModel())
+    way = Radiography(imaging, IdealResponse())
     acquisition = Acquisition(plan, way, Sample("normal"), seed, made.__setitem__, moments)
     asyncio.run(acquisition.produce(list(plan.exposures)))
     return made, projector.angles
@@ -98,14 +98,14 @@ def test_moments_spread_evenly_over_the_exposure_about_the_nominal_angle(tmp_pat
 def test_noise_is_numbered_by_the_place_among_all_saved_images(tmp_path: Path) -> None:
     noisy, _ = scan(tmp_path, 1, seed=9)
     flat = np.full((16, 16), np.float32(2.0), dtype=np.float32)  # frame 4 stands at 180 degrees
-    expected = expose(DetectorModel(), flat, ExposureSettings(90.0, 1.0, 1000.0), frame_rng(9, 4))
+    expected = expose(IdealResponse(), flat, ExposureSettings(90.0, 1.0, 1000.0), frame_rng(9, 4))
     assert np.array_equal(noisy["scan_000004.tif"], expected)
 
 
 def test_an_empty_stage_needs_no_projector_and_offsets_reach_it(tmp_path: Path) -> None:
     projector = AngleProjector()
     store = SampleStore(open_data(tmp_path))
-    imaging = Imaging(projector, TrueGeometry(), store, M.detector.sensor)
+    imaging = Imaging(projector, TrueGeometry(), store, M.detector.pixels)
     plan = plan_script(parse_script(FLY), M, P)
     camera = plan.exposures[0].camera
     from flexdt.twin.machine.kinematics import poses

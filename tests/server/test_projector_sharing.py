@@ -47,7 +47,7 @@ class Shelf:
 
 
 def imaging_of(projector: Any, shelf: Shelf) -> Imaging:
-    return Imaging(projector, TrueGeometry(), shelf, M.detector.sensor)  # type: ignore[arg-type]
+    return Imaging(projector, TrueGeometry(), shelf, M.detector.pixels)  # type: ignore[arg-type]
 
 
 async def brightest(imaging: Imaging, name: str = "thing") -> float:
@@ -146,7 +146,7 @@ def test_a_projector_that_is_full_forgets_versions_before_it_refuses() -> None:
 
 def test_materials_of_a_sample_are_named_by_content_too(tmp_path: Path) -> None:
     async def work(server: ProjectorServer, one: Any, other: Any, pool: ProjectorPool) -> None:
-        imaging = Imaging(one, TrueGeometry(), SampleStore(open_data(tmp_path)), M.detector.sensor)
+        imaging = Imaging(one, TrueGeometry(), SampleStore(open_data(tmp_path)), M.detector.pixels)
         channels, paths, _ = await imaging.path_lengths(Sample("lego"), POSES, CAMERA)
         assert len(channels) == len(paths) > 1
         names = [v.name for v in (await one.volumes()).volumes]

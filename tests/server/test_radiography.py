@@ -48,8 +48,8 @@ from flexdt.twin.machine.description import (
 )
 from flexdt.twin.machine.kinematics import poses
 from flexdt.twin.physics.chain import Chain, weights_of
-from flexdt.twin.physics.exposure import FEW_COUNTS, DetectorModel, ExposureSettings
-from flexdt.twin.physics.panel import Panel
+from flexdt.twin.physics.detector import Detector
+from flexdt.twin.physics.exposure import FEW_COUNTS, ExposureSettings
 from flexdt.twin.physics.scatter.simulation import Beam, ScatterSettings, scatter_image
 from flexdt.twin.physics.spectrum import Filter, TubeModel, tube_spectrum
 from flexdt.twin.projection import TriangleMesh, Volume, forward, project_body, project_scene
@@ -87,9 +87,9 @@ FLY = "\r\n".join(
 
 def radiography(tmp_path: Path, physics: str, **panel: float) -> Radiography:
     imaging = Imaging(
-        DirectProjector(), TrueGeometry(), SampleStore(open_data(tmp_path)), M.detector.sensor
+        DirectProjector(), TrueGeometry(), SampleStore(open_data(tmp_path)), M.detector.pixels
     )
-    made = Radiography.of(imaging, DetectorModel(), M, physics)  # type: ignore[arg-type]
+    made = Radiography.of(imaging, M, physics)  # type: ignore[arg-type]
     return replace(made, panel=replace(made.panel, **panel))
 
 
@@ -168,10 +168,10 @@ def test_scatter_of_a_view_does_not_depend_on_the_views_beside_it(tmp_path: Path
 
 def test_ideal_physics_has_no_scatter(tmp_path: Path) -> None:
     imaging = Imaging(
-        DirectProjector(), TrueGeometry(), SampleStore(open_data(tmp_path)), M.detector.sensor
+        DirectProjector(), TrueGeometry(), SampleStore(open_data(tmp_path)), M.detector.pixels
     )
     with pytest.raises(LimitError, match="scatter mc needs physics mono or poly, not ideal"):
-        Radiography.of(imaging, DetectorModel(), M, "ideal", "mc")
+        Radiography.of(imaging, M, "ideal", "mc")
 
 
 def test_materials_by_formula() -> None:
@@ -236,7 +236,7 @@ def test_filters_and_focal_spot_are_the_machine_file_s(tmp_path: Path) -> None:
         }
     )  # fmt: skip
     plain = radiography(tmp_path, "poly", dead_fraction=0.0)
-    way = replace(plain, tube=Radiography.of(plain.imaging, plain.model, own, "poly").tube)
+    way = replace(plain, tube=Radiography.of(plain.imaging, own, "poly").tube)
     assert plain.tube == TubeModel()  # what ships is the assumed default
     pose = poses(M, P, MIDDLE, {})
 
@@ -270,7 +270,7 @@ def test_rays_from_points_of_the_focal_spot_blur_each_depth_as_it_is(tmp_path: P
     spot = f"smallest_spot_mm = {fwhm}\nspot_points = 48"
     own = parse_machine(re.sub("smallest_spot_mm = .*", spot, FLEXRAY.read_text()), "own.toml")
     way = radiography(tmp_path, "mono")
-    made = Radiography.of(way.imaging, way.model, own, "mono")
+    made = Radiography.of(way.imaging, own, "mono")
     assert TubeModel.of_figures(made.record()) == made.tube
     seen = CameraSettings("HW2SW1High", Roi(932, 628, 975, 907))  # 22 x 140 image pixels
     pose = poses(M, P, seen, {"mag_obj": [150.0], "rot_obj": [20.0]})
@@ -395,7 +395,7 @@ def test_the_machine_file_states_the_traps(tmp_path: Path) -> None:
     detector = M.detector.model_copy(update={"long_lag_fraction": 0.004, "long_lag_s": 3.0})
     own = M.model_copy(update={"detector": detector})
     way = radiography(tmp_path, "poly")
-    made = Radiography.of(way.imaging, way.model, own, "poly")
+    made = Radiography.of(way.imaging, own, "poly")
     assert (made.panel.long_lag_fraction, made.panel.long_lag_s) == (0.004, 3.0)
     assert made.traps
     assert not replace(made, physics="ideal").traps
@@ -408,7 +408,7 @@ def test_the_machine_file_gives_a_measured_response(tmp_path: Path) -> None:
     curve = "response = [[20, 16], [33, 19], [34, 23], [100, 20], [300, 9]]"
     own = parse_machine(text.replace("[detector]", f"[detector]\n{curve}", 1), "own.toml")
     way = radiography(tmp_path, "poly")
-    made = Radiography.of(way.imaging, way.model, own, "poly")
+    made = Radiography.of(way.imaging, own, "poly")
     assert made.record()["response_34_keV"] == 23.0
     aluminium = Substance.parse("Al@2.70")
     spectrum = tube_spectrum(90.0, made.tube)
@@ -424,7 +424,7 @@ def test_the_machine_file_gives_a_measured_response(tmp_path: Path) -> None:
     through = np.exp(-20.0 * aluminium.attenuation())
     assert signal @ through / signal.sum() == pytest.approx(behind @ left / (fluence @ left))
     assert (noise >= signal**2 / np.maximum(fluence, 1e-300)).all()  # no less than Poisson's
-    plain = weights_of(Chain(Panel(), made.tube, (aluminium,), (40.0,)), 90.0)[0]
+    plain = weights_of(Chain(Detector(), made.tube, (aluminium,), (40.0,)), 90.0)[0]
     assert abs(plain @ through / plain.sum() / (signal @ through / signal.sum()) - 1.0) > 0.02
 
 
@@ -463,7 +463,7 @@ def test_the_data_set_says_what_made_it(tmp_path: Path) -> None:
     figures = radiography(tmp_path, "poly").record()
     assert figures["physics_poly"] == 1.0
     assert figures["scintillator_CsI@4.51"] == 1.0
-    assert figures["full_well_e_high"] == Panel().full_well_e[0]
+    assert figures["full_well_e_high"] == 1.6e6
     assert set(radiography(tmp_path, "ideal").record()) >= {"i0_counts", "read_noise_counts"}
 
 

@@ -12,7 +12,7 @@ from flexdt.server.scans.runner import JobAborted, ScanRunner, rejoin
 from flexdt.server.scans.twin_clock import TwinClock
 from flexdt.twin.errors import CollisionError, LimitError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
-from flexdt.twin.physics.exposure import DetectorModel, ExposureSettings, expose, frame_rng
+from flexdt.twin.physics.exposure import ExposureSettings, IdealResponse, expose, frame_rng
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.script import Exposure, ScanPlan
 from flexdt.twin.script.parse import parse_script
@@ -83,7 +83,7 @@ class Lab:
             thickness = sum(e.positions.values()) % 3.0
             image = np.full((8, 8), thickness, dtype=np.float32)
             tube = ExposureSettings(e.kV, e.power_W, e.exposure_ms, e.averages, e.xrays_on)
-            counts = expose(DetectorModel(), image, tube, frame_rng(4, e.index))
+            counts = expose(IdealResponse(), image, tube, frame_rng(4, e.index))
             self.made[e.file] = counts.tobytes()
 
     def pause_at(self, file: str, error: Exception | None = None) -> None:

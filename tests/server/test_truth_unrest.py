@@ -37,7 +37,7 @@ def test_vibration_has_the_size_asked_for_and_repeats() -> None:
     magnified = (
         0.01 * float(cone.source_detector_distance[0]) / float(np.linalg.norm(cone.source[0, :2]))
     )
-    pixels = magnified / M.detector.camera.pixel_mm(M.detector.sensor)
+    pixels = magnified / M.detector.camera.pixel_mm(M.detector.pixels)
     np.testing.assert_allclose(off.std(axis=0), pixels, rtol=0.07)
     np.testing.assert_allclose(off.mean(axis=0), 0.0, atol=0.1 * pixels)
     np.testing.assert_array_equal(shadow(truth, 2000) - still, off)

@@ -19,7 +19,6 @@ from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import Machine, builtin_machine, profile_of
-from flexdt.twin.physics.exposure import DetectorModel
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import ScanPlan, parse_script, plan_script
 from flexdt.twin.script.compose import ScanRequest, compose_script
@@ -42,14 +41,14 @@ def bead_scan_on(
     imaging = Imaging(
         DirectProjector(), TrueGeometry(Offsets.from_edge(truth)),
         SampleStore(open_data(root / "s")),
-        machine.detector.sensor,
+        machine.detector.pixels,
     )  # fmt: skip
     record = ScanRecord.from_plan(
         plan, name="lego", started=datetime(2026, 1, 2), sample=SampleRecord(name="lego"),
         noise=NoiseRecord(3, {}),
     )  # fmt: skip
     writer = DatasetWriter(open_data(root), record, script=script, sync=False)
-    way = Radiography.of(imaging, DetectorModel(), machine, "ideal")
+    way = Radiography.of(imaging, machine, "ideal")
     acquisition = Acquisition(plan, way, Sample("lego"), 3, writer.put)
     for exposure in plan.exposures:
         asyncio.run(acquisition.produce([exposure]))

@@ -197,7 +197,7 @@ def test_bodies_sit_where_the_x_ray_geometry_is(profile: str) -> None:
     rng = np.random.default_rng(3)
     marks = np.array([[3.0, 7.0, -11.0], [-20.0, 1.0, 4.0], [5.0, -6.0, 30.0], [1.0, 2.0, 3.0]])
     s = build_scene(M, p, [box((2, 2, 2), mark) for mark in marks])
-    sensor = M.detector.sensor
+    sensor = M.detector.pixels
     for _ in range(20):
         motors = {n: rng.uniform(a.lower, a.upper) for n, a in M.axes.items()}
         seen = poses(M, p, M.detector.camera, motors)
@@ -242,7 +242,7 @@ def test_bodies_follow_the_correction_in_force(seed: int) -> None:
     s = build_scene(M, p, [box((2, 2, 2), m) for m in marks], correction)
     motors = {n: rng.uniform(a.lower, a.upper) for n, a in M.axes.items()}
     cone = poses(M, p, M.detector.camera, motors).cone_vec(correction)
-    sensor, pixel = M.detector.sensor, M.detector.camera.pixel_mm(M.detector.sensor)
+    sensor, pixel = M.detector.pixels, M.detector.camera.pixel_mm(M.detector.pixels)
     columns, rows = M.detector.camera.roi_shift_mm(sensor)
     u, v = cone.u[0] / pixel, cone.v[0] / pixel
     # The panel tilts about its own centre, the image about the ROI's; they are 1.2 mm apart.

@@ -9,15 +9,15 @@ import pytest
 
 from flexdt.twin.machine.description import builtin_machine
 from flexdt.twin.physics.exposure import (
-    DetectorModel,
     ExposureSettings,
-    detector_model,
+    IdealResponse,
     expose,
     frame_rng,
+    ideal_response,
     open_beam,
 )
 
-MODEL = DetectorModel()
+MODEL = IdealResponse()
 LISTING_1 = ExposureSettings(kV=90.0, power_W=50.0, exposure_ms=100.0)
 SHAPE = (190, 239)
 
@@ -50,7 +50,7 @@ def test_saturation_clips_at_fourteen_bits_and_darkness_at_zero() -> None:
     bright = ExposureSettings(90.0, 90.0, 500.0)
     assert (expose(MODEL, full(0.0), bright) == 16_383).all()
     assert (expose(MODEL, full(0.0), bright, frame_rng(0, 0)) == 16_383).all()
-    noisy = DetectorModel(dark_counts=1.0, read_noise_counts=5.0)
+    noisy = IdealResponse(dark_counts=1.0, read_noise_counts=5.0)
     off = ExposureSettings(90.0, 50.0, 100.0, xrays_on=False)
     dark = expose(noisy, full(0.0), off, frame_rng(0, 0))
     assert dark.min() == 0
@@ -78,7 +78,7 @@ def test_noise_has_the_poisson_and_read_variance(averages: int, attenuation: flo
 
 def test_few_photons_follow_poisson_and_not_a_gaussian() -> None:
     """At two expected photons without read noise, counts are multiples of one photon's."""
-    model = DetectorModel(photons_per_count=0.25, read_noise_counts=0.0)
+    model = IdealResponse(photons_per_count=0.25, read_noise_counts=0.0)
     attenuation = -math.log(2.0 / (12_000.0 * 0.25))
     counts = expose(model, full(attenuation, 500, 500), LISTING_1, frame_rng(3, 0))
     photons = (counts - 100.0) * 0.25
@@ -105,6 +105,6 @@ def test_a_frame_depends_on_seed_and_index_only_and_input_stays() -> None:
 
 
 def test_the_machine_decides_the_depth() -> None:
-    model = detector_model(builtin_machine())
+    model = ideal_response(builtin_machine())
     assert model == MODEL
     assert model.full_scale == 16_383

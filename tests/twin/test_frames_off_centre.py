@@ -21,7 +21,7 @@ from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.machine.kinematics import poses
 
 MACHINE = builtin_machine()
-SENSOR = MACHINE.detector.sensor
+SENSOR = MACHINE.detector.pixels
 FULL_ROI = Roi(0, 0, SENSOR.columns - 1, SENSOR.rows - 1)
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pydantic import BaseModel, ValidationError
 
 from flexdt.twin.errors import LimitError, MachineFileError, UnknownNameError
-from flexdt.twin.machine.camera import CameraSettings, Roi, Sensor, binning_of, check_roi
+from flexdt.twin.machine.camera import CameraSettings, PixelGrid, Roi, binning_of, check_roi
 from flexdt.twin.machine.description import (
     Axis,
     Component,
@@ -133,9 +133,9 @@ def test_what_a_file_leaves_out() -> None:
     assert [(f.material, f.thickness_mm) for f in tube.filters] == [("Al@2.70", 0.5)]
     assert (panel.exposure_ms, panel.min_exposure_ms, panel.max_exposure_ms) == (100.0, 1.0, 6e4)
     assert (panel.long_lag_fraction, panel.long_lag_s) == (0.0, 10.0)
-    assert panel.area_mm == pytest.approx((20.0, 16.0))
+    assert panel.pixels.size_mm == pytest.approx((20.0, 16.0))
     oblong = DetectorSpec(**PANEL, row_pitch_mm=0.3)  # type: ignore[arg-type]
-    assert oblong.area_mm == pytest.approx((20.0, 24.0))
+    assert oblong.pixels.size_mm == pytest.approx((20.0, 24.0))
     profile = Profile(name="a", machine="b", source="c")
     assert (profile.det_tan, profile.src_ort, profile.axs_tan, profile.c_obj, profile.c_det,
             profile.det_roll_deg) == (0.0,) * 6  # fmt: skip
@@ -195,7 +195,7 @@ def test_parts_stand_where_the_x_ray_geometry_has_them(base: str, text: str, sai
 def test_the_panel_s_body_may_be_half_a_millimetre_smaller_on_each_side(
     side: int, less: float, fine: bool
 ) -> None:
-    size = [*builtin_machine("micro_ct").detector.area_mm, 40.0]
+    size = [*builtin_machine("micro_ct").detector.pixels.size_mm, 40.0]
     size[1], size[2] = size[2], size[1]
     size[side] -= less
     part = f"[[components]]\nname = 'panel'\nsize_mm = {size}\n"
@@ -213,7 +213,7 @@ def test_the_middle_of_a_region_is_that_of_its_binned_pixels(
     data: st.DataObject, binning: int
 ) -> None:
     """What is left over at the right and at the bottom makes no pixel."""
-    sensor = Sensor(1944, 1536, 0.0748, 14, 0.08)
+    pixels = PixelGrid(1944, 1536, 0.0748, 0.08)
     left, top = data.draw(st.integers(0, 1900)), data.draw(st.integers(0, 1500))
     right = data.draw(st.integers(left + binning - 1, 1943))
     bottom = data.draw(st.integers(top + binning - 1, 1535))
@@ -223,7 +223,7 @@ def test_the_middle_of_a_region_is_that_of_its_binned_pixels(
     assert camera.shape == (len(rows), len(columns))
     across = ((columns[0] + columns[-1] + binning) / 2 - 972) * 0.0748
     down = ((rows[0] + rows[-1] + binning) / 2 - 768) * 0.08
-    assert camera.roi_shift_mm(sensor) == pytest.approx((across, down), abs=1e-9)
+    assert camera.roi_shift_mm(pixels) == pytest.approx((across, down), abs=1e-9)
 
 
 FLEXRAY = (resources.files("flexdt.twin") / "data/machines/flexray.toml").read_text("utf-8")
@@ -410,8 +410,8 @@ def test_unknown_axis_lists_the_valid_ones() -> None:
 def test_default_camera_is_956_by_760_of_0_1496() -> None:
     d = builtin_machine().detector
     assert d.camera.shape == (760, 956)
-    assert d.camera.pixel_mm(d.sensor) == pytest.approx(0.1496)
-    assert d.camera.roi_shift_mm(d.sensor) == pytest.approx((1.1968, 0.0))
+    assert d.camera.pixel_mm(d.pixels) == pytest.approx(0.1496)
+    assert d.camera.roi_shift_mm(d.pixels) == pytest.approx((1.1968, 0.0))
 
 
 def test_size_follows_mode_and_roi() -> None:
@@ -428,7 +428,7 @@ def test_unknown_mode(mode: str) -> None:
 
 
 def test_roi_outside_the_sensor_names_the_edge() -> None:
-    sensor = builtin_machine().detector.sensor
+    sensor = builtin_machine().detector.pixels
     with pytest.raises(LimitError, match="bottom 1907 is outside the sensor's 1536 rows"):
         check_roi(Roi(0, 12, 1919, 1907), sensor, 2)
     with pytest.raises(LimitError, match="holds no pixel"):
@@ -591,7 +591,7 @@ def test_a_short_file_from_a_few_answers() -> None:
     assert made.fixed["detector_y"] == 800.0
     assert (made.detector.columns, made.detector.rows) == (1536, 1944)
     assert made.detector.roi == (0, 0, 1535, 1943)
-    assert made.detector.camera.pixels_mm(made.detector.sensor) == pytest.approx((0.1496, 0.1508))
+    assert made.detector.camera.pixels_mm(made.detector.pixels) == pytest.approx((0.1496, 0.1508))
     assert made.tube.kV == 100.0
     assert "Y" not in made.axes
     for base in builtin_machines():

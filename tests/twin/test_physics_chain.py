@@ -14,7 +14,7 @@ from image_quality import edge_mtf, photon_transfer, region
 
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import LimitError, TwinError
-from flexdt.twin.machine.camera import CameraSettings, Roi
+from flexdt.twin.machine.camera import CameraSettings, PixelGrid, Roi
 from flexdt.twin.physics.chain import (
     Chain,
     Expected,
@@ -27,9 +27,9 @@ from flexdt.twin.physics.chain import (
     spot_blur_px,
     weights_of,
 )
+from flexdt.twin.physics.detector import Detector, pattern
 from flexdt.twin.physics.effective import effective_beam
 from flexdt.twin.physics.exposure import ExposureSettings, frame_rng
-from flexdt.twin.physics.panel import Panel, pattern
 from flexdt.twin.physics.radiograph import radiographs
 from flexdt.twin.physics.spectrum import tube_spectrum
 
@@ -84,7 +84,7 @@ def assert_holds(beam, signal, noise, substances, thickest) -> None:
 )
 @pytest.mark.parametrize("kV", [40.0, 90.0])
 def test_few_energies_hold_the_full_spectrum(substances, thickest, kV):
-    signal, noise = weights_of(Chain(Panel()), kV)
+    signal, noise = weights_of(Chain(Detector()), kV)
     beam = effective_beam(signal, noise, substances, thickest)
     assert len(beam.bins) <= 20
     assert_holds(beam, signal, noise, substances, thickest)
@@ -95,7 +95,7 @@ def test_few_energies_hold_the_full_spectrum(substances, thickest, kV):
 @pytest.mark.parametrize("kV", [30.0, 60.0, 80.0, 90.0, 160.0])
 @pytest.mark.parametrize("thickest", [0.1, 4.0, 60.0])
 def test_few_energies_hold_for_metals_however_thin(metal, kV, thickest):
-    signal, noise = weights_of(Chain(Panel()), kV)
+    signal, noise = weights_of(Chain(Detector()), kV)
     beam = effective_beam(signal, noise, (metal,), (thickest,))
     assert len(beam.bins) <= 20
     assert_holds(beam, signal, noise, (metal,), (thickest,))
@@ -104,7 +104,7 @@ def test_few_energies_hold_for_metals_however_thin(metal, kV, thickest):
 def test_many_heavy_elements_at_once():
     names = ("W@19.3", "Pb@11.3", "Gd@7.9", "Sn@7.3", "I@4.9", "Ba@3.6")
     heavy = tuple(Substance.of(n, n.split("@")[0], float(n.split("@")[1])) for n in names)
-    signal, noise = weights_of(Chain(Panel()), 90.0)
+    signal, noise = weights_of(Chain(Detector()), 90.0)
     beam = effective_beam(signal, noise, heavy, (20.0,) * 6)
     assert len(beam.bins) <= 32
     assert_holds(beam, signal, noise, heavy, (20.0,) * 6)
@@ -117,20 +117,20 @@ def test_least_squares_that_go_round_in_circles_do_not_stop_it(monkeypatch):
         raise RuntimeError("Maximum number of iterations reached.")
 
     monkeypatch.setattr(scipy.optimize, "nnls", nnls)
-    signal, noise = weights_of(Chain(Panel()), 90.0)
+    signal, noise = weights_of(Chain(Detector()), 90.0)
     beam = effective_beam(signal, noise, (STEEL,), (10.0,))
     assert_holds(beam, signal, noise, (STEEL,), (10.0,))
 
 
 def test_what_cannot_be_held_is_refused():
-    signal, noise = weights_of(Chain(Panel()), 90.0)
+    signal, noise = weights_of(Chain(Detector()), 90.0)
     with pytest.raises(TwinError, match="effective energies reach") as refused:
         effective_beam(signal, noise, (STEEL,), (10.0,), tolerance=1e-13)
     assert refused.value.data["reached"] > 1e-13
 
 
 def test_slabs_of_one_energy_follow_beer_lambert():
-    chain = Chain(Panel(), substances=(ABS, STEEL), thickest_mm=(50, 5), mono_keV=50.25)
+    chain = Chain(Detector(), substances=(ABS, STEEL), thickest_mm=(50, 5), mono_keV=50.25)
     abs_mm, steel_mm = [0.0, 1.0, 20.0, 50.0, 0.0, 20.0], [0.0, 0.0, 0.0, 0.0, 1.0, 2.0]
     energy = tube_spectrum(90.0).energy_keV
     at = np.argmin(np.abs(energy - 50.25))
@@ -146,7 +146,7 @@ def test_slabs_of_one_energy_follow_beer_lambert():
 
 
 def test_a_wedge_hardens_the_beam_as_the_integral_says():
-    chain = Chain(Panel(), substances=(ALUMINIUM,), thickest_mm=(40.0,))
+    chain = Chain(Detector(), substances=(ALUMINIUM,), thickest_mm=(40.0,))
     thickness = np.linspace(0.0, 40.0, 9)
     signal, _ = weights_of(chain, 90.0)
     full = np.exp(-np.outer(thickness, ALUMINIUM.attenuation())) @ signal
@@ -164,7 +164,7 @@ def test_a_wedge_hardens_the_beam_as_the_integral_says():
 
 
 def test_signal_follows_tube_time_and_distance():
-    chain = Chain(Panel(), substances=(), thickest_mm=())
+    chain = Chain(Detector(), substances=(), thickest_mm=())
     empty = np.zeros((0, 3, 3), np.float32)
     one = expected_signal(chain, empty, VIEW, LISTING_1).mean_e[1, 1]
     double = expected_signal(chain, empty, VIEW, ExposureSettings(90, 25, 400)).mean_e[1, 1]
@@ -192,7 +192,7 @@ def flat(chain: Chain, exposure: ExposureSettings, cam: CameraSettings, seed: in
 
 @pytest.mark.parametrize("mode", ["HW2SW1High", "HW2SW1Low"])
 def test_photon_transfer_recovers_gain_and_read_noise(mode):
-    panel = Panel(dead_fraction=0.0)
+    panel = Detector(dead_fraction=0.0)
     chain = Chain(panel)
     cam = camera(500, 700, mode)
     brightest = 100.0 if mode.endswith("High") else 30.0
@@ -205,7 +205,7 @@ def test_photon_transfer_recovers_gain_and_read_noise(mode):
     darks = [(flat(chain, off, cam, 0), flat(chain, off, cam, 1))]
     result = photon_transfer(pairs, darks)
     signal, noise = weights_of(chain, 90.0)
-    per_count = panel.electrons_per_count(cam)
+    per_count = panel.gain(cam)
     assert result.counts_per_quantum == pytest.approx(
         float(noise.sum() / signal.sum()) / per_count, rel=0.02
     )
@@ -213,7 +213,7 @@ def test_photon_transfer_recovers_gain_and_read_noise(mode):
 
 
 def test_flat_corrected_air_is_one_within_noise():
-    chain, cam = Chain(Panel(dead_fraction=0.0)), camera(200, 300)
+    chain, cam = Chain(Detector(dead_fraction=0.0)), camera(200, 300)
     off = ExposureSettings(90.0, 50.0, 100.0, 400, xrays_on=False)
     many = ExposureSettings(90.0, 50.0, 100.0, 400)
     dark = flat(chain, off, cam, 0).astype(float)
@@ -230,20 +230,20 @@ def test_flat_corrected_air_is_one_within_noise():
 def test_counts_saturate_and_never_wrap():
     cam = camera(40, 50)
     bright = ExposureSettings(90.0, 90.0, 5000.0)
-    counts = flat(Chain(Panel(dead_fraction=0.0)), bright, cam, 3)
+    counts = flat(Chain(Detector(dead_fraction=0.0)), bright, cam, 3)
     assert counts.dtype == np.uint16
     assert (counts == 16_383).all()
 
 
 def test_fixed_pattern_belongs_to_the_panel():
-    panel = Panel()
+    panel = Detector()
     whole = pattern(panel, 1, (0, 0, 1943, 1535))
     part = pattern(panel, 2, (32, 8, 1943, 1527))
     np.testing.assert_allclose(part.gain[0, 0], whole.gain[8:10, 32:34].mean(), rtol=1e-5)
     assert part.gain.shape == (760, 956)
     assert whole.dead.sum() == pytest.approx(panel.dead_fraction * 1944 * 1536, rel=0.6)
-    assert pattern(Panel(serial=2), 1, (0, 0, 1943, 1535)).gain[0, 0] != whole.gain[0, 0]
-    plain = Panel(dead_fraction=0.01)
+    assert pattern(Detector(serial=2), 1, (0, 0, 1943, 1535)).gain[0, 0] != whole.gain[0, 0]
+    plain = Detector(dead_fraction=0.01)
     counts = flat(Chain(plain), LISTING_1, CameraSettings("HW1SW1High", Roi(0, 0, 99, 99)), 1)
     dead = pattern(plain, 1, (0, 0, 99, 99)).dead
     assert dead.any()
@@ -251,7 +251,7 @@ def test_fixed_pattern_belongs_to_the_panel():
 
 
 def test_same_seed_same_bytes_in_any_order():
-    chain, cam = Chain(Panel()), camera(30, 40)
+    chain, cam = Chain(Detector()), camera(30, 40)
     forwards = [flat(chain, LISTING_1, cam, i) for i in range(4)]
     backwards = [flat(chain, LISTING_1, cam, i) for i in reversed(range(4))][::-1]
     assert all((a == b).all() for a, b in zip(forwards, backwards, strict=True))
@@ -259,27 +259,27 @@ def test_same_seed_same_bytes_in_any_order():
 
 
 def test_few_photons_keep_mean_and_variance():
-    panel = Panel(dead_fraction=0.0, gain_sigma=0.0, offset_sigma_counts=0.0, blur_mm=0.0,
-                  read_noise_e=(0.0, 0.0), dark_e_per_s=0.0, full_well_e=(1e5, 1e5))  # fmt: skip
+    panel = Detector(dead_fraction=0.0, gain_sigma=0.0, offset_sigma_counts=0.0, blur_mm=0.0,
+                  read_noise_e=0.0, dark_e_per_s=0.0, electrons_per_count=1e5 / 2**14)  # fmt: skip
     chain, cam = Chain(panel), camera(300, 300)
     dim = ExposureSettings(90.0, 0.1, 50.0)
     expected = expected_signal(chain, np.zeros((0, 300, 300), np.float32), VIEW, dim)
     counts = read_out(panel, expected, cam, dim, frame_rng(0, 0)) - panel.offset_counts
-    per_count = panel.electrons_per_count(cam)
+    per_count = panel.gain(cam)
     assert expected.mean_e.mean() ** 2 / expected.variance_e.mean() < 10  # few indeed
     assert counts.mean() * per_count == pytest.approx(expected.mean_e.mean(), rel=0.01)
     assert counts.var() * per_count**2 == pytest.approx(expected.variance_e.mean(), rel=0.03)
 
 
 def test_earlier_frames_leave_something_behind():
-    panel, cam = Panel(gain_sigma=0.0, offset_sigma_counts=0.0), camera(10, 10)
+    panel, cam = Detector(gain_sigma=0.0, offset_sigma_counts=0.0), camera(10, 10)
     bright = expected_signal(Chain(panel), np.zeros((0, 10, 10), np.float32), VIEW, LISTING_1)
     off = ExposureSettings(90.0, 50.0, 100.0, xrays_on=False)
     dark = expected_signal(Chain(panel), np.zeros((0, 10, 10), np.float32), VIEW, off)
     alone = read_out(panel, dark, cam, off).astype(float)
     soon = read_out(panel, dark, cam, off, before=[(bright.mean_e, 0.0)]) - alone
     late = read_out(panel, dark, cam, off, before=[(bright.mean_e, 5.0)]) - alone
-    open_counts = float(bright.mean_e.mean()) / panel.electrons_per_count(cam)
+    open_counts = float(bright.mean_e.mean()) / panel.gain(cam)
     assert soon.mean() == pytest.approx(panel.lag_fraction * open_counts, abs=0.6)
     assert not late.any()
 
@@ -301,13 +301,13 @@ def test_blur_has_the_variance_asked_for():
 @pytest.mark.parametrize("blur_mm", [0.03, 0.06, 0.15])
 def test_neighbours_share_the_noise_of_light_that_reaches_both(blur_mm: float) -> None:
     """Covariance of pixels, beside the light of two points integrated over two squares."""
-    panel = Panel(gain_sigma=0.0, offset_sigma_counts=0.0, dead_fraction=0.0, blur_mm=blur_mm,
-                  read_noise_e=(0.0, 0.0))  # fmt: skip
+    panel = Detector(gain_sigma=0.0, offset_sigma_counts=0.0, dead_fraction=0.0, blur_mm=blur_mm,
+                  read_noise_e=0.0)  # fmt: skip
     cam = CameraSettings("HW1SW1High", Roi(0, 0, 599, 599))
     expected = expected_signal(Chain(panel), np.zeros((0, 600, 600), np.float32), VIEW, LISTING_1)
     image = read_out(panel, expected, cam, LISTING_1, frame_rng(3, 0)).astype(float)
-    image = (image - image.mean())[10:-10, 10:-10] * panel.electrons_per_count(cam)
-    wide = blur_mm / panel.pitch_mm * np.sqrt(2.0)
+    image = (image - image.mean())[10:-10, 10:-10] * panel.gain(cam)
+    wide = blur_mm / panel.pixels.pitch_mm * np.sqrt(2.0)
     x = (np.arange(2000) + 0.5) / 1000.0 - 1.0  # from one place in a pixel to one in the other
     shares = [
         np.sum((1 - abs(x)) * np.exp(-((x - n) ** 2) / (2 * wide**2)))
@@ -335,7 +335,7 @@ def test_noise_is_spread_as_wide_as_light_is(sigma: float) -> None:
 def test_hardly_a_photon_is_none_and_not_a_black_pixel() -> None:
     """Below about 1e-19 electrons their square is no float32."""
     dim = np.geomspace(1e-38, 1e-3, 64, dtype=np.float32).reshape(8, 8)
-    panel = Panel(read_noise_e=(0.0, 0.0), dead_fraction=0.0)
+    panel = Detector(read_noise_e=0.0, dead_fraction=0.0)
     counts = [
         read_out(panel, Expected(signal, 400.0 * signal), camera(8, 8), LISTING_1, frame_rng(3, 1))
         for signal in (dim, 0.0 * dim)
@@ -352,13 +352,13 @@ def test_small_pixels_have_their_own_area() -> None:
 
 
 def test_a_beam_of_next_to_nothing_has_no_line_integrals_below_0() -> None:
-    chain = Chain(Panel(), substances=(STEEL,), thickest_mm=(10.0,))
+    chain = Chain(Detector(), substances=(STEEL,), thickest_mm=(10.0,))
     paths = np.full((1, 1, 4, 5), 10.0, np.float32)
     faint = ExposureSettings(90.0, 1e-9, 1e-6)
     [image] = radiographs(chain, paths, VIEW[None], [faint])
     assert np.isfinite(image.integrals).all()
     assert image.integrals.min() >= 0.0
-    weak = Panel(scintillator="H@1e-30", scintillator_mm=1e-6)
+    weak = Detector(scintillator="H@1e-30", scintillator_mm=1e-6)
     with pytest.raises(LimitError, match="no photon leaves anything in the detector"):
         radiographs(replace(chain, panel=weak), paths, VIEW[None], [LISTING_1])
 
@@ -391,9 +391,10 @@ def test_signal_to_noise():
     assert region(one).snr == pytest.approx(5.0, rel=0.02)
 
 
-def test_every_default_says_where_it_comes_from():
-    _, *body = ast.parse(textwrap.dedent(inspect.getsource(Panel))).body[0].body
+@pytest.mark.parametrize("kind", [Detector, PixelGrid])
+def test_every_default_says_where_it_comes_from(kind):
+    _, *body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body
     fields = [(one, after) for one, after in pairwise(body) if isinstance(one, ast.AnnAssign)]
-    assert [one.target.id for one, _ in fields] == list(Panel.__dataclass_fields__)
+    assert [one.target.id for one, _ in fields] == list(kind.__dataclass_fields__)
     for _, said in fields:
         assert said.value.value.split(":")[0].rstrip(".") in ("Measured", "Literature", "Assumed")

@@ -229,7 +229,7 @@ def test_a_readout_follows_whatever_it_is_made_of() -> None:
                 asked.stand(Sample(), Correction("c", "2026-01-01T00:00:00Z", offsets), None, time)
         rest = asked.rest_time(time) + 1.0
         for now in (time, time + 1.0, rest):
-            fresh = readout(asked.poses(now), asked.camera, M.detector.sensor, asked.parameters)
+            fresh = readout(asked.poses(now), asked.camera, M.detector.pixels, asked.parameters)
             assert asked.state(now).readout == fresh
             seen.add(fresh)
         time = rest

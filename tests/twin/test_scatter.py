@@ -25,7 +25,7 @@ from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.physics.chain import Chain
-from flexdt.twin.physics.panel import Panel
+from flexdt.twin.physics.detector import Detector
 from flexdt.twin.physics.scatter import scatter_kernels
 from flexdt.twin.physics.scatter.simulation import (
     Beam,
@@ -263,7 +263,7 @@ def scene(seed: int, error: float = 0.05) -> ScatterImage:
     materials = (Substance.of("pmma", "C5H8O2", 1.19), Substance.of("aluminium", "Al", 2.7))
     thing = Object(amounts, (2.5, 2.5, 2.5), (0.0, 1.0, 0.0), materials)
     view = [0, -300, 0, 5, 200, 0, 0.8, 0, 0, 0, 0, -0.8]
-    beam = Beam.of(Chain(Panel()), 90.0)
+    beam = Beam.of(Chain(Detector()), 90.0)
     return scatter_image(thing, view, (90, 120), beam, ScatterSettings(error=error, seed=seed))
 
 
@@ -355,7 +355,7 @@ def radiograph(row, atoms, density, inside, points, each, counts=(7, 9)):  # typ
     _, energy = mono(KEV)
     formula = "".join(f"{s}{n}" for s, n in atoms.items())
     substance = Substance.of(formula, formula, density)
-    response = Panel().charge_of_photons()[0]
+    response = Detector().charge_of_photons()[0]
     source, centre, u, v = row.reshape(4, 3)
     rows, cols = TURN.of_shape(None)
     normal = np.cross(u, v) / np.linalg.norm(np.cross(u, v))
@@ -434,7 +434,7 @@ def test_subtracted_scatter_leaves_no_cupping(
     clean = np.tile(-np.log(straight), views)
     measured = np.tile(-np.log(straight + scatter), views)
     formula = "".join(f"{s}{n}" for s, n in atoms.items())
-    chain = Chain(Panel(), substances=(Substance.of(formula, formula, density),), mono_keV=KEV)
+    chain = Chain(Detector(), substances=(Substance.of(formula, formula, density),), mono_keV=KEV)
     settings = ScatterSettings(nodes=100, step_deg=90.0)
     corrected = without_scatter(measured, TURN, chain, 90.0, settings)
     truth, cupped, flat = (np.array(cupping(one, radius)) for one in (clean, measured, corrected))
@@ -457,7 +457,7 @@ def test_a_scatter_correction_needs_materials_that_differ() -> None:
     water = Substance.of("water", "H2O", 1.0)
     for substances, why in (((), "no material"), ((water, replace(water, name="w")), "alike")):
         with pytest.raises(LimitError, match=why):
-            without_scatter(air, TURN, Chain(Panel(), substances=substances), 90.0)
+            without_scatter(air, TURN, Chain(Detector(), substances=substances), 90.0)
 
 
 @given(st.floats(-10.0, 2.0**100, width=32), st.floats(0.0, 1e3, width=32))
@@ -485,7 +485,7 @@ def test_panels_of_one_row_or_column(shape: tuple[int, int]) -> None:
 def test_line_integrals_that_are_not_finite_are_refused(value: float) -> None:
     """They were found to be air, by which nothing is scattered."""
     scan = ConeVec.circular(sod=300, sdd=500, angles=24, shape=(10, 16), pixel=4)
-    chain = Chain(Panel(), substances=(Substance.of("water", "H2O", 1.0),))
+    chain = Chain(Detector(), substances=(Substance.of("water", "H2O", 1.0),))
     images = np.zeros((24, 10, 16), np.float32)
     images[3, 4, 5] = value
     with pytest.raises(GeometryError, match="not finite"):

@@ -150,7 +150,7 @@ class DatasetDocument(_Model):
             detector=DetectorEntry(
                 rows=rows,
                 cols=cols,
-                pixel_mm=camera.pixel_mm(record.machine.detector.sensor),
+                pixel_mm=camera.pixel_mm(record.machine.detector.pixels),
                 bits=record.machine.detector.bits,
                 **camera.of_image,
             ),

@@ -36,17 +36,28 @@ class Roi:
 
 
 @dataclass(frozen=True)
-class Sensor:
-    """The full, unbinned sensor: (columns, rows), pitch [mm] and depth [bit].
+class PixelGrid:
+    """The unbinned pixels of a flat panel; the defaults are those of a Dexela 1512NDT."""
 
-    `pitch_mm` is from column to column; `row_pitch_mm` from row to row, None where it is the same.
-    """
-
-    columns: int
-    rows: int
-    pitch_mm: float
-    bits: int
+    columns: int = 1944
+    """Literature: data sheet, thesis 2.3."""
+    rows: int = 1536
+    """Literature: data sheet, thesis 2.3."""
+    pitch_mm: float = 0.0748
+    """Literature: data sheet, thesis 2.3. From column to column."""
     row_pitch_mm: float | None = None
+    """Literature: as pitch_mm. From row to row, where that differs."""
+
+    @property
+    def edges_mm(self) -> tuple[float, float]:
+        """Pitch from column to column and from row to row."""
+        return self.pitch_mm, self.pitch_mm if self.row_pitch_mm is None else self.row_pitch_mm
+
+    @property
+    def size_mm(self) -> tuple[float, float]:
+        """Width and height of the active area."""
+        across, up = self.edges_mm
+        return self.columns * across, self.rows * up
 
 
 @dataclass(frozen=True)
@@ -89,29 +100,29 @@ class CameraSettings:
         """What is set, by name: `of_image` and the number of images."""
         return {**self.of_image, "frames": self.frames}
 
-    def facts(self, sensor: Sensor) -> dict[str, Any]:
+    def facts(self, grid: PixelGrid) -> dict[str, Any]:
         """What is set and the image's `shape` and `pixel_mm`: the wire's camera."""
-        return {**self.stated, "shape": self.shape, "pixel_mm": self.pixel_mm(sensor)}
+        return {**self.stated, "shape": self.shape, "pixel_mm": self.pixel_mm(grid)}
 
-    def pixel_mm(self, sensor: Sensor) -> float:
+    def pixel_mm(self, grid: PixelGrid) -> float:
         """Binned pixel pitch from column to column [mm]."""
-        return sensor.pitch_mm * self.binning
+        return grid.pitch_mm * self.binning
 
-    def pixels_mm(self, sensor: Sensor) -> tuple[float, float]:
+    def pixels_mm(self, grid: PixelGrid) -> tuple[float, float]:
         """Binned pixel pitch from column to column and from row to row [mm]."""
-        row = sensor.pitch_mm if sensor.row_pitch_mm is None else sensor.row_pitch_mm
-        return self.pixel_mm(sensor), row * self.binning
+        across, up = grid.edges_mm
+        return across * self.binning, up * self.binning
 
-    def roi_shift_mm(self, sensor: Sensor) -> tuple[float, float]:
+    def roi_shift_mm(self, grid: PixelGrid) -> tuple[float, float]:
         """Shift of the image's centre from the sensor's: (columns growing, rows growing) [mm].
 
         For the thesis's ROI 32 8 1943 1527 that is (+1.1968, 0), as flexDATA has it.
         """
         rows, cols = self.shape
         b, r = self.binning, self.roi
-        column = r.left + (cols * b - 1) / 2 - (sensor.columns - 1) / 2
-        row = r.top + (rows * b - 1) / 2 - (sensor.rows - 1) / 2
-        return column * sensor.pitch_mm, row * self.pixels_mm(sensor)[1] / b
+        column = r.left + (cols * b - 1) / 2 - (grid.columns - 1) / 2
+        row = r.top + (rows * b - 1) / 2 - (grid.rows - 1) / 2
+        return column * grid.pitch_mm, row * self.pixels_mm(grid)[1] / b
 
 
 def binning_of(mode: str, modes: Mapping[str, int] | None = None) -> int:
@@ -145,17 +156,17 @@ def binning_of(mode: str, modes: Mapping[str, int] | None = None) -> int:
     return int(match[1]) * int(match[2])
 
 
-def check_roi(roi: Roi, sensor: Sensor, binning: int) -> Roi:
+def check_roi(roi: Roi, grid: PixelGrid, binning: int) -> Roi:
     """Return `roi` if it lies on the sensor and holds at least one binned pixel.
 
     Raises:
         LimitError: says which edge, its value and what is allowed.
     """
     for name, value, size in (
-        ("left", roi.left, sensor.columns),
-        ("right", roi.right, sensor.columns),
-        ("top", roi.top, sensor.rows),
-        ("bottom", roi.bottom, sensor.rows),
+        ("left", roi.left, grid.columns),
+        ("right", roi.right, grid.columns),
+        ("top", roi.top, grid.rows),
+        ("bottom", roi.bottom, grid.rows),
     ):
         if not 0 <= value < size:
             what = "columns" if name in ("left", "right") else "rows"

@@ -28,7 +28,7 @@ from pydantic_core import PydanticCustomError
 
 from flexdt.twin.errors import LimitError, MachineFileError, TwinError, UnknownNameError
 from flexdt.twin.geometry.offsets import NAMES
-from flexdt.twin.machine.camera import CameraSettings, Roi, Sensor, binning_of, check_roi
+from flexdt.twin.machine.camera import CameraSettings, PixelGrid, Roi, binning_of, check_roi
 from flexdt.twin.values import message_of
 
 Positive = Annotated[float, Field(gt=0, le=1e6)]
@@ -134,7 +134,8 @@ class VirtualAxis(_Frozen):
 
 
 class DetectorSpec(_Frozen):
-    """The flat panel, unbinned, and the camera settings in force at start."""
+    """The table `[detector]` of a machine file: what of the flat panel is the machine's own, and
+    the camera settings in force at start. `physics.detector_of` makes the detector of it."""
 
     model: str
     shape: Literal["flat"] = "flat"
@@ -163,14 +164,9 @@ class DetectorSpec(_Frozen):
     between the points, and from the first one to nothing at 0. None: computed for CsI."""
 
     @property
-    def sensor(self) -> Sensor:
-        """The sensor alone."""
-        return Sensor(self.columns, self.rows, self.pitch_mm, self.bits, self.row_pitch_mm)
-
-    @property
-    def area_mm(self) -> tuple[float, float]:
-        """Width and height of the active area."""
-        return self.columns * self.pitch_mm, self.rows * (self.row_pitch_mm or self.pitch_mm)
+    def pixels(self) -> PixelGrid:
+        """Its unbinned pixels."""
+        return PixelGrid(self.columns, self.rows, self.pitch_mm, self.row_pitch_mm)
 
     @property
     def camera(self) -> CameraSettings:
@@ -185,7 +181,7 @@ class DetectorSpec(_Frozen):
         except LimitError as error:
             raise _refused("mode", self.mode, error.message) from None
         try:
-            check_roi(Roi(*self.roi), self.sensor, binning)
+            check_roi(Roi(*self.roi), self.pixels, binning)
         except LimitError as error:
             raise _refused("roi", self.roi, error.message) from None
         for i, (energy, left) in enumerate(self.response):
@@ -558,7 +554,7 @@ class Machine(_Frozen):
         Otherwise a motor of `geometry` would move the image and leave the body behind, and what
         collides would be called free.
         """
-        across, up = self.detector.area_mm
+        across, up = self.detector.pixels.size_mm
         for role, anchor, half in (
             ("tube", "source", (0.0, 0.0, 0.0)),
             ("sample_holder", "object", (0.0, 0.0)),

@@ -80,8 +80,8 @@ def motor_poses(
         added = {"x": x, "y": y, "z": z}
         return np.stack([total(f"{anchor}_{c}") + more for c, more in added.items()], axis=1)
 
-    column_shift, row_shift = camera.roi_shift_mm(machine.detector.sensor)
-    pixel, row_pixel = camera.pixels_mm(machine.detector.sensor)
+    column_shift, row_shift = camera.roi_shift_mm(machine.detector.pixels)
+    pixel, row_pixel = camera.pixels_mm(machine.detector.pixels)
     u, v = turn_detector(
         np.multiply(COLUMN_DIRECTION, pixel),
         np.multiply(ROW_DIRECTION, row_pixel),

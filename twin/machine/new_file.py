@@ -140,8 +140,8 @@ def new_machine_text(answers: Answers) -> str:
     seen = {key: value for key, value in tables["detector"].items() if value is not None}
     if panel is not None and (rail or seen.keys() & {"columns", "rows", "pitch_mm"}):
         part: dict[str, object] = {"name": panel.name, "axis": _RAIL_AXIS if rail else None}
-        across, up = base.detector.model_copy(update=seen).area_mm
-        if (across, up) != base.detector.area_mm:
+        across, up = base.detector.model_copy(update=seen).pixels.size_mm
+        if (across, up) != base.detector.pixels.size_mm:
             sides = (across + _BESIDE_MM, panel.size_mm[1], up + _BESIDE_MM)
             part |= {"size_mm": [round(side, 1) for side in sides], "source": "assumed"}
         text += f"\n[[components]]\n{_lines(part)}"

@@ -10,16 +10,16 @@ from flexdt.twin.physics.chain import (
     spot_blur_px,
     weights_of,
 )
+from flexdt.twin.physics.detector import Detector, detector_of
 from flexdt.twin.physics.effective import EffectiveBeam, effective_beam
 from flexdt.twin.physics.exposure import (
     Counts,
     ExposureSettings,
-    detector_model,
     expose,
     frame_rng,
+    ideal_response,
     open_beam,
 )
-from flexdt.twin.physics.panel import Panel, panel_of
 from flexdt.twin.physics.radiograph import check_rays, within_pixels
 from flexdt.twin.physics.scatter.simulation import Beam, ScanScatter, ScatterSettings, scan_scatter
 from flexdt.twin.physics.scintillator import deposited
@@ -37,10 +37,10 @@ __all__ = [
     "Beam",
     "Chain",
     "Counts",
+    "Detector",
     "EffectiveBeam",
     "ExposureSettings",
     "Filter",
-    "Panel",
     "ScanScatter",
     "ScatterSettings",
     "Spectrum",
@@ -48,15 +48,15 @@ __all__ = [
     "blurred",
     "check_rays",
     "deposited",
-    "detector_model",
+    "detector_of",
     "effective_beam",
     "expected_signal",
     "expose",
     "flux_of",
     "frame_rng",
+    "ideal_response",
     "monochromatic",
     "open_beam",
-    "panel_of",
     "read_out",
     "scan_scatter",
     "spot_blur_px",

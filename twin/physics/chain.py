@@ -26,9 +26,9 @@ from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.physics.detector import Detector, pattern
 from flexdt.twin.physics.effective import EffectiveBeam, effective_beam
 from flexdt.twin.physics.exposure import FEW, Counts, ExposureSettings
-from flexdt.twin.physics.panel import Panel, pattern
 from flexdt.twin.physics.spectrum import TubeModel, monochromatic, tube_spectrum
 
 FWHM = 2.3548200450309493
@@ -114,7 +114,7 @@ class Chain:
             None for the whole spectrum.
     """
 
-    panel: Panel
+    panel: Detector
     tube: TubeModel = field(default_factory=TubeModel)
     substances: tuple[Substance, ...] = ()
     thickest_mm: tuple[float, ...] = ()
@@ -204,7 +204,7 @@ def expected_signal(
 
 
 def read_out(
-    panel: Panel,
+    panel: Detector,
     expected: Expected,
     camera: CameraSettings,
     exposure: ExposureSettings,
@@ -255,8 +255,8 @@ def read_out(
         charge = charge + blurred(noise, *blur, weights=noise_kernel)
     fixed = pattern(panel, camera.binning, camera.roi.edges)
     charge = charge * fixed.gain
-    charge += np.float32(panel.dark_e_per_s * camera.binning**2 * exposure.exposure_ms / 1000.0)
-    per_count = panel.electrons_per_count(camera)
+    charge += np.float32(panel.dark_charge(camera) * exposure.exposure_ms / 1000.0)
+    per_count = panel.gain(camera)
     if rng is not None:
         electronic = np.float32(panel.read_noise(camera) / np.sqrt(averages))
         charge += electronic * rng.standard_normal(shape, dtype=np.float32)
@@ -269,7 +269,7 @@ def read_out(
 
 
 def trapped_after(
-    panel: Panel,
+    panel: Detector,
     trapped: Float32Array,
     expected: Expected | None,
     exposure: ExposureSettings,

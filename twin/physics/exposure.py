@@ -29,8 +29,9 @@ Counts = npt.NDArray[np.uint16]
 
 
 @dataclass(frozen=True)
-class DetectorModel:
-    """A linear, photon-counting-like panel. All values but `bits` are assumed.
+class IdealResponse:
+    """Counts of the `ideal` physics: linear, of tube and detector together. All values but `bits`
+    are assumed.
 
     Attributes:
         bits: depth; counts are clipped to [0, 2^bits - 1].
@@ -71,11 +72,11 @@ class ExposureSettings:
         return self.exposure_ms * self.averages / 1000.0
 
 
-def detector_model(machine: Machine) -> DetectorModel:
-    """The model for the detector of `machine`; an open beam fills about 3/4 of its depth."""
-    model = DetectorModel()
+def ideal_response(machine: Machine) -> IdealResponse:
+    """That of `machine`; an open beam fills about 3/4 of its depth."""
+    model = IdealResponse()
     scale = 2.0 ** (machine.detector.bits - model.bits)
-    return DetectorModel(
+    return IdealResponse(
         bits=machine.detector.bits,
         i0_counts=model.i0_counts * scale,
         dark_counts=model.dark_counts * scale,
@@ -84,7 +85,7 @@ def detector_model(machine: Machine) -> DetectorModel:
     )
 
 
-def open_beam(model: DetectorModel, settings: ExposureSettings) -> float:
+def open_beam(model: IdealResponse, settings: ExposureSettings) -> float:
     """Signal above dark [counts] of a ray that meets nothing."""
     if not settings.xrays_on:
         return 0.0
@@ -108,7 +109,7 @@ def frame_rng(seed: int, index: int) -> np.random.Generator:
 
 
 def expose(
-    model: DetectorModel,
+    model: IdealResponse,
     line_integrals: Float32Array,
     settings: ExposureSettings,
     rng: np.random.Generator | None = None,
@@ -116,7 +117,7 @@ def expose(
     """Counts of one image.
 
     Args:
-        model: the detector.
+        model: of tube and detector.
         line_integrals: float32 (rows, cols), or (moments, rows, cols) spread evenly over the
             exposure: intensities are averaged, as a moving object blurs. Not changed.
         settings: tube and camera.
@@ -146,7 +147,7 @@ def expose(
 
 
 def _noisy(
-    model: DetectorModel,
+    model: IdealResponse,
     settings: ExposureSettings,
     rng: np.random.Generator,
     signal: Float32Array,

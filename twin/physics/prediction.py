@@ -65,10 +65,10 @@ def pixel_reading(
 
     Example:
         >>> from flexdt.twin.machine.camera import Roi
-        >>> from flexdt.twin.physics.panel import Panel
+        >>> from flexdt.twin.physics.detector import Detector
         >>> from flexdt.twin.physics.spectrum import TubeModel
         >>> aluminium = Substance.of("aluminium", "Al", 2.7)
-        >>> chain = Chain(Panel(), TubeModel(), (aluminium,), (50.0,))
+        >>> chain = Chain(Detector(), TubeModel(), (aluminium,), (50.0,))
         >>> camera = CameraSettings("HW2SW1High", Roi(32, 8, 1943, 1527))
         >>> behind = [pixel_reading(chain, camera, ExposureSettings(90.0, 50.0, 100.0), 2e-4, [x])
         ...           for x in (0.0, 20.0)]
@@ -88,7 +88,7 @@ def pixel_reading(
     kept = math.prod(float((noise_kernel(s).astype(np.float64) ** 2).sum()) for s in sigmas)
     kept = kept if max(sigmas) >= NARROWEST else 1.0
     quanta = float(noise @ through) * scale * kept
-    per_count = panel.electrons_per_count(camera)
+    per_count = panel.gain(camera)
     variance = (quanta + panel.read_noise(camera) ** 2) / exposure.averages / per_count**2
     return PixelValue(float(signal @ through) * scale / per_count, math.sqrt(variance + 1.0 / 12.0))
 

@@ -27,7 +27,7 @@ from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.physics.chain import Chain, weights_of
-from flexdt.twin.physics.panel import Panel
+from flexdt.twin.physics.detector import Detector
 from flexdt.twin.physics.scatter.simulation import Beam, Object, ScatterSettings, scan_scatter
 from flexdt.twin.physics.spectrum import TubeModel
 from flexdt.twin.projection import Grid, Volume
@@ -107,7 +107,7 @@ def hardening(
     material: Substance,
     kV: float,
     energy_keV: float,
-    panel: Panel | None = None,
+    panel: Detector | None = None,
     tube: TubeModel | None = None,
 ) -> Hardening:
     """The correction for an object of one material, from tube and detector as modelled.
@@ -121,7 +121,7 @@ def hardening(
     Raises:
         LimitError: there is no spectrum for `kV`.
     """
-    chain = Chain(Panel() if panel is None else panel, TubeModel() if tube is None else tube)
+    chain = Chain(Detector() if panel is None else panel, TubeModel() if tube is None else tube)
     signal, _ = weights_of(chain, kV)
     mu = material.attenuation()
     energies = tables().energy_keV
@@ -197,9 +197,9 @@ def without_scatter(
     Example:
         >>> from flexdt.twin.attenuation.substances import Substance
         >>> from flexdt.twin.physics.chain import Chain
-        >>> from flexdt.twin.physics.panel import Panel
+        >>> from flexdt.twin.physics.detector import Detector
         >>> scan = ConeVec.circular(sod=300, sdd=500, angles=36, shape=(20, 30), pixel=2)
-        >>> chain = Chain(Panel(), substances=(Substance.of("water", "H2O", 1.0),))
+        >>> chain = Chain(Detector(), substances=(Substance.of("water", "H2O", 1.0),))
         >>> air = np.zeros((36, 20, 30), np.float32)
         >>> bool(without_scatter(air, scan, chain, 90.0).any())
         False

@@ -12,12 +12,12 @@ import numpy as np
 
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
-from flexdt.twin.machine.camera import CameraSettings, Sensor
+from flexdt.twin.machine.camera import CameraSettings, PixelGrid
 from flexdt.twin.scanner.state import Readout
 
 
 def readout(
-    poses: Poses, camera: CameraSettings, sensor: Sensor, parameters: Offsets = NOMINAL
+    poses: Poses, camera: CameraSettings, sensor: PixelGrid, parameters: Offsets = NOMINAL
 ) -> Readout | None:
     """Derived quantities of the first of `poses`.
 

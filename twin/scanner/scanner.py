@@ -163,7 +163,7 @@ class ScannerTwin:
     @property
     def pixel_mm(self) -> float:
         """Binned pixel pitch [mm]."""
-        return self.camera.pixel_mm(self.machine.detector.sensor)
+        return self.camera.pixel_mm(self.machine.detector.pixels)
 
     def poses(self, now: float) -> Poses:
         """Nominal poses, n = 1."""
@@ -182,7 +182,7 @@ class ScannerTwin:
             GeometryError: a geometry no scanner can have.
         """
         parameters = NOMINAL if correction is None else correction.parameters
-        pixel = camera.pixels_mm(self.machine.detector.sensor)
+        pixel = camera.pixels_mm(self.machine.detector.pixels)
         return check_cone_vec(nominal.cone_vec(parameters), pixel)
 
     def cone_vec(self, now: float) -> ConeVec:
@@ -217,7 +217,7 @@ class ScannerTwin:
         made_of = (tuple(positions.values()), self.camera, self.parameters)
         if self._derived[0] != made_of:
             poses = self.poses_at(positions, self.camera)
-            sensor = self.machine.detector.sensor
+            sensor = self.machine.detector.pixels
             self._derived = (made_of, readout(poses, self.camera, sensor, self.parameters))
         return self._derived[1]
 

@@ -83,7 +83,7 @@ def changed_camera(
     """
     stated: dict[str, Any] = {name: x for name, x in change.items() if x is not None}
     new = replace(camera, **stated)
-    check_roi(new.roi, spec.sensor, new.binning)
+    check_roi(new.roi, spec.pixels, new.binning)
     least, most = spec.min_exposure_ms, spec.max_exposure_ms
     _require_within("camera", "exposure_ms", new.exposure_ms, least, most)
     _require_within("camera", "averages", new.averages, 1, 10_000)
@@ -110,7 +110,7 @@ def require_applicable(
     offsets = NOMINAL if correction is None else correction.parameters
     travels = (a.upper - a.lower for a in machine.axes.values() if a.unit == "mm")
     require_plausible(offsets, max(travels, default=math.inf))
-    sensor = machine.detector.sensor
+    sensor = machine.detector.pixels
     nearest = motor_poses(machine, profile, camera, _nearest(machine))
     cone = check_cone_vec(nearest.cone_vec(offsets), camera.pixels_mm(sensor))
     if readout(nearest, camera, sensor, offsets) is None:

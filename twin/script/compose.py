@@ -109,7 +109,7 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
     if request.roi is not None:
         camera = machine.detector.camera
         binning = replace(camera, mode=request.mode or camera.mode).binning
-        check_roi(request.roi, machine.detector.sensor, binning)
+        check_roi(request.roi, machine.detector.pixels, binning)
     attempts = list(_usual(request, _Places(machine, profile)))
     for sod, sdd, height in attempts:
         placed = (ScanPosition(sod),) if request.placements is None else request.placements
@@ -346,7 +346,7 @@ class _Writer(_Places):
     def tiled(self) -> Iterator[str]:
         w, camera = self.request, self.camera
         self.need("a tiled scan", "detector_x")
-        width = camera.shape[1] * camera.pixel_mm(self.machine.detector.sensor)
+        width = camera.shape[1] * camera.pixel_mm(self.machine.detector.pixels)
         for k in range(w.tiles):
             shift = (k - (w.tiles - 1) / 2) * 0.9 * width
             yield from self.go(*self.aside, "detector_x", shift=shift)
@@ -502,7 +502,7 @@ class _Writer(_Places):
                 wanted[f"object_{across}"] += self.region[k] * sod / w.sdd_mm
         found = self.solved(wanted)
         rows, cols = self.camera.shape
-        pixel, row_pixel = self.camera.pixels_mm(self.machine.detector.sensor)
+        pixel, row_pixel = self.camera.pixels_mm(self.machine.detector.pixels)
         if not self.has("detector_x"):
             wanted["detector_x"] = 0.0  # the region lies where it lies
         if not self.has("detector_z"):
@@ -544,7 +544,7 @@ class _Writer(_Places):
         centre = self.station(w.sod_mm)[name]
         across = quantity == "object_x"
         size = camera.shape[1 if across else 0]
-        pixel = camera.pixels_mm(self.machine.detector.sensor)[0 if across else 1]
+        pixel = camera.pixels_mm(self.machine.detector.pixels)[0 if across else 1]
         away = size * pixel * w.sod_mm / w.sdd_mm / 2 + FREE_MM
         room = max(centre - axis.lower, axis.upper - centre) * abs(factor)
         sign = -1.0 if (centre - axis.lower > axis.upper - centre) == (factor > 0.0) else 1.0
@@ -579,7 +579,7 @@ class _Writer(_Places):
     @property
     def region(self) -> FloatArray:
         """The middle of the camera's region from the panel's, in the world (3,) [mm]."""
-        across, down = self.camera.roi_shift_mm(self.machine.detector.sensor)
+        across, down = self.camera.roi_shift_mm(self.machine.detector.pixels)
         u, v = turn_detector(
             COLUMN_DIRECTION, ROW_DIRECTION, 0.0, 0.0, math.radians(self.profile.det_roll_deg)
         )

@@ -33,11 +33,11 @@ from flexdt.twin.machine.description import Machine, builtin_machine
 from flexdt.twin.physics import (
     Chain,
     ExposureSettings,
-    detector_model,
+    detector_of,
     expected_signal,
     expose,
+    ideal_response,
     open_beam,
-    panel_of,
     read_out,
     tube_of,
 )
@@ -136,7 +136,7 @@ def _camera(
     wanted = plan.camera
     if wanted.shape is not None and wanted.pixel_mm is not None:
         return None, (wanted.shape[0], wanted.shape[1]), wanted.pixel_mm, (0.0, 0.0)
-    standard, sensor = machine.detector.camera, machine.detector.sensor
+    standard, sensor = machine.detector.camera, machine.detector.pixels
     roi = standard.roi if wanted.roi is None else Roi(*wanted.roi)
     camera = replace(
         standard, mode=wanted.mode or standard.mode, roi=roi, averages=plan.images.averages
@@ -321,7 +321,7 @@ def _ideal(plan: Plan, item: Item, cone: ConeVec) -> Array:
     lines = line_integrals(item.phantom, cone, item.shape)
     if plan.images.values == "line_integrals" and not plan.images.noise:
         return lines
-    model = detector_model(item.machine)
+    model = ideal_response(item.machine)
     counts = [
         expose(model, image, item.exposure, _rng(plan, item, i)) for i, image in enumerate(lines)
     ]
@@ -340,7 +340,7 @@ def _logarithm(counts: Counts, dark: np.float32, bright: np.float32 | Float32Arr
 def _physical(plan: Plan, item: Item, cone: ConeVec) -> Array:
     assert item.camera is not None
     parts = channels(item.phantom)
-    panel, tube = panel_of(item.machine.detector), tube_of(item.machine.tube)
+    panel, tube = detector_of(item.machine.detector), tube_of(item.machine.tube)
     mono_keV = stated_keV() if plan.images.physics == "mono" else None
     chain = chain_through(parts, panel, tube, mono_keV)
     paths = np.stack([project_body(part.body, cone, item.shape) for part in parts])

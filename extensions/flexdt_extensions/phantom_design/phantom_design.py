@@ -89,7 +89,7 @@ def circle_poses(
                 "0 < SOD < SDD"
             )
     camera = machine.detector.camera
-    pitch = camera.pixel_mm(machine.detector.sensor)
+    pitch = camera.pixel_mm(machine.detector.pixels)
     angle = 2.0 * math.pi * np.arange(frames) / frames
     parts = [
         Poses.upright([0, 0, 0], [lateral, sod, 0], [0, sdd_mm, 0], pitch, angle)

@@ -11,7 +11,7 @@ from flexdt.clients.figures import require_plots
 from flexdt.phantoms import Phantom, cuboid_with_beads, load_phantom, loop_positions, material
 from flexdt.twin.calibration import SIX, BeadModel, bead_model
 from flexdt.twin.errors import TwinError, UnknownNameError
-from flexdt.twin.physics import Chain, EffectiveBeam, Panel, effective_beam, weights_of
+from flexdt.twin.physics import Chain, Detector, EffectiveBeam, effective_beam, weights_of
 from flexdt_extensions.executors import executor
 from flexdt_extensions.studies import experiment_4 as real
 from flexdt_extensions.studies import experiment_4_images as real_images
@@ -222,7 +222,7 @@ def _real(
 def lego_beam() -> EffectiveBeam:
     """Effective energies of the tube's beam behind the LEGO phantom."""
     names = sorted({solid.material for solid in load_phantom("lego").scene.solids})
-    signal, noise = weights_of(Chain(Panel()), KILOVOLTS)
+    signal, noise = weights_of(Chain(Detector()), KILOVOLTS)
     longest = [60.0 if name == "abs" else 2.5 for name in names]
     return effective_beam(signal, noise, [material(n).substance for n in names], longest)
 

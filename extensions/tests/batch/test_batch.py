@@ -22,7 +22,7 @@ import pytest
 import flexdt as fx
 from flexdt.clients.cli.entry import run
 from flexdt.clients.failure import CommandError
-from flexdt.twin.physics.exposure import detector_model, expose
+from flexdt.twin.physics.exposure import expose, ideal_response
 from flexdt.twin.projection import project_scene
 from flexdt_extensions.batch.batch_plan import Plan, parse_plan, read_plan
 from flexdt_extensions.batch.batch_run import figures, run_batch
@@ -237,7 +237,7 @@ def test_noise_has_the_detectors_size_and_is_the_items_own() -> None:
     noisy = run_item(parse_plan(varied(("images", {"noise": True}))).text, 0)
     lines, seen = clean.arrays["projections"], noisy.arrays["projections"]
     item = draw_item(parse_plan(varied()), 0)
-    model = detector_model(item.machine)
+    model = ideal_response(item.machine)
     counts = expose(model, lines[0], item.exposure) - model.dark_counts
     variance = counts / model.photons_per_count + model.read_noise_counts**2 + 1 / 12
     pulls = (seen[0] - lines[0]) * counts / np.sqrt(variance)

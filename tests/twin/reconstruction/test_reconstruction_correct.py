@@ -9,7 +9,7 @@ from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import LimitError
 from flexdt.twin.physics.chain import Chain, weights_of
-from flexdt.twin.physics.panel import Panel
+from flexdt.twin.physics.detector import Detector
 from flexdt.twin.reconstruction import Grid, fdk, hardening, ring_errors
 from tests.twin.reconstruction.scans import ball, circle
 
@@ -18,7 +18,7 @@ ALUMINIUM = Substance.of("aluminium", "Al", 2.7)
 
 def test_hardening_is_undone():
     """Independent of the correction's table: a finer sum over the spectrum at other thicknesses."""
-    signal, _ = weights_of(Chain(Panel()), 90.0)
+    signal, _ = weights_of(Chain(Detector()), 90.0)
     thickness = np.array([0.0, 0.37, 1.9, 7.3, 23.0])
     measured = -np.log(
         np.exp(-np.outer(thickness, ALUMINIUM.attenuation())) @ signal / signal.sum()

@@ -307,7 +307,7 @@ class ImageCollector:
         if "roi_fit" in self._complained:
             return
         try:
-            check_roi(camera.roi, self.machine.detector.sensor, camera.binning)
+            check_roi(camera.roi, self.machine.detector.pixels, camera.binning)
         except LimitError as error:
             self._complained.add("roi_fit")
             self.note("error", "roi", error.message)

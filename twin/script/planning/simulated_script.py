@@ -239,7 +239,7 @@ class Simulation:
     def _roi(self, command: c.SetRoi) -> Span:
         roi = self.camera.settings.roi
         try:
-            roi = check_roi(command.roi, self.machine.detector.sensor, 1)
+            roi = check_roi(command.roi, self.machine.detector.pixels, 1)
         except LimitError as error:
             self.note("error", "roi", error.message)
         return self._stated("roi", roi)

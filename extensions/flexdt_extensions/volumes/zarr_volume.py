@@ -8,16 +8,20 @@ or when.
 from __future__ import annotations
 
 import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
+import zarr
 
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import Grid
 
+Sink = Callable[[Float32Array], None]
 CHUNK: Final = 64
 """Voxels along each side of a chunk."""
 ROWS: Final = 4 * CHUNK
@@ -28,6 +32,18 @@ SLABS: Final = 256
 """Most slabs of a large volume, whose slabs are larger instead: each reads all frames again."""
 COARSEST: Final = 128
 """Voxels along the longest side below which there is no coarser resolution."""
+
+
+def opened(path: Path) -> Any:
+    """The group of a volume that is there."""
+    return zarr.open_group(path, mode="r")
+
+
+def move(made: Path, path: Path) -> None:
+    """Give a whole volume its name, in place of one that is there."""
+    if (path / "zarr.json").is_file():
+        shutil.rmtree(path)
+    os.replace(made, path)
 
 
 def slabs(grid: Grid) -> list[tuple[int, int]]:
@@ -51,8 +67,6 @@ def levels(grid: Grid) -> list[tuple[int, int, int]]:
 
 def create(path: Path, grid: Grid) -> Any:
     """The group with its empty arrays; returns it."""
-    import zarr
-
     axes = [{"name": name, "type": "space", "unit": "millimeter"} for name in "zyx"]
     datasets: list[Any] = []
     about: Any = {"name": "attenuation [1/mm]", "axes": axes, "datasets": datasets}
@@ -119,3 +133,32 @@ def halved(values: Float32Array) -> Float32Array:
     # One after the other, so that the sums do not depend on the order of values in memory.
     total = sum((even[a, b, c] for a, b, c in product(halves, repeat=3)), np.float32(0.0))
     return np.asarray(total * np.float32(0.125), dtype=np.float32)
+
+
+class VolumeFormat:
+    """`.zarr` for flexdt (entry point `zarr`)."""
+
+    @staticmethod
+    def write(part: Path, path: Path, grid: Grid) -> Iterator[Sink]:
+        """Yield what takes the layers in order; then `part` is whole and becomes `path`."""
+        group, todo = create(part, grid), list(enumerate(slabs(grid)))
+        held: list[Float32Array] = []
+
+        def take(layers: Float32Array) -> None:
+            held.append(layers)
+            while todo and sum(map(len, held)) >= todo[0][1][1] - todo[0][1][0]:
+                number, (first, last) = todo.pop(0)
+                whole = held[0] if len(held) == 1 else np.concatenate(held)
+                put(group, grid, number, whole[: last - first])
+                held[:] = [whole[last - first :]]
+
+        yield take
+        move(part, path)
+
+    @staticmethod
+    def read(path: Path) -> tuple[Float32Array, float, Sequence[float], bool]:
+        """Values, voxel [mm], centre (x, y, z) [mm] of the first one, and that it is its."""
+        group = opened(path)
+        (scale,) = group.attrs["ome"]["multiscales"]
+        size, place = scale["datasets"][0]["coordinateTransformations"]
+        return group["0"][:], float(size["scale"][0]), place["translation"][::-1], True

@@ -13,18 +13,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zarr
 
 import flexdt as fx
 from flexdt.clients.cli.entry import run
 from flexdt.clients.datasets.dataset import load_dataset
-from flexdt.clients.reconstruction import zarr_volume
-from flexdt.clients.reconstruction.on_workers import as_made
 from flexdt.clients.reconstruction.reconstruct import VolumeRequest as Request
 from flexdt.clients.reconstruction.reconstruct import reconstruct_dataset
 from flexdt.twin.errors import LimitError, TwinError
+from flexdt_extensions.volumes import zarr_volume
+from flexdt_extensions.volumes.on_workers import as_made
 
 STUDIES = Path(__file__).parents[1] / "studies"
-zarr = pytest.importorskip("zarr", reason="the extra `batch`")
 
 SOD, SDD, VIEWS, ROWS, COLS, PIXEL = 600.0, 1059.0, 24, 96, 120, 1.19
 SHAPE, VOXEL = (150, 70, 61), 0.5
@@ -213,7 +213,7 @@ def test_what_workers_do_not_do(
     data = load_dataset(scan)
     with pytest.raises(LimitError, match=r"by fdk; not .* by sirt"):
         reconstruct_dataset(data, tmp_path / "v.zarr", Request("sirt"), workers=nullcontext(Here()))
-    monkeypatch.setattr("flexdt.clients.reconstruction.on_workers.version", lambda name: next(old))
+    monkeypatch.setattr("flexdt_extensions.volumes.on_workers.version", lambda name: next(old))
     old = iter(["0.3", "0.2", "0.2", "0.2"])
     with pytest.raises(TwinError, match=r"a worker has flexdt 0\.2, this is 0\.3"):
         reconstruct_dataset(data, tmp_path / "v.zarr", REQUEST, workers=nullcontext(Here()))

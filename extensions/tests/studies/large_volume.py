@@ -1,6 +1,7 @@
 """How long FDK by workers will take: rates of this machine, and a plan for another.
 
-    python tests/studies/large_volume.py [--nodes N] [--cores C] [--read GB/S] [--write GB/S]
+    python extensions/tests/studies/large_volume.py [--nodes N] [--cores C]
+        [--read GB/S] [--write GB/S]
 
 Measured here, with all cores: voxel updates of the backprojection, pixels filtered, pixels read and
 made line integrals (from files that the system has in memory), and voxels written as Zarr. The plan
@@ -23,9 +24,9 @@ import numpy as np
 from lab import machine
 
 import flexdt as fx
-from flexdt.clients.reconstruction import zarr_volume
 from flexdt.twin.reconstruction import fdk
 from flexdt.twin.reconstruction.fdk import filtered, ramp
+from flexdt_extensions.volumes import zarr_volume
 
 
 def seconds(work: Callable[[], object], least_s: float = 0.0) -> float:

@@ -15,21 +15,21 @@ import shutil
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Executor, Future, as_completed
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
-from flexdt.clients.extras import package
-from flexdt.clients.reconstruction import zarr_volume
-from flexdt.clients.reconstruction.volume_files import ZARR_MARK, ending, volume_writer
-from flexdt.twin.errors import TwinError
+from flexdt.clients.reconstruction.reconstruct import ScanFrames, VolumeRequest
+from flexdt.extending import volume_writer
+from flexdt.measuring import gpu
+from flexdt.twin.errors import LimitError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import Grid
-from flexdt.twin.projection.gpu import availability
 from flexdt.twin.reconstruction import Truncation, fdk_parts
+from flexdt_extensions.volumes import zarr_volume
 
 STORE: Final = "volume.zarr"
 _T = TypeVar("_T")
@@ -80,29 +80,48 @@ def make_slab(work: SlabWork, slab: int, store: Path, made_by: str) -> bool:
         raise TwinError(
             f"a worker lacks memory for a slab of {like.data.size >> 18} MiB: {error}"
         ) from None
-    return bool(availability().present)
+    return bool(gpu.availability().present)
 
 
 def fdk_on_workers(
-    work: SlabWork,
+    views: ScanFrames,
+    grid: Grid,
+    request: VolumeRequest,
     out: Path,
-    identity: object,
     pool: Executor,
     tell: Callable[[float, float], None],
 ) -> list[str]:
     """Make the slabs that are missing, then the file; returns what is doubtful.
 
     Args:
-        work: the volume.
+        views: the frames, of a data set in a folder.
+        grid: of the volume.
+        request: the volume, by FDK.
         out: the file; the slabs lie in a hidden folder beside it until all are there.
-        identity: JSON-able, what the values depend on.
         pool: of the workers.
         tell: called with slabs done and slabs to do.
 
     Raises:
-        TwinError: zarr is not installed, or as `make_slab`.
+        LimitError: another algorithm, or a data set in memory.
+        TwinError: as `make_slab`.
     """
-    package("zarr")
+    data = views.dataset
+    if request.algorithm != "fdk" or data.folder is None:
+        raise LimitError(
+            f"workers reconstruct data sets in folders, by fdk; not {data.where} by "
+            f"{request.algorithm}",
+            {"asked": request.algorithm, "allowed": ["fdk"]},
+        )
+    files = [path for i in views.indices if (path := data.frames[i].path) is not None]
+    stats = [(str(file), file.stat()) for file in (*files, *data.darks, *data.flats)]
+    identity = (
+        asdict(replace(request, png=False)), asdict(grid), views.cone_vec.rows.tolist(),
+        [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats],
+    )  # fmt: skip
+    # Workers compute for themselves what this process has computed of the data set.
+    sent = replace(views, dataset=replace(data))
+    truncation = views.truncation()
+    work = SlabWork(sent.parts, views.cone_vec, views.shape, grid, request.window, truncation)
     home, made_by = folder_of(out, identity)
     store = home / STORE
     if not store.exists():
@@ -119,9 +138,9 @@ def fdk_on_workers(
         for done, on_device in enumerate(made, 1):
             kinds.add(on_device)
             tell(done, len(missing))
-    _finish(store, out, work.grid)
+    _finish(store, out, grid)
     shutil.rmtree(home, ignore_errors=True)
-    doubts = []
+    doubts = [truncation.doubt] if truncation is not None and truncation.doubt else []
     if len(kinds) > 1:
         doubts.append("some slabs were made on devices, others on processors: last digits differ")
     return doubts
@@ -160,12 +179,10 @@ def same_version(made_by: str) -> None:
 
 def _finish(store: Path, out: Path, grid: Grid) -> None:
     """The file of a store that is whole."""
-    if ending(out) == ".zarr":
-        if (out / ZARR_MARK).is_file():
-            shutil.rmtree(out)
-        os.replace(store, out)
+    if out.suffix.lower() == ".zarr":
+        zarr_volume.move(store, out)
         return
-    values: Any = package("zarr").open_group(store, mode="r")["0"]
+    values = zarr_volume.opened(store)["0"]
     with volume_writer(out, grid) as write:
         for first, last in zarr_volume.slabs(grid):
             write(values[first:last])

@@ -1,0 +1,352 @@
+"""The flat panel: light, charge, noise, blur, fixed pattern and the converter, with provenance.
+
+A pixel collects electrons in proportion to the energy its scintillator absorbs. `Detector` holds
+the figures, and says of each default whether it is measured, from the literature or assumed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.attenuation.substances import Substance
+from flexdt.twin.attenuation.tables import tables
+from flexdt.twin.errors import LimitError, require_within
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.machine.camera import CameraSettings, PixelGrid, Roi
+from flexdt.twin.machine.description import DetectorSpec
+from flexdt.twin.physics.scintillator import deposited
+from flexdt.twin.physics.spectrum import Filter
+
+FULL_WELL_E = 1.6e6, 0.5e6
+"""Of a pixel in modes ending in High and Low: Konstantinidis et al., NIM A 689 (2012) 12, the same
+sensor family."""
+LOW_READ_NOISE = 165.0 / 360.0
+"""Read noise of modes ending in Low, as a part of that of High: the same paper."""
+DARK_E_PER_S = 2000.0
+"""Assumed: of an unbinned pixel."""
+CAMERA_MODE = "HW1SW1High"
+"""Reads out the pixels as they are."""
+USUAL_MS = 100.0
+"""Exposure of a `Detector` that states none, where no tube says how bright its images are [ms]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Detector:
+    """A flat panel with a scintillator, of any make; the defaults are the twin's, a Dexela 1512NDT
+    with CsI(Tl). What stands below each says where it comes from.
+
+    How many pixels it has and how large they are is the geometry's to say in `simulate`.
+
+    Args:
+        pixel_mm: pitch of the pixels [mm]; None for the geometry's. Another pitch than the
+            geometry's is an error.
+        exposure_ms: of one read-out [ms]; None: `flexdt.simulate` chooses it so that the brightest
+            pixel of the open beam reaches 80 % of the largest count.
+        averages: read-outs averaged into an image.
+        bits: depth, 1 to 16; counts end at 2^bits - 1.
+        electrons_per_count: conversion gain; a pixel saturates at 2^bits times that. None: so that
+            a pixel of 14 bits holds as much charge for its area as the twin's.
+        electrons_per_keV: charge for each keV that the scintillator keeps.
+        scintillator: FORMULA@DENSITY [g/cm3] without gaps, such as Gd2O2S@7.34.
+        scintillator_mm: its thickness [mm]; packing: the part of it that is not gaps.
+        swank: statistical factor of the light from one photon (1: always the same).
+        read_noise_e: standard deviation of one read-out of an image pixel [electrons].
+        offset_counts: level without charge [counts].
+        dark_e_per_s: charge of an unbinned pixel without X-rays [electrons/s]; None: as much for
+            its area as the twin's.
+        blur_mm: standard deviation of the point spread in the scintillator [mm].
+        gain_sigma, offset_sigma_counts: fixed pattern of gain (relative) and offset [counts], each
+            unbinned pixel.
+        dead_fraction: unbinned pixels that give nothing.
+        serial: seed of the fixed pattern: another panel has another one.
+        pixels: of the panel, unbinned; `simulate` takes the geometry's.
+        lag_fraction, lag_s: part of the charge left for later images of a scan on the scanner, and
+            how fast it fades [s]; `simulate` has none.
+        long_lag_fraction, long_lag_s: part of the charge that traps take from its own image there,
+            and the time constant with which they give it back [s].
+        response: measured: energy of a photon and what it leaves on average [keV], instead of what
+            is computed for the scintillator.
+
+    Raises:
+        LimitError: a figure that no detector has; says what is allowed.
+        UnknownNameError: a scintillator of an element without a table.
+
+    Example:
+        >>> Detector(bits=16, electrons_per_count=20).full_scale
+        65535
+    """
+
+    pixel_mm: float | None = None
+    """Assumed: as the geometry has it."""
+    exposure_ms: float | None = None
+    """Assumed."""
+    averages: int = 1
+    """Assumed."""
+    bits: int = 14
+    """Literature: thesis 2.3."""
+    electrons_per_count: float | None = None
+    """Literature: FULL_WELL_E over the converter's depth."""
+    electrons_per_keV: float = 16.0
+    """Assumed: between 10 and 25 for CsI(Tl) on CMOS."""
+    scintillator: str = "CsI@4.51"
+    """Literature: data sheet."""
+    scintillator_mm: float = 0.15
+    """Assumed: a usual thickness for this family."""
+    packing: float = 0.8
+    """Assumed: usual for columnar CsI."""
+    swank: float = 0.9
+    """Assumed: usual for CsI(Tl)."""
+    read_noise_e: float = 360.0
+    """Literature: Konstantinidis et al., NIM A 689 (2012) 12, the same family."""
+    offset_counts: float = 100.0
+    """Assumed."""
+    dark_e_per_s: float | None = None
+    """Assumed: DARK_E_PER_S."""
+    blur_mm: float = 0.06
+    """Assumed: half of the contrast at 3 line pairs a mm."""
+    gain_sigma: float = 0.01
+    """Assumed."""
+    offset_sigma_counts: float = 1.0
+    """Assumed."""
+    dead_fraction: float = 1e-5
+    """Assumed."""
+    serial: int = 1512
+    """Assumed."""
+    pixels: PixelGrid = field(default_factory=PixelGrid)
+    """Literature: see `PixelGrid`."""
+    lag_fraction: float = 0.002
+    """Assumed."""
+    lag_s: float = 0.5
+    """Assumed."""
+    long_lag_fraction: float = 0.0
+    """Assumed: none on CMOS; 0.001 to 0.004 of amorphous silicon (literature)."""
+    long_lag_s: float = 10.0
+    """Assumed: between the 3 and 20 s of amorphous silicon (literature)."""
+    response: tuple[tuple[float, float], ...] = ()
+    """Assumed: computed for the scintillator."""
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in _BOUNDS.items():
+            value = getattr(self, name)
+            if value is not None:
+                require_within(f"Detector: {name}", value, low, high)
+        Substance.parse(self.scintillator)
+        for name in ("bits", "averages", "serial"):
+            value = getattr(self, name)
+            if value != int(value):
+                raise LimitError(
+                    f"Detector: {name} is {value}; allowed: a whole number",
+                    {"asked": value, "allowed": "a whole number"},
+                )
+            object.__setattr__(self, name, int(value))
+
+    @classmethod
+    def ideal(cls, **figures: float) -> Detector:
+        """A detector whose only noise is that of the X-rays: no blur, pattern, dark charge,
+        dead pixels or read noise; `figures` replace fields.
+
+        Example:
+            >>> Detector.ideal(bits=16).blur_mm
+            0.0
+        """
+        nothing = dict.fromkeys(
+            ("read_noise_e", "dark_e_per_s", "blur_mm", "gain_sigma", "offset_sigma_counts",
+             "dead_fraction"),
+            0.0,
+        )  # fmt: skip
+        known = {f.name for f in fields(cls)}
+        if unknown := sorted(set(figures) - known):
+            raise LimitError(
+                f"a Detector has no {', '.join(unknown)}; allowed: {', '.join(sorted(known))}",
+                {"asked": unknown, "allowed": sorted(known)},
+            )
+        return cls(**{**nothing, **figures})  # type: ignore[arg-type]
+
+    def of_pixels(self, pixels: PixelGrid) -> Detector:
+        """This detector with the pixels of a geometry, each with the charge that its area has.
+
+        Raises:
+            LimitError: the detector states another pitch.
+
+        Example:
+            >>> Detector(electrons_per_count=20).of_pixels(PixelGrid(200, 100, 0.1)).pixels.size_mm
+            (20.0, 10.0)
+        """
+        pitch = pixels.pitch_mm
+        if self.pixel_mm is not None and abs(self.pixel_mm - pitch) > 1e-6 * pitch:
+            raise LimitError(
+                f"the detector's pixel_mm is {self.pixel_mm:g} mm, the geometry's {pitch:g} mm",
+                {"asked": self.pixel_mm, "allowed": pitch, "unit": "mm"},
+            )
+        across, up = pixels.edges_mm
+        # In pixels of the twin as it is usually read out, binned 2 x.
+        area = across * up / (2 * PixelGrid.pitch_mm) ** 2
+        gain, dark = self.electrons_per_count, self.dark_e_per_s
+        return replace(
+            self,
+            pixels=pixels,
+            electrons_per_count=FULL_WELL_E[0] * area / 2.0**self.bits if gain is None else gain,
+            dark_e_per_s=4.0 * DARK_E_PER_S * area if dark is None else dark,
+        )
+
+    def camera(self, shape: tuple[int, int]) -> CameraSettings:
+        """Settings that read out all of (rows, cols) pixels.
+
+        Example:
+            >>> Detector(exposure_ms=50).camera((100, 200)).roi
+            Roi(left=0, top=0, right=199, bottom=99)
+        """
+        roi = Roi(0, 0, shape[1] - 1, shape[0] - 1)
+        time = USUAL_MS if self.exposure_ms is None else float(self.exposure_ms)
+        return CameraSettings(CAMERA_MODE, roi, time, self.averages)
+
+    @property
+    def full_scale(self) -> int:
+        """Largest count."""
+        return (1 << self.bits) - 1
+
+    def blur_px(self, camera: CameraSettings) -> tuple[float, float]:
+        """Standard deviation of the light's spread along and across the rows [image pixels]."""
+        across, up = self.pixels.edges_mm
+        sigma = self.blur_mm / camera.binning
+        return sigma / across, sigma / up
+
+    def gain(self, camera: CameraSettings) -> float:
+        """Electrons in each count: by default the unbinned pixel's full well fills the converter's
+        depth."""
+        if self.electrons_per_count is not None:
+            return self.electrons_per_count
+        return FULL_WELL_E[_is_low(camera)] / 2.0**self.bits
+
+    def read_noise(self, camera: CameraSettings) -> float:
+        """Standard deviation of one read-out of an image pixel [electrons].
+
+        Pixels binned on the panel are read once; so are, assumed, those binned later.
+        """
+        return self.read_noise_e * (LOW_READ_NOISE if _is_low(camera) else 1.0)
+
+    def dark_charge(self, camera: CameraSettings) -> float:
+        """Charge of an image pixel without X-rays [electrons/s]."""
+        each = DARK_E_PER_S if self.dark_e_per_s is None else self.dark_e_per_s
+        return each * camera.binning**2
+
+    def figures(self) -> dict[str, float]:
+        """What it is by name, for data sets; without the camera's settings."""
+        left_out = {"pixel_mm", "exposure_ms", "averages", "electrons_per_count", "read_noise_e"}
+        if self.long_lag_fraction == 0.0:  # as before there was any, so that older scans go on
+            left_out |= {"long_lag_fraction", "long_lag_s"}
+        held = {
+            name: float(value)
+            for name, value in {**vars(self.pixels), **vars(self)}.items()
+            if isinstance(value, int | float) and name not in left_out
+        }
+        for well in ("High", "Low"):
+            camera = replace(self.camera((1, 1)), mode=f"HW1SW1{well}")
+            held[f"full_well_e_{well.lower()}"] = self.gain(camera) * 2.0**self.bits
+            held[f"read_noise_e_{well.lower()}"] = self.read_noise(camera)
+        held["dark_e_per_s"] = self.dark_charge(camera)
+        held[f"scintillator_{self.scintillator}"] = 1.0
+        return held | {f"response_{energy:g}_keV": float(left) for energy, left in self.response}
+
+    def charge_of_photons(self) -> tuple[FloatArray, FloatArray]:
+        """Mean charge of a photon of each energy [electrons], and what it adds to the variance of
+        a signal of many [electrons^2], (e,) both.
+
+        The number of photons is Poisson's, each leaves a spread energy and that a spread charge.
+        """
+        full = Substance.parse(self.scintillator)
+        layer = replace(full, density_g_cm3=full.density_g_cm3 * self.packing)
+        part, square = deposited(Filter(layer, self.scintillator_mm))
+        energy = tables().energy_keV
+        if self.response:
+            # What one photon leaves is spread as computed, for want of another measurement.
+            spread, points = square / part, np.array([(0.0, 0.0), *self.response])
+            part = np.interp(energy, *points.T) / energy
+            square = part * np.maximum(spread, part)
+        charge = energy * self.electrons_per_keV
+        mean = part * charge
+        return mean, square * charge**2 / self.swank + mean
+
+
+_BOUNDS = {
+    "pixel_mm": (1e-6, 100.0),
+    "exposure_ms": (1e-6, 1e7),
+    "averages": (1, 1_000_000),
+    "bits": (1, 16),
+    "electrons_per_count": (1e-18, 1e18),
+    "electrons_per_keV": (1e-6, 1e6),
+    "scintillator_mm": (1e-6, 100.0),
+    "packing": (1e-3, 1.0),
+    "swank": (1e-3, 1.0),
+    "read_noise_e": (0.0, 1e9),
+    "offset_counts": (0.0, 65535.0),
+    "dark_e_per_s": (0.0, 1e18),
+    "blur_mm": (0.0, 10.0),
+    "gain_sigma": (0.0, 1.0),
+    "offset_sigma_counts": (0.0, 65535.0),
+    "dead_fraction": (0.0, 1.0),
+    "serial": (0, 2**63 - 1),
+    "lag_fraction": (0.0, 1.0),
+    "lag_s": (1e-6, 1e7),
+    "long_lag_fraction": (0.0, 1.0),
+    "long_lag_s": (1e-6, 1e7),
+}
+
+
+def _is_low(camera: CameraSettings) -> bool:
+    """Whether its mode has the low full well ("High" means the full well: assumed)."""
+    return camera.mode.strip().lower().endswith("low")
+
+
+def detector_of(spec: DetectorSpec) -> Detector:
+    """The detector of a machine: its own pixels and depth, all else as for the default."""
+    return Detector(
+        pixels=spec.pixels, bits=spec.bits, long_lag_fraction=spec.long_lag_fraction,
+        long_lag_s=spec.long_lag_s, response=spec.response,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """Fixed pattern of the image pixels: gain (mean 1), offset [counts], dead (True gives 0)."""
+
+    gain: Float32Array
+    offset: Float32Array
+    dead: npt.NDArray[np.bool_]
+
+
+@lru_cache(maxsize=8)
+def pattern(panel: Detector, binning: int, roi: tuple[int, int, int, int]) -> Pattern:
+    """The fixed pattern that image pixels of a mode and region of interest show.
+
+    The unbinned pattern belongs to the panel, so every mode and region sees the same panel. An
+    image pixel is dead when more than half of its pixels are.
+
+    Args:
+        panel: the detector.
+        binning: unbinned pixels per image pixel along each side.
+        roi: left, top, right, bottom, inclusive, unbinned.
+    """
+    rng = np.random.default_rng([panel.serial])
+    shape = (panel.pixels.rows, panel.pixels.columns)
+    gain = 1.0 + panel.gain_sigma * rng.standard_normal(shape, dtype=np.float32)
+    offset = panel.offset_sigma_counts * rng.standard_normal(shape, dtype=np.float32)
+    alive = rng.random(shape, dtype=np.float32) >= panel.dead_fraction
+    b = binning
+    left, top, right, bottom = roi
+    rows, cols = (bottom - top + 1) // b, (right - left + 1) // b
+
+    def blocks(values: npt.NDArray[np.float32]) -> Float32Array:
+        part = values[top : top + rows * b, left : left + cols * b]
+        mean: Float32Array = part.reshape(rows, b, cols, b).mean(axis=(1, 3), dtype=np.float32)
+        return mean
+
+    living = blocks(alive.astype(np.float32))
+    made = Pattern(blocks(gain * alive), blocks(offset), living < 0.5)
+    for array in (made.gain, made.offset, made.dead):
+        array.flags.writeable = False
+    return made
