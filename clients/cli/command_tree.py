@@ -5,8 +5,8 @@ Command modules import what they need inside their functions, so building the tr
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from itertools import islice
 from typing import Any, Final
 
 import typer
@@ -35,7 +35,7 @@ from flexdt.clients.cli.commands.scanner import (
     snap_command,
     state_commands,
 )
-from flexdt.clients.cli.options import answering, option
+from flexdt.clients.cli.options import Json, Server, TokenFile, completed, option
 
 COMMANDS: Final[Mapping[str, Callable[..., object]]] = {
     "demo": demo_command.demo,
@@ -105,8 +105,43 @@ SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
 """Sections of the help page; commands in none of them are listed under Extensions."""
 
 
+OWN: Final[Mapping[str, str]] = {
+    "--json": "--json", "--server": "--server HOST:PORT", "--token-file": "--token-file FILE",
+}  # fmt: skip
+"""Options of `flexdt` itself that may also follow the command's name, as help pages show them."""
+
+
+def own_first(words: Sequence[str], flags: Collection[str]) -> tuple[list[str], list[str]]:
+    """The words of these options of `OWN`, and the other words."""
+    first, rest = list[str](), list[str]()
+    more = iter(words)
+    for word in more:
+        if word == "--":
+            rest += [word, *more]
+        elif word.partition("=")[0] not in flags:
+            rest.append(word)
+        else:
+            first.append(word)
+            first += islice(more, 1 if word in OWN and word != "--json" else 0)
+    return first, rest
+
+
 class InSections(TyperGroup):
-    """Lists its commands in `SECTIONS`."""
+    """Lists its commands in `SECTIONS`, and takes `OWN` wherever they are on the command line."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put the options of `flexdt` itself that the command heeds before its name."""
+        command: Any = self
+        for word in own_first(args, OWN)[1]:
+            if word[:1] != "-" and hasattr(command, "commands"):
+                command = command.commands.get(word)
+        heeds = getattr(getattr(command, "callback", None), "heeds", ())
+        first, rest = own_first(args, heeds)
+        if first and first[-1] in OWN and first[-1] != "--json":
+            ctx.fail(f"Option '{first[-1]}' requires an argument.")
+        if command not in (None, self) and rest[0].partition("=")[0] in OWN:
+            ctx.fail(f"{rest[0].partition('=')[0]} is no option of `flexdt {command.name}`")
+        return list(super().parse_args(ctx, [*first, *rest]))
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the sections of the help page."""
@@ -144,8 +179,11 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
         version: bool = option(
             False, "Print the version and exit.", "--version", callback=_version, is_eager=True
         ),
+        json: Json = False,
+        server: Server = None,
+        token_file: TokenFile = None,
     ) -> None:
-        pass
+        """What these options say, `completed` commands take from the context."""
 
     for name, command in COMMANDS.items():
         passes = name == "up" or name in ALONE
@@ -155,12 +193,12 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
         }
         if name in ALONE:
             context["help_option_names"] = []
-        app.command(name, context_settings=context)(_complete(command))
+        _add(app, name, command, context)
     groups = {}
     for name, (about, commands) in GROUPS.items():
         groups[name] = typer.Typer(help=about, no_args_is_help=True, add_completion=False)
         for one, command in commands.items():
-            groups[name].command(one)(_complete(command))
+            _add(groups[name], one, command)
         app.add_typer(groups[name], name=name)
     _add_others(app, groups, words)
     return app
@@ -182,16 +220,19 @@ def _add_others(
         group, _, one = name.rpartition(" ")
         place = groups[group] if group else app
         if command is not None:
-            place.command(one)(_complete(command))
+            _add(place, one, command)
         elif name in extension_commands.KNOWN:
             # Whatever follows the name, the answer is how to install it.
             bare = {"ignore_unknown_options": True, "help_option_names": list[str]()}
             place.command(one, context_settings=bare)(extension_commands.listed(name))
 
 
-def _complete(command: Callable[..., Any]) -> Callable[..., object]:
-    """A command as typer takes it: with --json, if it yields its answer."""
-    return answering(command) if inspect.isgeneratorfunction(inspect.unwrap(command)) else command
+def _add(app: typer.Typer, name: str, command: Callable[..., Any], context: Any = None) -> None:
+    """Add a command; its help page ends with the options of `flexdt` that it heeds."""
+    complete, heeds = completed(command)
+    complete.heeds = heeds  # type: ignore[attr-defined]
+    also = f"Also, of flexdt itself: {', '.join(OWN[flag] for flag in heeds)}" if heeds else None
+    app.command(name, context_settings=context, epilog=also)(complete)
 
 
 def _version(asked: bool) -> None:

@@ -13,9 +13,9 @@ from typing import Any
 from typer.main import get_command
 
 from flexdt.clients.cli.command_tree import SECTIONS, build
-from flexdt.clients.cli.connecting import TABLES
+from flexdt.clients.cli.settings_file import TABLES
 
-MOST_OPTIONS = 311
+MOST_OPTIONS = 218
 THEIRS = ("flexdt study", "flexdt batch", "flexdt bench", "flexdt phantom design")
 PAGE = Path(__file__).parents[2] / "docs" / "command-line.md"
 

@@ -13,6 +13,7 @@ import typer
 from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.console import note, warn
 from flexdt.clients.cli.options import Answer, argument, option
+from flexdt.clients.cli.settings_file import ExportSettings, chosen
 
 if TYPE_CHECKING:
     from flexdt.clients.datasets.exchange import Given
@@ -38,12 +39,6 @@ def export(
         metavar="FILE",
     ),
     rows: Rows = option("down", "Count rows down or up; up: for images turned upside down."),
-    tolerance: float = option(
-        1e-9,
-        "Let a view lie so far from what flexDATA can state.",
-        metavar="MM",
-        min=0.0,
-    ),
     texts: options.Texts = False,
 ) -> Answer:
     """Write a data set's geometry in another program's format; nxtomo holds its images, too.
@@ -57,6 +52,7 @@ def export(
     from flexdt.clients.launch.random_truth import read
     from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 
+    tolerance = chosen(ExportSettings).tolerance
     report = None if correction is None else read_report(correction)
     parameters = report.parameters if report else None if corrected else NOMINAL
     data = scan_of(dataset, texts, report)

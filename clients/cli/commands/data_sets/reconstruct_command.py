@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import typer
 
 from flexdt.clients.cli import option_values, options
-from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import ProgressBar, duration, note, size, warn
-from flexdt.clients.cli.options import Answer, argument, option
+from flexdt.clients.cli.options import Answer, Twin, argument, option
+from flexdt.clients.cli.settings_file import ReconstructSettings, chosen
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 Algorithm = Literal["fdk", "sirt", "sart", "cgls", "em", "tv"]
 
 
-@on_twin
 def reconstruct(
     twin: Twin,
     dataset: Path = argument(..., "DATASET"),
@@ -44,9 +43,6 @@ def reconstruct(
     every: int | None = option(None, "Use every n-th frame.", min=1),
     iterations: int | None = option(None, "Iterate so often; default: the algorithm's.", min=1),
     weight: float | None = option(None, "Weigh the total variation of tv by this.", min=0.0),
-    window: str | None = option(
-        None, "Filter FDK with ram-lak, shepp-logan, cosine, hamming or hann."
-    ),
     correction: str | None = option(
         None,
         "Apply a report's correction, or the twin's; default: the scan's.",
@@ -82,19 +78,19 @@ def reconstruct(
     """
     own = {
         "algorithm": None if algorithm == "fdk" else algorithm, "voxel": voxel, "shape": shape,
-        "binning": binning, "every": every, "iterations": iterations, "window": window,
-        "weight": weight, "center": center, "rings": rings or None, "material": material,
+        "binning": binning, "every": every, "iterations": iterations, "weight": weight,
+        "center": center, "rings": rings or None, "material": material,
         "scatter-correction": scatter_correction, "scheduler": scheduler, "slurm": slurm,
     }  # fmt: skip
     other = {"kv": kv, "correction": correction, "geometry": geometry}
-    chosen = {name: value for name, value in (own | other).items() if value is not None}
-    _check_together(chosen, out, [name for name in own if name in chosen] if preview else [])
+    given = {name: value for name, value in (own | other).items() if value is not None}
+    _check_together(given, out, [name for name in own if name in given] if preview else [])
     from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_dataset
     from flexdt.clients.reconstruction.reconstruct import preview as quick_look
 
     request = VolumeRequest(
         algorithm or "fdk", voxel, None if shape is None else _shape(shape), binning or 1,
-        every or 1, iterations, window or "ram-lak",
+        every or 1, iterations, chosen(ReconstructSettings).window,
         None if center is None else option_values.triple(center, "center", "X,Y,Z, e.g. 0,0,-5.5"),
         rings, material, kv, png, weight,
         None if scatter_correction is None else option_values.names(scatter_correction),
@@ -127,24 +123,23 @@ def reconstruct(
     yield from (f"  {file}" for file in document["slices"])
 
 
-def _check_together(chosen: Mapping[str, object], out: Path, kept_out: Iterable[str]) -> None:
+def _check_together(given: Mapping[str, object], out: Path, kept_out: Iterable[str]) -> None:
     """Usage errors of options that do not go together; a preview keeps some out."""
     from flexdt.clients.reconstruction.volume_files import SUFFIXES, ending
 
-    algorithm = chosen.get("algorithm", "fdk")
-    corrects = {"material", "scatter-correction"} & chosen.keys()
+    algorithm = given.get("algorithm", "fdk")
+    corrects = {"material", "scatter-correction"} & given.keys()
     for wrong, name, why in (
         *((True, name, "--preview chooses for itself") for name in kept_out),
         (ending(out) not in SUFFIXES, "out",
          f"{out}: the ending must be one of {', '.join(SUFFIXES)}"),
-        ("kv" in chosen and not corrects, "kv", "it is for --material and --scatter-correction"),
-        ("iterations" in chosen and algorithm == "fdk", "iterations", "fdk has none"),
-        ("weight" in chosen and algorithm != "tv", "weight", f"{algorithm} has none"),
-        ("window" in chosen and algorithm != "fdk", "window", f"{algorithm} has no filter"),
-        ({"scheduler", "slurm"} <= chosen.keys(), "slurm", "not together with --scheduler"),
+        ("kv" in given and not corrects, "kv", "it is for --material and --scatter-correction"),
+        ("iterations" in given and algorithm == "fdk", "iterations", "fdk has none"),
+        ("weight" in given and algorithm != "tv", "weight", f"{algorithm} has none"),
+        ({"scheduler", "slurm"} <= given.keys(), "slurm", "not together with --scheduler"),
         *((algorithm != "fdk", name, f"{algorithm} is not done by workers; allowed: fdk")
-          for name in ("scheduler", "slurm") if name in chosen),
-        ({"correction", "geometry"} <= chosen.keys(), "correction",
+          for name in ("scheduler", "slurm") if name in given),
+        ({"correction", "geometry"} <= given.keys(), "correction",
          "no correction is added to a geometry from a file"),
     ):  # fmt: skip
         if wrong:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from flexdt.clients.cli import options
-from flexdt.clients.cli.console import emit, note, say
-from flexdt.clients.cli.options import option
+from flexdt.clients.cli.console import note, say
+from flexdt.clients.cli.options import Answer, option
 
 
 def demo(
@@ -16,8 +15,8 @@ def demo(
     truth: Path | None = option(
         None, "Hide this misalignment; default: a random one.", metavar="FILE"
     ),
-    json: options.Json = False,
-) -> None:
+    json: bool = False,
+) -> Answer:
     """Do the main job: script, scan, data set, calibration.
 
     Starts the servers on free ports, scans the LEGO bead phantom with the example script,
@@ -34,6 +33,4 @@ def demo(
         except KeyboardInterrupt:
             note("")
 
-    document = run_demo(out, truth, note if json else say, None if no_viewer else stay)
-    if json:
-        emit(document)
+    yield run_demo(out, truth, note if json else say, None if no_viewer else stay)

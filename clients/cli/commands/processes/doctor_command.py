@@ -6,26 +6,25 @@ from pathlib import Path
 
 import typer
 
-from flexdt.clients.cli.options import Answer, option
+from flexdt.clients.cli.options import Answer
+from flexdt.clients.cli.settings_file import chosen
+from flexdt.process_settings import UpSettings
 
 MARKS = {"ok": "ok     ", "warning": "warning", "error": "ERROR  "}
 
 
-def doctor(
-    data: Path = option(Path("data"), "Check the directory of data sets.", metavar="DIR"),
-    port: int = option(55000, "Check the twin's port."),
-    projector_port: int = option(55001, "Check the projector's port."),
-    viewer_port: int = option(8080, "Check the viewer's port."),
-) -> Answer:
+def doctor() -> Answer:
     """Check this installation: Python, packages, compiled kernels, threads, GPU, ports, disk.
 
-    Ends with exit code 1 when something is wrong; warnings alone are fine.
+    Ports and data directory are those that `flexdt up` would use. Ends with exit code 1 when
+    something is wrong; warnings alone are fine.
     """
     from flexdt.clients.launch.doctor import examine
 
-    ports = (("twin", port), ("projector", projector_port), ("viewer", viewer_port))
+    up = chosen(UpSettings)
+    ports = (("twin", up.port), ("projector", up.projector_port), ("viewer", up.viewer_port))
     findings = []
-    for finding in examine(data, ports):
+    for finding in examine(up.data or Path("data"), ports):
         findings.append(finding)
         advice = f" -> {finding.advice}" if finding.advice else ""
         yield f"{MARKS[finding.verdict]}  {finding.what}: {finding.found}{advice}"

@@ -17,15 +17,8 @@ from typing import Annotated, Any, Final, Literal
 import typer
 
 from flexdt.clients.cli import option_values
-from flexdt.clients.cli.connecting import TABLES, configuration
-from flexdt.process_settings import (
-    TwinSettings,
-    UpSettings,
-    has_parameters,
-    parameters,
-    read,
-    words,
-)
+from flexdt.clients.cli.settings_file import TABLES, settings_of
+from flexdt.process_settings import UpSettings, has_parameters, parameters, words
 
 MODULES: Final = {
     "up": "flexdt.clients.launch.up",
@@ -87,10 +80,7 @@ gateway = alone(
 
 def start(name: str, more: Sequence[str]) -> None:
     """Become a process, with the settings file's options and then those of `more` words."""
-    kind, own = TABLES[name], configuration()
-    writes = issubclass(kind, UpSettings | TwinSettings)
-    data = {"data": own.data or str(TwinSettings().data)} if writes else {}
-    settings = read(kind, [*words({**data, **own.processes.get(name, {})}), *more])
+    settings = settings_of(TABLES[name], more)
     if settings is not None:
         given = {f.name: getattr(settings, f.name) for f in fields(settings)}
         _check(given)

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 from flexdt import machines
 from flexdt.clients.cli import options
 from flexdt.clients.cli.boundary import REFUSED, USAGE
-from flexdt.clients.cli.console import emit, note, say
-from flexdt.clients.cli.options import argument, option
+from flexdt.clients.cli.console import note, say
+from flexdt.clients.cli.options import Answer, argument, option
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -49,8 +49,8 @@ def follow(
     seconds: float | None = option(
         None, "End after so many seconds.", "--for", metavar="S", min=0.0
     ),
-    json: options.Json = False,
-) -> None:
+    json: bool = False,
+) -> Answer:
     """Follow a real scanner: hear its messages, compare, and say what leaves the prediction.
 
     Nothing is ever sent to the scanner. Ends with Ctrl-C or after --for. Exit code 4 if there was
@@ -86,8 +86,7 @@ def follow(
         except* zmq.ZMQError as group:
             why = "; ".join(map(str, group.exceptions))
             raise CommandError(f"{at}: {why}", REFUSED) from None
-    if json:
-        emit({"address": at, "unread": session.unread, **session.mirror.to_dict(session.clock())})
+    yield {"address": at, "unread": session.unread, **session.mirror.to_dict(session.clock())}
     if session.mirror.heard_s is None and not session.mirror.connected:
         raise CommandError(f"{at}: there has been no connection", REFUSED)
 

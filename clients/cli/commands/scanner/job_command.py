@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import duration, table, warn
-from flexdt.clients.cli.options import Answer
+from flexdt.clients.cli.options import Answer, Twin
 
 if TYPE_CHECKING:
     from flexdt.clients.client.client import TwinClient
@@ -20,7 +19,6 @@ Job = Annotated[
 ]
 
 
-@on_twin
 def list_jobs(twin: Twin) -> Answer:
     """List all jobs, oldest first."""
     with twin() as client:
@@ -34,7 +32,6 @@ def list_jobs(twin: Twin) -> Answer:
 def _on_job(does: str, act: Callable[[TwinClient, str | None], JobStatus]) -> Callable[..., Answer]:
     """A command that does something with one job and shows how the job is then."""
 
-    @on_twin
     def command(twin: Twin, job: Job = None) -> Answer:
         with twin() as client:
             status = act(client, job)

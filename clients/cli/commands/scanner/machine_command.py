@@ -11,8 +11,9 @@ import typer
 from flexdt import machines
 from flexdt.clients.cli import option_values
 from flexdt.clients.cli.commands.scanner.script_commands import read_log_file, tell
-from flexdt.clients.cli.console import say, table
+from flexdt.clients.cli.console import table
 from flexdt.clients.cli.options import Answer, argument, option
+from flexdt.clients.cli.settings_file import MachineNewSettings, chosen
 
 if TYPE_CHECKING:
     from flexdt.twin.machine.description import Axis, Machine
@@ -47,16 +48,17 @@ def show(name: NameOrFile) -> Answer:
     yield "\n" + _times(found)
 
 
-def check(name: NameOrFile) -> None:
+def check(name: NameOrFile) -> Answer:
     """Check a machine file: every value, its zero offsets, and whether it can stand at home."""
     from flexdt.twin.collision.home_check import check_home
 
     found = machines.machine(name)
     check_home(found, machines.profile(None, found, name), name)
-    say(f"{name}: ok ({len(found.axes)} axes, {len(found.components)} components)\n")
-    say(_places(found))
+    yield {"ok": True, "axes": len(found.axes), "components": len(found.components)}
+    yield f"{name}: ok ({len(found.axes)} axes, {len(found.components)} components)\n"
+    yield _places(found)
     if not found.components:
-        say("\nno components: nothing is checked for collisions")
+        yield "\nno components: nothing is checked for collisions"
 
 
 def new(
@@ -65,7 +67,6 @@ def new(
     base: str | None = option(
         None, "Begin with this machine, the one it is most like.", metavar="NAME"
     ),
-    scanner: str | None = option(None, "Name it so in data sets.", metavar="TEXT"),
     detector: str | None = option(
         None, "Set the detector's unbinned columns and rows.", metavar="COLUMNSxROWS"
     ),
@@ -81,7 +82,7 @@ def new(
         None, "Set the travel of an axis.", metavar="AXIS=LOWER:UPPER"
     ),
     without: list[str] | None = option(None, "Leave out this axis.", metavar="AXIS"),
-) -> None:
+) -> Answer:
     """Write a short file for a machine of your own; asks for what is not said, on a terminal."""
     from flexdt.twin.collision.home_check import check_home
     from flexdt.twin.machine.description import builtin_machine, builtin_machines, parse_machine
@@ -113,7 +114,7 @@ def new(
     answers = Answers(
         name=name,
         base=base,
-        scanner=scanner,
+        scanner=chosen(MachineNewSettings).scanner,
         columns=None if pixels is None else int(pixels[0]),
         rows=None if pixels is None else int(pixels[1]),
         pitch_mm=None if pitch is None else _pair(pitch, "--pitch"),
@@ -131,8 +132,11 @@ def new(
     check_home(made, machines.profile(None, made, str(out)), str(out))
     out.write_text(text, encoding="utf-8")
     least = f", the tube's least voltage ({made.tube.min_kV:g} kV) included"
-    say(f"{out}: {len(text.splitlines())} lines; everything else as in {base}"
-        f"{least if answers.min_kV is None else ''}; see: flexdt machine show {out}")  # fmt: skip
+    yield {"file": str(out), "text": text}
+    yield (
+        f"{out}: {len(text.splitlines())} lines; everything else as in {base}"
+        f"{least if answers.min_kV is None else ''}; see: flexdt machine show {out}"
+    )
 
 
 def _pair(word: str, what: str, *, whole: bool = False) -> tuple[float, float]:

@@ -13,9 +13,8 @@ import typer
 
 from flexdt.clients.cli import option_values
 from flexdt.clients.cli.boundary import REFUSED
-from flexdt.clients.cli.connecting import Twin, on_twin
-from flexdt.clients.cli.console import duration, note, say, warn
-from flexdt.clients.cli.options import Answer, argument, option
+from flexdt.clients.cli.console import duration, note, warn
+from flexdt.clients.cli.options import Answer, Twin, argument, option
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -31,7 +30,6 @@ JOG_RENEWED = 0.3
 JOG_POLL_S = 0.002
 
 
-@on_twin
 def move(
     twin: Twin,
     targets: list[str] = argument(..., "AXIS=VALUE...", "mm or deg, script's sign."),
@@ -58,7 +56,6 @@ def move(
     yield f"{verb} {duration(done.duration_s)} of the twin's clock"
 
 
-@on_twin
 def jog(
     twin: Twin,
     axis: str = argument(..., "AXIS"),
@@ -66,7 +63,7 @@ def jog(
     seconds: str | None = option(
         None, "Stop after so many seconds of the twin's clock.", "--for", metavar="SECONDS"
     ),
-) -> None:
+) -> Answer:
     """Move an axis at a velocity until Ctrl-C, or for a time."""
     speed = option_values.number(velocity, "the velocity")
     lasting = math.inf if seconds is None else option_values.number(seconds, "--for")
@@ -80,7 +77,8 @@ def jog(
             note("")
         client.jog(axis, 0.0)
         position = client.state().axes[axis]
-    say(f"{axis} braking at {position.position:.4f} {position.unit}")
+    yield position
+    yield f"{axis} braking at {position.position:.4f} {position.unit}"
 
 
 def _lease(client: TwinClient, axis: str, speed: float, seconds: float) -> None:
@@ -110,7 +108,6 @@ def _lease(client: TwinClient, axis: str, speed: float, seconds: float) -> None:
         left -= min(lease, now.time - begun)
 
 
-@on_twin
 def stop(twin: Twin) -> Answer:
     """Bring all motors to rest (pauses a running job)."""
     with twin() as client:
@@ -119,7 +116,6 @@ def stop(twin: Twin) -> Answer:
     yield f"{_rest(current)}; a running job is paused"
 
 
-@on_twin
 def estop(twin: Twin) -> Answer:
     """Emergency stop: everything halts, X-rays off."""
     with twin() as client:
@@ -138,7 +134,6 @@ def _rest(state: Stopped) -> str:
     return f"at rest in {stopping.duration_s:.3g} s: {', '.join(ways)}{hit}"
 
 
-@on_twin
 def reset(twin: Twin) -> Answer:
     """Leave the emergency stop."""
     with twin() as client:

@@ -14,6 +14,7 @@ import typer
 from flexdt.clients.cli import option_values
 from flexdt.clients.cli.console import note, table
 from flexdt.clients.cli.options import Answer, argument, option
+from flexdt.clients.cli.settings_file import PhantomMakeSettings, chosen
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -41,7 +42,6 @@ def make(
     beads: int = option(5, "Put so many beads on a spiral.", metavar="K"),
     radius: float = option(2.0, "Set the beads' radius.", metavar="MM"),
     body: str = option("abs", "Make the body of this material.", metavar="MATERIAL"),
-    bead: str = option("steel", "Make the beads of this material.", metavar="MATERIAL"),
     mesh: Path | None = option(None, "Fill this mesh: STL, OBJ, PLY, GLB or OFF.", metavar="FILE"),
     unit: str | None = option(None, "Read the mesh in this unit; default: mm, for GLB m."),
     stl: Path | None = option(None, "Write its surfaces, too, to print it.", metavar="FILE.stl"),
@@ -62,7 +62,7 @@ def make(
             beads,
             bead_radius_mm=radius,
             body_material=body,
-            bead_material=bead,
+            bead_material=chosen(PhantomMakeSettings).bead,
         )
     file.write_text(json_text.dumps(made.to_dict()), encoding="utf-8")
     if stl is not None:

@@ -7,12 +7,10 @@ from typing import Literal
 
 import typer
 
-from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import warn
-from flexdt.clients.cli.options import Answer, argument, option
+from flexdt.clients.cli.options import Answer, Twin, argument, option
 
 
-@on_twin
 def sample(
     twin: Twin,
     name: str | None = argument(

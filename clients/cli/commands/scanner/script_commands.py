@@ -24,9 +24,9 @@ from flexdt.clients.cli.boundary import (
 )
 from flexdt.clients.cli.commands.scanner.job_command import describe
 from flexdt.clients.cli.commands.scanner.snap_command import warn_of_exposure
-from flexdt.clients.cli.connecting import Twin, on_twin
-from flexdt.clients.cli.console import ProgressBar, duration, emit, note, say, size, table, warn
-from flexdt.clients.cli.options import Answer, option
+from flexdt.clients.cli.console import ProgressBar, duration, note, size, table, warn
+from flexdt.clients.cli.options import Answer, Twin, option
+from flexdt.clients.cli.settings_file import ScriptNewSettings, chosen
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -53,14 +53,14 @@ def check(
     against: Path | None = option(
         None, "Compare with the log of this script, line by line.", metavar="LOG"
     ),
-    json: options.Json = False,
-) -> None:
+    json: bool = False,
+) -> Answer:
     """Parse, plan and check a script, without a server.
 
     Exit code 0 with warnings alone, 1 for an invalid script, 3 for a collision or limit.
     """
     if against is not None:
-        compare(script, against, machine, html, json)
+        yield from compare(script, against, machine, html)
         return
     from flexdt.phantoms.samples import as_phantom
     from flexdt.scripts import collisions, size_of
@@ -68,14 +68,14 @@ def check(
     from flexdt.twin.script.problems import in_order
 
     data = script.read_bytes()
-    chosen = machines.machine(machine)
+    scanner = machines.machine(machine)
     phantom = None if sample is None else as_phantom(sample)
     report = check_script(
         data,
-        chosen,
-        machines.profile(profile, chosen, machine),
+        scanner,
+        machines.profile(profile, scanner, machine),
         sample=size_of(phantom),
-        collision=collisions(phantom) if chosen.components else None,
+        collision=collisions(phantom) if scanner.components else None,
     )
     if phantom is not None and not report.errors:
         from flexdt.phantoms.exposure_forecast import exposure_problems
@@ -84,11 +84,14 @@ def check(
         report = replace(report, problems=in_order((*report.problems, *more)))
     if html is not None:
         html.write_text(html_report(report, script.name), encoding="utf-8")
-    emit(report.to_dict()) if json else show(report, str(script))
+    yield report.to_dict()
+    if not json:
+        tell(report.problems, str(script))
+    yield from show(report, str(script))
     raise typer.Exit(exit_code(report))
 
 
-def compare(script: Path, log: Path, machine: str | None, html: Path | None, json: bool) -> None:
+def compare(script: Path, log: Path, machine: str | None, html: Path | None) -> Answer:
     """Each line of an executed script beside its prediction, the greatest errors first.
 
     Raises:
@@ -109,11 +112,9 @@ def compare(script: Path, log: Path, machine: str | None, html: Path | None, jso
     tell(found.problems, str(log))
     if html is not None:
         html.write_text(against_html(found, script.name), encoding="utf-8")
-    if json:
-        emit(found.to_dict())
-        return
-    say(table(found.table(), found.HEADER) + "\n")
-    say(table([(f"{label}:", value) for label, value in against_summary(found)]))
+    yield found.to_dict()
+    yield table(found.table(), found.HEADER) + "\n"
+    yield table([(f"{label}:", value) for label, value in against_summary(found)])
 
 
 def read_log_file(log: Path) -> tuple[Executed, ...]:
@@ -147,12 +148,11 @@ def tell(problems: Sequence[Problem], file: str) -> None:
         note(f"{place}: {p.severity}: {p.message} [{p.code}]")
 
 
-def show(report: CheckReport, file: str) -> None:
-    """A check for people: problems to standard error, figures and plan to standard output."""
+def show(report: CheckReport, file: str) -> Answer:
+    """The plan and the figures of a check."""
     from flexdt.twin.script.planning.dry_run_report import between, summary
     from flexdt.twin.script.planning.plan import step_range
 
-    tell(report.problems, file)
     timing = report.plan.machine.timing
     steps = [
         (s.line, f"{s.start_s:.2f}", f"{s.duration_s:.2f}", between(step_range(s, timing)),
@@ -161,12 +161,11 @@ def show(report: CheckReport, file: str) -> None:
     ]  # fmt: skip
     if steps:
         head = ("line", "start [s]", "takes [s]", "90 %", "of it commands", "what")
-        say(table(steps, head) + "\n")
-    say(table([(f"{label}:", value) for label, value in summary(report)]))
-    say(f"{file}: {'ok' if report.ok else 'not ok'}")
+        yield table(steps, head) + "\n"
+    yield table([(f"{label}:", value) for label, value in summary(report)])
+    yield f"{file}: {'ok' if report.ok else 'not ok'}"
 
 
-@on_twin
 def run(
     twin: Twin,
     script: ScriptFile,
@@ -268,9 +267,6 @@ def new(
     ),
     sod: float | None = option(None, USUAL, metavar="MM"),
     sdd: float | None = option(None, USUAL, metavar="MM"),
-    height: float | None = option(
-        None, "Set the height of source and detector centre.", metavar="MM"
-    ),
     frames: int = option(361, "Take so many images in a turn, or in all."),
     exposure: float = option(100.0, "Expose each image so long.", metavar="MS"),
     averages: int = option(1, "Average so many read-outs in an image."),
@@ -300,7 +296,7 @@ def new(
         kind=kind,
         sod_mm=sod,
         sdd_mm=sdd,
-        height_mm=height,
+        height_mm=chosen(ScriptNewSettings).height,
         frames=frames,
         exposure_ms=exposure,
         averages=averages,

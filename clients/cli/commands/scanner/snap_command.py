@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
-from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import note
-from flexdt.clients.cli.options import Answer, argument, option
+from flexdt.clients.cli.options import Answer, Twin, argument, option
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -20,7 +19,6 @@ if TYPE_CHECKING:
 SUFFIXES = (".tif", ".tiff", ".png")
 
 
-@on_twin
 def snap(
     twin: Twin,
     file: Path = argument(..., "FILE.{tif,png}"),

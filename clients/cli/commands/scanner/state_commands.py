@@ -8,15 +8,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from flexdt.clients.cli import option_values, options
-from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import table
-from flexdt.clients.cli.options import Answer, argument, option
+from flexdt.clients.cli.options import Answer, Twin, argument, option
 
 if TYPE_CHECKING:
     from flexdt.protocol.state_model import AxisState, State, TubeState
 
 
-@on_twin
 def state(twin: Twin) -> Answer:
     """Show axes, geometry, tube, camera, sample, safety, job."""
     with twin() as client:
@@ -64,7 +62,6 @@ def _facts(state: State) -> list[tuple[str, str]]:
     return facts
 
 
-@on_twin
 def tube(
     twin: Twin,
     kV: float | None = option(None, "Set the tube's voltage.", "--kv"),
@@ -88,7 +85,6 @@ def xrays(tube: TubeState) -> str:
     return "on" if tube.on else "off"
 
 
-@on_twin
 def camera(
     twin: Twin,
     exposure_ms: float | None = option(None, "Set the exposure time.", "--exposure", metavar="MS"),
@@ -108,7 +104,6 @@ def camera(
            f"averages {c.averages}, ROI {' '.join(map(str, c.roi))}")  # fmt: skip
 
 
-@on_twin
 def clock(twin: Twin, speed_up: str = argument(..., "X or max")) -> Answer:
     """Set how fast the twin's time runs."""
     wanted = option_values.speed_up(speed_up)
