@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -24,30 +25,43 @@ from flexdt.protocol.openrpc import document
 
 ROOT = Path(__file__).parents[2]
 WEB, BUILT = ROOT / "clients" / "viewer" / "web", ROOT / "clients" / "viewer" / "data"
+SOURCE = "".join(
+    path.read_text("utf-8") for path in sorted(WEB.glob("*.ts")) if path.name != "wire.d.ts"
+)
 COLUMNS = 120
 HEAD = """\
 // Written by tests/viewer/test_page_source.py from the OpenRPC document of the wire and of the
-// viewer's own methods. Answers have all their fields; what a request may leave out bears a "?".
+// viewer's own methods: the methods that the page calls, and the types that it names.
+// Answers have all their fields; what a request may leave out bears a "?".
 """
 
 
 def types() -> str:
-    """TypeScript of every type of the wire and of what a page may request."""
+    """TypeScript of the methods that the page calls and of the types that it names."""
     own = {
         name: Method(name, asked, METHODS[name].result if name in METHODS else Nothing, name)
         for name, (asked, _) in PAGE_METHODS.items()
     }
-    table = {**METHODS, **own}
-    schemas = document(table)["components"]["schemas"]
+    table = {name: m for name, m in {**METHODS, **own}.items() if called(name)}
+    schemas = document({**METHODS, **own})["components"]["schemas"]
+    answers = [m for m in table.values() if m.name in METHODS]
     asked = within([m.params.__name__ for m in table.values()], schemas)
+    imported = ",".join(re.findall(r"^import type \{(.*?)\}", SOURCE, re.MULTILINE | re.DOTALL))
+    named = [name for name in map(str.strip, imported.split(",")) if name in schemas]
+    used = asked | within([*named, *(m.result.__name__ for m in answers)], schemas)
     lines = [HEAD]
-    for name, schema in sorted(schemas.items()):
-        lines.append(f"export type {name} = {typed(schema, name in asked)};\n")
+    for name in sorted(used):
+        lines.append(f"export type {name} = {typed(schemas[name], name in asked)};\n")
     lines.append("\nexport interface Requests {\n")
     lines += [f'  "{m.name}": {m.params.__name__};\n' for m in table.values()]
     lines.append("}\nexport interface WireAnswers {\n")
-    lines += [f'  "{m.name}": {m.result.__name__};\n' for m in METHODS.values()]
+    lines += [f'  "{m.name}": {m.result.__name__};\n' for m in answers]
     return "".join([*lines, "}\n"])
+
+
+def called(name: str) -> bool:
+    """Whether the page names a method, by itself or by its group (`job.${action}`)."""
+    return f'"{name}"' in SOURCE or f"`{name.split('.')[0]}.${{" in SOURCE
 
 
 def within(names: list[str], schemas: Mapping[str, Any]) -> set[str]:

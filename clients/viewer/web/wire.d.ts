@@ -1,15 +1,6 @@
 // Written by tests/viewer/test_page_source.py from the OpenRPC document of the wire and of the
-// viewer's own methods. Answers have all their fields; what a request may leave out bears a "?".
-export type AxisSet = {
-  axis: string;
-  speed?: number | null;
-  acceleration?: number | null;
-};
-export type AxisSetResult = {
-  axis: string;
-  speed: number;
-  acceleration: number;
-};
+// viewer's own methods: the methods that the page calls, and the types that it names.
+// Answers have all their fields; what a request may leave out bears a "?".
 export type AxisState = {
   position: number;
   target: number;
@@ -56,9 +47,6 @@ export type CalibrationFitResult = {
   steps: Array<CalibrationStep>;
   tracks: Record<string, JsonValue> | null;
   problems: Array<CalibrationProblem>;
-};
-export type CalibrationGet = {
-  name?: string | null;
 };
 export type CalibrationProblem = {
   code: string;
@@ -118,9 +106,6 @@ export type CheckStep = {
   duration_s: number;
   what: string;
 };
-export type ClockSet = {
-  speed_up: number | "max";
-};
 export type ClockState = {
   time_s: number;
   speed_up: number | "max";
@@ -169,29 +154,6 @@ export type CorrectionResult = {
   correction: Correction | null;
   warnings: Array<string>;
 };
-export type DatasetFrame = {
-  name: string;
-  index: number;
-  kind?: "line_integral" | "counts";
-  binning?: number;
-};
-export type DatasetFrameResult = {
-  dtype: "uint8" | "int16" | "uint16" | "int32" | "uint32" | "float32" | "float64";
-  shape: Array<number>;
-  data: string;
-  name: string;
-  index: number;
-  file: string;
-  image: "dark" | "flat" | "projection";
-  projection: number | null;
-  kind: "line_integral" | "counts";
-  time_s: number | null;
-  exposure_ms: number | null;
-  positions: Record<string, number> | null;
-  cone_vec: Array<number> | null;
-  tube: Record<string, JsonValue> | null;
-  camera: Record<string, JsonValue> | null;
-};
 export type DatasetGet = {
   name: string;
   points?: number;
@@ -218,12 +180,6 @@ export type DatasetInfo = {
   problem: string;
   thumbnail: ImageValue | null;
 };
-export type DatasetList = {
-  search?: string;
-  start?: number;
-  count?: number;
-  thumbnail?: number;
-};
 export type DatasetListResult = {
   datasets: Array<DatasetInfo>;
   total: number;
@@ -248,11 +204,6 @@ export type DatasetResult = {
 export type Datasets = {
   search?: string;
   start?: number;
-};
-export type Discovery = {
-  openrpc: string;
-  info: Record<string, JsonValue>;
-  methods: Array<Record<string, JsonValue>>;
 };
 export type Empty = Record<string, never>;
 export type Estimated = {
@@ -292,11 +243,6 @@ export type ExposurePrediction = {
 export type Feed = {
   kind: "line_integral" | "counts";
 };
-export type GeometryResult = {
-  cone_vec: Array<number>;
-  detector_shape: [number, number];
-  pixel_mm: number;
-};
 export type GeometryState = {
   SOD_mm: number;
   SDD_mm: number;
@@ -306,11 +252,6 @@ export type GeometryState = {
   field_of_view_mm: [number, number];
   cone_angle_deg: number | null;
   axis_column_px: number | null;
-};
-export type Hello = {
-  protocol: string | number;
-  client: string;
-  token?: string | null;
 };
 export type HelloResult = {
   protocol: string;
@@ -402,7 +343,6 @@ export type MoveResult = {
   moves: Array<Record<string, number>> | null;
   arrived: boolean | null;
 };
-export type Nothing = Record<string, unknown>;
 export type Placement = {
   x?: number;
   y?: number;
@@ -413,9 +353,6 @@ export type Placement = {
 };
 export type Plan = {
   text?: string | null;
-};
-export type Pong = {
-  time: number;
 };
 export type PredictedSetting = {
   kV: number;
@@ -432,32 +369,8 @@ export type Problem = {
   column: number | null;
   message: string;
 };
-export type Projection = {
-  dtype: "uint8" | "int16" | "uint16" | "int32" | "uint32" | "float32" | "float64";
-  shape: Array<number>;
-  data: string;
-  cone_vec: Array<number>;
-  kind: "line_integral" | "counts";
-  time: number | null;
-  flags: ImageFlags | null;
-  marks: ImageValue | null;
-};
-export type ProjectionGet = {
-  kind?: "line_integral" | "counts";
-  binning?: number;
-  marks?: boolean;
-  positions?: Record<string, number> | null;
-  tube?: TubeSet | null;
-  camera?: CameraSet | null;
-};
 export type Ray = {
   pixel?: [number, number] | null;
-};
-export type RayGet = {
-  pixel: [number, number];
-};
-export type RayResult = {
-  paths_mm: Record<string, number>;
 };
 export type Recorded = {
   name?: string | null;
@@ -491,18 +404,6 @@ export type SampleInfo = {
 export type SampleListResult = {
   samples: Array<SampleInfo>;
   materials: Array<string>;
-};
-export type SampleMesh = {
-  start?: number;
-  count?: number;
-};
-export type SampleMeshResult = {
-  name: string;
-  revision: string | null;
-  format: "stl";
-  total: number;
-  start: number;
-  data: string;
 };
 export type SamplePart = {
   name: "" | string;
@@ -631,22 +532,8 @@ export type SubmitResult = {
   dataset: string | null;
   warnings: Array<string>;
 };
-export type Subscribe = {
-  topics: Array<"state" | "projection" | "job" | "log">;
-  max_rate_hz?: number | null;
-  projection_kind?: "line_integral" | "counts";
-  projection_binning?: number;
-};
 export type Theme = {
   dark?: boolean;
-};
-export type TrajectoryInput = {
-  poses: Array<Record<string, number>>;
-  exposure_ms?: number | null;
-  name?: string | null;
-  speed_up?: number | "max" | null;
-  motion_samples?: number;
-  seed?: number | null;
 };
 export type TransmissionShares = {
   least: number;
@@ -673,9 +560,6 @@ export type TubeState = {
   ready: boolean;
   ready_in_s: number | null;
 };
-export type Unsubscribe = {
-  topics: Array<"state" | "projection" | "job" | "log">;
-};
 export type UploadResult = {
   name: string;
   received: number;
@@ -689,51 +573,34 @@ export type Window = {
 };
 
 export interface Requests {
-  "session.hello": Hello;
   "session.control": Control;
-  "session.ping": Empty;
-  "state.get": Empty;
-  "state.subscribe": Subscribe;
-  "state.unsubscribe": Unsubscribe;
   "axes.move": Move;
   "axes.jog": Jog;
-  "axes.set": AxisSet;
   "axes.stop": Empty;
   "safety.estop": Empty;
   "safety.reset": Reset;
-  "clock.set": ClockSet;
   "tube.set": TubeSet;
   "camera.set": CameraSet;
   "sample.set": SampleSet;
   "sample.list": Empty;
-  "sample.mesh": SampleMesh;
   "sample.upload": SampleUpload;
-  "projection.get": ProjectionGet;
-  "projection.ray": RayGet;
-  "geometry.get": Empty;
   "exposure.predict": ExposurePredict;
   "script.check": ScriptInput;
   "script.submit": ScriptInput;
-  "trajectory.check": TrajectoryInput;
-  "trajectory.submit": TrajectoryInput;
   "job.status": JobRef;
   "job.pause": JobRef;
   "job.resume": JobRef;
   "job.step": JobRef;
   "job.abort": JobRef;
   "job.list": Empty;
-  "dataset.list": DatasetList;
   "dataset.get": DatasetGet;
-  "dataset.frame": DatasetFrame;
   "calibration.apply": Correct;
-  "calibration.get": CalibrationGet;
   "calibration.list": Empty;
   "calibration.revert": Empty;
   "calibration.fit": CalibrationFit;
   "calibration.align": CalibrationAlign;
   "scene.save": SceneSave;
   "scene.load": SceneLoad;
-  "rpc.discover": Empty;
   "viewer.layers": Layers;
   "viewer.theme": Theme;
   "viewer.camera": Camera;
@@ -752,49 +619,32 @@ export interface Requests {
   "viewer.export": Export;
 }
 export interface WireAnswers {
-  "session.hello": HelloResult;
   "session.control": ControlResult;
-  "session.ping": Pong;
-  "state.get": State;
-  "state.subscribe": Nothing;
-  "state.unsubscribe": Nothing;
   "axes.move": MoveResult;
   "axes.jog": MoveResult;
-  "axes.set": AxisSetResult;
   "axes.stop": Stopped;
   "safety.estop": Stopped;
   "safety.reset": State;
-  "clock.set": ClockState;
   "tube.set": TubeState;
   "camera.set": CameraState;
   "sample.set": SampleResult;
   "sample.list": SampleListResult;
-  "sample.mesh": SampleMeshResult;
   "sample.upload": UploadResult;
-  "projection.get": Projection;
-  "projection.ray": RayResult;
-  "geometry.get": GeometryResult;
   "exposure.predict": ExposurePrediction;
   "script.check": CheckResult;
   "script.submit": SubmitResult;
-  "trajectory.check": CheckResult;
-  "trajectory.submit": SubmitResult;
   "job.status": JobStatus;
   "job.pause": JobStatus;
   "job.resume": JobStatus;
   "job.step": JobStatus;
   "job.abort": JobStatus;
   "job.list": JobListResult;
-  "dataset.list": DatasetListResult;
   "dataset.get": DatasetResult;
-  "dataset.frame": DatasetFrameResult;
   "calibration.apply": CorrectionResult;
-  "calibration.get": CorrectionResult;
   "calibration.list": CorrectionListResult;
   "calibration.revert": CorrectionResult;
   "calibration.fit": CalibrationFitResult;
   "calibration.align": CalibrationAlignResult;
   "scene.save": SceneResult;
   "scene.load": State;
-  "rpc.discover": Discovery;
 }
