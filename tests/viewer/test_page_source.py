@@ -52,10 +52,11 @@ def types() -> str:
     lines = [HEAD]
     for name in sorted(used):
         lines.append(f"export type {name} = {typed(schemas[name], name in asked)};\n")
-    lines.append("\nexport interface Requests {\n")
-    lines += [f'  "{m.name}": {m.params.__name__};\n' for m in table.values()]
-    lines.append("}\nexport interface WireAnswers {\n")
-    lines += [f'  "{m.name}": {m.result.__name__};\n' for m in answers]
+    lines.append("\n// Method -> its parameters, and its answer where the wire names one.\n")
+    lines.append("export interface Methods {\n")
+    for m in table.values():
+        answer = m.result.__name__ if m in answers else "object"
+        lines.append(f'  "{m.name}": [{m.params.__name__}, {answer}];\n')
     return "".join([*lines, "}\n"])
 
 
