@@ -15,7 +15,7 @@ import typer
 
 from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
-from flexdt.clients.cli.commands.data_sets.exchange_commands import said
+from flexdt.clients.cli.commands.data_commands import said
 from flexdt.clients.cli.console import as_json, note, table, warn
 from flexdt.clients.cli.options import Answer, Twin, argument, option
 from flexdt.clients.cli.settings_file import CalibrateSettings, chosen
@@ -63,9 +63,7 @@ def calibrate(
         "Know offsets so well, not as the machine says; none: all exactly.",
         metavar="P=SIGMA,...",
     ),
-    frames: Path | None = option(
-        None, "Read any scanner's TIFFs here, with --geometry.", metavar="DIR"
-    ),
+    frames: Path | None = option(None, "Read any scanner's TIFFs, with --geometry.", metavar="DIR"),
     shape: str | None = option(
         None, "Take this detector shape where FILE does not say it.", metavar="ROWS,COLS"
     ),
@@ -77,9 +75,7 @@ def calibrate(
     ),
     scale: str | None = option(None, "Set the distance of two unknown markers.", metavar="A-B=MM"),
     radius: float | None = option(None, "Look for bead spots of this radius.", metavar="PX"),
-    start: list[str] | None = option(
-        None, "Begin with these offsets (mm, deg).", metavar="P=V,..."
-    ),
+    start: list[str] | None = option(None, "Begin at these offsets (mm, deg).", metavar="P=V,..."),
     push: options.Push = False,
 ) -> Answer:
     """Calibrate the geometry from scans of a bead phantom or of unknown markers.
@@ -88,8 +84,8 @@ def calibrate(
     are for those of any other scanner, --markers for what was marked by hand. Exit code 5 when the
     data cannot determine what was asked for; then nothing is pushed.
     """
-    if report is not None and report.suffix.lower() not in (".html", ".json"):
-        raise typer.BadParameter(f"{report.name}: the report's ending must be .html or .json")
+    if report is not None:
+        option_values.require_ending(report, ".html", ".json")
     from flexdt.clients.calibration.calibrate import calibrate_datasets
     from flexdt.clients.calibration.calibration_report import write_report
     from flexdt.clients.calibration.markers import Scale
@@ -112,7 +108,7 @@ def calibrate(
     if report is not None:
         write_report(outcome, report)
     if tracks is not None:
-        from flexdt.clients.calibration.tracks import write_tracks
+        from flexdt.clients.calibration.compare import write_tracks
 
         write_tracks(outcome, tracks)
     yield document
@@ -220,8 +216,8 @@ def align(
     the source turns. Exit code 5 when the scan cannot tell column and roll; then there is no
     correction.
     """
-    if out is not None and out.suffix.lower() != ".json":
-        raise typer.BadParameter(f"--out: {out.name}: the ending must be .json")
+    if out is not None:
+        option_values.require_ending(out, ".json")
     from flexdt.clients.calibration.align_dataset import align_dataset
 
     if push:

@@ -16,8 +16,7 @@ from flexdt.clients.cli.options import Answer, argument, option
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
-    from flexdt.clients.following.frames import FramesBeside
-    from flexdt.clients.following.session import Session
+    from flexdt.clients.following.session import FramesBeside, Session
     from flexdt.twin.following.follower import Follower
     from flexdt.twin.following.mirror import Alarm
 
@@ -46,9 +45,7 @@ def follow(
         min=0,
         max=65535,
     ),
-    seconds: float | None = option(
-        None, "End after so many seconds.", "--for", metavar="S", min=0.0
-    ),
+    seconds: float | None = option(None, "End after this time.", "--for", metavar="S", min=0.0),
     json: bool = False,
 ) -> Answer:
     """Follow a real scanner: hear its messages, compare, and say what leaves the prediction.
@@ -59,8 +56,7 @@ def follow(
     from flexdt.clients.extras import package
 
     zmq = package("zmq", "flexdt follow", "gateway")
-    from flexdt.clients.following.scanner_link import endpoint
-    from flexdt.clients.following.session import Session
+    from flexdt.clients.following.session import Session, endpoint
 
     try:
         at = endpoint(address)
@@ -69,7 +65,7 @@ def follow(
     follower = _follower(machine, profile, script, sample)
     beside = None
     if frames is not None:
-        from flexdt.clients.following.frames import FramesBeside
+        from flexdt.clients.following.session import FramesBeside
         from flexdt.phantoms.samples import as_phantom
 
         if sample is None or not frames.is_dir():
