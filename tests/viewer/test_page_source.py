@@ -28,10 +28,11 @@ WEB, BUILT = ROOT / "clients" / "viewer" / "web", ROOT / "clients" / "viewer" / 
 SOURCE = "".join(
     path.read_text("utf-8") for path in sorted(WEB.glob("*.ts")) if path.name != "wire.d.ts"
 )
+WORDS = set(re.findall(r"\w+", SOURCE))
 COLUMNS = 120
 HEAD = """\
 // Written by tests/viewer/test_page_source.py from the OpenRPC document of the wire and of the
-// viewer's own methods: the methods that the page calls, and the types that it names.
+// viewer's own methods: the methods that the page calls, and the types and fields that it names.
 // Answers have all their fields; what a request may leave out bears a "?".
 """
 
@@ -46,9 +47,11 @@ def types() -> str:
     schemas = document({**METHODS, **own})["components"]["schemas"]
     answers = [m for m in table.values() if m.name in METHODS]
     asked = within([m.params.__name__ for m in table.values()], schemas)
+    schemas = {name: of_page(schema, name in asked) for name, schema in schemas.items()}
     imported = ",".join(re.findall(r"^import type \{(.*?)\}", SOURCE, re.MULTILINE | re.DOTALL))
     named = [name for name in map(str.strip, imported.split(",")) if name in schemas]
-    used = asked | within([*named, *(m.result.__name__ for m in answers)], schemas)
+    own_types = [each.__name__ for m in table.values() for each in (m.params, m.result)]
+    used = within([*named, *own_types], schemas) - {Nothing.__name__}
     lines = [HEAD]
     for name in sorted(used):
         lines.append(f"export type {name} = {typed(schemas[name], name in asked)};\n")
@@ -58,6 +61,12 @@ def types() -> str:
         answer = m.result.__name__ if m in answers else "object"
         lines.append(f'  "{m.name}": [{m.params.__name__}, {answer}];\n')
     return "".join([*lines, "}\n"])
+
+
+def of_page(schema: Mapping[str, Any], asked: bool) -> Mapping[str, Any]:
+    """A type with the fields that the page names or, in a request, has to send."""
+    fields, needed = schema.get("properties", {}), schema.get("required", []) if asked else ()
+    return {**schema, "properties": {k: v for k, v in fields.items() if k in WORDS or k in needed}}
 
 
 def called(name: str) -> bool:

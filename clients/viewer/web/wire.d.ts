@@ -1,5 +1,5 @@
 // Written by tests/viewer/test_page_source.py from the OpenRPC document of the wire and of the
-// viewer's own methods: the methods that the page calls, and the types that it names.
+// viewer's own methods: the methods that the page calls, and the types and fields that it names.
 // Answers have all their fields; what a request may leave out bears a "?".
 export type AxisState = {
   position: number;
@@ -9,12 +9,10 @@ export type AxisState = {
   moving: boolean;
   unit: "mm" | "deg";
   speed: number | null;
-  acceleration: number | null;
   virtual: boolean;
 };
 export type CalibrationAlign = {
   name: string;
-  per_frame?: boolean;
 };
 export type CalibrationAlignResult = {
   identifiable: boolean;
@@ -28,10 +26,7 @@ export type CalibrationFit = {
   datasets: Array<string>;
   phantom: string;
   free?: Array<string> | null;
-  priors?: Record<string, number>;
-  per_frame?: Array<string>;
   steps?: number;
-  residuals?: boolean;
   tracks?: boolean;
   markers?: Array<Mark> | null;
   scale?: string | null;
@@ -40,10 +35,7 @@ export type CalibrationFitResult = {
   identifiable: boolean;
   parameters: Record<string, Estimated>;
   correction: Record<string, number> | null;
-  covariance: Array<Array<number | null>>;
   rms_px: number | null;
-  rms_per_bead_px: Array<number | null>;
-  residuals_px: Array<Array<[number, number] | null>> | null;
   steps: Array<CalibrationStep>;
   tracks: Record<string, JsonValue> | null;
   problems: Array<CalibrationProblem>;
@@ -55,7 +47,6 @@ export type CalibrationProblem = {
 };
 export type CalibrationStep = {
   frames: number;
-  covariance: Array<Array<number>> | null;
 };
 export type Camera = {
   view?: "iso" | "beam" | "side" | "free";
@@ -88,7 +79,6 @@ export type CheckCollision = {
   line: number | null;
   time_s: number;
   pair: Array<string>;
-  last_free: Record<string, number>;
 };
 export type CheckResult = {
   ok: boolean;
@@ -125,7 +115,6 @@ export type Control = {
 };
 export type ControlResult = {
   controller: string | null;
-  yours: boolean;
 };
 export type Correct = {
   parameters: Record<string, number>;
@@ -171,7 +160,6 @@ export type DatasetInfo = {
   present: number;
   machine: string | null;
   sample: string;
-  operator: string;
   kV: number | null;
   power_W: number | null;
   exposure_ms: number | null;
@@ -270,13 +258,10 @@ export type ImageFlags = {
   good_lines: [number, number] | null;
 };
 export type ImageValue = {
-  dtype: "uint8" | "int16" | "uint16" | "int32" | "uint32" | "float32" | "float64";
   shape: Array<number>;
   data: string;
 };
-export type JobListResult = {
-  jobs: Array<JobStatus>;
-};
+export type JobListResult = Record<string, unknown>;
 export type JobRef = {
   job?: string | null;
 };
@@ -293,7 +278,6 @@ export type JobStatus = {
   speed_up: number | "max";
   real_time_factor: number | null;
   error: Record<string, unknown> | null;
-  retry_s: number | null;
   warnings: Array<string>;
   step: number | null;
   line: number | null;
@@ -335,7 +319,6 @@ export type Move = {
   relative?: boolean;
   wait?: boolean;
   plan?: boolean;
-  shortest?: boolean;
 };
 export type MoveResult = {
   duration_s: number;
@@ -389,7 +372,6 @@ export type SafetyState = {
   message: string;
   stop: number;
   stopped_by: string | null;
-  blocked_attempts: number;
   clearance_mm: number | null;
   pair: Array<string> | null;
   warnings: Array<string>;
@@ -456,8 +438,6 @@ export type Scene = {
   machine: string;
   profile: string;
   positions: Record<string, number>;
-  speeds?: Record<string, number>;
-  accelerations?: Record<string, number>;
   tube: TubePart;
   camera: CameraPart;
   sample: SamplePart;
@@ -479,11 +459,8 @@ export type Screenshot = {
 };
 export type ScriptInput = {
   text?: string | null;
-  data_base64?: string | null;
   name?: string | null;
   speed_up?: number | "max" | null;
-  motion_samples?: number;
-  seed?: number | null;
 };
 export type Scrub = {
   time_s?: number | null;
@@ -518,14 +495,6 @@ export type Stopped = {
   clock: ClockState;
   controller: string | null;
   image: ImageFlags | null;
-  stopping: Stopping | null;
-};
-export type Stopping = {
-  path: "along" | "apart" | "coasting";
-  duration_s: number;
-  distances: Record<string, number>;
-  would_hit: Array<string> | null;
-  would_hit_in_s: number | null;
 };
 export type SubmitResult = {
   job: string;
@@ -538,8 +507,6 @@ export type Theme = {
 export type TransmissionShares = {
   least: number;
   p1: number;
-  p5: number;
-  median: number;
   edges: Array<number>;
   shares: Array<number>;
 };
