@@ -40,7 +40,8 @@ def up(context: typer.Context, only: str | None, **given: object) -> None:
     """Start projector, twin and viewer; Ctrl-C stops all.
 
     They run as processes under one supervisor, which restarts a dead one. Prints one
-    JSON `ready` line with the addresses once everything listens.
+    JSON `ready` line with the addresses once everything listens. `flexdt twin --help` and its like
+    list further options, which `up` takes, too.
     """
     start(only or "up", [*words(given), *context.args])
 

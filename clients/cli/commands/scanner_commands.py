@@ -302,7 +302,7 @@ def snap(
     dense parts dark, and shows line integrals unless said, so X-rays may be off. It shows in colour
     what would be wrong with the exposure: saturated red, starved blue, cut-off edges yellow.
     """
-    option_values.require_ending(file, ".tif", ".tiff", ".png")
+    option_values.require_ending(file, ".tiff", ".tif", ".png")
     option_values.require_folder(file)
     with twin() as client:
         wanted = kind or ("line_integral" if file.suffix.lower() == ".png" else "counts")
