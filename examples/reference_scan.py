@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from flexdt.clients import TwinClient
-from flexdt.clients.cli.commands.scanner.script_commands import follow
+from flexdt.clients.cli.commands.scan_commands import follow
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.launch.processes import Servers
 from flexdt.clients.reconstruction.reconstruct import (

@@ -9,7 +9,7 @@ once, the document of `--json`. The entry point group `flexdt.commands` gives it
 A dot in the name stands for a group: `phantom.design` is `flexdt phantom design`.
 """
 
-from flexdt.clients.cli.commands.processes.process_commands import become
+from flexdt.clients.cli.commands.process_commands import become
 from flexdt.clients.cli.console import note, size, table, warn
 from flexdt.clients.cli.option_values import names, numbers, position, triple
 from flexdt.clients.cli.options import (

@@ -127,6 +127,7 @@ def further_projectors() -> Any:
     return option(
         None,
         "Deal the views among these projectors, too.",
+        public=False,
         metavar="HOST:PORT,...",
         parser=several,
     )
@@ -139,15 +140,21 @@ def where_the_twin_is() -> Any:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProcessSettings:
-    """What every process has.
+class Settings:
+    """A table of the settings file.
 
     Attributes:
-        command: name of its `flexdt` command.
+        command: the `flexdt` command that the table is for.
     """
 
     command: ClassVar[str]
-    host: str = option(LOOPBACK, "Listen on this address.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProcessSettings(Settings):
+    """What every process has."""
+
+    host: str = option(LOOPBACK, "Listen on this address.", public=False)
     port: int = tcp_port(0, "Listen on this port; 0 is any free one.")
 
 
@@ -156,8 +163,10 @@ class ServerSettings(ProcessSettings):
     """What twin, projector and viewer share."""
 
     token_file: Path | None = some_file("Require the token in this file of every client.")
-    tls_cert: Path | None = some_file("Speak TLS with this certificate.")
-    tls_key: Path | None = some_file("Use the private key of the certificate in this file.")
+    tls_cert: Path | None = some_file("Speak TLS with this certificate.", public=False)
+    tls_key: Path | None = some_file(
+        "Use the private key of the certificate in this file.", public=False
+    )
     limit: tuple[str, ...] = option(
         (), "Set a limit of docs/twin-server.md; may be repeated.", public=False,
         metavar="NAME=VALUE",
@@ -219,7 +228,7 @@ class ScannerSettings(ServerSettings):
         "off", "Simulate scattered radiation, with physics mono and poly.", metavar="off or mc",
         parser=scatter_method,
     )  # fmt: skip
-    fresh: bool = option(False, "Start anew instead of where the last twin left off.")
+    fresh: bool = option(False, "Start anew instead of where the last twin left off.", public=False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -322,11 +331,11 @@ class UpSettings(ScannerSettings):
     )
 
 
-S = TypeVar("S", bound=ProcessSettings)
+S = TypeVar("S", bound=Settings)
 
 
-def parameters(settings: type[ProcessSettings]) -> dict[str, inspect.Parameter]:
-    """The options of a process, as parameters of a function that typer reads."""
+def parameters(settings: type[Settings]) -> dict[str, inspect.Parameter]:
+    """A table's keys as options: parameters of a function that typer reads."""
     hints, found = get_type_hints(settings), {}
     for f in fields(settings):
         flags = f.metadata["flags"] or (f"--{f.name.replace('_', '-')}",)
@@ -351,7 +360,7 @@ def read(settings: type[S], words: Sequence[str] | None = None) -> S | None:
     """The settings that words say; None where they asked for the help, which is shown.
 
     Args:
-        settings: class of the process.
+        settings: class of the process or command.
         words: of the command line, `sys.argv`'s where left out.
 
     Raises:

@@ -63,6 +63,12 @@ def _usage(error: Exception) -> tuple[str, ...]:
         return tuple(message.splitlines())
     context = getattr(error, "ctx", None)
     command = context.command_path if context is not None else "flexdt"
+    flag = getattr(error, "option_name", None)
+    if flag is not None and message.startswith("No such option"):
+        from flexdt.clients.cli.settings_file import home_of
+
+        home = home_of(command, flag)
+        message += "" if home is None else f"; set {home}"
     return (f"{command}: {message}", f"Try '{command} --help'.")
 
 

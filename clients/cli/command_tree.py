@@ -5,91 +5,87 @@ Command modules import what they need inside their functions, so building the tr
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from itertools import islice
 from typing import Any, Final
 
 import typer
 from typer.core import TyperGroup
 
-from flexdt.clients.cli import extension_commands
-from flexdt.clients.cli.commands.data_sets import (
-    calibrate_commands,
-    exchange_commands,
-    expose_command,
-    reconstruct_command,
-)
-from flexdt.clients.cli.commands.processes import (
-    demo_command,
-    doctor_command,
-    process_commands,
-)
-from flexdt.clients.cli.commands.scanner import (
-    follow_command,
-    job_command,
-    machine_command,
-    motion_commands,
-    phantom_command,
-    sample_command,
-    script_commands,
-    snap_command,
-    state_commands,
-)
-from flexdt.clients.cli.options import answering, option
+from flexdt.clients.cli.commands import analysis_commands as analysis
+from flexdt.clients.cli.commands import calibrate_commands as geometry
+from flexdt.clients.cli.commands import data_commands as data
+from flexdt.clients.cli.commands import process_commands as processes
+from flexdt.clients.cli.commands import scan_commands as scans
+from flexdt.clients.cli.commands import scanner_commands as scanner
+from flexdt.clients.cli.commands.demo_command import demo
+from flexdt.clients.cli.commands.follow_command import follow
+from flexdt.clients.cli.options import Json, Server, TokenFile, argument, completed, option
 
 COMMANDS: Final[Mapping[str, Callable[..., object]]] = {
-    "demo": demo_command.demo,
-    "up": process_commands.up,
-    "twin": process_commands.twin,
-    "projector": process_commands.projector,
-    "viewer": process_commands.viewer,
-    "gateway": process_commands.gateway,
-    "check": script_commands.check,
-    "run": script_commands.run,
-    "state": state_commands.state,
-    "tube": state_commands.tube,
-    "camera": state_commands.camera,
-    "clock": state_commands.clock,
-    "move": motion_commands.move,
-    "jog": motion_commands.jog,
-    "stop": motion_commands.stop,
-    "estop": motion_commands.estop,
-    "reset": motion_commands.reset,
-    "sample": sample_command.sample,
-    "snap": snap_command.snap,
-    "calibrate": calibrate_commands.calibrate,
-    "align": calibrate_commands.align,
-    "compare": calibrate_commands.compare,
-    "expose": expose_command.expose,
-    "reconstruct": reconstruct_command.reconstruct,
-    "export": exchange_commands.export,
-    "import": exchange_commands.import_,
-    "follow": follow_command.follow,
-    "doctor": doctor_command.doctor,
+    "demo": demo,
+    "up": processes.up,
+    "twin": processes.twin,
+    "projector": processes.projector,
+    "viewer": processes.viewer,
+    "gateway": processes.gateway,
+    "check": scans.check,
+    "run": scans.run,
+    "state": scanner.state,
+    "tube": scanner.tube,
+    "camera": scanner.camera,
+    "clock": scanner.clock,
+    "move": scanner.move,
+    "jog": scanner.jog,
+    "stop": scanner.stop,
+    "estop": scanner.estop,
+    "reset": scanner.reset,
+    "sample": scanner.sample,
+    "snap": scanner.snap,
+    "calibrate": geometry.calibrate,
+    "align": geometry.align,
+    "compare": geometry.compare,
+    "expose": scans.expose,
+    "reconstruct": data.reconstruct,
+    "export": data.export,
+    "import": data.import_,
+    "follow": follow,
+    "doctor": processes.doctor,
 }
 """Name -> what it runs."""
 GROUPS: Final[Mapping[str, tuple[str, Mapping[str, Callable[..., object]]]]] = {
-    "script": ("Scan scripts.", {"new": script_commands.new}),
-    "job": ("Jobs: scripts and trajectories being run.", job_command.COMMANDS),
+    "script": ("Scan scripts.", {"new": scans.new}),
+    "job": ("Jobs: scripts and trajectories being run.", scans.JOB_COMMANDS),
     "phantom": (
         "Phantoms: objects to scan.",
         {
-            "list": phantom_command.list_phantoms,
-            "make": phantom_command.make,
+            "list": analysis.list_phantoms,
+            "make": analysis.make,
         },
     ),
     "machine": (
         "Machines as data, and from their logs.",
         {
-            "list": machine_command.list_machines,
-            "show": machine_command.show,
-            "check": machine_command.check,
-            "new": machine_command.new,
-            "fit": machine_command.fit,
+            "list": analysis.list_machines,
+            "show": analysis.show,
+            "check": analysis.check,
+            "new": analysis.new,
+            "fit": analysis.fit,
         },
     ),
 }
 """Name -> what its commands are about, and the commands."""
+GROUP: Final = "flexdt.commands"
+"""Entry points that add other distributions' commands."""
+KNOWN: Final[Mapping[str, str]] = {
+    "simulate": "Simulate a CTSimU scenario: projections, dark and flat images as TIFF.",
+    "study": "Repeat an experiment of the thesis.",
+    "batch": "Make a batch of scans or calibrations.",
+    "bench": "Measure speed and accuracy, beside the peers that are installed.",
+    "phantom design": "Choose bead places that determine the geometry best.",
+}
+"""Command of `flexdt-extensions` -> its line of the help page, which needs no look at what is
+installed: an entry point is looked up when its command is on the command line."""
 NUMBERS_WITH_SIGN: Final = ("jog", "clock")
 """Commands whose arguments may begin with a minus."""
 ALONE: Final = ("twin", "projector", "viewer", "gateway")
@@ -105,8 +101,43 @@ SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
 """Sections of the help page; commands in none of them are listed under Extensions."""
 
 
+OWN: Final[Mapping[str, str]] = {
+    "--json": "--json", "--server": "--server HOST:PORT", "--token-file": "--token-file FILE",
+}  # fmt: skip
+"""Options of `flexdt` itself that may also follow the command's name, as help pages show them."""
+
+
+def own_first(words: Sequence[str], flags: Collection[str]) -> tuple[list[str], list[str]]:
+    """The words of these options of `OWN`, and the other words."""
+    first, rest = list[str](), list[str]()
+    more = iter(words)
+    for word in more:
+        if word == "--":
+            rest += [word, *more]
+        elif word.partition("=")[0] not in flags:
+            rest.append(word)
+        else:
+            first.append(word)
+            first += islice(more, 1 if word in OWN and word != "--json" else 0)
+    return first, rest
+
+
 class InSections(TyperGroup):
-    """Lists its commands in `SECTIONS`."""
+    """Lists its commands in `SECTIONS`, and takes `OWN` wherever they are on the command line."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put the options of `flexdt` itself that the command heeds before its name."""
+        command: Any = self
+        for word in own_first(args, OWN)[1]:
+            if word[:1] != "-" and hasattr(command, "commands"):
+                command = command.commands.get(word)
+        heeds = getattr(getattr(command, "callback", None), "heeds", ())
+        first, rest = own_first(args, heeds)
+        if first and first[-1] in OWN and first[-1] != "--json":
+            ctx.fail(f"Option '{first[-1]}' requires an argument.")
+        if command not in (None, self) and rest[0].partition("=")[0] in OWN:
+            ctx.fail(f"{rest[0].partition('=')[0]} is no option of `flexdt {command.name}`")
+        return list(super().parse_args(ctx, [*first, *rest]))
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the sections of the help page."""
@@ -144,8 +175,11 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
         version: bool = option(
             False, "Print the version and exit.", "--version", callback=_version, is_eager=True
         ),
+        json: Json = False,
+        server: Server = None,
+        token_file: TokenFile = None,
     ) -> None:
-        pass
+        """What these options say, `completed` commands take from the context."""
 
     for name, command in COMMANDS.items():
         passes = name == "up" or name in ALONE
@@ -155,15 +189,35 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
         }
         if name in ALONE:
             context["help_option_names"] = []
-        app.command(name, context_settings=context)(_complete(command))
+        _add(app, name, command, context)
     groups = {}
     for name, (about, commands) in GROUPS.items():
         groups[name] = typer.Typer(help=about, no_args_is_help=True, add_completion=False)
         for one, command in commands.items():
-            groups[name].command(one)(_complete(command))
+            _add(groups[name], one, command)
         app.add_typer(groups[name], name=name)
     _add_others(app, groups, words)
     return app
+
+
+def found(name: str) -> Callable[..., Any] | None:
+    """The function of a command, a word or two, that an installed distribution offers."""
+    from flexdt.clients.extras import offered
+
+    function: Callable[..., Any] | None = offered(name.replace(" ", "."), GROUP)
+    return function
+
+
+def listed(name: str) -> Callable[..., None]:
+    """A command for the help page; where it is run, its distribution is missing."""
+
+    def command(words: list[str] | None = argument(None, "...")) -> None:
+        from flexdt.clients.extras import extension
+
+        extension(name.replace(" ", "."), f"`flexdt {name}`", GROUP)
+
+    command.__doc__ = KNOWN[name]
+    return command
 
 
 def _add_others(
@@ -171,27 +225,30 @@ def _add_others(
 ) -> None:
     """Add other distributions' commands, which take no name of ours."""
     if words is None:
-        asked = [*extension_commands.KNOWN]
+        asked = [*KNOWN]
     else:
         first, second = [*words, "", ""][:2]
         asked = [f"{first} {second}" if first in GROUPS else first]
     ours = {*COMMANDS, *(f"{group} {one}" for group, (_, more) in GROUPS.items() for one in more)}
     asked = [name for name in asked if name not in ours and name and name.split()[-1][0] != "-"]
-    for name in dict.fromkeys([*extension_commands.KNOWN, *asked]):
-        command = extension_commands.found(name) if name in asked else None
+    for name in dict.fromkeys([*KNOWN, *asked]):
+        command = found(name) if name in asked else None
         group, _, one = name.rpartition(" ")
         place = groups[group] if group else app
         if command is not None:
-            place.command(one)(_complete(command))
-        elif name in extension_commands.KNOWN:
+            _add(place, one, command)
+        elif name in KNOWN:
             # Whatever follows the name, the answer is how to install it.
             bare = {"ignore_unknown_options": True, "help_option_names": list[str]()}
-            place.command(one, context_settings=bare)(extension_commands.listed(name))
+            place.command(one, context_settings=bare)(listed(name))
 
 
-def _complete(command: Callable[..., Any]) -> Callable[..., object]:
-    """A command as typer takes it: with --json, if it yields its answer."""
-    return answering(command) if inspect.isgeneratorfunction(inspect.unwrap(command)) else command
+def _add(app: typer.Typer, name: str, command: Callable[..., Any], context: Any = None) -> None:
+    """Add a command; its help page ends with the options of `flexdt` that it heeds."""
+    complete, heeds = completed(command)
+    complete.heeds = heeds  # type: ignore[attr-defined]
+    also = f"Also, of flexdt itself: {', '.join(OWN[flag] for flag in heeds)}" if heeds else None
+    app.command(name, context_settings=context, epilog=also)(complete)
 
 
 def _version(asked: bool) -> None:

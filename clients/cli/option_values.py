@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Literal
 
 import typer
 
+from flexdt.clients.failure import CommandError
 from flexdt.process_settings import LOOPBACK, address
 
 DEFAULT_SERVER = "127.0.0.1:55000"
@@ -136,3 +138,24 @@ def position(word: str) -> tuple[float, float]:
 def names(word: str) -> tuple[str, ...]:
     """A comma-separated list of names, blanks dropped."""
     return tuple(part.strip() for part in word.split(",") if part.strip())
+
+
+def require_ending(file: Path, *allowed: str) -> None:
+    """Check a file's ending.
+
+    Raises:
+        typer.BadParameter: another one.
+    """
+    if file.suffix.lower() not in allowed:
+        raise typer.BadParameter(f"{file.name}: the ending must be {' or '.join(allowed)}")
+
+
+def require_folder(*files: Path | None) -> None:
+    """Check that files can be written where they are to be.
+
+    Raises:
+        CommandError: a folder does not exist.
+    """
+    for file in files:
+        if file is not None and not file.absolute().parent.is_dir():
+            raise CommandError(f"{file}: the folder does not exist")

@@ -1,17 +1,29 @@
-"""How commands declare their options, and the options that several of them share."""
+"""How commands declare their options, the options that several share, and the twin's connection.
+
+`--json`, `--server` and `--token-file` are options of `flexdt` itself, which commands get as
+arguments: what yields answers `--json`, and a parameter `twin: Twin` connects to the server.
+"""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from flexdt.clients.cli import option_values
 from flexdt.clients.cli.console import emit, say
+from flexdt.clients.cli.settings_file import configuration
+from flexdt.clients.failure import CommandError
 from flexdt.process_settings import has_parameters
+
+if TYPE_CHECKING:
+    import ssl
+
+    from flexdt.clients.client.client import TwinClient
 
 Answer = Iterator[object]
 """What most commands yield: texts, which are lines for people, and one thing that is no text, which
@@ -39,22 +51,88 @@ def argument(default: object, metavar: str, help: str = "") -> Any:
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else.")]
 
 
-def answering(command: Callable[..., Answer]) -> Callable[..., None]:
-    """A command that yields its answer, with the option that prints its document instead."""
+Twin = Callable[[], "TwinClient"]
+"""Connects to the twin that the command line names, for use as `with twin() as client`."""
+Server = Annotated[
+    str | None,
+    typer.Option(
+        metavar="HOST:PORT",
+        help=f"Talk to the twin there; default: {option_values.DEFAULT_SERVER}, or configured.",
+    ),
+]
+TokenFile = Annotated[
+    str | None, typer.Option(metavar="FILE", help="Show the twin the token in this file.")
+]
+GIVEN: Final = ("twin", "json")
+"""Parameters of commands that come from options of `flexdt` itself."""
+
+
+def completed(command: Callable[..., Any]) -> tuple[Callable[..., None], tuple[str, ...]]:
+    """A command as typer takes it, and the options of `flexdt` that it heeds."""
+    own = inspect.signature(command, eval_str=True).parameters
+    if "context" in own:  # it passes its words on
+        return command, ()
+    yields = inspect.isgeneratorfunction(inspect.unwrap(command))
 
     @wraps(command)
-    def answered(json: bool, **given: Any) -> None:
-        for part in command(**given):
-            if isinstance(part, str) and not json:
+    def complete(context: typer.Context, **given: Any) -> None:
+        root = context.find_root().params
+        if "twin" in own:
+            given["twin"] = partial(connect, root["server"], root["token_file"])
+        if "json" in own:
+            given["json"] = root["json"]
+        answer = command(**given)
+        for part in answer if yields else ():
+            if isinstance(part, str) and not root["json"]:
                 say(part)
-            elif json and not isinstance(part, str):
+            elif root["json"] and not isinstance(part, str):
                 emit(part)
 
-    own = inspect.signature(command, eval_str=True).parameters.values()
-    asked = inspect.Parameter("json", inspect.Parameter.KEYWORD_ONLY, default=False,
-                              annotation=Json)  # fmt: skip
-    has_parameters(answered, [*own, asked])
-    return answered
+    context = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
+    has_parameters(complete, [context, *(p for name, p in own.items() if name not in GIVEN)])
+    heeds = ("--json",) if yields or "json" in own else ()
+    return complete, (*heeds, "--server", "--token-file") if "twin" in own else heeds
+
+
+def connect(server: str | None = None, token_file: str | None = None) -> TwinClient:
+    """A client for a twin, to be used as a context manager.
+
+    What is None is taken from the user's configuration, see `configuration`.
+
+    Args:
+        server: HOST:PORT, see `option_values.server`; 127.0.0.1:55000 if nothing says otherwise.
+        token_file: file whose first line is the session's token; shows none by default.
+
+    Raises:
+        typer.BadParameter: the address has another form.
+        CommandError: the certificate file holds no certificate, or the configuration is wrong.
+        OSError: the token or certificate file cannot be read, or nothing answers.
+    """
+    own = configuration()
+    host, port = option_values.server(server or own.server or option_values.DEFAULT_SERVER)
+    shown = token_file or own.token_file
+    token = own.token if shown is None else _first_line(Path(shown))
+    context = None if own.tls_ca is None else _trusting(Path(own.tls_ca))
+
+    from flexdt.clients.client.client import TwinClient
+
+    return TwinClient(host, port, token=token, name="flexdt", ssl=context)
+
+
+def _trusting(certificate: Path) -> ssl.SSLContext:
+    """A TLS context that trusts a file's certificates and checks the server's name."""
+    import ssl
+
+    text = certificate.read_text(encoding="ascii", errors="replace")
+    try:
+        return ssl.create_default_context(cadata=text)
+    except (ssl.SSLError, ValueError):
+        raise CommandError(f"{certificate}: no certificate (PEM)") from None
+
+
+def _first_line(path: Path) -> str:
+    lines = path.read_text(encoding="utf-8").splitlines()
+    return lines[0].strip() if lines else ""
 
 
 MachineName = Annotated[

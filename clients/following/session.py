@@ -1,28 +1,217 @@
 """A session of `flexdt follow`: messages in; alarms, a record and a mirror in the twin out.
 
 It decides nothing: `flexdt.twin.following` says what a message changes. Time is this machine's
-monotonic clock when a message came.
+monotonic clock when a message came. The only socket is a SUB socket, which cannot send a message;
+ZeroMQ's own heartbeats tell within a second that a cable is out.
+
+With a folder of frames, the last real one is written beside the twin's radiograph of the mirrored
+machine: its positions and camera when the frame appeared, the profile's offsets and the phantom on
+the stage. Their distance comes from the peak of their cross-correlation, whitened (phase
+correlation; Kuglin and Hines 1975).
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import json
+import re
 import time
 from collections.abc import Callable, Collection
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from flexdt.clients.following.frames import FramesBeside, newest_frame
-from flexdt.clients.following.scanner_link import listen
+import cv2
+import numpy as np
+import zmq
+import zmq.asyncio
+from zmq.utils.monitor import parse_monitor_message
+
+from flexdt.clients.datasets.pictures import png
 from flexdt.clients.gateway.vocabulary import MoveRelative, Question, Refusal, read_command
-from flexdt.protocol.acquila import AcquilaError, Event, parse_event
+from flexdt.clients.whole_files import write_whole
+from flexdt.phantoms import Phantom
+from flexdt.phantoms.channels import line_integrals as projected
+from flexdt.protocol.acquila import MAX_BYTES, AcquilaError, Event, parse_event
+from flexdt.runtime.files.dataset_folder import list_folder, mean_image, read_image
+from flexdt.twin.dataset.normalise import LineIntegrals
 from flexdt.twin.errors import TwinError
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Alarm, Heard, Mirror
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.grammar import own_name
+
+PORT: Final = 50000
+HEARTBEAT_MS: Final = 200
+SILENT_MS: Final = 500
+"""A scanner whose ZeroMQ does not answer a heartbeat for so long is not there."""
+RETRY_MS: Final = 100
+MOST_RETRY_MS: Final = 1000
+MAX_HELD: Final = 10_000
+_ADDRESS: Final = re.compile(r"(?:tcp://)?(\[[0-9a-fA-F:.]+\]|[^\s:/\[\]]+)(?::(\d{1,5}))?/?")
+
+
+def endpoint(address: str) -> str:
+    """ZeroMQ's name of `tcp://HOST[:PORT]`.
+
+    Raises:
+        ValueError: it is none.
+
+    Example:
+        >>> endpoint("tcp://scanner"), endpoint("10.0.0.7:5555")
+        ('tcp://scanner:50000', 'tcp://10.0.0.7:5555')
+    """
+    match = _ADDRESS.fullmatch(address.strip())
+    port = PORT if match is None or match[2] is None else int(match[2])
+    if match is None or not 0 < port < 65536:
+        raise ValueError(f"{address!r} is no address; allowed: tcp://HOST[:PORT], PORT 1 to 65535")
+    return f"tcp://{match[1]}:{port}"
+
+
+async def listen(
+    address: str, message: Callable[[bytes], None], link: Callable[[bool, str], None]
+) -> None:
+    """Listen until cancelled.
+
+    Args:
+        address: see `endpoint`.
+        message: called with every message.
+        link: called with whether there is a connection, and why not, when that changes.
+
+    Raises:
+        ValueError, zmq.ZMQError: no address that can be connected to.
+    """
+    with zmq.asyncio.Context() as context, context.socket(zmq.SUB) as socket:
+        for option, value in (
+            (zmq.LINGER, 0), (zmq.RCVHWM, MAX_HELD), (zmq.MAXMSGSIZE, MAX_BYTES),
+            (zmq.HEARTBEAT_IVL, HEARTBEAT_MS), (zmq.HEARTBEAT_TIMEOUT, SILENT_MS),
+            (zmq.RECONNECT_IVL, RETRY_MS), (zmq.RECONNECT_IVL_MAX, MOST_RETRY_MS),
+            (zmq.IPV6, int("[" in address)),
+        ):  # fmt: skip
+            socket.setsockopt(option, value)
+        socket.subscribe(b"")
+        events = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED
+        monitor = socket.get_monitor_socket(events)
+        watching = asyncio.create_task(_watch(monitor, link))
+        try:
+            socket.connect(endpoint(address))
+            while True:
+                frames = await socket.recv_multipart()
+                message(frames[0] if len(frames) == 1 else b"")
+        finally:
+            watching.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await watching
+            socket.disable_monitor()
+            monitor.close(linger=0)
+
+
+async def _watch(monitor: zmq.asyncio.Socket, link: Callable[[bool, str], None]) -> None:
+    while True:
+        event = parse_monitor_message(await monitor.recv_multipart())
+        if event["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+            link(True, "")
+        else:
+            link(False, "the scanner has ended the connection, or does not answer")
+
+
+def newest_frame(folder: Path) -> tuple[Path, float] | None:
+    """The TIFF that was written last, and when; None if there is none.
+
+    Darks and flats are none.
+    """
+    found = []
+    for path in folder.glob("*.tif*"):
+        with suppress(OSError):  # it has gone meanwhile
+            if not path.name.startswith(("di", "io")):
+                found.append((path.stat().st_mtime, path))
+    written, newest = max(found, default=(0.0, None))
+    return None if newest is None else (newest, written)
+
+
+@dataclass(frozen=True)
+class FramesBeside:
+    """Writes `beside.png` (real, virtual) and `beside.json` into a folder.
+
+    Args:
+        follower: its machine and profile.
+        phantom: what stands on the stage.
+        out: where to.
+    """
+
+    follower: Follower
+    phantom: Phantom
+    out: Path
+
+    def write(self, path: Path, mirror: Mirror, age_s: float) -> dict[str, object]:
+        """One frame beside its radiograph.
+
+        Args:
+            path: of the frame.
+            mirror: the machine when it appeared.
+            age_s: of the frame.
+
+        Raises:
+            TwinError: no readable image, or of another shape than the camera's.
+        """
+        shape = mirror.camera.shape
+        real, white = line_integrals(path, shape)
+        machine, profile = self.follower.machine, self.follower.profile
+        poses = motor_poses(machine, profile, mirror.camera, mirror.positions)
+        virtual = projected(self.phantom, poses.cone_vec(), shape)[0]
+        columns, rows = shift(virtual, real)
+        told = {
+            "file": path.name,
+            "age_s": round(age_s, 3),
+            "positions": mirror.positions,
+            "assumed": list(mirror.assumed),
+            "white": white,
+            "shift_px": {"columns": columns, "rows": rows},
+        }
+        picture = png(np.concatenate([real, virtual], axis=1), dark_is_dense=True)
+        self.out.mkdir(parents=True, exist_ok=True)
+        for name, data in (("png", picture), ("json", json.dumps(told, indent=2).encode())):
+            write_whole(self.out / f"beside.{name}", data)
+        return told
+
+
+def line_integrals(path: Path, shape: tuple[int, int]) -> tuple[Float32Array, str]:
+    """A frame's line integrals (rows, cols), and what they take for white.
+
+    With a dark and a flat beside it these are used; else white is a percentile of the frame.
+
+    Raises:
+        TwinError: no readable image, or of another shape.
+    """
+    counts = read_image(path, shape).astype(np.float32)
+    folder = list_folder(path.parent)
+    dark, white = np.zeros_like(counts), np.full_like(counts, np.percentile(counts, 99.5))
+    what = "99.5 % of the frame"
+    if folder.darks and folder.flats:
+        dark = mean_image(folder.paths(folder.darks), shape)
+        white = mean_image(folder.paths(folder.flats), shape)
+        what = "dark and flat of the folder"
+    return LineIntegrals.of(dark, white)(counts), what
+
+
+def shift(virtual: Float32Array, real: Float32Array) -> tuple[float, float]:
+    """By how much the real image lies aside of the virtual one [px], (columns, rows).
+
+    Example:
+        >>> image = np.zeros((32, 48), np.float32)
+        >>> image[10:20, 15:25] = 1.0
+        >>> columns, rows = shift(image, np.roll(image, (2, -3), axis=(0, 1)))
+        >>> round(columns, 1), round(rows, 1)
+        (-3.0, 2.0)
+    """
+    (columns, rows), _ = cv2.phaseCorrelate(virtual.astype(np.float64), real.astype(np.float64))
+    return float(columns), float(rows)
+
 
 # Bytes of the scanner's interface to what a follower hears: no socket, no clock.
 

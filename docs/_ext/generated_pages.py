@@ -74,8 +74,11 @@ def commands() -> str:
         "[the command line](../command-line.md).",
         "",
     ]
-    for path, command in _walk(get_command(build()), "flexdt"):
+    root = get_command(build())
+    for path, command in (("flexdt", root), *_walk(root, "flexdt")):
         out += [f"## `{path}`", "", _cell(command.help or "", "\n\n"), ""]
+        if command.epilog:
+            out += [command.epilog, ""]
         rows = [_option(p) for p in command.params if not getattr(p, "hidden", False)]
         if rows:
             out += ["| argument | default | |", "|---|---|---|", *rows, ""]

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from flexdt.clients import extras
+from flexdt.clients.cli.command_tree import GROUP, KNOWN
 from flexdt.clients.cli.entry import run
-from flexdt.clients.cli.extension_commands import GROUP, KNOWN
 
 Run = Callable[..., tuple[int, str, str]]
 

@@ -58,7 +58,7 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
             for n, matrix in covariance_by_step(fitted, asked.steps)
         ]
     if asked.tracks:
-        told["tracks"] = import_module("flexdt.clients.calibration.tracks").tracks_document(found)
+        told["tracks"] = import_module("flexdt.clients.calibration.compare").tracks_document(found)
     return p.CalibrationFitResult.model_validate(from_root(told, root.path))
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from flexdt.clients.cli import boundary, entry
-from flexdt.clients.cli.commands.processes import process_commands as processes
+from flexdt.clients.cli.commands import process_commands as processes
 from flexdt.clients.failure import CommandError
 from flexdt.process_settings import words
 from flexdt.protocol.rpc_errors import RpcError
@@ -108,9 +108,7 @@ def test_ctrl_c_is_clean(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(
-        "flexdt.clients.cli.commands.processes.process_commands.become", interrupted
-    )
+    monkeypatch.setattr("flexdt.clients.cli.commands.process_commands.become", interrupted)
     assert entry.run(["projector"]) == 130
     assert capsys.readouterr().err == "flexdt: interrupted\n"
 

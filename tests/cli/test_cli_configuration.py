@@ -5,14 +5,21 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
-from flexdt.clients.cli.commands.processes import process_commands
-from flexdt.clients.cli.connecting import Configuration, config_file, configuration
+from flexdt.clients.cli.commands import process_commands
 from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.settings_file import (
+    TABLES,
+    Configuration,
+    config_file,
+    configuration,
+)
 from flexdt.clients.failure import CommandError
+from flexdt.process_settings import ProcessSettings
 
 NOBODY = "127.0.0.1:9"  # the port of the discard service
 
@@ -121,6 +128,80 @@ def test_a_table_of_the_file_holds_the_options_of_a_process(
     no_configuration.write_text("[twin]\nhttp_prot = 9101\n")
     assert run(["twin"]) == 1
     assert "[twin] unknown key 'http_prot'; allowed: host, port" in capsys.readouterr().err
+
+
+COMMANDS = [kind for kind in TABLES.values() if not issubclass(kind, ProcessSettings)]
+
+
+@pytest.mark.parametrize(
+    ("command", "flag", "table"),
+    [
+        *((kind.command, f.name, table) for table, kind in TABLES.items()
+          if kind in COMMANDS for f in fields(kind)),
+        *(("doctor", name, "up") for name in ("port", "projector_port", "viewer_port", "data")),
+    ],
+)  # fmt: skip
+def test_an_option_that_went_to_the_file_names_its_key(
+    command: str, flag: str, table: str, no_configuration: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [*command.split(), f"--{flag.replace('_', '-')}", "1"]
+    assert run(words) == 2
+    assert f"set `{flag}` in [{table}] of {no_configuration}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "words", "code", "message"),
+    [
+        *(
+            (f"[script_new]\nheight = {height}", "script new --kind fly", code, message)
+            for height, code, message in (("nan", 3, "height_mm is nan; allowed"),
+                                    ("inf", 3, "height_mm is inf; allowed"),
+                                    ('"high"', 1, "[script_new] Invalid value for '--height'"))
+        ),
+        ("[export]\ntolerance = -1.0", "export . --format csv --out x", 1,
+         "[export] Invalid value for '--tolerance'"),
+        ('[reconstruct]\nwindow = "square"', "reconstruct . --out x.tif", 1,
+         "[reconstruct] Invalid value for '--window': "),
+        ('[phantom_make]\nbead = "cheese"', "phantom make p.json --like normal", 1, "cheese"),
+    ],
+)  # fmt: skip
+def test_commands_read_their_tables(
+    text: str, words: str, code: int, message: str, no_configuration: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(no_configuration.parent)
+    no_configuration.write_text(text)
+    assert run(words.split()) == code
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words", [["job", "status", "7"], ["move", "a=1", "--relative"], ["camera", "--roi", "1,2,3,4"]]
+)
+@pytest.mark.parametrize("form", [["--server", NOBODY], [f"--server={NOBODY}"]])
+def test_options_of_flexdt_itself_may_stand_anywhere(
+    words: list[str], form: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    places = [at for at in range(len(words) + 1) if at == 0 or words[at - 1] != "--roi"]
+    for at in places:
+        assert run([*words[:at], *form, *words[at:], "--json"]) == 4
+        assert NOBODY in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["state", "--server"], "'--server' requires an argument"),
+        (["check", "x", "--server", NOBODY], "No such option: --server"),
+        (["--server", NOBODY, "check", "x"], "--server is no option of `flexdt check`"),
+        (["--json", "up"], "--json is no option of `flexdt up`"),
+    ],
+)
+def test_a_command_that_does_not_heed_an_option_says_so(
+    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(words) == 2
+    assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

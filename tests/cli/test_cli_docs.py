@@ -13,11 +13,13 @@ from typing import Any
 from typer.main import get_command
 
 from flexdt.clients.cli.command_tree import SECTIONS, build
-from flexdt.clients.cli.connecting import TABLES
+from flexdt.clients.cli.settings_file import TABLES
 
-MOST_OPTIONS = 311
+MOST_OPTIONS = 218
 THEIRS = ("flexdt study", "flexdt batch", "flexdt bench", "flexdt phantom design")
-PAGE = Path(__file__).parents[2] / "docs" / "command-line.md"
+PROCESSES = ("up", "twin", "projector", "viewer", "gateway")
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "command-line.md"
 
 
 def commands(group: Any, prefix: str = "") -> set[str]:
@@ -74,6 +76,31 @@ def options(command: Any) -> list[Any]:
 def test_there_are_no_more_options_than_a_person_can_read() -> None:
     """The ceiling may only fall; what nobody sets belongs into the settings file."""
     assert sum(len(options(command)) for _, command in parts()) <= MOST_OPTIONS
+
+
+def taken(path: str, command: Any) -> set[str]:
+    """Flags that a command takes: its own, those of `flexdt` itself, those it passes on."""
+    out = {flag for option in options(command) for flag in (*option.opts, *option.secondary_opts)}
+    out |= {"--help", *getattr(command.callback, "heeds", ())}
+    name = path.split()[-1]
+    for table in PROCESSES if name == "up" else {name} & set(PROCESSES):
+        for f in fields(TABLES[table]):
+            out |= {f"--{f.name.replace('_', '-')}", *f.metadata["flags"]}
+    return out
+
+
+def test_options_that_the_pages_name_are_taken() -> None:
+    by_name = {path.removeprefix("flexdt "): taken(path, command) for path, command in parts()}
+    found = []
+    for page in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md")):
+        text = page.read_text("utf-8").replace("\\\n", " ")
+        for line in re.findall(r"(?:^|`)flexdt ([^`\n]*)", text, re.MULTILINE):
+            words = line.split()
+            name = " ".join(words[:2]) if " ".join(words[:2]) in by_name else words[0]
+            flags = re.findall(r"(?<![\w-])--[a-zA-Z][\w-]*", line) if name in by_name else ()
+            found += [(page.name, name, flag, flag in by_name[name]) for flag in flags]
+    assert len(found) > 100
+    assert [each for *each, there in found if not there] == []
 
 
 def test_h_is_help_and_every_section_names_commands() -> None:

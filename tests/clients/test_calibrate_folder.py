@@ -20,8 +20,7 @@ from flexdt.clients.calibration.calibrate import (
     inside_95,
 )
 from flexdt.clients.calibration.calibration_report import write_report
-from flexdt.clients.calibration.compare import compare_folder, write_comparison
-from flexdt.clients.calibration.tracks import write_tracks
+from flexdt.clients.calibration.compare import compare_folder, write_comparison, write_tracks
 from flexdt.clients.cli.entry import run
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.phantoms import load_phantom

@@ -19,10 +19,8 @@ import zmq.asyncio
 
 from flexdt.clients.cli.entry import run
 from flexdt.clients.client.async_client import AsyncTwinClient
-from flexdt.clients.following.frames import FramesBeside
 from flexdt.clients.following.read_only_twin import ReadOnlyTwin
-from flexdt.clients.following.scanner_link import endpoint
-from flexdt.clients.following.session import Session
+from flexdt.clients.following.session import FramesBeside, Session, endpoint
 from flexdt.phantoms import load_phantom
 from flexdt.protocol import RpcError
 from flexdt.runtime.access import AccessError

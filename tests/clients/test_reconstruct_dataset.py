@@ -321,7 +321,6 @@ def test_the_command(
     for extra, about in (
         (["--kv", "60"], "--kv"),
         (["--iterations", "5"], "--iterations"),
-        (["--algorithm", "sirt", "--window", "hann"], "--window"),
         (["--algorithm", "sirt", "--weight", "0.01"], "--weight"),
         (["--correction", "none", "--geometry", str(out)], "--correction"),
     ):
@@ -330,7 +329,7 @@ def test_the_command(
     there = tmp_path / "d.mha"
     there.write_bytes(b"earlier work")
     for words in ("--algorithm sirt", "--iterations 3", "--voxel 0.3", "--rings", "--binning 1",
-                  "--shape 9,9,9", "--window hann", "--material abs", "--every 2",
+                  "--shape 9,9,9", "--material abs", "--every 2",
                   "--center 0,0,0", "--scatter-correction abs"):  # fmt: skip
         assert run([*base, "--preview", *words.split()]) == 2
         shown = capsys.readouterr().err

@@ -275,7 +275,7 @@ def test_the_example_shows_that_nothing_is_lost(folder: Path, tmp_path: Path) ->
 def test_calibrate_takes_imported_geometries(folder: Path, tmp_path: Path) -> None:
     from typer import BadParameter
 
-    from flexdt.clients.cli.commands.data_sets.calibrate_commands import _opened
+    from flexdt.clients.cli.commands.calibrate_commands import _opened
 
     file = tmp_path / "g.json"
     data = load_dataset(folder)

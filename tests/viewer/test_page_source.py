@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -24,30 +25,53 @@ from flexdt.protocol.openrpc import document
 
 ROOT = Path(__file__).parents[2]
 WEB, BUILT = ROOT / "clients" / "viewer" / "web", ROOT / "clients" / "viewer" / "data"
+SOURCE = "".join(
+    path.read_text("utf-8") for path in sorted(WEB.glob("*.ts")) if path.name != "wire.d.ts"
+)
+WORDS = set(re.findall(r"\w+", SOURCE))
 COLUMNS = 120
 HEAD = """\
 // Written by tests/viewer/test_page_source.py from the OpenRPC document of the wire and of the
-// viewer's own methods. Answers have all their fields; what a request may leave out bears a "?".
+// viewer's own methods: the methods that the page calls, and the types and fields that it names.
+// Answers have all their fields; what a request may leave out bears a "?".
 """
 
 
 def types() -> str:
-    """TypeScript of every type of the wire and of what a page may request."""
+    """TypeScript of the methods that the page calls and of the types that it names."""
     own = {
         name: Method(name, asked, METHODS[name].result if name in METHODS else Nothing, name)
         for name, (asked, _) in PAGE_METHODS.items()
     }
-    table = {**METHODS, **own}
-    schemas = document(table)["components"]["schemas"]
+    table = {name: m for name, m in {**METHODS, **own}.items() if called(name)}
+    schemas = document({**METHODS, **own})["components"]["schemas"]
+    answers = [m for m in table.values() if m.name in METHODS]
     asked = within([m.params.__name__ for m in table.values()], schemas)
+    schemas = {name: of_page(schema, name in asked) for name, schema in schemas.items()}
+    imported = ",".join(re.findall(r"^import type \{(.*?)\}", SOURCE, re.MULTILINE | re.DOTALL))
+    named = [name for name in map(str.strip, imported.split(",")) if name in schemas]
+    own_types = [each.__name__ for m in table.values() for each in (m.params, m.result)]
+    used = within([*named, *own_types], schemas) - {Nothing.__name__}
     lines = [HEAD]
-    for name, schema in sorted(schemas.items()):
-        lines.append(f"export type {name} = {typed(schema, name in asked)};\n")
-    lines.append("\nexport interface Requests {\n")
-    lines += [f'  "{m.name}": {m.params.__name__};\n' for m in table.values()]
-    lines.append("}\nexport interface WireAnswers {\n")
-    lines += [f'  "{m.name}": {m.result.__name__};\n' for m in METHODS.values()]
+    for name in sorted(used):
+        lines.append(f"export type {name} = {typed(schemas[name], name in asked)};\n")
+    lines.append("\n// Method -> its parameters, and its answer where the wire names one.\n")
+    lines.append("export interface Methods {\n")
+    for m in table.values():
+        answer = m.result.__name__ if m in answers else "object"
+        lines.append(f'  "{m.name}": [{m.params.__name__}, {answer}];\n')
     return "".join([*lines, "}\n"])
+
+
+def of_page(schema: Mapping[str, Any], asked: bool) -> Mapping[str, Any]:
+    """A type with the fields that the page names or, in a request, has to send."""
+    fields, needed = schema.get("properties", {}), schema.get("required", []) if asked else ()
+    return {**schema, "properties": {k: v for k, v in fields.items() if k in WORDS or k in needed}}
+
+
+def called(name: str) -> bool:
+    """Whether the page names a method, by itself or by its group (`job.${action}`)."""
+    return f'"{name}"' in SOURCE or f"`{name.split('.')[0]}.${{" in SOURCE
 
 
 def within(names: list[str], schemas: Mapping[str, Any]) -> set[str]:

@@ -21,8 +21,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from flexdt.clients.viewer.feed import ShownImage, grey, halved, packed, window_of
-from flexdt.clients.viewer.scenes import collision_bodies as bodies
 from flexdt.clients.viewer.scenes import parts
+from flexdt.clients.viewer.scenes import parts as bodies
 from flexdt.clients.viewer.scenes import sample as shapes
 from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.beam_shade import MOST, fans

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 import viser
 
-from flexdt.clients.viewer.scenes import collision_bodies as bodies
 from flexdt.clients.viewer.scenes import parts, world
+from flexdt.clients.viewer.scenes import parts as bodies
 from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.beam_shade import BeamShade
 from flexdt.clients.viewer.scenes.gizmos import Drag, Gizmos

@@ -17,8 +17,11 @@ import numpy as np
 import trimesh
 
 from flexdt.clients.viewer.scenes import sample as s
+from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.sample import PaintedMesh
 from flexdt.phantoms.files.mesh_files import read_part
+from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid
+from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Component, Machine
 
 Builder = Callable[[float, float, float], list[PaintedMesh]]
@@ -190,3 +193,28 @@ ROLES: Mapping[str, Builder] = {
     "panel": _panel,
 }
 """Component role -> its builder, where the name says nothing."""
+
+
+FINENESS = 2
+"""Of the ball that a body is grown by: an icosphere, whose points lie along the axes too."""
+
+
+def bare(solid: Solid) -> trimesh.Trimesh:
+    """A convex solid [mm]."""
+    if isinstance(solid, Cylinder):
+        size = 2.0 * solid.radius, solid.height
+        return solids.cylinder(*size, solid.center, solids.STEEL).mesh
+    assert isinstance(solid, Polytope)
+    return _hull(solid.vertices)
+
+
+def grown(body: trimesh.Trimesh, margin_mm: float) -> trimesh.Trimesh:
+    """A convex body and everything within `margin_mm` of it."""
+    ball = trimesh.creation.icosphere(subdivisions=FINENESS, radius=margin_mm).vertices
+    corners = np.asarray(body.vertices)[:, None, :] + np.asarray(ball)[None, :, :]
+    return _hull(corners.reshape(-1, 3))
+
+
+def _hull(points: FloatArray) -> trimesh.Trimesh:
+    hull: trimesh.Trimesh = trimesh.convex.convex_hull(points)
+    return hull

@@ -18,7 +18,7 @@ import numpy as np
 import viser
 from scipy.spatial.transform import Rotation
 
-from flexdt.clients.viewer.scenes import collision_bodies as bodies
+from flexdt.clients.viewer.scenes import parts as bodies
 from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.sample import MM
 from flexdt.protocol.state_model import CameraState, State

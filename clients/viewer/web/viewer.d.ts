@@ -1,5 +1,5 @@
 // What the viewer says beside the wire: its messages, its own methods' answers, and what the page makes of them.
-import type { CalibrationFitResult, CheckStep, DatasetListResult, DatasetResult, HelloResult, ImageFlags, JobStatus, Mark, State, WireAnswers } from "./wire.js";
+import type { CalibrationFitResult, CheckStep, DatasetListResult, DatasetResult, HelloResult, ImageFlags, JobStatus, Mark, Methods, State } from "./wire.js";
 
 export type * from "./wire.js";
 
@@ -53,8 +53,10 @@ export interface FitReport extends Omit<CalibrationFitResult, "tracks"> {
   frames: number; cost_reduction_pct: number | null; weak: string[]; tracks: { phantom: string; datasets: TrackedScan[] } | null;
 }
 
-type Quiet = Record<`viewer.${"layers" | "theme" | "camera" | "feed" | "window" | "live"}`, object>;
-export interface Answers extends Omit<WireAnswers, "calibration.fit">, Quiet {
+export type Requests = { [M in keyof Methods]: Methods[M][0] };
+type WireAnswers = { [M in keyof Methods]: Methods[M][1] };
+// The viewer's own methods answer with nothing, unless they are named here.
+export interface Answers extends WireAnswers {
   "calibration.fit": FitReport;
   "viewer.ray": { paths_mm: Record<string, number>; length_mm: number };
   "viewer.spectrum": { energy_keV: number[]; photons: number[]; mean_keV: number; filters: Array<{ material: string; thickness_mm: number }>; limits: { kV: Pair; power_W: Pair; exposure_ms: Pair } };

@@ -1,15 +1,6 @@
 // Written by tests/viewer/test_page_source.py from the OpenRPC document of the wire and of the
-// viewer's own methods. Answers have all their fields; what a request may leave out bears a "?".
-export type AxisSet = {
-  axis: string;
-  speed?: number | null;
-  acceleration?: number | null;
-};
-export type AxisSetResult = {
-  axis: string;
-  speed: number;
-  acceleration: number;
-};
+// viewer's own methods: the methods that the page calls, and the types and fields that it names.
+// Answers have all their fields; what a request may leave out bears a "?".
 export type AxisState = {
   position: number;
   target: number;
@@ -18,12 +9,10 @@ export type AxisState = {
   moving: boolean;
   unit: "mm" | "deg";
   speed: number | null;
-  acceleration: number | null;
   virtual: boolean;
 };
 export type CalibrationAlign = {
   name: string;
-  per_frame?: boolean;
 };
 export type CalibrationAlignResult = {
   identifiable: boolean;
@@ -37,10 +26,7 @@ export type CalibrationFit = {
   datasets: Array<string>;
   phantom: string;
   free?: Array<string> | null;
-  priors?: Record<string, number>;
-  per_frame?: Array<string>;
   steps?: number;
-  residuals?: boolean;
   tracks?: boolean;
   markers?: Array<Mark> | null;
   scale?: string | null;
@@ -49,16 +35,10 @@ export type CalibrationFitResult = {
   identifiable: boolean;
   parameters: Record<string, Estimated>;
   correction: Record<string, number> | null;
-  covariance: Array<Array<number | null>>;
   rms_px: number | null;
-  rms_per_bead_px: Array<number | null>;
-  residuals_px: Array<Array<[number, number] | null>> | null;
   steps: Array<CalibrationStep>;
   tracks: Record<string, JsonValue> | null;
   problems: Array<CalibrationProblem>;
-};
-export type CalibrationGet = {
-  name?: string | null;
 };
 export type CalibrationProblem = {
   code: string;
@@ -67,7 +47,6 @@ export type CalibrationProblem = {
 };
 export type CalibrationStep = {
   frames: number;
-  covariance: Array<Array<number>> | null;
 };
 export type Camera = {
   view?: "iso" | "beam" | "side" | "free";
@@ -100,7 +79,6 @@ export type CheckCollision = {
   line: number | null;
   time_s: number;
   pair: Array<string>;
-  last_free: Record<string, number>;
 };
 export type CheckResult = {
   ok: boolean;
@@ -117,9 +95,6 @@ export type CheckStep = {
   start_s: number;
   duration_s: number;
   what: string;
-};
-export type ClockSet = {
-  speed_up: number | "max";
 };
 export type ClockState = {
   time_s: number;
@@ -140,7 +115,6 @@ export type Control = {
 };
 export type ControlResult = {
   controller: string | null;
-  yours: boolean;
 };
 export type Correct = {
   parameters: Record<string, number>;
@@ -169,29 +143,6 @@ export type CorrectionResult = {
   correction: Correction | null;
   warnings: Array<string>;
 };
-export type DatasetFrame = {
-  name: string;
-  index: number;
-  kind?: "line_integral" | "counts";
-  binning?: number;
-};
-export type DatasetFrameResult = {
-  dtype: "uint8" | "int16" | "uint16" | "int32" | "uint32" | "float32" | "float64";
-  shape: Array<number>;
-  data: string;
-  name: string;
-  index: number;
-  file: string;
-  image: "dark" | "flat" | "projection";
-  projection: number | null;
-  kind: "line_integral" | "counts";
-  time_s: number | null;
-  exposure_ms: number | null;
-  positions: Record<string, number> | null;
-  cone_vec: Array<number> | null;
-  tube: Record<string, JsonValue> | null;
-  camera: Record<string, JsonValue> | null;
-};
 export type DatasetGet = {
   name: string;
   points?: number;
@@ -209,7 +160,6 @@ export type DatasetInfo = {
   present: number;
   machine: string | null;
   sample: string;
-  operator: string;
   kV: number | null;
   power_W: number | null;
   exposure_ms: number | null;
@@ -217,12 +167,6 @@ export type DatasetInfo = {
   shape: [number, number] | null;
   problem: string;
   thumbnail: ImageValue | null;
-};
-export type DatasetList = {
-  search?: string;
-  start?: number;
-  count?: number;
-  thumbnail?: number;
 };
 export type DatasetListResult = {
   datasets: Array<DatasetInfo>;
@@ -248,11 +192,6 @@ export type DatasetResult = {
 export type Datasets = {
   search?: string;
   start?: number;
-};
-export type Discovery = {
-  openrpc: string;
-  info: Record<string, JsonValue>;
-  methods: Array<Record<string, JsonValue>>;
 };
 export type Empty = Record<string, never>;
 export type Estimated = {
@@ -292,11 +231,6 @@ export type ExposurePrediction = {
 export type Feed = {
   kind: "line_integral" | "counts";
 };
-export type GeometryResult = {
-  cone_vec: Array<number>;
-  detector_shape: [number, number];
-  pixel_mm: number;
-};
 export type GeometryState = {
   SOD_mm: number;
   SDD_mm: number;
@@ -306,11 +240,6 @@ export type GeometryState = {
   field_of_view_mm: [number, number];
   cone_angle_deg: number | null;
   axis_column_px: number | null;
-};
-export type Hello = {
-  protocol: string | number;
-  client: string;
-  token?: string | null;
 };
 export type HelloResult = {
   protocol: string;
@@ -329,13 +258,10 @@ export type ImageFlags = {
   good_lines: [number, number] | null;
 };
 export type ImageValue = {
-  dtype: "uint8" | "int16" | "uint16" | "int32" | "uint32" | "float32" | "float64";
   shape: Array<number>;
   data: string;
 };
-export type JobListResult = {
-  jobs: Array<JobStatus>;
-};
+export type JobListResult = Record<string, unknown>;
 export type JobRef = {
   job?: string | null;
 };
@@ -352,7 +278,6 @@ export type JobStatus = {
   speed_up: number | "max";
   real_time_factor: number | null;
   error: Record<string, unknown> | null;
-  retry_s: number | null;
   warnings: Array<string>;
   step: number | null;
   line: number | null;
@@ -394,7 +319,6 @@ export type Move = {
   relative?: boolean;
   wait?: boolean;
   plan?: boolean;
-  shortest?: boolean;
 };
 export type MoveResult = {
   duration_s: number;
@@ -402,7 +326,6 @@ export type MoveResult = {
   moves: Array<Record<string, number>> | null;
   arrived: boolean | null;
 };
-export type Nothing = Record<string, unknown>;
 export type Placement = {
   x?: number;
   y?: number;
@@ -413,9 +336,6 @@ export type Placement = {
 };
 export type Plan = {
   text?: string | null;
-};
-export type Pong = {
-  time: number;
 };
 export type PredictedSetting = {
   kV: number;
@@ -432,32 +352,8 @@ export type Problem = {
   column: number | null;
   message: string;
 };
-export type Projection = {
-  dtype: "uint8" | "int16" | "uint16" | "int32" | "uint32" | "float32" | "float64";
-  shape: Array<number>;
-  data: string;
-  cone_vec: Array<number>;
-  kind: "line_integral" | "counts";
-  time: number | null;
-  flags: ImageFlags | null;
-  marks: ImageValue | null;
-};
-export type ProjectionGet = {
-  kind?: "line_integral" | "counts";
-  binning?: number;
-  marks?: boolean;
-  positions?: Record<string, number> | null;
-  tube?: TubeSet | null;
-  camera?: CameraSet | null;
-};
 export type Ray = {
   pixel?: [number, number] | null;
-};
-export type RayGet = {
-  pixel: [number, number];
-};
-export type RayResult = {
-  paths_mm: Record<string, number>;
 };
 export type Recorded = {
   name?: string | null;
@@ -476,7 +372,6 @@ export type SafetyState = {
   message: string;
   stop: number;
   stopped_by: string | null;
-  blocked_attempts: number;
   clearance_mm: number | null;
   pair: Array<string> | null;
   warnings: Array<string>;
@@ -491,18 +386,6 @@ export type SampleInfo = {
 export type SampleListResult = {
   samples: Array<SampleInfo>;
   materials: Array<string>;
-};
-export type SampleMesh = {
-  start?: number;
-  count?: number;
-};
-export type SampleMeshResult = {
-  name: string;
-  revision: string | null;
-  format: "stl";
-  total: number;
-  start: number;
-  data: string;
 };
 export type SamplePart = {
   name: "" | string;
@@ -555,8 +438,6 @@ export type Scene = {
   machine: string;
   profile: string;
   positions: Record<string, number>;
-  speeds?: Record<string, number>;
-  accelerations?: Record<string, number>;
   tube: TubePart;
   camera: CameraPart;
   sample: SamplePart;
@@ -578,11 +459,8 @@ export type Screenshot = {
 };
 export type ScriptInput = {
   text?: string | null;
-  data_base64?: string | null;
   name?: string | null;
   speed_up?: number | "max" | null;
-  motion_samples?: number;
-  seed?: number | null;
 };
 export type Scrub = {
   time_s?: number | null;
@@ -617,42 +495,18 @@ export type Stopped = {
   clock: ClockState;
   controller: string | null;
   image: ImageFlags | null;
-  stopping: Stopping | null;
-};
-export type Stopping = {
-  path: "along" | "apart" | "coasting";
-  duration_s: number;
-  distances: Record<string, number>;
-  would_hit: Array<string> | null;
-  would_hit_in_s: number | null;
 };
 export type SubmitResult = {
   job: string;
   dataset: string | null;
   warnings: Array<string>;
 };
-export type Subscribe = {
-  topics: Array<"state" | "projection" | "job" | "log">;
-  max_rate_hz?: number | null;
-  projection_kind?: "line_integral" | "counts";
-  projection_binning?: number;
-};
 export type Theme = {
   dark?: boolean;
-};
-export type TrajectoryInput = {
-  poses: Array<Record<string, number>>;
-  exposure_ms?: number | null;
-  name?: string | null;
-  speed_up?: number | "max" | null;
-  motion_samples?: number;
-  seed?: number | null;
 };
 export type TransmissionShares = {
   least: number;
   p1: number;
-  p5: number;
-  median: number;
   edges: Array<number>;
   shares: Array<number>;
 };
@@ -673,9 +527,6 @@ export type TubeState = {
   ready: boolean;
   ready_in_s: number | null;
 };
-export type Unsubscribe = {
-  topics: Array<"state" | "projection" | "job" | "log">;
-};
 export type UploadResult = {
   name: string;
   received: number;
@@ -688,113 +539,50 @@ export type Window = {
   high?: number | null;
 };
 
-export interface Requests {
-  "session.hello": Hello;
-  "session.control": Control;
-  "session.ping": Empty;
-  "state.get": Empty;
-  "state.subscribe": Subscribe;
-  "state.unsubscribe": Unsubscribe;
-  "axes.move": Move;
-  "axes.jog": Jog;
-  "axes.set": AxisSet;
-  "axes.stop": Empty;
-  "safety.estop": Empty;
-  "safety.reset": Reset;
-  "clock.set": ClockSet;
-  "tube.set": TubeSet;
-  "camera.set": CameraSet;
-  "sample.set": SampleSet;
-  "sample.list": Empty;
-  "sample.mesh": SampleMesh;
-  "sample.upload": SampleUpload;
-  "projection.get": ProjectionGet;
-  "projection.ray": RayGet;
-  "geometry.get": Empty;
-  "exposure.predict": ExposurePredict;
-  "script.check": ScriptInput;
-  "script.submit": ScriptInput;
-  "trajectory.check": TrajectoryInput;
-  "trajectory.submit": TrajectoryInput;
-  "job.status": JobRef;
-  "job.pause": JobRef;
-  "job.resume": JobRef;
-  "job.step": JobRef;
-  "job.abort": JobRef;
-  "job.list": Empty;
-  "dataset.list": DatasetList;
-  "dataset.get": DatasetGet;
-  "dataset.frame": DatasetFrame;
-  "calibration.apply": Correct;
-  "calibration.get": CalibrationGet;
-  "calibration.list": Empty;
-  "calibration.revert": Empty;
-  "calibration.fit": CalibrationFit;
-  "calibration.align": CalibrationAlign;
-  "scene.save": SceneSave;
-  "scene.load": SceneLoad;
-  "rpc.discover": Empty;
-  "viewer.layers": Layers;
-  "viewer.theme": Theme;
-  "viewer.camera": Camera;
-  "viewer.feed": Feed;
-  "viewer.window": Window;
-  "viewer.ray": Ray;
-  "viewer.spectrum": Spectrum;
-  "viewer.plan": Plan;
-  "viewer.recorded": Recorded;
-  "viewer.recorded_image": RecordedImage;
-  "viewer.live": Live;
-  "viewer.compose": Compose;
-  "viewer.datasets": Datasets;
-  "viewer.scrub": Scrub;
-  "viewer.screenshot": Screenshot;
-  "viewer.export": Export;
-}
-export interface WireAnswers {
-  "session.hello": HelloResult;
-  "session.control": ControlResult;
-  "session.ping": Pong;
-  "state.get": State;
-  "state.subscribe": Nothing;
-  "state.unsubscribe": Nothing;
-  "axes.move": MoveResult;
-  "axes.jog": MoveResult;
-  "axes.set": AxisSetResult;
-  "axes.stop": Stopped;
-  "safety.estop": Stopped;
-  "safety.reset": State;
-  "clock.set": ClockState;
-  "tube.set": TubeState;
-  "camera.set": CameraState;
-  "sample.set": SampleResult;
-  "sample.list": SampleListResult;
-  "sample.mesh": SampleMeshResult;
-  "sample.upload": UploadResult;
-  "projection.get": Projection;
-  "projection.ray": RayResult;
-  "geometry.get": GeometryResult;
-  "exposure.predict": ExposurePrediction;
-  "script.check": CheckResult;
-  "script.submit": SubmitResult;
-  "trajectory.check": CheckResult;
-  "trajectory.submit": SubmitResult;
-  "job.status": JobStatus;
-  "job.pause": JobStatus;
-  "job.resume": JobStatus;
-  "job.step": JobStatus;
-  "job.abort": JobStatus;
-  "job.list": JobListResult;
-  "dataset.list": DatasetListResult;
-  "dataset.get": DatasetResult;
-  "dataset.frame": DatasetFrameResult;
-  "calibration.apply": CorrectionResult;
-  "calibration.get": CorrectionResult;
-  "calibration.list": CorrectionListResult;
-  "calibration.revert": CorrectionResult;
-  "calibration.fit": CalibrationFitResult;
-  "calibration.align": CalibrationAlignResult;
-  "scene.save": SceneResult;
-  "scene.load": State;
-  "rpc.discover": Discovery;
+// Method -> its parameters, and its answer where the wire names one.
+export interface Methods {
+  "session.control": [Control, ControlResult];
+  "axes.move": [Move, MoveResult];
+  "axes.jog": [Jog, MoveResult];
+  "axes.stop": [Empty, Stopped];
+  "safety.estop": [Empty, Stopped];
+  "safety.reset": [Reset, State];
+  "tube.set": [TubeSet, TubeState];
+  "camera.set": [CameraSet, CameraState];
+  "sample.set": [SampleSet, SampleResult];
+  "sample.list": [Empty, SampleListResult];
+  "sample.upload": [SampleUpload, UploadResult];
+  "exposure.predict": [ExposurePredict, ExposurePrediction];
+  "script.check": [ScriptInput, CheckResult];
+  "script.submit": [ScriptInput, SubmitResult];
+  "job.status": [JobRef, JobStatus];
+  "job.pause": [JobRef, JobStatus];
+  "job.resume": [JobRef, JobStatus];
+  "job.step": [JobRef, JobStatus];
+  "job.abort": [JobRef, JobStatus];
+  "job.list": [Empty, JobListResult];
+  "dataset.get": [DatasetGet, DatasetResult];
+  "calibration.apply": [Correct, CorrectionResult];
+  "calibration.list": [Empty, CorrectionListResult];
+  "calibration.revert": [Empty, CorrectionResult];
+  "calibration.fit": [CalibrationFit, CalibrationFitResult];
+  "calibration.align": [CalibrationAlign, CalibrationAlignResult];
+  "scene.save": [SceneSave, SceneResult];
+  "scene.load": [SceneLoad, State];
+  "viewer.layers": [Layers, object];
+  "viewer.theme": [Theme, object];
+  "viewer.camera": [Camera, object];
+  "viewer.feed": [Feed, object];
+  "viewer.window": [Window, object];
+  "viewer.ray": [Ray, object];
+  "viewer.spectrum": [Spectrum, object];
+  "viewer.plan": [Plan, object];
+  "viewer.recorded": [Recorded, object];
+  "viewer.recorded_image": [RecordedImage, object];
+  "viewer.live": [Live, object];
+  "viewer.compose": [Compose, object];
+  "viewer.datasets": [Datasets, object];
+  "viewer.scrub": [Scrub, object];
+  "viewer.screenshot": [Screenshot, object];
+  "viewer.export": [Export, object];
 }

@@ -1,4 +1,4 @@
-"""The stages of `flexdt demo`, one function each, and the document that summarises them.
+"""`flexdt demo`: the main job from end to end, on this machine, with nothing prepared.
 
 Each stage does its real work through the public client and the files, as a user would, and stops
 the demonstration with a readable error when something is wrong. A stage that did not run is absent
@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
-from flexdt.clients.cli.commands.data_sets.calibrate_commands import (
+from flexdt.clients.cli.commands.calibrate_commands import (
     parameter_rows,
     push_correction,
     write_json,
 )
-from flexdt.clients.cli.commands.scanner.script_commands import follow
-from flexdt.clients.cli.console import duration, size, table
+from flexdt.clients.cli.commands.scan_commands import follow
+from flexdt.clients.cli.console import duration, note, say, size, table
+from flexdt.clients.cli.options import Answer, option
 from flexdt.clients.failure import CommandError
 from flexdt.clients.launch import random_truth as hidden
 from flexdt.clients.launch.processes import Servers
@@ -31,6 +32,31 @@ if TYPE_CHECKING:
     from flexdt.clients.calibration.calibrate import Outcome
     from flexdt.clients.client.client import TwinClient
     from flexdt.clients.datasets.data_set import DataSet
+
+
+def demo(
+    out: Path = option(Path("flexdt-demo"), "Write everything to this folder.", metavar="DIR"),
+    no_viewer: bool = option(False, "Exit when the work is done, without a viewer.", "--no-viewer"),
+    truth: Path | None = option(None, "Hide this misalignment, not a random one.", metavar="FILE"),
+    json: bool = False,
+) -> Answer:
+    """Do the main job: script, scan, data set, calibration.
+
+    Starts the servers on free ports, scans the LEGO bead phantom with the example script,
+    accelerated, calibrates from the data set, and says what was done, where the files are and how
+    the result compares with the hidden truth. With the viewer it stays up until Ctrl-C.
+    """
+
+    def stay(url: str) -> None:
+        note(f"the lab is at {url}; Ctrl-C ends the demonstration")
+        try:
+            while True:
+                time.sleep(3600.0)
+        except KeyboardInterrupt:
+            note("")
+
+    yield run_demo(out, truth, note if json else say, None if no_viewer else stay)
+
 
 SAMPLE: Final = "lego"
 SCRIPT: Final = "lego-fly-360.txt"

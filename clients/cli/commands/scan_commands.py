@@ -1,14 +1,15 @@
-"""Scan scripts on the command line: `flexdt check`, `flexdt run` and `flexdt script new`.
+"""`flexdt expose`, `check`, `run`, `script new` and `job`: scans predicted, checked and run.
 
-They check a script without a server, run it on a twin, and write a valid one from options (by
-`flexdt.twin.script.compose`).
+Scripts are checked without a server, run on a twin, and written from options by
+`flexdt.twin.script.compose`.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
@@ -22,17 +23,17 @@ from flexdt.clients.cli.boundary import (
     verdict,
     wire_code,
 )
-from flexdt.clients.cli.commands.scanner.job_command import describe
-from flexdt.clients.cli.commands.scanner.snap_command import warn_of_exposure
-from flexdt.clients.cli.connecting import Twin, on_twin
-from flexdt.clients.cli.console import ProgressBar, duration, emit, note, say, size, table, warn
-from flexdt.clients.cli.options import Answer, option
+from flexdt.clients.cli.commands.scanner_commands import warn_of_exposure
+from flexdt.clients.cli.console import ProgressBar, duration, note, size, table, warn
+from flexdt.clients.cli.options import Answer, Twin, argument, option
+from flexdt.clients.cli.settings_file import ScriptNewSettings, chosen
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from flexdt.clients.client.client import TwinClient
+    from flexdt.clients.expose import Forecast, Measured, Transmission
     from flexdt.protocol.state_model import JobStatus
     from flexdt.twin.script import CheckReport, Problem
     from flexdt.twin.script.executed_log import Executed
@@ -53,14 +54,14 @@ def check(
     against: Path | None = option(
         None, "Compare with the log of this script, line by line.", metavar="LOG"
     ),
-    json: options.Json = False,
-) -> None:
+    json: bool = False,
+) -> Answer:
     """Parse, plan and check a script, without a server.
 
     Exit code 0 with warnings alone, 1 for an invalid script, 3 for a collision or limit.
     """
     if against is not None:
-        compare(script, against, machine, html, json)
+        yield from compare(script, against, machine, html)
         return
     from flexdt.phantoms.samples import as_phantom
     from flexdt.scripts import collisions, size_of
@@ -68,14 +69,14 @@ def check(
     from flexdt.twin.script.problems import in_order
 
     data = script.read_bytes()
-    chosen = machines.machine(machine)
+    scanner = machines.machine(machine)
     phantom = None if sample is None else as_phantom(sample)
     report = check_script(
         data,
-        chosen,
-        machines.profile(profile, chosen, machine),
+        scanner,
+        machines.profile(profile, scanner, machine),
         sample=size_of(phantom),
-        collision=collisions(phantom) if chosen.components else None,
+        collision=collisions(phantom) if scanner.components else None,
     )
     if phantom is not None and not report.errors:
         from flexdt.phantoms.exposure_forecast import exposure_problems
@@ -84,11 +85,14 @@ def check(
         report = replace(report, problems=in_order((*report.problems, *more)))
     if html is not None:
         html.write_text(html_report(report, script.name), encoding="utf-8")
-    emit(report.to_dict()) if json else show(report, str(script))
+    yield report.to_dict()
+    if not json:
+        tell(report.problems, str(script))
+    yield from show(report, str(script))
     raise typer.Exit(exit_code(report))
 
 
-def compare(script: Path, log: Path, machine: str | None, html: Path | None, json: bool) -> None:
+def compare(script: Path, log: Path, machine: str | None, html: Path | None) -> Answer:
     """Each line of an executed script beside its prediction, the greatest errors first.
 
     Raises:
@@ -109,11 +113,9 @@ def compare(script: Path, log: Path, machine: str | None, html: Path | None, jso
     tell(found.problems, str(log))
     if html is not None:
         html.write_text(against_html(found, script.name), encoding="utf-8")
-    if json:
-        emit(found.to_dict())
-        return
-    say(table(found.table(), found.HEADER) + "\n")
-    say(table([(f"{label}:", value) for label, value in against_summary(found)]))
+    yield found.to_dict()
+    yield table(found.table(), found.HEADER) + "\n"
+    yield table([(f"{label}:", value) for label, value in against_summary(found)])
 
 
 def read_log_file(log: Path) -> tuple[Executed, ...]:
@@ -147,12 +149,11 @@ def tell(problems: Sequence[Problem], file: str) -> None:
         note(f"{place}: {p.severity}: {p.message} [{p.code}]")
 
 
-def show(report: CheckReport, file: str) -> None:
-    """A check for people: problems to standard error, figures and plan to standard output."""
+def show(report: CheckReport, file: str) -> Answer:
+    """The plan and the figures of a check."""
     from flexdt.twin.script.planning.dry_run_report import between, summary
     from flexdt.twin.script.planning.plan import step_range
 
-    tell(report.problems, file)
     timing = report.plan.machine.timing
     steps = [
         (s.line, f"{s.start_s:.2f}", f"{s.duration_s:.2f}", between(step_range(s, timing)),
@@ -161,12 +162,11 @@ def show(report: CheckReport, file: str) -> None:
     ]  # fmt: skip
     if steps:
         head = ("line", "start [s]", "takes [s]", "90 %", "of it commands", "what")
-        say(table(steps, head) + "\n")
-    say(table([(f"{label}:", value) for label, value in summary(report)]))
-    say(f"{file}: {'ok' if report.ok else 'not ok'}")
+        yield table(steps, head) + "\n"
+    yield table([(f"{label}:", value) for label, value in summary(report)])
+    yield f"{file}: {'ok' if report.ok else 'not ok'}"
 
 
-@on_twin
 def run(
     twin: Twin,
     script: ScriptFile,
@@ -268,9 +268,6 @@ def new(
     ),
     sod: float | None = option(None, USUAL, metavar="MM"),
     sdd: float | None = option(None, USUAL, metavar="MM"),
-    height: float | None = option(
-        None, "Set the height of source and detector centre.", metavar="MM"
-    ),
     frames: int = option(361, "Take so many images in a turn, or in all."),
     exposure: float = option(100.0, "Expose each image so long.", metavar="MS"),
     averages: int = option(1, "Average so many read-outs in an image."),
@@ -300,7 +297,7 @@ def new(
         kind=kind,
         sod_mm=sod,
         sdd_mm=sdd,
-        height_mm=height,
+        height_mm=chosen(ScriptNewSettings).height,
         frames=frames,
         exposure_ms=exposure,
         averages=averages,
@@ -349,3 +346,143 @@ def _own(kind: Kind, **given: Any) -> dict[str, Any]:
     if "rise" in own:
         own["rise_mm"] = own.pop("rise")
     return own
+
+
+Job = Annotated[
+    str | None, typer.Argument(metavar="JOB", help="As in `job list`; the current one if left out.")
+]
+
+
+def list_jobs(twin: Twin) -> Answer:
+    """List all jobs, oldest first."""
+    with twin() as client:
+        found = client.jobs()
+    yield found
+    rows = [(j.job, j.state, f"{j.frames_done}/{j.frames_total}", j.dataset or j.name)
+            for j in found.jobs]  # fmt: skip
+    yield table(rows, ("job", "state", "frames", "data set")) if rows else "no jobs yet"
+
+
+def _on_job(does: str, act: Callable[[TwinClient, str | None], JobStatus]) -> Callable[..., Answer]:
+    """A command that does something with one job and shows how the job is then."""
+
+    def command(twin: Twin, job: Job = None) -> Answer:
+        with twin() as client:
+            status = act(client, job)
+        warn(status.warnings)
+        yield status
+        yield describe(status)
+
+    command.__doc__ = does
+    return command
+
+
+def describe(status: JobStatus) -> str:
+    """A job in one line."""
+    text = f"{status.job}: {status.state}, {status.frames_done} of {status.frames_total} frames"
+    if status.line is not None:
+        text += f", line {status.line}"
+    if status.what:
+        text += f" ({status.what})"
+    if status.remaining_s is not None and status.state in ("queued", "running", "paused"):
+        text += f", {duration(status.remaining_s)} left on the twin's clock"
+    if status.error:
+        text += f"; {status.error.get('message', status.error)}"
+    if status.dataset:
+        text += f"; data set {status.dataset}"
+    return text
+
+
+JOB_COMMANDS: Final = {
+    "list": list_jobs,
+    "status": _on_job("Show how far a job is.", lambda client, job: client.job_status(job)),
+    "pause": _on_job(
+        "Pause a job; a frame under exposure is taken again.",
+        lambda client, job: client.pause_job(job),
+    ),
+    "resume": _on_job(
+        "Return to the pose of the pause and go on.", lambda client, job: client.resume_job(job)
+    ),
+    "step": _on_job("Run a paused job for one step.", lambda client, job: client.step_job(job)),
+    "abort": _on_job(
+        "End a job; its data set stays, marked incomplete.",
+        lambda client, job: client.abort_job(job),
+    ),
+}
+"""Commands of the group by name."""
+
+
+BEST = 5
+"""Proposed settings that are shown."""
+
+
+def expose(
+    dataset: Path | None = argument(None, "[DATASET]", "Measure a scan's radiographs instead."),
+    sample: str = option("lego", "Predict the scan of this sample.", metavar="NAME or FILE"),
+    material: str | None = option(None, "Fill a mesh file with this material.", metavar="M"),
+    kV: list[float] | None = option(
+        None, "Try this voltage; repeat it for more, and the best is chosen.", "--kV", "--kv"
+    ),
+    power: float | None = option(None, "Set the tube's power.", metavar="W"),
+    filter: str = option("", "Put this filter beside the machine's own.", metavar="MATERIAL:MM"),
+    exposure: float | None = option(None, "Expose each image so long.", metavar="MS"),
+    averages: int = option(1, "Average so many read-outs in an image."),
+    frames: int = option(361, "Take so many images of the scan."),
+    sod: float = option(600.0, "Set the distance from source to axis.", metavar="MM"),
+    sdd: float = option(1059.0, "Set the distance from source to panel.", metavar="MM"),
+    detail: str = option(
+        "void:0.5", "See this detail; void:MM for less of the sample.", metavar="MATERIAL:MM"
+    ),
+    machine: options.MachineName = None,
+) -> Answer:
+    """Predict transmission, contrast to noise, dose and the best voltage and filter."""
+    from flexdt.clients import expose as of
+    from flexdt.clients.datasets.dataset import load_dataset
+
+    if dataset is not None:
+        data = load_dataset(dataset)
+        warn(data.warnings, dataset)
+        measured = of.exposure_of(data)
+        yield asdict(measured)
+        yield from _seen(measured)
+        return
+    forecast = of.expose(
+        sample,
+        kV=kV or None,
+        power_W=power,
+        filter=filter,
+        exposure_ms=exposure,
+        averages=averages,
+        images=frames,
+        sod=sod,
+        sdd=sdd,
+        detail=detail,
+        machine=machines.machine(machine),
+        material=material,
+    )
+    warn(forecast.assumed)
+    yield asdict(forecast)
+    yield from _told(forecast)
+
+
+def _seen(found: Forecast | Measured) -> Answer:
+    seen: Transmission = found.transmission
+    yield (f"transmission: least {seen.least:.3g}, 1 % below {seen.p1:.3g}, "
+           f"5 % below {seen.p5:.3g}, half below {seen.median:.3g}")  # fmt: skip
+    full = "unknown" if found.saturated is None else f"{100 * found.saturated:.3g} % of the pixels"
+    yield f"saturated {full}, starved {100 * found.starved:.3g} %"
+
+
+def _told(forecast: Forecast) -> Answer:
+    yield from _seen(forecast)
+    asked = forecast.asked
+    yield f"{forecast.detail} on the darkest ray: contrast {asked.cnr:.3g} times the noise"
+    yield (f"air kerma on the axis {asked.kerma_mGy:.3g} mGy; {forecast.images} images, at least "
+           f"{duration(forecast.seconds)}, {size(forecast.bytes)}")  # fmt: skip
+    rows = [
+        (f"{s.kV:g}", s.filter or "-", f"{s.averages} x {s.exposure_ms:.4g}", f"{s.cnr:.3g}",
+         f"{s.kerma_mGy:.3g}")
+        for s in forecast.best[:BEST]
+    ]  # fmt: skip
+    yield f"best of {len(forecast.best)} settings of the same power and time:"
+    yield table(rows, ("kV", "filter", "ms", "contrast/noise", "mGy"))

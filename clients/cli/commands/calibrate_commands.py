@@ -15,10 +15,10 @@ import typer
 
 from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
-from flexdt.clients.cli.commands.data_sets.exchange_commands import said
-from flexdt.clients.cli.connecting import Twin, on_twin
+from flexdt.clients.cli.commands.data_commands import said
 from flexdt.clients.cli.console import as_json, note, table, warn
-from flexdt.clients.cli.options import Answer, argument, option
+from flexdt.clients.cli.options import Answer, Twin, argument, option
+from flexdt.clients.cli.settings_file import CalibrateSettings, chosen
 from flexdt.clients.failure import CommandError
 from flexdt.clients.whole_files import write_whole
 
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 ReadingName = Literal["axis", "mount"]
 
 
-@on_twin
 def calibrate(
     twin: Twin,
     datasets: list[Path] | None = argument(None, "[DATASET...]"),
@@ -64,12 +63,7 @@ def calibrate(
         "Know offsets so well, not as the machine says; none: all exactly.",
         metavar="P=SIGMA,...",
     ),
-    bound: float | None = option(
-        None, "Refuse a sigma above this (mm, deg); default: 5.", metavar="MM"
-    ),
-    frames: Path | None = option(
-        None, "Read any scanner's TIFFs here, with --geometry.", metavar="DIR"
-    ),
+    frames: Path | None = option(None, "Read any scanner's TIFFs, with --geometry.", metavar="DIR"),
     shape: str | None = option(
         None, "Take this detector shape where FILE does not say it.", metavar="ROWS,COLS"
     ),
@@ -81,9 +75,7 @@ def calibrate(
     ),
     scale: str | None = option(None, "Set the distance of two unknown markers.", metavar="A-B=MM"),
     radius: float | None = option(None, "Look for bead spots of this radius.", metavar="PX"),
-    start: list[str] | None = option(
-        None, "Begin with these offsets (mm, deg).", metavar="P=V,..."
-    ),
+    start: list[str] | None = option(None, "Begin at these offsets (mm, deg).", metavar="P=V,..."),
     push: options.Push = False,
 ) -> Answer:
     """Calibrate the geometry from scans of a bead phantom or of unknown markers.
@@ -92,16 +84,14 @@ def calibrate(
     are for those of any other scanner, --markers for what was marked by hand. Exit code 5 when the
     data cannot determine what was asked for; then nothing is pushed.
     """
-    if report is not None and report.suffix.lower() not in (".html", ".json"):
-        raise typer.BadParameter(f"{report.name}: the report's ending must be .html or .json")
+    if report is not None:
+        option_values.require_ending(report, ".html", ".json")
     from flexdt.clients.calibration.calibrate import calibrate_datasets
     from flexdt.clients.calibration.calibration_report import write_report
     from flexdt.clients.calibration.markers import Scale
     from flexdt.clients.figures import require_plots
 
-    request = _request(
-        phantom, free, per_scan, per_frame, reading, bead_tolerance, prior, bound, start
-    )
+    request = _request(phantom, free, per_scan, per_frame, reading, bead_tolerance, prior, start)
     target = _named(phantom)
     if per_scan and len(datasets or ()) > 1 and push:
         raise typer.BadParameter("--push: with --per-scan there is no one geometry to push")
@@ -118,7 +108,7 @@ def calibrate(
     if report is not None:
         write_report(outcome, report)
     if tracks is not None:
-        from flexdt.clients.calibration.tracks import write_tracks
+        from flexdt.clients.calibration.compare import write_tracks
 
         write_tracks(outcome, tracks)
     yield document
@@ -133,26 +123,24 @@ def calibrate(
 
 def _request(
     phantom: str | None, free: str | None, per_scan: str, per_frame: str, reading: ReadingName,
-    bead_tolerance: float | None, prior: list[str] | None, bound: float | None,
-    start: list[str] | None,
+    bead_tolerance: float | None, prior: list[str] | None, start: list[str] | None,
 ) -> Request:  # fmt: skip
     """What is to be estimated, and what is known of it."""
     from flexdt.twin.calibration.fit.priors import exact
     from flexdt.twin.calibration.fit.problem import SIX, Reading
-    from flexdt.twin.calibration.fit.weak_directions import BOUND
     from flexdt.twin.calibration.pipeline import Request
     from flexdt.twin.calibration.unknown_markers import UNKNOWN
     from flexdt.twin.geometry.offsets import Offsets
 
     usual = ("dO_x",) if phantom == UNKNOWN else SIX
-    chosen = usual if free is None else option_values.names(free)
+    asked = usual if free is None else option_values.names(free)
     return Request(
-        free=chosen,
+        free=asked,
         per_scan=option_values.names(per_scan),
         reading={"axis": Reading.AXIS_AT_O_PLUS_TAU, "mount": Reading.MOUNT_SHIFT}[reading],
         bead_tolerance_mm=bead_tolerance,
-        priors=exact(chosen) if prior == ["none"] else _assigned(prior),
-        bound=BOUND if bound is None else bound,
+        priors=exact(asked) if prior == ["none"] else _assigned(prior),
+        bound=chosen(CalibrateSettings).bound,
         start=Offsets.from_edge(_assigned(start)),
         per_frame=option_values.names(per_frame),
     )
@@ -212,7 +200,6 @@ def _opened(folders: list[Path], geometries: list[Path] | None) -> list[DataSet]
     return [with_geometry(d, load_geometry(f)) for d, f in zip(data, geometries, strict=True)]
 
 
-@on_twin
 def align(
     twin: Twin,
     dataset: Path = argument(..., "DATASET"),
@@ -229,8 +216,8 @@ def align(
     the source turns. Exit code 5 when the scan cannot tell column and roll; then there is no
     correction.
     """
-    if out is not None and out.suffix.lower() != ".json":
-        raise typer.BadParameter(f"--out: {out.name}: the ending must be .json")
+    if out is not None:
+        option_values.require_ending(out, ".json")
     from flexdt.clients.calibration.align_dataset import align_dataset
 
     if push:

@@ -1,4 +1,4 @@
-"""`flexdt up [--only PROCESS]`, and `twin`, `projector`, `viewer` and `gateway`, which mean that.
+"""`flexdt up`, its aliases `twin`, `projector`, `viewer` and `gateway`, and `doctor`.
 
 The servers are programs of their own (`python -m flexdt.server...`); this process turns into one,
 so signals and exit codes are the server's. Their options come from `flexdt.process_settings`: the
@@ -12,20 +12,15 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
+from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import typer
 
 from flexdt.clients.cli import option_values
-from flexdt.clients.cli.connecting import TABLES, configuration
-from flexdt.process_settings import (
-    TwinSettings,
-    UpSettings,
-    has_parameters,
-    parameters,
-    read,
-    words,
-)
+from flexdt.clients.cli.options import Answer
+from flexdt.clients.cli.settings_file import TABLES, chosen, settings_of
+from flexdt.process_settings import UpSettings, has_parameters, parameters, words
 
 MODULES: Final = {
     "up": "flexdt.clients.launch.up",
@@ -45,7 +40,8 @@ def up(context: typer.Context, only: str | None, **given: object) -> None:
     """Start projector, twin and viewer; Ctrl-C stops all.
 
     They run as processes under one supervisor, which restarts a dead one. Prints one
-    JSON `ready` line with the addresses once everything listens.
+    JSON `ready` line with the addresses once everything listens. `flexdt twin --help` and its like
+    list further options, which `up` takes, too.
     """
     start(only or "up", [*words(given), *context.args])
 
@@ -87,10 +83,7 @@ gateway = alone(
 
 def start(name: str, more: Sequence[str]) -> None:
     """Become a process, with the settings file's options and then those of `more` words."""
-    kind, own = TABLES[name], configuration()
-    writes = issubclass(kind, UpSettings | TwinSettings)
-    data = {"data": own.data or str(TwinSettings().data)} if writes else {}
-    settings = read(kind, [*words({**data, **own.processes.get(name, {})}), *more])
+    settings = settings_of(TABLES[name], more)
     if settings is not None:
         given = {f.name: getattr(settings, f.name) for f in fields(settings)}
         _check(given)
@@ -112,3 +105,28 @@ def become(module: str, given: Mapping[str, object], more: Sequence[str] = ()) -
     sys.stdout.flush()
     sys.stderr.flush()
     os.execv(sys.executable, [sys.executable, "-P", "-m", module, *words(given), *more])
+
+
+MARKS = {"ok": "ok     ", "warning": "warning", "error": "ERROR  "}
+
+
+def doctor() -> Answer:
+    """Check this installation: Python, packages, compiled kernels, threads, GPU, ports, disk.
+
+    Ports and data directory are those that `flexdt up` would use. Ends with exit code 1 when
+    something is wrong; warnings alone are fine.
+    """
+    from flexdt.clients.launch.doctor import examine
+
+    up = chosen(UpSettings)
+    ports = (("twin", up.port), ("projector", up.projector_port), ("viewer", up.viewer_port))
+    findings = []
+    for finding in examine(up.data or Path("data"), ports):
+        findings.append(finding)
+        advice = f" -> {finding.advice}" if finding.advice else ""
+        yield f"{MARKS[finding.verdict]}  {finding.what}: {finding.found}{advice}"
+    sound = all(finding.verdict != "error" for finding in findings)
+    yield {"ok": sound, "findings": [vars(finding) for finding in findings]}
+    if not sound:
+        raise typer.Exit(1)
+    yield "This installation is sound."

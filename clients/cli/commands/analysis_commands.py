@@ -1,7 +1,11 @@
-"""`flexdt machine {list,show,check,new,fit}`: machines as data, new ones, fitted ones."""
+"""`flexdt machine` and `flexdt phantom`: machines and phantoms as data, new ones, fitted machines.
+
+A phantom file is JSON and may be named wherever `--phantom` is.
+"""
 
 from __future__ import annotations
 
+import json as json_text
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
@@ -10,11 +14,13 @@ import typer
 
 from flexdt import machines
 from flexdt.clients.cli import option_values
-from flexdt.clients.cli.commands.scanner.script_commands import read_log_file, tell
-from flexdt.clients.cli.console import say, table
+from flexdt.clients.cli.commands.scan_commands import read_log_file, tell
+from flexdt.clients.cli.console import note, table
 from flexdt.clients.cli.options import Answer, argument, option
+from flexdt.clients.cli.settings_file import MachineNewSettings, PhantomMakeSettings, chosen
 
 if TYPE_CHECKING:
+    from flexdt.phantoms import Phantom
     from flexdt.twin.machine.description import Axis, Machine
 
 T = TypeVar("T")
@@ -47,41 +53,35 @@ def show(name: NameOrFile) -> Answer:
     yield "\n" + _times(found)
 
 
-def check(name: NameOrFile) -> None:
+def check(name: NameOrFile) -> Answer:
     """Check a machine file: every value, its zero offsets, and whether it can stand at home."""
     from flexdt.twin.collision.home_check import check_home
 
     found = machines.machine(name)
     check_home(found, machines.profile(None, found, name), name)
-    say(f"{name}: ok ({len(found.axes)} axes, {len(found.components)} components)\n")
-    say(_places(found))
+    yield {"ok": True, "axes": len(found.axes), "components": len(found.components)}
+    yield f"{name}: ok ({len(found.axes)} axes, {len(found.components)} components)\n"
+    yield _places(found)
     if not found.components:
-        say("\nno components: nothing is checked for collisions")
+        yield "\nno components: nothing is checked for collisions"
 
 
 def new(
     name: str = argument(..., "NAME", "One word."),
     out: Path = option(..., "Write the machine to this file.", metavar="FILE"),
-    base: str | None = option(
-        None, "Begin with this machine, the one it is most like.", metavar="NAME"
-    ),
-    scanner: str | None = option(None, "Name it so in data sets.", metavar="TEXT"),
+    base: str | None = option(None, "Begin with this machine, the most similar.", metavar="NAME"),
     detector: str | None = option(
         None, "Set the detector's unbinned columns and rows.", metavar="COLUMNSxROWS"
     ),
     pitch: str | None = option(None, "Set the pitch of columns, and of rows.", metavar="MM[xMM]"),
     bits: int | None = option(None, "Set the bits of a pixel."),
-    sod: str | None = option(None, "Set source to axis, or least:greatest.", metavar="MM or MM:MM"),
-    sdd: str | None = option(
-        None, "Set source to panel, or least:greatest.", metavar="MM or MM:MM"
-    ),
+    sod: str | None = option(None, "Set source to axis, or least:most.", metavar="MM or MM:MM"),
+    sdd: str | None = option(None, "Set source to panel, or least:most.", metavar="MM or MM:MM"),
     kv: str | None = option(None, "Set the largest voltage, or least:most.", metavar="KV or KV:KV"),
     power: float | None = option(None, "Set the largest power.", metavar="W"),
-    limit: list[str] | None = option(
-        None, "Set the travel of an axis.", metavar="AXIS=LOWER:UPPER"
-    ),
+    limit: list[str] | None = option(None, "Set an axis's travel so.", metavar="AXIS=LOWER:UPPER"),
     without: list[str] | None = option(None, "Leave out this axis.", metavar="AXIS"),
-) -> None:
+) -> Answer:
     """Write a short file for a machine of your own; asks for what is not said, on a terminal."""
     from flexdt.twin.collision.home_check import check_home
     from flexdt.twin.machine.description import builtin_machine, builtin_machines, parse_machine
@@ -113,7 +113,7 @@ def new(
     answers = Answers(
         name=name,
         base=base,
-        scanner=scanner,
+        scanner=chosen(MachineNewSettings).scanner,
         columns=None if pixels is None else int(pixels[0]),
         rows=None if pixels is None else int(pixels[1]),
         pitch_mm=None if pitch is None else _pair(pitch, "--pitch"),
@@ -131,8 +131,11 @@ def new(
     check_home(made, machines.profile(None, made, str(out)), str(out))
     out.write_text(text, encoding="utf-8")
     least = f", the tube's least voltage ({made.tube.min_kV:g} kV) included"
-    say(f"{out}: {len(text.splitlines())} lines; everything else as in {base}"
-        f"{least if answers.min_kV is None else ''}; see: flexdt machine show {out}")  # fmt: skip
+    yield {"file": str(out), "text": text}
+    yield (
+        f"{out}: {len(text.splitlines())} lines; everything else as in {base}"
+        f"{least if answers.min_kV is None else ''}; see: flexdt machine show {out}"
+    )
 
 
 def _pair(word: str, what: str, *, whole: bool = False) -> tuple[float, float]:
@@ -220,3 +223,68 @@ def _times(machine: Machine) -> str:
     if timing.spread:
         rows.append(("all together", "", "", f"+-{100 * timing.drift:.0f} %", "log; for totals"))
     return table(rows, ("time of a", "median [s]", "5 %", "95 %", f"source ({timing.source})"))
+
+
+def list_phantoms() -> Answer:
+    """List the phantoms that ship."""
+    from flexdt.phantoms import load_phantom, phantom_names
+
+    found = {name: load_phantom(name) for name in phantom_names()}
+    yield {"phantoms": [_summary(name, p) for name, p in found.items()]}
+    rows = [
+        (name, " x ".join(f"{s:g}" for s in p.size_mm), len(p.beads), p.description)
+        for name, p in found.items()
+    ]
+    yield table(rows, ("name", "size [mm]", "beads", "what it is"))
+    yield "\nCuboids take a number of beads: normal-7 has seven."
+
+
+def make(
+    file: Path = argument(..., "FILE.json", "Where to write it."),
+    like: str | None = option(None, "Begin with this cuboid of `phantom list`.", metavar="NAME"),
+    size: str | None = option(None, "Set width, breadth and height [mm].", metavar="W,B,H"),
+    beads: int = option(5, "Put so many beads on a spiral.", metavar="K"),
+    radius: float = option(2.0, "Set the beads' radius.", metavar="MM"),
+    body: str = option("abs", "Make the body of this material.", metavar="MATERIAL"),
+    mesh: Path | None = option(None, "Fill this mesh: STL, OBJ, PLY, GLB or OFF.", metavar="FILE"),
+    unit: str | None = option(None, "Read the mesh in this unit; default: mm, for GLB m."),
+    stl: Path | None = option(None, "Write its surfaces, too, to print it.", metavar="FILE.stl"),
+) -> Answer:
+    """Write a new phantom: a bead cuboid of your own size, or a mesh."""
+    if sum(given is not None for given in (like, size, mesh)) != 1:
+        raise typer.BadParameter("give one of --like NAME, --size W,B,H or --mesh FILE")
+    option_values.require_folder(file, stl)
+    from flexdt.phantoms import bead_phantom, mesh_phantom
+
+    if mesh is not None:
+        made = mesh_phantom(mesh, unit=unit, material=body, name=file.stem)
+    else:
+        made = bead_phantom(
+            like if like is not None else _size(size or ""),
+            beads,
+            bead_radius_mm=radius,
+            body_material=body,
+            bead_material=chosen(PhantomMakeSettings).bead,
+        )
+    file.write_text(json_text.dumps(made.to_dict()), encoding="utf-8")
+    if stl is not None:
+        made.mesh().export(stl, file_type="stl")
+    for line in made.assumed:
+        note(f"assumed: {line}")
+    yield {"file": str(file), "stl": stl, **_summary(made.name, made)}
+    yield f"{file}: {made.description}"
+
+
+def _size(text: str) -> tuple[float, float, float]:
+    return option_values.triple(text, "size", "W,B,H, e.g. 20,40,60")
+
+
+def _summary(name: str, phantom: Phantom) -> dict[str, object]:
+    return {
+        "name": name,
+        "size_mm": list(phantom.size_mm),
+        "beads": len(phantom.beads),
+        "bead_radius_mm": phantom.bead_radius_mm.tolist(),
+        "description": phantom.description,
+        "assumed": list(phantom.assumed),
+    }

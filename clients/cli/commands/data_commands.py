@@ -1,4 +1,7 @@
-"""`flexdt reconstruct`: a volume from a data set and the geometry in force."""
+"""`flexdt reconstruct`, `export` and `import`: volumes from data sets, geometry in other formats.
+
+The work is in `flexdt.clients.reconstruction` and `flexdt.clients.datasets.exchange`.
+"""
 
 from __future__ import annotations
 
@@ -12,21 +15,21 @@ from typing import TYPE_CHECKING, Any, Literal
 import typer
 
 from flexdt.clients.cli import option_values, options
-from flexdt.clients.cli.connecting import Twin, on_twin
 from flexdt.clients.cli.console import ProgressBar, duration, note, size, warn
-from flexdt.clients.cli.options import Answer, argument, option
+from flexdt.clients.cli.options import Answer, Twin, argument, option
+from flexdt.clients.cli.settings_file import ExportSettings, ReconstructSettings, chosen
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from flexdt.clients.datasets.data_set import DataSet
+    from flexdt.clients.datasets.exchange import Given
     from flexdt.twin.geometry.offsets import Offsets
 
 Algorithm = Literal["fdk", "sirt", "sart", "cgls", "em", "tv"]
 
 
-@on_twin
 def reconstruct(
     twin: Twin,
     dataset: Path = argument(..., "DATASET"),
@@ -44,9 +47,6 @@ def reconstruct(
     every: int | None = option(None, "Use every n-th frame.", min=1),
     iterations: int | None = option(None, "Iterate so often; default: the algorithm's.", min=1),
     weight: float | None = option(None, "Weigh the total variation of tv by this.", min=0.0),
-    window: str | None = option(
-        None, "Filter FDK with ram-lak, shepp-logan, cosine, hamming or hann."
-    ),
     correction: str | None = option(
         None,
         "Apply a report's correction, or the twin's; default: the scan's.",
@@ -55,9 +55,7 @@ def reconstruct(
     center: str | None = option(None, "Put the volume's centre there [mm].", metavar="X,Y,Z"),
     texts: options.Texts = False,
     rings: bool = option(False, "Correct the images for rings.", "--rings"),
-    material: str | None = option(
-        None, "Correct beam hardening of an object of this material alone."
-    ),
+    material: str | None = option(None, "Correct beam hardening of an object of this material."),
     scatter_correction: str | None = option(
         None,
         "Subtract the scatter of an object of these, e.g. pmma,aluminium.",
@@ -65,16 +63,10 @@ def reconstruct(
     ),
     kv: float | None = option(None, "Take this tube voltage; default: the data set's."),
     png: bool = option(False, "Write three slices beside the volume.", "--png"),
-    preview: bool = option(
-        False,
-        "Make a quick, coarse volume by FDK, and slices as PNG.",
-        "--preview",
-    ),
+    preview: bool = option(False, "Make a quick, coarse FDK volume, and PNG slices.", "--preview"),
     geometry: options.Geometry = None,
     scheduler: options.Scheduler = None,
-    slurm: Path | None = option(
-        None, "Submit workers to SLURM as this TOML file says.", metavar="FILE"
-    ),
+    slurm: Path | None = option(None, "Submit workers to SLURM as this file says.", metavar="FILE"),
 ) -> Answer:
     """Reconstruct a volume from a data set.
 
@@ -82,25 +74,24 @@ def reconstruct(
     """
     own = {
         "algorithm": None if algorithm == "fdk" else algorithm, "voxel": voxel, "shape": shape,
-        "binning": binning, "every": every, "iterations": iterations, "window": window,
-        "weight": weight, "center": center, "rings": rings or None, "material": material,
+        "binning": binning, "every": every, "iterations": iterations, "weight": weight,
+        "center": center, "rings": rings or None, "material": material,
         "scatter-correction": scatter_correction, "scheduler": scheduler, "slurm": slurm,
     }  # fmt: skip
     other = {"kv": kv, "correction": correction, "geometry": geometry}
-    chosen = {name: value for name, value in (own | other).items() if value is not None}
-    _check_together(chosen, out, [name for name in own if name in chosen] if preview else [])
+    given = {name: value for name, value in (own | other).items() if value is not None}
+    _check_together(given, out, [name for name in own if name in given] if preview else [])
     from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_dataset
     from flexdt.clients.reconstruction.reconstruct import preview as quick_look
 
     request = VolumeRequest(
         algorithm or "fdk", voxel, None if shape is None else _shape(shape), binning or 1,
-        every or 1, iterations, window or "ram-lak",
+        every or 1, iterations, chosen(ReconstructSettings).window,
         None if center is None else option_values.triple(center, "center", "X,Y,Z, e.g. 0,0,-5.5"),
         rings, material, kv, png, weight,
         None if scatter_correction is None else option_values.names(scatter_correction),
     )  # fmt: skip
-    if not out.absolute().parent.is_dir():
-        raise CommandError(f"{out}: the folder does not exist")
+    option_values.require_folder(out)
     parameters, report = _correction(correction, twin)
     # Workers have working directories of their own.
     shared = scheduler is not None or slurm is not None
@@ -127,24 +118,23 @@ def reconstruct(
     yield from (f"  {file}" for file in document["slices"])
 
 
-def _check_together(chosen: Mapping[str, object], out: Path, kept_out: Iterable[str]) -> None:
+def _check_together(given: Mapping[str, object], out: Path, kept_out: Iterable[str]) -> None:
     """Usage errors of options that do not go together; a preview keeps some out."""
     from flexdt.clients.reconstruction.volume_files import SUFFIXES, ending
 
-    algorithm = chosen.get("algorithm", "fdk")
-    corrects = {"material", "scatter-correction"} & chosen.keys()
+    algorithm = given.get("algorithm", "fdk")
+    corrects = {"material", "scatter-correction"} & given.keys()
     for wrong, name, why in (
         *((True, name, "--preview chooses for itself") for name in kept_out),
         (ending(out) not in SUFFIXES, "out",
          f"{out}: the ending must be one of {', '.join(SUFFIXES)}"),
-        ("kv" in chosen and not corrects, "kv", "it is for --material and --scatter-correction"),
-        ("iterations" in chosen and algorithm == "fdk", "iterations", "fdk has none"),
-        ("weight" in chosen and algorithm != "tv", "weight", f"{algorithm} has none"),
-        ("window" in chosen and algorithm != "fdk", "window", f"{algorithm} has no filter"),
-        ({"scheduler", "slurm"} <= chosen.keys(), "slurm", "not together with --scheduler"),
+        ("kv" in given and not corrects, "kv", "it is for --material and --scatter-correction"),
+        ("iterations" in given and algorithm == "fdk", "iterations", "fdk has none"),
+        ("weight" in given and algorithm != "tv", "weight", f"{algorithm} has none"),
+        ({"scheduler", "slurm"} <= given.keys(), "slurm", "not together with --scheduler"),
         *((algorithm != "fdk", name, f"{algorithm} is not done by workers; allowed: fdk")
-          for name in ("scheduler", "slurm") if name in chosen),
-        ({"correction", "geometry"} <= chosen.keys(), "correction",
+          for name in ("scheduler", "slurm") if name in given),
+        ({"correction", "geometry"} <= given.keys(), "correction",
          "no correction is added to a geometry from a file"),
     ):  # fmt: skip
         if wrong:
@@ -263,3 +253,129 @@ def moved(data: DataSet, report: Report) -> DataSet:
         return data.with_motion(Motion.from_dict(here[0]))
     except TwinError as error:
         raise CommandError(f"{path}: {error}") from None
+
+
+Format = Literal["ctsimu", "rtk", "astra", "tomosipo", "flexdata", "csv"]
+Exported = Literal[Format, "nxtomo"]
+Rows = Literal["down", "up"]
+
+
+def export(
+    dataset: Path = argument(..., "DATASET"),
+    format: Exported = option(..., "Write this program's format."),
+    out: Path = option(..., "Write the geometry to this file.", metavar="FILE"),
+    corrected: bool = option(
+        True, "Apply the correction in force, or leave it out.", "--corrected/--nominal"
+    ),
+    correction: Path | None = option(
+        None, "Apply the correction of this calibration report instead.", metavar="FILE"
+    ),
+    unknown: Path | None = option(
+        None,
+        "State, for CTSimU, what reconstruction does not know (TOML).",
+        metavar="FILE",
+    ),
+    rows: Rows = option("down", "Count rows down or up; up: for images turned upside down."),
+    texts: options.Texts = False,
+) -> Answer:
+    """Write a data set's geometry in another program's format; nxtomo holds its images, too.
+
+    What the format cannot carry is an error, and nothing is written: docs/exchange.md.
+    """
+    if correction is not None and not corrected:
+        raise typer.BadParameter("--correction and --nominal exclude each other")
+    from flexdt.clients.cli.commands.data_commands import read_report, scan_of
+    from flexdt.clients.datasets.exchange import export_dataset
+    from flexdt.clients.launch.random_truth import read
+    from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+
+    tolerance = chosen(ExportSettings).tolerance
+    report = None if correction is None else read_report(correction)
+    parameters = report.parameters if report else None if corrected else NOMINAL
+    data = scan_of(dataset, texts, report)
+    warn(data.warnings, dataset)
+    real = None if unknown is None else Offsets.from_edge(read(unknown))
+    written = export_dataset(
+        data,
+        out,
+        format,
+        parameters=parameters,
+        real=real,
+        rows_up=rows == "up",
+        tolerance_mm=tolerance,
+    )
+    height, width = written.shape or (0, 0)
+    yield {
+        "format": format, "file": str(out), "views": len(written), "shape": [height, width],
+        "corrected": corrected, "rows": "up" if format == "flexdata" else rows,
+    }  # fmt: skip
+    what = "corrected" if corrected else "nominal"
+    yield f"{out}: {len(written)} views of {width} x {height} pixels, {what}, {format}"
+
+
+def import_(
+    file: Path = argument(..., "FILE"),
+    format: Format = option(..., "Read this program's format."),
+    out: Path = option(..., "Write the geometry to this file.", metavar="FILE.{json,npy}"),
+    like: Path | None = option(
+        None, "Take what FILE does not say from this data set.", metavar="DATASET"
+    ),
+    shape: str | None = option(
+        None, "Set the detector's shape where FILE does not say it.", metavar="ROWS,COLS"
+    ),
+    pixel: str | None = option(
+        None, "Set the pixel pitch where FILE does not say it (RTK).", metavar="MM or U,V"
+    ),
+    views: int | None = option(None, "Set the number of projections (flexDATA).", min=1),
+    rows: Rows = option("down", "Count rows down or up; up: v is negated."),
+    real: bool = option(
+        False, "Take, of a CTSimU file, what is so, or what reconstruction knows.", "--real/--known"
+    ),
+) -> Answer:
+    """Read a geometry in another program's format and write it as a geometry file.
+
+    `flexdt reconstruct` and `calibrate` take it with --geometry, Python with `load_geometry`.
+    """
+    given = said(like, shape, pixel, views)
+    from dataclasses import replace
+
+    from flexdt.clients.datasets.exchange import import_geometry, save_geometry
+
+    geometry = import_geometry(file, format, given, rows_up=rows == "up")
+    if real and geometry.real is not None:
+        geometry = replace(geometry, cone_vec=geometry.real, real=None, notes=())
+    save_geometry(geometry, out)
+    for text in geometry.notes:
+        note(f"{file}: {text}")
+    yield {
+        "format": format, "file": str(file), "out": str(out), "views": len(geometry),
+        "shape": None if geometry.shape is None else list(geometry.shape),
+        "pixel_mm": list(geometry.pitch_mm), "notes": list(geometry.notes),
+    }  # fmt: skip
+    height, width = geometry.shape or (None, None)
+    size = "unknown size" if width is None else f"{width} x {height} pixels"
+    u, v = geometry.pitch_mm
+    yield f"{out}: {len(geometry)} views of {size}, pixel {u:.6g} x {v:.6g} mm"
+
+
+def said(
+    like: Path | None, shape: str | None, pixel: str | None, views: int | None = None
+) -> Given:
+    """What the options say that a geometry's file does not."""
+    size = pitch = None
+    if shape is not None:
+        form = "ROWS,COLS, e.g. 760,956"
+        size = option_values.numbers(shape, "shape", form, 2, whole=True)
+    if pixel is not None:
+        pitch = option_values.numbers(pixel, "pixel pitch", "MM or U,V", 1, 2)
+    if pitch is not None and min(pitch) <= 0.0:
+        raise typer.BadParameter(f"pixel pitch {pixel!r} must be above 0")
+    from flexdt.clients.datasets.dataset import load_dataset
+    from flexdt.clients.datasets.exchange import Given
+
+    known = Given() if like is None else Given.of(load_dataset(like))
+    return Given(
+        known.shape if size is None else (int(size[0]), int(size[1])),
+        known.pitch_mm if pitch is None else (pitch[0], pitch[-1]),
+        known.views if views is None else views,
+    )

@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING
 from flexdt import machines
 from flexdt.clients.cli import options
 from flexdt.clients.cli.boundary import REFUSED, USAGE
-from flexdt.clients.cli.console import emit, note, say
-from flexdt.clients.cli.options import argument, option
+from flexdt.clients.cli.console import note, say
+from flexdt.clients.cli.options import Answer, argument, option
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
-    from flexdt.clients.following.frames import FramesBeside
-    from flexdt.clients.following.session import Session
+    from flexdt.clients.following.session import FramesBeside, Session
     from flexdt.twin.following.follower import Follower
     from flexdt.twin.following.mirror import Alarm
 
@@ -46,11 +45,9 @@ def follow(
         min=0,
         max=65535,
     ),
-    seconds: float | None = option(
-        None, "End after so many seconds.", "--for", metavar="S", min=0.0
-    ),
-    json: options.Json = False,
-) -> None:
+    seconds: float | None = option(None, "End after this time.", "--for", metavar="S", min=0.0),
+    json: bool = False,
+) -> Answer:
     """Follow a real scanner: hear its messages, compare, and say what leaves the prediction.
 
     Nothing is ever sent to the scanner. Ends with Ctrl-C or after --for. Exit code 4 if there was
@@ -59,8 +56,7 @@ def follow(
     from flexdt.clients.extras import package
 
     zmq = package("zmq", "flexdt follow", "gateway")
-    from flexdt.clients.following.scanner_link import endpoint
-    from flexdt.clients.following.session import Session
+    from flexdt.clients.following.session import Session, endpoint
 
     try:
         at = endpoint(address)
@@ -69,7 +65,7 @@ def follow(
     follower = _follower(machine, profile, script, sample)
     beside = None
     if frames is not None:
-        from flexdt.clients.following.frames import FramesBeside
+        from flexdt.clients.following.session import FramesBeside
         from flexdt.phantoms.samples import as_phantom
 
         if sample is None or not frames.is_dir():
@@ -86,8 +82,7 @@ def follow(
         except* zmq.ZMQError as group:
             why = "; ".join(map(str, group.exceptions))
             raise CommandError(f"{at}: {why}", REFUSED) from None
-    if json:
-        emit({"address": at, "unread": session.unread, **session.mirror.to_dict(session.clock())})
+    yield {"address": at, "unread": session.unread, **session.mirror.to_dict(session.clock())}
     if session.mirror.heard_s is None and not session.mirror.connected:
         raise CommandError(f"{at}: there has been no connection", REFUSED)
 

@@ -1,8 +1,8 @@
-"""The options of every command that talks to a twin, and the connection that they describe.
+"""The settings file: what commands and processes leave out comes from it.
 
-What a command leaves out comes from environment variables, then from the user's configuration file.
-The file is TOML: `$XDG_CONFIG_HOME/flexdt/config.toml`, `~/.config/flexdt/config.toml` where that
-variable is not set, or the one that FLEXDT_CONFIG names. Options of commands override both.
+Environment variables override the file, options of commands override both. The file is TOML:
+`$XDG_CONFIG_HOME/flexdt/config.toml`, `~/.config/flexdt/config.toml` where that variable is not
+set, or the one that FLEXDT_CONFIG names.
 
     server = "scanner-room:55000"     # FLEXDT_SERVER
     token_file = "~/.flexdt-token"    # FLEXDT_TOKEN_FILE; or token = "...", FLEXDT_TOKEN
@@ -11,41 +11,87 @@ variable is not set, or the one that FLEXDT_CONFIG names. Options of commands ov
 
     [twin]                            # also [up], [projector], [viewer], [gateway]
     http_port = 9101                  # any option of `flexdt twin --help`
+
+    [reconstruct]                     # a command's rarely changed choices, see `TABLES`
+    window = "hann"
 """
 
 from __future__ import annotations
 
-import inspect
 import os
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from functools import partial, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
-import typer
-
-from flexdt.clients.cli import option_values
 from flexdt.clients.failure import CommandError
 from flexdt.process_settings import (
     GatewaySettings,
     ProjectorSettings,
+    Settings,
     TwinSettings,
     UpSettings,
     ViewerSettings,
-    has_parameters,
+    option,
+    read,
+    words,
 )
 
-if TYPE_CHECKING:
-    import ssl
-
-    from flexdt.clients.client.client import TwinClient
-
-_R = TypeVar("_R")
+S = TypeVar("S", bound=Settings)
 
 PREFIX: Final = "FLEXDT_"
 PATHS: Final = ("token_file", "tls_ca", "data")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateSettings(Settings):
+    """`flexdt calibrate`."""
+
+    command = "calibrate"
+    bound: float = option(5.0, "Refuse a sigma above this (mm, deg).")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportSettings(Settings):
+    """`flexdt export`."""
+
+    command = "export"
+    tolerance: float = option(1e-9, "Let a view be so far from what flexDATA states.", min=0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MachineNewSettings(Settings):
+    """`flexdt machine new`."""
+
+    command = "machine new"
+    scanner: str | None = option(None, "Name the scanner so in data sets.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhantomMakeSettings(Settings):
+    """`flexdt phantom make`."""
+
+    command = "phantom make"
+    bead: str = option("steel", "Make the beads of this material.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructSettings(Settings):
+    """`flexdt reconstruct`."""
+
+    command = "reconstruct"
+    window: Literal["ram-lak", "shepp-logan", "cosine", "hamming", "hann"] = option(
+        "ram-lak", "Filter FDK with this window."
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScriptNewSettings(Settings):
+    """`flexdt script new`."""
+
+    command = "script new"
+    height: float | None = option(None, "Set the height of source and detector centre [mm].")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +104,7 @@ class Configuration:
         token_file: file whose first line is the token.
         tls_ca: certificates (PEM) to trust; speaks TLS.
         data: directory that a twin started here writes to.
-        processes: options of processes started here, by the names of their settings.
+        tables: options of processes and commands, by the names of their tables.
     """
 
     server: str | None = None
@@ -66,15 +112,21 @@ class Configuration:
     token_file: str | None = None
     tls_ca: str | None = None
     data: str | None = None
-    processes: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
+    tables: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
 
 
-TABLES: Final = {
-    kind.command: kind
-    for kind in (UpSettings, TwinSettings, ProjectorSettings, ViewerSettings, GatewaySettings)
-}
+TABLES: Final[Mapping[str, type[Settings]]] = {
+    kind.command.replace(" ", "_"): kind
+    for kind in (
+        UpSettings, TwinSettings, ProjectorSettings, ViewerSettings, GatewaySettings,
+        CalibrateSettings, ExportSettings, MachineNewSettings, PhantomMakeSettings,
+        ReconstructSettings, ScriptNewSettings,
+    )
+}  # fmt: skip
 """Tables of the file, and what their keys are."""
-KEYS: Final = tuple(f.name for f in fields(Configuration) if f.name != "processes")
+ELSEWHERE: Final[Mapping[str, str]] = {"doctor": "up"}
+"""Commands that read the table of another one."""
+KEYS: Final = tuple(f.name for f in fields(Configuration) if f.name != "tables")
 
 
 def config_file(environ: Mapping[str, str]) -> Path:
@@ -106,12 +158,12 @@ def configuration(environ: Mapping[str, str] | None = None) -> Configuration:
     if "token" in found and "token_file" in found:
         where = "FLEXDT_TOKEN and FLEXDT_TOKEN_FILE" if own else f"{path}: token and token_file"
         raise CommandError(f"{where} are both set; allowed: one of them")
-    processes = {name: found.pop(name) for name in TABLES if name in found}
+    tables = {name: found.pop(name) for name in TABLES if name in found}
     given = {key: value for key, value in found.items() if value}
     for key in PATHS:
         if key in given:
             given[key] = str(Path(given[key]).expanduser())
-    return Configuration(**given, processes=processes)
+    return Configuration(**given, tables=tables)
 
 
 def _of_file(path: Path, *, required: bool) -> dict[str, Any]:
@@ -142,78 +194,43 @@ def _of_file(path: Path, *, required: bool) -> dict[str, Any]:
     return dict(document)
 
 
-Twin = Callable[[], "TwinClient"]
-"""Connects to the twin that the command line names, for use as `with twin() as client`."""
-Server = Annotated[
-    str | None,
-    typer.Option(
-        metavar="HOST:PORT",
-        help=f"Talk to the twin there; default: {option_values.DEFAULT_SERVER}, or configured.",
-    ),
-]
-TokenFile = Annotated[
-    str | None, typer.Option(metavar="FILE", help="Show the twin the token in this file.")
-]
-CONNECTION: Final = tuple(
-    inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kind)
-    for name, kind in (("server", Server), ("token_file", TokenFile))
-)
-"""Arguments of `connect` as options."""
-
-
-def on_twin(command: Callable[..., _R]) -> Callable[..., _R]:
-    """Give a command the connection options in place of its first parameter, a `Twin`.
-
-    Typer builds the command line from the signature of what this returns. The command itself
-    decides when to connect.
-    """
-
-    @wraps(command)
-    def with_connection(**given: Any) -> _R:
-        address = {p.name: given.pop(p.name) for p in CONNECTION}
-        return command(partial(connect, **address), **given)
-
-    _, *own = inspect.signature(command, eval_str=True).parameters.values()
-    has_parameters(with_connection, [*own, *CONNECTION])
-    return with_connection
-
-
-def connect(server: str | None = None, token_file: str | None = None) -> TwinClient:
-    """A client for a twin, to be used as a context manager.
-
-    What is None is taken from the user's configuration, see `configuration`.
+def settings_of(kind: type[S], more: Sequence[str] = ()) -> S | None:
+    """A table of the file as settings; None if `more` asked for the help, which is shown.
 
     Args:
-        server: HOST:PORT, see `option_values.server`; 127.0.0.1:55000 if nothing says otherwise.
-        token_file: file whose first line is the session's token; shows none by default.
+        kind: of a process or command.
+        more: words of the command line, which override the file.
 
     Raises:
-        typer.BadParameter: the address has another form.
-        CommandError: the certificate file holds no certificate, or the configuration is wrong.
-        OSError: the token or certificate file cannot be read, or nothing answers.
+        CommandError: a value of the file does not hold; names file, table and key.
+        Exception: typer's usage errors of `more`.
     """
     own = configuration()
-    host, port = option_values.server(server or own.server or option_values.DEFAULT_SERVER)
-    shown = token_file or own.token_file
-    token = own.token if shown is None else _first_line(Path(shown))
-    context = None if own.tls_ca is None else _trusting(Path(own.tls_ca))
-
-    from flexdt.clients.client.client import TwinClient
-
-    return TwinClient(host, port, token=token, name="flexdt", ssl=context)
-
-
-def _trusting(certificate: Path) -> ssl.SSLContext:
-    """A TLS context that trusts a file's certificates and checks the server's name."""
-    import ssl
-
-    text = certificate.read_text(encoding="ascii", errors="replace")
+    data = {"data": own.data or "data"} if issubclass(kind, UpSettings | TwinSettings) else {}
+    name = kind.command.replace(" ", "_")
+    given = words({**data, **own.tables.get(name, {})})
     try:
-        return ssl.create_default_context(cadata=text)
-    except (ssl.SSLError, ValueError):
-        raise CommandError(f"{certificate}: no certificate (PEM)") from None
+        found = read(kind, given)
+    except Exception as error:
+        if not hasattr(error, "format_message"):
+            raise
+        raise CommandError(
+            f"{config_file(os.environ)}: [{name}] {error.format_message()}"
+        ) from None
+    return read(kind, [*given, *more]) if more else found
 
 
-def _first_line(path: Path) -> str:
-    lines = path.read_text(encoding="utf-8").splitlines()
-    return lines[0].strip() if lines else ""
+def chosen(kind: type[S]) -> S:
+    """The settings of a command, from its table of the file; errors as `settings_of`."""
+    found = settings_of(kind)
+    assert found is not None
+    return found
+
+
+def home_of(command: str, flag: str) -> str | None:
+    """Where the file says what `flag` of a command said once; None if it has no such key."""
+    name = "_".join(command.split()[1:])
+    table, key = ELSEWHERE.get(name, name), flag.lstrip("-").replace("-", "_")
+    if table not in TABLES or key not in {f.name for f in fields(TABLES[table])}:
+        return None
+    return f"`{key}` in [{table}] of {config_file(os.environ)}"

@@ -1,1 +1,0 @@
-"""Commands about scans as data: predicted, simulated, calibrated, reconstructed, exchanged."""

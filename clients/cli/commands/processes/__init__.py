@@ -1,1 +1,0 @@
-"""Commands that start processes or look at this installation: servers, demonstration, checks."""

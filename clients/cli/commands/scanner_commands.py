@@ -1,0 +1,366 @@
+"""`flexdt state`, `move`, `jog`, `stop`, `tube`, `camera`, `sample`, `snap` and their like.
+
+They show or set what a running twin has. The twin checks ranges and limits; its error is printed as
+it comes.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import typer
+
+from flexdt.clients.cli import option_values, options
+from flexdt.clients.cli.boundary import REFUSED
+from flexdt.clients.cli.console import duration, note, table, warn
+from flexdt.clients.cli.options import Answer, Twin, argument, option
+from flexdt.clients.failure import CommandError
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from flexdt.clients.client.client import TwinClient
+    from flexdt.protocol.state_model import AxisState, ImageFlags, State, Stopped, TubeState
+
+
+def state(twin: Twin) -> Answer:
+    """Show axes, geometry, tube, camera, sample, safety, job."""
+    with twin() as client:
+        current = client.state()
+    yield current
+    yield table([_axis(n, a) for n, a in current.axes.items()],
+                ("axis", "position", "target", "velocity", "limits", "unit", ""))  # fmt: skip
+    yield ""
+    for name, text in _facts(current):
+        yield f"{name:12} {text}"
+
+
+def _axis(name: str, axis: AxisState) -> tuple[str, ...]:
+    lower, upper = axis.limits
+    doing = "moving" if axis.moving else "virtual" if axis.virtual else ""
+    return (
+        name, f"{axis.position:.4f}", f"{axis.target:.4f}", f"{axis.velocity:.3f}",
+        f"[{lower:g}, {upper:g}]", axis.unit, doing,
+    )  # fmt: skip
+
+
+def _facts(state: State) -> list[tuple[str, str]]:
+    g, c, t, s = state.geometry, state.camera, state.tube, state.sample
+    rows, cols = c.shape
+    facts = [
+        ("geometry", f"SOD {g.SOD_mm:.4f} mm, SDD {g.SDD_mm:.4f} mm, magnification "
+                     f"{g.magnification:.4f}, voxel {g.voxel_size_mm * 1000:.3f} um"),
+        ("view", f"{g.field_of_view_mm[0]:.2f} x {g.field_of_view_mm[1]:.2f} mm, piercing point "
+                 f"column {g.piercing_point_px[0]:.2f}, row {g.piercing_point_px[1]:.2f}"),
+        ("tube", f"{xrays(t)}, {t.kV:g} kV, {t.power_W:g} W"),
+        ("camera", f"{c.mode}, {cols} x {rows} pixels of {c.pixel_mm:g} mm, {c.exposure_ms:g} ms"),
+        ("sample", s.name or "none"),
+        ("safety", " ".join(w for w in (state.safety.state, state.safety.message) if w)),
+        ("clock", f"{state.clock.time_s:.2f} s, speed-up {state.clock.speed_up}"),
+        ("correction", state.correction.name if state.correction else "none"),
+        ("controller", state.controller or "nobody"),
+    ]  # fmt: skip
+    if state.image is not None:
+        i = state.image
+        cut = f", sample cut off at: {', '.join(i.truncated)}" if i.truncated else ""
+        facts.append(("image", f"{i.saturated:.1%} saturated, {i.starved:.1%} starved{cut}"))
+    if state.job is not None:
+        j = state.job
+        facts.append(("job", f"{j.job} {j.state}, {j.frames_done} of {j.frames_total} frames"))
+    return facts
+
+
+def tube(
+    twin: Twin,
+    kV: float | None = option(None, "Set the tube's voltage.", "--kv"),
+    power_W: float | None = option(None, "Set the tube's power.", "--power", metavar="W"),
+    on: bool | None = option(None, "Switch X-rays on or off.", "--on/--off"),
+) -> Answer:
+    """Set the X-ray tube, or show it; what is left out stays."""
+    with twin() as client:
+        if kV is None and power_W is None and on is None:
+            t = client.state().tube
+        else:
+            t = client.set_tube(kV=kV, power_W=power_W, on=on)
+    yield t
+    yield f"X-rays {xrays(t)}, {t.kV:g} kV, {t.power_W:g} W"
+
+
+def xrays(tube: TubeState) -> str:
+    """Off, on, or when they will be ready."""
+    if tube.on and not tube.ready:
+        return f"on, ready in {tube.ready_in_s or 0.0:.1f} s"
+    return "on" if tube.on else "off"
+
+
+def camera(
+    twin: Twin,
+    exposure_ms: float | None = option(None, "Set the exposure time.", "--exposure", metavar="MS"),
+    mode: str | None = option(None, "Set the mode: HWaSWbHigh or HWaSWbLow."),
+    roi: options.Roi = None,
+    averages: int | None = option(None, "Average so many read-outs in an image."),
+) -> Answer:
+    """Set the camera, or show it; what is left out stays."""
+    with twin() as client:
+        if exposure_ms is None and mode is None and roi is None and averages is None:
+            c = client.state().camera
+        else:
+            c = client.set_camera(exposure_ms=exposure_ms, mode=mode, roi=roi, averages=averages)
+    yield c
+    rows, cols = c.shape
+    yield (f"{c.mode}, {cols} x {rows} pixels of {c.pixel_mm:g} mm, {c.exposure_ms:g} ms, "
+           f"averages {c.averages}, ROI {' '.join(map(str, c.roi))}")  # fmt: skip
+
+
+def clock(twin: Twin, speed_up: str = argument(..., "X or max")) -> Answer:
+    """Set how fast the twin's time runs."""
+    wanted = option_values.speed_up(speed_up)
+    with twin() as client:
+        now = client.set_clock(wanted)
+    yield now
+    yield f"speed-up {now.speed_up}, {now.time_s:.2f} s on the twin's clock"
+
+
+JOG_LEASE_S = 1.0
+"""How long an axis goes on after this process has died, in real seconds."""
+LONGEST_LEASE_S = 10.0
+"""The wire's, on the twin's clock."""
+JOG_RENEWED = 0.3
+"""After which part of a lease the next one is taken."""
+JOG_POLL_S = 0.002
+
+
+def move(
+    twin: Twin,
+    targets: list[str] = argument(..., "AXIS=VALUE...", "mm or deg, script's sign."),
+    relative: bool = option(False, "Move by these values instead of to them.", "--relative"),
+    plan: bool = option(False, "Plan a path around obstacles.", "--plan"),
+    shortest: bool = option(False, "Turn rot_obj by the shortest way.", "--shortest"),
+    no_wait: bool = option(False, "Return without waiting for the arrival.", "--no-wait"),
+) -> Answer:
+    """Move axes; several start together."""
+    wanted = option_values.assignments(targets)
+    with twin() as client:
+        try:
+            done = client.move(
+                wanted, relative=relative, plan=plan, shortest=shortest, wait=not no_wait
+            )
+        except KeyboardInterrupt:
+            note("flexdt: the axes keep moving; `flexdt stop` brakes them")
+            raise
+    warn(done.warnings)
+    yield done
+    if done.arrived is False:
+        raise CommandError("the move did not end at its target; see `flexdt state`", REFUSED)
+    verb = "moving, arrives in" if no_wait else "arrived after"
+    yield f"{verb} {duration(done.duration_s)} of the twin's clock"
+
+
+def jog(
+    twin: Twin,
+    axis: str = argument(..., "AXIS"),
+    velocity: str = argument(..., "VELOCITY", "mm/s or deg/s, signed."),
+    seconds: str | None = option(
+        None, "Stop after so many seconds of the twin's clock.", "--for", metavar="SECONDS"
+    ),
+) -> Answer:
+    """Move an axis at a velocity until Ctrl-C, or for a time."""
+    speed = option_values.number(velocity, "the velocity")
+    lasting = math.inf if seconds is None else option_values.number(seconds, "--for")
+    if lasting <= 0:
+        raise typer.BadParameter(f"--for {seconds}: the seconds must be more than 0")
+    with twin() as client:
+        note(f"jogging {axis} at {speed:g}; Ctrl-C stops it")
+        try:
+            _lease(client, axis, speed, lasting)
+        except KeyboardInterrupt:
+            note("")
+        client.jog(axis, 0.0)
+        position = client.state().axes[axis]
+    yield position
+    yield f"{axis} braking at {position.position:.4f} {position.unit}"
+
+
+def _lease(client: TwinClient, axis: str, speed: float, seconds: float) -> None:
+    """Jog for so many seconds of the twin's clock, lease after lease, at whatever speed it runs."""
+    now, left, shown = client.state(), seconds, ""
+    while left > 0:
+        pace = math.inf if now.clock.speed_up == "max" else now.clock.speed_up
+        lease = min(JOG_LEASE_S * pace, LONGEST_LEASE_S, left)
+        jogged = client.jog(axis, speed, lease_s=lease)
+        if jogged.duration_s == 0.0:
+            return  # at the end of its travel
+        for warning in jogged.warnings:  # a contact cuts it short
+            if warning != shown:
+                note(shown := warning)
+        if (
+            lease == left
+        ):  # it ends by itself, to the moment: counted from after its start, not from before
+            now = client.state()
+            end = now.time + jogged.duration_s
+            while now.time < end and now.axes[axis].moving:
+                time.sleep(JOG_POLL_S)
+                now = client.state()
+            return
+        begun = now.time
+        time.sleep(max(JOG_POLL_S, JOG_RENEWED * lease / pace))
+        now = client.state()
+        left -= min(lease, now.time - begun)
+
+
+def stop(twin: Twin) -> Answer:
+    """Bring all motors to rest (pauses a running job)."""
+    with twin() as client:
+        current = client.stop()
+    yield current
+    yield f"{_rest(current)}; a running job is paused"
+
+
+def estop(twin: Twin) -> Answer:
+    """Emergency stop: everything halts, X-rays off."""
+    with twin() as client:
+        current = client.estop()
+    yield current
+    yield f"emergency stop, {_rest(current)}; `flexdt reset` leaves it"
+
+
+def _rest(state: Stopped) -> str:
+    """How the motors come to rest, in words."""
+    stopping = state.stopping
+    if stopping is None or not stopping.distances:
+        return "nothing moves"
+    ways = [f"{n} after {d:.3g} {state.axes[n].unit}" for n, d in stopping.distances.items()]
+    hit = f"; {' and '.join(stopping.would_hit)} would collide" if stopping.would_hit else ""
+    return f"at rest in {stopping.duration_s:.3g} s: {', '.join(ways)}{hit}"
+
+
+def reset(twin: Twin) -> Answer:
+    """Leave the emergency stop."""
+    with twin() as client:
+        seen = client.state().safety  # what is released; a twin of before has no number for it
+        current = client.reset(seen.stop or None)
+    why = f": {current.safety.message}" if current.safety.message else ""
+    yield current
+    yield f"safety: {current.safety.state}{why}"
+
+
+def sample(
+    twin: Twin,
+    name: str | None = argument(
+        None,
+        "NAME or FILE",
+        "A mesh, phantom or scene file is sent first. Lists what there is if left out.",
+    ),
+    unit: Literal["um", "mm", "cm", "m", "inch"] | None = option(
+        None, "Read a mesh in this unit; default: mm, for GLB m."
+    ),
+    material: str | None = option(None, "Fill a mesh with this material; default: abs."),
+) -> Answer:
+    """Put a sample on the stage, or list what there is."""
+    from flexdt.clients.client.uploads import MESH_FORMATS, SCENE_FORMATS
+
+    file = None if name is None else Path(name)
+    kind = "" if file is None else file.suffix.lower().lstrip(".")
+    if file is None or kind not in (*MESH_FORMATS, *SCENE_FORMATS) or not file.is_file():
+        file = None
+    if (file is None or kind not in MESH_FORMATS) and (unit is not None or material is not None):
+        raise typer.BadParameter("--unit and --material are for a mesh file")
+    with twin() as client:
+        if name is None:
+            found = client.samples()
+            yield found
+            yield from (f"{one.name:20} {one.description}" for one in found.samples)
+            return
+        if file is not None:
+            if kind in SCENE_FORMATS:
+                sent = client.upload_scene(file)
+            else:
+                sent = client.upload_mesh(file, unit=unit, material=material)
+            now = client.set_sample(file=sent.name)
+        else:
+            now = client.set_sample(name)
+    warn(now.warnings)
+    yield now
+    yield f"on the stage: {now.sample.name or 'nothing'}"
+
+
+def snap(
+    twin: Twin,
+    file: Path = argument(..., "FILE.{tif,png}"),
+    kind: Literal["counts", "line_integral"] | None = option(
+        None, "Write this kind; default: counts in a TIFF, integrals in a PNG."
+    ),
+    binning: int = option(1, "Average so many pixels a side.", min=1, max=32),
+    marks: bool = option(True, "Colour saturated, starved and cut-off pixels of a PNG."),
+) -> Answer:
+    """Take a projection at the current pose.
+
+    A TIFF holds the values as they come: uint16 counts unless said. A PNG is windowed to 8 bit,
+    dense parts dark, and shows line integrals unless said, so X-rays may be off. It shows in colour
+    what would be wrong with the exposure: saturated red, starved blue, cut-off edges yellow.
+    """
+    option_values.require_ending(file, ".tiff", ".tif", ".png")
+    option_values.require_folder(file)
+    with twin() as client:
+        wanted = kind or ("line_integral" if file.suffix.lower() == ".png" else "counts")
+        tube = client.state().tube
+        dark = wanted == "counts" and not (tube.on and tube.ready)
+        colours = marks and file.suffix.lower() == ".png" and not dark
+        taken = client.projection(kind=wanted, binning=binning, marks=colours)
+    image = taken.image
+    save(file, image, dark_is_dense=wanted == "line_integral", marks=taken.marks)
+    if dark and not tube.on:
+        note(
+            "warning: X-rays are off, so this is a dark image; `flexdt tube --on` switches them on"
+        )
+    elif dark:
+        note(f"warning: X-rays warm up (ready in {tube.ready_in_s:.1f} s): this is a dark image")
+    elif taken.flags is not None:
+        warn_of_exposure(taken.flags)
+    flags = None if dark or taken.flags is None else taken.flags.model_dump()
+    yield {"file": str(file), "dtype": str(image.dtype), "shape": image.shape,
+           "cone_vec": taken.cone_vec, "kind": wanted, "flags": flags}  # fmt: skip
+    rows, cols = image.shape
+    yield f"{file}: {cols} x {rows} {image.dtype}"
+    if taken.marks is not None:
+        from flexdt.clients.datasets.pictures import legend
+
+        yield from legend(taken.marks)
+
+
+def warn_of_exposure(flags: ImageFlags) -> None:
+    """Say which part of an image's pixels is saturated or starved, where it is worth saying."""
+    from flexdt.twin.physics.exposure import NOTICED
+
+    for name, share in (("saturated", flags.saturated), ("starved", flags.starved)):
+        if share >= NOTICED:
+            note(f"warning: {100 * share:.3g} % of the pixels are {name}")
+
+
+def save(
+    file: Path,
+    image: npt.NDArray[Any],
+    *,
+    dark_is_dense: bool = False,
+    marks: npt.NDArray[Any] | None = None,
+) -> None:
+    """Write an image as TIFF, or windowed to 8 bit as PNG, with its marks in colour.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    if file.suffix.lower() == ".png":
+        from flexdt.clients.datasets.pictures import png
+
+        try:
+            encoded = png(image, dark_is_dense=dark_is_dense, marks=marks)
+        except ValueError as error:
+            raise CommandError(f"{file}: {error}") from None
+        file.write_bytes(encoded)
+    else:
+        import tifffile
+
+        tifffile.imwrite(file, image)
