@@ -19,7 +19,7 @@ QUICK := tests/protocol tests/twin/script $(TWIN:%=tests/twin/test_%.py) \
 # each worker every test and its assertions, anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install demo quick test test-extensions slow studies page failed docs web lint typecheck lowest newest clean
+.PHONY: install demo kernels quick test test-extensions slow studies page failed docs web lint typecheck lowest newest clean
 
 install: $(STAMP) $(TYPES)
 
@@ -55,10 +55,14 @@ lint: install
 typecheck: install $(TEST_STAMP)
 	$(BIN)/mypy -p flexdt -p flexdt_extensions
 
+# The kernels that most tests run: compiled once, not by both workers and by each server they start.
+kernels: $(TEST_STAMP)
+	$(BIN)/python -c 'from flexdt.twin.projection import warm_up; warm_up()'
+
 quick: lint typecheck
 	$(BIN)/pytest -q -n 2 --dist loadfile -m 'not slow' $(QUICK)
 
-test: lint typecheck $(TEST_STAMP) $(WEB_STAMP)
+test: lint typecheck kernels $(WEB_STAMP)
 	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m 'not slow and not browser' \
 	  --junitxml=build/durations/test.xml
 

@@ -144,7 +144,10 @@ def pulls(found: object, scanner: Scanner) -> tuple[float, float]:
     )
 
 
-@pytest.mark.parametrize(("photons", "column", "roll"), [(1e4, 0.04, 0.06), (100, 0.15, 0.3)])
+@pytest.mark.parametrize(
+    ("photons", "column", "roll"),
+    [(1e4, 0.04, 0.06), pytest.param(100, 0.15, 0.3, marks=pytest.mark.slow)],
+)
 def test_column_and_roll_are_where_they_are_within_their_sigmas(
     scans: list[tuple[Scanner, np.ndarray]], photons: float, column: float, roll: float
 ) -> None:
@@ -195,7 +198,11 @@ def test_the_row_is_right_above_and_below_the_panel_and_refused_beside_it(
             assert abs(row_pull(found, scanner)[1]) < 4
 
 
-@pytest.mark.parametrize(("size", "photons"), [(0.3, 1e4), (0.0, 1e4), (0.3, 300)])
+@pytest.mark.parametrize(
+    ("size", "photons"),
+    [(0.3, 1e4), pytest.param(0.0, 1e4, marks=pytest.mark.slow),
+     pytest.param(0.3, 300, marks=pytest.mark.slow)],
+)  # fmt: skip
 def test_shifts_of_single_frames_are_found_with_their_sigmas(size: float, photons: float) -> None:
     rng, degrees = np.random.default_rng(7), np.arange(120) * 3.0
     scanner = Scanner.drawn(rng)
@@ -224,27 +231,33 @@ def test_shifts_of_single_frames_are_found_with_their_sigmas(size: float, photon
         assert 0.4 < left[:, i].std() / sigma[i] < 1.3
 
 
+@pytest.mark.daily(1)
+@pytest.mark.parametrize("k", range(2))
 def test_a_ramp_of_the_flat_field_and_missing_frames_do_not_mislead(
-    scans: list[tuple[Scanner, np.ndarray]],
+    scans: list[tuple[Scanner, np.ndarray]], k: int
 ) -> None:
-    for k, (scanner, lines) in enumerate(scans[:2]):
-        rng = np.random.default_rng(k)
-        found = data_set(lines, DEGREES, 1e4, rng, ramp=0.01).align()
-        assert np.abs(pulls(found, scanner)).max() < 4
-        keep = np.setdiff1d(np.arange(48), [20, 21, 40])
-        found = data_set(lines[keep], DEGREES[keep], 1e4, rng).align()
-        assert np.abs(pulls(found, scanner)).max() < 4
-        lost = data_set(lines[[*range(31), 30, *range(31, 47)]], DEGREES, 1e4, rng).align()
-        assert np.abs(pulls(lost, scanner)).max() < 4  # the stage missed a step
+    scanner, lines = scans[k]
+    rng = np.random.default_rng(k)
+    found = data_set(lines, DEGREES, 1e4, rng, ramp=0.01).align()
+    assert np.abs(pulls(found, scanner)).max() < 4
+    keep = np.setdiff1d(np.arange(48), [20, 21, 40])
+    found = data_set(lines[keep], DEGREES[keep], 1e4, rng).align()
+    assert np.abs(pulls(found, scanner)).max() < 4
+    lost = data_set(lines[[*range(31), 30, *range(31, 47)]], DEGREES, 1e4, rng).align()
+    assert np.abs(pulls(lost, scanner)).max() < 4  # the stage missed a step
 
 
-def test_what_slips_aside_and_stays_is_told(scans: list[tuple[Scanner, np.ndarray]]) -> None:
-    for k, (scanner, lines) in enumerate(scans[:3]):
-        aside = (lines + np.roll(lines, 1, axis=2)) / 2
-        slipped = np.concatenate([lines[:20], aside[20:]])
-        found = data_set(slipped, DEGREES, 1e4, np.random.default_rng(k)).align()
-        assert "after frame 19 the images step" in " ".join(found.warnings)
-        assert np.abs(pulls(found, scanner)).max() < 4
+@pytest.mark.daily(1)
+@pytest.mark.parametrize("k", range(3))
+def test_what_slips_aside_and_stays_is_told(
+    scans: list[tuple[Scanner, np.ndarray]], k: int
+) -> None:
+    scanner, lines = scans[k]
+    aside = (lines + np.roll(lines, 1, axis=2)) / 2
+    slipped = np.concatenate([lines[:20], aside[20:]])
+    found = data_set(slipped, DEGREES, 1e4, np.random.default_rng(k)).align()
+    assert "after frame 19 the images step" in " ".join(found.warnings)
+    assert np.abs(pulls(found, scanner)).max() < 4
 
 
 @pytest.mark.parametrize("rays", [1, pytest.param(3, marks=pytest.mark.slow)])
