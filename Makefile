@@ -15,7 +15,11 @@ QUICK := tests/protocol tests/twin/script $(TWIN:%=tests/twin/test_%.py) \
   $(filter-out %_voxels.py %_lego.py,$(wildcard tests/phantoms/test_*.py)) \
   $(filter-out %_rtk.py %_astra.py,$(wildcard tests/twin/exchange/test_*.py))
 
-.PHONY: install demo quick test test-extensions slow studies page failed docs web lint typecheck lowest newest clean
+# The tests start some hundred processes. Where bytecode may not be kept, each compiles flexdt, and
+# each worker every test and its assertions, anew.
+unexport PYTHONDONTWRITEBYTECODE
+
+.PHONY: install demo kernels quick test test-extensions slow studies page failed docs web lint typecheck lowest newest clean
 
 install: $(STAMP) $(TYPES)
 
@@ -51,11 +55,15 @@ lint: install
 typecheck: install $(TEST_STAMP)
 	$(BIN)/mypy -p flexdt -p flexdt_extensions
 
+# The kernels that most tests run: compiled once, not by both workers and by each server they start.
+kernels: $(TEST_STAMP)
+	$(BIN)/python -c 'from flexdt.twin.projection import warm_up; warm_up()'
+
 quick: lint typecheck
 	$(BIN)/pytest -q -n 2 --dist loadfile -m 'not slow' $(QUICK)
 
-test: lint typecheck $(TEST_STAMP) $(WEB_STAMP)
-	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'not slow and not browser' \
+test: lint typecheck kernels $(WEB_STAMP)
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m 'not slow and not browser' \
 	  --junitxml=build/durations/test.xml
 
 # The second distribution's own tests, the long ones included.
@@ -66,7 +74,7 @@ slow: studies page
 
 # Studies in their short form, the demonstration, the site.
 studies: $(TEST_STAMP)
-	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'slow and not browser' \
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m 'slow and not browser' \
 	  --junitxml=build/durations/studies.xml
 
 # The page in a browser, which draws on all cores: nothing else runs beside it.

@@ -3,6 +3,7 @@ kinematics are written out here, with scanners drawn by a seed."""
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import re
@@ -117,15 +118,12 @@ def data_set(
 DEGREES = np.arange(48) * 7.5
 
 
-@pytest.fixture(scope="module")
-def scans() -> list[tuple[Scanner, np.ndarray]]:
-    """Ten scanners, each with a body of its own."""
-    out = []
-    for seed in range(10):
-        rng = np.random.default_rng([18, seed])
-        scanner = Scanner.drawn(rng)
-        out.append((scanner, scanner.lines(bodies(rng), np.radians(DEGREES))))
-    return out
+@functools.cache
+def scan(seed: int) -> tuple[Scanner, np.ndarray]:
+    """One of ten scanners, with a body of its own."""
+    rng = np.random.default_rng([18, seed])
+    scanner = Scanner.drawn(rng)
+    return scanner, scanner.lines(bodies(rng), np.radians(DEGREES))
 
 
 def pulls(found: object, scanner: Scanner) -> tuple[float, float]:
@@ -144,18 +142,34 @@ def pulls(found: object, scanner: Scanner) -> tuple[float, float]:
     )
 
 
+def aligned(k: int, photons: float, column: float, roll: float) -> tuple[object, Scanner]:
+    """What is found in scan `k`, its sigmas [px, deg] below those allowed."""
+    scanner, lines = scan(k)
+    found = data_set(lines, DEGREES, photons, np.random.default_rng(k)).align()
+    assert found.identifiable
+    assert found.parameters["axis_column_px"]["sigma"] < column
+    assert found.parameters["det_roll"]["sigma"] < roll
+    return found, scanner
+
+
+@pytest.mark.parametrize("k", range(3))
+def test_column_and_roll_are_where_they_are(k: int) -> None:
+    found, scanner = aligned(k, 1e4, 0.04, 0.06)
+    assert np.abs(pulls(found, scanner)).max() < 4
+    if "source_row_px" in found.parameters:
+        assert abs(row_pull(found, scanner)[1]) < 4
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("photons", "column", "roll"), [(1e4, 0.04, 0.06), (100, 0.15, 0.3)])
 def test_column_and_roll_are_where_they_are_within_their_sigmas(
-    scans: list[tuple[Scanner, np.ndarray]], photons: float, column: float, roll: float
+    photons: float, column: float, roll: float
 ) -> None:
     off, rows = [], []
-    for k, (scanner, lines) in enumerate(scans):
-        found = data_set(lines, DEGREES, photons, np.random.default_rng(k)).align()
-        assert found.identifiable
+    for k in range(10):
+        found, scanner = aligned(k, photons, column, roll)
         if "source_row_px" in found.parameters:
             rows.append(row_pull(found, scanner))
-        assert found.parameters["axis_column_px"]["sigma"] < column
-        assert found.parameters["det_roll"]["sigma"] < roll
         off.append(pulls(found, scanner))
     assert np.abs(off).max() < 4
     assert (np.sqrt(np.mean(np.square(off), axis=0)) < 1.7).all()
@@ -180,22 +194,28 @@ def row_pull(found: object, scanner: Scanner) -> tuple[float, float]:
     return error, error / told["sigma"]
 
 
+@pytest.mark.parametrize(
+    ("high", "wide"), [pytest.param(60.0, 14.0, marks=pytest.mark.slow), (14.0, 45.0)]
+)
 def test_the_row_is_right_above_and_below_the_panel_and_refused_beside_it(
-    scans: list[tuple[Scanner, np.ndarray]],
+    high: float, wide: float
 ) -> None:
-    scanner = scans[0][0]
-    for high, wide in ((60.0, 14.0), (14.0, 45.0)):
-        body = bodies(np.random.default_rng(3))
-        body[0] = [0, 0, 0, wide, wide, high, 0.01]
-        lines = scanner.lines(body, np.radians(DEGREES))
-        found = data_set(lines, DEGREES, 1e4, np.random.default_rng(1)).align()
-        if wide > high:
-            assert "source_row_px" in found.document["refused"]
-        elif "source_row_px" in found.parameters:
-            assert abs(row_pull(found, scanner)[1]) < 4
+    scanner, _ = scan(0)
+    body = bodies(np.random.default_rng(3))
+    body[0] = [0, 0, 0, wide, wide, high, 0.01]
+    lines = scanner.lines(body, np.radians(DEGREES))
+    found = data_set(lines, DEGREES, 1e4, np.random.default_rng(1)).align()
+    if wide > high:
+        assert "source_row_px" in found.document["refused"]
+    elif "source_row_px" in found.parameters:
+        assert abs(row_pull(found, scanner)[1]) < 4
 
 
-@pytest.mark.parametrize(("size", "photons"), [(0.3, 1e4), (0.0, 1e4), (0.3, 300)])
+@pytest.mark.parametrize(
+    ("size", "photons"),
+    [(0.3, 1e4), pytest.param(0.0, 1e4, marks=pytest.mark.slow),
+     pytest.param(0.3, 300, marks=pytest.mark.slow)],
+)  # fmt: skip
 def test_shifts_of_single_frames_are_found_with_their_sigmas(size: float, photons: float) -> None:
     rng, degrees = np.random.default_rng(7), np.arange(120) * 3.0
     scanner = Scanner.drawn(rng)
@@ -224,30 +244,35 @@ def test_shifts_of_single_frames_are_found_with_their_sigmas(size: float, photon
         assert 0.4 < left[:, i].std() / sigma[i] < 1.3
 
 
-def test_a_ramp_of_the_flat_field_and_missing_frames_do_not_mislead(
-    scans: list[tuple[Scanner, np.ndarray]],
-) -> None:
-    for k, (scanner, lines) in enumerate(scans[:2]):
-        rng = np.random.default_rng(k)
-        found = data_set(lines, DEGREES, 1e4, rng, ramp=0.01).align()
-        assert np.abs(pulls(found, scanner)).max() < 4
-        keep = np.setdiff1d(np.arange(48), [20, 21, 40])
-        found = data_set(lines[keep], DEGREES[keep], 1e4, rng).align()
-        assert np.abs(pulls(found, scanner)).max() < 4
-        lost = data_set(lines[[*range(31), 30, *range(31, 47)]], DEGREES, 1e4, rng).align()
-        assert np.abs(pulls(lost, scanner)).max() < 4  # the stage missed a step
+@pytest.mark.daily(2)
+@pytest.mark.parametrize("k", range(2))
+@pytest.mark.parametrize("spoilt", ["ramp", "missing frames", "missed step"])
+def test_a_ramp_of_the_flat_field_and_missing_frames_do_not_mislead(spoilt: str, k: int) -> None:
+    scanner, lines = scan(k)
+    frames = {
+        "ramp": np.arange(48),
+        "missing frames": np.setdiff1d(np.arange(48), [20, 21, 40]),
+        "missed step": np.r_[:31, 30, 31:47],
+    }[spoilt]
+    degrees = DEGREES if spoilt == "missed step" else DEGREES[frames]
+    ramp = 0.01 if spoilt == "ramp" else 0.0
+    found = data_set(lines[frames], degrees, 1e4, np.random.default_rng(k), ramp=ramp).align()
+    assert np.abs(pulls(found, scanner)).max() < 4
 
 
-def test_what_slips_aside_and_stays_is_told(scans: list[tuple[Scanner, np.ndarray]]) -> None:
-    for k, (scanner, lines) in enumerate(scans[:3]):
-        aside = (lines + np.roll(lines, 1, axis=2)) / 2
-        slipped = np.concatenate([lines[:20], aside[20:]])
-        found = data_set(slipped, DEGREES, 1e4, np.random.default_rng(k)).align()
-        assert "after frame 19 the images step" in " ".join(found.warnings)
-        assert np.abs(pulls(found, scanner)).max() < 4
+@pytest.mark.daily(1)
+@pytest.mark.parametrize("k", range(3))
+def test_what_slips_aside_and_stays_is_told(k: int) -> None:
+    scanner, lines = scan(k)
+    aside = (lines + np.roll(lines, 1, axis=2)) / 2
+    slipped = np.concatenate([lines[:20], aside[20:]])
+    found = data_set(slipped, DEGREES, 1e4, np.random.default_rng(k)).align()
+    assert "after frame 19 the images step" in " ".join(found.warnings)
+    assert np.abs(pulls(found, scanner)).max() < 4
 
 
-@pytest.mark.parametrize("rays", [1, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("rays", [1, 3])
 def test_flat_ends_along_the_rows_in_images_of_few_rays_a_pixel_do_not_mislead(
     rays: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -296,10 +321,8 @@ def test_what_spoils_scans_misleads_nobody(capsys: pytest.CaptureFixture[str]) -
     assert re.search(r"^all +14 +1[0-4] ", capsys.readouterr().out, re.MULTILINE)
 
 
-def test_a_round_body_that_turns_back_is_no_repeated_frame(
-    scans: list[tuple[Scanner, np.ndarray]],
-) -> None:
-    scanner, degrees = scans[0][0], np.arange(120) * 3.0
+def test_a_round_body_that_turns_back_is_no_repeated_frame() -> None:
+    scanner, degrees = scan(0)[0], np.arange(120) * 3.0
     rod = np.array([[9.0, 4.0, 0, 11, 11, 21, 0.02]])
     lines = scanner.lines(rod, np.radians(degrees))
     found = data_set(lines, degrees, 1.5e4, np.random.default_rng(3)).align()
@@ -307,10 +330,8 @@ def test_a_round_body_that_turns_back_is_no_repeated_frame(
     assert np.abs(pulls(found, scanner)).max() < 4
 
 
-def test_an_exact_copy_of_a_frame_is_left_out_by_name(
-    scans: list[tuple[Scanner, np.ndarray]],
-) -> None:
-    scanner, lines = scans[0]
+def test_an_exact_copy_of_a_frame_is_left_out_by_name() -> None:
+    scanner, lines = scan(0)
     data = data_set(lines, DEGREES, 1e4, np.random.default_rng(1))
     counts = data.counts().copy()
     counts[31] = counts[30]
@@ -319,10 +340,8 @@ def test_an_exact_copy_of_a_frame_is_left_out_by_name(
     assert np.abs(pulls(found, scanner)).max() < 4
 
 
-def test_what_a_scan_cannot_tell_is_refused_with_the_reason(
-    scans: list[tuple[Scanner, np.ndarray]],
-) -> None:
-    _, lines = scans[0]
+def test_what_a_scan_cannot_tell_is_refused_with_the_reason() -> None:
+    _, lines = scan(0)
     rng = np.random.default_rng(1)
     good = data_set(lines, DEGREES, 1e4, rng)
     refused = good.align().document["refused"]
@@ -348,9 +367,9 @@ def test_what_a_scan_cannot_tell_is_refused_with_the_reason(
 
 
 def test_the_command_writes_a_correction_that_reconstruct_takes(
-    scans: list[tuple[Scanner, np.ndarray]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    scanner, lines = scans[1]
+    scanner, lines = scan(1)
     data_set(lines, DEGREES, 1e4, np.random.default_rng(5)).save(tmp_path / "scan")
     report = tmp_path / "axis.json"
     assert run(["align", str(tmp_path / "scan"), "--out", str(report), "--json"]) == 0

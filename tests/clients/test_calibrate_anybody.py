@@ -27,7 +27,7 @@ from flexdt.clients.calibration.markers import (
 )
 from flexdt.clients.cli.entry import run
 from flexdt.phantoms import load_phantom
-from flexdt.twin.calibration import detect_beads
+from flexdt.twin.calibration import Detections, detect_beads
 from flexdt.twin.calibration.frame_source import nothing
 from flexdt.twin.calibration.pipeline import Request
 from flexdt.twin.calibration.unknown_markers import link, triangulate
@@ -195,17 +195,28 @@ def test_sigmas_of_unknown_markers_are_true() -> None:
     assert max(abs(p) for r in rows for p in r["pulls"].values()) < 4.5
 
 
-def test_linking_refuses_what_does_not_turn(written: Path) -> None:
-    """All spots are there, but the angles are not those of the images."""
+@pytest.fixture(scope="module")
+def seen(written: Path) -> tuple[fx.DataSet, list[Detections]]:
+    """The written frames with the spots in each."""
     data = fx.read_tiffs(written / "frames", written / "geometry.json")
-    spots = [detect_beads(image) for image in data]
+    return data, [detect_beads(image) for image in data]
+
+
+def test_linking_finds_what_turns(seen: tuple[fx.DataSet, list[Detections]]) -> None:
+    data, spots = seen
     index, places, _ = link(spots, data.poses, NOMINAL)
     assert index.shape == (16, len(places)) == (16, 8)
+    with pytest.raises(TwinError, match="0 markers are found"):
+        link([nothing(d.shape) for d in spots], data.poses, NOMINAL)
+
+
+@pytest.mark.slow
+def test_linking_refuses_what_does_not_turn(seen: tuple[fx.DataSet, list[Detections]]) -> None:
+    """All spots are there, but the angles are not those of the images."""
+    data, spots = seen
     wrong = np.random.default_rng(0).permutation(16)
     with pytest.raises(TwinError, match=r"markers are found that move as the angles say"):
         link([spots[i] for i in wrong], data.poses, NOMINAL)
-    with pytest.raises(TwinError, match="0 markers are found"):
-        link([nothing(d.shape) for d in spots], data.poses, NOMINAL)
 
 
 def test_points_seen_from_one_direction_are_nowhere() -> None:

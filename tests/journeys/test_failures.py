@@ -24,12 +24,11 @@ Plain = Any
 LINUX = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs Linux's /proc")
 
 
-@pytest.fixture
-def own(tmp_path: Path) -> Iterator[tuple[Servers, Path]]:
-    """Servers of this test alone, and their data directory."""
-    data = tmp_path / "data"
-    data.mkdir()
-    with Servers({"data": data, "speed-up": "max"}, tmp_path / "servers.log") as servers:
+@pytest.fixture(scope="module")
+def own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Servers, Path]]:
+    """Servers that these tests may harm, and their data directory; the last one kills them."""
+    data = tmp_path_factory.mktemp("data")
+    with Servers({"data": data, "speed-up": "max"}, data.parent / "failures.log") as servers:
         yield servers, data
 
 
@@ -62,12 +61,12 @@ def whole(folder: Path, shape: tuple[int, int]) -> int:
 
 
 def started(
-    own: tuple[Servers, Path], connect: Callable[..., Plain], script: str, frames: int
+    own: tuple[Servers, Path], connect: Callable[..., Plain], script: str, frames: int, name: str
 ) -> tuple[Plain, str]:
     """A scan in progress, `frames` of it done."""
     client = connect(own[0].address)
     client.call("sample.set", name="normal-5")
-    job = client.call("script.submit", text=script, name="scan")["job"]
+    job = client.call("script.submit", text=script, name=name)["job"]
     client.until(job, lambda s: s["frames_done"] >= frames)
     return client, job
 
@@ -76,7 +75,7 @@ def started(
 def test_projector_killed_in_mid_scan(
     own: tuple[Servers, Path], connect: Callable[..., Plain], fly_script: Callable[..., str]
 ) -> None:
-    client, job = started(own, connect, fly_script(181, exposure_ms=100), 5)
+    client, job = started(own, connect, fly_script(181, exposure_ms=100), 5, "killed")
     os.kill(process_of(own[0], "flexdt.server.projector.main"), signal.SIGKILL)
     status = client.until(job, lambda s: s["state"] not in ("queued", "running"))
     if status["state"] == "paused":  # the projector was away for longer than the twin waits
@@ -84,18 +83,18 @@ def test_projector_killed_in_mid_scan(
         client.call("job.resume", job=job)
         status = client.wait(job)
     assert (status["state"], status["frames_done"]) == ("done", 181)
-    assert whole(own[1] / "scan", (160, 200)) == 183
+    assert whole(own[1] / "killed", (160, 200)) == 183
     assert client.call("projection.get", binning=8)["shape"]
 
 
 def test_client_gone_in_mid_scan(
     own: tuple[Servers, Path], connect: Callable[..., Plain], fly_script: Callable[..., str]
 ) -> None:
-    client, job = started(own, connect, fly_script(121, exposure_ms=100), 3)
+    client, job = started(own, connect, fly_script(121, exposure_ms=100), 3, "left")
     client.close()
     other = connect(own[0].address)
     assert other.wait(job)["state"] == "done"
-    assert whole(own[1] / "scan", (160, 200)) == 123
+    assert whole(own[1] / "left", (160, 200)) == 123
     other.call("axes.move", targets={"tra_obj": 1}, wait=True)
 
 
@@ -106,14 +105,14 @@ def test_disk_full_in_mid_scan(
     """Files beyond a size cannot be written: what a write error looks like to the twin."""
     import resource
 
-    client, job = started(own, connect, fly_script(121, exposure_ms=100), 3)
+    client, job = started(own, connect, fly_script(121, exposure_ms=100), 3, "full")
     twin = process_of(own[0], "flexdt.server.twin.main")
     resource.prlimit(twin, resource.RLIMIT_FSIZE, (40_000, resource.RLIM_INFINITY))
     status = client.until(job, lambda s: s["state"] not in ("queued", "running"))
     assert (status["state"], status["error"]["code"]) == ("paused", -32001)
     assert status["error"]["message"]
     assert status["retry_s"] is not None
-    folder = own[1] / "scan"
+    folder = own[1] / "full"
     # Every frame that counts is there; of the batch that failed some may be, and are kept.
     assert status["frames_done"] + 2 <= whole(folder, (160, 200)) < 123
     assert json.loads((folder / "flexdt.json").read_text())["complete"] is False
@@ -126,18 +125,20 @@ def test_disk_full_in_mid_scan(
 def test_abort_marks_the_data_set_incomplete(
     own: tuple[Servers, Path], connect: Callable[..., Plain], fly_script: Callable[..., str]
 ) -> None:
-    client, job = started(own, connect, fly_script(361, exposure_ms=100), 3)
+    client, job = started(own, connect, fly_script(361, exposure_ms=100), 3, "aborted")
     client.call("job.abort", job=job)
     status = client.wait(job)
     assert status["state"] == "aborted"
-    folder = own[1] / "scan"
+    folder = own[1] / "aborted"
     assert whole(folder, (160, 200)) < 363
     assert "SCRIPT CANCELLED!" in (folder / "scan settings.txt").read_text(errors="replace")
     assert not [p for p in folder.rglob("*") if p.suffix in (".part", ".tmp")]
 
 
 @LINUX
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_up_stops_cleanly(number: signal.Signals, tmp_path: Path) -> None:
     words = ["up", "--port", "0", "--projector-port", "0", "--viewer-port", "0",
              "--data", str(tmp_path)]  # fmt: skip

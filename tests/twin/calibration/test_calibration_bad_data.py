@@ -20,15 +20,17 @@ def outcome(kind: str, seed: int = 0) -> Outcome:
 @pytest.mark.parametrize(
     ("kind", "code"),
     [
-        ("angle_endpoint", "angle_endpoint"),
+        # Named from spots alone in test_calibration_causes.py: endpoint, renumbered.
+        pytest.param("angle_endpoint", "angle_endpoint", marks=pytest.mark.slow),
         ("mirrored_phantom", "mirrored_phantom"),
         ("wrong_phantom", "wrong_phantom"),
         ("no_beads", "no_beads"),
         ("one_bead", "one_bead"),
-        ("frames_renumbered", "frame_numbers"),
+        pytest.param("frames_renumbered", "frame_numbers", marks=pytest.mark.slow),
         ("scaled_phantom", "bead_size"),
         ("image_mirrored", "image_mirrored"),
-        ("not_turning", "not_turning"),
+        # Named from annotated markers in test_calibrate_anybody.py.
+        pytest.param("not_turning", "not_turning", marks=pytest.mark.slow),
     ],
 )
 def test_refused_and_named(kind: str, code: str) -> None:

@@ -56,6 +56,7 @@ def test_beads_that_are_lost_are_named() -> None:
     assert "bead 0, 3 of 'lego' has no spot in any frame" in told.text
 
 
+@pytest.mark.daily(1)
 @pytest.mark.parametrize("first", [0.0, 37.0])
 def test_a_stage_that_turns_the_other_way_is_not_called_turned_images(first: float) -> None:
     """Four of the five beads fit images turned by 180 deg, too, and more closely."""
@@ -63,17 +64,23 @@ def test_a_stage_that_turns_the_other_way_is_not_called_turned_images(first: flo
     assert codes(detections) == [("angle_reversed", "error")]
 
 
-def test_a_gap_in_the_numbers_is_not_another_phantom() -> None:
-    for at in (15, 21):
-        gap = ANGLES + np.where(np.arange(36) >= at, 20.0, 0.0)
-        assert codes(spots(gap, [0, 1, 2, 3, 4])) == [("frame_numbers", "error")]
-    assert codes(spots(np.random.default_rng(1).permutation(ANGLES), [0, 1, 2, 3, 4])) == [
-        ("frame_numbers", "error")
-    ]
+def test_steps_of_a_turn_over_one_frame_less_are_named() -> None:
+    assert codes(spots(ANGLES * 36 / 35, [0, 1, 2, 3, 4])) == [("angle_endpoint", "error")]
+
+
+@pytest.mark.daily(1)
+@pytest.mark.parametrize("at", [15, 21, None])
+def test_a_gap_in_the_numbers_is_not_another_phantom(at: int | None) -> None:
+    """20 deg more from this frame on; without one, the frames are shuffled."""
+    if at is None:
+        seen = np.random.default_rng(1).permutation(ANGLES)
+    else:
+        seen = ANGLES + np.where(np.arange(36) >= at, 20.0, 0.0)
+    assert codes(spots(seen, [0, 1, 2, 3, 4])) == [("frame_numbers", "error")]
 
 
 SOME = (
-    "nothing", "low_dose", "panel_far_rolled", "screw", "jump_across", "slip", "short_turn",
+    "nothing", "low_dose", "panel_far_rolled", "screw", "jump_across", "short_turn", "slip",
     "shuffled", "frames_swapped", "beads_lost", "bead_extra", "bead_displaced",
     "phantom_upside_down", "images_turned", "images_upside_down", "axis_far_aslant", "symmetric",
     "other_phantom",
@@ -123,8 +130,8 @@ def test_what_is_held_exactly_and_wrongly_is_never_offered_in_silence(kind: str)
 @pytest.mark.parametrize(
     ("kind", "seed"),
     [
-        ("gap", 303),  # both the last half and the last third fit by themselves
         ("screw", 303),  # panel and axis had taken up a part of it
+        ("gap", 303),  # both the last half and the last third fit by themselves
         ("angle_factor", 300),  # its last frames are where no others put them
         ("angle_factor", 301),  # a fifth of the frames was left out
         ("spot_drift", 1002),  # its last frames were

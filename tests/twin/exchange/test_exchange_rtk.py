@@ -20,6 +20,9 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection import Volume, forward
 from tests.twin.exchange.scans import CHIRAL, PITCH, SHAPE, some_parameters, some_poses, worst
 
+# Loading RTK's wrappers takes longer than all that these tests ask of it.
+pytestmark = pytest.mark.slow
+
 if find_spec("itk") is None:  # it is used in a process of its own, not imported here
     required("itk")
 
@@ -46,7 +49,6 @@ def scan(seed: int) -> ScanGeometry:
     return ScanGeometry(poses.cone_vec(some_parameters(rng)), SHAPE)
 
 
-@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), up=st.booleans())
 def test_rtk_reads_ours_and_sees_the_same(rtk: Rtk, seed: int, up: bool) -> None:
