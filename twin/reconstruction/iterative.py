@@ -79,9 +79,10 @@ class Problem:
             GeometryError: no views, or shapes that do not fit.
             LimitError: no iterations.
         """
-        if iterations < 1:
+        if not isinstance(iterations, int | np.integer) or iterations < 1:
             raise LimitError(
-                f"{iterations} iterations; allowed: at least 1", {"asked": iterations, "allowed": 1}
+                f"iterations is {iterations!r}; allowed: a whole number from 1",
+                {"asked": repr(iterations), "allowed": 1},
             )
         geometry = as_cone_vec(cone_vec)
         if not len(geometry):
