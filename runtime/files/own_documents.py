@@ -95,7 +95,7 @@ class Changes:
         self._made.clear()
 
     def undo(self) -> None:
-        """Everything as it was, but for what others have written since; trouble is logged."""
+        """Restore each file unless somebody else has changed it since; failures are logged."""
         for folder, name, before, data in reversed(self._made):
             try:
                 if folder.read(name) != data:

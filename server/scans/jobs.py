@@ -127,8 +127,8 @@ class Jobs:
 
     @contextmanager
     def manual_control(self) -> Iterator[None]:
-        """Somebody moves or sets things while the job is paused: it no longer goes on by itself,
-        unless that is refused and nothing was set in motion."""
+        """Manual control cancels the automatic resume of a paused job, unless the command is
+        refused before anything has moved."""
         by_hand, programmes = self._by_hand, self._scanner.programmes
         self._by_hand = True
         try:

@@ -295,10 +295,10 @@ class TwinServer:
         return sample
 
     async def _guarded(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Keep a service going: what one thing it meets does to it is logged, and it goes on.
+        """Keep a service going: an exception in it is logged, and the service is restarted.
 
-        One that fails again and again ends the process, which is started anew: without it the
-        server would answer and do nothing.
+        A service that fails again and again ends the process, which its supervisor starts anew:
+        without the service the server would answer and do nothing.
         """
         ends: deque[float] = deque(maxlen=FAILURES)
         while not self.failed.is_set():

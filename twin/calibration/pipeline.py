@@ -118,7 +118,7 @@ class Request:
         bound: sigma [mm, deg] beyond which the result is not identifiable.
         known_sizes: the beads' radii are known; else they were taken from the spots.
         misfit_px: residual above which a fit is not to be used unless explained.
-        per_frame: those that may also differ from frame to frame, see `fit.motion`.
+        per_frame: those that may also differ from frame to frame, see `fit.fitted_motion`.
 
     Raises:
         UnknownNameError: a name that is no parameter, or cannot differ from frame to frame.

@@ -176,7 +176,7 @@ def build_scene(
     Args:
         machine: its components, limits, margin.
         profile: zero offsets, so that bodies sit where the X-ray geometry is.
-        sample: convex pieces in the object's frame (see `sample.convex_pieces`).
+        sample: convex pieces in the object's frame (see `sample_hull.convex_pieces`).
         parameters: the correction in force; bodies sit where it says they are.
         margin_mm: clearance to keep; default: the machine's.
     """

@@ -38,7 +38,7 @@ def switched(
         machine: says how long the high voltage takes, and a warm-up after a long rest.
         tube: before; switching on what is on changes nothing.
         on: which.
-        now: time of the command [s]; None is long ago, so that X-rays are ready at once.
+        now: time of the command [s]; None: the X-rays are ready already.
         warm: no warm-up, however long the rest was.
     """
     if now is None:

@@ -102,7 +102,7 @@ def plan_poses(
         poses: axis -> position [mm, deg]; axes left out stay where they are.
         machine: whose axes these are.
         profile: zero offsets.
-        exposure_ms: of every image; the machine's default if None.
+        exposure_ms: of every image; None keeps the camera's current exposure.
         start: the scanner before; the machine's homes if None.
         sample: its size, if known.
 
