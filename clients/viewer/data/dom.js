@@ -26,6 +26,11 @@ export function el(tag, attributes = {}, ...children) {
     node.append(...children.filter((c) => c !== null && c !== undefined));
     return node;
 }
+// Id of a button -> what it does.
+export function clicks(acts) {
+    for (const [id, act] of Object.entries(acts))
+        $(`#${id}`).addEventListener("click", () => void act());
+}
 // Attributes of what is pressed like a button and looks like none.
 export function pressed(f) {
     return { role: "button", tabIndex: 0, onclick: f, onkeydown: (e) => { if (e.key === "Enter" && !e.repeat)

@@ -24,6 +24,10 @@ export function el<T extends keyof HTMLElementTagNameMap>(tag: T, attributes: At
   node.append(...children.filter((c) => c !== null && c !== undefined));
   return node;
 }
+// Id of a button -> what it does.
+export function clicks(acts: Record<string, () => unknown>): void {
+  for (const [id, act] of Object.entries(acts)) $(`#${id}`).addEventListener("click", () => void act());
+}
 // Attributes of what is pressed like a button and looks like none.
 export function pressed(f: () => unknown) {
   return { role: "button", tabIndex: 0, onclick: f, onkeydown: (e: KeyboardEvent) => { if (e.key === "Enter" && !e.repeat) f(); } };

@@ -1,5 +1,5 @@
 // The Setup tab: tube, camera, sample on the stage (with upload), layers of the scene.
-import { $, $$, $button, $canvas, $input, $select, base64, cleared, el, field, fixed, parsed, words } from "./dom.js";
+import { $, $$, $button, $canvas, $input, $select, base64, cleared, clicks, el, field, fixed, parsed, words } from "./dom.js";
 import type { ExposurePrediction, Layers, Placement, PredictedSetting, Requests, SampleUpload, State, UploadResult } from "./viewer.js";
 import { call, command, emit, on, store } from "./link.js";
 
@@ -28,14 +28,6 @@ const tube = el("div", { class: "card" }, el("h2", {}, "X-ray tube"), el("div", 
   ...label("voltage [kV]", number("kV")), ...label("power [W]", number("power")),
   el("button", { id: "tube-apply", "data-apply": "", class: "small", onclick: setTube }, "Apply"),
   el("button", { id: "beam", onclick: () => command("tube.set", { on: !store.state?.tube.on }, "The tube refuses") }, "X-rays on")));
-const beam = el("div", { class: "card" }, el("h2", {}, "Spectrum and physics"), el("div", { class: "form" },
-  el("span", { class: "muted" }, "physics"), el("b", { id: "physics" }, "–"),
-  el("span", { id: "physics-note", class: "wide muted small-text" }),
-  el("span", { class: "muted" }, "filters"), el("span", { id: "filters" }, "–"),
-  el("canvas", { id: "spectrum", role: "img", "aria-label": "Photons by energy" }),
-  el("span", { id: "spectrum-note", class: "wide muted small-text mono" }),
-  el("button", { id: "predict", class: "small", title: "Contrast to noise of a void of 0.5 mm on the darkest ray, with the sample on the stage", onclick: predict }, "Predict"),
-  el("span", { id: "predicted", class: "muted small-text" }, "image quality of a scan")));
 const camera = el("div", { class: "card" }, el("h2", {}, "Camera"), el("div", { class: "form" },
   ...label("exposure [ms]", number("exposure")),
   ...label("mode", select("mode", ...MODES.map((m) => el("option", {}, m)))),
@@ -49,16 +41,14 @@ const sample = el("div", { class: "card" }, el("h2", {}, "Sample"), el("div", { 
   ...label("turn x y z [°]", number("off-rx"), number("off-ry"), number("off-rz")),
   el("button", { id: "sample-apply", "data-apply": "", class: "small", onclick: setSample }, "Put on stage"), el("span", { id: "sample-note", class: "muted" }),
   ...label("opacity", opacity)));
-const upload = el("div", { class: "card" }, el("h2", {}, "Upload a mesh"), el("div", { class: "form" },
-  ...label("file", el("input", { type: "file", id: "mesh-file", accept: FORMATS.map((f) => `.${f}`).join(",") })),
-  ...label("unit", el("select", { id: "mesh-unit" }, ...["mm", "um", "cm", "m", "inch"].map((u) => el("option", {}, u)))),
-  ...label("material", el("select", { id: "mesh-material" })),
-  el("button", { id: "mesh-upload", class: "small", onclick: sendMesh }, "Upload"), el("span", { id: "mesh-note", class: "muted" })));
 const layers = el("div", { class: "card" }, el("h2", {}, "Shown in the scenes"), ...Object.entries(LAYERS).map(([name, text]) => {
   const box: HTMLInputElement = el("input", { type: "checkbox", id: `layer-${name}`, onchange: () => showLayer(name, box.checked) });
   return el("div", {}, el("label", {}, box, text));
 }));
-$("#tab-setup").append(tube, beam, camera, sample, upload, layers);
+$("#spectrum-card").before(tube);
+$("#spectrum-card").after(camera, sample);
+$("#tab-setup").append(layers);
+clicks({ predict, "mesh-upload": sendMesh });
 
 // A field or a list of these.
 const of = (id: string) => $<HTMLInputElement | HTMLSelectElement>(`#${id}`);

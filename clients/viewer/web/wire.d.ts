@@ -243,7 +243,6 @@ export type GeometryState = {
 };
 export type HelloResult = {
   protocol: string;
-  server: string;
   machine: string;
   profile: string | null;
   session: string | null;
