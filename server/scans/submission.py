@@ -93,7 +93,7 @@ class Submissions:
         operator: str = "",
         ensure_allowed: Callable[[], None] = lambda: None,
     ) -> Job:
-        """Put a scan in the queue; `ensure_allowed` raises if the requester has lost control meanwhile.
+        """Put a scan in the queue; `ensure_allowed` raises if the requester has lost control.
 
         Raises:
             RpcError: -32005 script invalid, -32002 collisions, -32602 the name is taken.
