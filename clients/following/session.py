@@ -17,7 +17,7 @@ from typing import BinaryIO, Final
 from flexdt.clients.following.frames import FramesBeside, newest_frame
 from flexdt.clients.following.scanner_link import listen
 from flexdt.clients.gateway.vocabulary import MoveRelative, Question, Refusal, read_command
-from flexdt.protocol.acquila import AcquilaError, Event, parse_event
+from flexdt.protocol.acquila import AcquilaError, AcquilaEvent, parse_event
 from flexdt.twin.errors import TwinError
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Alarm, Heard, Mirror
@@ -50,7 +50,9 @@ def heard(data: bytes, axes: Collection[str], mirror: Mirror, stamp: str) -> Hea
     return Heard(event.key, what, words, command, event.reply, asks, stamp)  # type: ignore[arg-type]
 
 
-def _read(event: Event, axes: Collection[str], mirror: Mirror) -> tuple[c.Command | None, str]:
+def _read(
+    event: AcquilaEvent, axes: Collection[str], mirror: Mirror
+) -> tuple[c.Command | None, str]:
     """The typed command, and what a question asks for; neither of what the scripts do not know."""
     try:
         command = read_command(event, axes)
@@ -72,7 +74,7 @@ Tell = Callable[[Alarm], None]
 
 
 @dataclass
-class Session:
+class FollowSession:
     """What one `flexdt follow` knows.
 
     Args:

@@ -24,10 +24,10 @@ from flexdt.protocol.projector import (
     PROJECTOR_METHODS,
     Backproject,
     Cancel,
-    Grid,
     Project,
     VolumePut,
     VolumeRef,
+    VoxelGrid,
 )
 from flexdt.protocol.rpc_errors import cancelled, invalid_params, too_large
 from flexdt.server.projector.compute import ComputeJob, projection_steps, views_a_block
@@ -174,7 +174,7 @@ def _document() -> object:
     return openrpc.document(PROJECTOR_METHODS, title="flexdt projector server")
 
 
-def _accumulator(context: Context, name: str | None, grid: Grid) -> Volume | None:
+def _accumulator(context: Context, name: str | None, grid: VoxelGrid) -> Volume | None:
     if name is None or name not in context.store:
         return None
     held = context.store.get(name)

@@ -10,14 +10,14 @@ from collections import OrderedDict
 
 from flexdt.phantoms import Phantom
 from flexdt.server.storage.stored_samples import Phantoms
-from flexdt.twin.collision.collision_scene import Scene, build_scene
+from flexdt.twin.collision.collision_scene import CollisionScene, build_scene
 from flexdt.twin.collision.convex_solids import Polytope
 from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.sample_hull import convex_pieces
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.scanner.safety import Guard
-from flexdt.twin.scanner.state import Placement, Sample
+from flexdt.twin.scanner.state import Sample, StagePlacement
 from flexdt.twin.script.planning.plan import SampleSize
 
 KEPT = 8
@@ -33,7 +33,7 @@ class Stage:
 
     def __init__(self, machine: Machine, profile: Profile, samples: Phantoms) -> None:
         self._machine, self._profile, self._samples = machine, profile, samples
-        self._scenes: OrderedDict[tuple[_Content, Offsets], Scene] = OrderedDict()
+        self._scenes: OrderedDict[tuple[_Content, Offsets], CollisionScene] = OrderedDict()
         self._pieces: OrderedDict[_Content, tuple[Polytope, ...]] = OrderedDict()
 
     def beside(self, samples: Phantoms) -> Stage:
@@ -72,7 +72,7 @@ class Stage:
             return None
         return SampleSize.around(phantom.size_mm, f"sample {sample.name}", sample.offset)
 
-    def scene(self, sample: Sample, parameters: Offsets = NOMINAL) -> Scene | None:
+    def scene(self, sample: Sample, parameters: Offsets = NOMINAL) -> CollisionScene | None:
         """What may touch what with this sample; None where the machine has no components.
 
         Args:
@@ -109,7 +109,7 @@ _Content = tuple[Sample, str | None]
 """A sample and what its upload held: another file may come under the same name."""
 
 
-def _pieces(phantom: Phantom, offset: Placement) -> tuple[Polytope, ...]:
+def _pieces(phantom: Phantom, offset: StagePlacement) -> tuple[Polytope, ...]:
     return convex_pieces(
         phantom.mesh(around=True), rotation=offset.rotation, offset=(offset.x, offset.y, offset.z)
     )

@@ -118,7 +118,7 @@ EMPTY = "empty"
 
 
 @dataclass(frozen=True)
-class Upload:
+class ReceivedSample:
     """An upload that is whole and readable.
 
     Attributes:
@@ -151,7 +151,7 @@ class _With:
     """The samples there are, and an upload under its name."""
 
     store: SampleStore
-    upload: Upload
+    upload: ReceivedSample
 
     def load(self, name: str, material: str | None = None) -> Phantom:
         if name != self.upload.head.name:
@@ -265,7 +265,7 @@ class SampleStore:
         file_stem(head.name)
         return self._incoming.receive(head, start, data)
 
-    def parse(self, name: str, material: str | None = None) -> Upload:
+    def parse(self, name: str, material: str | None = None) -> ReceivedSample:
         """Parse a complete upload, which may take seconds; nothing is stored.
 
         Args:
@@ -278,13 +278,13 @@ class SampleStore:
         head, raw = self._incoming.take(name)
         phantom = _parse(head, raw, head.material)
         worn = None if material is None else (material, _parse(head, raw, material))
-        return Upload(head, raw, phantom, _revision(head, raw), worn)
+        return ReceivedSample(head, raw, phantom, _revision(head, raw), worn)
 
-    def with_upload(self, upload: Upload) -> Phantoms:
+    def with_upload(self, upload: ReceivedSample) -> Phantoms:
         """The samples there are, as if an upload was among them already."""
         return _With(self, upload)
 
-    def store(self, changes: Changes, upload: Upload) -> None:
+    def store(self, changes: Changes, upload: ReceivedSample) -> None:
         """Write an upload; the previous one of that name stays beside it until `know`.
 
         Raises:
@@ -296,7 +296,7 @@ class SampleStore:
         document["revision"] = upload.revision
         changes.put_json(self._folder, f"{stem}.json", document)
 
-    def know(self, upload: Upload) -> None:
+    def know(self, upload: ReceivedSample) -> None:
         """Make a stored upload the current one of its name; `tidy` removes the previous one."""
         name = upload.head.name
         with self._lock:

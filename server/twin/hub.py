@@ -38,7 +38,7 @@ Render = Callable[[ImageWish], object]
 """Makes an event's data for one view; called at most once a view."""
 
 
-class Listener(Protocol):
+class EventSink(Protocol):
     """Where events go: a connection."""
 
     def post(self, message: Message | Prepared, slot: str | None = None) -> None:
@@ -94,16 +94,16 @@ class Hub:
         self._kept: dict[Topic, deque[_Event]] = {
             topic: deque(maxlen=count) for topic, count in (kept or {}).items()
         }
-        self._told: dict[tuple[Listener, Topic], int] = {}
+        self._told: dict[tuple[EventSink, Topic], int] = {}
         self._seq: dict[Topic, int] = {}
-        self._listeners: dict[Topic, dict[Listener, _Subscription]] = {}
-        self._due: deque[tuple[Listener, _Subscription, _Event]] = deque()
+        self._listeners: dict[Topic, dict[EventSink, _Subscription]] = {}
+        self._due: deque[tuple[EventSink, _Subscription, _Event]] = deque()
         self._room = A_TURN
         self._refilling = False
 
     def subscribe(
         self,
-        listener: Listener,
+        listener: EventSink,
         topics: Iterable[Topic],
         max_rate_hz: float | None = None,
         view: ImageWish | None = None,
@@ -127,7 +127,7 @@ class Hub:
                 if earlier.seq > told:
                     self._deliver(listener, subscription, earlier)
 
-    def _require_room(self, listener: Listener, topics: set[Topic], view: ImageWish) -> None:
+    def _require_room(self, listener: EventSink, topics: set[Topic], view: ImageWish) -> None:
         views = [
             s.view
             for topic, listeners in self._listeners.items()
@@ -142,14 +142,14 @@ class Hub:
                 data = {"asked": asked, "allowed": most}
                 raise busy(f"there would be {asked} {what}; this server has {most} at most", data)
 
-    def unsubscribe(self, listener: Listener, topics: Iterable[Topic]) -> None:
+    def unsubscribe(self, listener: EventSink, topics: Iterable[Topic]) -> None:
         """Send them no longer; topics that were not subscribed to are fine."""
         for topic in topics:
             subscription = self._listeners.get(topic, {}).pop(listener, None)
             if subscription is not None and subscription.timer is not None:
                 subscription.timer.cancel()
 
-    def drop(self, listener: Listener) -> None:
+    def drop(self, listener: EventSink) -> None:
         """Forget a connection."""
         self.unsubscribe(listener, list(self._listeners))
         for topic in self._kept:
@@ -191,7 +191,7 @@ class Hub:
             self._offer(listener, subscription, new)
 
     def snapshot(
-        self, listener: Listener, topic: Topic, data: object | Render, slot: str | None = ""
+        self, listener: EventSink, topic: Topic, data: object | Render, slot: str | None = ""
     ) -> None:
         """Tell one subscriber of `topic` how things are: the last event's `seq`, out of turn.
 
@@ -206,7 +206,7 @@ class Hub:
             seq = max(0, self._seq.get(topic, 0) - 1)
             self._deliver(listener, subscription, _Event(topic, seq, self._now(), data, slot))
 
-    def _offer(self, listener: Listener, subscription: _Subscription, new: _Event) -> None:
+    def _offer(self, listener: EventSink, subscription: _Subscription, new: _Event) -> None:
         loop = asyncio.get_running_loop()
         wait = subscription.next_at - loop.time()
         if new.slot is not None and (wait > 0.0 or subscription.timer is not None):
@@ -217,14 +217,14 @@ class Hub:
         subscription.next_at = loop.time() + subscription.min_interval_s
         self._deliver(listener, subscription, new)
 
-    def _flush(self, listener: Listener, subscription: _Subscription) -> None:
+    def _flush(self, listener: EventSink, subscription: _Subscription) -> None:
         subscription.timer = None
         subscription.next_at = asyncio.get_running_loop().time() + subscription.min_interval_s
         pending, subscription.pending = subscription.pending, {}
         for newest in pending.values():
             self._deliver(listener, subscription, newest)
 
-    def _deliver(self, listener: Listener, subscription: _Subscription, new: _Event) -> None:
+    def _deliver(self, listener: EventSink, subscription: _Subscription, new: _Event) -> None:
         """Post an event at once, or in its turn when many are due."""
         self._due.append((listener, subscription, new))
         self._drain()

@@ -9,16 +9,16 @@ import numpy as np
 import trimesh
 
 from flexdt.clients.viewer.scenes import sample as solids
-from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid
+from flexdt.twin.collision.convex_solids import ConvexSolid, Polytope, UprightCylinder
 from flexdt.twin.geometry.conventions import FloatArray
 
 FINENESS = 2
 """Of the ball that a body is grown by: an icosphere, whose points lie along the axes too."""
 
 
-def bare(solid: Solid) -> trimesh.Trimesh:
+def bare(solid: ConvexSolid) -> trimesh.Trimesh:
     """A convex solid [mm]."""
-    if isinstance(solid, Cylinder):
+    if isinstance(solid, UprightCylinder):
         size = 2.0 * solid.radius, solid.height
         return solids.cylinder(*size, solid.center, solids.STEEL).mesh
     assert isinstance(solid, Polytope)

@@ -17,7 +17,7 @@ from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
     from flexdt.clients.following.frames import FramesBeside
-    from flexdt.clients.following.session import Session
+    from flexdt.clients.following.session import FollowSession
     from flexdt.twin.following.follower import Follower
     from flexdt.twin.following.mirror import Alarm
 
@@ -60,7 +60,7 @@ def follow(
 
     zmq = package("zmq", "flexdt follow", "gateway")
     from flexdt.clients.following.scanner_link import endpoint
-    from flexdt.clients.following.session import Session
+    from flexdt.clients.following.session import FollowSession
 
     try:
         at = endpoint(address)
@@ -78,7 +78,7 @@ def follow(
     with ExitStack() as files:
         log = None if record is None else files.enter_context(record.open("ab"))
         tell = (lambda alarm: None) if json else _say
-        session = Session(follower, tell, log)
+        session = FollowSession(follower, tell, log)
         note(f"following {at}, compared with machine {follower.machine.name}; Ctrl-C ends it")
         try:
             with suppress(KeyboardInterrupt):
@@ -112,7 +112,7 @@ def _follower(
 
 
 async def _run(
-    session: Session,
+    session: FollowSession,
     address: str,
     seconds: float | None,
     port: int | None,
@@ -137,7 +137,7 @@ async def _run(
         raise error
 
 
-async def _status(session: Session) -> None:
+async def _status(session: FollowSession) -> None:
     """Say now and then how old what is known is."""
     while True:
         await asyncio.sleep(STATUS_S)

@@ -133,9 +133,9 @@ def _rest(state: Stopped) -> str:
     stopping = state.stopping
     if stopping is None or not stopping.distances:
         return "nothing moves"
-    ways = [f"{n} after {d:.3g} {state.axes[n].unit}" for n, d in stopping.distances.items()]
+    distances = [f"{n} after {d:.3g} {state.axes[n].unit}" for n, d in stopping.distances.items()]
     hit = f"; {' and '.join(stopping.would_hit)} would collide" if stopping.would_hit else ""
-    return f"at rest in {stopping.duration_s:.3g} s: {', '.join(ways)}{hit}"
+    return f"at rest in {stopping.duration_s:.3g} s: {', '.join(distances)}{hit}"
 
 
 @on_twin
