@@ -53,7 +53,7 @@ from flexdt.twin.projection import (
 from flexdt.twin.projection.analytic_solids import Box, Scene, Solid, Sphere
 from flexdt.twin.projection.cpu import threads
 from flexdt.twin.projection.kernels import fan_kernels
-from flexdt.twin.projection.kernels.fan_types import FanVolume as VoxelBox
+from flexdt.twin.projection.kernels.fan_types import Box as VoxelBox
 from flexdt.twin.projection.mesh import TriangleMesh
 from flexdt.twin.projection.operators import box_of, voxel_rays
 from flexdt_extensions.bench import rtk_peer as rtk

@@ -17,7 +17,7 @@ import numpy as np
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.convex import corner_shadows
 from flexdt.twin.projection.fan_plan import IntArray, exchanged, lying, plan_fans, plan_turns
-from flexdt.twin.projection.kernels.fan_types import FanVolume
+from flexdt.twin.projection.kernels.fan_types import Box
 from flexdt.twin.projection.volume import LANES
 
 ROOM = 64 << 20
@@ -43,7 +43,7 @@ TILE = 8
 """Detector columns a job of single rays."""
 
 
-def project(box: FanVolume, views: FloatArray, out: Float32Array, *, fans: bool = True) -> None:
+def project(box: Box, views: FloatArray, out: Float32Array, *, fans: bool = True) -> None:
     """Fill out (n, rows, cols) with line integrals.
 
     Args:
@@ -67,7 +67,7 @@ def project(box: FanVolume, views: FloatArray, out: Float32Array, *, fans: bool 
             _project(box, views[some], out[some])
 
 
-def _project(box: FanVolume, views: FloatArray, out: Float32Array) -> None:
+def _project(box: Box, views: FloatArray, out: Float32Array) -> None:
     from flexdt.twin.projection.kernels import fan_kernels, siddon_kernels
 
     shape = (out.shape[1], out.shape[2])
@@ -80,12 +80,7 @@ def _project(box: FanVolume, views: FloatArray, out: Float32Array) -> None:
 
 
 def spread(
-    box: FanVolume,
-    views: FloatArray,
-    values: Float32Array,
-    *,
-    clean: bool = True,
-    fans: bool = True,
+    box: Box, views: FloatArray, values: Float32Array, *, clean: bool = True, fans: bool = True
 ) -> None:
     """The transpose of `project`: values (n, rows, cols) into box.flat.
 
@@ -109,7 +104,7 @@ def spread(
 
 
 def _spread(
-    box: FanVolume, views: FloatArray, values: Float32Array, clean: bool, *, fans: bool = True
+    box: Box, views: FloatArray, values: Float32Array, clean: bool, *, fans: bool = True
 ) -> None:
     from flexdt.twin.projection.kernels import fan_kernels, siddon_kernels
 
@@ -143,7 +138,7 @@ def z_slices(nz: int, count: int) -> IntArray:
 
 
 def box_shadows(
-    box: FanVolume, views: FloatArray, levels: tuple[int, int], shape: tuple[int, int]
+    box: Box, views: FloatArray, levels: tuple[int, int], shape: tuple[int, int]
 ) -> IntArray:
     """Pixels that levels [low, high) of a box can reach: (n, 4) = first row, last row + 1, first
     column, last column + 1.

@@ -28,7 +28,7 @@ import numpy.typing as npt
 from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.fan_plan import exchanged, lying
-from flexdt.twin.projection.kernels.fan_types import FanVolume
+from flexdt.twin.projection.kernels.fan_types import Box
 
 DRIVERS = {"win32": "nvcuda.dll"}
 """Name of the CUDA driver's library by platform, where it is not libcuda.so.1."""
@@ -114,7 +114,7 @@ def _project_one_ray() -> None:
     Raises:
         Exception: whatever numba or the driver meets, or a wrong number.
     """
-    box = FanVolume(np.array([1, 3], np.float32), None, 0, 1, 2, 2, 1, 1, 0.5, 0.5, 0.5)
+    box = Box(np.array([1, 3], np.float32), None, 0, 1, 2, 2, 1, 1, 0.5, 0.5, 0.5)
     views = np.array([[-1.0, 0.5, 0.5, 4.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0]])
     image = np.zeros((1, 1, 1), np.float32)
     project(box, [upload(box.flat)], views, image)
@@ -273,7 +273,7 @@ def demand(work: Callable[[], Any]) -> Any:
     return found[0]
 
 
-def project_there(box: FanVolume, voxels: Any, views: FloatArray, shape: tuple[int, ...]) -> Any:
+def project_there(box: Box, voxels: Any, views: FloatArray, shape: tuple[int, ...]) -> Any:
     """Images (n, rows, cols) of a volume on the device, which stay there."""
     from numba import cuda
 
@@ -282,7 +282,7 @@ def project_there(box: FanVolume, voxels: Any, views: FloatArray, shape: tuple[i
     return images.reshape(len(views), *shape)
 
 
-def project(box: FanVolume, voxels: Sequence[Any], views: FloatArray, out: Float32Array) -> None:
+def project(box: Box, voxels: Sequence[Any], views: FloatArray, out: Float32Array) -> None:
     """Fill out (n, rows, cols) with line integrals.
 
     Portions are dealt to the devices in turn, and fetched as late as that leaves one for each.
@@ -308,7 +308,7 @@ def project(box: FanVolume, voxels: Sequence[Any], views: FloatArray, out: Float
 
 
 def spread_there(
-    box: FanVolume, voxels: Any, views: FloatArray, values: Any, *, deterministic: bool = False
+    box: Box, voxels: Any, views: FloatArray, values: Any, *, deterministic: bool = False
 ) -> None:
     """The transpose of `project`: adds values (n, rows, cols) to voxels on the device.
 
@@ -342,7 +342,7 @@ def spread_there(
 
 
 def spread(
-    box: FanVolume,
+    box: Box,
     views: FloatArray,
     values: Float32Array,
     *,
@@ -372,7 +372,7 @@ def spread(
         for device, (low, high) in enumerate(layers):
             deep = high - low
             room = rooms[device]
-            piece = FanVolume(room, None, 0, deep, deep * box.nx, box.nx, box.ny, deep, *box[8:])
+            piece = Box(room, None, 0, deep, deep * box.nx, box.nx, box.ny, deep, *box[8:])
             lowered = views[part] - low * (np.arange(12) == 2)  # source's z
             with on(device):
                 spread_there(piece, room, lowered, values[part], deterministic=deterministic)
@@ -383,7 +383,7 @@ def spread(
             columns[:, :, low:high] = rooms[device].copy_to_host().reshape(box.ny, box.nx, -1)
 
 
-def whole_factor(box: FanVolume, values: Any) -> float:
+def whole_factor(box: Box, values: Any) -> float:
     """The power of 2 by which values are multiplied to be added as integers of 64 bits.
 
     A ray adds at most its value times a voxel's diagonal; all rays together stay below 2^62.
@@ -394,7 +394,7 @@ def whole_factor(box: FanVolume, values: Any) -> float:
     return 2.0 ** math.floor(62 - math.log2(most)) if 0.0 < most < math.inf else 1.0
 
 
-def by_slabs(box: FanVolume, views: FloatArray, shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
+def by_slabs(box: Box, views: FloatArray, shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
     """Views whose rays all cross the whole box, from the source to the pixel, and rise at most one
     voxel for each that they pass along the faster one of x and y.
 
@@ -430,7 +430,7 @@ def _launch(*arguments: Any, **options: Any) -> None:
 
 
 def launcher(
-    box: FanVolume,
+    box: Box,
     voxels: Any,
     views: FloatArray,
     images: Any,

@@ -19,7 +19,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec, check_spread
 from flexdt.twin.geometry.cone_vec import check_shape as check_shape
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import cpu, gpu
-from flexdt.twin.projection.kernels.fan_types import FanVolume
+from flexdt.twin.projection.kernels.fan_types import Box
 from flexdt.twin.projection.level_axis import ORDERS, Order, by_level_axis, in_order
 from flexdt.twin.projection.volume import (
     DeviceVolume,
@@ -207,9 +207,9 @@ def _spread(
         bring_over(data, layout.flat, layout.stride_x, layout.stride_y, adding=True)
 
 
-def box_of(layout: Layout) -> FanVolume:
+def box_of(layout: Layout) -> Box:
     """A layout as the kernels take it."""
-    return FanVolume(
+    return Box(
         layout.flat,
         layout.spans,
         layout.base,

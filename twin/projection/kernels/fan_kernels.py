@@ -30,7 +30,7 @@ from flexdt.twin.projection.kernels.fan_rays_kernels import (
     sort_by_slope,
     start,
 )
-from flexdt.twin.projection.kernels.fan_types import FanVolume
+from flexdt.twin.projection.kernels.fan_types import Box
 from flexdt.twin.projection.kernels.fan_walk_kernels import ZERO, walk
 from flexdt.twin.projection.kernels.siddon_kernels import open_column, walk_ray
 
@@ -161,7 +161,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                 while item < count:
                     part, unit = item % len(slices), begin + item // len(slices)
                     low, high = slices[part]
-                    piece = FanVolume(
+                    piece = Box(
                         box.flat, marks[part], box.base + low, box.hop_x, box.hop_y,
                         box.nx, box.ny, high - low, box.size_x, box.size_y, box.size_z,
                     )  # fmt: skip

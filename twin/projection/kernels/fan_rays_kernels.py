@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from flexdt.twin.projection.kernels.compiling import kernel, maker
-from flexdt.twin.projection.kernels.fan_types import Fan, FanGrid, Found, Rays, Work
+from flexdt.twin.projection.kernels.fan_types import Fan, Found, Grid, Rays, Work
 from flexdt.twin.projection.kernels.fan_walk_kernels import BINS, NONE, ZERO
 
 SPREAD = 1e-7
@@ -47,7 +47,7 @@ def oriented(box, g, lines, line, rows):
     if sign_t < 0:
         st, base, hop_t = nt - st, base + (nt - 1) * hop_t, -hop_t
         span_base, span_t = span_base + (nt - 1) * span_t, -span_t
-    return FanGrid(
+    return Grid(
         axis, sign_l, sign_t, base, hop_l, hop_t, span_base, span_l, span_t, nl, nt, box.nz,
         sl, st, g[2], square_l, square_t, sz,
     )  # fmt: skip

@@ -7,7 +7,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 
-class FanVolume(NamedTuple):
+class Box(NamedTuple):
     """Voxels (ix, iy, iz) at flat[base + ix * hop_x + iy * hop_y + iz]; counts; edges [mm].
 
     spans (ny, nx, 2): occupied voxels of a column, first <= iz < last.
@@ -39,7 +39,7 @@ class Fans(NamedTuple):
     widest: int
 
 
-class FanGrid(NamedTuple):
+class Grid(NamedTuple):
     """A box as one fan sees it: axis of t (0 x, 1 y), signs of the mirroring, offset and steps in
     the voxels and in their spans, counts, source, and squares of the voxel's edges [mm^2].
     """
@@ -119,7 +119,7 @@ class Rays(NamedTuple):
     picked: Any
 
 
-class FanPart(NamedTuple):
+class Part(NamedTuple):
     """Neighbours in a sorted fan: what the correction at a vertex touches."""
 
     acc: Any

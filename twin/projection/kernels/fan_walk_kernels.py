@@ -23,7 +23,7 @@ import math
 import numpy as np
 
 from flexdt.twin.projection.kernels.compiling import fused, inline, kernel, prefetch
-from flexdt.twin.projection.kernels.fan_types import FanPart
+from flexdt.twin.projection.kernels.fan_types import Part
 from flexdt.twin.projection.kernels.siddon_kernels import open_column
 
 NONE = np.uint32(0xFFFFFFFF)
@@ -70,7 +70,7 @@ def mix(out, right, left, right_before, left_before):
 @inline
 def part_of(rays, first, last):
     """Rays first to last - 1 of a sorted fan."""
-    return FanPart(
+    return Part(
         rays.acc[first:last],
         rays.weight[first:last],
         rays.tilt[first:last],

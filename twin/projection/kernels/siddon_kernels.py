@@ -12,7 +12,7 @@ import numpy as np
 from numba import prange
 
 from flexdt.twin.projection.kernels.compiling import inline, kernel, parallel
-from flexdt.twin.projection.kernels.fan_types import FanVolume
+from flexdt.twin.projection.kernels.fan_types import Box
 
 
 @inline
@@ -154,7 +154,7 @@ def spread_rays(box, views, chosen, values, slices, marks):
     rows, cols = values.shape[1:]
     for job in prange(len(slices)):
         z0, z1 = slices[job, 0], slices[job, 1]
-        piece = FanVolume(
+        piece = Box(
             box.flat, marks[job], box.base + z0, box.hop_x, box.hop_y, box.nx, box.ny, z1 - z0,
             box.size_x, box.size_y, box.size_z,
         )  # fmt: skip
