@@ -126,7 +126,7 @@ Place = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)
 """(x, y, z) [mm]."""
 
 
-class Grid(Params):
+class VoxelGrid(Params):
     """Voxels without values."""
 
     shape: VoxelShape
@@ -139,7 +139,7 @@ class Grid(Params):
         return 4 * math.prod(self.shape)
 
     @model_validator(mode="after")
-    def _extent(self) -> Grid:
+    def _extent(self) -> VoxelGrid:
         require_extent(self.shape, self.voxel_mm)
         return self
 
@@ -171,7 +171,7 @@ class VolumePut(Params):
     scene: dict[str, Any] | None = Field(
         default=None, description="{solids: [{shape: {kind, ...}, material, mu_per_mm}]}"
     )
-    grid: Grid | None = None
+    grid: VoxelGrid | None = None
     mesh: MeshSize | None = None
     start: Bytes = Field(default=0, description="position of this chunk [bytes]")
     data: Buffer | None = None
@@ -207,7 +207,7 @@ class Backproject(Params):
     """The adjoint of `project`; with `into` it is added to a named volume instead of answered."""
 
     cone_vec: ConeVecs
-    grid: Grid
+    grid: VoxelGrid
     into: VolumeName | None = None
     projections: Stack
 

@@ -108,7 +108,7 @@ EMPTY = "empty"
 
 
 @dataclass(frozen=True)
-class Upload:
+class ReceivedSample:
     """An upload that is whole and readable.
 
     Attributes:
@@ -231,7 +231,7 @@ class SampleStore:
         file_stem(head.name)
         return self._incoming.receive(head, start, data)
 
-    def parse(self, name: str, material: str | None = None) -> Upload:
+    def parse(self, name: str, material: str | None = None) -> ReceivedSample:
         """Parse a complete upload, which may take seconds; nothing is stored.
 
         Args:
@@ -244,9 +244,9 @@ class SampleStore:
         head, raw = self._incoming.take(name)
         phantom = _parse(head, raw, head.material)
         worn = None if material is None else (material, _parse(head, raw, material))
-        return Upload(head, raw, phantom, _revision(head, raw), worn)
+        return ReceivedSample(head, raw, phantom, _revision(head, raw), worn)
 
-    def store(self, changes: Changes, upload: Upload) -> None:
+    def store(self, changes: Changes, upload: ReceivedSample) -> None:
         """Write an upload; the previous one of that name stays beside it until `know`.
 
         Raises:
@@ -258,7 +258,7 @@ class SampleStore:
         document["revision"] = upload.revision
         changes.put_json(self._folder, f"{stem}.json", document)
 
-    def know(self, upload: Upload) -> None:
+    def know(self, upload: ReceivedSample) -> None:
         """Make a stored upload the current one of its name; `tidy` removes the previous one."""
         name = upload.head.name
         with self._lock:

@@ -37,7 +37,7 @@ from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
 from flexdt.server.storage.corrections import Corrections
 from flexdt.server.storage.memory import Memory, StateStore, read_memory, remember, restore
 from flexdt.server.storage.past_scans import PastScans
-from flexdt.server.storage.stored_samples import SampleStore, Upload, sample_material
+from flexdt.server.storage.stored_samples import ReceivedSample, SampleStore, sample_material
 from flexdt.server.twin import wire_values as views
 from flexdt.server.twin.hub import Hub
 from flexdt.server.twin.live import LiveView, Shot, StateFeed
@@ -52,7 +52,7 @@ from flexdt.twin.physics.scatter.simulation import Scatter
 from flexdt.twin.scanner.safety import Guard
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.stage_change import StageChange
-from flexdt.twin.scanner.state import Correction, Sample, ScannerState, TubeState
+from flexdt.twin.scanner.state import NamedCorrection, Sample, ScannerState, TubeSettings
 from flexdt.twin.script import Exposure
 
 # Who may move: one controller at a time, everyone may watch.
@@ -62,7 +62,7 @@ from flexdt.twin.script import Exposure
 # from whoever has it. The caller says which requests move.
 
 
-class Control:
+class ControlLease:
     """The controller's lease; `holder` is a connection's name or None.
 
     Args:
@@ -176,7 +176,7 @@ class TwinServer:
         self.hub = Hub(
             self.clock.now, {"log": LOG_KEPT}, self.limits.max_subscriptions, self.limits.max_views
         )
-        self.control = Control(self.limits.control_idle_s, wall)
+        self.control = ControlLease(self.limits.control_idle_s, wall)
         settle(root, RESERVED)
         self.samples = SampleStore(root.folder("samples"), self.limits.max_upload)
         self.samples.standing = lambda: (self.scanner.sample.name, self.scanner.sample.material)
@@ -275,7 +275,7 @@ class TwinServer:
         if lost is not None:
             self.tell("warning", f"the correction in force, {lost!r}, is lost: none is in force")
         try:
-            self.scanner.stand(Sample(), last, None, self.clock.now())
+            self.scanner.initialise_stage(Sample(), last, None, self.clock.now())
         except GeometryError as error:
             self.corrections.history = self.corrections.after(None)
             self.tell("warning", "the correction in force does not fit this machine: none is",
@@ -360,7 +360,7 @@ class TwinServer:
             revision=self.samples.revision(sample.name),
         )
 
-    def correction_state(self, correction: Correction | None) -> w.Correction | None:
+    def correction_state(self, correction: NamedCorrection | None) -> w.Correction | None:
         """A correction and what it came from, for the wire."""
         source = None if correction is None else self.corrections.source(correction.name)
         return views.correction_view(correction, source)
@@ -394,16 +394,16 @@ class TwinServer:
         """At the start: put `sample` on the stage wherever the motors stand."""
         correction = self.scanner.correction
         guard = await self._guard(sample, correction)
-        for warning in self.scanner.stand(sample, correction, guard, self.clock.now()):
+        for warning in self.scanner.initialise_stage(sample, correction, guard, self.clock.now()):
             self.tell("warning", f"at the start {warning}; motion that brings them apart is free")
         self.changed()
 
     async def certified_stage(
         self,
         sample: Sample,
-        correction: Correction | None,
+        correction: NamedCorrection | None,
         *,
-        upload: Upload | None = None,
+        upload: ReceivedSample | None = None,
         targets: Mapping[str, float] | None = None,
         paces: Mapping[str, tuple[float, float]] | None = None,
     ) -> StageChange:
@@ -445,7 +445,10 @@ class TwinServer:
         return [] if halted is None else [halted.message]
 
     async def _guard(
-        self, sample: Sample, correction: Correction | None, upload: Upload | None = None
+        self,
+        sample: Sample,
+        correction: NamedCorrection | None,
+        upload: ReceivedSample | None = None,
     ) -> Guard | None:
         parameters = NOMINAL if correction is None else correction.parameters
         return await asyncio.to_thread(self.stage.guard, sample, parameters, upload)
@@ -503,7 +506,7 @@ class TwinServer:
             Shot.of(self.scanner, now),
             positions=tuple(sorted(frame.positions.items())),
             camera=frame.camera,
-            tube=TubeState(frame.kV, frame.power_W, frame.xrays_on),
+            tube=TubeSettings(frame.kV, frame.power_W, frame.xrays_on),
         )
         if frame.kind == "projection":
             self.live.judge(radiograph, shot)

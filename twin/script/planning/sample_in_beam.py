@@ -19,7 +19,7 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.script.planning.plan import ImageKind, ScanPlan
-from flexdt.twin.script.problems import Problem
+from flexdt.twin.script.problems import ScriptProblem
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -97,9 +97,9 @@ def _probes(count: int) -> list[int]:
     return spread
 
 
-def beam_problems(plan: ScanPlan) -> tuple[Problem, ...]:
+def beam_problems(plan: ScanPlan) -> tuple[ScriptProblem, ...]:
     """Warnings: the sample outside the beam in projections, or inside it in flats."""
-    found: list[Problem] = []
+    found: list[ScriptProblem] = []
     for view in views(plan):
         outside = view.outside
         if view.kind == "projection" and outside.any():
@@ -109,10 +109,10 @@ def beam_problems(plan: ScanPlan) -> tuple[Problem, ...]:
     return tuple(found)
 
 
-def _aggregate(view: View, bad: BoolArray, code: str, text: str) -> Problem:
+def _aggregate(view: View, bad: BoolArray, code: str, text: str) -> ScriptProblem:
     lines = sorted({line for line, b in zip(view.lines, bad.tolist(), strict=True) if b})
     more = f" (and at {len(lines) - 1} more lines)" if len(lines) > 1 else ""
-    return Problem("warning", code, lines[0], 1, text + more)
+    return ScriptProblem("warning", code, lines[0], 1, text + more)
 
 
 def _outside_text(view: View) -> str:

@@ -20,7 +20,7 @@ from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.grammar import is_reserved, own_name
 from flexdt.twin.script.planning.describe import describe
-from flexdt.twin.script.planning.plan import SampleSize, Settings, StartState, Step
+from flexdt.twin.script.planning.plan import PlanStep, SampleSize, Settings, StartState
 from flexdt.twin.script.planning.planned_images import ImageCollector
 from flexdt.twin.script.planning.planned_scanner import (
     Motors,
@@ -30,7 +30,7 @@ from flexdt.twin.script.planning.planned_scanner import (
     Trigger,
     clamp,
 )
-from flexdt.twin.script.problems import Problem, Severity
+from flexdt.twin.script.problems import ScriptProblem, Severity
 
 # The binary argument of `scanner set sample info`: the sample's size and names.
 #
@@ -67,14 +67,14 @@ class Simulation:
         )
         self.settings: Settings | None = None
         self.sample: SampleSize | None = None
-        self.steps: list[Step] = []
-        self.problems: list[Problem] = []
+        self.steps: list[PlanStep] = []
+        self.problems: list[ScriptProblem] = []
         self.command: c.Command = c.Command()
 
     def note(self, severity: Severity, code: str, message: str) -> None:
         """Add a problem at the command in hand."""
         self.problems.append(
-            Problem(severity, code, self.command.line, self.command.column, message)
+            ScriptProblem(severity, code, self.command.line, self.command.column, message)
         )
 
     @property
@@ -96,7 +96,7 @@ class Simulation:
             self.now = self._release(command, span)
             holds = self.now - before
             self.steps.append(
-                Step(
+                PlanStep(
                     index=len(self.steps),
                     line=command.line,
                     start_s=span.start,
