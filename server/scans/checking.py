@@ -203,7 +203,8 @@ def planned(matter: CheckInput) -> tuple[ScanPlan, list[str]]:
     report = matter.report()
     require_sound(report)
     warnings = [p.where_and_what for p in report.warnings[:MAX_PROBLEMS]]
-    return report.plan, warnings + _more(report.warnings)
+    left = len(report.warnings) - MAX_PROBLEMS
+    return report.plan, [*warnings, f"and {left} more"] if left > 0 else warnings
 
 
 def in_pieces(matter: CheckInput) -> list[bytes]:
@@ -274,11 +275,6 @@ def require_sound(report: CheckReport) -> None:
             "allowed": "a path without contact",
         },
     )
-
-
-def _more(many: Sequence[object]) -> list[str]:
-    left = len(many) - MAX_PROBLEMS
-    return [f"and {left} more"] if left > 0 else []
 
 
 def _worst(problems: list[ScriptProblem]) -> Sequence[ScriptProblem]:

@@ -146,7 +146,9 @@ class Submissions:
         plan, prepare, warnings = await self._ready(sidecar, name, begun, ensure_allowed)
         await self._queued(
             sidecar, name, ensure_allowed,
-            lambda: self.jobs.draft_again(job, plan, prepare, sidecar.speed_up, warnings),
+            lambda: self.jobs.draft(
+                name, job.folder, plan, prepare, sidecar.speed_up, warnings, job
+            ),
         )  # fmt: skip
 
     async def _queued(

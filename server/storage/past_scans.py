@@ -208,16 +208,11 @@ def _place(root: Directory, name: str) -> tuple[Path, tuple[object, ...]]:
     return root.path / name, (name, *((s.st_ino, s.st_mtime_ns, s.st_size) for s in parts))
 
 
-def _document(folder: Folder, most: int) -> DatasetDocument:
-    if folder.document is None:
-        raise DatasetMissingError(f"there is no {DOCUMENT}: poses and settings are not known")
-    path = folder.path / DOCUMENT
-    return parse_document(read_text(path, most), DOCUMENT)
-
-
 def _scan(folder: Folder, most: int) -> _Scan:
     try:
-        document = _document(folder, most)
+        if folder.document is None:
+            raise DatasetMissingError(f"there is no {DOCUMENT}: poses and settings are not known")
+        document = parse_document(read_text(folder.path / DOCUMENT, most), DOCUMENT)
         return _Scan(folder, tuple(document.frames), document)
     except DatasetError as error:
         if not folder.projections:

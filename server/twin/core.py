@@ -226,8 +226,12 @@ class TwinServer:
         """Ends of motions that somebody waits for."""
 
     async def start(self, sample: Sample | None = None) -> None:
-        """Begin to work, with `sample` on the stage."""
-        await self._begin_with(Sample() if sample is None else sample)
+        """Begin to work, with `sample` on the stage wherever the motors stand."""
+        shown, correction = sample or Sample(), self.scanner.correction
+        guard = await self._guard(shown, correction)
+        for warning in self.scanner.initialise_stage(shown, correction, guard, self.clock.now()):
+            self.tell("warning", f"at the start {warning}; motion that brings them apart is free")
+        self.changed()
         work: list[Callable[[], Coroutine[Any, Any, None]]] = [
             self.jobs.work,
             self.live.run,
@@ -390,14 +394,6 @@ class TwinServer:
         history = self.corrections.history
         return remember(self.scanner, self.clock.now(), jobs, made, history, ended=ended)
 
-    async def _begin_with(self, sample: Sample) -> None:
-        """At the start: put `sample` on the stage wherever the motors stand."""
-        correction = self.scanner.correction
-        guard = await self._guard(sample, correction)
-        for warning in self.scanner.initialise_stage(sample, correction, guard, self.clock.now()):
-            self.tell("warning", f"at the start {warning}; motion that brings them apart is free")
-        self.changed()
-
     async def certified_stage(
         self,
         sample: Sample,
@@ -481,14 +477,9 @@ class TwinServer:
         entry = w.LogEntry(level=level, message=message, data=data)
         self.hub.publish("log", entry, slot=None)
 
-    def announce(self, job: Job) -> w.JobStatus:
-        """Tell watchers of jobs how this one is."""
+    def _job_changed(self, job: Job) -> None:
         status = self.jobs.status(job)
         self.hub.publish("job", status, slot=job.id)
-        return status
-
-    def _job_changed(self, job: Job) -> None:
-        status = self.announce(job)
         if status.state not in ("running", job.logged):
             data: dict[str, object] = {"job": job.id, "error": status.error}
             level: Level = "error" if status.error else "info"
