@@ -50,6 +50,10 @@ class Stage:
         """
         return self._samples.load(sample.name, sample.material) if sample.name else None
 
+    def revision(self, sample: Sample) -> str | None:
+        """Names what the upload of a sample shows, once it has been read; None for others."""
+        return self._samples.revision(sample.name)
+
     def pieces(self, sample: Sample) -> tuple[Polytope, ...]:
         """Convex pieces that hold the sample, object frame; it may take a second."""
         before = self._content(sample)
@@ -102,7 +106,7 @@ class Stage:
         return None if scene is None else SceneGuard(scene)
 
     def _content(self, sample: Sample) -> _Content:
-        return sample, self._samples.revision(sample.name)
+        return sample, self.revision(sample)
 
 
 _Content = tuple[Sample, str | None]

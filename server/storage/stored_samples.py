@@ -143,7 +143,7 @@ class Phantoms(Protocol):
         """The phantom called `name`."""
 
     def revision(self, name: str) -> str | None:
-        """Names the content of an upload that has been read."""
+        """Names what an upload that has been read shows: its content, and its own material."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ class _With:
     def revision(self, name: str) -> str | None:
         if name != self.upload.head.name:
             return self.store.revision(name)
-        return self.upload.revision
+        return _shown(self.upload.head, self.upload.revision)
 
 
 class SampleStore:
@@ -212,8 +212,10 @@ class SampleStore:
         return self._heads.get(name)
 
     def revision(self, name: str) -> str | None:
-        """Names the content of an upload that has been read; None for a shipped phantom."""
-        return self._revisions.get(name)
+        """Names what an upload that has been read shows; None for a shipped phantom."""
+        with self._lock:
+            revision, head = self._revisions.get(name), self._heads.get(name)
+        return None if revision is None or head is None else _shown(head, revision)
 
     def load(self, name: str, material: str | None = None) -> Phantom:
         """The phantom called `name`; parsed once and cached.
@@ -365,6 +367,11 @@ def _revision(head: UploadHead, raw: bytes) -> str:
     """A name of a content: bytes and how they are read."""
     how = f"{head.kind} {head.format} {head.unit} {head.shape} {head.voxel_mm}".encode()
     return hashlib.sha256(how + b"\0" + raw).hexdigest()[:16]
+
+
+def _shown(head: UploadHead, revision: str) -> str:
+    """A name of what an upload shows: the same content may come again in another material."""
+    return revision if head.material is None else f"{revision} {head.material}"
 
 
 def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
