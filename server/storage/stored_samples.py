@@ -346,7 +346,7 @@ class SampleStore:
             stored = self._stored.get(head.name)
         file = _bytes_file(head.name, stored)
         try:
-            raw = self._folder.read(file)
+            raw = self._folder.read(file, head.total)
             if len(raw) != head.total:
                 raise ValueError(f"{len(raw)} bytes, not {head.total}")
             if stored is not None and _revision(head, raw) != stored:
