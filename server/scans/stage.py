@@ -51,6 +51,10 @@ class Stage:
         """
         return self._samples.load(sample.name, sample.material) if sample.name else None
 
+    def revision(self, sample: Sample) -> str | None:
+        """Names what the upload of a sample shows, once it has been read; None for others."""
+        return self._samples.revision(sample.name)
+
     def pieces(self, sample: Sample, upload: ReceivedSample | None = None) -> tuple[Polytope, ...]:
         """Convex pieces that hold the sample, object frame; it may take a second.
 
@@ -63,9 +67,8 @@ class Stage:
         if pieces is None:
             phantom = self.phantom(sample) if upload is None else upload.standing
             pieces = () if phantom is None else _pieces(phantom, sample.offset)
-            now = self._content(
-                sample, upload
-            )  # the revision is known once an upload has been read
+            # The revision is known once an upload has been read.
+            now = self._content(sample, upload)
             if before[1] not in (None, now[1]):
                 return pieces  # another file came under the name meanwhile
             self._pieces[now] = pieces
@@ -116,7 +119,7 @@ class Stage:
         return None if scene is None else SceneGuard(scene)
 
     def _content(self, sample: Sample, upload: ReceivedSample | None) -> _Content:
-        return sample, upload.revision if upload else self._samples.revision(sample.name)
+        return sample, upload.shown if upload else self.revision(sample)
 
 
 _Content = tuple[Sample, str | None]

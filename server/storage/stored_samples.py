@@ -126,6 +126,11 @@ class ReceivedSample:
     worn: tuple[str, Phantom] | None = None
 
     @property
+    def shown(self) -> str:
+        """A name of what it shows, as `SampleStore.revision` gives it."""
+        return _shown(self.head, self.revision)
+
+    @property
     def standing(self) -> Phantom:
         """The phantom that it will be on the stage."""
         return self.phantom if self.worn is None else self.worn[1]
@@ -178,8 +183,10 @@ class SampleStore:
         return self._heads.get(name)
 
     def revision(self, name: str) -> str | None:
-        """Names the content of an upload that has been read; None for a shipped phantom."""
-        return self._revisions.get(name)
+        """Names what an upload that has been read shows; None for a shipped phantom."""
+        with self._lock:
+            revision, head = self._revisions.get(name), self._heads.get(name)
+        return None if revision is None or head is None else _shown(head, revision)
 
     def load(self, name: str, material: str | None = None) -> Phantom:
         """The phantom called `name`; parsed once and cached.
@@ -306,7 +313,7 @@ class SampleStore:
             stored = self._stored.get(head.name)
         file = _bytes_file(head.name, stored)
         try:
-            raw = self._folder.read(file)
+            raw = self._folder.read(file, head.total)
             if len(raw) != head.total:
                 raise ValueError(f"{len(raw)} bytes, not {head.total}")
             if stored is not None and _revision(head, raw) != stored:
@@ -327,6 +334,11 @@ def _revision(head: UploadHead, raw: bytes) -> str:
     """A name of a content: bytes and how they are read."""
     how = f"{head.kind} {head.format} {head.unit} {head.shape} {head.voxel_mm}".encode()
     return hashlib.sha256(how + b"\0" + raw).hexdigest()[:16]
+
+
+def _shown(head: UploadHead, revision: str) -> str:
+    """A name of what an upload shows: the same content may come again in another material."""
+    return revision if head.material is None else f"{revision} {head.material}"
 
 
 def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
