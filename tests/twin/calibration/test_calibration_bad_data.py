@@ -48,7 +48,7 @@ def test_refused_and_named(kind: str, code: str) -> None:
         pytest.param("bead_lost", None, marks=pytest.mark.slow),
         pytest.param("extra_beads", None, marks=pytest.mark.slow),
         pytest.param("bead_tolerance", "bead_tolerance", marks=pytest.mark.slow),
-        ("low_dose", None),
+        pytest.param("low_dose", None, marks=pytest.mark.slow),
         pytest.param("gradient", None, marks=pytest.mark.slow),
     ],
 )
@@ -60,6 +60,7 @@ def test_survived_within_its_own_sigmas(kind: str, code: str | None) -> None:
         assert code in found.findings
 
 
+@pytest.mark.slow
 def test_a_blur_of_two_pixels_is_seen_and_allowed_for() -> None:
     """Estimated as 1.7 px at most, it left a bead that touches a face 0.01 px off: 8 sigmas."""
     _, found = run_case(("blurred", 109, "normal-4"))
@@ -67,6 +68,7 @@ def test_a_blur_of_two_pixels_is_seen_and_allowed_for() -> None:
     assert found.worst < 4.0
 
 
+@pytest.mark.slow
 def test_dead_columns_and_pixels_are_no_shadows() -> None:
     """They were taken for a body and for beads elsewhere: the magnification was 5 sigmas off."""
     _, found = run_case(("dead_pixels", 325, "normal-5"))
