@@ -39,19 +39,20 @@ def test_refused_and_named(kind: str, code: str) -> None:
     assert code in found.findings
 
 
-@pytest.mark.parametrize(
-    ("kind", "code"),
-    [
-        ("control", None),
-        pytest.param("half_dark", "frames_dark", marks=pytest.mark.slow),
-        pytest.param("frames_missing", "frames_missing", marks=pytest.mark.slow),
-        pytest.param("bead_lost", None, marks=pytest.mark.slow),
-        pytest.param("extra_beads", None, marks=pytest.mark.slow),
-        pytest.param("bead_tolerance", "bead_tolerance", marks=pytest.mark.slow),
-        pytest.param("low_dose", None, marks=pytest.mark.slow),
-        pytest.param("gradient", None, marks=pytest.mark.slow),
-    ],
+SURVIVED = (
+    ("control", None),
+    ("half_dark", "frames_dark"),
+    ("frames_missing", "frames_missing"),
+    ("bead_lost", None),
+    ("extra_beads", None),
+    ("bead_tolerance", "bead_tolerance"),
+    ("low_dose", None),
+    ("gradient", None),
 )
+
+
+@pytest.mark.daily(1)
+@pytest.mark.parametrize(("kind", "code"), SURVIVED)
 def test_survived_within_its_own_sigmas(kind: str, code: str | None) -> None:
     found = outcome(kind, 5)
     assert not found.refused
@@ -78,6 +79,6 @@ def test_dead_columns_and_pixels_are_no_shadows() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", SURVIVABLE)
+@pytest.mark.parametrize("kind", [kind for kind in SURVIVABLE if kind not in dict(SURVIVED)])
 def test_never_confidently_wrong(kind: str) -> None:
     assert not outcome(kind, 1001).wrong
