@@ -15,7 +15,7 @@ from faults import READS, damaged, starts
 from simulation import Simulation
 from whole_run import PARTS, Part, voxels
 
-from flexdt.server.files.directory import Directory
+from flexdt.runtime.files.directory import Directory
 
 
 @pytest.fixture(scope="module")
