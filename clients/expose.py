@@ -57,8 +57,9 @@ def exposure_of(data: DataSet | str | PathLike[str]) -> Measured:
 def image_doubts(scan: DataSet, *, needed: bool = False) -> list[str]:
     """What in the exposure of a scan's images makes its line integrals doubtful.
 
-    Saturated pixels are those with the panel's largest count, or, where that is not known, with the
-    largest one among the images; `VIEWS` radiographs and the flat image are looked at.
+    Saturated pixels are those with the panel's largest count. Where that is not known, it is the
+    largest among the images if it is one at which converters end (2^bits - 1). `VIEWS` radiographs
+    and the flat image are looked at.
 
     Raises:
         DatasetFormatError: line integrals are `needed`, and the images hold none: no pixel of the
@@ -69,7 +70,10 @@ def image_doubts(scan: DataSet, *, needed: bool = False) -> list[str]:
     if not alive.any():
         doubts = [DARK]
     else:
-        top = float(max(counts.max(), flat.max())) if scan.full_scale is None else scan.full_scale
+        top: float | None = scan.full_scale
+        if top is None:
+            top = float(max(counts.max(), flat.max()))
+            top = top if np.log2(top + 1.0).is_integer() else np.inf
         images = {"radiographs": counts[:, alive] >= top, "flat image": flat[alive] >= top}
         shares = {what: float(there.mean()) for what, there in images.items()}
         doubts = [

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 from pathlib import Path
 
@@ -40,7 +39,6 @@ def test_each_room_keeps_its_budget() -> None:
 
 
 if __name__ == "__main__":
-    text = BUDGET.read_text("utf-8")
-    for room, count in rooms().items():
-        text = re.sub(rf'^"{room}" = \d+', f'"{room}" = {count}', text, flags=re.MULTILINE)
-    BUDGET.write_text(text, "utf-8")
+    head = BUDGET.read_text("utf-8").partition("[lines]")[0]
+    lines = "".join(f'"{room}" = {count}\n' for room, count in sorted(rooms().items()))
+    BUDGET.write_text(f"{head}[lines]\n{lines}", "utf-8")

@@ -210,14 +210,26 @@ class Detector:
         return (1 << self.bits) - 1
 
     def blur_px(self, camera: CameraSettings) -> tuple[float, float]:
-        """Standard deviation of the light's spread along and across the rows [image pixels]."""
+        """Standard deviation of the light's spread along and across the rows [image pixels].
+
+        Example:
+            >>> panel = Detector(blur_mm=0.3, pixels=PixelGrid(4, 4, 0.1))
+            >>> [round(sigma, 6) for sigma in panel.blur_px(panel.camera((4, 4)))]
+            [3.0, 3.0]
+        """
         across, up = self.pixels.edges_mm
         sigma = self.blur_mm / camera.binning
         return sigma / across, sigma / up
 
     def gain(self, camera: CameraSettings) -> float:
         """Electrons in each count: by default the unbinned pixel's full well fills the converter's
-        depth."""
+        depth.
+
+        Example:
+            >>> panel = Detector(electrons_per_count=20)
+            >>> panel.gain(panel.camera((4, 4)))
+            20
+        """
         if self.electrons_per_count is not None:
             return self.electrons_per_count
         return FULL_WELL_E[_is_low(camera)] / 2.0**self.bits
@@ -226,16 +238,32 @@ class Detector:
         """Standard deviation of one read-out of an image pixel [electrons].
 
         Pixels binned on the panel are read once; so are, assumed, those binned later.
+
+        Example:
+            >>> panel = Detector(read_noise_e=200.0)
+            >>> panel.read_noise(panel.camera((4, 4)))
+            200.0
         """
         return self.read_noise_e * (LOW_READ_NOISE if _is_low(camera) else 1.0)
 
     def dark_charge(self, camera: CameraSettings) -> float:
-        """Charge of an image pixel without X-rays [electrons/s]."""
+        """Charge of an image pixel without X-rays [electrons/s].
+
+        Example:
+            >>> panel = Detector(dark_e_per_s=100.0)
+            >>> panel.dark_charge(panel.camera((4, 4)))
+            100.0
+        """
         each = DARK_E_PER_S if self.dark_e_per_s is None else self.dark_e_per_s
         return each * camera.binning**2
 
     def figures(self) -> dict[str, float]:
-        """What it is by name, for data sets; without the camera's settings."""
+        """What it is by name, for data sets; without the camera's settings.
+
+        Example:
+            >>> Detector(bits=12).figures()["bits"]
+            12.0
+        """
         left_out = {"pixel_mm", "exposure_ms", "averages", "electrons_per_count", "read_noise_e"}
         if self.long_lag_fraction == 0.0:  # as before there was any, so that older scans go on
             left_out |= {"long_lag_fraction", "long_lag_s"}
@@ -257,6 +285,11 @@ class Detector:
         a signal of many [electrons^2], (e,) both.
 
         The number of photons is Poisson's, each leaves a spread energy and that a spread charge.
+
+        Example:
+            >>> charge, variance = Detector().charge_of_photons()
+            >>> charge.shape == variance.shape, bool((charge >= 0).all())
+            (True, True)
         """
         full = Substance.parse(self.scintillator)
         layer = replace(full, density_g_cm3=full.density_g_cm3 * self.packing)
