@@ -57,7 +57,7 @@ typecheck: install $(TEST_STAMP)
 
 # The kernels that most tests run: compiled once, not by both workers and by each server they start.
 kernels: $(TEST_STAMP)
-	$(BIN)/python -c 'from flexdt.twin.projection import warm_up; warm_up()'
+	$(BIN)/python tests/support/compile_kernels.py
 
 quick: lint typecheck
 	$(BIN)/pytest -q -n 2 --dist loadfile -m 'not slow' $(QUICK)

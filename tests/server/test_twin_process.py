@@ -191,9 +191,11 @@ def test_sigterm_in_mid_scan_ends_cleanly_and_the_data_set_says_incomplete(
     assert not list(folder.glob(".*"))
 
 
+@pytest.mark.daily(3)
 @pytest.mark.parametrize(
     ("options", "code", "says"),
     [
+        (["--host", "0.0.0.0"], 2, "token"),
         (["--truth", "{data}/truth.toml"], 1, "inside the data directory"),
         (["--machine", "warp-drive"], 1, "flexray"),
         (["--profile", "yesterday"], 1, "cwi-2023-08-21"),
@@ -202,7 +204,6 @@ def test_sigterm_in_mid_scan_ends_cleanly_and_the_data_set_says_incomplete(
         (["--machine", "xyzr_cabinet", "--profile", "thesis"], 1, "for machine 'flexray'"),
         (["--speed-up", "-3"], 1, "speed-up"),
         (["--sample", "unicorn"], 1, "lego"),
-        (["--host", "0.0.0.0"], 2, "token"),
     ],
 )
 def test_a_bad_configuration_is_one_readable_line(

@@ -229,6 +229,7 @@ def analog(size, atoms, density, energy, source, panel_y, half_panel, photons, r
     return once, more, absorbed, interacting
 
 
+@pytest.mark.slow
 def test_forced_detection_counts_what_analog_photons_count() -> None:
     """Water, 60 keV, a near panel: photons on it after one and after more interactions, absorbed
     and interacting, within four standard errors and 2 %."""
