@@ -3,6 +3,9 @@
 Documents come from outside, so every reader either returns the right type or raises PhantomError
 with the path, the value and what is allowed. `Text`, `Number`, `Lengths`, `Place` and `Packed` make
 pydantic read the fields of a dataclass so.
+
+`scene_to_dict` and `scene_from_dict` are a scene as such a document and back; shapes are tagged by
+kind.
 """
 
 from __future__ import annotations
@@ -10,15 +13,27 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import fields
 from functools import partial
-from typing import Annotated, Final, TypeVar
+from typing import Annotated, Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BeforeValidator, PlainSerializer, PlainValidator
 
 from flexdt.twin.errors import TwinError
-from flexdt.twin.projection.analytic_solids import Matrix, Vector
+from flexdt.twin.projection.analytic_solids import (
+    Box,
+    ConvexPolyhedron,
+    Cylinder,
+    Ellipsoid,
+    Matrix,
+    Scene,
+    Shape,
+    Solid,
+    Sphere,
+    Vector,
+)
 
 MAX_ARRAY_BYTES: Final = 4 << 30
 MAX_TEXT: Final = 4096
@@ -159,3 +174,99 @@ def _three(value: object, where: str, read: Callable[[object, str], float]) -> V
     if len(numbers) != 3:
         raise wrong(value, where, "three numbers")
     return (numbers[0], numbers[1], numbers[2])
+
+
+MAX_SOLIDS: Final = 100_000
+
+_KINDS: Final[Mapping[str, type[Shape]]] = {
+    "sphere": Sphere,
+    "box": Box,
+    "cylinder": Cylinder,
+    "ellipsoid": Ellipsoid,
+    "convex": ConvexPolyhedron,
+}
+_KIND_OF: Final[Mapping[type[Shape], str]] = {cls: kind for kind, cls in _KINDS.items()}
+
+_READERS: Final[Mapping[str, Callable[[object, str], object]]] = {
+    "center": vector,
+    "size": lengths,
+    "semi_axes": lengths,
+    "radius": positive,
+    "height": positive,
+    "axis": unit,
+    "axes": axes,
+    "normals": lambda value, where: each(value, where, unit),
+    "offsets": lambda value, where: each(value, where, number),
+}
+"""How each field of a shape is read."""
+
+_OPTIONAL: Final = ("axis", "axes")
+
+
+def scene_to_dict(scene: Scene) -> dict[str, object]:
+    """JSON-able document of a scene: `{solids: [{shape: {kind, ...}, material, mu_per_mm}]}`.
+
+    Example:
+        >>> from flexdt.phantoms import load_phantom
+        >>> scene = load_phantom("normal-3").scene
+        >>> len(scene_to_dict(scene)["solids"])
+        4
+    """
+    return {
+        "solids": [
+            {
+                "shape": {
+                    "kind": _KIND_OF[type(s.shape)],
+                    **{f.name: getattr(s.shape, f.name) for f in fields(s.shape)},
+                },
+                "material": s.material,
+                "mu_per_mm": s.mu_per_mm,
+            }
+            for s in scene.solids
+        ]
+    }
+
+
+def scene_from_dict(document: object, where: str = "scene") -> Scene:
+    """The scene of a document that `scene_to_dict` made.
+
+    Raises:
+        PhantomError: names the key path, the value and what is allowed.
+
+    Example:
+        >>> from flexdt.phantoms import load_phantom
+        >>> scene = load_phantom("normal-3").scene
+        >>> scene_from_dict(scene_to_dict(scene)) == scene
+        True
+    """
+    solids = get(document, "solids", where)
+    if isinstance(solids, list | tuple) and len(solids) > MAX_SOLIDS:
+        raise wrong(f"{len(solids)} solids", f"{where}.solids", f"at most {MAX_SOLIDS}")
+    return Scene(each(solids, f"{where}.solids", _solid))
+
+
+def _solid(document: object, where: str) -> Solid:
+    return Solid(
+        shape_from_dict(get(document, "shape", where), f"{where}.shape"),
+        string(get(document, "material", where), f"{where}.material"),
+        number(get(document, "mu_per_mm", where), f"{where}.mu_per_mm"),
+    )
+
+
+def shape_from_dict(document: object, where: str) -> Shape:
+    """The shape of `{kind, ...}`; raises PhantomError naming the key path."""
+    kind = get(document, "kind", where)
+    if not isinstance(kind, str) or kind not in _KINDS:
+        raise wrong(kind, f"{where}.kind", ", ".join(_KINDS))
+    given = mapping(document, where)
+    names = [f.name for f in fields(_KINDS[kind])]
+    unknown = sorted(str(key) for key in given if key not in (*names, "kind"))
+    if unknown:
+        said = f"{where}: a {kind} has no {', '.join(unknown)}"
+        raise PhantomError.instead(said, unknown, names, path=where)
+    values: dict[str, Any] = {
+        name: _READERS[name](get(given, name, where), f"{where}.{name}")
+        for name in names
+        if name in given or name not in _OPTIONAL
+    }
+    return _KINDS[kind](**values)

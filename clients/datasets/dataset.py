@@ -34,7 +34,7 @@ from flexdt.twin.dataset.scan_settings import ScanSettings
 from flexdt.twin.dataset.scan_settings_text import parse_scan_settings
 from flexdt.twin.dataset.xre import parse_xre
 from flexdt.twin.errors import TwinError
-from flexdt.twin.exchange.geometry_json import read_geometry_text
+from flexdt.twin.exchange.number_tables import read_geometry_text
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.description import (
     Machine,

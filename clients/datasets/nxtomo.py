@@ -25,8 +25,7 @@ from flexdt.twin.dataset.scan_settings_text import format_scan_settings
 from flexdt.twin.dataset.xre import format_settings
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.exchange.geometry import ScanGeometry
-from flexdt.twin.exchange.geometry_json import geometry_text
-from flexdt.twin.exchange.number_tables import VECTOR_NAMES
+from flexdt.twin.exchange.number_tables import VECTOR_NAMES, geometry_text
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.lazy_backend import File
 

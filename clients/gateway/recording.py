@@ -33,7 +33,7 @@ from flexdt.twin.dataset.xre import format_xre
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.scanner.state import Correction
-from flexdt.twin.script.planning.image_names import bare_name, kind_of
+from flexdt.twin.script.grammar import bare_name, kind_of
 
 UNNAMED: Final = "gateway"
 """Name of the folder until an output path is set."""

@@ -24,8 +24,8 @@ from annotated_types import Ge, Le
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from flexdt.protocol.fields import SpeedUp
+from flexdt.protocol.methods.document_messages import Scene
 from flexdt.protocol.rpc_errors import RpcError
-from flexdt.protocol.scene_document import Scene
 from flexdt.protocol.state_model import JobPhase
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.own_documents import Changes, read_json, read_or_set_aside

@@ -18,8 +18,7 @@ from flexdt.twin.following.mirror import MOST_WAITING, Alarm, Heard, Mirror, Wai
 from flexdt.twin.machine.description import Machine, Profile, unknown_axis
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.executed_log import MotorReply, log_line, motor_reply
-from flexdt.twin.script.grammar import FIXED, ArgumentError, find, number
-from flexdt.twin.script.planning.describe import describe
+from flexdt.twin.script.grammar import FIXED, ArgumentError, describe, find, number
 from flexdt.twin.script.planning.dry_run import CollisionCheck, check_plan
 from flexdt.twin.script.planning.plan import Range, SampleSize, Step, step_range, total_range
 from flexdt.twin.script.planning.planner import plan_script, simulated

@@ -18,9 +18,8 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.camera import CameraSettings, check_roi
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.script import commands as c
-from flexdt.twin.script.grammar import shorten
+from flexdt.twin.script.grammar import image_name, kind_of, sequence_names, shorten
 from flexdt.twin.script.planning import smooth_scan as smooth
-from flexdt.twin.script.planning.image_names import image_name, kind_of, sequence_names
 from flexdt.twin.script.planning.plan import ExposureGroup, FlyScan, ImageKind
 from flexdt.twin.script.planning.planned_scanner import (
     Motors,

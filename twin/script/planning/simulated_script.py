@@ -18,8 +18,7 @@ from flexdt.twin.machine.camera import binning_of, check_roi
 from flexdt.twin.machine.description import Machine, unknown_axis
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.script import commands as c
-from flexdt.twin.script.grammar import is_reserved, own_name
-from flexdt.twin.script.planning.describe import describe
+from flexdt.twin.script.grammar import describe, is_reserved, own_name
 from flexdt.twin.script.planning.plan import SampleSize, Settings, StartState, Step
 from flexdt.twin.script.planning.planned_images import ImageCollector
 from flexdt.twin.script.planning.planned_scanner import (
