@@ -22,18 +22,7 @@ import numpy.typing as npt
 from pydantic import BeforeValidator, PlainSerializer, PlainValidator
 
 from flexdt.twin.errors import TwinError
-from flexdt.twin.projection.analytic_solids import (
-    Box,
-    ConvexPolyhedron,
-    Cylinder,
-    Ellipsoid,
-    Matrix,
-    Scene,
-    Shape,
-    Solid,
-    Sphere,
-    Vector,
-)
+from flexdt.twin.projection import analytic_solids as analytic
 
 MAX_ARRAY_BYTES: Final = 4 << 30
 MAX_TEXT: Final = 4096
@@ -100,17 +89,17 @@ def each(value: object, where: str, read: Callable[[object, str], _T]) -> tuple[
     return tuple(read(item, f"{where}[{i}]") for i, item in enumerate(value))
 
 
-def vector(value: object, where: str) -> Vector:
+def vector(value: object, where: str) -> analytic.Vector:
     """`value` as three finite numbers."""
     return _three(value, where, number)
 
 
-def lengths(value: object, where: str) -> Vector:
+def lengths(value: object, where: str) -> analytic.Vector:
     """`value` as three numbers above 0."""
     return _three(value, where, positive)
 
 
-def unit(value: object, where: str) -> Vector:
+def unit(value: object, where: str) -> analytic.Vector:
     """`value` as a unit vector."""
     found = vector(value, where)
     if abs(math.hypot(*found) - 1.0) > 1e-6:
@@ -118,7 +107,7 @@ def unit(value: object, where: str) -> Vector:
     return found
 
 
-def axes(value: object, where: str) -> Matrix:
+def axes(value: object, where: str) -> analytic.Matrix:
     """`value` as three orthogonal unit vectors."""
     rows = each(value, where, unit)
     if len(rows) != 3 or not np.allclose(np.array(rows) @ np.array(rows).T, np.eye(3), atol=1e-6):
@@ -128,8 +117,8 @@ def axes(value: object, where: str) -> Matrix:
 
 Text = Annotated[str, BeforeValidator(partial(string, where=IT))]
 Number = Annotated[float, BeforeValidator(partial(number, where=IT))]
-Place = Annotated[Vector, BeforeValidator(partial(vector, where=IT))]
-Lengths = Annotated[Vector, BeforeValidator(partial(lengths, where=IT))]
+Place = Annotated[analytic.Vector, BeforeValidator(partial(vector, where=IT))]
+Lengths = Annotated[analytic.Vector, BeforeValidator(partial(lengths, where=IT))]
 
 
 def packed(dtype: str) -> PlainValidator:
@@ -169,7 +158,7 @@ def _count(value: object, where: str) -> int:
     return value
 
 
-def _three(value: object, where: str, read: Callable[[object, str], float]) -> Vector:
+def _three(value: object, where: str, read: Callable[[object, str], float]) -> analytic.Vector:
     numbers = each(value, where, read)
     if len(numbers) != 3:
         raise wrong(value, where, "three numbers")
@@ -178,14 +167,14 @@ def _three(value: object, where: str, read: Callable[[object, str], float]) -> V
 
 MAX_SOLIDS: Final = 100_000
 
-_KINDS: Final[Mapping[str, type[Shape]]] = {
-    "sphere": Sphere,
-    "box": Box,
-    "cylinder": Cylinder,
-    "ellipsoid": Ellipsoid,
-    "convex": ConvexPolyhedron,
+_KINDS: Final[Mapping[str, type[analytic.Shape]]] = {
+    "sphere": analytic.Sphere,
+    "box": analytic.Box,
+    "cylinder": analytic.Cylinder,
+    "ellipsoid": analytic.Ellipsoid,
+    "convex": analytic.ConvexPolyhedron,
 }
-_KIND_OF: Final[Mapping[type[Shape], str]] = {cls: kind for kind, cls in _KINDS.items()}
+_KIND_OF: Final[Mapping[type[analytic.Shape], str]] = {cls: kind for kind, cls in _KINDS.items()}
 
 _READERS: Final[Mapping[str, Callable[[object, str], object]]] = {
     "center": vector,
@@ -203,7 +192,7 @@ _READERS: Final[Mapping[str, Callable[[object, str], object]]] = {
 _OPTIONAL: Final = ("axis", "axes")
 
 
-def scene_to_dict(scene: Scene) -> dict[str, object]:
+def scene_to_dict(scene: analytic.Scene) -> dict[str, object]:
     """JSON-able document of a scene: `{solids: [{shape: {kind, ...}, material, mu_per_mm}]}`.
 
     Example:
@@ -227,7 +216,7 @@ def scene_to_dict(scene: Scene) -> dict[str, object]:
     }
 
 
-def scene_from_dict(document: object, where: str = "scene") -> Scene:
+def scene_from_dict(document: object, where: str = "scene") -> analytic.Scene:
     """The scene of a document that `scene_to_dict` made.
 
     Raises:
@@ -242,18 +231,18 @@ def scene_from_dict(document: object, where: str = "scene") -> Scene:
     solids = get(document, "solids", where)
     if isinstance(solids, list | tuple) and len(solids) > MAX_SOLIDS:
         raise wrong(f"{len(solids)} solids", f"{where}.solids", f"at most {MAX_SOLIDS}")
-    return Scene(each(solids, f"{where}.solids", _solid))
+    return analytic.Scene(each(solids, f"{where}.solids", _solid))
 
 
-def _solid(document: object, where: str) -> Solid:
-    return Solid(
+def _solid(document: object, where: str) -> analytic.Solid:
+    return analytic.Solid(
         shape_from_dict(get(document, "shape", where), f"{where}.shape"),
         string(get(document, "material", where), f"{where}.material"),
         number(get(document, "mu_per_mm", where), f"{where}.mu_per_mm"),
     )
 
 
-def shape_from_dict(document: object, where: str) -> Shape:
+def shape_from_dict(document: object, where: str) -> analytic.Shape:
     """The shape of `{kind, ...}`; raises PhantomError naming the key path."""
     kind = get(document, "kind", where)
     if not isinstance(kind, str) or kind not in _KINDS:

@@ -20,15 +20,7 @@ import numpy.typing as npt
 from flexdt.phantoms.checked_reading import PACK, Lengths, Number, PhantomError, Place, Text, packed
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection import TriangleMesh
-from flexdt.twin.projection.analytic_solids import (
-    Box,
-    ConvexPolyhedron,
-    Cylinder,
-    Scene,
-    Shape,
-    Solid,
-    Vector,
-)
+from flexdt.twin.projection import analytic_solids as analytic
 from flexdt.twin.projection.convex import as_convex
 from flexdt.twin.values import ArrayValue
 
@@ -106,7 +98,7 @@ def freeze(target: object, **arrays: npt.NDArray[np.generic]) -> None:
         object.__setattr__(target, name, array)
 
 
-def size_about_origin(scene: Scene, surfaces: Sequence[Surface] = ()) -> Vector:
+def size_about_origin(scene: analytic.Scene, surfaces: Sequence[Surface] = ()) -> analytic.Vector:
     """Full extent along x, y, z [mm] of the box about the origin that holds everything.
 
     Raises:
@@ -120,14 +112,16 @@ def size_about_origin(scene: Scene, surfaces: Sequence[Surface] = ()) -> Vector:
     return (x, y, z)
 
 
-def bounds(shape: Shape) -> tuple[FloatArray, FloatArray]:
+def bounds(shape: analytic.Shape) -> tuple[FloatArray, FloatArray]:
     """Corners of the smallest axis-aligned box around the shape, (3,) each [mm].
 
     Raises:
         GeometryError: a shape that cannot be, such as an unbounded polyhedron.
     """
     one = as_convex(shape)
-    if isinstance(shape, Cylinder):  # the corners that `as_convex` gives are those of a prism
+    if isinstance(
+        shape, analytic.Cylinder
+    ):  # the corners that `as_convex` gives are those of a prism
         axis = np.asarray(shape.axis)
         half = np.abs(axis) * shape.height / 2.0
         half = half + shape.radius * np.sqrt(np.maximum(1.0 - axis**2, 0.0))
@@ -160,8 +154,8 @@ def united(mesh: TriangleMesh) -> TriangleMesh | None:
 
 
 def cut(
-    parts: Sequence[tuple[Scene, Sequence[Surface], float]],
-) -> tuple[Scene, tuple[Surface, ...]]:
+    parts: Sequence[tuple[analytic.Scene, Sequence[Surface], float]],
+) -> tuple[analytic.Scene, tuple[Surface, ...]]:
     """Solids and surfaces of which each has only what none of a higher priority takes.
 
     Args:
@@ -178,12 +172,12 @@ def cut(
         >>> round(TriangleMesh(shell.vertices, shell.faces).volume_mm3, 6)
         56.0
     """
-    pieces: list[tuple[Solid | Surface, float]] = []
+    pieces: list[tuple[analytic.Solid | Surface, float]] = []
     for scene, surfaces, rank in parts:
         pieces += [(one, rank) for one in scene.solids]
         pieces += [(one, rank) for one in surfaces]
     boxes = [_box(one) for one, _ in pieces]
-    left: list[Solid | Surface] = []
+    left: list[analytic.Solid | Surface] = []
     for (one, rank), (low, high) in zip(pieces, boxes, strict=True):
         above = [
             other
@@ -193,24 +187,24 @@ def cut(
         rest = _outside(_filled(one), [_filled(other) for other in above]) if above else one
         left += [] if rest is None else [rest]
     return (
-        Scene(tuple(one for one in left if isinstance(one, Solid))),
+        analytic.Scene(tuple(one for one in left if isinstance(one, analytic.Solid))),
         tuple(one for one in left if isinstance(one, Surface)),
     )
 
 
-def _box(one: Solid | Surface) -> tuple[FloatArray, FloatArray]:
-    if isinstance(one, Solid):
+def _box(one: analytic.Solid | Surface) -> tuple[FloatArray, FloatArray]:
+    if isinstance(one, analytic.Solid):
         return bounds(one.shape)
     return one.vertices.min(axis=0), one.vertices.max(axis=0)
 
 
-def _filled(one: Solid | Surface) -> Surface:
+def _filled(one: analytic.Solid | Surface) -> Surface:
     """The piece as a mesh of exactly its form."""
     from flexdt.phantoms.surface import solid_mesh
 
     if isinstance(one, Surface):
         return one
-    if not isinstance(one.shape, Box | ConvexPolyhedron) or one.mu_per_mm < 0.0:
+    if not isinstance(one.shape, analytic.Box | analytic.ConvexPolyhedron) or one.mu_per_mm < 0.0:
         what = type(one.shape).__name__.lower() if one.mu_per_mm > 0.0 else "hole"
         raise PhantomError(
             f"a {what} of {one.material} overlaps something of another priority; allowed: meshes, "

@@ -26,8 +26,15 @@ from flexdt.runtime.files.dataset_folder import (
     read_text,
     read_values,
 )
-from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetFormatError, DatasetMissingError
-from flexdt.twin.dataset.file_names import DOCUMENT, GEOMETRY, SCAN_SETTINGS, XRE_SETTINGS
+from flexdt.twin.dataset.dataset_errors import (
+    DOCUMENT,
+    GEOMETRY,
+    SCAN_SETTINGS,
+    XRE_SETTINGS,
+    DatasetError,
+    DatasetFormatError,
+    DatasetMissingError,
+)
 from flexdt.twin.dataset.flexdt_json import parse_document
 from flexdt.twin.dataset.rebuild import rebuild
 from flexdt.twin.dataset.scan_settings import ScanSettings

@@ -49,14 +49,12 @@ def openrpc_document(
     methods: Mapping[str, AnyMethod] = METHODS,
     *,
     title: str = "flexdt twin server",
-    version: str = PROTOCOL,
 ) -> dict[str, Any]:
     """The OpenRPC document of a server as plain data (https://spec.open-rpc.org, version 1.3).
 
     Args:
         methods: its method table.
         title: its name.
-        version: of its protocol.
     """
     models: list[type[BaseModel]] = [m.params for m in methods.values()]
     models += [m.result for m in methods.values()]
@@ -69,7 +67,7 @@ def openrpc_document(
         "openrpc": "1.3.2",
         "info": {
             "title": title,
-            "version": version,
+            "version": PROTOCOL,
             "description": "JSON-RPC 2.0 over TCP; JSON lines or length-prefixed MessagePack.",
             "license": {"name": "Apache-2.0"},
         },

@@ -11,24 +11,7 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Le, MaxLen
 from pydantic import ConfigDict, Field, JsonValue
 
-from flexdt.protocol.fields import (
-    AxisName,
-    Comment,
-    Empty,
-    Exposure,
-    Material,
-    Name,
-    Pace,
-    Params,
-    Position,
-    Result,
-    RoiAsked,
-    Shift,
-    ShortText,
-    Turn,
-    Version1,
-    few,
-)
+from flexdt.protocol import fields as f
 from flexdt.protocol.method import by_hand, read
 from flexdt.protocol.state_model import State
 
@@ -36,21 +19,21 @@ Averages = Annotated[int, Ge(1), Le(100_000)]
 Frames = Annotated[int, Ge(1), Le(1_000_000)]
 Kept = Annotated[float, Ge(-2e9), Le(2e9)]
 """A `Deviation` that has been to radians and back."""
-Paces = Annotated[dict[AxisName, Pace], MaxLen(64), few(64)]
+Paces = Annotated[dict[f.AxisName, f.Pace], MaxLen(64), f.few(64)]
 
 
-class Placement(Params):
+class Placement(f.Params):
     """Shift [mm] and turns about x, y, z [deg] of a sample in the object's frame."""
 
-    x: Shift = 0.0
-    y: Shift = 0.0
-    z: Shift = 0.0
-    rx: Turn = 0.0
-    ry: Turn = 0.0
-    rz: Turn = 0.0
+    x: f.Shift = 0.0
+    y: f.Shift = 0.0
+    z: f.Shift = 0.0
+    rx: f.Turn = 0.0
+    ry: f.Turn = 0.0
+    rz: f.Turn = 0.0
 
 
-class TubePart(Params):
+class TubePart(f.Params):
     """Tube settings; `on` is kept for the record and never switched by loading."""
 
     kV: Annotated[float, Ge(0), Le(1e4)]
@@ -58,43 +41,43 @@ class TubePart(Params):
     on: bool = False
 
 
-class CameraPart(Params):
+class CameraPart(f.Params):
     """Camera settings."""
 
-    mode: ShortText
-    roi: RoiAsked
-    exposure_ms: Exposure
+    mode: f.ShortText
+    roi: f.RoiAsked
+    exposure_ms: f.Exposure
     averages: Averages
     frames: Frames
 
 
-class SamplePart(Params):
+class SamplePart(f.Params):
     """What stood on the stage; the empty name for nothing."""
 
-    name: Literal[""] | Name
-    material: Material | None = None
+    name: Literal[""] | f.Name
+    material: f.Material | None = None
     offset: Placement = Field(default_factory=Placement)
 
 
-class CorrectionPart(Params):
+class CorrectionPart(f.Params):
     """The correction in force; parameters in mm and deg."""
 
-    name: Name
-    date: ShortText
-    parameters: Annotated[dict[AxisName, Kept], MaxLen(64), few(64)]
-    comment: Comment = ""
+    name: f.Name
+    date: f.ShortText
+    parameters: Annotated[dict[f.AxisName, Kept], MaxLen(64), f.few(64)]
+    comment: f.Comment = ""
 
 
-class Scene(Params):
+class Scene(f.Params):
     """The whole state of a scanner as one versioned document: the result of `scene.save`."""
 
-    schema_version: Version1 = Field(alias="schema")
-    flexdt: ShortText = ""
-    name: ShortText = ""
-    saved: ShortText = ""
-    machine: ShortText
-    profile: ShortText
-    positions: Annotated[dict[AxisName, Position], MaxLen(64), few(64)]
+    schema_version: f.Version1 = Field(alias="schema")
+    flexdt: f.ShortText = ""
+    name: f.ShortText = ""
+    saved: f.ShortText = ""
+    machine: f.ShortText
+    profile: f.ShortText
+    positions: Annotated[dict[f.AxisName, f.Position], MaxLen(64), f.few(64)]
     speeds: Paces = Field(default_factory=dict)
     accelerations: Paces = Field(default_factory=dict)
     tube: TubePart
@@ -105,25 +88,25 @@ class Scene(Params):
     model_config = ConfigDict(populate_by_name=True)
 
 
-class SceneSave(Params):
+class SceneSave(f.Params):
     """Name and comment for the document."""
 
-    name: Name | None = None
+    name: f.Name | None = None
 
 
-class SceneLoad(Params):
+class SceneLoad(f.Params):
     """A document made by `scene.save`."""
 
     document: Scene
 
 
-class SceneResult(Result):
+class SceneResult(f.Result):
     """The whole state as one versioned document."""
 
     document: dict[str, JsonValue]
 
 
-class Discovery(Result):
+class Discovery(f.Result):
     """An OpenRPC document."""
 
     openrpc: str
@@ -133,4 +116,4 @@ class Discovery(Result):
 
 SCENE_SAVE = read("scene.save", SceneSave, SceneResult, "whole state as one versioned document")
 SCENE_LOAD = by_hand("scene.load", SceneLoad, State, "restore such a document")
-RPC_DISCOVER = read("rpc.discover", Empty, Discovery, "this table as an OpenRPC document")
+RPC_DISCOVER = read("rpc.discover", f.Empty, Discovery, "this table as an OpenRPC document")

@@ -31,8 +31,7 @@ from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.own_documents import Changes, read_json, read_or_set_aside
 from flexdt.runtime.log import log
 from flexdt.server.storage.scene import apply_settings, require_fit, sample_of, save_scene
-from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetWriteError
-from flexdt.twin.dataset.file_names import plain_name
+from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetWriteError, plain_name
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.scanner.scanner import ScannerTwin

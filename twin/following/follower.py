@@ -209,7 +209,7 @@ class Follower:
         about = getattr(command, "component", "") or waiting.heard.words[0]
         if isinstance(command, c.MoveAbsolute):
             mirror = mirror.cleared(about, *_OF_A_MOVE)
-        for p in sim.problems:
+        for p in sim.findings.problems:
             if p.code in _OF_ONE_COMMAND and not (mirror.xrays_on is None and "xray" in p.code):
                 kind = _OF_ONE_COMMAND[p.code]
                 mirror = _alarm(mirror, now, "error", kind, about, p.message)
