@@ -68,7 +68,8 @@ test: lint typecheck kernels $(WEB_STAMP)
 
 # The second distribution's own tests, the long ones included.
 test-extensions: lint typecheck $(TEST_STAMP)
-	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder extensions/tests
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder extensions/tests \
+	  --junitxml=build/durations/extensions.xml
 
 slow: studies page
 

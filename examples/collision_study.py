@@ -26,8 +26,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from flexdt.phantoms import load_phantom
-from flexdt.twin.collision.collision_scene import Scene, build_scene, scene_of
-from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid, box, hull
+from flexdt.twin.collision.collision_scene import CollisionScene, build_scene, scene_of
+from flexdt.twin.collision.convex_solids import ConvexSolid, Polytope, UprightCylinder, box, hull
 from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.collision.sample_hull import convex_pieces
@@ -54,7 +54,7 @@ class Case:
 
     kind: str
     shapes: tuple[str, str]
-    scene: Scene
+    scene: CollisionScene
     trajectories: Mapping[str, Trajectory]
     end: float
 
@@ -76,13 +76,15 @@ class Outcome:
     samples: int
 
 
-def random_solid(rng: np.random.Generator) -> tuple[str, Solid]:
+def random_solid(rng: np.random.Generator) -> tuple[str, ConvexSolid]:
     """A solid of a random kind, off its frame's origin by up to 60 mm."""
     name = rng.choice(["box", "hull", "wall", "long", "cylinder"])
     center = rng.uniform(-60, 60, 3) * rng.integers(0, 2)
     turn = Rotation.random(random_state=rng).as_matrix()
     if name == "cylinder":
-        return name, Cylinder((0.0, 0.0, float(center[2])), rng.uniform(2, 80), rng.uniform(2, 60))
+        return name, UprightCylinder(
+            (0.0, 0.0, float(center[2])), rng.uniform(2, 80), rng.uniform(2, 60)
+        )
     if name == "hull":
         points = rng.normal(size=(rng.integers(5, 60), 3)) * rng.uniform(2, 40, 3)
         return name, hull(points @ turn.T + center)
@@ -129,7 +131,9 @@ def random_case(rng: np.random.Generator, kind: str) -> Case:
         slides[i, 4 * i : 4 * i + 3] = Rotation.random(random_state=rng).as_matrix()
         turns[i, 4 * i + 3] = math.radians(1.0)
     spins = [
-        np.array([0.0, 0.0, -1.0]) if isinstance(s, Cylinder) or rng.random() < 0.3 else _unit(rng)
+        np.array([0.0, 0.0, -1.0])
+        if isinstance(s, UprightCylinder) or rng.random() < 0.3
+        else _unit(rng)
         for s in (a, b)
     ]
     bodies = [
@@ -168,11 +172,11 @@ def _unit(rng: np.random.Generator) -> np.ndarray:
     return v / np.linalg.norm(v)
 
 
-def _tip(solid: Solid, direction: np.ndarray) -> np.ndarray:
+def _tip(solid: ConvexSolid, direction: np.ndarray) -> np.ndarray:
     """The solid's farthest point along `direction`."""
     if isinstance(solid, Polytope):
         return solid.vertices[np.argmax(solid.vertices @ direction)]
-    assert isinstance(solid, Cylinder)
+    assert isinstance(solid, UprightCylinder)
     across = direction[:2] / max(np.linalg.norm(direction[:2]), 1e-12) * solid.radius
     return np.array(solid.center) + [*across, math.copysign(0.5 * solid.height, direction[2])]
 
@@ -189,7 +193,7 @@ def reference(case: Case, times: np.ndarray) -> np.ndarray:
         turns = Rotation.from_rotvec((q @ body.turns)[:, None] * body.spin_axis).as_matrix()
         origins = body.origin + q @ body.slides
         solid = body.solid
-        if isinstance(solid, Cylinder):
+        if isinstance(solid, UprightCylinder):
             shape = fcl.Cylinder(solid.radius, solid.height)
             origins = origins + turns @ np.array(solid.center)
         else:
@@ -245,7 +249,7 @@ def sample_times(case: Case) -> np.ndarray:
     return np.union1d(np.interp(np.linspace(0, total[-1], count), total, fine), [0.0, case.end])
 
 
-def swept(scene: Scene, trajectories: Mapping[str, Trajectory], end: float) -> SweepResult:
+def swept(scene: CollisionScene, trajectories: Mapping[str, Trajectory], end: float) -> SweepResult:
     """The first contact from 0 s to `end` [s]; without one the least clearance, as `check` does."""
     search = PathSearch(scene, scene.path(trajectories, 0.0, end))
     found = search.first_contact()

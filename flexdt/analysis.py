@@ -19,7 +19,7 @@ from flexdt.clients.datasets.exchange import with_geometry
 from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_volume
 from flexdt.phantoms import Phantom
 from flexdt.twin.calibration.fit.problem import SIX
-from flexdt.twin.calibration.pipeline import Request
+from flexdt.twin.calibration.pipeline import CalibrationRequest
 from flexdt.twin.calibration.unknown_markers import UNKNOWN
 from flexdt.twin.errors import TwinError
 from flexdt.twin.exchange.geometry import ScanGeometry
@@ -93,7 +93,7 @@ def calibrate(
     chosen = (("dO_x",) if phantom == UNKNOWN else SIX) if free is None else tuple(free)
     begin = Offsets.from_edge(start or {})
     moving = tuple(per_frame)
-    request = Request(free=chosen, priors=priors or {}, start=begin, per_frame=moving)
+    request = CalibrationRequest(free=chosen, priors=priors or {}, start=begin, per_frame=moving)
     return calibrate_datasets(
         sets, phantom, request, markers=markers, radius_px=radius,
         scale=None if scale is None else Scale.of(scale),

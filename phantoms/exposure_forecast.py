@@ -33,7 +33,7 @@ from flexdt.twin.physics.radiograph import radiographs
 from flexdt.twin.physics.spectrum import Filter, tube_of, voltages
 from flexdt.twin.projection import project_body
 from flexdt.twin.script.planning.plan import ScanPlan
-from flexdt.twin.script.problems import Problem
+from flexdt.twin.script.problems import ScriptProblem
 
 VIEWS: Final = 8
 """Views of a turn that are looked at."""
@@ -268,7 +268,7 @@ def expose(
     )
 
 
-def exposure_problems(plan: ScanPlan, phantom: Phantom) -> tuple[Problem, ...]:
+def exposure_problems(plan: ScanPlan, phantom: Phantom) -> tuple[ScriptProblem, ...]:
     """Warnings: the projections of a plan whose pixels will be saturated or starved.
 
     A few views of each setting of tube and camera are made without noise.
@@ -284,7 +284,7 @@ def exposure_problems(plan: ScanPlan, phantom: Phantom) -> tuple[Problem, ...]:
             _, known = found.setdefault((lit, replace(camera, frames=1)), (group.line, []))
             known.extend(range(first, first + len(group)))
         first += len(group)
-    problems: list[Problem] = []
+    problems: list[ScriptProblem] = []
     for (lit, camera), (line, numbers) in list(found.items())[:SETTINGS]:
         some = np.unique(np.linspace(0, len(numbers) - 1, FEW_VIEWS).astype(int))
         index = [numbers[i] for i in some]
@@ -294,7 +294,7 @@ def exposure_problems(plan: ScanPlan, phantom: Phantom) -> tuple[Problem, ...]:
         for name, share in zip(("saturated", "starved"), shares, strict=True):
             if share >= NOTICED:
                 text = f"about {100 * share:.3g} % of the projections' pixels will be {name}"
-                problems.append(Problem("warning", f"{name}_pixels", line, 1, text))
+                problems.append(ScriptProblem("warning", f"{name}_pixels", line, 1, text))
     return tuple(problems)
 
 

@@ -28,7 +28,7 @@ from flexdt.twin.values import ArrayValue, adapter_of, told
 if TYPE_CHECKING:
     import trimesh
 
-    from flexdt.phantoms.surface import Part
+    from flexdt.phantoms.surface import SurfacePart
     from flexdt.twin.projection import Volume
 
 SCHEMA = 1
@@ -112,7 +112,7 @@ class Phantom(ArrayValue):
         """Radius of the smallest sphere about the origin that is sure to hold it [mm]."""
         return float(np.linalg.norm(np.asarray(self.size_mm) / 2.0))
 
-    def parts(self) -> tuple[Part, ...]:
+    def parts(self) -> tuple[SurfacePart, ...]:
         """The scene side piece by piece: one closed mesh for each solid, with its material."""
         from flexdt.phantoms.surface import parts_of
 

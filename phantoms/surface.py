@@ -28,7 +28,7 @@ CYLINDER_SECTIONS = 48
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class SurfacePart:
     """One closed mesh of a phantom.
 
     Attributes:
@@ -42,7 +42,7 @@ class Part:
     hole: bool
 
 
-def parts_of(phantom: Phantom, *, around: bool = False) -> tuple[Part, ...]:
+def parts_of(phantom: Phantom, *, around: bool = False) -> tuple[SurfacePart, ...]:
     """See `Phantom.parts`; voxels appear as the box around them.
 
     Args:
@@ -51,22 +51,22 @@ def parts_of(phantom: Phantom, *, around: bool = False) -> tuple[Part, ...]:
     """
     voxels = phantom.voxels
     out = [
-        Part(solid_mesh(s, around), s.material, hole=_is_hole(s, phantom.beads))
+        SurfacePart(solid_mesh(s, around), s.material, hole=_is_hole(s, phantom.beads))
         for s in phantom.scene.solids
     ]
     for surface in phantom.surfaces:
         mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
-        out.append(Part(mesh, surface.material, hole=False))
+        out.append(SurfacePart(mesh, surface.material, hole=False))
     if voxels is not None:
         box = trimesh.creation.box(
             extents=np.array(voxels.data.shape[::-1]) * np.asarray(voxels.voxel_mm)
         )
         box.apply_translation(voxels.center_mm)
-        out.append(Part(box, "voxels", hole=False))
+        out.append(SurfacePart(box, "voxels", hole=False))
     return tuple(out)
 
 
-def joined(parts: Sequence[Part]) -> trimesh.Trimesh:
+def joined(parts: Sequence[SurfacePart]) -> trimesh.Trimesh:
     """All parts as one mesh, holes turned inside out.
 
     Raises:

@@ -62,7 +62,7 @@ class AcquilaError(ValueError):
 
 
 @dataclass(frozen=True)
-class Event:
+class AcquilaEvent:
     """One event; texts may be empty, `uuid` is as it came (a number, or some clients' text).
 
     The interface's UUIDs are unsigned 64-bit numbers, but programs send negative and greater ones,
@@ -95,20 +95,20 @@ class Event:
         """What a command and its replies have in common, even where a reply's UUID became a float.
 
         Example:
-            >>> a, b = (Event("tube", "xrayon", uuid=u) for u in (2**63 + 1, float(2**63)))
+            >>> a, b = (AcquilaEvent("tube", "xrayon", uuid=u) for u in (2**63 + 1, float(2**63)))
             >>> a.key == b.key, a.uuid == b.uuid
             (True, False)
         """
         return self.uuid if isinstance(self.uuid, str) else float(self.uuid), self.tick_count
 
-    def answer(self, reply_type: ReplyType, reply: str = "", comp_type: str = "") -> Event:
+    def answer(self, reply_type: ReplyType, reply: str = "", comp_type: str = "") -> AcquilaEvent:
         """The event that replies to this one: same UUID, same tick count."""
         return replace(
             self, reply_type=reply_type, reply=reply, comp_type=comp_type or self.comp_type
         )
 
 
-def parse_event(data: bytes | str) -> Event:
+def parse_event(data: bytes | str) -> AcquilaEvent:
     """Read one event.
 
     Missing texts are empty, as is null; numbers in arguments are taken as they are written.
@@ -138,10 +138,10 @@ def parse_event(data: bytes | str) -> Event:
     read["reply_type"] = kind
     read["tick_count"] = _whole(content.get("tick count"))
     read["uuid"] = _uuid(content.get("UUID"))
-    return Event(**read)
+    return AcquilaEvent(**read)
 
 
-def format_event(event: Event) -> str:
+def format_event(event: AcquilaEvent) -> str:
     """One event as JSON, with every field."""
     content = {name: getattr(event, _attribute(name)) for name in FIELDS}
     content["reply type"] = event.reply_type.value
@@ -162,7 +162,11 @@ class Exchange:
     """
 
     def __init__(
-        self, command: Event, comp_type: ComponentType, now: float, period: float = FEEDBACK_S
+        self,
+        command: AcquilaEvent,
+        comp_type: ComponentType,
+        now: float,
+        period: float = FEEDBACK_S,
     ) -> None:
         if not command.is_command:
             raise AcquilaError(f"{command.reply_type.value} is a reply and no command")
@@ -179,32 +183,32 @@ class Exchange:
         """When the next FDB is due [s]."""
         return self._last + self._period
 
-    def received(self, now: float) -> Event:
+    def received(self, now: float) -> AcquilaEvent:
         """RCV; the first event of every exchange."""
         self._require(not self._received, "RCV goes out once")
         self._received, self._last = True, now
         return self._answer(ReplyType.RCV, "")
 
-    def feedback(self, text: str, now: float) -> Event:
+    def feedback(self, text: str, now: float) -> AcquilaEvent:
         """FDB, due or not."""
         self._require(self._received and not self._ended, "FDB stands between RCV and the end")
         self._last = now
         return self._answer(ReplyType.FDB, text)
 
-    def done(self, reply: str = "") -> Event:
+    def done(self, reply: str = "") -> AcquilaEvent:
         """ACK, the end."""
         return self._end(ReplyType.ACK, reply)
 
-    def failed(self, message: str) -> Event:
+    def failed(self, message: str) -> AcquilaEvent:
         """ERR, the end."""
         return self._end(ReplyType.ERR, message)
 
-    def _end(self, kind: ReplyType, reply: str) -> Event:
+    def _end(self, kind: ReplyType, reply: str) -> AcquilaEvent:
         self._require(self._received and not self._ended, f"{kind.value} ends a command once")
         self._ended = True
         return self._answer(kind, reply)
 
-    def _answer(self, kind: ReplyType, reply: str) -> Event:
+    def _answer(self, kind: ReplyType, reply: str) -> AcquilaEvent:
         return self.command.answer(kind, reply, self._type)
 
     def _require(self, holds: bool, rule: str) -> None:
@@ -213,7 +217,7 @@ class Exchange:
 
 
 def _attribute(name: str) -> str:
-    """The attribute of `Event` that holds the field called `name`."""
+    """The attribute of `AcquilaEvent` that holds the field called `name`."""
     return name.lower().replace(" ", "_")
 
 

@@ -115,7 +115,7 @@ Place = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)
 """(x, y, z) [mm]."""
 
 
-class Grid(f.Params):
+class VoxelGrid(f.Params):
     """Voxels without values."""
 
     shape: f.VoxelShape
@@ -128,7 +128,7 @@ class Grid(f.Params):
         return 4 * math.prod(self.shape)
 
     @model_validator(mode="after")
-    def _extent(self) -> Grid:
+    def _extent(self) -> VoxelGrid:
         f.require_extent(self.shape, self.voxel_mm)
         return self
 
@@ -160,7 +160,7 @@ class VolumePut(f.Params):
     scene: dict[str, Any] | None = Field(
         default=None, description="{solids: [{shape: {kind, ...}, material, mu_per_mm}]}"
     )
-    grid: Grid | None = None
+    grid: VoxelGrid | None = None
     mesh: MeshSize | None = None
     start: Bytes = Field(default=0, description="position of this chunk [bytes]")
     data: Buffer | None = None
@@ -196,7 +196,7 @@ class Backproject(f.Params):
     """The adjoint of `project`; with `into` it is added to a named volume instead of answered."""
 
     cone_vec: ConeVecs
-    grid: Grid
+    grid: VoxelGrid
     into: f.VolumeName | None = None
     projections: Stack
 

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from threading import Thread
 from typing import Any, Final
-from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
+from wsgiref.simple_server import WSGIRequestHandler, make_server
 
-from flexdt.process_settings import LOOPBACK, ServerSettings
+from flexdt.process_settings import ServerSettings
 from flexdt.runtime.access import check_bind, is_loopback, read_token, token_matches
 from flexdt.runtime.log import dropped
 from flexdt.runtime.loop import Holds, ServerLoop
@@ -92,48 +92,38 @@ def _application(pages: Pages, token: str | None) -> Callable[..., list[bytes]]:
     return application
 
 
-async def serve_http(
-    pages: Pages, host: str = LOOPBACK, port: int = 0, *, token: str | None = None
-) -> WSGIServer:
-    """Serve `pages` on `host`:`port`, in daemon threads, until `shutdown` and `server_close`.
+@contextlib.asynccontextmanager
+async def served_pages(pages: Pages, settings: ServerSettings) -> AsyncIterator[dict[str, object]]:
+    """Serve `pages`, in daemon threads, as long as the context lasts.
+
+    Without a port for them in the settings nothing is served.
 
     Args:
         pages: path -> function that makes the page, called in the loop that runs now.
-        host, port: where; beyond the loopback only with a token.
-        token: of the server.
+        settings: host and port; beyond the loopback only with a token.
+
+    Yields:
+        What the process's `ready` line says about it.
 
     Raises:
         AccessError: the address can be reached by others and there is no token.
         OSError: the address is taken or not ours.
     """
+    if settings.http_port is None:
+        yield {}
+        return
     from prometheus_client.exposition import ThreadingWSGIServer
 
+    host, token = settings.http_host, read_token(settings.token_file)
     check_bind(host, token)
 
     class Server(ThreadingWSGIServer):
         address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
 
     application = _application(pages, None if is_loopback(host) else token)
-    made = await asyncio.to_thread(make_server, host, port, application, Server, _Handler)
-    Thread(target=made.serve_forever, name="http pages", daemon=True).start()
-    return made
-
-
-@contextlib.asynccontextmanager
-async def served_pages(pages: Pages, settings: ServerSettings) -> AsyncIterator[dict[str, object]]:
-    """Serve `pages` as long as the context lasts, where the settings name a port for them.
-
-    Yields:
-        What the process's `ready` line says about it.
-
-    Raises:
-        AccessError, OSError: as `serve_http`.
-    """
-    if settings.http_port is None:
-        yield {}
-        return
-    token = read_token(settings.token_file)
-    server = await serve_http(pages, settings.http_host, settings.http_port, token=token)
+    port = settings.http_port
+    server = await asyncio.to_thread(make_server, host, port, application, Server, _Handler)
+    Thread(target=server.serve_forever, name="http pages", daemon=True).start()
     try:
         yield {"http_port": server.server_port}
     finally:

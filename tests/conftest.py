@@ -1,5 +1,17 @@
 """What every test may rely on; see `tests/support/suite.py`."""
 
-from suite import data_dir, pytest_collection_modifyitems, servers
+from suite import (
+    data_dir,
+    pytest_collection_modifyitems,
+    pytest_runtest_makereport,
+    pytest_runtest_setup,
+    servers,
+)
 
-__all__ = ["data_dir", "pytest_collection_modifyitems", "servers"]
+__all__ = [
+    "data_dir",
+    "pytest_collection_modifyitems",
+    "pytest_runtest_makereport",
+    "pytest_runtest_setup",
+    "servers",
+]

@@ -7,6 +7,7 @@ a program. The server maps the types to wire codes.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from numbers import Real
 from typing import Self
 
 
@@ -81,10 +82,16 @@ def require_within(what: str, value: float, low: float, high: float, unit: str =
         Traceback (most recent call last):
         flexdt.twin.errors.LimitError: tube: kV is 300; allowed: 20 to 240 kV
     """
-    if not low <= value <= high:
+    number = isinstance(value, Real)
+    if not (number and low <= value <= high):
+        given = f"{value:g}" if number else f"{value!r}, no number"
         raise LimitError(
-            f"{what} is {value:g}; allowed: {low:g} to {high:g} {unit}".rstrip(),
-            {"asked": value, "allowed": [low, high], **({"unit": unit} if unit else {})},
+            f"{what} is {given}; allowed: {low:g} to {high:g} {unit}".rstrip(),
+            {
+                "asked": value if number else repr(value),
+                "allowed": [low, high],
+                **({"unit": unit} if unit else {}),
+            },
         )
 
 

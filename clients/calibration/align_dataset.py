@@ -14,7 +14,7 @@ from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.without_phantom.align import Alignment, align_turn
 from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.offsets import NOMINAL
-from flexdt.twin.scanner.state import Correction
+from flexdt.twin.scanner.state import NamedCorrection
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -56,7 +56,7 @@ class Aligned:
         return found
 
     @property
-    def correction(self) -> Correction:
+    def correction(self) -> NamedCorrection:
         """The correction, for `DataSet.with_correction` and `calibration.apply`: the one that was
         in force, with dO_x, det_roll, det_yaw and dD_y replaced.
 
@@ -69,7 +69,7 @@ class Aligned:
         now = datetime.now(UTC)
         name = f"alignment {now:%Y-%m-%d %H:%M:%S}"
         note = f"without a phantom, {self.alignment.frames} frames of {self.dataset.name}"
-        return Correction(name, now.isoformat(timespec="seconds"), offsets, note)
+        return NamedCorrection(name, now.isoformat(timespec="seconds"), offsets, note)
 
 
 def align_dataset(data: DataSet, per_frame: bool = False) -> Aligned:

@@ -37,7 +37,7 @@ from flexdt.twin.calibration.fit.image_quantities import image_quantities
 from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.fit.problem import SIX, from_printed_reading
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, look_in_parts, nothing
-from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate
+from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
 from flexdt.twin.calibration.unknown_markers import UNKNOWN
 from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.dataset.normalise import MIN_COUNTS, LineIntegrals
@@ -45,7 +45,7 @@ from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import NAMES, Offsets
 from flexdt.twin.projection.analytic_solids import Scene
-from flexdt.twin.scanner.state import Correction
+from flexdt.twin.scanner.state import NamedCorrection
 
 # A data set's images as calibration needs them: detected and cut into windows by a few threads.
 #
@@ -252,7 +252,7 @@ class Outcome:
         return ", ".join(d.name for d in self.datasets)
 
     @property
-    def correction(self) -> Correction:
+    def correction(self) -> NamedCorrection:
         """The correction, for `DataSet.with_correction` and `calibration.apply`.
 
         Raises:
@@ -263,7 +263,7 @@ class Outcome:
             raise TwinError("this calibration is not identifiable: there is nothing to push")
         now = datetime.now(UTC)
         rms = result.fit.certificate.rms_px
-        return Correction(
+        return NamedCorrection(
             f"calibration {now:%Y-%m-%d %H:%M:%S}",
             now.isoformat(timespec="seconds"),
             result.fit.parameters,
@@ -274,7 +274,7 @@ class Outcome:
 def calibrate_datasets(
     datasets: Sequence[DataSet],
     phantom: str | Phantom,
-    request: Request | None = None,
+    request: CalibrationRequest | None = None,
     *,
     markers: str | PathLike[str] | Sequence[Mark] | None = None,
     scale: Scale | None = None,
@@ -300,7 +300,7 @@ def calibrate_datasets(
     if not datasets:
         raise TwinError("no data sets; allowed: one or more", {"asked": 0, "allowed": 1})
     unknown = phantom == UNKNOWN
-    want = request or Request(free=("dO_x",) if unknown else SIX)
+    want = request or CalibrationRequest(free=("dO_x",) if unknown else SIX)
     frames = [DatasetFrames(d) for d in datasets]
     low, high = SpotFinder().radius_px
     sought = None

@@ -31,7 +31,7 @@ from flexdt.twin.calibration.fit.fit import estimate_geometry
 from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.frame_source import Frames, FrameSpots, FrameState, SpotFrames
-from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate
+from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
 from flexdt.twin.calibration.unknown_markers import (
     ANYWHERE_MM,
     Index,
@@ -262,7 +262,7 @@ def spots_of(markers: Markers, shape: tuple[int, int]) -> tuple[list[FrameSpots]
 
 
 def calibrate_known(
-    data: DataSet, markers: Markers, phantom: Phantom, request: Request
+    data: DataSet, markers: Markers, phantom: Phantom, request: CalibrationRequest
 ) -> Calibration:
     """Calibrate from the marked beads of a phantom; marker "3" is its bead 3, counted from 0.
 
@@ -288,7 +288,7 @@ def calibrate_unknown(
     data: DataSet,
     images: Frames | None,
     markers: Markers | None,
-    request: Request,
+    request: CalibrationRequest,
     scale: Scale | None = None,
     detector: SpotFinder | None = None,
 ) -> tuple[Calibration, dict[str, object]]:
@@ -411,7 +411,7 @@ def _calibrated(
     looks: Sequence[FrameSpots],
     index: Index,
     model: BeadModel | Phantom,
-    request: Request,
+    request: CalibrationRequest,
     images: Frames | None = None,
 ) -> Calibration:
     priors = prior_widths(data.machine, data.profile)

@@ -63,20 +63,22 @@ Server = Annotated[
 TokenFile = Annotated[
     str | None, typer.Option(metavar="FILE", help="Show the twin the token in this file.")
 ]
-GIVEN: Final = ("twin", "json")
-"""Parameters of commands that come from options of `flexdt` itself."""
+GIVEN: Final = ("context", "twin", "json")
+"""Parameters of commands that are no options of theirs."""
 
 
 def completed(command: Callable[..., Any]) -> tuple[Callable[..., None], tuple[str, ...]]:
     """A command as typer takes it, and the options of `flexdt` that it heeds."""
     own = inspect.signature(command, eval_str=True).parameters
-    if "context" in own:  # it passes its words on
-        return command, ()
     yields = inspect.isgeneratorfunction(inspect.unwrap(command))
+    if not yields and "context" in own:  # it passes its words on
+        return command, ()
 
     @wraps(command)
     def complete(context: typer.Context, **given: Any) -> None:
         root = context.find_root().params
+        if "context" in own:
+            given["context"] = context
         if "twin" in own:
             given["twin"] = partial(connect, root["server"], root["token_file"])
         if "json" in own:

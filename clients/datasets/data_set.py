@@ -29,7 +29,7 @@ from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.lazy_backend import File, lazy_backend
 from flexdt.twin.machine.description import Machine, Profile
-from flexdt.twin.scanner.state import Correction
+from flexdt.twin.scanner.state import NamedCorrection
 
 if TYPE_CHECKING:
     from flexdt.clients.calibration.align_dataset import Aligned
@@ -94,7 +94,7 @@ class DataSet:
     frames: tuple[Frame, ...]
     shape: tuple[int, int]
     cone_vec: ConeVec
-    correction: Correction | None = None
+    correction: NamedCorrection | None = None
     folder: Path | None = None
     darks: tuple[Path, ...] = ()
     flats: tuple[Path, ...] = ()
@@ -261,7 +261,7 @@ class DataSet:
             parameters = NOMINAL if self.correction is None else self.correction.parameters
         return self.poses.cone_vec(parameters)
 
-    def with_correction(self, correction: Correction | Offsets | None) -> DataSet:
+    def with_correction(self, correction: NamedCorrection | Offsets | None) -> DataSet:
         """The same data set with another correction in force, such as `calibrate(...).correction`;
         None for the nominal geometry.
 
@@ -273,7 +273,7 @@ class DataSet:
             'given'
         """
         if isinstance(correction, Offsets):
-            correction = Correction("given", "", correction)
+            correction = NamedCorrection("given", "", correction)
         return replace(self, correction=correction)
 
     def with_motion(self, motion: Motion) -> DataSet:

@@ -35,7 +35,7 @@ from flexdt.clients.gateway.vocabulary import MoveRelative, Question, Refusal, r
 from flexdt.clients.whole_files import write_whole
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import line_integrals as projected
-from flexdt.protocol.acquila import MAX_BYTES, AcquilaError, Event, parse_event
+from flexdt.protocol.acquila import MAX_BYTES, AcquilaError, AcquilaEvent, parse_event
 from flexdt.runtime.files.dataset_folder import list_folder, mean_image, read_image
 from flexdt.twin.dataset.normalise import LineIntegrals
 from flexdt.twin.errors import TwinError
@@ -239,7 +239,9 @@ def heard(data: bytes, axes: Collection[str], mirror: Mirror, stamp: str) -> Hea
     return Heard(event.key, what, words, command, event.reply, asks, stamp)  # type: ignore[arg-type]
 
 
-def _read(event: Event, axes: Collection[str], mirror: Mirror) -> tuple[c.Command | None, str]:
+def _read(
+    event: AcquilaEvent, axes: Collection[str], mirror: Mirror
+) -> tuple[c.Command | None, str]:
     """The typed command, and what a question asks for; neither of what the scripts do not know."""
     try:
         command = read_command(event, axes)
@@ -261,7 +263,7 @@ Tell = Callable[[Alarm], None]
 
 
 @dataclass
-class Session:
+class FollowSession:
     """What one `flexdt follow` knows.
 
     Args:

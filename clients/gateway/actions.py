@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from flexdt.clients.client import twin_methods as m
-from flexdt.clients.gateway.connected_twin import POLL_S, Armed, ConnectedTwin, Progress
+from flexdt.clients.gateway.connected_twin import POLL_S, Armed, CommandProgress, ConnectedTwin
 from flexdt.clients.gateway.recording import Image
 from flexdt.clients.gateway.vocabulary import (
     AbortScript,
@@ -40,28 +40,30 @@ READY_S: Final = 900.0
 TEN_DECIMALS: Final = ("position", "speed")
 """The scanner's replies have ten decimals there and six elsewhere."""
 
-Action = Callable[[ConnectedTwin, Any, Progress], Awaitable[str]]
+Action = Callable[[ConnectedTwin, Any, CommandProgress], Awaitable[str]]
 
 
-async def pause(twin: ConnectedTwin, command: c.Pause, progress: Progress) -> str:
+async def pause(twin: ConnectedTwin, command: c.Pause, progress: CommandProgress) -> str:
     """Wait, on the twin's clock."""
     await twin.until(command.duration_ms / 1000.0, progress, "pause")
     return ""
 
 
-async def output_path(twin: ConnectedTwin, command: c.SetOutputPath, progress: Progress) -> str:
+async def output_path(
+    twin: ConnectedTwin, command: c.SetOutputPath, progress: CommandProgress
+) -> str:
     """Save later images in a folder of that name inside the data directory."""
     twin.begin_recording(command.path)
     return command.path
 
 
-async def remember(twin: ConnectedTwin, command: c.Command, progress: Progress) -> str:
+async def remember(twin: ConnectedTwin, command: c.Command, progress: CommandProgress) -> str:
     """Keep the command in the transcript; the twin does nothing with it."""
     return ""
 
 
 async def write_settings(
-    twin: ConnectedTwin, command: c.WriteSettingsFile, progress: Progress
+    twin: ConnectedTwin, command: c.WriteSettingsFile, progress: CommandProgress
 ) -> str:
     """Write the present motor positions into the settings texts."""
     try:
@@ -82,14 +84,16 @@ def setting(
         reply: the text of ACK, from the command.
     """
 
-    async def send(twin: ConnectedTwin, command: c.Command, progress: Progress) -> str:
+    async def send(twin: ConnectedTwin, command: c.Command, progress: CommandProgress) -> str:
         await twin.ask(method, params(command))
         return reply(command)
 
     return send
 
 
-async def wait_ready(twin: ConnectedTwin, command: c.WaitXrayReady, progress: Progress) -> str:
+async def wait_ready(
+    twin: ConnectedTwin, command: c.WaitXrayReady, progress: CommandProgress
+) -> str:
     """Wait until X-rays are ready: the script's polling loop as one command."""
     state = await twin.state()
     if not state.tube.on:
@@ -105,7 +109,7 @@ async def wait_ready(twin: ConnectedTwin, command: c.WaitXrayReady, progress: Pr
     return "TRUE"
 
 
-async def take_image(twin: ConnectedTwin, command: c.TakeImage, progress: Progress) -> str:
+async def take_image(twin: ConnectedTwin, command: c.TakeImage, progress: CommandProgress) -> str:
     """Take an image at the present pose and settings and keep it in the camera."""
     state = await twin.state()
     counts = np.asarray((await twin.run(m.projection("counts"))).image, dtype=np.uint16)
@@ -116,7 +120,7 @@ async def take_image(twin: ConnectedTwin, command: c.TakeImage, progress: Progre
     return f"{cols} x {rows}, mean {counts.mean():.1f}"
 
 
-async def save_image(twin: ConnectedTwin, command: c.SaveImage, progress: Progress) -> str:
+async def save_image(twin: ConnectedTwin, command: c.SaveImage, progress: CommandProgress) -> str:
     """Save the last image under the bare name of the path."""
     if twin.image is None:
         raise Refusal("no image has been taken; camera take image first")
@@ -131,7 +135,7 @@ async def save_image(twin: ConnectedTwin, command: c.SaveImage, progress: Progre
         raise Refusal(str(error)) from None
 
 
-async def move(twin: ConnectedTwin, command: c.MoveAbsolute, progress: Progress) -> str:
+async def move(twin: ConnectedTwin, command: c.MoveAbsolute, progress: CommandProgress) -> str:
     """Move to a position and wait for arrival.
 
     With a trigger position, the move waits for an image sequence and is then a part of its job.
@@ -152,14 +156,16 @@ async def move(twin: ConnectedTwin, command: c.MoveAbsolute, progress: Progress)
     return await asyncio.shield(armed.ended)
 
 
-async def move_relative(twin: ConnectedTwin, command: MoveRelative, progress: Progress) -> str:
+async def move_relative(
+    twin: ConnectedTwin, command: MoveRelative, progress: CommandProgress
+) -> str:
     """Move by a distance from the present position."""
     state = await twin.state()
     at = state.axes[command.component].position
     return await _go(twin, command.component, at + command.step, progress)
 
 
-async def _go(twin: ConnectedTwin, axis: str, target: float, progress: Progress) -> str:
+async def _go(twin: ConnectedTwin, axis: str, target: float, progress: CommandProgress) -> str:
     await twin.ask("axes.move", {"targets": {axis: target}})
     state = await twin.state()
     bound = state.axes[axis].target
@@ -181,7 +187,7 @@ def _why(state: State) -> str:
     return f" ({safety.message or safety.state})" if safety.state != "ok" else ""
 
 
-async def question(twin: ConnectedTwin, command: Question, progress: Progress) -> str:
+async def question(twin: ConnectedTwin, command: Question, progress: CommandProgress) -> str:
     """Answer with a part of the twin's state as text."""
     value: object = (await twin.state()).model_dump(mode="json")
     for key in command.path:
@@ -198,7 +204,7 @@ async def question(twin: ConnectedTwin, command: Question, progress: Progress) -
     return "" if value is None else str(value)
 
 
-async def sequence(twin: ConnectedTwin, command: c.TakeSequence, progress: Progress) -> str:
+async def sequence(twin: ConnectedTwin, command: c.TakeSequence, progress: CommandProgress) -> str:
     """Take an image sequence as a job of the twin, at rest or during the armed move.
 
     The twin decides by its own clock when each image is taken, so the frames lie where the
@@ -258,12 +264,12 @@ def _sequence_script(state: State, command: c.TakeSequence, armed: Armed | None)
     return "".join("\t".join((*line, "", "")) + "\r\n" for line in lines)
 
 
-async def run_script(twin: ConnectedTwin, command: RunScript, progress: Progress) -> str:
+async def run_script(twin: ConnectedTwin, command: RunScript, progress: CommandProgress) -> str:
     """Run a whole script as a job; FDB counts frames, ACK names the data set's folder."""
     return await _run(twin, command.text.encode(), command.name or "script", progress)
 
 
-async def abort_script(twin: ConnectedTwin, command: AbortScript, progress: Progress) -> str:
+async def abort_script(twin: ConnectedTwin, command: AbortScript, progress: CommandProgress) -> str:
     """Abort the job that this gateway started."""
     if twin.job is None:
         raise Refusal("no script or sequence of this gateway is running")
@@ -271,7 +277,7 @@ async def abort_script(twin: ConnectedTwin, command: AbortScript, progress: Prog
     return twin.job
 
 
-async def _run(twin: ConnectedTwin, script: bytes, name: str, progress: Progress) -> str:
+async def _run(twin: ConnectedTwin, script: bytes, name: str, progress: CommandProgress) -> str:
     """Submit a script and wait for the end of its job; returns the data set's folder."""
     if twin.job is not None:
         raise Refusal(f"{twin.job} is running; wait for it or scanner abort script")

@@ -38,7 +38,7 @@ POLL_S: Final = 0.05
 
 
 @dataclass
-class Progress:
+class CommandProgress:
     """How far a command has come, as the text of FDB."""
 
     text: str = ""
@@ -149,7 +149,7 @@ class ConnectedTwin:
         self.axes = tuple(state.axes)
         return state
 
-    async def until(self, seconds: float, progress: Progress, what: str) -> None:
+    async def until(self, seconds: float, progress: CommandProgress, what: str) -> None:
         """Wait for `seconds` of the twin's clock; at full speed they need no waiting."""
         state = await self.state()
         end = state.time + seconds

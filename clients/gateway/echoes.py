@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from flexdt.clients.gateway.vocabulary import component_type
-from flexdt.protocol.acquila import Event, Exchange
+from flexdt.protocol.acquila import AcquilaEvent, Exchange
 from flexdt.protocol.state_model import AxisState, JobStatus, State
 from flexdt.twin.script import grammar
 from flexdt.twin.script.lexer import CodeLine, rows
@@ -79,7 +79,7 @@ class Echoes:
         """A component is as a command of the interface itself has left it."""
         self._known |= {k: v for k, v in told(state).items() if k[0] == component}
 
-    def see(self, state: State, own: Collection[str], now: float) -> Iterator[Event]:
+    def see(self, state: State, own: Collection[str], now: float) -> Iterator[AcquilaEvent]:
         """Events for what has changed.
 
         Args:
@@ -115,7 +115,7 @@ class Echoes:
         script: Callable[[JobStatus], bytes | None],
         state: State,
         now: float,
-    ) -> Iterator[Event]:
+    ) -> Iterator[AcquilaEvent]:
         """Events for the lines that a job has come to.
 
         Args:
@@ -158,15 +158,17 @@ class Echoes:
 
     def _begin(
         self, words: tuple[str, ...], state: State, now: float
-    ) -> tuple[Exchange, Event, Event]:
+    ) -> tuple[Exchange, AcquilaEvent, AcquilaEvent]:
         kind = component_type(words[0], state.axes) or "other"
         uuid, tick = self.uuids.getrandbits(52) + 1, int(now * 1000) % 2**32
         component, name, arg1, arg2 = words[:4]
-        command = Event(component, name, arg1, arg2, comp_type=kind, tick_count=tick, uuid=uuid)
+        command = AcquilaEvent(
+            component, name, arg1, arg2, comp_type=kind, tick_count=tick, uuid=uuid
+        )
         exchange = Exchange(command, kind, now)
         return exchange, command, exchange.received(now)
 
-    def _end(self, state: State, reply: str | None = None) -> Iterator[Event]:
+    def _end(self, state: State, reply: str | None = None) -> Iterator[AcquilaEvent]:
         line, self._line = self._line, None
         if line is None:
             return

@@ -21,15 +21,15 @@ import zmq
 import zmq.asyncio
 
 from flexdt.clients.gateway.actions import ACTIONS, AT_ONCE
-from flexdt.clients.gateway.connected_twin import ConnectedTwin, Progress
+from flexdt.clients.gateway.connected_twin import CommandProgress, ConnectedTwin
 from flexdt.clients.gateway.echoes import Echoes
 from flexdt.clients.gateway.vocabulary import Refusal, component_type, read_command
 from flexdt.protocol.acquila import (
     FIELDS,
     MAX_BYTES,
     AcquilaError,
+    AcquilaEvent,
     ComponentType,
-    Event,
     Exchange,
     ReplyType,
     format_event,
@@ -124,7 +124,7 @@ class Gateway:
             self._log_failure(event.command)
             self._send(event.answer(ReplyType.ERR, FAILED))
 
-    def _take(self, event: Event) -> None:
+    def _take(self, event: AcquilaEvent) -> None:
         if not event.is_command:
             self._forward(event)
             return
@@ -165,20 +165,20 @@ class Gateway:
                 self._log_failure("echo")
                 await asyncio.sleep(PAUSE_S)
 
-    async def _guarded(self, work: Coroutine[Any, Any, None], event: Event) -> None:
+    async def _guarded(self, work: Coroutine[Any, Any, None], event: AcquilaEvent) -> None:
         try:
             await work
         except Exception:
             self._log_failure(event.command)
             self._send(event.answer(ReplyType.ERR, FAILED))
 
-    async def _execute(self, event: Event, kind: ComponentType) -> None:
+    async def _execute(self, event: AcquilaEvent, kind: ComponentType) -> None:
         clock = asyncio.get_running_loop().time
         exchange = Exchange(event, kind, clock())
         self._send(exchange.received(clock()))
         component = own_name(event.component, self.twin.axes)
         self._busy[component] += 1
-        progress = Progress()
+        progress = CommandProgress()
         task = asyncio.ensure_future(self._do(event, progress))
         try:
             while not task.done():
@@ -199,7 +199,7 @@ class Gateway:
         await self._release()  # before the last reply: its receiver may want control
         self._send(end)
 
-    async def _do(self, event: Event, progress: Progress) -> str:
+    async def _do(self, event: AcquilaEvent, progress: CommandProgress) -> str:
         if not self.twin.axes:
             await self.twin.state()
         command = read_command(event, self.twin.axes)
@@ -210,7 +210,7 @@ class Gateway:
         async with lock:
             return await self._act(event, command, progress)
 
-    async def _act(self, event: Event, command: c.Command, progress: Progress) -> str:
+    async def _act(self, event: AcquilaEvent, command: c.Command, progress: CommandProgress) -> str:
         line = transcript_line(event, command)
         lines = self.twin.record().transcript
         if line is not None:
@@ -222,7 +222,7 @@ class Gateway:
                 lines.remove(line)
             raise
 
-    async def _foreign(self, event: Event) -> None:
+    async def _foreign(self, event: AcquilaEvent) -> None:
         """Wait for some subscriber to answer a command that is not for the scanner."""
         key = event.key
         heard = self._awaited.setdefault(key, asyncio.Event())
@@ -239,7 +239,7 @@ class Gateway:
         finally:
             self._awaited.pop(key, None)
 
-    def _forward(self, event: Event) -> None:
+    def _forward(self, event: AcquilaEvent) -> None:
         """Forward the reply of a component elsewhere, unless it is an echo of ours."""
         text = format_event(event)
         if hash(text) in self._recent:
@@ -272,7 +272,7 @@ class Gateway:
             except Exception:
                 self._log_failure("session.control")
 
-    def _send(self, event: Event) -> None:
+    def _send(self, event: AcquilaEvent) -> None:
         text = format_event(event)
         self._recent.append(hash(text))
         # A PUB socket never blocks: it drops what a slow subscriber does not take.
@@ -284,7 +284,7 @@ class Gateway:
             log("gateway event refused", logging.WARNING, reason=why)
         fields = ", ".join(FIELDS)
         reply = f"{why}; an event is a JSON object with {fields}"
-        self._send(Event("gateway", "receive", reply=reply, reply_type=ReplyType.ERR))
+        self._send(AcquilaEvent("gateway", "receive", reply=reply, reply_type=ReplyType.ERR))
 
     def _log_failure(self, command: str) -> None:
         """Log the exception being handled, unless very many have been logged."""
@@ -357,7 +357,7 @@ def bound_port(socket: zmq.asyncio.Socket) -> int:
     return int(socket.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
 
 
-def transcript_line(event: Event, command: c.Command) -> str | None:
+def transcript_line(event: AcquilaEvent, command: c.Command) -> str | None:
     """The command as a line of a script; None if it cannot occur in one."""
     if type(command).__module__ != c.__name__:
         return None

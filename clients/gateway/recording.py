@@ -37,7 +37,7 @@ from flexdt.twin.dataset.scan_settings_text import format_scan_settings
 from flexdt.twin.dataset.xre import format_xre
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine, Profile
-from flexdt.twin.scanner.state import Correction
+from flexdt.twin.scanner.state import NamedCorrection
 from flexdt.twin.script.grammar import bare_name, kind_of
 
 UNNAMED: Final = "gateway"
@@ -255,9 +255,9 @@ def _positions(state: State) -> Mapping[str, float]:
     return {n: a.position for n, a in state.axes.items() if not a.virtual}
 
 
-def _correction(state: State) -> Correction | None:
+def _correction(state: State) -> NamedCorrection | None:
     c = state.correction
-    return None if c is None else Correction.from_edge(c.name, c.date, c.parameters, c.comment)
+    return None if c is None else NamedCorrection.from_edge(c.name, c.date, c.parameters, c.comment)
 
 
 def _blocks(frames: Sequence[FrameEntry], start: float) -> list[FrameBlock]:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from typing import Final
 
-from flexdt.protocol.acquila import ComponentType, Event
+from flexdt.protocol.acquila import AcquilaEvent, ComponentType
 from flexdt.twin.script import commands as c
 from flexdt.twin.script import grammar
 from flexdt.twin.script.grammar import ArgumentError
@@ -48,7 +48,7 @@ class Question(c.Command):
     path: tuple[str, ...]
 
 
-Extra = Callable[[Event], c.Command]
+Extra = Callable[[AcquilaEvent], c.Command]
 
 
 def _question(*path: str) -> Extra:
@@ -59,12 +59,12 @@ def _about(key: str) -> Extra:
     return lambda event: Question(path=("axes", event.component, key))
 
 
-def _relative(event: Event) -> c.Command:
+def _relative(event: AcquilaEvent) -> c.Command:
     step = grammar.number(event.arg1.strip(), "displacement")
     return MoveRelative(component=event.component, step=step)
 
 
-def _script(event: Event) -> c.Command:
+def _script(event: AcquilaEvent) -> c.Command:
     if not event.arg1.strip():
         raise ArgumentError("the script's text (argument 1) is missing")
     return RunScript(text=event.arg1, name=event.arg2.strip())
@@ -121,7 +121,7 @@ def known_commands(component: str) -> tuple[str, ...]:
     return (*grammar.vocabulary(component), *own)
 
 
-def read_command(event: Event, axes: Collection[str]) -> c.Command:
+def read_command(event: AcquilaEvent, axes: Collection[str]) -> c.Command:
     """The command of an event.
 
     Args:
@@ -155,7 +155,7 @@ def read_command(event: Event, axes: Collection[str]) -> c.Command:
     return spec.type(**fields)  # type: ignore[arg-type]
 
 
-def _extra(event: Event, name: str) -> c.Command:
+def _extra(event: AcquilaEvent, name: str) -> c.Command:
     table = _EXTRA.get(name, _EXTRA[""])
     asked = " ".join(event.command.lower().split())
     for command, make in table.items():

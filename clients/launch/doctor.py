@@ -28,7 +28,7 @@ SLOW_SYNC_S: Final = 0.05
 
 
 @dataclass(frozen=True)
-class Checked:
+class CheckOutcome:
     """What one check found; `advice` where something can be done."""
 
     what: str
@@ -37,30 +37,30 @@ class Checked:
     advice: str = ""
 
 
-def examine(data: Path, ports: Sequence[tuple[str, int]]) -> Iterator[Checked]:
+def examine(data: Path, ports: Sequence[tuple[str, int]]) -> Iterator[CheckOutcome]:
     """All checks, one after the other.
 
     Args:
         data: the data directory, which need not exist.
         ports: what is to listen there, and the port.
     """
-    checks: list[Callable[[], Checked]] = [python, packages, kernels, threads, memory, gpu]
+    checks: list[Callable[[], CheckOutcome]] = [python, packages, kernels, threads, memory, gpu]
     checks += [lambda what=what, port=port: listening(what, port) for what, port in ports]  # type: ignore[misc]
     checks.append(lambda: disk(data))
     for check in checks:
         try:
             yield check()
         except Exception as error:  # a check that fails is a finding, and the others go on
-            yield Checked(check.__name__, "error", f"{type(error).__name__}: {error}")
+            yield CheckOutcome(check.__name__, "error", f"{type(error).__name__}: {error}")
 
 
-def python() -> Checked:
+def python() -> CheckOutcome:
     """The interpreter."""
     found = f"{platform.python_implementation()} {platform.python_version()}, {platform.system()}"
-    return Checked("python", "ok", f"{found} {platform.machine()}, flexdt {version('flexdt')}")
+    return CheckOutcome("python", "ok", f"{found} {platform.machine()}, flexdt {version('flexdt')}")
 
 
-def packages() -> Checked:
+def packages() -> CheckOutcome:
     """What flexdt says it needs, extras apart."""
     have, lack = [], []
     for name in needed():
@@ -69,8 +69,10 @@ def packages() -> Checked:
         except PackageNotFoundError:
             lack.append(name)
     if lack:
-        return Checked("packages", "error", f"missing: {', '.join(lack)}", "pip install flexdt")
-    return Checked("packages", "ok", ", ".join(have))
+        return CheckOutcome(
+            "packages", "error", f"missing: {', '.join(lack)}", "pip install flexdt"
+        )
+    return CheckOutcome("packages", "ok", ", ".join(have))
 
 
 def needed() -> tuple[str, ...]:
@@ -80,7 +82,7 @@ def needed() -> tuple[str, ...]:
     return tuple(re.split(r"[^A-Za-z0-9._-]", line, maxsplit=1)[0] for line in wanted)
 
 
-def kernels() -> Checked:
+def kernels() -> CheckOutcome:
     """Compile and run: the shadow of a sphere in parallel to its closed form."""
     import numpy as np
 
@@ -103,38 +105,38 @@ def kernels() -> Checked:
     worst = float(np.abs(image - right).max() / right.max())
     found = f"a sphere's shadow is right to {worst:.1e}; first use took {first:.1f} s"
     if worst > WORST_ERROR:
-        return Checked("kernels", "error", found, "reinstall numba; see docs/performance.md")
-    return Checked("kernels", "ok", found)
+        return CheckOutcome("kernels", "error", found, "reinstall numba; see docs/performance.md")
+    return CheckOutcome("kernels", "ok", found)
 
 
-def threads() -> Checked:
+def threads() -> CheckOutcome:
     """Cores and numba's threads."""
     import numba
 
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     found = f"{usable} of {os.cpu_count()} cores usable, {numba.get_num_threads()} numba threads"
     if usable is not None and numba.get_num_threads() < usable:
-        return Checked("threads", "warning", found, "NUMBA_NUM_THREADS is below the cores")
-    return Checked("threads", "ok", found)
+        return CheckOutcome("threads", "warning", found, "NUMBA_NUM_THREADS is below the cores")
+    return CheckOutcome("threads", "ok", found)
 
 
-def memory() -> Checked:
+def memory() -> CheckOutcome:
     """What the projector may fill."""
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     found = f"{total / 2**30:.1f} GiB; the projector holds volumes up to half of it"
-    return Checked("memory", "ok" if total > 3 << 30 else "warning", found)
+    return CheckOutcome("memory", "ok" if total > 3 << 30 else "warning", found)
 
 
-def gpu() -> Checked:
+def gpu() -> CheckOutcome:
     """A CUDA device is an option, so its absence is no fault."""
     from flexdt.twin.projection.gpu import availability
 
     found = availability()
     computes = f"{found.reason} computes" if found.present else f"the processor: {found.reason}"
-    return Checked("gpu", "warning" if "failed" in found.reason else "ok", computes)
+    return CheckOutcome("gpu", "warning" if "failed" in found.reason else "ok", computes)
 
 
-def listening(what: str, port: int) -> Checked:
+def listening(what: str, port: int) -> CheckOutcome:
     """Whether a server may listen, or one of ours does already."""
     name = f"port {port}"
     with socket.socket() as probe:
@@ -144,15 +146,15 @@ def listening(what: str, port: int) -> Checked:
         except OSError as error:
             taken = error
         else:
-            return Checked(name, "ok", f"free for the {what}")
+            return CheckOutcome(name, "ok", f"free for the {what}")
     answer = _greeting(port) if what == "twin" else ""
     if answer:
-        return Checked(name, "ok", f"{answer} listens")
+        return CheckOutcome(name, "ok", f"{answer} listens")
     advice = f"fine if that is your {what}; else choose another port"
-    return Checked(name, "warning", f"in use ({taken.strerror})", advice)
+    return CheckOutcome(name, "warning", f"in use ({taken.strerror})", advice)
 
 
-def disk(data: Path) -> Checked:
+def disk(data: Path) -> CheckOutcome:
     """Whether data sets can be written: room, rights, speed of a flush."""
     folder = nearest_there(data)
     try:
@@ -163,14 +165,16 @@ def disk(data: Path) -> Checked:
             os.fsync(file.fileno())
             took = time.perf_counter() - begun
     except OSError as error:
-        return Checked("disk", "error", f"{folder} cannot be written: {error.strerror}", "--data")
+        return CheckOutcome(
+            "disk", "error", f"{folder} cannot be written: {error.strerror}", "--data"
+        )
     free = free_bytes(folder)
     found = f"{folder}: {free / 2**30:.1f} GiB free, 1 MiB reaches the disk in {1000 * took:.1f} ms"
     if free < LITTLE_ROOM:
-        return Checked("disk", "warning", found, "a scan of 1500 frames takes 2 to 4 GiB")
+        return CheckOutcome("disk", "warning", found, "a scan of 1500 frames takes 2 to 4 GiB")
     if took > SLOW_SYNC_S:
-        return Checked("disk", "warning", found, "slow; scans at full speed will wait for it")
-    return Checked("disk", "ok", found)
+        return CheckOutcome("disk", "warning", found, "slow; scans at full speed will wait for it")
+    return CheckOutcome("disk", "ok", found)
 
 
 def _greeting(port: int) -> str:

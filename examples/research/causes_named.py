@@ -24,7 +24,7 @@ from faults_drawn import KINDS, Faulty, drawn
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, SpotFrames, nothing
-from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate
+from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
@@ -79,7 +79,7 @@ def calibrated(scan: Faulty, per_frame: tuple[str, ...] = ()) -> Calibration:
         looks.append(FrameSpots(outlines, FrameState.USABLE))
     b = scan.believed
     poses = Poses.upright([0, 0, 0], [0, b.sod, 0], [0, b.sdd, 0], b.pixel, np.radians(b.angles))
-    request = Request(
+    request = CalibrationRequest(
         free=b.free, start=Offsets.from_edge(b.held), priors=b.priors, second_look=False,
         per_frame=per_frame,
     )  # fmt: skip

@@ -15,7 +15,7 @@ from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.fit.priors import exact
 from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.frame_source import ArrayFrames
-from flexdt.twin.calibration.pipeline import Request, Scan, calibrate
+from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt_extensions.studies.experiments import SHAPE
 from flexdt_extensions.studies.rendered_runs import Rendering, exposures, line_integrals
@@ -66,7 +66,7 @@ def draw(seed: int, model: BeadModel, scene: Scene, camera: Rendering, frames: i
     result = calibrate(
         [Scan(ArrayFrames(images, SHAPE), nominal)],
         replace(model),
-        Request(priors=exact()),
+        CalibrationRequest(priors=exact()),
         scene=scene,
     )
     codes = tuple(f.code for f in result.findings)

@@ -29,7 +29,7 @@ from flexdt.twin.calibration.fit.fit import estimate_geometry
 from flexdt.twin.calibration.fit.fitted_motion import MotionFit, aware, follow_motion
 from flexdt.twin.calibration.fit.priors import exact
 from flexdt.twin.calibration.frame_source import ArrayFrames
-from flexdt.twin.calibration.pipeline import Request, Scan, calibrate
+from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate
 from flexdt.twin.geometry.offsets import Offsets, to_internal
 from flexdt.twin.geometry.poses import Poses
 
@@ -94,8 +94,8 @@ def one(seed: int, kind: str, images: bool) -> dict[str, Any]:
             radiographs(rng, beads, angles[i : i + 1], SOD, t)[0] for i, t in enumerate(frames)
         ]
         scan = Scan(ArrayFrames(shown, SHAPE), poses, priors=exact(SIX))
-        still = calibrate([scan], model, Request(priors=exact(SIX)))
-        found = calibrate([scan], model, Request(priors=exact(SIX), per_frame=names))
+        still = calibrate([scan], model, CalibrationRequest(priors=exact(SIX)))
+        found = calibrate([scan], model, CalibrationRequest(priors=exact(SIX), per_frame=names))
         if found.fit is None or not found.motions:
             return {"kind": kind, "refused": [f.code for f in found.findings]}
         before = still.fit.certificate.rms_px if still.fit else np.nan

@@ -28,7 +28,7 @@ from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
 from flexdt.twin.calibration.fit.image_quantities import image_quantities
 from flexdt.twin.calibration.fit.priors import ASSUMED, exact
 from flexdt.twin.calibration.frame_source import ArrayFrames
-from flexdt.twin.calibration.pipeline import Request, Scan, calibrate
+from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate
 from flexdt.twin.geometry.poses import Poses
 
 Array = npt.NDArray[np.float64]
@@ -167,7 +167,7 @@ def scan(
             for s, p in zip(sods, poses, strict=True)
         ]
         model = BeadModel(beads, np.full(len(beads), RADIUS))
-        found = calibrate(scans, model, Request(priors=exact() if sure else {}))
+        found = calibrate(scans, model, CalibrationRequest(priors=exact() if sure else {}))
         wide = "priors_narrow" in [f.code for f in found.findings]
         return found.fit if found.identifiable else None, wide, seen
     tracks = np.concatenate([pixels(beads, angles, sod, truth) for sod in sods])

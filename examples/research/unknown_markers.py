@@ -31,7 +31,7 @@ from flexdt.clients.calibration.markers import (
 )
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.twin.calibration.frame_source import ArrayFrames
-from flexdt.twin.calibration.pipeline import Calibration, Request
+from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest
 from flexdt.twin.geometry.cone_vec import ConeVec
 
 Array = npt.NDArray[np.float64]
@@ -89,7 +89,9 @@ def rendered(seed: int, frames: int = 36) -> dict[str, Any]:
     angles = 360.0 * np.arange(frames) / frames
     images = radiographs(rng, beads, angles, SOD, truth, *SMALL)
     data = markers_alone(geometry(angles), "rendered")
-    found, told = calibrate_unknown(data, ArrayFrames(images, SHAPE), None, Request(free=("dO_x",)))
+    found, told = calibrate_unknown(
+        data, ArrayFrames(images, SHAPE), None, CalibrationRequest(free=("dO_x",))
+    )
     assert found.fit is not None
     fit = found.fit
     seen = pixels(beads, angles, SOD, truth)
@@ -126,7 +128,7 @@ def annotated(
     (some,), markers = seen_alone(data, markers)
     mm = float(np.linalg.norm(beads[0] - beads[1]))
     found, told = calibrate_unknown(
-        some, None, markers, Request(free=("dO_x",)), Scale("0", "1", mm, 0.001 * mm)
+        some, None, markers, CalibrationRequest(free=("dO_x",)), Scale("0", "1", mm, 0.001 * mm)
     )
     assert found.fit is not None
     return {

@@ -18,7 +18,7 @@ from scipy import ndimage
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.fit.priors import ASSUMED
 from flexdt.twin.calibration.fit.problem import SIX
-from flexdt.twin.calibration.pipeline import Request
+from flexdt.twin.calibration.pipeline import CalibrationRequest
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
@@ -56,7 +56,7 @@ class Spoilt:
     truth: Offsets
     camera: Rendering
     images: tuple[Float32Array | None, ...] = ()
-    request: Request = field(default_factory=Request)
+    request: CalibrationRequest = field(default_factory=CalibrationRequest)
 
 
 Change = Callable[[Spoilt, Rng], Spoilt]
@@ -255,7 +255,7 @@ def _some_held(scan: Spoilt, rng: Rng, off: Callable[[], float]) -> Spoilt:
     edge = scan.truth.to_edge()
     start = Offsets.from_edge({n: edge[n] + off() for n in held})
     free = tuple(n for n in SIX if n not in held)
-    return replace(scan, request=Request(free=free, start=start))
+    return replace(scan, request=CalibrationRequest(free=free, start=start))
 
 
 def _held_off(scan: Spoilt, rng: Rng) -> Spoilt:

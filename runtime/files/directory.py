@@ -33,6 +33,9 @@ TEMPORARY: Final = ".part-"
 """Prefix of temporary names; no plain name starts with a dot, so they never collide."""
 BEFORE: Final = ".before-"
 """Prefix of the name under which what a change replaces is kept until the change has been made."""
+LARGEST: Final = 256 << 20
+"""Bytes of a file that is read whole, where its size is not known. The record of a scan of 200 000
+poses has about 50 MB; a sparse file may claim any size."""
 
 _NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _RELATIVE: Final = hasattr(os, "O_DIRECTORY")
@@ -194,10 +197,18 @@ class Directory:
             raise OSError(errno.EINVAL, "it is no regular file", str(self.path / name))
         return open(name, "rb", opener=lambda *_: file)  # some readers want to know a name
 
-    def read(self, name: str) -> bytes:
-        """The content of a regular file; raises as `open`."""
+    def read(self, name: str, most: int = LARGEST) -> bytes:
+        """The content of a regular file of at most `most` bytes.
+
+        Raises:
+            OSError: as `open`, or it has more.
+        """
         with self.open(name) as file:
-            return file.read()
+            size = os.fstat(file.fileno()).st_size
+            if size > most:
+                what = f"it has {size} bytes, {most} allowed"
+                raise OSError(errno.EFBIG, what, str(self.path / name))
+            return file.read(size)
 
     def link(self, name: str, second: str, to: Directory | None = None) -> None:
         """Give what stands under `name` a second name, here or in another directory.

@@ -17,7 +17,7 @@ from contextlib import suppress
 from typing import TypeVar
 
 from flexdt.protocol.fields import MAX_STEM, encoded
-from flexdt.runtime.files.directory import BEFORE, Directory, writing
+from flexdt.runtime.files.directory import BEFORE, LARGEST, Directory, writing
 from flexdt.runtime.log import log
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.errors import LimitError
@@ -95,10 +95,10 @@ class Changes:
         self._made.clear()
 
     def undo(self) -> None:
-        """Everything as it was, but for what others have written since; trouble is logged."""
+        """Restore each file unless somebody else has changed it since; failures are logged."""
         for folder, name, before, data in reversed(self._made):
             try:
-                if folder.read(name) != data:
+                if folder.read(name, max(LARGEST, len(data))) != data:
                     continue
                 if before is None:
                     folder.unlink(name)
@@ -120,14 +120,15 @@ def _second_name(folder: Directory, name: str, second: str) -> bool:
         DatasetWriteError: the system refuses.
     """
     with writing(folder.path / name, f"cannot write {folder.path / name}"):
-        if folder.stat(name) is None:
+        about = folder.stat(name)
+        if about is None:
             return False
         with suppress(FileNotFoundError):
             folder.unlink(second)  # of a killed writer with the same numbers, as in a container
         try:
             folder.link(name, second)
         except OSError:  # a file system without links
-            folder.keep(second, folder.read(name))
+            folder.keep(second, folder.read(name, about.st_size))
     return True
 
 

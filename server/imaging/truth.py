@@ -22,7 +22,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
-from flexdt.twin.scanner.state import Placement
+from flexdt.twin.scanner.state import StagePlacement
 
 LARGEST = 1e6
 """Above any value of a truth file [mm, deg, s]; NaN and infinities are not below it."""
@@ -47,7 +47,7 @@ class TrueGeometry:
         return "TrueGeometry(hidden)"
 
     def cone_vec(
-        self, poses: Poses, placement: Placement, times: npt.ArrayLike | None = None
+        self, poses: Poses, placement: StagePlacement, times: npt.ArrayLike | None = None
     ) -> ConeVec:
         """True geometry of each pose, in the frame of a sample placed at `placement`.
 

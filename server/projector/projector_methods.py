@@ -30,10 +30,10 @@ from flexdt.protocol.projector import (
     PROJECTOR_METHODS,
     Backproject,
     Cancel,
-    Grid,
     Project,
     VolumePut,
     VolumeRef,
+    VoxelGrid,
 )
 from flexdt.protocol.rpc_errors import cancelled, invalid_params, superseded, too_large
 from flexdt.runtime.log import Sparing
@@ -295,7 +295,7 @@ def _document() -> object:
     return openrpc_document(PROJECTOR_METHODS, title="flexdt projector server")
 
 
-def _accumulator(context: Context, name: str | None, grid: Grid) -> Volume | None:
+def _accumulator(context: Context, name: str | None, grid: VoxelGrid) -> Volume | None:
     if name is None or name not in context.store:
         return None
     held = context.store.get(name)

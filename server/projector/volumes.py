@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexdt.protocol.projector import Grid, MeshSize, VolumeInfo
+from flexdt.protocol.projector import MeshSize, VolumeInfo, VoxelGrid
 from flexdt.protocol.rpc_errors import RpcError, invalid_params, too_large
 from flexdt.twin.projection import Body, TriangleMesh, Volume
 
@@ -28,7 +28,7 @@ class _Upload:
     """Voxels or a mesh that are still coming, and their bytes."""
 
     owner: object
-    what: Grid | MeshSize
+    what: VoxelGrid | MeshSize
     data: np.ndarray[tuple[int], np.dtype[np.uint8]]
     received: int = 0
 
@@ -38,7 +38,7 @@ class _Upload:
         Raises:
             GeometryError: a mesh that does not close.
         """
-        if isinstance(self.what, Grid):
+        if isinstance(self.what, VoxelGrid):
             voxels = self.data.view("<f4").reshape(self.what.shape)
             return Volume(voxels, self.what.voxel_mm, self.what.center_mm)
         corners = 24 * self.what.vertices
@@ -96,7 +96,7 @@ class VolumeStore:
         self._held[name] = value
 
     def chunk(
-        self, owner: object, name: str, what: Grid | MeshSize, start: int, data: memoryview
+        self, owner: object, name: str, what: VoxelGrid | MeshSize, start: int, data: memoryview
     ) -> tuple[int, Callable[[], Volume | TriangleMesh] | None]:
         """Take a chunk of voxels or of a mesh.
 
@@ -162,8 +162,8 @@ def memory_of(value: Body) -> int:
     return SOLID_BYTES * max(1, len(value.solids))
 
 
-def _needed(what: Grid | MeshSize) -> int:
-    if isinstance(what, Grid):
+def _needed(what: VoxelGrid | MeshSize) -> int:
+    if isinstance(what, VoxelGrid):
         return LAYOUT_COPIES * what.nbytes
     return 24 * (what.vertices + what.triangles) + what.nbytes
 

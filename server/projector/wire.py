@@ -313,7 +313,8 @@ class ProjectorLink:
         except asyncio.CancelledError:
             sent = True  # perhaps, so the answer may come
             if not self.lost:
-                self._notify(Notification("cancel", {"request": request.id}))
+                cancel = Notification("cancel", {"request": request.id})
+                self._keep(asyncio.ensure_future(self.link.send(cancel)))
             raise
         finally:
             self._calls.abandon(request, sent=sent)
@@ -328,9 +329,6 @@ class ProjectorLink:
                 self.close()
             if not self._notes:
                 self._keep(asyncio.ensure_future(self.ask("health", {})))
-
-    def _notify(self, notification: Notification) -> None:
-        self._keep(asyncio.ensure_future(self.link.send(notification)))
 
     def _keep(self, note: asyncio.Future[Any]) -> None:
         self._notes.add(note)

@@ -56,6 +56,7 @@ class Acquisition:
         put: stores an image.
         moments: poses averaged within the exposure of a frame taken in motion.
         shown: told of images for watchers.
+        ensure_same: raises if the sample has become another one; asked after each projection.
     """
 
     plan: ScanPlan
@@ -65,6 +66,7 @@ class Acquisition:
     put: Put
     moments: int = 1
     shown: FrameListener | None = None
+    ensure_same: Callable[[], None] = lambda: None
     _recent: dict[int, Radiograph] = field(default_factory=dict, init=False)
     """Images by index that later frames may ask for."""
     _trapped: dict[int, Float32Array] = field(default_factory=dict, init=False)
@@ -77,6 +79,7 @@ class Acquisition:
         Raises:
             ProjectorUnavailable: nothing of the batch was stored.
             DatasetWriteError: not all of it was stored; storing again is allowed.
+            Exception: as `ensure_same`; nothing was stored.
         """
         if batch[0].xrays_on:
             images = await self._take(batch)
@@ -153,9 +156,11 @@ class Acquisition:
         nominal = motor_poses(self.plan.machine, self.plan.profile, frame.camera, positions)
         exposures = [settings_of(e) for e in batch]
         times = np.repeat([e.start_s for e in batch], len(nominal) // len(batch))
-        return await self.radiography.take(
+        images = await self.radiography.take(
             self.sample, nominal, frame.camera, exposures, times=times
         )
+        self.ensure_same()  # of what was projected, not of what stands there before
+        return images
 
     @cached_property
     def _numbers(self) -> Mapping[str, int]:

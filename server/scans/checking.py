@@ -28,7 +28,7 @@ from flexdt.twin.collision.convex_solids import Polytope
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import Machine, Profile
-from flexdt.twin.script import Problem, ScanPlan, StartState, plan_poses
+from flexdt.twin.script import ScanPlan, ScriptProblem, StartState, plan_poses
 from flexdt.twin.script.lexer import LIGHT_BYTES, is_light
 from flexdt.twin.script.planning.dry_run import (
     CheckReport,
@@ -203,7 +203,8 @@ def planned(matter: CheckInput) -> tuple[ScanPlan, list[str]]:
     report = matter.report()
     require_sound(report)
     warnings = [p.where_and_what for p in report.warnings[:MAX_PROBLEMS]]
-    return report.plan, warnings + _more(report.warnings)
+    left = len(report.warnings) - MAX_PROBLEMS
+    return report.plan, [*warnings, f"and {left} more"] if left > 0 else warnings
 
 
 def in_pieces(matter: CheckInput) -> list[bytes]:
@@ -249,7 +250,7 @@ def require_sound(report: CheckReport) -> None:
     """
     if report.ok:
         return
-    problems: list[Problem] = list(report.problems)
+    problems: list[ScriptProblem] = list(report.problems)
     errors = [p for p in problems if p.severity == "error"]
     other = [p for p in errors if p.code != "collision"]
     if other:
@@ -276,12 +277,7 @@ def require_sound(report: CheckReport) -> None:
     )
 
 
-def _more(many: Sequence[object]) -> list[str]:
-    left = len(many) - MAX_PROBLEMS
-    return [f"and {left} more"] if left > 0 else []
-
-
-def _worst(problems: list[Problem]) -> Sequence[Problem]:
+def _worst(problems: list[ScriptProblem]) -> Sequence[ScriptProblem]:
     """No more than may be listed, errors rather than warnings, in the order they had."""
     if len(problems) <= MAX_PROBLEMS:
         return problems

@@ -49,9 +49,9 @@ class Job:
     id: str
     name: str
     folder: str
-    prepare: Prepare | None
-    frames_total: int
-    duration_s: float
+    prepare: Prepare | None = None
+    frames_total: int = 0
+    duration_s: float = 0.0
     speed_up: SpeedUp | None = None
     warnings: list[str] = field(default_factory=list)
     phase: JobPhase = "queued"

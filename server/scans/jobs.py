@@ -127,8 +127,8 @@ class Jobs:
 
     @contextmanager
     def manual_control(self) -> Iterator[None]:
-        """Somebody moves or sets things while the job is paused: it no longer goes on by itself,
-        unless that is refused and nothing was set in motion."""
+        """Manual control cancels the automatic resume of a paused job, unless the command is
+        refused before anything has moved."""
         by_hand, programmes = self._by_hand, self._scanner.programmes
         self._by_hand = True
         try:
@@ -180,16 +180,28 @@ class Jobs:
         prepare: Prepare,
         speed_up: SpeedUp | None = None,
         warnings: list[str] | None = None,
+        job: Job | None = None,
     ) -> Job:
-        """The next job, which nobody knows until `enqueue`.
+        """The next job, or one that has ended as it will be; nobody knows it until `enqueue`.
+
+        Args:
+            name, folder: of the data set.
+            plan, prepare, speed_up, warnings: of the scan.
+            job: that goes on; None for a new one.
 
         Raises:
-            RpcError: -32003, too many wait already.
+            RpcError: -32003, too many wait already, or it has not ended.
         """
-        self._require_place()
-        return Job(
-            f"job-{self._count + 1}", name, folder, prepare, plan.frames, plan.duration_s,
-            speed_up, warnings or [],
+        waiting = sum(each.phase == "queued" for each in self._all.values())
+        if waiting >= self.max_waiting:
+            data = {"asked": waiting + 1, "allowed": self.max_waiting}
+            raise busy(f"{waiting} jobs wait already", data)
+        if job is not None and job.phase not in ENDED:
+            raise self._cannot("resume", job, ENDED)
+        return replace(
+            job or Job(f"job-{self._count + 1}", name, folder), prepare=prepare, phase="queued",
+            error=None, speed_up=speed_up, frames_total=plan.frames, duration_s=plan.duration_s,
+            warnings=warnings or [],
         )  # fmt: skip
 
     def enqueue(self, draft: Job) -> Job:
@@ -202,27 +214,6 @@ class Jobs:
         self._queue.put_nowait(job)
         self._notify(job)
         return job
-
-    def draft_again(
-        self,
-        job: Job,
-        plan: ScanPlan,
-        prepare: Prepare,
-        speed_up: SpeedUp | None = None,
-        warnings: list[str] | None = None,
-    ) -> Job:
-        """A job that has ended as it will be once more, which nobody knows until `enqueue`.
-
-        Raises:
-            RpcError: -32003, too many wait already, or it has not ended.
-        """
-        self._require_place()
-        if job.phase not in ENDED:
-            raise self._cannot("resume", job, ENDED)
-        return replace(
-            job, prepare=prepare, phase="queued", error=None, speed_up=speed_up,
-            frames_total=plan.frames, duration_s=plan.duration_s, warnings=warnings or [],
-        )  # fmt: skip
 
     def pause(self, job: Job, error: Exception | None = None) -> None:
         """Pause a running job; nothing to do for one that is paused.
@@ -398,13 +389,6 @@ class Jobs:
             f"cannot {what} {job.id}: it is {job.phase}",
             {"asked": what, "state": job.phase, "allowed": list(phases)},
         )
-
-    def _require_place(self) -> None:
-        waiting = sum(job.phase == "queued" for job in self._all.values())
-        if waiting >= self.max_waiting:
-            raise busy(
-                f"{waiting} jobs wait already", {"asked": waiting + 1, "allowed": self.max_waiting}
-            )
 
     def _progress(self, job: Job) -> None:
         assert job.runner is not None

@@ -20,8 +20,8 @@ from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.motion import profiles as motion
 from flexdt.twin.motion.profiles import Piece, Trajectory
 from flexdt.twin.scanner.scanner import ScannerTwin
-from flexdt.twin.scanner.state import TubeState
-from flexdt.twin.script import Exposure, ScanPlan, Step
+from flexdt.twin.scanner.state import TubeSettings
+from flexdt.twin.script import Exposure, PlanStep, ScanPlan
 from flexdt.twin.script import commands as c
 
 # How a scanner gets back onto a plan: the pose to return to, and the programme from there on.
@@ -154,7 +154,7 @@ class Progress:
     phase: Phase = "running"
     tau: float = 0.0
     frames_done: int = 0
-    step: Step | None = None
+    step: PlanStep | None = None
     what: str = ""
     error: Exception | None = None
 
@@ -271,14 +271,14 @@ class ScanRunner:
             first = self._first_moment()
             await self._begin()
             for moment, event in self._events:
-                if isinstance(event, Step) and moment < first:
+                if isinstance(event, PlanStep) and moment < first:
                     await self._take_effect(event)
             await self._rejoin_or_pause(first)
             for moment, event in self._events:
                 match event:
-                    case Step() if moment < first:
+                    case PlanStep() if moment < first:
                         continue
-                    case Step():
+                    case PlanStep():
                         await self._until(moment)
                         await self._take_effect(event)
                         length = 0.0 if event.index in self._quick else event.holds_s
@@ -323,7 +323,7 @@ class ScanRunner:
         made = sum(e.kind == "projection" for e in batch)
         self._set(frames_done=self.progress.frames_done + made)
 
-    async def _take_effect(self, step: Step) -> None:
+    async def _take_effect(self, step: PlanStep) -> None:
         self._set(step=step, what=step.what)
         while True:
             try:
@@ -512,7 +512,7 @@ class ScanRunner:
 class _Settings:
     """What an operator may change while a run is paused."""
 
-    tube: TubeState
+    tube: TubeSettings
     camera: CameraSettings
     paces: Mapping[str, tuple[float, float]]
 
@@ -533,10 +533,10 @@ class _Settings:
 
 
 def _events(
-    steps: Sequence[Step], frames: Sequence[Exposure]
-) -> list[tuple[float, Step | Exposure]]:
+    steps: Sequence[PlanStep], frames: Sequence[Exposure]
+) -> list[tuple[float, PlanStep | Exposure]]:
     """Commands and frames by time; at one moment a command comes before its own frames."""
-    keyed: list[tuple[tuple[float, int, int], Step | Exposure]] = []
+    keyed: list[tuple[tuple[float, int, int], PlanStep | Exposure]] = []
     keyed += [((s.start_s, s.index, 0), s) for s in steps]
     keyed += [((e.start_s, e.step, 1), e) for e in frames]
     return [(key[0], event) for key, event in sorted(keyed, key=lambda k: k[0])]

@@ -91,7 +91,12 @@ class ScanSource:
 
 @dataclass(frozen=True)
 class StartConditions:
-    """What a scan starts from, kept so that it can be resumed."""
+    """What a scan starts from, kept so that it can be resumed.
+
+    Attributes:
+        revision: names what the sample's upload showed then; None for a shipped phantom, and in
+            what older servers wrote.
+    """
 
     start: StartState
     sample: Sample
@@ -99,6 +104,7 @@ class StartConditions:
     moments: Annotated[int, Field(ge=1, le=MAX_MOMENTS, strict=True)]
     physics: Physics = "ideal"
     scatter: Scatter = "off"
+    revision: str | None = None
 
 
 BEGINNING: Final = TypeAdapter(StartConditions)

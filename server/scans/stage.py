@@ -13,15 +13,15 @@ from typing import Any, Final
 
 from flexdt.phantoms import Phantom
 from flexdt.protocol.rpc_errors import too_large
-from flexdt.server.storage.stored_samples import SampleStore, Upload
-from flexdt.twin.collision.collision_scene import Scene, build_scene
+from flexdt.server.storage.stored_samples import ReceivedSample, SampleStore
+from flexdt.twin.collision.collision_scene import CollisionScene, build_scene
 from flexdt.twin.collision.convex_solids import Polytope
 from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.sample_hull import convex_pieces
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.scanner.safety import Guard
-from flexdt.twin.scanner.state import Placement, Sample
+from flexdt.twin.scanner.state import Sample, StagePlacement
 from flexdt.twin.script.planning.plan import SampleSize
 
 KEPT = 8
@@ -40,7 +40,7 @@ class Stage:
 
     def __init__(self, machine: Machine, profile: Profile, samples: SampleStore) -> None:
         self._machine, self._profile, self._samples = machine, profile, samples
-        self._scenes: OrderedDict[tuple[_Content, Offsets], Scene] = OrderedDict()
+        self._scenes: OrderedDict[tuple[_Content, Offsets], CollisionScene] = OrderedDict()
         self._pieces: OrderedDict[_Content, tuple[Polytope, ...]] = OrderedDict()
 
     def phantom(self, sample: Sample) -> Phantom | None:
@@ -51,7 +51,11 @@ class Stage:
         """
         return self._samples.load(sample.name, sample.material) if sample.name else None
 
-    def pieces(self, sample: Sample, upload: Upload | None = None) -> tuple[Polytope, ...]:
+    def revision(self, sample: Sample) -> str | None:
+        """Names what the upload of a sample shows, once it has been read; None for others."""
+        return self._samples.revision(sample.name)
+
+    def pieces(self, sample: Sample, upload: ReceivedSample | None = None) -> tuple[Polytope, ...]:
         """Convex pieces that hold the sample, object frame; it may take a second.
 
         Args:
@@ -63,9 +67,8 @@ class Stage:
         if pieces is None:
             phantom = self.phantom(sample) if upload is None else upload.standing
             pieces = () if phantom is None else _pieces(phantom, sample.offset)
-            now = self._content(
-                sample, upload
-            )  # the revision is known once an upload has been read
+            # The revision is known once an upload has been read.
+            now = self._content(sample, upload)
             if before[1] not in (None, now[1]):
                 return pieces  # another file came under the name meanwhile
             self._pieces[now] = pieces
@@ -81,8 +84,8 @@ class Stage:
         return SampleSize.around(phantom.size_mm, f"sample {sample.name}", sample.offset)
 
     def scene(
-        self, sample: Sample, parameters: Offsets = NOMINAL, upload: Upload | None = None
-    ) -> Scene | None:
+        self, sample: Sample, parameters: Offsets = NOMINAL, upload: ReceivedSample | None = None
+    ) -> CollisionScene | None:
         """What may touch what with this sample; None where the machine has no components.
 
         Args:
@@ -103,7 +106,7 @@ class Stage:
         return scene
 
     def guard(
-        self, sample: Sample, parameters: Offsets = NOMINAL, upload: Upload | None = None
+        self, sample: Sample, parameters: Offsets = NOMINAL, upload: ReceivedSample | None = None
     ) -> Guard | None:
         """What sweeps every motion with this sample; None where the machine has no components.
 
@@ -115,15 +118,15 @@ class Stage:
         scene = self.scene(sample, parameters, upload)
         return None if scene is None else SceneGuard(scene)
 
-    def _content(self, sample: Sample, upload: Upload | None) -> _Content:
-        return sample, upload.revision if upload else self._samples.revision(sample.name)
+    def _content(self, sample: Sample, upload: ReceivedSample | None) -> _Content:
+        return sample, upload.shown if upload else self.revision(sample)
 
 
 _Content = tuple[Sample, str | None]
 """A sample and what its upload held: another file may come under the same name."""
 
 
-def _pieces(phantom: Phantom, offset: Placement) -> tuple[Polytope, ...]:
+def _pieces(phantom: Phantom, offset: StagePlacement) -> tuple[Polytope, ...]:
     return convex_pieces(
         phantom.mesh(around=True), rotation=offset.rotation, offset=(offset.x, offset.y, offset.z)
     )

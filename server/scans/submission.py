@@ -17,7 +17,7 @@ from datetime import datetime
 
 from flexdt.protocol import Codec
 from flexdt.protocol.messages import Encoded
-from flexdt.protocol.rpc_errors import RpcError, invalid_params
+from flexdt.protocol.rpc_errors import RpcError, busy, invalid_params
 from flexdt.runtime.files.dataset_folder import dated_name, read_document
 from flexdt.runtime.files.directory import Directory, free_bytes
 from flexdt.runtime.files.own_documents import used_bytes
@@ -100,10 +100,11 @@ class Submissions:
         operator: str = "",
         ensure_allowed: Callable[[], None] = lambda: None,
     ) -> Job:
-        """Put a scan in the queue; `still` raises if who asked may not any more.
+        """Put a scan in the queue; `ensure_allowed` raises if the requester has lost control.
 
         Raises:
-            RpcError: -32005 script invalid, -32002 collisions, -32602 the name is taken.
+            RpcError: -32005 script invalid, -32002 collisions, -32602 the name is taken, -32003
+                the sample of what is resumed is another one.
             LimitError, DiskFullError, DatasetNameError.
         """
         resumed = self._resumable(name, wish) if name is not None else None
@@ -153,7 +154,9 @@ class Submissions:
         plan, prepare, warnings = await self._ready(sidecar, name, begun, ensure_allowed)
         await self._queued(
             sidecar, name, ensure_allowed,
-            lambda: self.jobs.draft_again(job, plan, prepare, sidecar.speed_up, warnings),
+            lambda: self.jobs.draft(
+                name, job.folder, plan, prepare, sidecar.speed_up, warnings, job
+            ),
         )  # fmt: skip
 
     async def _queued(
@@ -193,6 +196,7 @@ class Submissions:
         checked = await self._checks.sound(
             await self._matter(asked.wish, begin.start, begin.sample)
         )
+        self._ensure_same(begin)
         await asyncio.to_thread(self._require_room, checked.plan.bytes, name)
         warnings = list(checked.warnings)
         if resume:
@@ -213,6 +217,9 @@ class Submissions:
             final = await self._checks.sound(
                 await self._matter(begun.wish, begun.begin.start, begun.begin.sample)
             )
+            self._ensure_same(begun.begin)
+            shows = begun.begin.revision or self.stage.revision(begun.begin.sample)
+            begun = replace(begun, begin=replace(begun.begin, revision=shows))
             return await asyncio.to_thread(self._open, begun, final.plan, name, resume)
 
         return checked.plan, prepare, warnings
@@ -270,9 +277,24 @@ class Submissions:
         asked.write(self.root, name)
         writer = DatasetWriter(self.root, record, script=asked.wish.script, resume=resume)
         acquisition = Acquisition(
-            plan, radiography, begin.sample, begin.seed, writer.put, begin.moments, self.shown
-        )
+            plan, radiography, begin.sample, begin.seed, writer.put, begin.moments, self.shown,
+            lambda: self._ensure_same(begin),
+        )  # fmt: skip
         return JobInputs(plan, writer, acquisition.produce)
+
+    def _ensure_same(self, begin: StartConditions) -> None:
+        """Check that a scan's sample, which has been read, is what it was when the scan began.
+
+        Raises:
+            RpcError: -32003, another file has come under its name.
+        """
+        now, name = self.stage.revision(begin.sample), begin.sample.name
+        if begin.revision not in (None, now):
+            raise busy(
+                f"the sample {name!r} has been uploaded anew since this scan began, and its images "
+                "would show two objects; upload the first file again, or begin another scan",
+                {"asked": now, "allowed": begin.revision, "sample": name},
+            )
 
     def _resumable(self, name: str, wish: ScanSource) -> StartConditions | None:
         """What an interrupted data set of that name started from; None if there is none.

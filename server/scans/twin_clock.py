@@ -1,4 +1,4 @@
-"""The twin's clock: virtual seconds that run at a chosen multiple of real ones, or as fast as may.
+"""The twin's clock: virtual seconds that run at a multiple of real ones, or as fast as possible.
 
 With a number for `speed_up` time flows; with "max" it stands still while anybody works and jumps to
 the next moment somebody waits for. Work that must not be outrun (a scan whose frames are not yet

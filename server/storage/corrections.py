@@ -29,7 +29,7 @@ from flexdt.runtime.files.own_documents import (
 from flexdt.server.storage.scene import correction_fields, correction_of
 from flexdt.twin.errors import UnknownNameError
 from flexdt.twin.geometry.offsets import Offsets, require_plausible
-from flexdt.twin.scanner.state import Correction
+from flexdt.twin.scanner.state import NamedCorrection
 
 KEPT = 1000
 """Corrections put in force that `revert` can go back through."""
@@ -54,7 +54,7 @@ class Corrections:
 
     def __init__(self, folder: Directory, history: Sequence[str | None] = ()) -> None:
         self._folder = folder
-        self._all: dict[str, Correction] = {}
+        self._all: dict[str, NamedCorrection] = {}
         self._sources: dict[str, str | None] = {}
         for file in ours(folder):
             without = "a correction cannot be read; without it"
@@ -69,7 +69,7 @@ class Corrections:
             known.append(None)
         self.history: History = [name for name in known if name is None or name in self._all]
 
-    def all(self) -> list[Correction]:
+    def all(self) -> list[NamedCorrection]:
         """Every correction, oldest first."""
         return sorted(self._all.values(), key=lambda c: c.date)
 
@@ -78,16 +78,16 @@ class Corrections:
         return self._sources.get(name)
 
     @property
-    def in_force(self) -> Correction | None:
+    def in_force(self) -> NamedCorrection | None:
         """The correction in force."""
         return self.last(self.history)
 
-    def last(self, history: History) -> Correction | None:
+    def last(self, history: History) -> NamedCorrection | None:
         """The correction in force after `history`."""
         name = history[-1] if history else None
         return None if name is None else self._all[name]
 
-    def get(self, name: str) -> Correction:
+    def get(self, name: str) -> NamedCorrection:
         """The correction called `name`.
 
         Raises:
@@ -101,7 +101,7 @@ class Corrections:
 
     def make(
         self, values: Mapping[str, float], name: str | None, note: str, when: datetime | None = None
-    ) -> Correction:
+    ) -> NamedCorrection:
         """A new correction from edge values [mm, deg]; nothing is stored yet.
 
         Raises:
@@ -117,16 +117,16 @@ class Corrections:
                 [{"path": "name", "message": "taken", "asked": chosen}],
                 "another name",
             )
-        return self._all.get(chosen) or Correction(chosen, date, parameters, note)
+        return self._all.get(chosen) or NamedCorrection(chosen, date, parameters, note)
 
-    def after(self, correction: Correction | None) -> History:
+    def after(self, correction: NamedCorrection | None) -> History:
         """The history once `correction` is in force instead of the last."""
         name = None if correction is None else correction.name
         if name is None and self.in_force is None:
             return self.history
         return [*self.history, name][-KEPT:]
 
-    def store(self, changes: Changes, correction: Correction, source: str | None) -> None:
+    def store(self, changes: Changes, correction: NamedCorrection, source: str | None) -> None:
         """Write a new correction; one that is known stays as it is.
 
         Raises:
@@ -139,7 +139,7 @@ class Corrections:
         name = f"{stamp} {file_stem(correction.name)}.json"
         changes.put_json(self._folder, name, document.model_dump(by_alias=True))
 
-    def know(self, correction: Correction, source: str | None) -> None:
+    def know(self, correction: NamedCorrection, source: str | None) -> None:
         """Add a correction, with what it came from, to those that there are."""
         if correction.name not in self._all:
             self._all[correction.name] = correction
@@ -153,7 +153,7 @@ class Corrections:
         return name
 
 
-def _read(data: bytes) -> tuple[Correction, str | None]:
+def _read(data: bytes) -> tuple[NamedCorrection, str | None]:
     document = CorrectionFile.model_validate(read_json(data))
     correction = correction_of(document)
     require_plausible(correction.parameters, math.inf)

@@ -214,16 +214,11 @@ def _place(root: Directory, name: str) -> tuple[Path, tuple[object, ...]]:
     return root.path / name, (name, *((s.st_ino, s.st_mtime_ns, s.st_size) for s in parts))
 
 
-def _document(folder: Folder, most: int) -> DatasetDocument:
-    if folder.document is None:
-        raise DatasetMissingError(f"there is no {DOCUMENT}: poses and settings are not known")
-    path = folder.path / DOCUMENT
-    return parse_document(read_text(path, most), DOCUMENT)
-
-
 def _scan(folder: Folder, most: int) -> _Scan:
     try:
-        document = _document(folder, most)
+        if folder.document is None:
+            raise DatasetMissingError(f"there is no {DOCUMENT}: poses and settings are not known")
+        document = parse_document(read_text(folder.path / DOCUMENT, most), DOCUMENT)
         return _Scan(folder, tuple(document.frames), document)
     except DatasetError as error:
         if not folder.projections:
@@ -483,17 +478,17 @@ def _mean(path: Path, key: tuple[object, ...]) -> float:
 @lru_cache(4)
 def _clearances(scan: _Scan, at: tuple[int, ...]) -> tuple[list[float | None], str]:
     from flexdt.twin.collision.collision_scene import build_scene
-    from flexdt.twin.collision.convex_solids import Cylinder
+    from flexdt.twin.collision.convex_solids import UprightCylinder
     from flexdt.twin.collision.scene_search import clearance
 
     document = scan.document
     assert document is not None
     machine, sample = document.machine_of(), document.sample
-    pieces: tuple[Cylinder, ...] = ()
+    pieces: tuple[UprightCylinder, ...] = ()
     what = "the machine without a sample, whose size is not known"
     if sample.diameter_mm > 0 and sample.height_mm > 0:
         # It contains the sample at every angle, so the sample is nowhere nearer.
-        pieces = (Cylinder((0.0, 0.0, 0.0), 0.5 * sample.diameter_mm, sample.height_mm),)
+        pieces = (UprightCylinder((0.0, 0.0, 0.0), 0.5 * sample.diameter_mm, sample.height_mm),)
         what = "the machine and the cylinder around the sample"
     correction = document.correction_in_force()
     offsets = NOMINAL if correction is None else correction.parameters

@@ -20,7 +20,7 @@ from flexdt.protocol.rpc_errors import invalid_params
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.machine.kinematics import resolve_targets
 from flexdt.twin.scanner.scanner import ScannerTwin
-from flexdt.twin.scanner.state import Correction, Placement, Sample
+from flexdt.twin.scanner.state import NamedCorrection, Sample, StagePlacement
 
 
 def save_scene(
@@ -50,7 +50,7 @@ def save_scene(
     )
 
 
-def correction_fields(correction: Correction) -> dict[str, Any]:
+def correction_fields(correction: NamedCorrection) -> dict[str, Any]:
     """A correction as documents and the wire name its values, in mm and deg."""
     return {
         "name": correction.name,
@@ -60,13 +60,13 @@ def correction_fields(correction: Correction) -> dict[str, Any]:
     }
 
 
-def correction_of(part: CorrectionPart) -> Correction:
+def correction_of(part: CorrectionPart) -> NamedCorrection:
     """The correction of a document.
 
     Raises:
         UnknownNameError: a name that is not a parameter.
     """
-    return Correction.from_edge(part.name, part.date, part.parameters, part.comment)
+    return NamedCorrection.from_edge(part.name, part.date, part.parameters, part.comment)
 
 
 def require_fit(scene: Scene, scanner: ScannerTwin) -> None:
@@ -112,5 +112,5 @@ def apply_settings(scene: Scene, scanner: ScannerTwin) -> None:
 def sample_of(scene: Scene) -> Sample:
     """The scene's sample."""
     return Sample(
-        scene.sample.name, Placement(**scene.sample.offset.model_dump()), scene.sample.material
+        scene.sample.name, StagePlacement(**scene.sample.offset.model_dump()), scene.sample.material
     )

@@ -108,7 +108,7 @@ EMPTY = "empty"
 
 
 @dataclass(frozen=True)
-class Upload:
+class ReceivedSample:
     """An upload that is whole and readable.
 
     Attributes:
@@ -124,6 +124,11 @@ class Upload:
     phantom: Phantom
     revision: str
     worn: tuple[str, Phantom] | None = None
+
+    @property
+    def shown(self) -> str:
+        """A name of what it shows, as `SampleStore.revision` gives it."""
+        return _shown(self.head, self.revision)
 
     @property
     def standing(self) -> Phantom:
@@ -178,8 +183,10 @@ class SampleStore:
         return self._heads.get(name)
 
     def revision(self, name: str) -> str | None:
-        """Names the content of an upload that has been read; None for a shipped phantom."""
-        return self._revisions.get(name)
+        """Names what an upload that has been read shows; None for a shipped phantom."""
+        with self._lock:
+            revision, head = self._revisions.get(name), self._heads.get(name)
+        return None if revision is None or head is None else _shown(head, revision)
 
     def load(self, name: str, material: str | None = None) -> Phantom:
         """The phantom called `name`; parsed once and cached.
@@ -231,7 +238,7 @@ class SampleStore:
         file_stem(head.name)
         return self._incoming.receive(head, start, data)
 
-    def parse(self, name: str, material: str | None = None) -> Upload:
+    def parse(self, name: str, material: str | None = None) -> ReceivedSample:
         """Parse a complete upload, which may take seconds; nothing is stored.
 
         Args:
@@ -244,9 +251,9 @@ class SampleStore:
         head, raw = self._incoming.take(name)
         phantom = _parse(head, raw, head.material)
         worn = None if material is None else (material, _parse(head, raw, material))
-        return Upload(head, raw, phantom, _revision(head, raw), worn)
+        return ReceivedSample(head, raw, phantom, _revision(head, raw), worn)
 
-    def store(self, changes: Changes, upload: Upload) -> None:
+    def store(self, changes: Changes, upload: ReceivedSample) -> None:
         """Write an upload; the previous one of that name stays beside it until `know`.
 
         Raises:
@@ -258,7 +265,7 @@ class SampleStore:
         document["revision"] = upload.revision
         changes.put_json(self._folder, f"{stem}.json", document)
 
-    def know(self, upload: Upload) -> None:
+    def know(self, upload: ReceivedSample) -> None:
         """Make a stored upload the current one of its name; `tidy` removes the previous one."""
         name = upload.head.name
         with self._lock:
@@ -306,7 +313,7 @@ class SampleStore:
             stored = self._stored.get(head.name)
         file = _bytes_file(head.name, stored)
         try:
-            raw = self._folder.read(file)
+            raw = self._folder.read(file, head.total)
             if len(raw) != head.total:
                 raise ValueError(f"{len(raw)} bytes, not {head.total}")
             if stored is not None and _revision(head, raw) != stored:
@@ -327,6 +334,11 @@ def _revision(head: UploadHead, raw: bytes) -> str:
     """A name of a content: bytes and how they are read."""
     how = f"{head.kind} {head.format} {head.unit} {head.shape} {head.voxel_mm}".encode()
     return hashlib.sha256(how + b"\0" + raw).hexdigest()[:16]
+
+
+def _shown(head: UploadHead, revision: str) -> str:
+    """A name of what an upload shows: the same content may come again in another material."""
+    return revision if head.material is None else f"{revision} {head.material}"
 
 
 def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:

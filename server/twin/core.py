@@ -37,7 +37,7 @@ from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
 from flexdt.server.storage.corrections import Corrections
 from flexdt.server.storage.memory import Memory, StateStore, read_memory, remember, restore
 from flexdt.server.storage.past_scans import PastScans
-from flexdt.server.storage.stored_samples import SampleStore, Upload, sample_material
+from flexdt.server.storage.stored_samples import ReceivedSample, SampleStore, sample_material
 from flexdt.server.twin import wire_values as views
 from flexdt.server.twin.hub import Hub
 from flexdt.server.twin.live import LiveView, Shot, StateFeed
@@ -52,7 +52,7 @@ from flexdt.twin.physics.scatter.simulation import Scatter
 from flexdt.twin.scanner.safety import Guard
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.stage_change import StageChange
-from flexdt.twin.scanner.state import Correction, Sample, ScannerState, TubeState
+from flexdt.twin.scanner.state import NamedCorrection, Sample, ScannerState, TubeSettings
 from flexdt.twin.script import Exposure
 
 # Who may move: one controller at a time, everyone may watch.
@@ -62,7 +62,7 @@ from flexdt.twin.script import Exposure
 # from whoever has it. The caller says which requests move.
 
 
-class Control:
+class ControlLease:
     """The controller's lease; `holder` is a connection's name or None.
 
     Args:
@@ -176,7 +176,7 @@ class TwinServer:
         self.hub = Hub(
             self.clock.now, {"log": LOG_KEPT}, self.limits.max_subscriptions, self.limits.max_views
         )
-        self.control = Control(self.limits.control_idle_s, wall)
+        self.control = ControlLease(self.limits.control_idle_s, wall)
         settle(root, RESERVED)
         self.samples = SampleStore(root.folder("samples"), self.limits.max_upload)
         self.samples.standing = lambda: (self.scanner.sample.name, self.scanner.sample.material)
@@ -226,8 +226,12 @@ class TwinServer:
         """Ends of motions that somebody waits for."""
 
     async def start(self, sample: Sample | None = None) -> None:
-        """Begin to work, with `sample` on the stage."""
-        await self._begin_with(Sample() if sample is None else sample)
+        """Begin to work, with `sample` on the stage wherever the motors stand."""
+        shown, correction = sample or Sample(), self.scanner.correction
+        guard = await self._guard(shown, correction)
+        for warning in self.scanner.initialise_stage(shown, correction, guard, self.clock.now()):
+            self.tell("warning", f"at the start {warning}; motion that brings them apart is free")
+        self.changed()
         work: list[Callable[[], Coroutine[Any, Any, None]]] = [
             self.jobs.work,
             self.live.run,
@@ -275,7 +279,7 @@ class TwinServer:
         if lost is not None:
             self.tell("warning", f"the correction in force, {lost!r}, is lost: none is in force")
         try:
-            self.scanner.stand(Sample(), last, None, self.clock.now())
+            self.scanner.initialise_stage(Sample(), last, None, self.clock.now())
         except GeometryError as error:
             self.corrections.history = self.corrections.after(None)
             self.tell("warning", "the correction in force does not fit this machine: none is",
@@ -295,10 +299,10 @@ class TwinServer:
         return sample
 
     async def _guarded(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Keep a service going: what one thing it meets does to it is logged, and it goes on.
+        """Keep a service going: an exception in it is logged, and the service is restarted.
 
-        One that fails again and again ends the process, which is started anew: without it the
-        server would answer and do nothing.
+        A service that fails again and again ends the process, which its supervisor starts anew:
+        without the service the server would answer and do nothing.
         """
         ends: deque[float] = deque(maxlen=FAILURES)
         while not self.failed.is_set():
@@ -360,7 +364,7 @@ class TwinServer:
             revision=self.samples.revision(sample.name),
         )
 
-    def correction_state(self, correction: Correction | None) -> w.Correction | None:
+    def correction_state(self, correction: NamedCorrection | None) -> w.Correction | None:
         """A correction and what it came from, for the wire."""
         source = None if correction is None else self.corrections.source(correction.name)
         return views.correction_view(correction, source)
@@ -390,20 +394,12 @@ class TwinServer:
         history = self.corrections.history
         return remember(self.scanner, self.clock.now(), jobs, made, history, ended=ended)
 
-    async def _begin_with(self, sample: Sample) -> None:
-        """At the start: put `sample` on the stage wherever the motors stand."""
-        correction = self.scanner.correction
-        guard = await self._guard(sample, correction)
-        for warning in self.scanner.stand(sample, correction, guard, self.clock.now()):
-            self.tell("warning", f"at the start {warning}; motion that brings them apart is free")
-        self.changed()
-
     async def certified_stage(
         self,
         sample: Sample,
-        correction: Correction | None,
+        correction: NamedCorrection | None,
         *,
-        upload: Upload | None = None,
+        upload: ReceivedSample | None = None,
         targets: Mapping[str, float] | None = None,
         paces: Mapping[str, tuple[float, float]] | None = None,
     ) -> StageChange:
@@ -445,7 +441,10 @@ class TwinServer:
         return [] if halted is None else [halted.message]
 
     async def _guard(
-        self, sample: Sample, correction: Correction | None, upload: Upload | None = None
+        self,
+        sample: Sample,
+        correction: NamedCorrection | None,
+        upload: ReceivedSample | None = None,
     ) -> Guard | None:
         parameters = NOMINAL if correction is None else correction.parameters
         return await asyncio.to_thread(self.stage.guard, sample, parameters, upload)
@@ -478,14 +477,9 @@ class TwinServer:
         entry = w.LogEntry(level=level, message=message, data=data)
         self.hub.publish("log", entry, slot=None)
 
-    def announce(self, job: Job) -> w.JobStatus:
-        """Tell watchers of jobs how this one is."""
+    def _job_changed(self, job: Job) -> None:
         status = self.jobs.status(job)
         self.hub.publish("job", status, slot=job.id)
-        return status
-
-    def _job_changed(self, job: Job) -> None:
-        status = self.announce(job)
         if status.state not in ("running", job.logged):
             data: dict[str, object] = {"job": job.id, "error": status.error}
             level: Level = "error" if status.error else "info"
@@ -503,7 +497,7 @@ class TwinServer:
             Shot.of(self.scanner, now),
             positions=tuple(sorted(frame.positions.items())),
             camera=frame.camera,
-            tube=TubeState(frame.kV, frame.power_W, frame.xrays_on),
+            tube=TubeSettings(frame.kV, frame.power_W, frame.xrays_on),
         )
         if frame.kind == "projection":
             self.live.judge(radiograph, shot)

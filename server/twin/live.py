@@ -32,7 +32,7 @@ from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.physics.exposure import ExposureSettings
 from flexdt.twin.physics.radiograph import Radiograph
 from flexdt.twin.scanner.scanner import ScannerTwin
-from flexdt.twin.scanner.state import Correction, Sample, TubeState
+from flexdt.twin.scanner.state import NamedCorrection, Sample, TubeSettings
 
 FRAME_INTERVAL_S = 0.04
 """Real seconds between live projections, at least."""
@@ -48,8 +48,8 @@ class Shot:
     positions: tuple[tuple[str, float], ...]
     camera: CameraSettings
     sample: Sample
-    tube: TubeState
-    correction: Correction | None
+    tube: TubeSettings
+    correction: NamedCorrection | None
 
     @classmethod
     def of(cls, scanner: ScannerTwin, now: float) -> Shot:

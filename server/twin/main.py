@@ -40,7 +40,7 @@ def speed_up_of(text: str) -> SpeedUp:
         LimitError: not a positive number and not "max".
     """
     try:
-        return check_speed_up(text if text == "max" else float(text))
+        return check_speed_up("max" if text.strip().lower() == "max" else float(text))
     except ValueError:
         return check_speed_up(text)
 

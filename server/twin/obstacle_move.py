@@ -31,7 +31,7 @@ class Way:
 
 @dataclass(eq=False, repr=False)
 class ObstacleMoves:
-    """Plans and executes ways around obstacles, one at a time.
+    """Plans and executes paths around obstacles, one at a time.
 
     Attributes:
         scanner, clock, stage: see their modules.

@@ -11,14 +11,14 @@ from flexdt.twin.collision.scene_search import NearestPair
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
-from flexdt.twin.scanner.joining import Stopping
-from flexdt.twin.scanner.state import Correction, Readout, Safety, TubeState
+from flexdt.twin.scanner.joining import StopMotion
+from flexdt.twin.scanner.state import NamedCorrection, Readout, Safety, TubeSettings
 
 SAFETY_NAMES = {"ready": "ok", "blocked": "aborted", "estopped": "estop"}
 """The twin's safety states as the wire names them."""
 
 
-def tube_view(tube: TubeState, now: float) -> w.TubeState:
+def tube_view(tube: TubeSettings, now: float) -> w.TubeState:
     """The tube at `now`."""
     return w.TubeState(
         on=tube.on,
@@ -66,7 +66,7 @@ def safety_view(safety: Safety, clearance: NearestPair | None, margin_mm: float)
     )
 
 
-def correction_view(correction: Correction | None, source: str | None) -> w.Correction | None:
+def correction_view(correction: NamedCorrection | None, source: str | None) -> w.Correction | None:
     """A correction, in mm and deg."""
     if correction is None:
         return None
@@ -80,7 +80,7 @@ def clock_view(clock: TwinClock) -> w.ClockState:
     )
 
 
-def stopped_view(state: w.State, stopping: Stopping, now: float) -> w.Stopped:
+def stopped_view(state: w.State, stopping: StopMotion, now: float) -> w.Stopped:
     """The state after a stop, and how the motors come to rest."""
     hit = stopping.would_hit
     how = w.Stopping(

@@ -29,7 +29,7 @@ from flexdt.clients.cli.entry import run
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration import Detections, detect_beads
 from flexdt.twin.calibration.frame_source import nothing
-from flexdt.twin.calibration.pipeline import Request
+from flexdt.twin.calibration.pipeline import CalibrationRequest
 from flexdt.twin.calibration.unknown_markers import link, triangulate
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.offsets import NOMINAL
@@ -335,7 +335,7 @@ def test_what_is_wrong_with_unknown_markers_is_named(change: Any, code: str | No
     _, angles, _, markers = study.marked(1, 12, 8, 0.1, 0.0)
     data = markers_alone(study.geometry(angles), "marks")
     marked = replace(markers, tracks=np.array(change(markers.tracks)))
-    found, _ = calibrate_unknown(data, None, marked, Request(free=("dO_x",)))
+    found, _ = calibrate_unknown(data, None, marked, CalibrationRequest(free=("dO_x",)))
     codes = [f.code for f in found.findings]
     assert codes == [] if code is None else code in codes
     assert found.identifiable == (code is None)
@@ -373,7 +373,7 @@ def test_poses_do_not_matter() -> None:
     own = Poses([0, 0, 0], [0, SOD, 0], [0, SDD, 0], u, v, np.radians(angles))
     found = []
     for data in (told, replace(told, nominal=own)):
-        result, _ = calibrate_unknown(data, None, markers, Request(free=("dO_x",)))
+        result, _ = calibrate_unknown(data, None, markers, CalibrationRequest(free=("dO_x",)))
         assert result.fit is not None
         found.append(result.fit)
     assert found[0].beads == pytest.approx(found[1].beads, abs=1e-3)

@@ -24,7 +24,7 @@ from flexdt.clients.calibration.compare import compare_folder, write_comparison,
 from flexdt.clients.cli.entry import run
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.phantoms import load_phantom
-from flexdt.twin.calibration.pipeline import Request
+from flexdt.twin.calibration.pipeline import CalibrationRequest
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
@@ -135,7 +135,7 @@ def test_two_scans_in_one_fit(copy: Path, folder: Path) -> None:
     apart = calibrate_datasets(
         [load_dataset(copy), load_dataset(folder)],
         "lego",
-        Request(per_scan=("alpha", "tau_x", "tau_z")),
+        CalibrationRequest(per_scan=("alpha", "tau_x", "tau_z")),
     ).document["parameters"]
     assert apart["alpha@0"]["value"] == pytest.approx(33.0, abs=0.1)  # type: ignore[index]
     assert apart["alpha@1"]["value"] == pytest.approx(33.0, abs=0.1)  # type: ignore[index]
@@ -178,14 +178,14 @@ def test_some_of_the_same_images_are_no_second_scan(
 
 def test_what_cannot_be_asked_for(folder: Path) -> None:
     with pytest.raises(UnknownNameError, match="unknown parameter 'foo'; allowed: dO_x"):
-        calibrate_datasets([load_dataset(folder)], "lego", Request(free=("dO_x", "foo")))
+        calibrate_datasets([load_dataset(folder)], "lego", CalibrationRequest(free=("dO_x", "foo")))
     with pytest.raises(TwinError, match="no parameter is free"):
-        Request(free=())
+        CalibrationRequest(free=())
     for tolerance in (-1.0, float("nan"), float("inf")):
         with pytest.raises(TwinError, match="bead tolerance"):
-            Request(bead_tolerance_mm=tolerance)
+            CalibrationRequest(bead_tolerance_mm=tolerance)
     with pytest.raises(TwinError, match="tau_x is to have a value in each scan but is not free"):
-        Request(free=("dO_x",), per_scan=("tau_x",))
+        CalibrationRequest(free=("dO_x",), per_scan=("tau_x",))
 
 
 def test_missing_and_broken_frames_are_named_and_survived(copy: Path) -> None:

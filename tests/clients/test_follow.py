@@ -20,7 +20,7 @@ import zmq.asyncio
 from flexdt.clients.cli.entry import run
 from flexdt.clients.client.async_client import AsyncTwinClient
 from flexdt.clients.following.read_only_twin import ReadOnlyTwin
-from flexdt.clients.following.session import FramesBeside, Session, endpoint
+from flexdt.clients.following.session import FollowSession, FramesBeside, endpoint
 from flexdt.phantoms import load_phantom
 from flexdt.protocol import RpcError
 from flexdt.runtime.access import AccessError
@@ -44,10 +44,10 @@ async def until(holds: Callable[[], bool]) -> None:
             await asyncio.sleep(0.01)
 
 
-def session(tmp_path: Path | None = None) -> tuple[Session, list[Alarm]]:
+def session(tmp_path: Path | None = None) -> tuple[FollowSession, list[Alarm]]:
     alarms: list[Alarm] = []
     follower = Follower(FLEXRAY, builtin_profile(FLEXRAY.default_profile))
-    return Session(follower, alarms.append), alarms
+    return FollowSession(follower, alarms.append), alarms
 
 
 def test_it_mirrors_records_and_comes_back_and_sends_nothing(tmp_path: Path) -> None:

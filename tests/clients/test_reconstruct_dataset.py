@@ -38,7 +38,7 @@ from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.physics.spectrum import Filter, TubeModel
 from flexdt.twin.projection import Volume
-from flexdt.twin.scanner.state import Correction, Sample
+from flexdt.twin.scanner.state import NamedCorrection, Sample
 from flexdt.twin.script import parse_script, plan_script
 from flexdt.twin.script.compose import ScanRequest, compose_script
 
@@ -61,7 +61,7 @@ def scan(root: Path, name: str, truth: Offsets, *, corrected: bool, physics: str
         SampleStore(open_data(root / "s")),
         M.detector.pixels,
     )
-    correction = Correction("found", "2026-01-02", truth) if corrected else None
+    correction = NamedCorrection("found", "2026-01-02", truth) if corrected else None
     record = ScanRecord.from_plan(
         plan, name=name, started=datetime(2026, 1, 2), sample=SampleRecord(name="lego"),
         noise=NoiseRecord(3, {}), correction=correction,

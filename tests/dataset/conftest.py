@@ -14,7 +14,7 @@ from flexdt.twin.dataset.record import FrameBlock, NoiseRecord, SampleRecord, Sc
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
-from flexdt.twin.scanner.state import Correction
+from flexdt.twin.scanner.state import NamedCorrection
 
 Image = npt.NDArray[np.uint16]
 AT = {"ver_tube": 26.5, "ver_det": 21.0, "tra_tube": 1.25, "tra_det": 24.0, "tra_obj": 2.5,
@@ -59,7 +59,7 @@ def make_record(name: str = "scan", frames: int = 5, **changes: object) -> ScanR
         "complete": True,
         "sample": SampleRecord("bricks", "Ada", diameter_mm=30.0),
         "noise": NoiseRecord(7, {"i0_counts": 12000.0}),
-        "correction": Correction("c1", "2026-03-13", Offsets.from_edge({"dO_x": 0.5})),
+        "correction": NamedCorrection("c1", "2026-03-13", Offsets.from_edge({"dO_x": 0.5})),
         "flat_axis": "tra_obj",
         "version": "0.1",
     }

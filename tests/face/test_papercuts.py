@@ -56,6 +56,25 @@ def test_nothing_at_all_is_refused(call: Callable[[], object], told: str) -> Non
         call()
 
 
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (lambda: fx.simulate(SCAN, BALL), "cone_vec: a dict; allowed: an array of numbers"),
+        (lambda: fx.Tube(kV="90"), "kV is '90', no number; allowed: 20 to 240 kV"),
+        (lambda: fx.Detector(bits="14"), "bits is '14', no number"),
+        (lambda: fx.Tube(filters="Al 0.5mm"), "filter 'A'; allowed: .FORMULA@DENSITY, thickness"),
+        (lambda: fx.Tube(filters=[("Al@2.70", "0.5")]), "filter Al@2.70 is '0.5', no number"),
+        (lambda: fx.simulate(BALL, SCAN, exposure_ms="9"), "exposure_ms is '9', no number"),
+        (lambda: fx.Volume("part.stl", 1.0), "volume data: a str; allowed: an array of numbers"),
+        (lambda: fx.sirt(np.zeros((16, 16, 16)), SCAN, fx.Grid((4, 4, 4), 1.0), iterations="9"),
+         "iterations is '9'; allowed: a whole number from 1"),
+    ],
+)  # fmt: skip
+def test_values_of_another_kind_get_a_sentence(call: Callable[[], object], told: str) -> None:
+    with pytest.raises(fx.TwinError, match=told):
+        call()
+
+
 def test_positions_outside_the_travel_are_not_a_pose() -> None:
     machine = builtin_machine()
     profile, camera = builtin_profile("thesis"), machine.detector.camera

@@ -22,7 +22,7 @@ import tifffile
 import zmq
 
 from flexdt.clients.datasets.dataset import load_dataset
-from flexdt.clients.following.session import Session
+from flexdt.clients.following.session import FollowSession
 from flexdt.clients.launch.processes import Servers
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
@@ -400,7 +400,7 @@ def test_who_follows_the_gateway_sees_where_its_machine_differs(
     machine = flexray.model_copy(update={"axes": {**flexray.axes, **known}})
     alarms: list[tuple[str, str]] = []
     follower = Follower(machine, builtin_profile(flexray.default_profile))
-    session = Session(follower, lambda a: alarms.append((a.kind, a.about)))
+    session = FollowSession(follower, lambda a: alarms.append((a.kind, a.about)))
 
     async def until(holds: Callable[[], bool]) -> None:
         async with asyncio.timeout(90):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from flexdt.protocol.acquila import (
     AcquilaError,
-    Event,
+    AcquilaEvent,
     Exchange,
     ReplyType,
     format_event,
@@ -135,7 +135,7 @@ def test_an_argument_may_be_binary() -> None:
 @settings(max_examples=40, deadline=None)
 @given(component=WORD, arg=st.text(max_size=40), uuid=st.integers(0, 2**64 - 1))
 def test_events_survive_the_wire(component: str, arg: str, uuid: int) -> None:
-    event = Event(component.strip(), "move absolute", arg, uuid=uuid, tick_count=7)
+    event = AcquilaEvent(component.strip(), "move absolute", arg, uuid=uuid, tick_count=7)
     assert parse_event(format_event(event)) == event
 
 

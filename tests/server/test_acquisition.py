@@ -22,7 +22,7 @@ from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.physics.exposure import ExposureSettings, IdealResponse, expose, frame_rng
-from flexdt.twin.scanner.state import Placement, Sample
+from flexdt.twin.scanner.state import Sample, StagePlacement
 from flexdt.twin.script.parse import parse_script
 from flexdt.twin.script.planning.planner import plan_script
 
@@ -116,7 +116,7 @@ def test_an_empty_stage_needs_no_projector_and_offsets_reach_it(tmp_path: Path) 
     assert not blank.any()
     assert projector.angles == []
     # A sample turned by 10 degrees sees the source 10 degrees less far round.
-    asyncio.run(imaging.line_integrals(Sample("lego", Placement(rz=10.0)), pose, camera))
+    asyncio.run(imaging.line_integrals(Sample("lego", StagePlacement(rz=10.0)), pose, camera))
     assert projector.angles == pytest.approx([20.0])
 
 

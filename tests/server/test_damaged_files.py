@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import pytest
 from faults import READS, damaged, starts
 from simulation import Simulation
 from whole_run import PARTS, Part, voxels
+
+from flexdt.runtime.files.directory import Directory
 
 
 @pytest.fixture(scope="module")
@@ -47,12 +50,62 @@ def on(whole: Path, root: Path, damage: Callable[[Path], object]) -> dict[str, A
             ],
             "told": [e["data"]["message"] for e in client.of("log")],
             "logged": [r.getMessage() for r in sim.log if r.levelname == "ERROR"],
+            "facts": [getattr(r, "facts", {}) for r in sim.log],
             "aside": sorted(str(f.relative_to(sim.data)) for f in sim.data.rglob("*unreadable*")),
         }
 
 
 def correction(data: Path, name: str) -> Path:
     return next((data / "corrections").glob(f"*{name}.json"))
+
+
+def test_files_that_claim_any_size_are_not_read(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sparse files of 8 GB, under every name that is read whole, take no room and no memory."""
+    taken, real = list[int](), Directory.open
+
+    def opened(folder: Directory, name: str) -> Counted:
+        return Counted(real(folder, name), taken)
+
+    def damage(data: Path) -> None:
+        for name in names:
+            os.truncate(data / name, 8 << 30)
+
+    files = [f.relative_to(whole) for f in whole.rglob("*") if f.is_file()]
+    names = [f for f in files if f.suffix in (".json", ".bin")]
+    assert {"state.json", "corrections", "jobs", "samples"} <= {f.parts[0] for f in names}
+    monkeypatch.setattr(Directory, "open", opened)
+    found = on(whole, tmp_path, damage)
+    assert max(taken, default=0) < 1 << 20
+    assert found["state"]["sample"]["name"] is None
+    assert (found["corrections"], found["uploads"]) == ([], [])
+    assert {"state.unreadable.json"} < set(found["aside"])
+    reasons = [said["reason"] for said in found["facts"] if "reason" in said]
+    assert sum("8589934592 bytes" in reason for reason in reasons) >= 4
+
+
+class Counted:
+    """A file, and the sizes of what is read of it."""
+
+    def __init__(self, file: BinaryIO, taken: list[int]) -> None:
+        self.file, self.taken = file, taken
+
+    def __enter__(self) -> Counted:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.file.close()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.file, name)
+
+    def read(self, size: int = -1) -> bytes:
+        whole = os.fstat(self.file.fileno()).st_size
+        self.taken.append(whole if size < 0 else min(size, whole))
+        if self.taken[-1] > 1 << 30:
+            raise MemoryError
+        return self.file.read(size)
 
 
 def test_a_damaged_correction_in_force_leaves_the_twin_nominal(whole: Path, tmp_path: Path) -> None:

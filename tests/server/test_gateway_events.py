@@ -31,7 +31,7 @@ from flexdt.protocol.acquila import (
     FIELDS,
     MAX_BYTES,
     AcquilaError,
-    Event,
+    AcquilaEvent,
     format_event,
     parse_event,
 )
@@ -173,7 +173,7 @@ def test_no_event_ends_the_loop(data: bytes, tmp_path_factory: pytest.TempPathFa
         twin = ConnectedTwin(Nowhere(), tmp_path_factory.getbasetemp())  # type: ignore[arg-type]
         twin.axes = ("mag_obj", "rot_obj")
         gateway = Gateway(twin, "127.0.0.1", 0)
-        said: list[Event] = []
+        said: list[AcquilaEvent] = []
         gateway._send = said.append  # type: ignore[method-assign, assignment]
         try:
             gateway._receive([data])

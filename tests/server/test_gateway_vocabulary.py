@@ -14,7 +14,7 @@ from flexdt.clients.gateway.vocabulary import (
     known_commands,
     read_command,
 )
-from flexdt.protocol.acquila import Event
+from flexdt.protocol.acquila import AcquilaEvent
 from flexdt.runtime.access import AccessError
 from flexdt.twin.machine.description import builtin_machine, builtin_machines
 from flexdt.twin.script import commands as c
@@ -24,7 +24,7 @@ AXES = (*builtin_machine().axes, *builtin_machine().virtual_axes)
 
 
 def read(component: str, command: str, arg1: str = "", arg2: str = "") -> c.Command:
-    return read_command(Event(component, command, arg1, arg2), AXES)
+    return read_command(AcquilaEvent(component, command, arg1, arg2), AXES)
 
 
 def test_commands_are_the_scripts_own() -> None:
@@ -44,9 +44,9 @@ def test_names_of_axes_are_the_machines_own_in_any_case() -> None:
         for name in axes:
             for asked in (name, name.upper(), name.lower()):
                 assert component_type(asked, axes) == "motor"
-                made = read_command(Event(asked, "move absolute", "10"), axes)
+                made = read_command(AcquilaEvent(asked, "move absolute", "10"), axes)
                 assert made == c.MoveAbsolute(component=name, target=10.0)
-                made = read_command(Event(asked, "status_position_get"), axes)
+                made = read_command(AcquilaEvent(asked, "status_position_get"), axes)
                 assert made == Question(path=("axes", name, "position"))
 
 
@@ -101,14 +101,14 @@ def test_the_transcript_is_a_script() -> None:
     asked = [("tube", "set kV", "90", ""), ("rot_obj", "move absolute", "360", "0"),
              ("camera", "take and save image sequence", "E:\\x\\scan_", "0"),
              ("scanner", "set output path", "E:\\a\tb", "")]  # fmt: skip
-    lines = [transcript_line(Event(*words), read(*words)) for words in asked]
+    lines = [transcript_line(AcquilaEvent(*words), read(*words)) for words in asked]
     assert None not in lines
     script = parse_script("\r\n".join(map(str, lines)))
     assert [type(command) for command in script.commands] == [
         c.SetVoltage, c.MoveAbsolute, c.TakeSequence, c.SetOutputPath,
     ]  # fmt: skip
     assert script.commands[1].wait is c.Wait.POS
-    assert transcript_line(Event("rot_obj", "stop"), read("rot_obj", "stop")) is None
+    assert transcript_line(AcquilaEvent("rot_obj", "stop"), read("rot_obj", "stop")) is None
 
 
 def test_only_this_machine_may_connect() -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from flexdt.protocol import Codec, Connection, Message, Prepared, RpcError
-from flexdt.server.twin.core import Control
+from flexdt.server.twin.core import ControlLease
 from flexdt.server.twin.hub import Hub, ImageWish
 from tests.support.simulated_loop import SimulatedLoop
 
@@ -133,7 +133,7 @@ def test_each_view_is_rendered_once_however_many_listen() -> None:
 
 
 def test_control_is_taken_implicitly_given_back_and_forced() -> None:
-    control = Control()
+    control = ControlLease()
     control.require("a", "axes.move")
     with pytest.raises(RpcError, match="a is the controller") as e:
         control.require("b", "session.control")

@@ -31,7 +31,7 @@ from flexdt.runtime.files.own_documents import used_bytes
 from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.scans import job as job_module
 from flexdt.server.scans.job import Retry, transient
-from flexdt.server.twin.core import Control
+from flexdt.server.twin.core import ControlLease
 from flexdt.twin.dataset.dataset_errors import DiskFullError
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
@@ -130,7 +130,7 @@ def test_limits_hold_in_a_process(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 def test_a_silent_controller_gives_way_to_whoever_asks() -> None:
     now = [0.0]
-    control = Control(10.0, lambda: now[0])
+    control = ControlLease(10.0, lambda: now[0])
     control.require("a", "session.control")
     now[0] = 9.0
     with pytest.raises(RpcError):

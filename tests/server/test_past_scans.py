@@ -10,6 +10,7 @@ import shutil
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -164,6 +165,31 @@ def test_the_nearest_parts_are_those_the_check_finds(server: Process, data: Path
     assert bare == near
     assert all(mm is not None for mm in near)
     assert min(mm for mm in near if mm is not None) > 0.2 * checked
+
+
+def test_mean_counts_that_were_late_are_read_the_next_time(
+    server: Process, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(data / "first scan", tmp_path / "scan")
+    clock = SimpleNamespace(now=0.0, monotonic=lambda: clock.now)
+
+    def slow(path: Path) -> Any:
+        clock.now += past_scans.MEASURE_S / 2
+        return tifffile.imread(path)
+
+    monkeypatch.setattr(past_scans, "time", clock)
+    monkeypatch.setattr(past_scans, "read_image", slow)
+    known = [0]
+    while True:
+        told = asked(tmp_path, DatasetGet(name="scan", measure=True))
+        there = [mean for mean in told["counts"] if mean is not None]
+        assert len(there) > known[-1]
+        known.append(len(there))
+        if len(there) == told["images"]:
+            break
+    assert len(known) > 3
+    images = [tifffile.imread(tmp_path / "scan" / file) for file in told["files"]]
+    assert there == pytest.approx([float(image.mean()) for image in images], rel=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexdt.protocol import RpcError
-from flexdt.protocol.projector import Grid
+from flexdt.protocol.projector import VoxelGrid
 from flexdt.server.projector.compute import FairQueue
 from flexdt.server.projector.volumes import SOLID_BYTES, VolumeStore
 from flexdt.twin.projection import Volume
@@ -77,7 +77,7 @@ def test_removing_and_closing() -> None:
     assert queue.take() is None
 
 
-GRID = Grid(shape=(2, 3, 4), voxel_mm=(1.0, 1.0, 1.0))
+GRID = VoxelGrid(shape=(2, 3, 4), voxel_mm=(1.0, 1.0, 1.0))
 DATA = np.arange(24, dtype=np.float32)
 
 

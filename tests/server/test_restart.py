@@ -141,7 +141,8 @@ def test_an_estop_survives_a_kill_and_positions_in_flight_are_nearly_kept(
         process.end()
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"null", b'{"schema": 99}', b"\xff" * 99])
+@pytest.mark.daily(1)
+@pytest.mark.parametrize("content", [b"{", b"", b"null", b'{"schema": 99}', b"\xff" * 99])
 def test_a_broken_memory_is_set_aside_and_the_twin_starts(
     content: bytes, rays: Process, tmp_path: Path
 ) -> None:

@@ -18,7 +18,7 @@ from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.motion import profiles as motion
 from flexdt.twin.scanner.safety import Contact, Guard
-from flexdt.twin.scanner.state import Placement, Sample
+from flexdt.twin.scanner.state import Sample, StagePlacement
 
 M = builtin_machine()
 
@@ -43,7 +43,7 @@ def test_a_guard_is_of_one_correction(tmp_path: Path) -> None:
 
 def test_the_sample_on_the_stage_decides(tmp_path: Path) -> None:
     stage = Stage(M, builtin_profile(M.default_profile), SampleStore(open_data(tmp_path)))
-    far_out = Sample("lego", Placement(y=200.0))
+    far_out = Sample("lego", StagePlacement(y=200.0))
     guards = [stage.guard(s) for s in (Sample(), Sample("lego"), far_out)]
     contacts = [approach(g) for g in guards if g is not None]
     assert [c.pair for c in contacts] == [

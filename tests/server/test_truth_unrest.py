@@ -12,7 +12,7 @@ from flexdt.twin.errors import MachineFileError
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.machine.kinematics import poses
-from flexdt.twin.scanner.state import Placement
+from flexdt.twin.scanner.state import StagePlacement
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)
@@ -26,7 +26,7 @@ def turn(n: int):
 
 def shadow(truth: TrueGeometry, n: int, times: object = None) -> np.ndarray:
     """Where the object's origin is seen, (n, 2) [pixels]."""
-    return truth.cone_vec(turn(n), Placement(), times).project_points(AXIS, SHAPE)[:, 0]  # type: ignore[arg-type]
+    return truth.cone_vec(turn(n), StagePlacement(), times).project_points(AXIS, SHAPE)[:, 0]  # type: ignore[arg-type]
 
 
 def test_vibration_has_the_size_asked_for_and_repeats() -> None:
@@ -49,14 +49,14 @@ def test_the_spot_wanders_while_the_tube_warms_up() -> None:
     unrest = HiddenMotion(spot_drift_mm=(0.02, -0.01), spot_drift_s=100.0)
     truth = TrueGeometry(NOMINAL, unrest)
     nominal = turn(3).cone_vec()
-    moved = truth.cone_vec(turn(3), Placement(), [0.0, 100.0, 1e6])
+    moved = truth.cone_vec(turn(3), StagePlacement(), [0.0, 100.0, 1e6])
     steps = np.linalg.norm(moved.source - nominal.source, axis=1)
     full = np.hypot(0.02, 0.01)
     np.testing.assert_allclose(steps, [0.0, full * (1 - np.exp(-1)), full], atol=1e-9)
     np.testing.assert_allclose(moved.detector, nominal.detector)
     up = moved.source[2] - nominal.source[2]
     assert up[2] == pytest.approx(-0.01)
-    at_start = truth.cone_vec(turn(3), Placement())
+    at_start = truth.cone_vec(turn(3), StagePlacement())
     np.testing.assert_allclose(at_start.rows, nominal.rows)
 
 

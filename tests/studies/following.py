@@ -27,7 +27,7 @@ import zmq
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from flexdt.clients.following.session import Session
+from flexdt.clients.following.session import FollowSession
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Alarm, Mirror
@@ -67,7 +67,7 @@ class Bench:
             FLEXRAY, builtin_profile(FLEXRAY.default_profile), parse_script(SCRIPT),
             collision=collision_check(),
         )  # fmt: skip
-        self.session = Session(follower, self.alarms.append, changed=self._changed)
+        self.session = FollowSession(follower, self.alarms.append, changed=self._changed)
 
     def _changed(self, mirror: Mirror) -> None:
         self.seen.append((time.monotonic(), mirror))

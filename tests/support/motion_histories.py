@@ -24,7 +24,7 @@ from flexdt.twin.errors import CollisionError, TwinError
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import Machine, Profile, builtin_profile, parse_machine
 from flexdt.twin.scanner.scanner import ScannerTwin
-from flexdt.twin.scanner.state import Correction, Placement, Sample
+from flexdt.twin.scanner.state import NamedCorrection, Sample, StagePlacement
 
 Rng = np.random.Generator
 LOSS_MM = 0.01
@@ -185,7 +185,7 @@ class Subject:
         shape, offset = self.samples[which]
         if shape is None:
             return Sample(), ()
-        put = Placement(**offset)
+        put = StagePlacement(**offset)
         return Sample(f"s{which}", put), (
             hull(shape.corners() @ put.rotation.T + [put.x, put.y, put.z]),
         )
@@ -199,7 +199,9 @@ class Subject:
         s = ScannerTwin(self.machine, self.profile, self.now)
         s.place(positions, self.now)
         put = _correction(self.correction)
-        s.stand(self._value(self.which)[0], put, self._guard(self.which, self.correction), self.now)
+        s.initialise_stage(
+            self._value(self.which)[0], put, self._guard(self.which, self.correction), self.now
+        )
         return s
 
     @property
@@ -362,8 +364,10 @@ class Subject:
         return out
 
 
-def _correction(values: Mapping[str, float]) -> Correction | None:
-    return Correction("drawn", "2026-01-01", Offsets.from_edge(dict(values))) if values else None
+def _correction(values: Mapping[str, float]) -> NamedCorrection | None:
+    return (
+        NamedCorrection("drawn", "2026-01-01", Offsets.from_edge(dict(values))) if values else None
+    )
 
 
 @dataclass

@@ -40,7 +40,7 @@ from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import builtin_profile, parse_machine
 from flexdt.twin.motion import profiles as motion
 from flexdt.twin.scanner.scanner import ScannerTwin
-from flexdt.twin.scanner.state import Correction, Placement, Sample
+from flexdt.twin.scanner.state import NamedCorrection, Sample, StagePlacement
 
 MACHINES = ("flexray", "rig", "mini")
 VERBS = ("move", "jog", "lease end", "stop", "programme", "pause", "resume", "abort", "sample",
@@ -111,7 +111,7 @@ def pieces(sample: Json | None) -> tuple[Polytope, ...]:
     solid = shape(sample)
     if sample is None or solid is None:
         return ()
-    o = Placement(**sample["offset"])
+    o = StagePlacement(**sample["offset"])
     return (hull(solid.corners() @ o.rotation.T + [o.x, o.y, o.z]),)
 
 
@@ -168,7 +168,9 @@ class Episode:
         scanner = ScannerTwin(self.machine, self.profile, self.now)
         scanner.place(positions, self.now)
         guard = self._guard(self.sample, self.correction)
-        scanner.stand(_sample(self.sample), _correction(self.correction), guard, self.now)
+        scanner.initialise_stage(
+            _sample(self.sample), _correction(self.correction), guard, self.now
+        )
         return scanner
 
     def _guard(self, sample: Json | None, correction: Json | None) -> Any:
@@ -503,13 +505,15 @@ class Episode:
 
 
 def _sample(sample: Json | None) -> Sample:
-    return Sample() if sample is None else Sample(sample["kind"], Placement(**sample["offset"]))
+    return (
+        Sample() if sample is None else Sample(sample["kind"], StagePlacement(**sample["offset"]))
+    )
 
 
-def _correction(values: Json | None) -> Correction | None:
+def _correction(values: Json | None) -> NamedCorrection | None:
     if values is None:
         return None
-    return Correction("drawn", "2026-01-01", Offsets.from_edge(values))
+    return NamedCorrection("drawn", "2026-01-01", Offsets.from_edge(values))
 
 
 # Drawing ----------------------------------------------------------------------------------------

@@ -92,7 +92,7 @@ class Simulation:
         self._time = 0.0
         self._lock: Callable[[], None] | None = None
         self._clients = 0
-        self._handler = _Kept(self.log)
+        self._handler = _LogRecords(self.log)
         self._watched = self.disk.watched()
 
     def __enter__(self) -> Simulation:
@@ -236,7 +236,7 @@ async def _of(task: asyncio.Task[T]) -> T:
     return await task
 
 
-class _Kept(logging.Handler):
+class _LogRecords(logging.Handler):
     def __init__(self, records: list[logging.LogRecord]) -> None:
         super().__init__()
         self._records = records

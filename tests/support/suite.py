@@ -59,6 +59,27 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: (item.path not in long, -count[item.path]))
 
 
+BEGUN = pytest.StashKey[float]()
+
+
+def processor_s() -> float:
+    """Processor time of this process and of the children that it has waited for [s]."""
+    spent = os.times()
+    return spent.user + spent.system + spent.children_user + spent.children_system
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    item.stash[BEGUN] = processor_s()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> None:
+    """What a test takes of the processor, fixtures included, goes into the file of durations."""
+    if call.when == "teardown":
+        item.user_properties.append(("processor_s", round(processor_s() - item.stash[BEGUN], 2)))
+
+
 @pytest.fixture(scope="module")
 def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("data")

@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 
-from flexdt.twin.collision.collision_scene import Scene
+from flexdt.twin.collision.collision_scene import CollisionScene
 from flexdt.twin.collision.scene_search import PathSearch, SweepResult
 from flexdt.twin.motion.profiles import Trajectory
 
 
 def sweep(
-    scene: Scene, trajectories: Mapping[str, Trajectory], start: float, end: float
+    scene: CollisionScene, trajectories: Mapping[str, Trajectory], start: float, end: float
 ) -> SweepResult:
     """The first contact; without one the least clearance, refined."""
     search = PathSearch(scene, scene.path(trajectories, start, end))

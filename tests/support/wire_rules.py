@@ -43,7 +43,17 @@ from flexdt.twin.errors import TwinError
 SPEED_UPS = (1.0, 7.3, 60.0, 1000.0, "max")
 BOXES = ((20, 30, 40), (180, 20, 30), (300, 20, 20), (90, 90, 90), (120, 260, 60), (40, 60, 220))
 DRUMS = ((30, 40), (140, 60), (260, 30), (60, 200))
-WATCHED = ("move", "jog", "stop", "estop", "reset", "place", "follow", "take_stage", "stand")
+WATCHED = (
+    "move",
+    "jog",
+    "stop",
+    "estop",
+    "reset",
+    "place",
+    "follow",
+    "take_stage",
+    "initialise_stage",
+)
 """What changes the scanner's motion or its stage."""
 
 
@@ -239,7 +249,7 @@ class WireEpisode:
         for pair, d in zip(new.pairs, new.clearances(pose).tolist(), strict=True):
             free = self.model.margin - 0.02
             was = before.get(pair.names, math.inf)
-            if name == "stand" or (was <= 0.0 and d <= 0.0):
+            if name == "initialise_stage" or (was <= 0.0 and d <= 0.0):
                 continue  # the past cannot be helped; how deep they overlap cannot be told
             if d < free and d < was - 0.02:
                 kind = "contact" if d <= 0.0 else "margin"

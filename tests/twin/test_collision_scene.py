@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from swept import sweep
 
-from flexdt.twin.collision.collision_scene import PairStack, Scene, build_scene, scene_of
-from flexdt.twin.collision.convex_solids import Cylinder, box
+from flexdt.twin.collision.collision_scene import CollisionScene, PairStack, build_scene, scene_of
+from flexdt.twin.collision.convex_solids import UprightCylinder, box
 from flexdt.twin.collision.scene_search import clearance, touching
 from flexdt.twin.collision.stages import Body
 from flexdt.twin.collision.sweep import Limits
@@ -83,7 +83,7 @@ def geometry(source: tuple, detector: tuple, obj: tuple) -> tuple[dict[str, floa
     return {n: float(v) for n, v in motors.items()}, float(obj[1])
 
 
-def scene(profile: str = "thesis", *samples: object, margin: float | None = None) -> Scene:
+def scene(profile: str = "thesis", *samples: object, margin: float | None = None) -> CollisionScene:
     return build_scene(M, builtin_profile(profile), samples, margin_mm=margin)  # type: ignore[arg-type]
 
 
@@ -91,7 +91,7 @@ def phantom(name: str, height: float) -> object:
     return box(np.array(TABLE_6_2[name]) + 4.0, (0.0, 0.0, height - M.sample_height_mm))
 
 
-def full_turn(s: Scene, motors: dict[str, float]) -> FloatArray:
+def full_turn(s: CollisionScene, motors: dict[str, float]) -> FloatArray:
     """Sweep one turn of the stage; returns its least clearance."""
     standing = {n: motion.at_rest(v) for n, v in motors.items()}
     turn = motion.move(0.0, 0.0, 360.0, 45.0, 22.5, 0.0)
@@ -275,8 +275,10 @@ def test_bodies_follow_the_correction_in_force(seed: int) -> None:
 
 def test_a_cylinder_sample_off_the_axis_is_held_by_its_prism() -> None:
     correction = Offsets.from_edge({"tau_x": 5.0, "axis_tilt_x": 2.0})
-    s = build_scene(M, builtin_profile("thesis"), [Cylinder((0, 0, 0), 30.0, 40.0)], correction)
-    plain = build_scene(M, builtin_profile("thesis"), [Cylinder((0, 0, 0), 30.0, 40.0)])
+    s = build_scene(
+        M, builtin_profile("thesis"), [UprightCylinder((0, 0, 0), 30.0, 40.0)], correction
+    )
+    plain = build_scene(M, builtin_profile("thesis"), [UprightCylinder((0, 0, 0), 30.0, 40.0)])
     moved, upright = (next(b for b in x.bodies if b.name == "sample").solid for x in (s, plain))
     angle = math.radians(2.0)
     for x, y, z in np.random.default_rng(0).normal(size=(50, 3)):

@@ -16,8 +16,8 @@ from scipy.optimize import lsq_linear
 from scipy.spatial import ConvexHull
 from swept import sweep
 
-from flexdt.twin.collision.collision_scene import Scene, build_scene, scene_of
-from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid, box, hull
+from flexdt.twin.collision.collision_scene import CollisionScene, build_scene, scene_of
+from flexdt.twin.collision.convex_solids import ConvexSolid, Polytope, UprightCylinder, box, hull
 from flexdt.twin.collision.guard import SceneGuard, _Overlap
 from flexdt.twin.collision.nearest import separation_of
 from flexdt.twin.collision.paths import Path, path_of
@@ -44,12 +44,12 @@ RUNG = 0.0052
 
 
 def one_against(
-    moving: Solid,
-    fixed: Sequence[Solid],
+    moving: ConvexSolid,
+    fixed: Sequence[ConvexSolid],
     *,
     spin: Sequence[float] = (0.0, 0.0, 1.0),
     margin: float = MARGIN,
-) -> Scene:
+) -> CollisionScene:
     """`moving` on x, y and turn (right-handed about `spin`); `fixed` around it."""
     slides = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 0]])
     turns = np.array([0.0, 0.0, math.radians(1.0)])
@@ -68,8 +68,8 @@ def one_against(
     )
 
 
-def go(scene: Scene, targets: Mapping[str, float], start: Mapping[str, float] | None = None,
-       speed: float = 50.0) -> SweepResult:  # fmt: skip
+def go(scene: CollisionScene, targets: Mapping[str, float],
+       start: Mapping[str, float] | None = None, speed: float = 50.0) -> SweepResult:  # fmt: skip
     begin = start or {}
     trajectories = {
         n: motion.move(begin.get(n, 0.0), 0.0, targets.get(n, begin.get(n, 0.0)), speed, 50.0, 0.0)
@@ -127,7 +127,7 @@ def test_passing_by_finds_the_least_clearance_in_the_middle() -> None:
 
 def test_two_motors_at_once_meet_only_because_of_their_timing() -> None:
     """Along x then y the corner is cut; the sweep follows the real paths, not their ends."""
-    post = [Cylinder((60.0, 60.0, 0.0), 5.0, 50.0)]
+    post = [UprightCylinder((60.0, 60.0, 0.0), 5.0, 50.0)]
     scene = one_against(box((10, 10, 10)), post)
     together = go(scene, {"x": 120.0, "y": 120.0})
     assert together.contact is not None
@@ -157,7 +157,7 @@ def test_a_turning_bar_meets_a_wall_at_the_angle_of_trigonometry() -> None:
 
 
 def test_a_cylinder_turns_on_the_spot() -> None:
-    scene = one_against(Cylinder((0, 0, 0), 50.0, 20.0), [box((10, 100, 100), (56.2, 0, 0))])
+    scene = one_against(UprightCylinder((0, 0, 0), 50.0, 20.0), [box((10, 100, 100), (56.2, 0, 0))])
     result = go(scene, {"turn": 7200.0}, speed=90.0)
     assert result.contact is None
     assert result.looks <= 3
@@ -270,11 +270,11 @@ def test_pauses_cost_nothing() -> None:
 # Certificates -----------------------------------------------------------------------------------
 
 
-def solid_points(solid: Solid) -> FloatArray:
+def solid_points(solid: ConvexSolid) -> FloatArray:
     """Points whose hull is (for a cylinder: lies inside) the solid."""
     if isinstance(solid, Polytope):
         return solid.vertices
-    assert isinstance(solid, Cylinder)
+    assert isinstance(solid, UprightCylinder)
     a = np.linspace(0, 2 * math.pi, 48)
     rim = np.stack([solid.radius * np.cos(a), solid.radius * np.sin(a)], axis=1)
     ends = [np.c_[rim, np.full(48, z)] for z in (-solid.height / 2, solid.height / 2)]
@@ -296,13 +296,15 @@ def true_distance(a: FloatArray, b: FloatArray) -> float:
     return float(np.linalg.norm(weights @ differences) / weights.sum())
 
 
-def random_solid(rng: np.random.Generator) -> Solid:
+def random_solid(rng: np.random.Generator) -> ConvexSolid:
     kind = rng.integers(3)
     if kind == 0:
         return box(rng.uniform(0.1, 40, 3), rng.uniform(-20, 20, 3))
     if kind == 1:
         return hull(rng.normal(size=(rng.integers(4, 12), 3)) * rng.uniform(1, 20, 3))
-    return Cylinder((0.0, 0.0, float(rng.uniform(-9, 9))), rng.uniform(1, 20), rng.uniform(1, 30))
+    return UprightCylinder(
+        (0.0, 0.0, float(rng.uniform(-9, 9))), rng.uniform(1, 20), rng.uniform(1, 30)
+    )
 
 
 @settings(max_examples=60, deadline=None)
@@ -317,7 +319,7 @@ def test_the_certified_clearance_is_the_distance_and_never_more(seed: int) -> No
     points_b = solid_points(b) @ turns[1].T
     distance = true_distance(points_a, points_b)
     # The 47-gon lies up to r (1 - cos(pi / 47)) inside a cylinder's rim.
-    polygon = 0.0023 * sum(s.radius for s in (a, b) if isinstance(s, Cylinder))
+    polygon = 0.0023 * sum(s.radius for s in (a, b) if isinstance(s, UprightCylinder))
     assert gap <= distance + 1e-5
     assert gap >= distance - polygon - 2e-5
     if gap > 0:
@@ -504,14 +506,14 @@ def test_the_error_allowed_in_a_clearance_is_absolute_or_a_share_of_it() -> None
     assert [limits.slack(mm) for mm in (0.0, 2.0, 5.0, 50.0)] == [0.1, 0.1, 0.1, 1.0]
 
 
-def centred_solid(rng: np.random.Generator) -> Solid:
+def centred_solid(rng: np.random.Generator) -> ConvexSolid:
     kind = rng.integers(3)
     if kind == 0:
         return box(rng.uniform(2, 40, 3))
     if kind == 1:
         corners = rng.normal(size=(rng.integers(5, 12), 3)) * rng.uniform(4, 20, 3)
         return hull(corners - corners.mean(axis=0))
-    return Cylinder((0.0, 0.0, 0.0), rng.uniform(2, 20), rng.uniform(2, 30))
+    return UprightCylinder((0.0, 0.0, 0.0), rng.uniform(2, 20), rng.uniform(2, 30))
 
 
 def signed_distance(a: FloatArray, b: FloatArray) -> float:
@@ -528,7 +530,7 @@ def test_depth_of_an_overlap_and_what_is_left_of_it_on_the_way_out(seed: int) ->
     scene = one_against(centred_solid(rng), [centred_solid(rng)])
     [pair] = scene.all.pairs
     a, b = (scene.bodies[i] for i in pair)
-    polygon = 0.0023 * sum(s.solid.radius for s in (a, b) if isinstance(s.solid, Cylinder))
+    polygon = 0.0023 * sum(s.solid.radius for s in (a, b) if isinstance(s.solid, UprightCylinder))
 
     def truth(q: FloatArray) -> float:
         points = [solid_points(x.solid) @ x.rotation(float(q @ x.turns)).T + q @ x.slides
@@ -658,11 +660,11 @@ def test_a_solid_reaches_as_far_from_an_axis_as_its_farthest_point(seed: int) ->
     rng = np.random.default_rng(seed)
     for axis in (np.array([0.0, 0.0, 1.0]), rng.normal(size=3)):
         way = axis / np.linalg.norm(axis)
-        for solid in (random_solid(rng), Cylinder(tuple(rng.uniform(-9, 9, 3)), 5.0, 8.0)):
+        for solid in (random_solid(rng), UprightCylinder(tuple(rng.uniform(-9, 9, 3)), 5.0, 8.0)):
             points = solid_points(solid)
-            rounding = 0.0023 * solid.radius if isinstance(solid, Cylinder) else 1e-9
+            rounding = 0.0023 * solid.radius if isinstance(solid, UprightCylinder) else 1e-9
             held = points
-            if isinstance(solid, Cylinder) and way[2] != 1.0:  # the box around it
+            if isinstance(solid, UprightCylinder) and way[2] != 1.0:  # the box around it
                 half = np.array([solid.radius, solid.radius, solid.height / 2])
                 signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
                 held, rounding = np.array(solid.center) + signs * half, 1e-9
@@ -857,12 +859,12 @@ def test_the_end_that_is_nearest_along_a_direction_is_found(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(12))
 def test_the_farthest_point_along_a_direction_is_one_of_the_solid(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    round_one = Cylinder(tuple(rng.uniform(-9, 9, 3)), 5.0, 8.0)
+    round_one = UprightCylinder(tuple(rng.uniform(-9, 9, 3)), 5.0, 8.0)
     for direction in (np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]), rng.normal(size=3)):
         for solid in (random_solid(rng), round_one):
             point = solid.farthest(direction)
             assert point @ direction >= (solid_points(solid) @ direction).max() - 1e-9
-            if isinstance(solid, Cylinder):
+            if isinstance(solid, UprightCylinder):
                 across, along = (point - solid.center)[:2], (point - solid.center)[2]
                 assert math.hypot(*across) <= solid.radius + 1e-9
                 assert abs(along) <= solid.height / 2 + 1e-9

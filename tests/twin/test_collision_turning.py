@@ -76,7 +76,7 @@ def test_what_turns_round_between_two_turntables_is_seen(seed: int) -> None:
         bar = (box((2 * HALF, 2 * WIDE, 20.0)),)
         guard = SceneGuard(build_scene(made, profile, bar))
         twin = ScannerTwin(made, profile)
-        twin.stand(Sample(), None, guard, 0.0)
+        twin.initialise_stage(Sample(), None, guard, 0.0)
         twin.move({"Z": rng.uniform(90.0, 130.0)}, 0.0)
         for _ in range(2):
             start = twin.rest_time(0.0)
@@ -123,7 +123,9 @@ def test_turns_after_the_first_are_not_looked_at_again(monkeypatch: pytest.Monke
         costs, ends = [], []
         for turns in (3, 90):
             twin = ScannerTwin(made, profile)
-            twin.stand(Sample(), None, SceneGuard(build_scene(made, profile, (sample,))), 0.0)
+            twin.initialise_stage(
+                Sample(), None, SceneGuard(build_scene(made, profile, (sample,))), 0.0
+            )
             twin.move({"R": 45.0, "X": aside}, 0.0)
             twin.move({"Z": place}, start := twin.rest_time(0.0))
             start = twin.rest_time(start)

@@ -218,7 +218,7 @@ def test_what_overlaps_already_may_come_apart_and_nothing_else() -> None:
     s.guard, guard = None, s.guard
     s.move({"mag_obj": 400.0, "mag_det": 560.0, "ver_tube": 100.0}, 0.0)
     now = s.rest_time(0.0)
-    s.stand(Sample("long"), None, guard, now)
+    s.initialise_stage(Sample("long"), None, guard, now)
     scene = build_scene(M, P, [long])
     stuck = touching(scene, s.positions(now))
     assert ("detector_tower", "sample") in [pair for pair, _ in stuck]

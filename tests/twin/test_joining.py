@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flexdt.twin.collision.collision_scene import Scene, build_scene
+from flexdt.twin.collision.collision_scene import CollisionScene, build_scene
 from flexdt.twin.collision.convex_solids import Polytope, box, hull
 from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.scene_search import clearance
@@ -25,7 +25,7 @@ from flexdt.twin.motion.profiles import Piece, Trajectory
 from flexdt.twin.scanner.safety import Contact, Guard
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.stage_change import StageChange
-from flexdt.twin.scanner.state import Correction, Sample
+from flexdt.twin.scanner.state import NamedCorrection, Sample
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)
@@ -41,7 +41,7 @@ def moments(s: ScannerTwin, now: float) -> FloatArray:
     return np.linspace(now, s.rest_time(now), MOMENTS)
 
 
-def least(scene: Scene, s: ScannerTwin, now: float) -> float:
+def least(scene: CollisionScene, s: ScannerTwin, now: float) -> float:
     """Least clearance of the poses that the scanner will take, each looked at by itself [mm]."""
     return min(clearance(scene, s.positions(t)).mm for t in moments(s, now).tolist())
 
@@ -71,7 +71,9 @@ def set_off(rng: np.random.Generator, s: ScannerTwin, now: float) -> None:
             programme(rng, s, now)
 
 
-def changed(seed: int) -> tuple[ScannerTwin, Scene, float, str, dict[str, Trajectory], bool]:
+def changed(
+    seed: int,
+) -> tuple[ScannerTwin, CollisionScene, float, str, dict[str, Trajectory], bool]:
     """A scanner under way, a bar put on its stage: what came of it, and what was programmed."""
     rng = np.random.default_rng(seed)
     s = scanner()
@@ -81,7 +83,7 @@ def changed(seed: int) -> tuple[ScannerTwin, Scene, float, str, dict[str, Trajec
     now = rng.uniform(0.0, s.rest_time(0.0))
     before = {name: drive.ahead(now) for name, drive in s._drives.items()}
     bar = box((rng.uniform(150, 320), rng.uniform(10, 40), 30.0))
-    shift = Correction("moved", "2026-01-01", Offsets(dD_z=rng.uniform(-20.0, 5.0)))
+    shift = NamedCorrection("moved", "2026-01-01", Offsets(dD_z=rng.uniform(-20.0, 5.0)))
     scene = build_scene(M, P, [bar], shift.parameters)
     try:
         change = s.stage_change(Sample("bar"), shift, SceneGuard(scene), now).certified()
@@ -166,7 +168,7 @@ def test_a_programme_is_not_taken_over_where_the_world_has_changed_since_its_swe
 def test_a_start_that_touches_is_blocked_until_motion_has_brought_it_apart() -> None:
     s = ScannerTwin(M, P)
     guard = SceneGuard(build_scene(M, P, [box((1000.0, 1000.0, 20.0))]))
-    (warning,) = s.stand(Sample("slab"), None, guard, 0.0)
+    (warning,) = s.initialise_stage(Sample("slab"), None, guard, 0.0)
     assert "closer than the margin" in warning
     state = s.state(0.0).safety
     assert (state.state, "sample" in (state.contact or ())) == ("blocked", True)
@@ -407,7 +409,7 @@ def test_a_stage_that_overlaps_may_change_into_one_that_overlaps_less_and_no_dee
 
     s = ScannerTwin(M, P)
     s.place({"mag_obj": 600.0, "mag_det": 700.0}, 0.0)
-    s.stand(*bar(300.0), 0.0)
+    s.initialise_stage(*bar(300.0), 0.0)
     assert s.safety.contact is not None
     with pytest.raises(CollisionError, match="nothing changes"):
         s.stage_change(*bar(301.0), 0.0).certified()
@@ -422,7 +424,7 @@ def test_a_retreat_of_a_sample_with_thousands_of_corners_is_judged_soon() -> Non
     ball = hull(150.0 * points / np.linalg.norm(points, axis=1)[:, None])
     s = ScannerTwin(M, P)
     s.place({"mag_obj": 600.0, "mag_det": 700.0}, 0.0)
-    s.stand(Sample("ball"), None, SceneGuard(build_scene(M, P, [ball])), 0.0)
+    s.initialise_stage(Sample("ball"), None, SceneGuard(build_scene(M, P, [ball])), 0.0)
     with pytest.raises(CollisionError, match="nothing changes"):
         s.move({"mag_det": 690.0, "ver_det": 21.0}, 0.0)
     with pytest.raises(CollisionError, match="nothing changes"):

@@ -15,7 +15,7 @@ from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.scanner.readout import readout
 from flexdt.twin.scanner.scanner import ScannerTwin
-from flexdt.twin.scanner.state import Correction, Placement, Sample
+from flexdt.twin.scanner.state import NamedCorrection, Sample, StagePlacement
 
 M = builtin_machine()
 
@@ -193,8 +193,8 @@ def test_readouts_of_listing_1() -> None:
 def test_a_correction_replaces_the_last_and_shows_in_cone_vec_and_readout() -> None:
     s = scanner()
     nominal = s.cone_vec(0.0)
-    one = Correction("one", "2026-01-01T00:00:00Z", Offsets(dO_z=3.0))
-    s.stand(Sample(), one, None, 0.0)
+    one = NamedCorrection("one", "2026-01-01T00:00:00Z", Offsets(dO_z=3.0))
+    s.initialise_stage(Sample(), one, None, 0.0)
     two = replace(one, name="two", parameters=Offsets(dO_z=5.0, tau_x=1.0))
     s.take_stage(s.stage_change(Sample(), two, None, 0.0).certified(), 0.0)
     assert s.cone_vec(0.0) == s.poses(0.0).cone_vec(Offsets(dO_z=5.0, tau_x=1.0))
@@ -226,7 +226,9 @@ def test_a_readout_follows_whatever_it_is_made_of() -> None:
                 asked.set_camera(roi=Roi(left, top, left + 799, top + 599))
             case _:
                 offsets = Offsets(dO_z=draw.uniform(-5.0, 5.0), tau_x=draw.uniform(-1.0, 1.0))
-                asked.stand(Sample(), Correction("c", "2026-01-01T00:00:00Z", offsets), None, time)
+                asked.initialise_stage(
+                    Sample(), NamedCorrection("c", "2026-01-01T00:00:00Z", offsets), None, time
+                )
         rest = asked.rest_time(time) + 1.0
         for now in (time, time + 1.0, rest):
             fresh = readout(asked.poses(now), asked.camera, M.detector.pixels, asked.parameters)
@@ -240,7 +242,7 @@ def test_sample_offset_moves_the_geometry_the_other_way() -> None:
     """A point of the sample, placed by hand, has the same shadow as in the sample's own frame."""
     s = scanner()
     cone = s.cone_vec(0.0)
-    offset = Placement(x=3.0, y=-2.0, z=7.0, rx=90.0, rz=90.0)
+    offset = StagePlacement(x=3.0, y=-2.0, z=7.0, rx=90.0, rz=90.0)
     point = np.array([1.0, 2.0, 3.0])
     # R_x(90): (1, -3, 2); R_z(90): (3, 1, 2); plus the shift.
     placed = np.array([3.0 + 3.0, 1.0 - 2.0, 2.0 + 7.0])
@@ -250,7 +252,7 @@ def test_sample_offset_moves_the_geometry_the_other_way() -> None:
         cone.project_points(placed, shape),
         atol=1e-9,
     )
-    s.stand(Sample("lego", offset), None, s.guard, 0.0)
+    s.initialise_stage(Sample("lego", offset), None, s.guard, 0.0)
     assert s.state(0.0).sample.offset.rx == 90.0
     with pytest.raises(LimitError, match="finite"):
-        Placement(x=float("nan"))
+        StagePlacement(x=float("nan"))

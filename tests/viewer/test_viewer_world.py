@@ -40,7 +40,7 @@ from flexdt.clients.viewer.scrubbed_plan import (
 from flexdt.phantoms import load_phantom, phantom_names
 from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SampleState, State
-from flexdt.twin.collision.convex_solids import Cylinder, hull
+from flexdt.twin.collision.convex_solids import UprightCylinder, hull
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import (
@@ -50,7 +50,7 @@ from flexdt.twin.machine.description import (
     profile_of,
 )
 from flexdt.twin.machine.kinematics import poses
-from flexdt.twin.scanner.state import Placement
+from flexdt.twin.scanner.state import StagePlacement
 
 MACHINE = builtin_machine()
 PROFILE = builtin_profile(MACHINE.default_profile)
@@ -98,7 +98,7 @@ def cone_of(world: World) -> ConeVec:
 
 
 def test_offset_of_the_sample_and_beads() -> None:
-    offset = Placement(3.0, -2.0, 1.0, 10.0, 20.0, 30.0)
+    offset = StagePlacement(3.0, -2.0, 1.0, 10.0, 20.0, 30.0)
     world = placed(MACHINE, PROFILE, CAMERA, AT, CORRECTION, offset)
     cone = poses(MACHINE, PROFILE, CAMERA, AT).cone_vec(CORRECTION)
     beads = load_phantom("lego").beads
@@ -279,7 +279,7 @@ def test_the_margin_is_the_body_and_what_is_within_the_clearance_of_it() -> None
     points = np.asarray(shell.vertices)
     outside = np.linalg.norm(points - np.clip(points, low, high), axis=1)
     np.testing.assert_allclose(outside, 2.5, atol=1e-9)
-    column = bodies.bare(Cylinder((1.0, 2.0, 3.0), 10.0, 30.0))
+    column = bodies.bare(UprightCylinder((1.0, 2.0, 3.0), 10.0, 30.0))
     points = np.asarray(bodies.grown(column, 2.0).vertices) - [1.0, 2.0, 3.0]
     radial = np.maximum(np.hypot(points[:, 0], points[:, 1]) - 10.0, 0.0)
     outside = np.hypot(radial, np.maximum(np.abs(points[:, 2]) - 15.0, 0.0))

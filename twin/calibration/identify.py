@@ -22,7 +22,7 @@ from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_mode
 from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.fit.identifiability import visible_beads
 from flexdt.twin.calibration.fit.priors import ASSUMED
-from flexdt.twin.calibration.fit.problem import SIX, Problem, as_poses, build_problem
+from flexdt.twin.calibration.fit.problem import SIX, FitProblem, as_poses, build_problem
 from flexdt.twin.calibration.fit.solver import RAYLEIGH_MEDIAN, Solver, solve
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -313,7 +313,7 @@ def assign(
     return out
 
 
-def _vote(problem: Problem, shadows: _Shadows, x: FloatArray) -> FloatArray:
+def _vote(problem: FitProblem, shadows: _Shadows, x: FloatArray) -> FloatArray:
     """`x` with dO_x and dO_y changed so that prediction and spots lie on top of each other."""
     try:
         predicted = problem.residuals(x)[0] - problem.origin[:, None, :]
@@ -341,7 +341,7 @@ def _vote(problem: Problem, shadows: _Shadows, x: FloatArray) -> FloatArray:
 
 
 def _rounds(
-    problem: Problem, shadows: _Shadows, h: _Hypothesis, gates: Sequence[float]
+    problem: FitProblem, shadows: _Shadows, h: _Hypothesis, gates: Sequence[float]
 ) -> _Hypothesis:
     x = h.x if math.isfinite(h.loss) else _vote(problem, shadows, h.x)
     quick = Solver(huber=2.0, trim=math.inf, max_iterations=3, tolerance=0.05)
@@ -372,7 +372,9 @@ def _loss(predicted: FloatArray, shadows: _Shadows, cap: float) -> tuple[float, 
     return float((d2.sum() + missing * cap * cap) / max(int(possible), 1)), len(d2)
 
 
-def _with_tracks(problem: Problem, shadows: _Shadows, index: npt.NDArray[np.int64]) -> Problem:
+def _with_tracks(
+    problem: FitProblem, shadows: _Shadows, index: npt.NDArray[np.int64]
+) -> FitProblem:
     """The problem with the assigned spots as measurements of unit weight."""
     seen = index >= 0
     rows = np.arange(len(index))[:, None]
@@ -401,7 +403,7 @@ def _turn_between(a: FloatArray, b: FloatArray) -> float:
 
 
 def _finish(
-    problem: Problem, shadows: _Shadows, h: _Hypothesis, how: Search, wide_px: float = 20.0
+    problem: FitProblem, shadows: _Shadows, h: _Hypothesis, how: Search, wide_px: float = 20.0
 ) -> _Hypothesis:
     """Assign and fit on all frames; the loss is per possible match, capped at the final gate.
 
@@ -429,7 +431,7 @@ def _finish(
 
 
 def _report(
-    problem: Problem,
+    problem: FitProblem,
     shadows: _Shadows,
     finals: Sequence[_Hypothesis],
     shapes: FloatArray,
@@ -478,7 +480,7 @@ def _report(
     )
 
 
-def _at(problem: Problem, x: FloatArray, start: Offsets) -> Offsets:
+def _at(problem: FitProblem, x: FloatArray, start: Offsets) -> Offsets:
     names = [n for n in problem.layout.names if n in NAMES]
     return replace(start, **dict(zip(names, x.tolist(), strict=True)))
 

@@ -101,7 +101,7 @@ AS_GOOD = 1.2
 
 
 @dataclass(frozen=True)
-class Request:
+class CalibrationRequest:
     """What to estimate and how.
 
     Attributes:
@@ -118,7 +118,7 @@ class Request:
         bound: sigma [mm, deg] beyond which the result is not identifiable.
         known_sizes: the beads' radii are known; else they were taken from the spots.
         misfit_px: residual above which a fit is not to be used unless explained.
-        per_frame: those that may also differ from frame to frame, see `fit.motion`.
+        per_frame: those that may also differ from frame to frame, see `fit.fitted_motion`.
 
     Raises:
         UnknownNameError: a name that is no parameter, or cannot differ from frame to frame.
@@ -207,7 +207,7 @@ class Calibration:
 def calibrate(
     scans: Sequence[Scan],
     phantom: BeadPhantom | BeadModel,
-    request: Request | None = None,
+    request: CalibrationRequest | None = None,
     *,
     scene: Scene | None = None,
     detector: SpotFinder | None = None,
@@ -226,7 +226,7 @@ def calibrate(
         TwinError: a scan has no frames, or the same images as another.
         GeometryError: rows counted upwards, or columns from right to left.
     """
-    want = Request() if request is None else request
+    want = CalibrationRequest() if request is None else request
     model = bead_model(phantom)
     solids = getattr(phantom, "scene", None) if scene is None else scene
     for scan in scans:
@@ -307,7 +307,9 @@ def calibrate(
     )
 
 
-def _identified(state: Calibration, want: Request) -> tuple[list[Identification], list[Finding]]:
+def _identified(
+    state: Calibration, want: CalibrationRequest
+) -> tuple[list[Identification], list[Finding]]:
     """Which spot is which bead, scan by scan until one tells nothing, and what is wrong with it."""
     out: list[Identification] = []
     findings: list[Finding] = []
@@ -374,7 +376,9 @@ def _require_different(scans: Sequence[Scan], looks: Sequence[Sequence[FrameSpot
         known |= dict.fromkeys(shadows, j)
 
 
-def _explain(state: Calibration, want: Request, fit: FitResult) -> tuple[FitResult, list[Finding]]:
+def _explain(
+    state: Calibration, want: CalibrationRequest, fit: FitResult
+) -> tuple[FitResult, list[Finding]]:
     return explain_residuals(
         fit,
         free_beads=want.bead_tolerance_mm is not None,
@@ -385,8 +389,8 @@ def _explain(state: Calibration, want: Request, fit: FitResult) -> tuple[FitResu
 
 def _with_held(
     state: Calibration,
-    asked: Request,
-    want: Request,
+    asked: CalibrationRequest,
+    want: CalibrationRequest,
     wide: FitResult,
     explained: list[Finding],
 ) -> tuple[FitResult, list[Finding]]:
@@ -451,7 +455,7 @@ def _with_held(
     return doubtful(fit, priors, without), [*explained, *narrow]
 
 
-def _loose(state: Calibration, want: Request, wide: FitResult) -> FitResult:
+def _loose(state: Calibration, want: CalibrationRequest, wide: FitResult) -> FitResult:
     """The fit with loosened priors, to compare them with. Beads that were freed because of the
     residuals stay free only if loose priors do not explain the residuals as well."""
     wide_priors = loosened({**want.priors, **_priors(state.scans, want)})
@@ -463,12 +467,12 @@ def _loose(state: Calibration, want: Request, wide: FitResult) -> FitResult:
     return out
 
 
-def _priors(scans: Sequence[Scan], want: Request) -> dict[str, float]:
+def _priors(scans: Sequence[Scan], want: CalibrationRequest) -> dict[str, float]:
     """Every prior of the fit."""
     return {n: w for n, w in _stated(scans, want).items() if w > 0}
 
 
-def _stated(scans: Sequence[Scan], want: Request) -> dict[str, float]:
+def _stated(scans: Sequence[Scan], want: CalibrationRequest) -> dict[str, float]:
     """The widest of the scans' priors for what is not free, and those of the request; 0: exact."""
     out: dict[str, float] = {n: w for n, w in FIXED.items() if n not in want.free}
     for scan in scans:
@@ -478,13 +482,13 @@ def _stated(scans: Sequence[Scan], want: Request) -> dict[str, float]:
     return out | {n: w for n, w in want.priors.items() if w > 0 or n not in want.free}
 
 
-def _freed(want: Request, names: Sequence[str]) -> Request:
+def _freed(want: CalibrationRequest, names: Sequence[str]) -> CalibrationRequest:
     """The request with more parameters free, and without their priors."""
     priors = {n: w for n, w in want.priors.items() if n in want.free or n not in names}
     return replace(want, free=tuple(dict.fromkeys((*want.free, *names))), priors=priors)
 
 
-def _held_start(state: Calibration, want: Request, fit: FitResult) -> list[Offsets]:
+def _held_start(state: Calibration, want: CalibrationRequest, fit: FitResult) -> list[Offsets]:
     """The geometry of a fit with what `want` holds exactly put back to where it is fixed."""
     held = from_printed_reading(want.start, want.reading)
     known = {*want.free, *_priors(state.scans, want)}
@@ -495,7 +499,7 @@ def _held_start(state: Calibration, want: Request, fit: FitResult) -> list[Offse
     ]
 
 
-def _start(state: Calibration, want: Request) -> list[Offsets]:
+def _start(state: Calibration, want: CalibrationRequest) -> list[Offsets]:
     """Start of each scan: what the identification found, as far as it is free."""
     out = []
     for found in state.identifications:
@@ -507,7 +511,7 @@ def _start(state: Calibration, want: Request) -> list[Offsets]:
 
 def _fit(
     state: Calibration,
-    want: Request,
+    want: CalibrationRequest,
     start: Sequence[Offsets] | None = None,
     bead_tolerance_mm: float | None = None,
 ) -> FitResult:
@@ -542,7 +546,7 @@ def _fit(
 
 
 def _second_look(
-    state: Calibration, want: Request, fit: FitResult, solids: Scene | None
+    state: Calibration, want: CalibrationRequest, fit: FitResult, solids: Scene | None
 ) -> tuple[Calibration, FitResult, int]:
     """Measure in windows and fit again; once more if the first fit was far off.
 
@@ -581,7 +585,7 @@ def _second_look(
 
 
 def _with_motion(
-    state: Calibration, want: Request, fit: FitResult
+    state: Calibration, want: CalibrationRequest, fit: FitResult
 ) -> tuple[Calibration, FitResult]:
     """The scans with their motion in the poses, and the fit to them."""
     still = [s.poses for s in state.scans]
@@ -602,7 +606,7 @@ def _with_motion(
 
 
 def _settled(
-    state: Calibration, want: Request, fit: FitResult
+    state: Calibration, want: CalibrationRequest, fit: FitResult
 ) -> tuple[Calibration, list[Finding]]:
     """The motion with sigmas that contain what the last fit would make of it."""
     held = state.motion
@@ -644,7 +648,7 @@ def _settled(
 
 def _refit(
     state: Calibration,
-    want: Request,
+    want: CalibrationRequest,
     fit: FitResult,
     *,
     extra: tuple[str, ...] = (),
@@ -670,4 +674,4 @@ def _sorted(findings: Sequence[Finding]) -> tuple[Finding, ...]:
     return tuple(sorted(findings, key=lambda f: not f.forbids))
 
 
-__all__ = ["Calibration", "FrameState", "Request", "Scan", "calibrate", "detector_for"]
+__all__ = ["Calibration", "CalibrationRequest", "FrameState", "Scan", "calibrate", "detector_for"]

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.collision.convex_solids import Solid
+from flexdt.twin.collision.convex_solids import ConvexSolid
 from flexdt.twin.collision.nearest import separation_of
 from flexdt.twin.collision.paths import Path, path_of
 from flexdt.twin.collision.relative import Separate
@@ -36,7 +36,7 @@ ACCURACY = (0.1, 0.02)
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class CollisionScene:
     """What may touch what.
 
     Attributes:
@@ -166,17 +166,17 @@ class PairStack:
 def build_scene(
     machine: Machine,
     profile: Profile,
-    sample: Sequence[Solid] = (),
+    sample: Sequence[ConvexSolid] = (),
     parameters: Offsets = NOMINAL,
     *,
     margin_mm: float | None = None,
-) -> Scene:
+) -> CollisionScene:
     """The scene of a machine with a sample.
 
     Args:
         machine: its components, limits, margin.
         profile: zero offsets, so that bodies sit where the X-ray geometry is.
-        sample: convex pieces in the object's frame (see `sample.convex_pieces`).
+        sample: convex pieces in the object's frame (see `sample_hull.convex_pieces`).
         parameters: the correction in force; bodies sit where it says they are.
         margin_mm: clearance to keep; default: the machine's.
     """
@@ -204,7 +204,7 @@ def scene_of(
     reach: FloatArray,
     home: FloatArray,
     limits: Limits,
-) -> Scene:
+) -> CollisionScene:
     """A scene of any bodies: sorts their pairs into near, distant and allowed.
 
     Args:
@@ -223,7 +223,7 @@ def scene_of(
         if bodies[i].group != bodies[j].group
         and frozenset((bodies[i].name, bodies[j].name)) not in may_touch
     ]
-    scene = Scene(tuple(axes), tuple(bodies), tuple(pairs), (), reach, home, limits)
+    scene = CollisionScene(tuple(axes), tuple(bodies), tuple(pairs), (), reach, home, limits)
     if not pairs:
         return scene
     least = scene.all.clearances(reach[:, 0], reach[:, 1])

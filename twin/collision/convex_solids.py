@@ -30,7 +30,7 @@ _BOX_FACES = np.array(
 """Outward triangles of a box over `_CORNERS`."""
 
 
-class Solid(Protocol):
+class ConvexSolid(Protocol):
     """What the sweep asks of a convex solid, in the frame of the body that carries it."""
 
     def farthest(self, directions: FloatArray) -> FloatArray:
@@ -51,7 +51,7 @@ class Solid(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Polytope(Solid):
+class Polytope(ConvexSolid):
     """The convex hull of `vertices` (k, 3) [mm]; `faces` (m, 3) are its outward triangles."""
 
     vertices: FloatArray
@@ -65,27 +65,27 @@ class Polytope(Solid):
         object.__setattr__(self, "vertices", vertices)
 
     def farthest(self, directions: FloatArray) -> FloatArray:
-        """See `Solid`."""
+        """See `ConvexSolid`."""
         corner: FloatArray = self.vertices[np.argmax(directions @ self.vertices.T, axis=-1)]
         return corner
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """See `Solid`."""
+        """See `ConvexSolid`."""
         return self.vertices.min(axis=0), self.vertices.max(axis=0)
 
     def radius_about(self, axis: FloatArray) -> float:
-        """See `Solid`."""
+        """See `ConvexSolid`."""
         along = self.vertices @ axis
         squared = np.einsum("ij,ij->i", self.vertices, self.vertices) - along * along
         return math.sqrt(max(0.0, float(squared.max())))
 
     def is_round(self, axis: FloatArray) -> bool:
-        """See `Solid`: never."""
+        """See `ConvexSolid`: never."""
         return False
 
 
 @dataclass(frozen=True)
-class Cylinder(Solid):
+class UprightCylinder(ConvexSolid):
     """An upright cylinder, its axis along z: `center`, `radius` and full `height` [mm]."""
 
     center: Vector3
@@ -93,19 +93,19 @@ class Cylinder(Solid):
     height: float
 
     def farthest(self, directions: FloatArray) -> FloatArray:
-        """See `Solid`."""
+        """See `ConvexSolid`."""
         across = np.hypot(directions[..., 0], directions[..., 1])
         out = directions * (self.radius / np.where(across > 0.0, across, 1.0))[..., None]
         out[..., 2] = np.copysign(0.5 * self.height, directions[..., 2])
         return np.asarray(out + self.center)
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """See `Solid`."""
+        """See `ConvexSolid`."""
         half = np.array([self.radius, self.radius, 0.5 * self.height])
         return np.array(self.center) - half, np.array(self.center) + half
 
     def radius_about(self, axis: FloatArray) -> float:
-        """See `Solid`."""
+        """See `ConvexSolid`."""
         if self._upright(axis):
             return self.radius + math.hypot(*self.center[:2])
         # The farthest point of the two rims' bounding squares: never too small.
@@ -113,7 +113,7 @@ class Cylinder(Solid):
         return box(upper - lower, 0.5 * (lower + upper)).radius_about(axis)
 
     def is_round(self, axis: FloatArray) -> bool:
-        """See `Solid`: about its own axis."""
+        """See `ConvexSolid`: about its own axis."""
         return self._upright(axis) and self.center[0] == 0.0 and self.center[1] == 0.0
 
     def prism(self, sides: int = 48) -> Polytope:

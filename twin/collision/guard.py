@@ -25,8 +25,8 @@ from functools import cached_property
 
 import numpy as np
 
-from flexdt.twin.collision.collision_scene import Scene
-from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid
+from flexdt.twin.collision.collision_scene import CollisionScene
+from flexdt.twin.collision.convex_solids import ConvexSolid, Polytope, UprightCylinder
 from flexdt.twin.collision.nearest import Separation
 from flexdt.twin.collision.paths import Path
 from flexdt.twin.collision.relative import START, Moment, RelativeMotion, Separate
@@ -48,7 +48,7 @@ REFINEMENTS = 40
 """Halvings of the step in which the direction of a round body's least overlap is looked for."""
 
 
-def leaving(scene: Scene, path: Path) -> Contact | None:
+def leaving(scene: CollisionScene, path: Path) -> Contact | None:
     """The first contact of a motion that begins with bodies overlapping, or None.
 
     Args:
@@ -62,7 +62,7 @@ def leaving(scene: Scene, path: Path) -> Contact | None:
     return min(contacts, key=lambda contact: contact.time, default=None)
 
 
-def _of_pair(scene: Scene, path: Path, pair: Pair) -> Contact | None:
+def _of_pair(scene: CollisionScene, path: Path, pair: Pair) -> Contact | None:
     """What stops one overlapping pair: coming closer, or touching again once free."""
     a, b = (scene.bodies[i] for i in pair)
     motion, overlap = RelativeMotion(a, b, path), _Overlap.at(a, b, path.q[0])
@@ -109,7 +109,7 @@ def _free_from(
     return None
 
 
-def _without(scene: Scene, pairs: list[Pair]) -> Scene:
+def _without(scene: CollisionScene, pairs: list[Pair]) -> CollisionScene:
     left_out = set(pairs)
     return replace(
         scene,
@@ -214,16 +214,16 @@ def _pose(body: Body, q: FloatArray) -> tuple[FloatArray, FloatArray]:
     return turn, q @ body.slides + body.origin
 
 
-def _many(solid: Solid) -> bool:
+def _many(solid: ConvexSolid) -> bool:
     return isinstance(solid, Polytope) and len(solid.vertices) > MANY
 
 
-def _corners(solid: Solid) -> FloatArray:
+def _corners(solid: ConvexSolid) -> FloatArray:
     """(k, 3): corners of a body, of one with very many only some."""
     if _many(solid):
         ways = np.random.default_rng(0).normal(size=(MANY, 3))
         return np.unique(solid.farthest(ways), axis=0)
-    upright = solid.prism() if isinstance(solid, Cylinder) else solid
+    upright = solid.prism() if isinstance(solid, UprightCylinder) else solid
     assert isinstance(upright, Polytope)
     return upright.vertices
 
@@ -236,7 +236,7 @@ HORIZON = 3600.0
 class SceneGuard:
     """Sweeps one scene; it keeps nothing between calls, so that threads may share it."""
 
-    scene: Scene
+    scene: CollisionScene
 
     def __call__(self, trajectories: Mapping[str, Trajectory], now: float) -> Contact | None:
         """The first contact from `now` on; when nothing moves, the nearest pair that touches.

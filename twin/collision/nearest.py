@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid
+from flexdt.twin.collision.convex_solids import ConvexSolid, Polytope, UprightCylinder
 from flexdt.twin.geometry.conventions import FloatArray
 
 Separation = tuple[float, FloatArray]
@@ -30,7 +30,7 @@ ROUNDS = 40
 
 
 def separation_of(
-    a: Solid, b: Solid
+    a: ConvexSolid, b: ConvexSolid
 ) -> Callable[[FloatArray, FloatArray | None, FloatArray | None], Separation]:
     """A function that separates `a` from `b`.
 
@@ -74,7 +74,12 @@ def separation_of(
 
 
 def _improved(
-    a: Solid, b: Solid, found: Separation, offset: FloatArray, ra: FloatArray, rb: FloatArray
+    a: ConvexSolid,
+    b: ConvexSolid,
+    found: Separation,
+    offset: FloatArray,
+    ra: FloatArray,
+    rb: FloatArray,
 ) -> Separation:
     """The certificate across the nearest point of the hull of all differences (Gilbert's search).
 
@@ -101,12 +106,12 @@ def _improved(
     return found
 
 
-def _as_fcl(solid: Solid) -> tuple[Any, FloatArray]:
+def _as_fcl(solid: ConvexSolid) -> tuple[Any, FloatArray]:
     """fcl's shape and where its own centre lies in the solid's frame."""
     import fcl
 
     match solid:
-        case Cylinder(center, radius, height):
+        case UprightCylinder(center, radius, height):
             return fcl.Cylinder(radius, height), np.array(center)
         case Polytope():
             counts = np.full((len(solid.faces), 1), 3, dtype=np.int32)

@@ -14,7 +14,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from flexdt.twin.collision.collision_scene import Scene
+from flexdt.twin.collision.collision_scene import CollisionScene
 from flexdt.twin.collision.scene_search import first_contact, touching
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.motion import profiles as motion
@@ -32,7 +32,7 @@ QUARTER = 90.0
 
 
 def free_moves(
-    scene: Scene,
+    scene: CollisionScene,
     machine: Machine,
     start: Mapping[str, float],
     targets: Mapping[str, float],
@@ -68,7 +68,7 @@ def free_moves(
 
 
 def direct_contact(
-    scene: Scene,
+    scene: CollisionScene,
     machine: Machine,
     start: Mapping[str, float],
     targets: Mapping[str, float],
@@ -82,7 +82,7 @@ def direct_contact(
 class _Planner:
     """One question: counts its sweeps and remembers which parts were in the way."""
 
-    scene: Scene
+    scene: CollisionScene
     machine: Machine
     start: dict[str, float]
     paces: dict[str, Pace]
@@ -100,15 +100,15 @@ class _Planner:
 
     def contact(self, moved: Mapping[str, float], step: Mapping[str, float]) -> Contact | None:
         """First contact of one move from the start with `moved` changed."""
-        ways = {}
+        trajectories = {}
         for axis in self.scene.axes:
             here = moved.get(axis, self.at(axis))
-            ways[axis] = motion.at_rest(here)
+            trajectories[axis] = motion.at_rest(here)
             if axis in step:
-                ways[axis] = motion.move(here, 0.0, step[axis], *self.pace(axis), 0.0)
+                trajectories[axis] = motion.move(here, 0.0, step[axis], *self.pace(axis), 0.0)
         self.sweeps += 1
-        end = max(way.end for way in ways.values())
-        contact = first_contact(self.scene, self.scene.path(ways, 0.0, end))
+        end = max(t.end for t in trajectories.values())
+        contact = first_contact(self.scene, self.scene.path(trajectories, 0.0, end))
         if contact is not None:
             self.blockers.update(dict.fromkeys(contact.pair))
         return contact

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flexdt.twin.collision.collision_scene import Scene, build_scene
-from flexdt.twin.collision.convex_solids import Cylinder, Solid
+from flexdt.twin.collision.collision_scene import CollisionScene, build_scene
+from flexdt.twin.collision.convex_solids import ConvexSolid, UprightCylinder
 from flexdt.twin.collision.paths import Path, path_of
 from flexdt.twin.collision.relative import START, Moment
 from flexdt.twin.collision.scene_search import PathSearch, clearance_trace
@@ -34,7 +34,7 @@ TRACE_POINTS = 120
 
 
 def collision_check(
-    sample: Sequence[Solid] | None = None, parameters: Offsets = NOMINAL
+    sample: Sequence[ConvexSolid] | None = None, parameters: Offsets = NOMINAL
 ) -> CollisionCheck:
     """A check for `check_script(..., collision=...)`.
 
@@ -54,7 +54,7 @@ def collision_check(
     return check
 
 
-def collision_report(plan: ScanPlan, scene: Scene) -> Clearance:
+def collision_report(plan: ScanPlan, scene: CollisionScene) -> Clearance:
     """Contacts and clearances of a plan.
 
     Args:
@@ -84,11 +84,11 @@ def _least(search: PathSearch, contacts: Sequence[Contact]) -> tuple[float, tupl
     return found.min_clearance_mm, found.nearest
 
 
-def _from_size(size: SampleSize | None) -> tuple[Solid, ...]:
+def _from_size(size: SampleSize | None) -> tuple[ConvexSolid, ...]:
     if size is None or size.diameter_mm <= 0.0:
         return ()
     height = size.height_mm or size.diameter_mm
-    return (Cylinder((0.0, 0.0, 0.0), 0.5 * size.diameter_mm, height),)
+    return (UprightCylinder((0.0, 0.0, 0.0), 0.5 * size.diameter_mm, height),)
 
 
 def _contacts(search: PathSearch) -> list[Contact]:
@@ -128,7 +128,7 @@ def _contacts_of(search: PathSearch, k: int) -> list[Contact]:
     return out
 
 
-def _line(plan: ScanPlan, scene: Scene, contact: Contact) -> int:
+def _line(plan: ScanPlan, scene: CollisionScene, contact: Contact) -> int:
     """The line of the last motion command under way at the contact that moves one of the two."""
     pairs = [scene.names(pair) == contact.pair for pair in scene.all.pairs]
     motors = {scene.axes[i] for i in np.flatnonzero(scene.all.moves[pairs].any(axis=0))}

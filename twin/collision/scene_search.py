@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from flexdt.twin.collision.collision_scene import Scene
+from flexdt.twin.collision.collision_scene import CollisionScene
 from flexdt.twin.collision.paths import Path
 from flexdt.twin.collision.relative import START, RelativeMotion
 from flexdt.twin.collision.sweep import PairResult, refine_pair, sweep_pair
@@ -50,7 +50,7 @@ class SweepResult:
     looks: int = 0
 
 
-def first_contact(scene: Scene, path: Path) -> Contact | None:
+def first_contact(scene: CollisionScene, path: Path) -> Contact | None:
     """The first contact along a path, without its clearances."""
     return PathSearch(scene, path).first_contact(only_contacts=True).contact
 
@@ -59,7 +59,7 @@ def first_contact(scene: Scene, path: Path) -> Contact | None:
 class PathSearch:
     """A scene on a path: the pairs that move relative to each other, nearest boxes first."""
 
-    scene: Scene
+    scene: CollisionScene
     path: Path
     _motions: dict[int, RelativeMotion] = field(default_factory=dict, init=False, repr=False)
     """Made when first asked for; a search belongs to the one thread that made it."""
@@ -146,20 +146,22 @@ class PathSearch:
         )
 
 
-def clearance(scene: Scene, positions: Mapping[str, float]) -> NearestPair:
+def clearance(scene: CollisionScene, positions: Mapping[str, float]) -> NearestPair:
     """The nearest pair of a pose (all pairs that may not touch), clearance 0 for a contact."""
     q = scene.vector(positions)
     stack = scene.candidates(q, q)
     return _nearest(scene, q, stack.pairs, stack.clearances(q, q))
 
 
-def touching(scene: Scene, positions: Mapping[str, float]) -> list[tuple[tuple[str, str], float]]:
+def touching(
+    scene: CollisionScene, positions: Mapping[str, float]
+) -> list[tuple[tuple[str, str], float]]:
     """Every pair of a pose that is within the margin, with its clearance [mm]."""
     found = bodies_touching(scene, scene.vector(positions))
     return [(scene.names(pair), gap) for pair, gap in found]
 
 
-def bodies_touching(scene: Scene, q: FloatArray) -> list[tuple[Pair, float]]:
+def bodies_touching(scene: CollisionScene, q: FloatArray) -> list[tuple[Pair, float]]:
     """Every pair within the margin with the motors at `q` (axes,), with its clearance [mm]."""
     stack = scene.candidates(q, q)
     limit = scene.limits.margin + scene.limits.tolerance
@@ -169,7 +171,7 @@ def bodies_touching(scene: Scene, q: FloatArray) -> list[tuple[Pair, float]]:
 
 
 def clearance_trace(
-    scene: Scene, path: Path, times: Sequence[float] | FloatArray
+    scene: CollisionScene, path: Path, times: Sequence[float] | FloatArray
 ) -> tuple[tuple[float, float, tuple[str, str] | None], ...]:
     """(time [s], clearance [mm], pair) at each of `times`."""
     if len(times) == 0:
@@ -181,7 +183,9 @@ def clearance_trace(
     return tuple((float(t), n.mm, n.pair) for t, n in zip(times, nearest, strict=True))
 
 
-def _nearest(scene: Scene, q: FloatArray, pairs: Sequence[Pair], bounds: FloatArray) -> NearestPair:
+def _nearest(
+    scene: CollisionScene, q: FloatArray, pairs: Sequence[Pair], bounds: FloatArray
+) -> NearestPair:
     best = NearestPair(math.inf, None)
     for k in np.argsort(bounds, kind="stable").tolist():
         if bounds[k] >= best.mm:
@@ -192,7 +196,7 @@ def _nearest(scene: Scene, q: FloatArray, pairs: Sequence[Pair], bounds: FloatAr
     return best
 
 
-def separation_at(scene: Scene, pair: Pair, q: FloatArray) -> float:
+def separation_at(scene: CollisionScene, pair: Pair, q: FloatArray) -> float:
     """Certified clearance [mm] of a pair with the motors at `q` (axes,); 0 for an overlap."""
     a, b = (scene.bodies[i] for i in pair)
     offset = q @ (a.slides - b.slides) + (a.origin - b.origin)

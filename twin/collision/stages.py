@@ -21,7 +21,7 @@ from functools import cached_property
 
 import numpy as np
 
-from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid, box, hull
+from flexdt.twin.collision.convex_solids import ConvexSolid, Polytope, UprightCylinder, box, hull
 from flexdt.twin.geometry.conventions import (
     COLUMN_DIRECTION,
     ROW_DIRECTION,
@@ -58,7 +58,7 @@ class Body:
     """
 
     name: str
-    solid: Solid
+    solid: ConvexSolid
     origin: FloatArray
     slides: FloatArray
     turns: FloatArray
@@ -159,7 +159,7 @@ def stage_bodies(machine: Machine, profile: Profile, parameters: Offsets = NOMIN
 def sample_bodies(
     machine: Machine,
     profile: Profile,
-    sample: Sequence[Solid],
+    sample: Sequence[ConvexSolid],
     parameters: Offsets = NOMINAL,
 ) -> list[Body]:
     """The sample's pieces as bodies on the component whose role is `sample_holder`.
@@ -216,9 +216,9 @@ def _shifts(machine: Machine, profile: Profile, p: Offsets) -> dict[str, FloatAr
 def _wherever(
     machine: Machine,
     part: Component,
-    solid: Cylinder | Polytope,
+    solid: UprightCylinder | Polytope,
     place: FloatArray | None = None,
-) -> Solid:
+) -> ConvexSolid:
     """`solid` with all places to which a stage on the turntable brings it.
 
     Args:
@@ -241,7 +241,7 @@ def _wherever(
             ends[:, i] += sorted((factors[motor] * axis.lower, factors[motor] * axis.upper))
     if not ends.any():
         return solid
-    points = (solid.prism() if isinstance(solid, Cylinder) else solid).vertices
+    points = (solid.prism() if isinstance(solid, UprightCylinder) else solid).vertices
     corners = np.array([[x, y, 0.0] for x in ends[:, 0] for y in ends[:, 1]])
     corners = corners if place is None else corners @ place.T
     return hull((points[:, None, :] + corners).reshape(-1, 3))
@@ -273,9 +273,9 @@ def _chain(
     return origin, slides, turns
 
 
-def _solid(part: Component, profile: Profile, p: Offsets) -> Cylinder | Polytope:
+def _solid(part: Component, profile: Profile, p: Offsets) -> UprightCylinder | Polytope:
     if part.shape == "cylinder":
-        return Cylinder(part.center_mm, 0.5 * part.size_mm[0], part.size_mm[2])
+        return UprightCylinder(part.center_mm, 0.5 * part.size_mm[0], part.size_mm[2])
     solid = hull(part.points_mm) if part.points_mm else box(part.size_mm, part.center_mm)
     turned = profile.det_roll_deg or p.det_yaw or p.det_pitch or p.det_roll
     if part.role == "panel" and turned:
@@ -292,13 +292,13 @@ def _panel_turn(profile: Profile, p: Offsets) -> FloatArray:
     return turned
 
 
-def _placed(piece: Solid, place: FloatArray, tau: FloatArray) -> Cylinder | Polytope:
+def _placed(piece: ConvexSolid, place: FloatArray, tau: FloatArray) -> UprightCylinder | Polytope:
     """A piece moved by p -> place (p - tau)."""
-    if not isinstance(piece, (Cylinder, Polytope)):
+    if not isinstance(piece, (UprightCylinder, Polytope)):
         raise TypeError(f"cannot place a {type(piece).__name__}")
     if not tau.any() and np.array_equal(place, np.eye(3)):
         return piece
-    if isinstance(piece, Cylinder):
+    if isinstance(piece, UprightCylinder):
         piece = piece.prism()
     return Polytope((piece.vertices - tau) @ place.T, piece.faces)
 

@@ -30,7 +30,7 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine import kinematics
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine, Profile
-from flexdt.twin.scanner.state import Correction
+from flexdt.twin.scanner.state import NamedCorrection
 from flexdt.twin.values import message_of
 
 SCHEMA: Final = 1
@@ -100,7 +100,7 @@ class CorrectionEntry(_Model):
     parameters: dict[str, float]
 
     @classmethod
-    def of(cls, correction: Correction | None) -> CorrectionEntry | None:
+    def of(cls, correction: NamedCorrection | None) -> CorrectionEntry | None:
         """The entry of a correction."""
         c = correction
         if c is None:
@@ -226,10 +226,12 @@ class DatasetDocument(_Model):
             return kinematics.motor_poses(machine, profile, camera, {})[0:0]
         return Poses.concatenate(parts)
 
-    def correction_in_force(self) -> Correction | None:
+    def correction_in_force(self) -> NamedCorrection | None:
         """The correction, in internal units."""
         c = self.correction
-        return None if c is None else Correction.from_edge(c.name, c.date, c.parameters, c.note)
+        return (
+            None if c is None else NamedCorrection.from_edge(c.name, c.date, c.parameters, c.note)
+        )
 
     def machine_of(self, file: str = DOCUMENT) -> Machine:
         """The scanner.

@@ -20,7 +20,7 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses
-from flexdt.twin.scanner.state import Correction
+from flexdt.twin.scanner.state import NamedCorrection
 from flexdt.twin.script import ScanPlan
 from flexdt.twin.script.planning.plan import saved_images
 from flexdt.twin.values import ArrayValue
@@ -131,7 +131,7 @@ class ScanRecord(ArrayValue):
     reason: str = ""
     sample: SampleRecord = field(default_factory=SampleRecord)
     noise: NoiseRecord = field(default_factory=NoiseRecord)
-    correction: Correction | None = None
+    correction: NamedCorrection | None = None
     operator: str = ""
     flat_axis: str = ""
     version: str = ""
@@ -151,7 +151,7 @@ class ScanRecord(ArrayValue):
         started: datetime,
         sample: SampleRecord | None = None,
         noise: NoiseRecord | None = None,
-        correction: Correction | None = None,
+        correction: NamedCorrection | None = None,
         operator: str = "",
         version: str = "",
     ) -> ScanRecord:

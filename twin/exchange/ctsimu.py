@@ -84,7 +84,7 @@ def scenario_document(scan: Scenario) -> dict[str, Any]:
     rows, cols = scan.shape
     start, stop, direction, uneven = _stage_motion(np.degrees(poses.angle))
     real = scan.known if scan.real is None else scan.real
-    pairs = _Pairs(scan.known, real)
+    pairs = _Deviations(scan.known, real)
     u, v = TO_CTSIMU @ poses.u[0], TO_CTSIMU @ poses.v[0]
     ahead, right = TO_CTSIMU @ [0.0, 1.0, 0.0], TO_CTSIMU @ [1.0, 0.0, 0.0]
     return {
@@ -170,7 +170,7 @@ def _stage_motion(angles_deg: FloatArray) -> tuple[float, float, str, list[dict[
     return start, stop, direction, [_drifting_turn(rest, True, "motors")] if uneven else []
 
 
-class _Pairs:
+class _Deviations:
     """Deviations of all parameters: the known amount, then what is added to it unknown."""
 
     def __init__(self, known: Offsets, real: Offsets) -> None:

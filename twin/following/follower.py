@@ -20,7 +20,7 @@ from flexdt.twin.script import commands as c
 from flexdt.twin.script.executed_log import MotorReply, log_line, motor_reply
 from flexdt.twin.script.grammar import FIXED, ArgumentError, describe, find, number
 from flexdt.twin.script.planning.dry_run import CollisionCheck, check_plan
-from flexdt.twin.script.planning.plan import Range, SampleSize, Step, step_range, total_range
+from flexdt.twin.script.planning.plan import PlanStep, Range, SampleSize, step_range, total_range
 from flexdt.twin.script.planning.planner import plan_script, simulated
 from flexdt.twin.script.planning.simulated_script import Simulation
 from flexdt.twin.script.problems import Severity
@@ -264,7 +264,7 @@ class Follower:
         return () if self.script is None else tuple(map(_bare, self.script.commands))
 
     @cached_property
-    def _steps(self) -> tuple[Step, ...]:
+    def _steps(self) -> tuple[PlanStep, ...]:
         if self.script is None:
             return ()
         start = Mirror.of(self.machine).start
@@ -412,7 +412,7 @@ def _alarm(
     return mirror.alarmed(Alarm(now, severity, kind, about, message))
 
 
-def _range(step: Step, machine: Machine) -> Range:
+def _range(step: PlanStep, machine: Machine) -> Range:
     """(5 %, 95 %) of a step; a time that is only assumed may be anything up to twice itself."""
     found = step_range(step, machine.timing)
     return (step.computed_s, step.holds_s + step.assumed_s) if found is None else found

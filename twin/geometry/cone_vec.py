@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.errors import GeometryError
-from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.conventions import FloatArray, as_numbers
 from flexdt.twin.geometry.trajectories import FULL_TURN, Bench, stage_angles
 from flexdt.twin.lazy_backend import File, lazy_backend
 
@@ -56,7 +56,7 @@ class ConeVec:
     detector_shape: Shape2 | None = None
 
     def __post_init__(self) -> None:
-        rows = np.array(self.rows, dtype=np.float64, ndmin=2)
+        rows = np.array(as_numbers("cone_vec", self.rows), ndmin=2)
         if rows.ndim != 2 or rows.shape[1] != ROW_LENGTH:
             raise GeometryError(
                 f"cone_vec has shape {np.shape(self.rows)}; allowed: (n, 12)",

@@ -25,9 +25,12 @@ the name. `T_a_b` takes coordinates in b to a.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from flexdt.twin.errors import GeometryError
 
 FloatArray = npt.NDArray[np.float64]
 Float32Array = npt.NDArray[np.float32]
@@ -43,6 +46,26 @@ COLUMN_DIRECTION = (1.0, 0.0, 0.0)
 """Direction of u, the step to the next column, for an untilted detector."""
 ROW_DIRECTION = (0.0, 0.0, -1.0)
 """Direction of v, the step to the next row, for an untilted detector."""
+
+
+def as_numbers(what: str, value: object, dtype: npt.DTypeLike = np.float64) -> npt.NDArray[Any]:
+    """An array of real numbers.
+
+    Raises:
+        GeometryError: it holds something else.
+
+    Example:
+        >>> as_numbers("distances", [1, 2]).tolist()
+        [1.0, 2.0]
+    """
+    try:
+        return np.asarray(value, dtype=dtype)
+    except (TypeError, ValueError):
+        kind = type(value).__name__
+        raise GeometryError(
+            f"{what}: {'an' if kind[0] in 'aeiou' else 'a'} {kind}; allowed: an array of numbers",
+            {"asked": kind, "allowed": "numbers"},
+        ) from None
 
 
 def rotation_x(angle: float) -> FloatArray:

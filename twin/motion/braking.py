@@ -154,10 +154,10 @@ def programme_time_at_rest(drives: Drives, at: float, most: Most) -> float:
 
 
 def braked_at(
-    drives: Drives, at: float, ways: Mapping[str, Trajectory], most: Most
+    drives: Drives, at: float, trajectories: Mapping[str, Trajectory], most: Most
 ) -> dict[str, Drive]:
-    """`drives` that follow `ways` from now on, and are braked along their path from `at` on."""
-    following = {**drives, **{name: drives[name].following(way) for name, way in ways.items()}}
+    """`drives` that follow `trajectories`, and are braked along their path from `at` on."""
+    following = {**drives, **{n: drives[n].following(t) for n, t in trajectories.items()}}
     braked = braked_along(following, at, most)
     return {
         name: drive.following(motion.rejoined(drive.ahead(at), at, braked[name]))

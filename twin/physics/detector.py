@@ -273,28 +273,15 @@ class Detector:
 
 
 _BOUNDS = {
-    "pixel_mm": (1e-6, 100.0),
-    "exposure_ms": (1e-6, 1e7),
-    "averages": (1, 1_000_000),
-    "bits": (1, 16),
-    "electrons_per_count": (1e-18, 1e18),
-    "electrons_per_keV": (1e-6, 1e6),
-    "scintillator_mm": (1e-6, 100.0),
-    "packing": (1e-3, 1.0),
-    "swank": (1e-3, 1.0),
-    "read_noise_e": (0.0, 1e9),
-    "offset_counts": (0.0, 65535.0),
-    "dark_e_per_s": (0.0, 1e18),
-    "blur_mm": (0.0, 10.0),
-    "gain_sigma": (0.0, 1.0),
-    "offset_sigma_counts": (0.0, 65535.0),
-    "dead_fraction": (0.0, 1.0),
-    "serial": (0, 2**63 - 1),
-    "lag_fraction": (0.0, 1.0),
-    "lag_s": (1e-6, 1e7),
-    "long_lag_fraction": (0.0, 1.0),
-    "long_lag_s": (1e-6, 1e7),
-}
+    "pixel_mm": (1e-6, 100.0), "exposure_ms": (1e-6, 1e7), "averages": (1, 1_000_000),
+    "bits": (1, 16), "electrons_per_count": (1e-18, 1e18), "electrons_per_keV": (1e-6, 1e6),
+    "scintillator_mm": (1e-6, 100.0), "packing": (1e-3, 1.0), "swank": (1e-3, 1.0),
+    "read_noise_e": (0.0, 1e9), "offset_counts": (0.0, 65535.0), "dark_e_per_s": (0.0, 1e18),
+    "blur_mm": (0.0, 10.0), "gain_sigma": (0.0, 1.0), "offset_sigma_counts": (0.0, 65535.0),
+    "dead_fraction": (0.0, 1.0), "serial": (0, 2**63 - 1), "lag_fraction": (0.0, 1.0),
+    "lag_s": (1e-6, 1e7), "long_lag_fraction": (0.0, 1.0), "long_lag_s": (1e-6, 1e7),
+}  # fmt: skip
+"""Least and most of each figure."""
 
 
 def _is_low(camera: CameraSettings) -> bool:

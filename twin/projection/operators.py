@@ -17,7 +17,7 @@ import numpy.typing as npt
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec, check_spread
 from flexdt.twin.geometry.cone_vec import check_shape as check_shape
-from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray, as_numbers
 from flexdt.twin.projection import cpu, gpu
 from flexdt.twin.projection.kernels.fan_types import Box
 from flexdt.twin.projection.level_axis import ORDERS, Order, by_level_axis, in_order
@@ -266,9 +266,8 @@ def voxel_rays(cone_vec: ConeVec, layout: Layout, shape: Shape2) -> FloatArray:
 
 def as_cone_vec(cone_vec: ConeVec | npt.ArrayLike) -> ConeVec:
     """cone_vec, (n, 12) [mm], with a ray for each pixel, or GeometryError naming the row."""
-    return check_spread(
-        cone_vec if isinstance(cone_vec, ConeVec) else ConeVec(np.asarray(cone_vec))
-    )
+    given = cone_vec if isinstance(cone_vec, ConeVec) else ConeVec(as_numbers("cone_vec", cone_vec))
+    return check_spread(given)
 
 
 def check_out(out: Float32Array | None, shape: tuple[int, int, int]) -> Float32Array:

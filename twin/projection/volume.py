@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.errors import GeometryError, NotBuiltError
-from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray, as_numbers
 from flexdt.twin.lazy_backend import File, lazy_backend
 
 Vector3 = tuple[float, float, float]
@@ -164,7 +164,7 @@ class Volume:
     center_mm: Vector3 = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        data = np.asarray(self.data, dtype=np.float32)
+        data = as_numbers("volume data", self.data, np.float32)
         if data.ndim != 3 or 0 in data.shape:
             wanted = ("nz", "ny", "nx")
             raise GeometryError.of_shape("volume data", data.shape, wanted, ", all positive")

@@ -4,7 +4,7 @@ SIRT, SART (ordered subsets), CGLS and EM (maximum likelihood for positive data)
 one function; all see geometry through `forward` and `back` only. Everything is held in memory. The
 caller chooses the number of iterations; there is no stopping rule.
 
-A `Problem` is what every method has in hand: data, geometry and grid, and the matched pair of
+A `LinearSystem` is what every method has in hand: data, geometry and grid, and the matched pair of
 operators on plain arrays. Where a CUDA device has room for all that a method holds, the same method
 runs on a `DeviceProblem`, whose arrays are there from the first iteration to the last.
 """
@@ -58,7 +58,7 @@ Watch = Callable[[Step], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class LinearSystem:
     """Data, geometry and grid, with the pair of operators on plain arrays."""
 
     measured: Float32Array
@@ -72,16 +72,17 @@ class Problem:
         cone_vec: ConeVec | npt.ArrayLike,
         like: Volume | Grid,
         iterations: int,
-    ) -> Problem:
+    ) -> LinearSystem:
         """From checked arguments.
 
         Raises:
             GeometryError: no views, or shapes that do not fit.
             LimitError: no iterations.
         """
-        if iterations < 1:
+        if not isinstance(iterations, int | np.integer) or iterations < 1:
             raise LimitError(
-                f"{iterations} iterations; allowed: at least 1", {"asked": iterations, "allowed": 1}
+                f"iterations is {iterations!r}; allowed: a whole number from 1",
+                {"asked": repr(iterations), "allowed": 1},
             )
         geometry = as_cone_vec(cone_vec)
         if not len(geometry):
@@ -145,7 +146,7 @@ class Problem:
 
 
 @dataclass(frozen=True, eq=False)
-class DeviceProblem(Problem):
+class DeviceProblem(LinearSystem):
     """The same on a CUDA device: every array is a `DeviceArray`.
 
     Attributes:
@@ -155,39 +156,39 @@ class DeviceProblem(Problem):
     returns: bool = True
 
     @classmethod
-    def of_host(cls, problem: Problem) -> DeviceProblem:
+    def of_host(cls, problem: LinearSystem) -> DeviceProblem:
         """With the line integrals moved there, unless they are there."""
         there: Any = DeviceArray.of_images(problem.measured)
         return cls(there, problem.geometry, problem.like, not gpu.is_there(problem.measured))
 
     def first(self, start: Volume | None) -> Any:
-        """See `Problem`."""
+        """See `LinearSystem`."""
         if start is None:
             return DeviceArray.of_volume(DeviceVolume.blank(self.like))
         return DeviceArray.of_voxels(replace(self.like, data=super().first(start)))
 
     def project(self, x: Any, geometry: ConeVec | None = None) -> Any:
-        """See `Problem`."""
+        """See `LinearSystem`."""
         geometry = self.geometry if geometry is None else geometry
         return DeviceArray.of_images(forward(x.volume, geometry, self.shape))
 
     def spread(self, y: Any, geometry: ConeVec | None = None) -> Any:
-        """See `Problem`; in memory of its own."""
+        """See `LinearSystem`; in memory of its own."""
         geometry = self.geometry if geometry is None else geometry
         found: Any = back(y.images, geometry, self.like)
         return DeviceArray.of_volume(found)
 
     def part(self, views: slice | npt.NDArray[np.intp]) -> Any:
-        """See `Problem`."""
+        """See `LinearSystem`."""
         all_of_them: Any = self.measured
         return all_of_them if isinstance(views, slice) else all_of_them.images_of(views)
 
     def volume(self, x: Any) -> Any:
-        """See `Problem`; a `DeviceVolume` where the images were on the device."""
+        """See `LinearSystem`; a `DeviceVolume` where the images were on the device."""
         return x.volume.to("cpu") if self.returns else x.volume
 
 
-def solved(problem: Problem, method: Callable[[Problem], Found]) -> Found:
+def solved(problem: LinearSystem, method: Callable[[LinearSystem], Found]) -> Found:
     """By a method on the device, if images are there or it has room, or else on the processor."""
     if gpu.is_there(problem.measured):
         return method(DeviceProblem.of_host(problem))
@@ -266,7 +267,7 @@ def sirt(
         >>> bool(abs(found.data - 0.02).max() < 0.002)
         True
     """
-    problem = Problem.of(projections, cone_vec, like, iterations)
+    problem = LinearSystem.of(projections, cone_vec, like, iterations)
     return solved(
         problem,
         lambda p: _subset_steps(p, [slice(None)], 1.0, iterations, start, nonnegative, watch),
@@ -301,7 +302,7 @@ def sart(
         >>> bool(abs(found.data - 0.02).max() < 0.002)
         True
     """
-    problem = Problem.of(projections, cone_vec, like, iterations)
+    problem = LinearSystem.of(projections, cone_vec, like, iterations)
     count = min(subsets, len(problem.geometry))
     if count < 1 or not 0.0 < relaxation < 2.0:
         raise LimitError(
@@ -317,7 +318,7 @@ def sart(
 
 
 def _subset_steps(
-    problem: Problem,
+    problem: LinearSystem,
     parts: Sequence[slice | npt.NDArray[np.intp]],
     relaxation: float,
     iterations: int,
@@ -367,11 +368,13 @@ def cgls(
         >>> bool(abs(found.data - 0.02).max() < 0.002)
         True
     """
-    problem = Problem.of(projections, cone_vec, like, iterations)
+    problem = LinearSystem.of(projections, cone_vec, like, iterations)
     return solved(problem, lambda p: _cgls(p, iterations, start, watch))
 
 
-def _cgls(problem: Problem, iterations: int, start: Volume | None, watch: Watch | None) -> Volume:
+def _cgls(
+    problem: LinearSystem, iterations: int, start: Volume | None, watch: Watch | None
+) -> Volume:
     x = problem.first(start)
     rest = problem.measured - problem.project(x)
     gradient = problem.spread(rest)
@@ -415,11 +418,13 @@ def em(
         >>> bool(abs(found.data - 0.02).max() < 0.002)
         True
     """
-    problem = Problem.of(projections, cone_vec, like, iterations)
+    problem = LinearSystem.of(projections, cone_vec, like, iterations)
     return solved(problem, lambda p: _em(p, iterations, start, watch))
 
 
-def _em(problem: Problem, iterations: int, start: Volume | None, watch: Watch | None) -> Volume:
+def _em(
+    problem: LinearSystem, iterations: int, start: Volume | None, watch: Watch | None
+) -> Volume:
     measured = np.maximum(problem.measured, np.float32(0))
     whole = problem.spread(ones(measured)).copy(order="K")
     x = problem.first(start)

@@ -28,7 +28,7 @@ from flexdt.twin.projection.device_arrays import DeviceArray
 from flexdt.twin.projection.linear_operator import norm_of
 from flexdt.twin.reconstruction.iterative import (
     DeviceProblem,
-    Problem,
+    LinearSystem,
     Watch,
     dot,
     far_apart,
@@ -128,7 +128,7 @@ def minimise_tv(
         >>> bool(abs(found.volume.data - 0.02).max() < 0.001), found.converged
         (True, True)
     """
-    problem = Problem.of(projections, cone_vec, like, iterations)
+    problem = LinearSystem.of(projections, cone_vec, like, iterations)
     for name, value, least in (
         ("weight", weight, 0.0), ("tolerance", tolerance, 0.0), ("subsets", subsets, 1),
     ):  # fmt: skip
@@ -138,7 +138,7 @@ def minimise_tv(
             )
     regular = Regular.of(problem.like, nonnegative, mask)
 
-    def minimised(problem: Problem) -> Minimised:
+    def minimised(problem: LinearSystem) -> Minimised:
         there = isinstance(problem, DeviceProblem)
         kept = DeviceRegular.of_host(regular, problem.like) if there else regular
         return _minimised(problem, kept, iterations, weight, tolerance, subsets, start, watch)
@@ -163,7 +163,7 @@ def tv(*args: Any, **options: Any) -> Volume:
 
 
 def _minimised(
-    problem: Problem,
+    problem: LinearSystem,
     regular: Regular | DeviceRegular,
     iterations: int,
     weight: float,
@@ -243,7 +243,7 @@ class _At:
 class _Objective:
     """The cost and its steps."""
 
-    problem: Problem
+    problem: LinearSystem
     strength: float
     regular: Regular | DeviceRegular
 

@@ -40,7 +40,7 @@ QUICKER = (0.0, 0.125, 0.25, 0.5)
 WORTH_S = 0.02
 """A stop that is quicker by less than this is not looked for [s]."""
 
-Ways = Mapping[str, Trajectory]
+Trajectories = Mapping[str, Trajectory]
 
 
 @dataclass(frozen=True)
@@ -48,16 +48,16 @@ class Joined:
     """A certified programme that does what was asked, or as much of it as is free.
 
     Attributes:
-        ways: motor -> trajectory, of the motors whose programme changes; none if nothing does.
+        trajectories: of the motors whose programme changes; none if nothing does.
         contact: what cut it short; None where all of it is free.
     """
 
-    ways: Ways
+    trajectories: Trajectories
     contact: Contact | None = None
 
 
 @dataclass(frozen=True)
-class Jog:
+class JogMotion:
     """What a jog comes to.
 
     Attributes:
@@ -81,11 +81,11 @@ class Jog:
 
 
 @dataclass(frozen=True)
-class Stopping:
+class StopMotion:
     """How motors come to rest.
 
     Attributes:
-        ways: motor -> trajectory, of the motors whose programme changes.
+        trajectories: of the motors whose programme changes.
         path: `along` the path they were on together; `apart`, each motor by itself, on a path that
             was swept for it; `coasting`, without power, on a path that nothing keeps free.
         duration_s: until all motors rest.
@@ -93,7 +93,7 @@ class Stopping:
         would_hit: what coasting runs into; None for the other two.
     """
 
-    ways: Ways
+    trajectories: Trajectories
     path: Literal["along", "apart", "coasting"]
     duration_s: float
     distances: Mapping[str, float]
@@ -102,15 +102,17 @@ class Stopping:
     @classmethod
     def of(
         cls,
-        ways: Ways,
+        trajectories: Trajectories,
         path: Literal["along", "apart", "coasting"],
         now: float,
         would_hit: Contact | None = None,
-    ) -> Stopping:
+    ) -> StopMotion:
         """From trajectories that begin at `now` or earlier."""
-        distances = {n: abs(t.target - t.position(now)) for n, t in ways.items() if t.moving(now)}
-        seconds = max((t.end - now for t in ways.values()), default=0.0)
-        return cls(ways, path, max(0.0, seconds), distances, would_hit)
+        distances = {
+            n: abs(t.target - t.position(now)) for n, t in trajectories.items() if t.moving(now)
+        }
+        seconds = max((t.end - now for t in trajectories.values()), default=0.0)
+        return cls(trajectories, path, max(0.0, seconds), distances, would_hit)
 
 
 @dataclass(frozen=True)
@@ -138,18 +140,18 @@ class Lookahead:
         """What is programmed for the motors that have not come to their last rest."""
         return {n: d.ahead(self.now) for n, d in self.drives.items() if d.end > self.now}
 
-    def contact(self, ways: Ways, since: float | None = None) -> Contact | None:
-        """The first contact if some motors follow `ways` and the others what they are to follow.
+    def contact(self, trajectories: Trajectories, since: float | None = None) -> Contact | None:
+        """The first contact if some motors follow `trajectories` and the others their programme.
 
         Args:
-            ways: motor -> trajectory.
+            trajectories: motor -> trajectory.
             since: everything before is known to be free [s]; now if None.
         """
         if self.guard is None:
             return None
         start = self.now if since is None else since
-        others = {n: d.ahead(self.now) for n, d in self.drives.items() if n not in ways}
-        return self.guard({**others, **ways}, start)
+        others = {n: d.ahead(self.now) for n, d in self.drives.items() if n not in trajectories}
+        return self.guard({**others, **trajectories}, start)
 
     def touching(self, *, deep: bool = False) -> Mapping[tuple[str, str], float]:
         """Pairs within the safety margin now, as `Guard.touching`, wherever they are going."""
@@ -158,7 +160,7 @@ class Lookahead:
 
     # Joining ------------------------------------------------------------------------------------
 
-    def joined(self, new: Ways) -> Joined:
+    def joined(self, new: Trajectories) -> Joined:
         """The first certified programme of these, or none.
 
         1. The new motors do what is asked, the others carry on.
@@ -177,7 +179,7 @@ class Lookahead:
         )
         if halted is None and others and any(name in new for name in self.ahead()):
             halted = self._halt_along({**self.ahead(), **new}, contact)
-        if halted is None or not any(self._goes(name, way) for name, way in halted.items()):
+        if halted is None or not any(self._goes(name, t) for name, t in halted.items()):
             return Joined({}, contact)
         return Joined(halted, contact)
 
@@ -187,7 +189,7 @@ class Lookahead:
         far = abs(way.target - here.position(self.now)) >= LEAST_STEP
         return far or here.velocity(self.now) != 0.0
 
-    def _alone(self, new: Ways, contact: Contact) -> dict[str, Trajectory] | None:
+    def _alone(self, new: Trajectories, contact: Contact) -> dict[str, Trajectory] | None:
         """One motor that moves alone: its last free position is known, and its way there."""
         if len(new) != 1:
             return None
@@ -204,23 +206,27 @@ class Lookahead:
         halted = {name: way}
         return halted if self.contact(halted) is None else None
 
-    def _halt_along(self, new: Ways, contact: Contact) -> dict[str, Trajectory] | None:
+    def _halt_along(self, new: Trajectories, contact: Contact) -> dict[str, Trajectory] | None:
         """`new`, slowed along its path as late as it can be; the path is free up to the contact."""
-        moving = {name: self.drives[name].following(way) for name, way in new.items()}
+        moving = {name: self.drives[name].following(t) for name, t in new.items()}
 
         def rests_in_time(at: float) -> bool:
             return programme_time_at_rest(moving, at, self.hardest) <= contact.last_free_time
 
         at = self._latest(rests_in_time, contact, HALVINGS)
-        return None if at is None else _ways(braked_at(self.drives, at, new, self.hardest), new)
+        return (
+            None
+            if at is None
+            else _trajectories(braked_at(self.drives, at, new, self.hardest), new)
+        )
 
-    def _new_halt_swept(self, new: Ways, contact: Contact) -> dict[str, Trajectory] | None:
+    def _new_halt_swept(self, new: Trajectories, contact: Contact) -> dict[str, Trajectory] | None:
         """`new`, slowed among itself as late as it can be while the others carry on."""
 
         alone = {name: self.drives[name] for name in new}
 
         def halted(at: float) -> dict[str, Trajectory]:
-            return _ways(braked_at(alone, at, new, self.hardest), new)
+            return _trajectories(braked_at(alone, at, new, self.hardest), new)
 
         def free(at: float) -> bool:
             return self.contact(halted(at), since=at) is None
@@ -253,7 +259,7 @@ class Lookahead:
 
     # Stopping -----------------------------------------------------------------------------------
 
-    def stopped(self, most: Most = None) -> Stopping:
+    def stopped(self, most: Most = None) -> StopMotion:
         """Everything brought to rest: along the path, or quicker where a sweep shows that free.
 
         Args:
@@ -265,30 +271,30 @@ class Lookahead:
         except Exception:  # whatever a sweep meets, motors are stopped
             quicker = None
         if quicker is not None:
-            return Stopping.of(quicker, "apart", self.now)
-        return Stopping.of(along, "along", self.now)
+            return StopMotion.of(quicker, "apart", self.now)
+        return StopMotion.of(along, "along", self.now)
 
-    def _quicker(self, along: Ways, most: Most) -> dict[str, Trajectory] | None:
+    def _quicker(self, along: Trajectories, most: Most) -> dict[str, Trajectory] | None:
         """Along the path for a while and then each motor by itself, if a sweep shows it free."""
         whole = max((t.end for t in along.values()), default=self.now) - self.now
         due = [n for n, d in self.drives.items() if d.end > self.now]
         strongest = {
             name: greatest(name, d.at(self.now), self.now, most) for name, d in self.drives.items()
         }
-        slowed = {name: self.drives[name].following(way) for name, way in along.items()}
+        slowed = {name: self.drives[name].following(t) for name, t in along.items()}
         for share in QUICKER:
             at = self.now + share * whole
             drives = slowed if share else self.drives
             apart = braked_apart(self.machine, drives, at, strongest)
             if max((t.end for t in apart.values()), default=at) > self.now + whole - WORTH_S:
                 return None
-            ways = {n: motion.rejoined(along[n], at, rest) for n, rest in apart.items()}
+            trajectories = {n: motion.rejoined(along[n], at, rest) for n, rest in apart.items()}
             # The one motor that has anything to do brakes on the path that it was swept on. Where
             # another is to set off later, it may rely on the room that one would make.
             alone = not share and len(due) == 1
-            free = alone or self.contact({**along, **ways}, since=at) is None
-            if free and self._within_travel(ways):
-                return {**along, **ways}
+            free = alone or self.contact({**along, **trajectories}, since=at) is None
+            if free and self._within_travel(trajectories):
+                return {**along, **trajectories}
         return None
 
     # Changes of the stage -----------------------------------------------------------------------
@@ -302,13 +308,13 @@ class Lookahead:
         """Trajectories of the motors that are under way; a long programme has thousands."""
         return sum(len(d.trajectories) for d in self.drives.values() if d.end > self.now)
 
-    def halted_at_once(self, contact: Contact) -> Ways | None:
+    def halted_at_once(self, contact: Contact) -> Trajectories | None:
         """What is under way, slowed along its path from now on, if it rests before a contact."""
         if programme_time_at_rest(self.drives, self.now, self.hardest) > contact.last_free_time:
             return None
         return braked_along(self.drives, self.now, self.hardest)
 
-    def halted(self, under_way: Ways, contact: Contact) -> Ways | None:
+    def halted(self, under_way: Trajectories, contact: Contact) -> Trajectories | None:
         """What is under way, brought to rest before a contact that has come to lie ahead of it.
 
         As late as can be along the path, which is free up to the contact; where the contact is
@@ -317,27 +323,27 @@ class Lookahead:
         halted = self._alone(under_way, contact) or self._halt_along(under_way, contact)
         if halted is not None:
             return halted
-        for ways in (
+        for trajectories in (
             braked_along(self.drives, self.now, self.hardest),
             braked_apart(self.machine, self.drives, self.now, self.hardest),
         ):
-            if self._within_travel(ways) and self.contact(ways) is None:
-                return ways
+            if self._within_travel(trajectories) and self.contact(trajectories) is None:
+                return trajectories
         return None
 
-    def _within_travel(self, ways: Ways) -> bool:
+    def _within_travel(self, trajectories: Trajectories) -> bool:
         """Whether motors that brake by themselves rest within their travel.
 
         One that stops in step with a weaker one goes farther than its own programme did.
         """
         axes = self.machine.axes
         return all(
-            axes[name].lower - SAME_PLACE <= way.target <= axes[name].upper + SAME_PLACE
-            for name, way in ways.items()
+            axes[name].lower - SAME_PLACE <= t.target <= axes[name].upper + SAME_PLACE
+            for name, t in trajectories.items()
         )
 
 
-def _ways(drives: Mapping[str, Drive], names: Ways) -> dict[str, Trajectory]:
+def _trajectories(drives: Mapping[str, Drive], names: Trajectories) -> dict[str, Trajectory]:
     return {name: drives[name].trajectories[0] for name in names}
 
 
@@ -361,12 +367,14 @@ class UnsweptProgramme:
 
     def certified(self) -> CertifiedProgramme:
         """Sweep all of it; takes about 60 ms for 1440 steps."""
-        ways = {name: motion.at_rest(x, 0.0) for name, x in self.start.items()}
-        for name, trajectories in self.programme.items():
-            if trajectories:
-                wait = [ways[name]] if trajectories[0].start > 0.0 else []
-                ways[name] = motion.joined([*wait, *trajectories])
-        return CertifiedProgramme(self, None if self.guard is None else self.guard(ways, 0.0))
+        trajectories = {name: motion.at_rest(x, 0.0) for name, x in self.start.items()}
+        for name, legs in self.programme.items():
+            if legs:
+                wait = [trajectories[name]] if legs[0].start > 0.0 else []
+                trajectories[name] = motion.joined([*wait, *legs])
+        return CertifiedProgramme(
+            self, None if self.guard is None else self.guard(trajectories, 0.0)
+        )
 
 
 @dataclass(frozen=True)

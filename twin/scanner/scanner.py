@@ -31,10 +31,10 @@ from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.scanner.joining import (
     LEAST_STEP,
     CertifiedProgramme,
-    Jog,
+    JogMotion,
     Joined,
     Lookahead,
-    Stopping,
+    StopMotion,
     UnsweptProgramme,
 )
 from flexdt.twin.scanner.readout import readout
@@ -58,13 +58,13 @@ from flexdt.twin.scanner.settings import (
 )
 from flexdt.twin.scanner.stage_change import StageChange
 from flexdt.twin.scanner.state import (
-    AxisState,
-    Correction,
+    AxisReading,
+    NamedCorrection,
     Readout,
     Safety,
     Sample,
     ScannerState,
-    TubeState,
+    TubeSettings,
 )
 
 
@@ -90,10 +90,10 @@ class ScannerTwin:
         self.machine = machine
         self.profile = profile
         self.guard = guard
-        self.tube = TubeState(machine.tube.kV, machine.tube.power_W, since=now)
+        self.tube = TubeSettings(machine.tube.kV, machine.tube.power_W, since=now)
         self.camera = machine.detector.camera
         self.sample = Sample()
-        self.correction: Correction | None = None
+        self.correction: NamedCorrection | None = None
         self.safety = Safety(max_blocked_attempts=machine.max_blocked_attempts, stop=last_stop)
         self._drives: dict[str, Drive] = plan.home(machine, now)
         self._coasts_until = -math.inf
@@ -174,7 +174,7 @@ class ScannerTwin:
         return motor_poses(self.machine, self.profile, camera, positions)
 
     def corrected(
-        self, nominal: Poses, camera: CameraSettings, correction: Correction | None
+        self, nominal: Poses, camera: CameraSettings, correction: NamedCorrection | None
     ) -> ConeVec:
         """Geometry of poses with `correction`, checked (thesis 4.8.3).
 
@@ -257,7 +257,7 @@ class ScannerTwin:
             what = "move " + ", ".join(f"{name}={value:g}" for name, value in targets.items())
             raise self._blocked(joined, now, what)
         self.safety = after_free_motion(self.safety)
-        self._take(joined.ways)
+        self._take(joined.trajectories)
         return {name: max(0.0, t.end - now) for name, t in new.items()}
 
     def resolve(
@@ -274,7 +274,7 @@ class ScannerTwin:
         )
         return {name: t.target for name, t in planned.items()}
 
-    def jog(self, axis: str, velocity: float, lease_s: float, now: float) -> Jog:
+    def jog(self, axis: str, velocity: float, lease_s: float, now: float) -> JogMotion:
         """Run `axis` at `velocity` until the lease ends or a limit nears, and brake.
 
         A jog that a contact cuts short runs as far as it is free, and says so. One that cannot go
@@ -286,23 +286,25 @@ class ScannerTwin:
         self._require_ready("motion", now)
         new = plan.plan_jog(self.machine, self._drives, axis, velocity, lease_s, now)
         joined = self._lookahead(now).joined(new)
-        if joined.contact is not None and not joined.ways:
+        if joined.contact is not None and not joined.trajectories:
             raise self._blocked(joined, now, f"jog {axis} at {velocity:g}")
-        goes = any(abs(t.target - t.position(now)) >= LEAST_STEP for t in joined.ways.values())
+        goes = any(
+            abs(t.target - t.position(now)) >= LEAST_STEP for t in joined.trajectories.values()
+        )
         if joined.contact is None and goes:
             self.safety = after_free_motion(self.safety)
-        self._take(joined.ways)
-        seconds = max((t.end - now for t in joined.ways.values()), default=0.0)
-        rests = {name: t.target for name, t in joined.ways.items()}
-        return Jog(max(0.0, seconds), joined.contact, rests)
+        self._take(joined.trajectories)
+        seconds = max((t.end - now for t in joined.trajectories.values()), default=0.0)
+        rests = {name: t.target for name, t in joined.trajectories.items()}
+        return JogMotion(max(0.0, seconds), joined.contact, rests)
 
-    def stop(self, now: float) -> Stopping:
+    def stop(self, now: float) -> StopMotion:
         """Bring every motor to rest on what was swept; works in every state, ends a programme."""
         if now < self._coasts_until:  # without power nothing brakes
-            return Stopping.of(self.trajectories(now), "coasting", now)
+            return StopMotion.of(self.trajectories(now), "coasting", now)
         return self._stopped(self._lookahead(now).stopped())
 
-    def estop(self, now: float, by: str = "") -> Stopping:
+    def estop(self, now: float, by: str = "") -> StopMotion:
         """Bring the motors to rest as the machine's stop category says; X-rays off.
 
         Motion and X-rays are rejected until a reset.
@@ -317,10 +319,10 @@ class ScannerTwin:
         if now < self._coasts_until:
             return self.stop(now)
         if self.machine.estop.category == 0:
-            ways = coasting(self.machine, self._drives, now, self.machine.estop.coasting)
-            hit = ahead.contact(ways) if ways else None
-            self._coasts_until = max((t.end for t in ways.values()), default=now)
-            return self._stopped(Stopping.of(ways, "coasting", now, hit))
+            trajectories = coasting(self.machine, self._drives, now, self.machine.estop.coasting)
+            hit = ahead.contact(trajectories) if trajectories else None
+            self._coasts_until = max((t.end for t in trajectories.values()), default=now)
+            return self._stopped(StopMotion.of(trajectories, "coasting", now, hit))
         return self._stopped(ahead.stopped(ahead.hardest))
 
     def reset(self, now: float, stop: int | None = None) -> None:
@@ -413,7 +415,7 @@ class ScannerTwin:
     def stage_change(
         self,
         sample: Sample,
-        correction: Correction | None,
+        correction: NamedCorrection | None,
         guard: Guard | None,
         now: float,
         *,
@@ -480,7 +482,7 @@ class ScannerTwin:
         verdict = anew.renewed(change)
         for name, (speed, acceleration) in change.paces.items():
             self._drives = plan.with_settings(self.machine, self._drives, name, speed, acceleration)
-        self._stand(change.sample, change.correction, change.guard)
+        self._set_stage(change.sample, change.correction, change.guard)
         if anew.moves:
             self._take(anew.moves)
         self.safety = self._safety_at(now)
@@ -494,8 +496,8 @@ class ScannerTwin:
         stops = {name: t.target for name, t in halted.items()}
         return collision_error(contact, now, self.safety, "the motion under way", stops)
 
-    def stand(
-        self, sample: Sample, correction: Correction | None, guard: Guard | None, now: float
+    def initialise_stage(
+        self, sample: Sample, correction: NamedCorrection | None, guard: Guard | None, now: float
     ) -> list[str]:
         """Begin with this stage, whatever it touches: at a start the past cannot be helped.
 
@@ -506,12 +508,12 @@ class ScannerTwin:
             GeometryError: a correction that no scanner can have.
         """
         self.require_applicable(correction)
-        self._stand(sample, correction, guard)
+        self._set_stage(sample, correction, guard)
         self.safety = in_contact(self.safety, self._touching(now))
         pair = self.safety.contact
         return [] if pair is None else [f"{pair[0]} and {pair[1]} are closer than the margin"]
 
-    def require_applicable(self, correction: Correction | None) -> None:
+    def require_applicable(self, correction: NamedCorrection | None) -> None:
         """Check that a correction leaves a geometry that a scanner can have.
 
         Raises:
@@ -572,18 +574,20 @@ class ScannerTwin:
 
     # Inside -------------------------------------------------------------------------------------
 
-    def _take(self, ways: Mapping[str, Trajectory]) -> None:
+    def _take(self, trajectories: Mapping[str, Trajectory]) -> None:
         """Replace the programmes of motors: the caller holds a certificate for it."""
         self._programmes += 1
-        for name, trajectory in ways.items():
+        for name, trajectory in trajectories.items():
             self._drives[name] = self._drives[name].following(trajectory)
 
-    def _stopped(self, stopping: Stopping) -> Stopping:
+    def _stopped(self, stopping: StopMotion) -> StopMotion:
         self._stops += 1
-        self._take(stopping.ways)
+        self._take(stopping.trajectories)
         return stopping
 
-    def _stand(self, sample: Sample, correction: Correction | None, guard: Guard | None) -> None:
+    def _set_stage(
+        self, sample: Sample, correction: NamedCorrection | None, guard: Guard | None
+    ) -> None:
         self.sample, self.correction, self.guard = sample, correction, guard
         self._stage += 1
 
@@ -629,18 +633,18 @@ class ScannerTwin:
         contact = joined.contact
         assert contact is not None
         self.safety = after_contact(self.safety, contact)
-        ways = joined.ways
+        trajectories = joined.trajectories
         if self.safety.state == "blocked" and self.safety.contact is None:
-            ways = self.stop(now).ways  # once too often: all motion ends
+            trajectories = self.stop(now).trajectories  # once too often: all motion ends
         else:
-            self._take(ways)
-        stops = {name: t.target for name, t in ways.items()}
+            self._take(trajectories)
+        stops = {name: t.target for name, t in trajectories.items()}
         return collision_error(contact, now - zero, self.safety, what, stops)
 
-    def _axis_state(self, name: str, now: float) -> AxisState:
+    def _axis_state(self, name: str, now: float) -> AxisReading:
         axis, drive = self.machine.axes[name], self._drives[name]
         t = drive.at(now)
-        return AxisState(
+        return AxisReading(
             position=t.position(now),
             target=t.target,
             velocity=t.velocity(now) + 0.0,  # no negative zero
@@ -651,7 +655,7 @@ class ScannerTwin:
             unit=axis.unit,
         )
 
-    def _virtual_state(self, name: str, other: AxisState, now: float) -> AxisState:
+    def _virtual_state(self, name: str, other: AxisReading, now: float) -> AxisReading:
         """A virtual axis, read from the one motor it is defined by."""
         virtual = self.machine.virtual_axes[name]
         lower, upper = sorted(virtual.constant + virtual.factor * x for x in other.limits)

@@ -16,7 +16,7 @@ from flexdt.twin.machine.camera import CameraSettings, Roi, check_roi
 from flexdt.twin.machine.description import DetectorSpec, Machine, Profile, TubeSpec
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.scanner.readout import readout
-from flexdt.twin.scanner.state import Correction, TubeState
+from flexdt.twin.scanner.state import NamedCorrection, TubeSettings
 
 
 class CameraChange(TypedDict, total=False):
@@ -30,15 +30,15 @@ class CameraChange(TypedDict, total=False):
 
 
 def switched(
-    machine: Machine, tube: TubeState, on: bool, now: float | None, *, warm: bool
-) -> TubeState:
+    machine: Machine, tube: TubeSettings, on: bool, now: float | None, *, warm: bool
+) -> TubeSettings:
     """The tube's state after it is switched on or off.
 
     Args:
         machine: says how long the high voltage takes, and a warm-up after a long rest.
         tube: before; switching on what is on changes nothing.
         on: which.
-        now: time of the command [s]; None is long ago, so that X-rays are ready at once.
+        now: time of the command [s]; None: the X-rays are ready already.
         warm: no warm-up, however long the rest was.
     """
     if now is None:
@@ -56,8 +56,8 @@ def switched(
 
 
 def changed_tube(
-    spec: TubeSpec, tube: TubeState, kV: float | None, power_W: float | None
-) -> TubeState:
+    spec: TubeSpec, tube: TubeSettings, kV: float | None, power_W: float | None
+) -> TubeSettings:
     """The tube with another voltage [kV] or power [W]; None stays.
 
     Raises:
@@ -100,7 +100,7 @@ def _require_within(device: str, name: str, value: float, lower: float, upper: f
 
 
 def require_applicable(
-    machine: Machine, profile: Profile, camera: CameraSettings, correction: Correction | None
+    machine: Machine, profile: Profile, camera: CameraSettings, correction: NamedCorrection | None
 ) -> None:
     """Check that a correction leaves a geometry that a scanner can have, anywhere in the travel.
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, replace
 
 from flexdt.twin.errors import CollisionError, SafetyError
 from flexdt.twin.motion.profiles import Trajectory
-from flexdt.twin.scanner.joining import Lookahead, Ways
+from flexdt.twin.scanner.joining import Lookahead, Trajectories
 from flexdt.twin.scanner.safety import Contact, Guard, floor
-from flexdt.twin.scanner.state import Correction, Sample
+from flexdt.twin.scanner.state import NamedCorrection, Sample
 
 MANY_LEGS = 500
 """A programme of more trajectories than these is too long to be swept at a takeover."""
@@ -30,7 +30,7 @@ class Verdict:
     """
 
     contact: Contact | None = None
-    halted: Ways | None = None
+    halted: Trajectories | None = None
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class StageChange:
     """
 
     sample: Sample
-    correction: Correction | None
+    correction: NamedCorrection | None
     guard: Guard | None = field(repr=False)
     ahead: Lookahead = field(repr=False)
     version: tuple[int, int, int]

@@ -21,7 +21,7 @@ SafetyName = Literal["ready", "blocked", "estopped"]
 
 
 @dataclass(frozen=True)
-class AxisState:
+class AxisReading:
     """One motor or `virtual` axis: mm or deg, per second; the fields are those of the wire."""
 
     position: float
@@ -36,7 +36,7 @@ class AxisState:
 
 
 @dataclass(frozen=True)
-class TubeState:
+class TubeSettings:
     """The X-ray tube's settings, and when it was switched.
 
     Attributes:
@@ -62,7 +62,7 @@ class TubeState:
 
 
 @dataclass(frozen=True)
-class Placement:
+class StagePlacement:
     """Placement of the sample on the stage: shift [mm], then turns about x, y, z [deg].
 
     A point p of the sample lies at R_z R_y R_x p + (x, y, z) in the object's frame; all turns are
@@ -93,7 +93,7 @@ class Placement:
 
     def to_sample(self, cone_vec: ConeVec) -> ConeVec:
         """A geometry of the object's frame in the sample's own frame (for the projector)."""
-        if self == Placement():
+        if self == StagePlacement():
             return cone_vec
         back = self.rotation.T
         return cone_vec.moved(back, -back @ [self.x, self.y, self.z])
@@ -104,12 +104,12 @@ class Sample:
     """The sample on the stage, by name; "" is an empty stage."""
 
     name: str = ""
-    offset: Placement = field(default_factory=Placement)
+    offset: StagePlacement = field(default_factory=StagePlacement)
     material: str | None = None
 
 
 @dataclass(frozen=True)
-class Correction:
+class NamedCorrection:
     """A dated, named, immutable calibration result: true minus nominal, added to nominal.
 
     Attributes:
@@ -125,7 +125,9 @@ class Correction:
     note: str = ""
 
     @classmethod
-    def from_edge(cls, name: str, date: str, values: Mapping[str, float], note: str) -> Correction:
+    def from_edge(
+        cls, name: str, date: str, values: Mapping[str, float], note: str
+    ) -> NamedCorrection:
         """The correction with these values [mm, deg].
 
         Raises:
@@ -188,11 +190,11 @@ class ScannerState:
     """Everything public about a scanner at `time` [s of the twin's clock]."""
 
     time: float
-    axes: Mapping[str, AxisState]
-    tube: TubeState
+    axes: Mapping[str, AxisReading]
+    tube: TubeSettings
     camera: CameraSettings
     sample: Sample
     readout: Readout | None
     safety: Safety
-    correction: Correction | None
+    correction: NamedCorrection | None
     moving: bool

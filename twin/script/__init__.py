@@ -13,27 +13,27 @@ from flexdt.twin.script.planning.dry_run import (
 from flexdt.twin.script.planning.dry_run_report import html_report
 from flexdt.twin.script.planning.plan import (
     Exposure,
+    PlanStep,
     SampleSize,
     ScanPlan,
     StartState,
-    Step,
 )
 from flexdt.twin.script.planning.planner import plan_poses, plan_script
-from flexdt.twin.script.problems import Problem, ScriptError
+from flexdt.twin.script.problems import ScriptError, ScriptProblem
 
 __all__ = [
     "CheckReport",
     "Clearance",
     "Collision",
     "Exposure",
-    "Problem",
+    "PlanStep",
     "SampleSize",
     "ScanPlan",
     "ScanRequest",
     "Script",
     "ScriptError",
+    "ScriptProblem",
     "StartState",
-    "Step",
     "Wait",
     "check_plan",
     "check_script",

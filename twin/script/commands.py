@@ -16,7 +16,7 @@ from typing import Annotated, Any, dataclass_transform
 from pydantic import BeforeValidator, PlainSerializer, PlainValidator
 
 from flexdt.twin.machine.camera import Roi
-from flexdt.twin.script.problems import Problem
+from flexdt.twin.script.problems import ScriptProblem
 from flexdt.twin.values import adapter_of
 
 Binary = Annotated[
@@ -241,7 +241,7 @@ class Script:
     """
 
     commands: tuple[Command, ...]
-    warnings: tuple[Problem, ...] = ()
+    warnings: tuple[ScriptProblem, ...] = ()
     lines: int = 0
 
     @classmethod

@@ -17,7 +17,7 @@ from flexdt.twin.script import grammar
 from flexdt.twin.script.grammar import ArgumentError, shorten
 from flexdt.twin.script.lexer import LOG_STAMP, rows
 from flexdt.twin.script.parse import read_row
-from flexdt.twin.script.problems import Problem, in_order
+from flexdt.twin.script.problems import ScriptProblem, in_order
 
 _WAIT = re.compile(rb"\t(?:ACK|no[ ]wait|POS|RCV)(?=\t)", re.IGNORECASE)
 COLUMNS: Final = (
@@ -73,7 +73,7 @@ class Executed:
         return self.command.line
 
 
-def read_log(data: bytes) -> tuple[tuple[Executed, ...], tuple[Problem, ...]]:
+def read_log(data: bytes) -> tuple[tuple[Executed, ...], tuple[ScriptProblem, ...]]:
     """The lines of an executed script that could be read, and what is wrong with the others.
 
     Args:
@@ -89,21 +89,23 @@ def read_log(data: bytes) -> tuple[tuple[Executed, ...], tuple[Problem, ...]]:
         (0.501, 'XrayOff', ())
     """
     made: list[Executed] = []
-    problems: list[Problem] = []
+    problems: list[ScriptProblem] = []
     number, start = 0, 0
     for number, stamp in enumerate(LOG_STAMP.finditer(data), 1):
         try:
             made.append(_line(data[start : stamp.start()], stamp, number, problems))
         except ArgumentError as error:
-            problems.append(Problem("error", error.code, number, 1, str(error)))
+            problems.append(ScriptProblem("error", error.code, number, 1, str(error)))
         start = stamp.end()
     if data[start:].strip(b"\0 \t\r\n\x1a"):
         what = f"the last line is cut off before its moment and left out; {COLUMNS}"
-        problems.append(Problem("warning", "cut_off", number + 1, 1, what))
+        problems.append(ScriptProblem("warning", "cut_off", number + 1, 1, what))
     return tuple(made), in_order(problems)
 
 
-def _line(record: bytes, stamp: re.Match[bytes], number: int, problems: list[Problem]) -> Executed:
+def _line(
+    record: bytes, stamp: re.Match[bytes], number: int, problems: list[ScriptProblem]
+) -> Executed:
     wait = _WAIT.search(record)
     tail = [] if wait is None else record[wait.end() + 1 :].split(b"\t", 3)
     if wait is None or len(tail) < 3:
@@ -133,7 +135,7 @@ def _line(record: bytes, stamp: re.Match[bytes], number: int, problems: list[Pro
                 f"must begin with {_DOUBLES} big-endian doubles (position near the target, limits "
                 "twice)"
             )
-            problems.append(Problem("warning", "reply", number, 1, what))
+            problems.append(ScriptProblem("warning", "reply", number, 1, what))
     return Executed(command, own, 3600 * hour + 60 * minute + second, reply, motor)
 
 

@@ -16,7 +16,7 @@ from flexdt.twin.script import commands as c
 from flexdt.twin.script import grammar
 from flexdt.twin.script.grammar import ArgumentError, Spec, shorten
 from flexdt.twin.script.lexer import CodeLine, Field, is_log, is_utf16, line_count, rows
-from flexdt.twin.script.problems import Problem, ScriptError, in_order
+from flexdt.twin.script.problems import ScriptError, ScriptProblem, in_order
 
 _COMMENT_MARKS = ("#", "//", ";")
 _CUSTOM_NAME = re.compile(r"[A-Za-z][\w$.-]*", re.ASCII)
@@ -46,7 +46,7 @@ def parse_script(text: Source) -> c.Script:
     return script
 
 
-def read_script(text: Source) -> tuple[c.Script, tuple[Problem, ...]]:
+def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
     """The commands that could be read, and every problem of the text, by line.
 
     Example:
@@ -57,27 +57,27 @@ def read_script(text: Source) -> tuple[c.Script, tuple[Problem, ...]]:
     text = content(text)
     if is_utf16(text):
         what = "the script is UTF-16 text; save it as UTF-8 or plain ASCII"
-        return c.Script((), (), 0), (Problem("error", "syntax", 1, 1, what),)
-    problems: list[Problem] = []
+        return c.Script((), (), 0), (ScriptProblem("error", "syntax", 1, 1, what),)
+    problems: list[ScriptProblem] = []
     if is_log(text):
         what = (
             "this is an executed script, a log: `flexdt machine fit` learns the machine from it, "
             "and `flexdt check SCRIPT --against` it compares; to run, a script has seven columns"
         )
-        return c.Script((), (), 0), (Problem("error", "executed_log", 0, 1, what),)
+        return c.Script((), (), 0), (ScriptProblem("error", "executed_log", 0, 1, what),)
     made: list[c.Command] = []
     for row in rows(text):
         command = read_row(row, problems)
         if command is not None:
             made.append(command)
     if not made and not problems:
-        problems.append(Problem("error", "syntax", 0, 1, "the script holds no command"))
+        problems.append(ScriptProblem("error", "syntax", 0, 1, "the script holds no command"))
     ordered = in_order(problems)
     warnings = tuple(p for p in ordered if p.severity == "warning")
     return c.Script(tuple(made), warnings, line_count(text)), ordered
 
 
-def read_row(row: CodeLine, problems: list[Problem]) -> c.Command | None:
+def read_row(row: CodeLine, problems: list[ScriptProblem]) -> c.Command | None:
     """The command of one row, or None; what is wrong with it is added to `problems`."""
     return _Line(row, problems).command()
 
@@ -105,15 +105,15 @@ class _Parts:
 class _Line:
     """Reads one row and notes what is wrong with it."""
 
-    def __init__(self, row: CodeLine, problems: list[Problem]) -> None:
+    def __init__(self, row: CodeLine, problems: list[ScriptProblem]) -> None:
         self.row, self.problems = row, problems
         self.component = row.columns[0] if row.columns else row.words()[0]
 
     def error(self, code: str, column: int, message: str) -> None:
-        self.problems.append(Problem("error", code, self.row.line, column, message))
+        self.problems.append(ScriptProblem("error", code, self.row.line, column, message))
 
     def warn(self, code: str, column: int, message: str) -> None:
-        self.problems.append(Problem("warning", code, self.row.line, column, message))
+        self.problems.append(ScriptProblem("warning", code, self.row.line, column, message))
 
     def command(self) -> c.Command | None:
         name = self.component.text

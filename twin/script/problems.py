@@ -16,7 +16,7 @@ Severity = Literal["error", "warning"]
 
 
 @dataclass(frozen=True)
-class Problem:
+class ScriptProblem:
     """One finding. `line` and `column` count from 1; line 0 is the script as a whole."""
 
     severity: Severity
@@ -41,15 +41,15 @@ class Problem:
 class WithProblems:
     """What has `problems`: the errors among them, and the warnings."""
 
-    problems: tuple[Problem, ...]
+    problems: tuple[ScriptProblem, ...]
 
     @property
-    def errors(self) -> tuple[Problem, ...]:
+    def errors(self) -> tuple[ScriptProblem, ...]:
         """Problems that forbid running the script."""
         return tuple(p for p in self.problems if p.severity == "error")
 
     @property
-    def warnings(self) -> tuple[Problem, ...]:
+    def warnings(self) -> tuple[ScriptProblem, ...]:
         """Problems that do not."""
         return tuple(p for p in self.problems if p.severity == "warning")
 
@@ -57,7 +57,7 @@ class WithProblems:
 class ScriptError(TwinError):
     """A script that does not hold; `problems` has every error and warning, in line order."""
 
-    def __init__(self, problems: Iterable[Problem]) -> None:
+    def __init__(self, problems: Iterable[ScriptProblem]) -> None:
         self.problems = in_order(problems)
         errors = [p for p in self.problems if p.severity == "error"]
         count = f"{len(errors)} error{'s' if len(errors) != 1 else ''}"
@@ -70,18 +70,18 @@ class Findings:
     """Collects problems; each is about the command at `place`, its line and column."""
 
     def __init__(self) -> None:
-        self.problems: list[Problem] = []
+        self.problems: list[ScriptProblem] = []
         self.place = (0, 1)
 
     def error(self, code: str, message: str) -> None:
         """Add an error."""
-        self.problems.append(Problem("error", code, *self.place, message))
+        self.problems.append(ScriptProblem("error", code, *self.place, message))
 
     def warn(self, code: str, message: str) -> None:
         """Add a warning."""
-        self.problems.append(Problem("warning", code, *self.place, message))
+        self.problems.append(ScriptProblem("warning", code, *self.place, message))
 
 
-def in_order(problems: Iterable[Problem]) -> tuple[Problem, ...]:
+def in_order(problems: Iterable[ScriptProblem]) -> tuple[ScriptProblem, ...]:
     """Problems by line and column; those of one place keep their order."""
     return tuple(sorted(problems, key=lambda p: (p.line, p.column)))

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from flexdt.clients.client.client import TwinClient
     from flexdt.clients.datasets.data_set import DataSet
     from flexdt.clients.datasets.exchange import Given
-    from flexdt.twin.calibration.pipeline import Request
-    from flexdt.twin.scanner.state import Correction
+    from flexdt.twin.calibration.pipeline import CalibrationRequest
+    from flexdt.twin.scanner.state import NamedCorrection
 
 ReadingName = Literal["axis", "mount"]
 
@@ -124,17 +124,17 @@ def calibrate(
 def _request(
     phantom: str | None, free: str | None, per_scan: str, per_frame: str, reading: ReadingName,
     bead_tolerance: float | None, prior: list[str] | None, start: list[str] | None,
-) -> Request:  # fmt: skip
+) -> CalibrationRequest:  # fmt: skip
     """What is to be estimated, and what is known of it."""
     from flexdt.twin.calibration.fit.priors import exact
     from flexdt.twin.calibration.fit.problem import SIX, Reading
-    from flexdt.twin.calibration.pipeline import Request
+    from flexdt.twin.calibration.pipeline import CalibrationRequest
     from flexdt.twin.calibration.unknown_markers import UNKNOWN
     from flexdt.twin.geometry.offsets import Offsets
 
     usual = ("dO_x",) if phantom == UNKNOWN else SIX
     asked = usual if free is None else option_values.names(free)
-    return Request(
+    return CalibrationRequest(
         free=asked,
         per_scan=option_values.names(per_scan),
         reading={"axis": Reading.AXIS_AT_O_PLUS_TAU, "mount": Reading.MOUNT_SHIFT}[reading],
@@ -289,7 +289,9 @@ def _require_answer(twin: Twin) -> None:
         pass
 
 
-def _push(twin: Twin, correction: Correction, source: str, document: Mapping[str, object]) -> None:
+def _push(
+    twin: Twin, correction: NamedCorrection, source: str, document: Mapping[str, object]
+) -> None:
     with twin() as client:
         push_correction(client, correction, source)
     note(f"in force on the twin: {correction.name}")
@@ -297,7 +299,7 @@ def _push(twin: Twin, correction: Correction, source: str, document: Mapping[str
         note("warning: a twin's correction is the same in all frames, without the motion")
 
 
-def push_correction(client: TwinClient, correction: Correction, source: str) -> None:
+def push_correction(client: TwinClient, correction: NamedCorrection, source: str) -> None:
     """Put a correction in force on the twin: the parameters that it changes."""
     from flexdt.twin.geometry.offsets import NOMINAL
 

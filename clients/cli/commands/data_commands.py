@@ -284,7 +284,6 @@ def export(
     """
     if correction is not None and not corrected:
         raise typer.BadParameter("--correction and --nominal exclude each other")
-    from flexdt.clients.cli.commands.data_commands import read_report, scan_of
     from flexdt.clients.datasets.exchange import export_dataset
     from flexdt.clients.launch.random_truth import read
     from flexdt.twin.geometry.offsets import NOMINAL, Offsets

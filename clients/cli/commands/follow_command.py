@@ -16,7 +16,7 @@ from flexdt.clients.cli.options import Answer, argument, option
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
-    from flexdt.clients.following.session import FramesBeside, Session
+    from flexdt.clients.following.session import FollowSession, FramesBeside
     from flexdt.twin.following.follower import Follower
     from flexdt.twin.following.mirror import Alarm
 
@@ -56,7 +56,7 @@ def follow(
     from flexdt.clients.extras import package
 
     zmq = package("zmq", "flexdt follow", "gateway")
-    from flexdt.clients.following.session import Session, endpoint
+    from flexdt.clients.following.session import FollowSession, endpoint
 
     try:
         at = endpoint(address)
@@ -74,7 +74,7 @@ def follow(
     with ExitStack() as files:
         log = None if record is None else files.enter_context(record.open("ab"))
         tell = (lambda alarm: None) if json else _say
-        session = Session(follower, tell, log)
+        session = FollowSession(follower, tell, log)
         note(f"following {at}, compared with machine {follower.machine.name}; Ctrl-C ends it")
         try:
             with suppress(KeyboardInterrupt):
@@ -107,7 +107,7 @@ def _follower(
 
 
 async def _run(
-    session: Session,
+    session: FollowSession,
     address: str,
     seconds: float | None,
     port: int | None,
@@ -132,7 +132,7 @@ async def _run(
         raise error
 
 
-async def _status(session: Session) -> None:
+async def _status(session: FollowSession) -> None:
     """Say now and then how old what is known is."""
     while True:
         await asyncio.sleep(STATUS_S)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from flexdt.clients.client.client import TwinClient
     from flexdt.clients.expose import Forecast, Measured, Transmission
     from flexdt.protocol.state_model import JobStatus
-    from flexdt.twin.script import CheckReport, Problem
+    from flexdt.twin.script import CheckReport, ScriptProblem
     from flexdt.twin.script.executed_log import Executed
 
 ScriptFile = Annotated[Path, typer.Argument(metavar="SCRIPT", help="Acquila scan script.")]
@@ -142,7 +142,7 @@ def exit_code(report: CheckReport) -> int:
     return verdict(p.code for p in report.problems if p.severity == "error")
 
 
-def tell(problems: Sequence[Problem], file: str) -> None:
+def tell(problems: Sequence[ScriptProblem], file: str) -> None:
     """Problems with their places, to standard error."""
     for p in problems:
         place = ":".join([file, *(str(n) for n in (p.line, p.column) if p.line)])

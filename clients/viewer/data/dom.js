@@ -26,6 +26,11 @@ export function el(tag, attributes = {}, ...children) {
     node.append(...children.filter((c) => c !== null && c !== undefined));
     return node;
 }
+// Id of a button -> what it does.
+export function clicks(acts) {
+    for (const [id, act] of Object.entries(acts))
+        $(`#${id}`).addEventListener("click", () => void act());
+}
 // Attributes of what is pressed like a button and looks like none.
 export function pressed(f) {
     return { role: "button", tabIndex: 0, onclick: f, onkeydown: (e) => { if (e.key === "Enter" && !e.repeat)
@@ -46,8 +51,9 @@ export function parsed(text) {
 // A field for a number (as text: browsers drop what they cannot read from number fields without a word).
 // What is typed is marked until Enter applies it or Escape takes it back.
 export function field(attributes, apply, back) {
-    const input = el("input", { type: "text", inputMode: "decimal", autocomplete: "off", ...attributes });
-    input.classList.add("num");
+    return numeric(el("input", { type: "text", inputMode: "decimal", autocomplete: "off", class: "num", ...attributes }), apply, back);
+}
+export function numeric(input, apply, back) {
     input.addEventListener("input", () => input.classList.add("typed"));
     input.addEventListener("keydown", (e) => {
         const step = e.key === "ArrowUp" ? 1 : e.key === "ArrowDown" ? -1 : 0, value = parsed(input.value);

@@ -1,5 +1,5 @@
 // The Share tab: pictures, files that open anywhere, scenes to save and load.
-import { $, $input, $select, bytes, chosen, download, el, words } from "./dom.js";
+import { $input, $select, bytes, chosen, clicks, download, words } from "./dom.js";
 import { command, emit } from "./link.js";
 import { picture } from "./film.js";
 import { current } from "./views.js";
@@ -34,9 +34,11 @@ async function save() {
     download(url, `flexdt-scene-${new Date().toISOString().slice(0, 19).replace(/[:T]/g, "-")}.json`);
     setTimeout(() => URL.revokeObjectURL(url), 10000);
 }
-const button = (id, text, f) => el("button", { id, class: "small", onclick: f }, text);
-const row = (...nodes) => el("div", { class: "row", style: "flex-wrap:wrap" }, ...nodes);
-$("#tab-share").append(el("div", { class: "card" }, el("h2", {}, "Picture of a view"), row(el("select", { id: "shot-size", "aria-label": "Size of the picture" }, ...["1280x800", "1920x1080", "3840x2160"].map((s) => el("option", {}, s))), button("shot", "Save PNG", shot), button("shot-film", "Radiograph PNG", film))), el("div", { class: "card" }, el("h2", {}, "The scene as it stands"), row(button("export-html", "One HTML file", exported("html")), button("export-viser", ".viser", exported("viser"))), el("p", { class: "muted" }, "The HTML opens in any browser, without a server.")), el("div", { class: "card" }, el("h2", {}, "A scan as a replay"), row(button("replay-html", "One HTML file", exported("html", true)), button("replay-viser", ".viser", exported("viser", true))), el("p", { class: "muted" }, "Of the script that was last scrubbed in the Scan tab.")), el("div", { class: "card" }, el("h2", {}, "Scenes"), row(button("scene-save", "Save", save), el("input", { type: "file", id: "scene-file", accept: ".json", hidden: true }), button("scene-load", "Load…", () => $input("#scene-file").click())), el("p", { class: "muted" }, "Positions, tube, camera, sample and correction. Loading moves the machine.")));
+clicks({
+    "shot": shot, "shot-film": film, "export-html": exported("html"), "export-viser": exported("viser"),
+    "replay-html": exported("html", true), "replay-viser": exported("viser", true),
+    "scene-save": save, "scene-load": () => $input("#scene-file").click(),
+});
 chosen($input("#scene-file"), async (file) => {
     try {
         if (await command("scene.load", { document: JSON.parse(await file.text()) }, "Not loaded"))

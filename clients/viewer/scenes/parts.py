@@ -20,7 +20,7 @@ from flexdt.clients.viewer.scenes import sample as s
 from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.sample import PaintedMesh
 from flexdt.phantoms.files.mesh_files import read_part
-from flexdt.twin.collision.convex_solids import Cylinder, Polytope, Solid
+from flexdt.twin.collision.convex_solids import ConvexSolid, Polytope, UprightCylinder
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Component, Machine
 
@@ -199,9 +199,9 @@ FINENESS = 2
 """Of the ball that a body is grown by: an icosphere, whose points lie along the axes too."""
 
 
-def bare(solid: Solid) -> trimesh.Trimesh:
+def bare(solid: ConvexSolid) -> trimesh.Trimesh:
     """A convex solid [mm]."""
-    if isinstance(solid, Cylinder):
+    if isinstance(solid, UprightCylinder):
         size = 2.0 * solid.radius, solid.height
         return solids.cylinder(*size, solid.center, solids.STEEL).mesh
     assert isinstance(solid, Polytope)

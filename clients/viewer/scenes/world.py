@@ -22,7 +22,7 @@ from flexdt.clients.viewer.scenes import parts as bodies
 from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.sample import MM
 from flexdt.protocol.state_model import CameraState, State
-from flexdt.twin.collision.collision_scene import Scene
+from flexdt.twin.collision.collision_scene import CollisionScene
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import (
     FloatArray,
@@ -36,7 +36,7 @@ from flexdt.twin.geometry.rigid import Rigid
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses
-from flexdt.twin.scanner.state import Placement
+from flexdt.twin.scanner.state import StagePlacement
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +135,7 @@ def world_of(machine: Machine, profile: Profile, state: State) -> World:
         state: as the twin sends it.
     """
     camera, positions = camera_of(machine, state.camera), motors(machine, state)
-    offset = Placement(**state.sample.offset.model_dump())
+    offset = StagePlacement(**state.sample.offset.model_dump())
     return placed(machine, profile, camera, positions, parameters_of(state), offset)
 
 
@@ -145,7 +145,7 @@ def placed(
     camera: CameraSettings,
     positions: Mapping[str, float],
     p: Offsets = NOMINAL,
-    offset: Placement | None = None,
+    offset: StagePlacement | None = None,
 ) -> World:
     """Where everything is.
 
@@ -164,7 +164,7 @@ def placed(
     stage = Rigid(turn, pivot + turn @ (pose.mount[0] - tau))
     # The rows are the authority on geometry: back from the object's frame to the world.
     view = stage @ pose.cone_vec(p).with_shape(camera.shape)
-    at = Placement() if offset is None else offset
+    at = StagePlacement() if offset is None else offset
     on_stage = Rigid(at.rotation, np.array([at.x, at.y, at.z]))
     source, detector, u, v = view.rows.reshape(4, 3)
     shifts = source - pose.source[0], detector - pose.detector[0]
@@ -216,7 +216,7 @@ class PlanDrawing:
         collision: its collision bodies.
     """
 
-    def __init__(self, machine: Machine, collision: Scene) -> None:
+    def __init__(self, machine: Machine, collision: CollisionScene) -> None:
         self._collision = collision
         moving = {part.name for part in machine.components if machine.chain(part)}
         self._moving = [body for body in collision.bodies if body.name in moving]

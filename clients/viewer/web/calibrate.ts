@@ -1,24 +1,12 @@
 // The Calibrate tab: corrections there are, the one in force, applying and undoing, running a fit.
-import { $, $$, $button, $input, chosen, el, fixed, words } from "./dom.js";
+import { $, $$, $button, $input, chosen, clicks, el, fixed, words } from "./dom.js";
 import { call, command, emit, on } from "./link.js";
 import type { CalibrationAlignResult, Correction, Estimated, FitReport, Requests } from "./viewer.js";
 import { know } from "./compare.js";
 import { open } from "./data.js";
 
-$("#tab-calibrate").append(
-  el("div", { class: "card" }, el("h2", {}, "In force"), el("div", { id: "in-force" }),
-    el("div", { class: "row", style: "margin-top:7px" }, el("button", { id: "revert", class: "small", onclick: revert }, "Undo"))),
-  el("div", { class: "card", id: "fit-card" }, el("h2", {}, "Calibrate from data sets"),
-    el("div", { class: "list", id: "datasets" }),
-    el("div", { class: "form", style: "margin-top:7px" },
-      el("label", { class: "muted" }, "phantom"), el("input", { type: "text", id: "fit-phantom", value: "lego", "aria-label": "Phantom", title: "unknown: markers of which nobody knows where they are", oninput: named }),
-      el("label", { class: "muted", id: "fit-scale-label", hidden: true }, "distance, mm"), el("input", { type: "text", id: "fit-scale", placeholder: "0-1=25", hidden: true, "aria-label": "Distance of two markers", title: "Of markers 0 and 1, say; empty: the scale is not known" }),
-      el("button", { id: "fit", class: "small primary", onclick: fit }, "Calibrate"), el("span", { id: "fit-note", class: "muted" })),
-    el("div", { class: "report", id: "fit-report" })),
-  el("div", { class: "card" }, el("h2", {}, "Apply a report"),
-    el("div", { class: "muted" }, "The JSON of “flexdt calibrate --json”, or parameter: value pairs."),
-    el("div", { class: "row", style: "margin-top:7px" }, el("input", { type: "file", id: "correction-file", accept: ".json", "aria-label": "A calibration's report" }))),
-  el("div", { class: "card" }, el("h2", {}, "History"), el("div", { class: "list", id: "corrections" })));
+clicks({ revert, fit });
+$input("#fit-phantom").addEventListener("input", named);
 
 type Parameters = Record<string, number | null>;
 const values = (parameters: object): Record<string, unknown> => Object.fromEntries(Object.entries(parameters).map(([k, v]: [string, unknown]) => [k, typeof v === "number" ? v : (v as { value?: unknown } | null)?.value]));

@@ -1,5 +1,5 @@
 // The Data tab: a browser of data sets; one that is open goes through its images, radiograph and machine together.
-import { $, $$, $button, $dialog, $select, el, fixed, putImage, seconds, setText, slid, within, words } from "./dom.js";
+import { $, $$, $button, $dialog, $input, $select, clicks, el, fixed, putImage, seconds, setText, slid, within, words } from "./dom.js";
 import { call, command, emit, on, store } from "./link.js";
 import { asked, remember } from "./address.js";
 import type { AboutImage, DatasetInfo, DatasetResult, ImageValue, JobStatus, Kind } from "./viewer.js";
@@ -14,11 +14,8 @@ const WORDS: Record<DatasetInfo["state"], string> = { complete: "complete", inco
 type Opened = DatasetResult & { whole?: DatasetResult };
 let listed: DatasetInfo[] = [], told: Opened | null = null, plan: Lanes | null = null, index = 0, next: number | null = null, asking = false, playing = false, number = 0;
 
-const search = el("input", { type: "text", id: "data-search", placeholder: "Search: name, sample, date, 90kV, incomplete …", "aria-label": "Search data sets" });
-$("#tab-data").append(
-  el("div", { class: "card" }, el("h2", {}, "Data sets"), search, el("div", { id: "data-list" }),
-    el("div", { class: "row between small-text" }, el("span", { id: "data-count", class: "muted" }),
-      el("button", { id: "data-more", class: "small", hidden: true, onclick: () => list(listed.length) }, "More"))));
+const search = $input("#data-search");
+clicks({ "data-more": () => list(listed.length) });
 const slider: HTMLInputElement = el("input", { type: "range", id: "record-frame", min: 0, step: 1, value: 0, "aria-label": "Image", oninput: () => show(Number(slider.value)) });
 const canvas = el("canvas", { id: "record-line", role: "img", "aria-label": "Motors, clearance and counts over time" });
 const button = (id: string, text: string, title: string, f: () => unknown) => el("button", { id, class: "small", title, onclick: f }, text);

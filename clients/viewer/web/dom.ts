@@ -24,6 +24,10 @@ export function el<T extends keyof HTMLElementTagNameMap>(tag: T, attributes: At
   node.append(...children.filter((c) => c !== null && c !== undefined));
   return node;
 }
+// Id of a button -> what it does.
+export function clicks(acts: Record<string, () => unknown>): void {
+  for (const [id, act] of Object.entries(acts)) $(`#${id}`).addEventListener("click", () => void act());
+}
 // Attributes of what is pressed like a button and looks like none.
 export function pressed(f: () => unknown) {
   return { role: "button", tabIndex: 0, onclick: f, onkeydown: (e: KeyboardEvent) => { if (e.key === "Enter" && !e.repeat) f(); } };
@@ -42,8 +46,9 @@ export function parsed(text: string): number {
 // A field for a number (as text: browsers drop what they cannot read from number fields without a word).
 // What is typed is marked until Enter applies it or Escape takes it back.
 export function field(attributes: Attributes, apply: () => unknown, back: () => unknown): HTMLInputElement {
-  const input = el("input", { type: "text", inputMode: "decimal", autocomplete: "off", ...attributes });
-  input.classList.add("num");
+  return numeric(el("input", { type: "text", inputMode: "decimal", autocomplete: "off", class: "num", ...attributes }), apply, back);
+}
+export function numeric(input: HTMLInputElement, apply: () => unknown, back: () => unknown): HTMLInputElement {
   input.addEventListener("input", () => input.classList.add("typed"));
   input.addEventListener("keydown", (e) => {
     const step = e.key === "ArrowUp" ? 1 : e.key === "ArrowDown" ? -1 : 0, value = parsed(input.value);

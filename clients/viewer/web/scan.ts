@@ -1,5 +1,5 @@
 // The Scan tab: a script to write, check, scrub and run; the job's progress; thumbnails of its frames.
-import { $, $button, $canvas, $input, $select, bytes, chosen, el, fixed, isNumber, pressed, putGrey, seconds, slid, words } from "./dom.js";
+import { $, $button, $canvas, $input, $select, bytes, chosen, clicks, el, fixed, isNumber, pressed, putGrey, seconds, slid, words } from "./dom.js";
 import type { CheckResult, CheckStep, Compose, JobStatus, Pair, PlanDocument, Problem, ScriptInput, State } from "./viewer.js";
 import { call, command, emit, Failure, on, store } from "./link.js";
 import { rememberedScript, rememberScript } from "./address.js";
@@ -9,57 +9,16 @@ import * as designer from "./designer.js";
 
 const FINAL = ["done", "failed", "aborted", "incomplete"];
 const MAX_THUMBS = 40;
-const SPEEDS: Array<[value: string, words: string]> = [["1", "1×"], ["10", "10×"], ["60", "60×"], ["max", "max"]];
-const text = el("textarea", {
-  id: "script", spellcheck: false, "aria-label": "Script",
-  placeholder: "Paste an Acquila script, open a file, or make one below",
-  title: "Tab writes a tab; Shift+Tab, or Escape and Tab, leaves",
-});
-const gutter = el("pre", { id: "gutter" }), ink = el("div"), LINE_PX = 16;
+const text = $<HTMLTextAreaElement>("#script"), gutter = $("#gutter"), ink = $("#paint div"), LINE_PX = 16;
 let written = [""], worst = new Map<number, "hit" | "soft">(), problems: Problem[] = [], plan: (Lanes & PlanDocument) | null = null, planned = "", lost = false, sent = "";
 
-function jobButton(action: "pause" | "resume" | "step" | "abort") {
-  const order = () => command(`job.${action}`, { job: store.job?.job }, `Cannot ${action}`);
-  return el("button", { class: `small${action === "abort" ? " warn" : ""}`, id: `job-${action}`, onclick: order }, action.charAt(0).toUpperCase() + action.slice(1));
-}
-$("#tab-scan").append(
-  el("div", { class: "card" },
-    el("h2", {}, "Script"),
-    el("div", { class: "editor" }, gutter, el("div", { id: "paint", "aria-hidden": "true" }, ink), text),
-    el("div", { id: "line-note", class: "small-text", "aria-live": "polite" }),
-    el("div", { class: "row", style: "margin-top:7px" },
-      el("label", { class: "inline" },
-        el("input", { type: "file", id: "script-file", accept: ".txt,.acq", hidden: true }),
-        el("button", { class: "small", onclick: () => $input("#script-file").click() }, "Open…")),
-      el("button", { id: "check", class: "small", onclick: checkAndPlan }, "Check"),
-      el("button", { id: "plan", class: "small", onclick: showPlan }, "Scrub"),
-      el("span", { class: "spacer" }),
-      el("span", { class: "inline" },
-        el("select", { id: "speed-up", title: "Speed-up", "aria-label": "Speed-up of the scan" }, ...SPEEDS.map(([v, t]) => el("option", { value: v }, t))),
-      el("button", { id: "run", class: "small primary", onclick: run }, "Run"))),
-    el("div", { class: "row", style: "margin-top:7px" },
-      el("select", { id: "wish-kind", "aria-label": "Kind of scan" },
-        ...["fly", "step", "tiled", "helical", "calibration"].map((k) => el("option", {}, k))),
-      el("label", { class: "inline muted" }, "frames", el("input", { type: "number", id: "wish-frames", value: 73, min: 2 })),
-      el("label", { class: "inline muted" }, "ms", el("input", { type: "number", id: "wish-exposure", value: 100 })),
-      el("button", { id: "compose", class: "small", onclick: () => compose() }, "Write")),
-    el("div", { class: "report", id: "report" })),
-  el("div", { class: "card", id: "timeline-card", hidden: true }, el("h2", {}, "Timeline"),
-    el("canvas", { id: "timeline", tabIndex: 0, role: "slider", "aria-label": "Moment of the plan", "aria-valuemin": 0 }),
-    el("div", { class: "row between small-text mono" },
-      el("span", { id: "scrub-at", class: "cut" }),
-      el("button", { class: "small", id: "unscrub", onclick: () => scrub(null) }, "Hide ghost"))),
-  el("div", { class: "card", id: "thumb-card", hidden: true }, el("h2", {}, "Frames"), el("div", { class: "thumbs", id: "thumbs" })));
 designer.place($("#tab-scan .card"));
-$("#job").append(
-  el("div", { class: "row between" }, el("b", { id: "job-name" }), el("span", { id: "job-state", class: "muted" })),
-  el("div", { class: "progress", id: "job-bar" }, el("i")),
-  el("div", { class: "row between small-text mono" }, el("span", { id: "job-frames" }), el("span", { id: "job-left" })),
-  el("div", { class: "muted small-text", id: "job-what" }),
-  el("div", { class: "row", style: "margin-top:6px" }, ...(["pause", "resume", "step", "abort"] as const).map(jobButton),
-    el("button", { id: "job-scrub", class: "small", title: "Go through this scan's plan on the timeline", onclick: recall }, "Go through it"),
-    el("button", { id: "job-data", class: "small", title: "Its images, with the machine as it stood",
-      onclick: () => { emit("show-tab", "data"); void openData(folder(store.job), null, true); } }, "Images")));
+clicks({
+  "script-open": () => $input("#script-file").click(), "check": checkAndPlan, "plan": showPlan, run,
+  "compose": () => compose(), "unscrub": () => scrub(null), "job-scrub": recall,
+  "job-data": () => { emit("show-tab", "data"); void openData(folder(store.job), null, true); },
+});
+for (const action of ["pause", "resume", "step", "abort"] as const) clicks({ [`job-${action}`]: () => command(`job.${action}`, { job: store.job?.job }, `Cannot ${action}`) });
 
 function marks() {
   written = text.value.split("\n"); worst = new Map();

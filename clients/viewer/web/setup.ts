@@ -1,64 +1,26 @@
 // The Setup tab: tube, camera, sample on the stage (with upload), layers of the scene.
-import { $, $$, $button, $canvas, $input, $select, base64, cleared, el, field, fixed, parsed, words } from "./dom.js";
-import type { ExposurePrediction, Layers, Placement, PredictedSetting, Requests, SampleUpload, State, UploadResult } from "./viewer.js";
+import { $, $$, $button, $canvas, $input, $select, base64, cleared, clicks, el, fixed, numeric, parsed, words } from "./dom.js";
+import type { ExposurePrediction, Placement, PredictedSetting, Requests, SampleUpload, State, UploadResult } from "./viewer.js";
 import { call, command, emit, on, store } from "./link.js";
 
 const CHUNK = 3 << 20;
-const MODES = ["HW1SW1High", "HW2SW1High", "HW2SW2High", "HW1SW1Low", "HW2SW1Low", "HW2SW2Low"];
 const FORMATS: Array<SampleUpload["format"]> = ["stl", "obj", "ply", "glb", "off"];
-const LAYERS: Record<Exclude<keyof Layers, "opacity">, string> = {
-  beam: "X-ray cone", panel: "image on the panel", axis: "axis, piercing point", ranges: "travel ranges",
-  bodies: "collision bodies", margin: "safety margin", sample: "sample", machine: "machine",
-  orbit: "planned trajectory", gizmos: "handles to drag", labels: "names, axes, scale",
-};
 const ROI = ["l", "t", "r", "b"], SIX = ["x", "y", "z", "rx", "ry", "rz"] as const;
 // What is set here and not yet applied bears the class "typed"; everything else shows the state.
-const number = (id: string) => { const input: HTMLInputElement = field({ id }, () => input.closest(".card")?.querySelector<HTMLElement>("[data-apply]")?.click(), () => takeBack(id)); return input; };
-const select = (id: string, ...options: Node[]) => {
-  const node: HTMLSelectElement = el("select", { id, onchange: () => node.classList.add("typed"), onkeydown: (e) => { if (e.key === "Escape") takeBack(id); } }, ...options);
-  return node;
-};
-function label(text: string, ...inputs: HTMLElement[]) {
-  if (inputs.length === 1 && inputs[0]) return [el("label", { class: "muted", htmlFor: inputs[0].id }, text), inputs[0]];
-  for (const input of inputs) input.setAttribute("aria-label", `${text.split(" ")[0]} ${input.id.split("-").pop() ?? ""}`);
-  return [el("span", { class: "muted" }, text), el("div", { class: inputs.length === 4 ? "quad" : "triple" }, ...inputs)];
+for (const input of $$<HTMLInputElement>("#tab-setup .num")) {
+  numeric(input, () => input.closest(".card")?.querySelector<HTMLElement>("[data-apply]")?.click(), () => takeBack(input.id));
 }
-
-const tube = el("div", { class: "card" }, el("h2", {}, "X-ray tube"), el("div", { class: "form" },
-  ...label("voltage [kV]", number("kV")), ...label("power [W]", number("power")),
-  el("button", { id: "tube-apply", "data-apply": "", class: "small", onclick: setTube }, "Apply"),
-  el("button", { id: "beam", onclick: () => command("tube.set", { on: !store.state?.tube.on }, "The tube refuses") }, "X-rays on")));
-const beam = el("div", { class: "card" }, el("h2", {}, "Spectrum and physics"), el("div", { class: "form" },
-  el("span", { class: "muted" }, "physics"), el("b", { id: "physics" }, "–"),
-  el("span", { id: "physics-note", class: "wide muted small-text" }),
-  el("span", { class: "muted" }, "filters"), el("span", { id: "filters" }, "–"),
-  el("canvas", { id: "spectrum", role: "img", "aria-label": "Photons by energy" }),
-  el("span", { id: "spectrum-note", class: "wide muted small-text mono" }),
-  el("button", { id: "predict", class: "small", title: "Contrast to noise of a void of 0.5 mm on the darkest ray, with the sample on the stage", onclick: predict }, "Predict"),
-  el("span", { id: "predicted", class: "muted small-text" }, "image quality of a scan")));
-const camera = el("div", { class: "card" }, el("h2", {}, "Camera"), el("div", { class: "form" },
-  ...label("exposure [ms]", number("exposure")),
-  ...label("mode", select("mode", ...MODES.map((m) => el("option", {}, m)))),
-  ...label("averages", number("averages")),
-  ...label("ROI l t r b", ...ROI.map((k) => number(`roi-${k}`))),
-  el("button", { id: "camera-apply", "data-apply": "", class: "small", onclick: setCamera }, "Apply"), el("span", { id: "camera-shape", class: "muted mono" })));
-const opacity: HTMLInputElement = el("input", { type: "range", id: "opacity", min: 0.1, max: 1, step: 0.05, value: 0.6, onchange: () => command("viewer.layers", { opacity: Number(opacity.value) }) });
-const sample = el("div", { class: "card" }, el("h2", {}, "Sample"), el("div", { class: "form" },
-  ...label("on the stage", select("sample")),
-  ...label("shift x y z", number("off-x"), number("off-y"), number("off-z")),
-  ...label("turn x y z [°]", number("off-rx"), number("off-ry"), number("off-rz")),
-  el("button", { id: "sample-apply", "data-apply": "", class: "small", onclick: setSample }, "Put on stage"), el("span", { id: "sample-note", class: "muted" }),
-  ...label("opacity", opacity)));
-const upload = el("div", { class: "card" }, el("h2", {}, "Upload a mesh"), el("div", { class: "form" },
-  ...label("file", el("input", { type: "file", id: "mesh-file", accept: FORMATS.map((f) => `.${f}`).join(",") })),
-  ...label("unit", el("select", { id: "mesh-unit" }, ...["mm", "um", "cm", "m", "inch"].map((u) => el("option", {}, u)))),
-  ...label("material", el("select", { id: "mesh-material" })),
-  el("button", { id: "mesh-upload", class: "small", onclick: sendMesh }, "Upload"), el("span", { id: "mesh-note", class: "muted" })));
-const layers = el("div", { class: "card" }, el("h2", {}, "Shown in the scenes"), ...Object.entries(LAYERS).map(([name, text]) => {
-  const box: HTMLInputElement = el("input", { type: "checkbox", id: `layer-${name}`, onchange: () => showLayer(name, box.checked) });
-  return el("div", {}, el("label", {}, box, text));
-}));
-$("#tab-setup").append(tube, beam, camera, sample, upload, layers);
+for (const list of [$select("#mode"), $select("#sample")]) {
+  list.addEventListener("change", () => list.classList.add("typed"));
+  list.addEventListener("keydown", (e) => { if (e.key === "Escape") takeBack(list.id); });
+}
+for (const box of $$<HTMLInputElement>("#layers input")) box.addEventListener("change", () => void showLayer(box.id.replace("layer-", ""), box.checked));
+const opacity = $input("#opacity");
+opacity.addEventListener("change", () => void command("viewer.layers", { opacity: Number(opacity.value) }));
+clicks({
+  "tube-apply": setTube, "camera-apply": setCamera, "sample-apply": setSample, predict, "mesh-upload": sendMesh,
+  "beam": () => command("tube.set", { on: !store.state?.tube.on }, "The tube refuses"),
+});
 
 // A field or a list of these.
 const of = (id: string) => $<HTMLInputElement | HTMLSelectElement>(`#${id}`);

@@ -1,15 +1,12 @@
 // The volume that grows while a scan runs: its three middle slices, from the images so far.
-import { $, $canvas, el, fixed, keep, putImage, setText, words } from "./dom.js";
+import { $, $canvas, $select, fixed, keep, putImage, setText, words } from "./dom.js";
 import { call, on, store } from "./link.js";
 import type { Live } from "./viewer.js";
 import { folder } from "./data.js";
 
-const KEY = "flexdt-volume", PLANES = { top: "from above", front: "from the source", side: "from the side" };
-const size = el("select", { id: "volume-side", "aria-label": "Slices while a scan runs", onchange: choose },
-  el("option", { value: "" }, "off"), ...[128, 192, 256].map((n) => el("option", { value: n }, `${n} voxels a side`)));
-const note = el("span", { id: "volume-note", class: "muted small-text mono" });
-const plates = Object.entries(PLANES).map(([name, words]) => el("figure", {}, el("canvas", { id: `slice-${name}`, role: "img", "aria-label": `Middle slice, ${words}` }), el("figcaption", {}, words)));
-$("#volume-card").append(el("div", { class: "row between" }, el("h2", {}, "Slices so far"), size), el("div", { class: "slices", hidden: true }, ...plates), note);
+const KEY = "flexdt-volume";
+const size = $select("#volume-side"), note = $("#volume-note");
+size.addEventListener("change", choose);
 size.value = localStorage.getItem(KEY) ?? "";
 
 let asked: string | null = null;

@@ -243,7 +243,6 @@ export type GeometryState = {
 };
 export type HelloResult = {
   protocol: string;
-  server: string;
   machine: string;
   profile: string | null;
   session: string | null;
@@ -293,12 +292,9 @@ export type Layers = {
   beam?: boolean | null;
   axis?: boolean | null;
   panel?: boolean | null;
-  ranges?: boolean | null;
-  bodies?: boolean | null;
   margin?: boolean | null;
   sample?: boolean | null;
   machine?: boolean | null;
-  orbit?: boolean | null;
   gizmos?: boolean | null;
   labels?: boolean | null;
   opacity?: number | null;

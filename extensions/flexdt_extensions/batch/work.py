@@ -376,14 +376,14 @@ def _calibrations(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, A
             noisy, model, item.poses, free, shape=item.shape, noise_px=item.noise_px
         )
         return {}, _judged(fit, item, free, fit.identifiable, "")
-    from flexdt.twin.calibration.pipeline import Request, Scan, calibrate
+    from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate
     from flexdt_extensions.studies.rendered_runs import Rendering, render
 
     camera = Rendering(counts=item.counts, blur_px=plan.calibrate.blur_px)
     key = [int(v) for v in seed_of(plan, item.index, NOISE).generate_state(4)]
     frames = render(item.phantom.scene, model, item.poses, item.truth, camera, key, item.shape)
     result = calibrate(
-        [Scan(frames, item.poses)], model, Request(free=free), scene=item.phantom.scene
+        [Scan(frames, item.poses)], model, CalibrationRequest(free=free), scene=item.phantom.scene
     )
     note = "; ".join(f.text for f in result.errors)
     return {}, _judged(result.fit, item, free, result.identifiable, note)

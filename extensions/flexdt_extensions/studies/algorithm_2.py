@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration import edge_factor
-from flexdt.twin.calibration.fit.problem import Problem
+from flexdt.twin.calibration.fit.problem import FitProblem
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import Offsets
@@ -79,7 +79,7 @@ class Algorithm2(Iterated):
     parameters: Offsets
 
 
-def algorithm_2(problem: Problem, lam: float = 1e-2) -> Algorithm2:
+def algorithm_2(problem: FitProblem, lam: float = 1e-2) -> Algorithm2:
     """Run Algorithm 2.
 
     Args:

@@ -21,7 +21,7 @@ from flexdt.twin.calibration.detect.windows import blur_kernel
 from flexdt.twin.calibration.fit.priors import exact
 from flexdt.twin.calibration.fit.problem import from_printed_reading, to_printed_reading
 from flexdt.twin.calibration.frame_source import ArrayFrames
-from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate
+from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.offsets import Offsets
@@ -138,7 +138,9 @@ def first_scan(
     really, _ = hidden_phantom(scene, model, seed)
     poses = poses_of(name, frames)
     images = radiographs(really, poses.cone_vec(hidden(name)), beam, [seed, 0])
-    request = Request(reading=Reading.MOUNT_SHIFT, bead_tolerance_mm=TOLERANCE_MM, priors=exact())
+    request = CalibrationRequest(
+        reading=Reading.MOUNT_SHIFT, bead_tolerance_mm=TOLERANCE_MM, priors=exact()
+    )
     result = calibrate([Scan(ArrayFrames(images, SHAPE), poses, name)], model, request, scene=scene)
     assert result.fit is not None
     # The last image repeats the first angle.
@@ -179,7 +181,7 @@ def image_runs(
         result = calibrate(
             [Scan(some, poses[chosen], name)],
             found,
-            Request(
+            CalibrationRequest(
                 reading=Reading.MOUNT_SHIFT, bead_tolerance_mm=found.tolerance_mm, priors=exact()
             ),
             scene=scene,

@@ -28,7 +28,7 @@ from flexdt.twin.calibration.detect.windows import (
 )
 from flexdt.twin.calibration.fit.priors import exact
 from flexdt.twin.calibration.frame_source import FrameSpots, look_at
-from flexdt.twin.calibration.pipeline import Request, Scan, calibrate, detector_for
+from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate, detector_for
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import Offsets
@@ -281,7 +281,7 @@ def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
             for g, (frames, poses) in enumerate(zip(made, everything, strict=True))
         ]
         result = calibrate(
-            scans, model, Request(free=task.free, priors=exact(task.free)), scene=scene
+            scans, model, CalibrationRequest(free=task.free, priors=exact(task.free)), scene=scene
         )
         note = "; ".join(f.text for f in result.errors)
         problem = None if result.fit is None or note else result.fit.problem

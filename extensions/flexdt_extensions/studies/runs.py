@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration import BeadModel, FitResult, estimate_geometry
-from flexdt.twin.calibration.fit.problem import Problem
+from flexdt.twin.calibration.fit.problem import FitProblem
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
@@ -131,7 +131,7 @@ def run_of(
     n: int,
     fit: FitResult | None,
     truth: Offsets,
-    problem: Problem | None,
+    problem: FitProblem | None,
     note: str = "",
 ) -> Run:
     """Compare a fit with the truth, and let Algorithm 2 solve the same tracks.
@@ -193,7 +193,7 @@ def errors_of(values: dict[str, float], truth: Offsets) -> dict[str, float]:
     }
 
 
-def _algorithm_2(task: WorkUnit, n: int, problem: Problem, truth: Offsets) -> Run | None:
+def _algorithm_2(task: WorkUnit, n: int, problem: FitProblem, truth: Offsets) -> Run | None:
     """What Algorithm 2 makes of the same tracks; nothing if beads are unknowns too."""
     if problem.layout.bead_column >= 0:
         return None

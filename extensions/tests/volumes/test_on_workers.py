@@ -24,7 +24,7 @@ from flexdt.twin.errors import LimitError, TwinError
 from flexdt_extensions.volumes import zarr_volume
 from flexdt_extensions.volumes.on_workers import as_made
 
-STUDIES = Path(__file__).parents[1] / "studies"
+STUDIES = Path(__file__).parents[3] / "tests" / "studies"
 
 SOD, SDD, VIEWS, ROWS, COLS, PIXEL = 600.0, 1059.0, 24, 96, 120, 1.19
 SHAPE, VOXEL = (150, 70, 61), 0.5

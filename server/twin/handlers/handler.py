@@ -22,10 +22,10 @@ from flexdt.server.network.shell_parts import Peer
 from flexdt.server.storage.corrections import History
 from flexdt.server.storage.memory import Memory, as_of
 from flexdt.server.storage.scene import apply_settings, paces_of
-from flexdt.server.storage.stored_samples import Upload
+from flexdt.server.storage.stored_samples import ReceivedSample
 from flexdt.server.twin.core import TwinServer
 from flexdt.twin.scanner.scanner import ScannerTwin
-from flexdt.twin.scanner.state import Correction, Sample
+from flexdt.twin.scanner.state import NamedCorrection, Sample
 
 Item = TypeVar("Item")
 View = TypeVar("View")
@@ -132,12 +132,12 @@ async def change_settings(
 async def change_stage(
     twin: TwinServer,
     sample: Sample,
-    correction: Correction | None,
+    correction: NamedCorrection | None,
     ready: Callable[[], None],
     *,
     history: History | None = None,
     source: str | None = None,
-    upload: Upload | None = None,
+    upload: ReceivedSample | None = None,
     scene: Scene | None = None,
 ) -> list[str]:
     """Put a sample on the stage and a correction in force; hold `stage_turn` meanwhile.

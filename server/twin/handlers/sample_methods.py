@@ -21,7 +21,7 @@ from flexdt.server.twin.handlers.handler import (
     in_turns,
 )
 from flexdt.twin.errors import LimitError, UnknownNameError
-from flexdt.twin.scanner.state import Placement, Sample
+from flexdt.twin.scanner.state import Sample, StagePlacement
 
 
 @answers(p.SAMPLE_SET)
@@ -32,7 +32,9 @@ async def set_sample(twin: TwinServer, client: Client, params: p.SampleSet) -> p
     head = twin.samples.head(name)
     if params.file is not None and head is None:
         raise _unknown(twin, name)
-    offset = Placement() if params.offset is None else Placement(**params.offset.model_dump())
+    offset = (
+        StagePlacement() if params.offset is None else StagePlacement(**params.offset.model_dump())
+    )
     if name == EMPTY:
         sample = Sample()
     else:

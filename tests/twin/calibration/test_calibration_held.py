@@ -14,7 +14,7 @@ from flexdt.twin.calibration.bead_model import bead_model
 from flexdt.twin.calibration.diagnose.fixed_parameters import HELD_SIGMAS, held_distance, judge_held
 from flexdt.twin.calibration.fit.priors import exact
 from flexdt.twin.calibration.frame_source import ArrayFrames
-from flexdt.twin.calibration.pipeline import Calibration, Request, Scan, calibrate
+from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
@@ -68,7 +68,7 @@ def scan() -> tuple[Poses, Float32Array]:
     return poses, radiographs(LEGO, cone, 20_000.0, 5)
 
 
-def calibrated(scan: tuple[Poses, Float32Array], request: Request) -> Calibration:
+def calibrated(scan: tuple[Poses, Float32Array], request: CalibrationRequest) -> Calibration:
     poses, images = scan
     return calibrate([Scan(ArrayFrames(list(images), SHAPE), poses)], LEGO, request)
 
@@ -87,7 +87,9 @@ def test_a_held_parameter_that_is_off_is_no_confident_answer(
 ) -> None:
     """Freed bead positions used to absorb it: hundreds of sigmas off, called identifiable."""
     known = exact(free)
-    result = calibrated(scan, Request(free=free, bead_tolerance_mm=tolerance, priors=known))
+    result = calibrated(
+        scan, CalibrationRequest(free=free, bead_tolerance_mm=tolerance, priors=known)
+    )
     assert not result.identifiable
     (found,) = [f for f in result.errors if f.code == "held_parameter"]
     assert says in found.text
@@ -97,7 +99,7 @@ def test_a_parameter_that_is_not_asked_for_is_not_taken_to_be_exact(
     scan: tuple[Poses, Float32Array],
 ) -> None:
     """tau lies 0.2 and 0.5 mm from where it is fixed; what is estimated is right all the same."""
-    fit = calibrated(scan, Request(free=("dO_x", "dO_y", "dO_z", "alpha"))).fit
+    fit = calibrated(scan, CalibrationRequest(free=("dO_x", "dO_y", "dO_z", "alpha"))).fit
     assert fit is not None
     for name, true in TRUTH.items():
         assert abs(fit.values[name] - true) < 4 * fit.sigmas[name]
@@ -112,7 +114,7 @@ def test_a_cause_that_looks_like_another_is_named_beside_it() -> None:
     for aside, offered in ((10.0, True), (30.0, False)):
         truth = Offsets.from_edge(TRUTH | {"dD_x": aside})
         images = radiographs(LEGO, poses.cone_vec(truth), 20_000.0, 5)
-        result = calibrated((poses, images), Request())
+        result = calibrated((poses, images), CalibrationRequest())
         assert result.identifiable == offered
         assert result.fit is not None
         if offered:
@@ -132,7 +134,7 @@ def test_a_parameter_held_where_it_is_stays_held(
     if reading is Reading.MOUNT_SHIFT:
         start = Offsets.from_edge({n: TRUTH[n] for n in (*held, "tau_x", "tau_z")})
     free = tuple(n for n in SIX if n not in held)
-    result = calibrated(scan, Request(free=free, start=start, reading=reading))
+    result = calibrated(scan, CalibrationRequest(free=free, start=start, reading=reading))
     assert result.identifiable
     assert result.findings == ()
     assert result.fit is not None
@@ -146,12 +148,12 @@ def test_the_last_look_at_the_bounds_of_doubt_widens_the_intervals(
     scan: tuple[Poses, Float32Array],
 ) -> None:
     """Held three sigmas off: too little to be named, enough to move what hangs together with it."""
-    best = calibrated(scan, Request(priors=exact(SIX))).fit
+    best = calibrated(scan, CalibrationRequest(priors=exact(SIX))).fit
     assert best is not None
     off = best.values["tau_x"] + 3.5 * best.sigmas["tau_x"]
     free = tuple(n for n in SIX if n != "tau_x")
     start = Offsets.from_edge({"tau_x": off})
-    result = calibrated(scan, Request(free=free, start=start, priors=exact(free)))
+    result = calibrated(scan, CalibrationRequest(free=free, start=start, priors=exact(free)))
     assert result.identifiable
     assert result.fit is not None
     moved = abs(result.fit.values["dO_x"] - best.values["dO_x"])
@@ -164,10 +166,10 @@ def test_a_detector_that_is_elsewhere_is_named() -> None:
     poses, _ = careful_scan(np.random.default_rng(7), FRAMES)
     truth = Offsets.from_edge(TRUTH | {"dD_z": 10.0})
     images = radiographs(LEGO, poses.cone_vec(truth), 20_000.0, 5)
-    result = calibrated((poses, images), Request())
+    result = calibrated((poses, images), CalibrationRequest())
     assert [f.code for f in result.errors] == ["held_parameter"]
     assert "dD_z is known as 0 +- 1 mm, the images say " in result.errors[0].text
-    freed = calibrated((poses, images), Request(free=(*SIX, "dD_z")))
+    freed = calibrated((poses, images), CalibrationRequest(free=(*SIX, "dD_z")))
     assert freed.identifiable
     assert freed.fit is not None
     assert abs(freed.fit.values["dD_z"] - 10.0) < 5 * freed.fit.sigmas["dD_z"]
@@ -184,7 +186,7 @@ def test_one_bead_can_still_show_where_it_is() -> None:
     held = {n: TRUTH[n] for n in ("dO_z", "alpha", "tau_x", "tau_z")}
     for start, good in ((held, True), (held | {"tau_z": 0.0}, False)):
         free = ("dO_x", "dO_y")
-        request = Request(free=free, start=Offsets.from_edge(start), priors=exact(free))
+        request = CalibrationRequest(free=free, start=Offsets.from_edge(start), priors=exact(free))
         frames = ArrayFrames(list(images), SHAPE)
         result = calibrate([Scan(frames, poses)], model, request, scene=bead.scene)
         assert result.identifiable == good
@@ -196,7 +198,7 @@ def test_what_is_exactly_known_stays_so_where_other_priors_are_widened() -> None
     poses, _ = careful_scan(np.random.default_rng(7), FRAMES)
     truth = Offsets.from_edge({**TRUTH, "det_roll": 1.5})
     images = radiographs(LEGO, poses.cone_vec(truth), 20_000.0, 5)
-    result = calibrated((poses, images), Request(priors={"dD_z": 0.0}))
+    result = calibrated((poses, images), CalibrationRequest(priors={"dD_z": 0.0}))
     assert result.identifiable
     assert "priors_narrow" in [f.code for f in result.findings]
     assert result.fit is not None

@@ -12,7 +12,7 @@ from calibration_scenarios import scenario
 from scipy import linalg
 
 from flexdt.twin.calibration.fit.fitted_motion import _Mixed
-from flexdt.twin.calibration.pipeline import Request
+from flexdt.twin.calibration.pipeline import CalibrationRequest
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.motion import MOVABLE, Motion
 
@@ -139,7 +139,7 @@ def test_a_motion_goes_into_poses_and_documents() -> None:
 
 def test_what_is_no_motion_is_refused() -> None:
     with pytest.raises(UnknownNameError, match="'tau_x' cannot differ from frame to frame"):
-        Request(per_frame=("tau_x",))
+        CalibrationRequest(per_frame=("tau_x",))
     values = np.ones((3, 1))
     motion = Motion(("dO_x",), values, values, (9.0,))
     with pytest.raises(TwinError, match="motion of 3 frames for a scan of 9"):

@@ -14,7 +14,7 @@ from flexdt.twin.calibration import estimate_geometry, identifiability
 from flexdt.twin.calibration.diagnose.fixed_parameters import judge_priors, loosened
 from flexdt.twin.calibration.fit.image_quantities import image_quantities
 from flexdt.twin.calibration.fit.priors import ASSUMED, exact, prior_widths
-from flexdt.twin.calibration.pipeline import Request
+from flexdt.twin.calibration.pipeline import CalibrationRequest
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
@@ -131,13 +131,13 @@ def test_widths_come_from_profile_machine_and_request() -> None:
     assert prior_widths(None, profile.model_copy(update={"priors": {"dD_x": 0.0}}))["dD_x"] == 0.0
     assert set(exact()) - set(exact(("dD_x",))) == {"dD_x"}
     with pytest.raises(TwinError, match=r"allowed: 0 \(exactly known\) or more"):
-        Request(priors={"dD_x": -1.0})
+        CalibrationRequest(priors={"dD_x": -1.0})
     with pytest.raises(UnknownNameError, match="dD_w"):
-        Request(priors={"dD_w": 1.0})
+        CalibrationRequest(priors={"dD_w": 1.0})
     with pytest.raises(TwinError, match="exactly known; choose one"):
-        Request(free=("dO_x", "dD_x"), priors={"dD_x": 0.0})
+        CalibrationRequest(free=("dO_x", "dD_x"), priors={"dD_x": 0.0})
     with pytest.raises(TwinError, match="bound"):
-        Request(bound=0.0)
+        CalibrationRequest(bound=0.0)
 
 
 def test_a_turn_of_everything_about_the_source_is_named() -> None:

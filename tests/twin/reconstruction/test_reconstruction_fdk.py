@@ -49,6 +49,7 @@ from tests.twin.reconstruction.scans import CENTRE, MU, RADIUS, ball, circle, me
 
 SHAPE = (120, 130)
 LIKE = Grid((80, 80, 80), 0.4).blank()
+NEAR = Grid((52, 52, 52), 0.4, CENTRE).blank()  # twice as wide as the ball
 
 
 @pytest.mark.parametrize(
@@ -71,7 +72,7 @@ LIKE = Grid((80, 80, 80), 0.4).blank()
          "two-turns", "yaw", "axis", "tilted"],
 )  # fmt: skip
 def test_a_ball_comes_back(scan):
-    found, centre = measure(fdk(ball(scan, SHAPE), scan, LIKE))
+    found, centre = measure(fdk(ball(scan, SHAPE), scan, NEAR))
     assert found == pytest.approx(1.0, abs=0.01)
     assert np.abs(centre).max() < 0.1
 
@@ -95,10 +96,11 @@ def rolled(scan: ConeVec, degrees: float) -> ConeVec:
     return ConeVec(rows)
 
 
+@pytest.mark.daily(4)
 @pytest.mark.parametrize("degrees", [30.0, 60.0, 89.9, 90.0, 180.0, 269.95, 270.0])
 def test_a_panel_turned_any_way_gives_the_same_ball(degrees):
     scan = rolled(circle(240), degrees)
-    found, centre = measure(fdk(ball(scan, SHAPE), scan, LIKE))
+    found, centre = measure(fdk(ball(scan, SHAPE), scan, NEAR))
     assert found == pytest.approx(1.0, abs=0.01)
     assert np.abs(centre).max() < 0.1
 
@@ -236,6 +238,7 @@ def with_four_dense_things(seed: int, field: float) -> list[Ellipse]:
     return parts
 
 
+@pytest.mark.daily(2)
 @pytest.mark.parametrize("seed", [0, 2, 4, 11])
 def test_dense_things_do_not_pull_the_outline_unsaid(seed):
     """Seeds 4 and 11 are hard: most rays meet something dense, and no quarter of them is clean."""

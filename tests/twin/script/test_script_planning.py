@@ -23,7 +23,7 @@ from flexdt.twin.machine.description import (
     parse_machine,
     profile_of,
 )
-from flexdt.twin.scanner.state import Placement
+from flexdt.twin.scanner.state import StagePlacement
 from flexdt.twin.script import (
     ScanPlan,
     StartState,
@@ -521,7 +521,7 @@ def test_the_cylinder_about_a_box_holds_its_corners_at_every_angle(
     """Corners of the box, turned about its own middle, shifted, and turned with the stage."""
     size = np.array([8.0, 5.0, 12.0])
     tilts = (40.0, 25.0) if tilted else (0.0, 0.0)
-    placed = Placement(*at, rx=tilts[0], ry=tilts[1])
+    placed = StagePlacement(*at, rx=tilts[0], ry=tilts[1])
     found = SampleSize.around(size.tolist(), "mesh", placed)
     corners = np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * size
     widest = highest = 0.0

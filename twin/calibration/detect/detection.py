@@ -43,7 +43,7 @@ class Detections:
         covariances: (k, 2, 2) [px^2].
         radii_px: (k,) radius of each spot.
         contrast: (k,) line integral through its middle, above the background.
-        bias: (k,) sphere-centre bias factor of the position (see `model.Centre`).
+        bias: (k,) sphere-centre bias factor of the position (see `fit.problem.Centre`).
         whole: (k,) whether all of the spot lies in the image.
         likeness: (k,) correlation with a ball's profile (whole ones), or the share of it in view.
         shape: (rows, cols) of the image.

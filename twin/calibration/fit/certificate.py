@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from flexdt.twin.calibration.fit.problem import Problem, edge_factor
+from flexdt.twin.calibration.fit.problem import FitProblem, edge_factor
 from flexdt.twin.calibration.fit.residual_structure import (
     SIGNIFICANT,
     Drift,
@@ -327,7 +327,7 @@ def widened(certificate: Certificate, more: FloatArray | Mapping[str, float]) ->
 
 
 def certify(
-    problem: Problem,
+    problem: FitProblem,
     x: FloatArray,
     use: npt.NDArray[np.bool_],
     prior_noise: float = 1.0,
@@ -441,7 +441,7 @@ def _of_what_was_asked(given: Conditioning, whole: Conditioning) -> Conditioning
 
 
 def spread_of_residuals(
-    problem: Problem, x: FloatArray, use: npt.NDArray[np.bool_], prior_noise: float
+    problem: FitProblem, x: FloatArray, use: npt.NDArray[np.bool_], prior_noise: float
 ) -> tuple[float, int]:
     """Standard deviation of the whitened residuals at `x`, priors included, and its degrees of
     freedom; nan if there are none. Arguments as `certify`."""
@@ -499,7 +499,7 @@ def _widened(
     return covariance, (together is not None, turning is not None), certain
 
 
-def _sampling_vectors(problem: Problem, predicted: FloatArray) -> FloatArray:
+def _sampling_vectors(problem: FitProblem, predicted: FloatArray) -> FloatArray:
     """Whitened unit errors that follow a bead's place in the pixel grid, (2 n k, 4 k).
 
     An error e(x) with the pixel's period, a sin(2 pi x + theta) with theta unknown, has the

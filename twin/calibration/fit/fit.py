@@ -20,7 +20,7 @@ from flexdt.twin.calibration.fit.priors import require_widths
 from flexdt.twin.calibration.fit.problem import (
     SIX,
     Centre,
-    Problem,
+    FitProblem,
     Reading,
     Shape,
     build_problem,
@@ -69,7 +69,7 @@ class FitResult:
     start_cost: float
     cost: float
     converged: bool
-    problem: Problem
+    problem: FitProblem
     solution: Solution
     bead_prior_mm: float = 0.0
 
@@ -264,7 +264,7 @@ def with_start(result: FitResult, start: Offsets, iterations: int) -> FitResult:
     return replace(result, start_cost=cost, iterations=iterations)
 
 
-def _solved(problem: Problem, solver: Solver | None) -> tuple[Solution, float]:
+def _solved(problem: FitProblem, solver: Solver | None) -> tuple[Solution, float]:
     """The solution, and the spread of the whitened residuals its priors were weighed with, which is
     that of the previous pass."""
     noise, x = 1.0, problem.start

@@ -25,7 +25,7 @@ from scipy import linalg
 
 from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import LEAST_NOISE, FitResult
-from flexdt.twin.calibration.fit.problem import Problem, edge_factor, layout
+from flexdt.twin.calibration.fit.problem import FitProblem, edge_factor, layout
 from flexdt.twin.calibration.fit.residual_structure import cross
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
@@ -169,7 +169,7 @@ def aware(fit: FitResult, held: MotionFit) -> FitResult:
     return replace(fit, certificate=widened(fit.certificate, more))
 
 
-def _used(problem: Problem, fit: FitResult) -> npt.NDArray[np.bool_]:
+def _used(problem: FitProblem, fit: FitResult) -> npt.NDArray[np.bool_]:
     """The positions the fit used, and all of a frame whose positions it mostly left out: single
     beads are outliers, all of them together are motion."""
     use = fit.solution.use.copy()
@@ -179,7 +179,7 @@ def _used(problem: Problem, fit: FitResult) -> npt.NDArray[np.bool_]:
 
 
 def derivative(
-    problem: Problem, fit: FitResult, name: str, use: npt.NDArray[np.bool_]
+    problem: FitProblem, fit: FitResult, name: str, use: npt.NDArray[np.bool_]
 ) -> FloatArray:
     """(2 n k,) whitened change of the positions with one frame's parameter, free or not."""
     params, beads = problem.spread(fit.solution.x)

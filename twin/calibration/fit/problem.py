@@ -181,7 +181,7 @@ def layout(
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class FitProblem:
     """Everything the kernels need; arrays are C-contiguous float64 / int64 / bool.
 
     Attributes:
@@ -302,7 +302,7 @@ class Problem:
         """
         return np.asarray((noise / self.prior_sigma) ** 2)
 
-    def with_base(self, base: FloatArray) -> Problem:
+    def with_base(self, base: FloatArray) -> FitProblem:
         """The same data with other starts, one row of seventeen values for each group."""
         return replace(self, base=base)
 
@@ -325,7 +325,7 @@ def build_problem(
     bead_tolerance_mm: float = math.inf,
     priors: Mapping[str, float] | None = None,
     prior_centre: Offsets | None = None,
-) -> Problem:
+) -> FitProblem:
     """Check the arguments of a fit and put them into arrays; see `fit_geometry` for each.
 
     Raises:
@@ -358,7 +358,7 @@ def build_problem(
         centres = values_in(from_printed_reading(prior_centre, reading))
     bases = [n.split("@")[0] for n in columns.names[: columns.parameter_count]]
     beads = len(columns.names) - len(bases)
-    return Problem(
+    return FitProblem(
         poses=poses,
         model=model,
         measured=np.ascontiguousarray(measured),

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from flexdt.twin.calibration.fit.problem import Problem
+from flexdt.twin.calibration.fit.problem import FitProblem
 from flexdt.twin.geometry.conventions import FloatArray
 
 SIGNIFICANT = 4.5
@@ -77,7 +77,7 @@ class Residuals:
         noise: standard deviation of the values.
     """
 
-    problem: Problem
+    problem: FitProblem
     jacobian: FloatArray
     values: FloatArray
     keep: npt.NDArray[np.bool_]

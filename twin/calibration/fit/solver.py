@@ -1,4 +1,4 @@
-"""Robust least squares on a `Problem`: Levenberg-Marquardt, Huber, then trimming, then refit.
+"""Robust least squares on a `FitProblem`: Levenberg-Marquardt, Huber, then trimming, then refit.
 
 The Huber stage finds the solution in spite of outliers; positions further than `trim` robust
 standard deviations are then left out and the rest is fitted by plain least squares, so that the
@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import lapack
 
-from flexdt.twin.calibration.fit.problem import Problem
+from flexdt.twin.calibration.fit.problem import FitProblem
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 
@@ -69,7 +69,7 @@ class Solution:
 
 
 def solve(
-    problem: Problem,
+    problem: FitProblem,
     solver: Solver | None = None,
     *,
     x: FloatArray | None = None,
@@ -122,7 +122,7 @@ def _spread(norms: FloatArray, columns: int, floor: float) -> float:
 
 
 def _levenberg(
-    p: Problem, x: FloatArray, use: npt.NDArray[np.bool_], how: Solver, prior_noise: float
+    p: FitProblem, x: FloatArray, use: npt.NDArray[np.bool_], how: Solver, prior_noise: float
 ) -> tuple[FloatArray, int, float, bool]:
     """Levenberg-Marquardt with Marquardt's diagonal from `x`.
 
@@ -206,7 +206,7 @@ def _step(hess: FloatArray, grad: FloatArray, damping: float) -> FloatArray | No
     return np.asarray(-scale * solved)
 
 
-def cost_at(problem: Problem, x: FloatArray, use: npt.NDArray[np.bool_]) -> float:
+def cost_at(problem: FitProblem, x: FloatArray, use: npt.NDArray[np.bool_]) -> float:
     """Half the sum of squared whitened residuals; inf where a bead would be behind the source."""
     try:
         norms = problem.residuals(x)[1]

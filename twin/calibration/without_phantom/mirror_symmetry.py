@@ -202,7 +202,7 @@ class _Level:
         c, r, w = mirror_map(self.view(values)) @ np.vstack([at - middle, np.ones(at.shape[1])])
         return np.asarray(np.stack([c / w, r / w]) + middle)
 
-    def _pairs(self, here: FloatArray) -> _Pairs | None:
+    def _pairs(self, here: FloatArray) -> _MirrorPairs | None:
         """The pixels with a mirror image on the panel, each pair once; None if they are too few."""
         image = self._mirrored(here, self.at)
         room = 4.0 * self.sigma + self.margin
@@ -211,10 +211,10 @@ class _Level:
         inside &= self.at[0] < image[0]
         if inside.sum() < max(100.0, OVERLAP / 4 * self.at.shape[1]):
             return None
-        return _Pairs(self, here, self.at[:, inside])
+        return _MirrorPairs(self, here, self.at[:, inside])
 
 
-class _Pairs:
+class _MirrorPairs:
     """Pixels and their mirror images, with slopes and weights taken at `here`."""
 
     def __init__(self, level: _Level, here: FloatArray, at: FloatArray) -> None:

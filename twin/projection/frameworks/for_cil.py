@@ -52,7 +52,7 @@ def cil_operator(
     images.set_panel([cols, rows], pitches)
     images.set_angles(list(range(n)))
     # CIL leaves out dimensions of one element.
-    return _Pair(
+    return _CilPair(
         voxels,
         images,
         lambda x: project(x.reshape(like.shape)),
@@ -60,7 +60,7 @@ def cil_operator(
     )
 
 
-class _Pair(LinearOperator):
+class _CilPair(LinearOperator):
     """A linear map with its transpose."""
 
     def __init__(self, domain: Any, range: Any, project: _Map, spread: _Map) -> None:

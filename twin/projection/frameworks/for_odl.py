@@ -29,10 +29,10 @@ def odl_operator(
     voxels = odl.uniform_discr(
         centre - size / 2, centre + size / 2, like.shape, dtype="float32", weighting=1.0
     )
-    return _Pair(voxels, odl.rn(image_shape, dtype="float32"), project, spread)
+    return _OdlPair(voxels, odl.rn(image_shape, dtype="float32"), project, spread)
 
 
-class _Pair(odl.Operator):
+class _OdlPair(odl.Operator):
     """A linear map with its transpose."""
 
     def __init__(self, domain: Any, range: Any, project: _Map, spread: _Map) -> None:
@@ -46,4 +46,4 @@ class _Pair(odl.Operator):
     @property
     def adjoint(self) -> Any:
         """The transpose."""
-        return _Pair(self.range, self.domain, self._spread, self._project)
+        return _OdlPair(self.range, self.domain, self._spread, self._project)

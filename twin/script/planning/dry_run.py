@@ -25,7 +25,7 @@ from flexdt.twin.script.planning.plan import (
     total_range,
 )
 from flexdt.twin.script.planning.planner import View, plan_script, views
-from flexdt.twin.script.problems import Problem, WithProblems, in_order
+from flexdt.twin.script.problems import ScriptProblem, WithProblems, in_order
 
 Trace = tuple[tuple[float, float], ...]
 
@@ -135,7 +135,7 @@ class CheckReport(WithProblems):
     """The whole report; `to_dict` is the document of `flexdt check --json`."""
 
     plan: ScanPlan
-    problems: tuple[Problem, ...]
+    problems: tuple[ScriptProblem, ...]
     clearance: Clearance | None
     optics: tuple[Optics, ...]
     dose: Dose
@@ -242,7 +242,7 @@ def check_script(
         >>> check_script(script).ok
         True
     """
-    problems: tuple[Problem, ...]
+    problems: tuple[ScriptProblem, ...]
     if isinstance(text, c.Script):
         script, problems, shown = text, text.warnings, ""
     else:
@@ -256,7 +256,7 @@ def check_script(
 
 def check_plan(
     plan: ScanPlan,
-    problems: Sequence[Problem] = (),
+    problems: Sequence[ScriptProblem] = (),
     collision: CollisionCheck | None = None,
     text: str = "",
     start_known: bool = True,
@@ -283,7 +283,7 @@ def check_plan(
     return CheckReport(plan, in_order(found), clearance, optics, _dose(plan), text, start_known)
 
 
-def _start_problems(plan: ScanPlan) -> list[Problem]:
+def _start_problems(plan: ScanPlan) -> list[ScriptProblem]:
     """A warning where the first projection is taken with motors that nothing has moved before."""
     seen = [group for group in plan.groups if group.kind == "projection"]
     if not seen:
@@ -300,12 +300,12 @@ def _start_problems(plan: ScanPlan) -> list[Problem]:
         return []
     where = ", ".join(f"{name}={x:g}" for name, x in left.items())
     what = f"nothing moves {', '.join(left)} before this image; home is assumed: {where}"
-    return [Problem("warning", "default_assumed", first.line, 1, what)]
+    return [ScriptProblem("warning", "default_assumed", first.line, 1, what)]
 
 
-def _collision_problem(x: Collision) -> Problem:
+def _collision_problem(x: Collision) -> ScriptProblem:
     what = f"{x.pair[0]} and {x.pair[1]} come within the safety margin at {x.time_s:.3f} s"
-    return Problem("error", "collision", x.line, 1, what)
+    return ScriptProblem("error", "collision", x.line, 1, what)
 
 
 def _optics(view: View) -> Optics:
@@ -341,7 +341,7 @@ def _extent(values: FloatArray) -> tuple[float, float]:
     return float(np.min(values)), float(np.max(values))
 
 
-def _truncation_problems(seen: Sequence[View]) -> list[Problem]:
+def _truncation_problems(seen: Sequence[View]) -> list[ScriptProblem]:
     """A warning where no image of the scan shows some part of the sample's width or height.
 
     Positions of several scans of one script (tiles, helical turns) make up for each other.
@@ -361,7 +361,7 @@ def _truncation_problems(seen: Sequence[View]) -> list[Problem]:
         ]
         if parts:
             what = f"the sample is cut off over the rotation: {', '.join(parts)}"
-            found.append(Problem("warning", "truncated", min(view.lines), 1, what))
+            found.append(ScriptProblem("warning", "truncated", min(view.lines), 1, what))
     return found
 
 

@@ -13,8 +13,8 @@ from collections.abc import Iterable, Sequence
 
 from flexdt.twin.script.planning.dry_run import HOME_ASSUMED, CheckReport, Optics, Trace
 from flexdt.twin.script.planning.log_fit import LogComparison
-from flexdt.twin.script.planning.plan import Range, Step, step_range, total_range
-from flexdt.twin.script.problems import Problem
+from flexdt.twin.script.planning.plan import PlanStep, Range, step_range, total_range
+from flexdt.twin.script.problems import ScriptProblem
 
 Facts = Sequence[tuple[str, str]]
 
@@ -193,7 +193,7 @@ def _facts_html(facts: Facts) -> str:
     return f"<dl>{rows}</dl>"
 
 
-def _problems_html(problems: Sequence[Problem]) -> str:
+def _problems_html(problems: Sequence[ScriptProblem]) -> str:
     if not problems:
         return ""
     rows = "".join(
@@ -211,7 +211,7 @@ def _steps_html(report: CheckReport) -> str:
     return f"<h2>Steps</h2><table>{head}{rows}</table>"
 
 
-def _step_html(s: Step, nine_of_ten: str) -> str:
+def _step_html(s: PlanStep, nine_of_ten: str) -> str:
     assumed = f"{s.assumed_s:.3f} s {html.escape(s.assumed_from)}" if s.assumed_s else ""
     return (
         f'<tr><td class="n">{s.line}</td><td class="n">{s.start_s:.3f}</td>'

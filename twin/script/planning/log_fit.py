@@ -29,7 +29,7 @@ from flexdt.twin.script.grammar import describe, own_name
 from flexdt.twin.script.planning.plan import Range, StartState, step_range, total_range
 from flexdt.twin.script.planning.planner import simulated
 from flexdt.twin.script.planning.simulated_script import Simulation
-from flexdt.twin.script.problems import Problem
+from flexdt.twin.script.problems import ScriptProblem
 
 BORROWED_TIMES: Final = 4.0
 """How many errors of its own the errors of the other kinds count for."""
@@ -144,7 +144,7 @@ class LogComparison:
 
     machine: Machine
     rows: tuple[LogRow, ...]
-    problems: tuple[Problem, ...] = ()
+    problems: tuple[ScriptProblem, ...] = ()
 
     HEADER: ClassVar = ("line", "real [s]", "predicted [s]", "90 %", "error [s]", "what")
 
@@ -269,9 +269,9 @@ def against_log(log: Log, machine: Machine) -> list[LogRow]:
     return rows
 
 
-def unlike(log: Log, machine: Machine) -> tuple[Problem, ...]:
+def unlike(log: Log, machine: Machine) -> tuple[ScriptProblem, ...]:
     """A warning for each axis of a log that the machine lacks or whose motor has other limits."""
-    found: dict[str, Problem] = {}
+    found: dict[str, ScriptProblem] = {}
     for x in log:
         name, own, what = _axis_of(x.command, machine), x.motor, ""
         axis = machine.axes.get(name)
@@ -283,7 +283,7 @@ def unlike(log: Log, machine: Machine) -> tuple[Problem, ...]:
                 f"to {axis.upper:g} on machine {machine.name}"
             )
         if what:
-            found.setdefault(name, Problem("warning", "other_machine", x.line, 1, what))
+            found.setdefault(name, ScriptProblem("warning", "other_machine", x.line, 1, what))
     return tuple(found.values())
 
 

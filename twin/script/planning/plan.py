@@ -28,9 +28,9 @@ from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine, Profile, Timing
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.motion.profiles import AxisPath, Trajectory
-from flexdt.twin.scanner.state import Placement
+from flexdt.twin.scanner.state import StagePlacement
 from flexdt.twin.script.commands import AnyCommand
-from flexdt.twin.script.problems import Problem, WithProblems
+from flexdt.twin.script.problems import ScriptProblem, WithProblems
 from flexdt.twin.values import Array, ArrayValue, JsonValue
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class StartState:
 
 
 @dataclass(frozen=True)
-class Step:
+class PlanStep:
     """One command on the plan's clock.
 
     Attributes:
@@ -219,10 +219,10 @@ class SampleSize:
 
     @classmethod
     def around(
-        cls, size_mm: Sequence[float], source: str = "given", offset: Placement | None = None
+        cls, size_mm: Sequence[float], source: str = "given", offset: StagePlacement | None = None
     ) -> SampleSize:
         """The cylinder that contains a box of `size_mm` (x, y, z) at `offset`, at every angle."""
-        at = Placement() if offset is None else offset
+        at = StagePlacement() if offset is None else offset
         x, y, z = size_mm
         radius = 0.5 * math.hypot(x, y)
         if at.rx or at.ry:
@@ -252,14 +252,14 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
     machine: Machine
     profile: Profile
     start: StartState
-    steps: tuple[Step, ...]
+    steps: tuple[PlanStep, ...]
     trajectories: Mapping[str, tuple[tuple[float, Trajectory], ...]]
     groups: tuple[ExposureGroup, ...]
     fly_scans: tuple[FlyScan, ...]
     settings: Settings | None
     beam: tuple[BeamOn, ...]
     sample: SampleSize | None
-    problems: tuple[Problem, ...]
+    problems: tuple[ScriptProblem, ...]
     duration_s: float
 
     def __repr__(self) -> str:
@@ -422,7 +422,7 @@ class _OfKind(Protocol):
     def kind(self) -> str: ...
 
 
-def step_range(step: Step, timing: Timing) -> Range | None:
+def step_range(step: PlanStep, timing: Timing) -> Range | None:
     """(5 %, 95 %) of how long the script waits for a step [s].
 
     None where no time of the machine is measured. A time that is only assumed, on a machine whose

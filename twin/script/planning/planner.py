@@ -32,7 +32,7 @@ from flexdt.twin.script import commands as c
 from flexdt.twin.script.parse import Source, parse_script
 from flexdt.twin.script.planning.plan import ImageKind, SampleSize, ScanPlan, StartState
 from flexdt.twin.script.planning.simulated_script import Simulation
-from flexdt.twin.script.problems import Problem, in_order
+from flexdt.twin.script.problems import ScriptProblem, in_order
 
 
 def plan_script(
@@ -113,7 +113,7 @@ def plan_poses(
         poses: axis -> position [mm, deg]; axes left out stay where they are.
         machine: whose axes these are.
         profile: zero offsets.
-        exposure_ms: of every image; the machine's default if None.
+        exposure_ms: of every image; None keeps the camera's current exposure.
         start: the scanner before; the machine's homes if None.
         sample: its size, if known.
 
@@ -248,15 +248,9 @@ def views(plan: ScanPlan) -> Iterator[View]:
         yield _view(plan, camera, kind, tuple(lines), positions)
 
 
-def _probes(count: int) -> list[int]:
-    """At most _PROBES of `count` images, spread evenly, first and last among them."""
-    spread: list[int] = np.linspace(0, count - 1, min(count, _PROBES)).round().astype(int).tolist()
-    return spread
-
-
-def beam_problems(plan: ScanPlan) -> tuple[Problem, ...]:
+def beam_problems(plan: ScanPlan) -> tuple[ScriptProblem, ...]:
     """Warnings: the sample outside the beam in projections, or inside it in flats."""
-    found: list[Problem] = []
+    found: list[ScriptProblem] = []
     for view in views(plan):
         outside = view.outside
         if view.kind == "projection" and outside.any():
@@ -266,10 +260,10 @@ def beam_problems(plan: ScanPlan) -> tuple[Problem, ...]:
     return tuple(found)
 
 
-def _aggregate(view: View, bad: BoolArray, code: str, text: str) -> Problem:
+def _aggregate(view: View, bad: BoolArray, code: str, text: str) -> ScriptProblem:
     lines = sorted({line for line, b in zip(view.lines, bad.tolist(), strict=True) if b})
     more = f" (and at {len(lines) - 1} more lines)" if len(lines) > 1 else ""
-    return Problem("warning", code, lines[0], 1, text + more)
+    return ScriptProblem("warning", code, lines[0], 1, text + more)
 
 
 def _outside_text(view: View) -> str:
@@ -292,6 +286,12 @@ def _inside_text(view: View) -> str:
     else:
         where = f"its shadow spans columns {view.left[i]:.0f} to {view.right[i]:.0f}"
     return f"the sample is in the beam in a flat image: {where} of 0 to {view.camera.shape[1] - 1}"
+
+
+def _probes(count: int) -> list[int]:
+    """At most _PROBES of `count` images, spread evenly, first and last among them."""
+    spread: list[int] = np.linspace(0, count - 1, min(count, _PROBES)).round().astype(int).tolist()
+    return spread
 
 
 def _view(

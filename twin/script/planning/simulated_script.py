@@ -20,7 +20,7 @@ from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.grammar import describe, is_reserved, own_name
 from flexdt.twin.script.planning import planned_scanner as planned
-from flexdt.twin.script.planning.plan import SampleSize, Settings, StartState, Step
+from flexdt.twin.script.planning.plan import PlanStep, SampleSize, Settings, StartState
 from flexdt.twin.script.planning.planned_images import ImageCollector
 from flexdt.twin.script.problems import Findings
 
@@ -60,7 +60,7 @@ class Simulation:
         )
         self.settings: Settings | None = None
         self.sample: SampleSize | None = None
-        self.steps: list[Step] = []
+        self.steps: list[PlanStep] = []
 
     @property
     def end(self) -> float:
@@ -81,7 +81,7 @@ class Simulation:
             self.now = self._release(command, span)
             holds = self.now - before
             self.steps.append(
-                Step(
+                PlanStep(
                     index=len(self.steps),
                     line=command.line,
                     start_s=span.start,

@@ -1,6 +1,6 @@
 """How long FDK by workers will take: rates of this machine, and a plan for another.
 
-    python extensions/tests/studies/large_volume.py [--nodes N] [--cores C]
+    python tests/studies/large_volume.py [--nodes N] [--cores C]
         [--read GB/S] [--write GB/S]
 
 Measured here, with all cores: voxel updates of the backprojection, pixels filtered, pixels read and

@@ -1,6 +1,6 @@
 """`flexdt reconstruct --scheduler`: speed, kills and memory.
 
-    python extensions/tests/studies/slabs.py WHAT
+    python tests/studies/slabs.py WHAT
 
 speed   1, 2 and 4 worker processes of one thread: seconds, and whether the bytes are equal.
 kills   SIGKILL of workers, client and scheduler at random moments; what is killed is started again,
