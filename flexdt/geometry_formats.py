@@ -24,8 +24,12 @@ from flexdt.clients.datasets.exchange import (
 )
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
-from flexdt.twin.exchange.geometry_json import read_json
-from flexdt.twin.exchange.number_tables import TOMOSIPO_NAMES, read_tomosipo, tomosipo_arrays
+from flexdt.twin.exchange.number_tables import (
+    TOMOSIPO_NAMES,
+    read_json,
+    read_tomosipo,
+    tomosipo_arrays,
+)
 from flexdt.twin.geometry.cone_vec import ConeVec, Shape2
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.lazy_backend import File

@@ -29,15 +29,7 @@ from flexdt.phantoms.materials import Material, material
 from flexdt.phantoms.phantom import Phantom
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import FloatArray, stage_rotation
-from flexdt.twin.projection.analytic_solids import (
-    Box,
-    Cylinder,
-    Scene,
-    Shape,
-    Solid,
-    Sphere,
-    Vector,
-)
+from flexdt.twin.projection import analytic_solids as analytic
 
 
 def lego_phantom() -> Phantom:
@@ -84,11 +76,11 @@ def _bead_positions(stack: Brickwork, radius: float) -> FloatArray:
 
 def brick_shapes(
     v: dict[str, float], studs: tuple[int, int], floor: float, turn: float
-) -> list[tuple[Shape, float]]:
+) -> list[tuple[analytic.Shape, float]]:
     """Shapes of one brick with +1 (filled) or -1 (hole), turned by `turn` about the axis."""
     rotation = stage_rotation(turn)
 
-    def at(x: float, y: float, z: float) -> Vector:
+    def at(x: float, y: float, z: float) -> analytic.Vector:
         px, py, pz = (rotation @ np.array([x, y, 0.0]) + [0.0, 0.0, z]).tolist()
         return (px, py, pz)
 
@@ -96,22 +88,26 @@ def brick_shapes(
     axes = (tuple(rows[0]), tuple(rows[1]), tuple(rows[2]))
     pitch, tall = v["stud_pitch_mm"], v["brick_height_mm"]
     outer = (studs[0] * pitch, studs[1] * pitch, tall)
-    out: list[tuple[Shape, float]] = [(Box(at(0, 0, floor + tall / 2), outer, axes), 1.0)]
+    out: list[tuple[analytic.Shape, float]] = [
+        (analytic.Box(at(0, 0, floor + tall / 2), outer, axes), 1.0)
+    ]
     stud_z = floor + tall + v["stud_height_mm"] / 2
     for i in range(studs[0]):
         for j in range(studs[1]):
             x, y = (i - (studs[0] - 1) / 2) * pitch, (j - (studs[1] - 1) / 2) * pitch
-            stud = Cylinder(at(x, y, stud_z), v["stud_diameter_mm"] / 2, v["stud_height_mm"])
+            stud = analytic.Cylinder(
+                at(x, y, stud_z), v["stud_diameter_mm"] / 2, v["stud_height_mm"]
+            )
             out.append((stud, 1.0))
     depth = tall - v["roof_mm"]
     inner = (outer[0] - 2 * v["wall_mm"], outer[1] - 2 * v["wall_mm"], depth)
-    out.append((Box(at(0, 0, floor + depth / 2), inner, axes), -1.0))
+    out.append((analytic.Box(at(0, 0, floor + depth / 2), inner, axes), -1.0))
     for i in range(studs[0] - 1):
         for j in range(studs[1] - 1):
             x, y = (i - (studs[0] - 2) / 2) * pitch, (j - (studs[1] - 2) / 2) * pitch
             foot = at(x, y, floor + depth / 2)
-            out.append((Cylinder(foot, v["tube_outer_diameter_mm"] / 2, depth), 1.0))
-            out.append((Cylinder(foot, v["tube_inner_diameter_mm"] / 2, depth), -1.0))
+            out.append((analytic.Cylinder(foot, v["tube_outer_diameter_mm"] / 2, depth), 1.0))
+            out.append((analytic.Cylinder(foot, v["tube_inner_diameter_mm"] / 2, depth), -1.0))
     return out
 
 
@@ -169,7 +165,7 @@ class Brickwork:
         return {key: value for key, value in given.items() if not isinstance(value, str)}
 
     @property
-    def size_mm(self) -> Vector:
+    def size_mm(self) -> analytic.Vector:
         """Width, breadth, height with the top studs."""
         v = self.measures
         return (
@@ -184,7 +180,9 @@ class Brickwork:
 
     def tubes_at(self) -> FloatArray:
         """(t, 2) axes of the tubes inside [mm]."""
-        return _grid((self.studs[0] - 1, self.studs[1] - 1), self.measures["stud_pitch_mm"])
+        pitch = self.measures["stud_pitch_mm"]
+        x, y = ((np.arange(n - 1) - (n - 2) / 2.0) * pitch for n in self.studs)
+        return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
 
     def seats(self, radius_mm: float) -> Seats:
         """Every seat for beads of this radius.
@@ -229,11 +227,11 @@ class Brickwork:
 
     def scene(
         self, beads: FloatArray, radius_mm: float, metal: Material, turn_deg: float = 0.0
-    ) -> Scene:
+    ) -> analytic.Scene:
         """The bricks, each turned by `turn_deg` against the one below, and beads (k, 3) [mm]."""
         plastic = material(lego_data()["assumed"]["material"])
         solids = [
-            Solid(shape, plastic.name, sign * plastic.mu_per_mm)
+            analytic.Solid(shape, plastic.name, sign * plastic.mu_per_mm)
             for k in range(self.bricks)
             for shape, sign in brick_shapes(
                 self.measures, self.studs, self.floor(k), math.radians(k * turn_deg)
@@ -241,10 +239,10 @@ class Brickwork:
         ]
         # In the cavities, touching no plastic: nothing to subtract.
         solids += [
-            Solid(Sphere((x, y, z), radius_mm), metal.name, metal.mu_per_mm)
+            analytic.Solid(analytic.Sphere((x, y, z), radius_mm), metal.name, metal.mu_per_mm)
             for x, y, z in beads.tolist()
         ]
-        return Scene(tuple(solids))
+        return analytic.Scene(tuple(solids))
 
     def phantom(
         self, name: str, beads: npt.ArrayLike, radius_mm: float, bead_material: str = "steel"
@@ -297,11 +295,6 @@ def grid_seats(size_mm: Sequence[float], radius_mm: float, step_mm: float) -> Fl
         )
     axes = [np.linspace(-h, h, max(2, round(2.0 * h / step_mm) + 1)) for h in half]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-
-
-def _grid(counts: Sequence[int], pitch: float) -> FloatArray:
-    x, y = ((np.arange(n) - (n - 1) / 2.0) * pitch for n in counts)
-    return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
 def _centred(studs: int, step: float, half: float) -> FloatArray:

@@ -3,6 +3,9 @@
 Documents come from outside, so every reader either returns the right type or raises PhantomError
 with the path, the value and what is allowed. `Text`, `Number`, `Lengths`, `Place` and `Packed` make
 pydantic read the fields of a dataclass so.
+
+`scene_to_dict` and `scene_from_dict` are a scene as such a document and back; shapes are tagged by
+kind.
 """
 
 from __future__ import annotations
@@ -10,15 +13,16 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import fields
 from functools import partial
-from typing import Annotated, Final, TypeVar
+from typing import Annotated, Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BeforeValidator, PlainSerializer, PlainValidator
 
 from flexdt.twin.errors import TwinError
-from flexdt.twin.projection.analytic_solids import Matrix, Vector
+from flexdt.twin.projection import analytic_solids as analytic
 
 MAX_ARRAY_BYTES: Final = 4 << 30
 MAX_TEXT: Final = 4096
@@ -85,17 +89,17 @@ def each(value: object, where: str, read: Callable[[object, str], _T]) -> tuple[
     return tuple(read(item, f"{where}[{i}]") for i, item in enumerate(value))
 
 
-def vector(value: object, where: str) -> Vector:
+def vector(value: object, where: str) -> analytic.Vector:
     """`value` as three finite numbers."""
     return _three(value, where, number)
 
 
-def lengths(value: object, where: str) -> Vector:
+def lengths(value: object, where: str) -> analytic.Vector:
     """`value` as three numbers above 0."""
     return _three(value, where, positive)
 
 
-def unit(value: object, where: str) -> Vector:
+def unit(value: object, where: str) -> analytic.Vector:
     """`value` as a unit vector."""
     found = vector(value, where)
     if abs(math.hypot(*found) - 1.0) > 1e-6:
@@ -103,7 +107,7 @@ def unit(value: object, where: str) -> Vector:
     return found
 
 
-def axes(value: object, where: str) -> Matrix:
+def axes(value: object, where: str) -> analytic.Matrix:
     """`value` as three orthogonal unit vectors."""
     rows = each(value, where, unit)
     if len(rows) != 3 or not np.allclose(np.array(rows) @ np.array(rows).T, np.eye(3), atol=1e-6):
@@ -113,8 +117,8 @@ def axes(value: object, where: str) -> Matrix:
 
 Text = Annotated[str, BeforeValidator(partial(string, where=IT))]
 Number = Annotated[float, BeforeValidator(partial(number, where=IT))]
-Place = Annotated[Vector, BeforeValidator(partial(vector, where=IT))]
-Lengths = Annotated[Vector, BeforeValidator(partial(lengths, where=IT))]
+Place = Annotated[analytic.Vector, BeforeValidator(partial(vector, where=IT))]
+Lengths = Annotated[analytic.Vector, BeforeValidator(partial(lengths, where=IT))]
 
 
 def packed(dtype: str) -> PlainValidator:
@@ -154,8 +158,104 @@ def _count(value: object, where: str) -> int:
     return value
 
 
-def _three(value: object, where: str, read: Callable[[object, str], float]) -> Vector:
+def _three(value: object, where: str, read: Callable[[object, str], float]) -> analytic.Vector:
     numbers = each(value, where, read)
     if len(numbers) != 3:
         raise wrong(value, where, "three numbers")
     return (numbers[0], numbers[1], numbers[2])
+
+
+MAX_SOLIDS: Final = 100_000
+
+_KINDS: Final[Mapping[str, type[analytic.Shape]]] = {
+    "sphere": analytic.Sphere,
+    "box": analytic.Box,
+    "cylinder": analytic.Cylinder,
+    "ellipsoid": analytic.Ellipsoid,
+    "convex": analytic.ConvexPolyhedron,
+}
+_KIND_OF: Final[Mapping[type[analytic.Shape], str]] = {cls: kind for kind, cls in _KINDS.items()}
+
+_READERS: Final[Mapping[str, Callable[[object, str], object]]] = {
+    "center": vector,
+    "size": lengths,
+    "semi_axes": lengths,
+    "radius": positive,
+    "height": positive,
+    "axis": unit,
+    "axes": axes,
+    "normals": lambda value, where: each(value, where, unit),
+    "offsets": lambda value, where: each(value, where, number),
+}
+"""How each field of a shape is read."""
+
+_OPTIONAL: Final = ("axis", "axes")
+
+
+def scene_to_dict(scene: analytic.Scene) -> dict[str, object]:
+    """JSON-able document of a scene: `{solids: [{shape: {kind, ...}, material, mu_per_mm}]}`.
+
+    Example:
+        >>> from flexdt.phantoms import load_phantom
+        >>> scene = load_phantom("normal-3").scene
+        >>> len(scene_to_dict(scene)["solids"])
+        4
+    """
+    return {
+        "solids": [
+            {
+                "shape": {
+                    "kind": _KIND_OF[type(s.shape)],
+                    **{f.name: getattr(s.shape, f.name) for f in fields(s.shape)},
+                },
+                "material": s.material,
+                "mu_per_mm": s.mu_per_mm,
+            }
+            for s in scene.solids
+        ]
+    }
+
+
+def scene_from_dict(document: object, where: str = "scene") -> analytic.Scene:
+    """The scene of a document that `scene_to_dict` made.
+
+    Raises:
+        PhantomError: names the key path, the value and what is allowed.
+
+    Example:
+        >>> from flexdt.phantoms import load_phantom
+        >>> scene = load_phantom("normal-3").scene
+        >>> scene_from_dict(scene_to_dict(scene)) == scene
+        True
+    """
+    solids = get(document, "solids", where)
+    if isinstance(solids, list | tuple) and len(solids) > MAX_SOLIDS:
+        raise wrong(f"{len(solids)} solids", f"{where}.solids", f"at most {MAX_SOLIDS}")
+    return analytic.Scene(each(solids, f"{where}.solids", _solid))
+
+
+def _solid(document: object, where: str) -> analytic.Solid:
+    return analytic.Solid(
+        shape_from_dict(get(document, "shape", where), f"{where}.shape"),
+        string(get(document, "material", where), f"{where}.material"),
+        number(get(document, "mu_per_mm", where), f"{where}.mu_per_mm"),
+    )
+
+
+def shape_from_dict(document: object, where: str) -> analytic.Shape:
+    """The shape of `{kind, ...}`; raises PhantomError naming the key path."""
+    kind = get(document, "kind", where)
+    if not isinstance(kind, str) or kind not in _KINDS:
+        raise wrong(kind, f"{where}.kind", ", ".join(_KINDS))
+    given = mapping(document, where)
+    names = [f.name for f in fields(_KINDS[kind])]
+    unknown = sorted(str(key) for key in given if key not in (*names, "kind"))
+    if unknown:
+        said = f"{where}: a {kind} has no {', '.join(unknown)}"
+        raise PhantomError.instead(said, unknown, names, path=where)
+    values: dict[str, Any] = {
+        name: _READERS[name](get(given, name, where), f"{where}.{name}")
+        for name in names
+        if name in given or name not in _OPTIONAL
+    }
+    return _KINDS[kind](**values)

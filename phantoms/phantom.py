@@ -19,10 +19,8 @@ import numpy as np
 from pydantic import PlainSerializer, PlainValidator, ValidationError
 
 from flexdt.phantoms import checked_reading as reading
-from flexdt.phantoms.checked_reading import PhantomError
-from flexdt.phantoms.json_form import scene_from_dict, scene_to_dict
-from flexdt.phantoms.mesh_booleans import cut
-from flexdt.phantoms.pieces import Surface, Voxels, freeze
+from flexdt.phantoms.checked_reading import PhantomError, scene_from_dict, scene_to_dict
+from flexdt.phantoms.pieces import Surface, Voxels, cut, freeze
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.values import ArrayValue, adapter_of, told

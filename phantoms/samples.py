@@ -15,13 +15,8 @@ import numpy as np
 
 from flexdt.phantoms.catalog import is_shipped, load_phantom, phantom_names
 from flexdt.phantoms.checked_reading import PhantomError
+from flexdt.phantoms.files import phantom_files as files
 from flexdt.phantoms.files.mesh_files import FORMATS, filled_mesh, mesh_phantom, voxel_phantom
-from flexdt.phantoms.files.phantom_files import (
-    phantom_of,
-    read_phantom_file,
-    require_replaced,
-    solids_of,
-)
 from flexdt.phantoms.materials import material as material_of
 from flexdt.phantoms.phantom import Phantom, assemble
 from flexdt.phantoms.pieces import size_about_origin
@@ -70,7 +65,7 @@ def as_phantom(
         (10.0, 10.0, 10.0)
     """
     made = _one(sample, material, voxel_mm, keep=False, priority=priority)
-    require_replaced(made, sample)
+    files.require_replaced(made, sample)
     return made
 
 
@@ -106,8 +101,8 @@ def _one(
         return _solids(sample)
     if isinstance(sample, Mapping):
         if "kind" not in sample:
-            return phantom_of(given)
-        return _solids(Scene(solids_of(sample, "sample")))
+            return files.phantom_of(given)
+        return _solids(Scene(files.solids_of(sample, "sample")))
     if isinstance(sample, Sequence) and sample:
         parts = [_one(each, None, voxel_mm, keep=True) for each in sample]
         return assemble("scene", parts, priority=priority)
@@ -128,7 +123,7 @@ def _named(word: str, material: str | None, keep: bool) -> Phantom:
     if is_shipped(word):
         return load_phantom(word)
     if kind in TEXTS or path.is_file():
-        return read_phantom_file(path)
+        return files.read_phantom_file(path)
     raise UnknownNameError(
         f"no sample {word!r}: neither a phantom that ships ({', '.join(phantom_names())}) nor a "
         f"file ending with {', '.join(TEXTS)}, {', '.join('.' + f for f in FORMATS)}",

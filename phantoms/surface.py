@@ -17,15 +17,7 @@ import trimesh
 
 from flexdt.phantoms.checked_reading import PhantomError
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.projection.analytic_solids import (
-    Box,
-    ConvexPolyhedron,
-    Cylinder,
-    Ellipsoid,
-    Shape,
-    Solid,
-    Sphere,
-)
+from flexdt.twin.projection import analytic_solids as analytic
 from flexdt.twin.projection.convex import polyhedron_corners
 
 if TYPE_CHECKING:
@@ -91,21 +83,21 @@ def joined(parts: Sequence[SurfacePart]) -> trimesh.Trimesh:
     return cast("trimesh.Trimesh", trimesh.util.concatenate(meshes))
 
 
-def _is_hole(solid: Solid, beads: FloatArray) -> bool:
+def _is_hole(solid: analytic.Solid, beads: FloatArray) -> bool:
     """A negative solid is a hole unless it is a bead that absorbs less than its body."""
     if solid.mu_per_mm >= 0.0:
         return False
-    if isinstance(solid.shape, Sphere) and len(beads):
+    if isinstance(solid.shape, analytic.Sphere) and len(beads):
         return not bool((beads == np.asarray(solid.shape.center)).all(axis=1).any())
     return True
 
 
-def solid_mesh(solid: Solid, around: bool = False) -> trimesh.Trimesh:
+def solid_mesh(solid: analytic.Solid, around: bool = False) -> trimesh.Trimesh:
     """Closed outward mesh of one solid [mm]; a round shape's is inscribed, or lies around it."""
     mesh = _mesh(solid.shape)
-    if around and isinstance(solid.shape, Sphere | Ellipsoid):
+    if around and isinstance(solid.shape, analytic.Sphere | analytic.Ellipsoid):
         mesh.vertices = solid.shape.center + (mesh.vertices - solid.shape.center) * _ball_around()
-    elif around and isinstance(solid.shape, Cylinder):
+    elif around and isinstance(solid.shape, analytic.Cylinder):
         axis = np.asarray(solid.shape.axis)
         out = mesh.vertices - solid.shape.center
         along = np.outer(out @ axis, axis)
@@ -129,22 +121,22 @@ def _ball_around() -> float:
     return 1.0 / float(np.einsum("ij,ij->i", ball.face_normals, corners).min())
 
 
-def _mesh(shape: Shape) -> trimesh.Trimesh:
+def _mesh(shape: analytic.Shape) -> trimesh.Trimesh:
     mesh: trimesh.Trimesh
     match shape:
-        case Sphere(center, radius):
+        case analytic.Sphere(center, radius):
             ball = _unit_ball()
             mesh = trimesh.Trimesh(ball.vertices * radius + center, ball.faces, process=False)
-        case Ellipsoid(center, semi_axes, axes):
+        case analytic.Ellipsoid(center, semi_axes, axes):
             mesh = _unit_ball().copy()
             mesh.apply_transform(_placed(np.asarray(axes).T * semi_axes, center))
-        case Box(center, size, axes):
+        case analytic.Box(center, size, axes):
             mesh = trimesh.creation.box(size, _placed(np.asarray(axes).T, center))
-        case Cylinder(center, radius, height, axis):
+        case analytic.Cylinder(center, radius, height, axis):
             half = np.asarray(axis) * height / 2.0
             ends = np.stack([center - half, center + half])
             mesh = trimesh.creation.cylinder(radius, sections=CYLINDER_SECTIONS, segment=ends)
-        case ConvexPolyhedron():
+        case analytic.ConvexPolyhedron():
             mesh = trimesh.convex.convex_hull(polyhedron_corners(shape))
     return mesh
 

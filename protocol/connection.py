@@ -23,14 +23,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import chain
 from typing import Final
 
-from flexdt.protocol.codec import (
-    Codec,
-    json_pieces,
-    read_json,
-    read_msgpack,
-    write_json,
-    write_msgpack,
-)
+from flexdt.protocol import codec as codecs
+from flexdt.protocol.codec import Codec
 from flexdt.protocol.messages import Encoded, Malformed, Message, Response, from_plain, to_plain
 from flexdt.protocol.rpc_errors import Code, ProtocolError, RpcError, parse_error, too_large
 
@@ -248,7 +242,7 @@ class Connection:
     def decode(self, raw: Raw) -> Message:
         """The message in the bytes that `next_raw` returned."""
         raw = raw if isinstance(raw, bytes) else b"".join(raw)
-        read = read_msgpack if self.codec is Codec.MSGPACK else read_json
+        read = codecs.read_msgpack if self.codec is Codec.MSGPACK else codecs.read_json
         try:
             document = read(raw)
         except (ValueError, RecursionError, MemoryError) as error:
@@ -449,23 +443,23 @@ def encoded(result: object, codec: Codec) -> Encoded:
     Raises:
         ValueError, TypeError, OverflowError: it holds a value that cannot be encoded.
     """
-    pieces = json_pieces(result) if codec is Codec.JSON else [write_msgpack(result)]
+    pieces = codecs.json_pieces(result) if codec is Codec.JSON else [codecs.write_msgpack(result)]
     return Encoded(tuple(pieces))
 
 
 def _json(message: Message) -> list[bytes]:
     match message:
         case Response(id, Encoded(pieces)):
-            return [b'{"jsonrpc":"2.0","id":%b,"result":' % write_json(id), *pieces, b"}"]
-    return json_pieces(to_plain(message))
+            return [b'{"jsonrpc":"2.0","id":%b,"result":' % codecs.write_json(id), *pieces, b"}"]
+    return codecs.json_pieces(to_plain(message))
 
 
 def _msgpack(message: Message) -> list[bytes]:
     match message:
         case Response(id, Encoded(pieces)):
             head = {"jsonrpc": "2.0", "id": id, "result": None}
-            return [write_msgpack(head)[:-1], *pieces]  # nil is one byte
-    return [write_msgpack(to_plain(message))]
+            return [codecs.write_msgpack(head)[:-1], *pieces]  # nil is one byte
+    return [codecs.write_msgpack(to_plain(message))]
 
 
 def _array_head(count: int) -> bytes:

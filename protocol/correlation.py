@@ -22,16 +22,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Generic, TypeVar
 
-from flexdt.protocol.messages import (
-    Batch,
-    Failure,
-    Id,
-    Malformed,
-    Message,
-    Notification,
-    Request,
-    Response,
-)
+from flexdt.protocol import messages as m
 from flexdt.protocol.method import PROTOCOL
 from flexdt.protocol.rpc_errors import Code, ProtocolError, RpcError, clip
 
@@ -50,7 +41,7 @@ class Answered(Generic[_W]):
     """An answer and the waiter that was registered with its request."""
 
     waiter: _W
-    answer: Response | Failure
+    answer: m.Response | m.Failure
 
     def result(self) -> object:
         """The result of the request.
@@ -58,7 +49,7 @@ class Answered(Generic[_W]):
         Raises:
             RpcError: the answer is an error.
         """
-        if isinstance(self.answer, Failure):
+        if isinstance(self.answer, m.Failure):
             raise self.answer.error
         return self.answer.result
 
@@ -91,15 +82,15 @@ class Correlation(Generic[_W]):
         self._ids = itertools.count(1)
         # Requests sent and not answered. The waiter is None once nobody waits any more: the
         # answer may still come, and it is not one that nobody asked for.
-        self._asked: dict[Id, _W | None] = {}
+        self._asked: dict[m.Id, _W | None] = {}
         # Requests received and not answered; a client may use an id twice at the same time.
-        self._owed: Counter[Id] = Counter()
+        self._owed: Counter[m.Id] = Counter()
 
     # -- the client's side -------------------------------------------------------------------
 
     def request(
         self, method: str, params: Mapping[str, object], waiter: _W, trace: str = ""
-    ) -> Request:
+    ) -> m.Request:
         """A request to send, with a new id.
 
         Args:
@@ -113,11 +104,11 @@ class Correlation(Generic[_W]):
         """
         _require_text_names(params, method)
         number = next(self._ids)
-        id: Id = f"{trace}/{number}" if trace else number
+        id: m.Id = f"{trace}/{number}" if trace else number
         self._asked[id] = waiter
-        return Request(id, method, dict(params))
+        return m.Request(id, method, dict(params))
 
-    def abandon(self, request: Request, *, sent: bool = True) -> None:
+    def abandon(self, request: m.Request, *, sent: bool = True) -> None:
         """Stop waiting for an answer.
 
         Args:
@@ -139,11 +130,11 @@ class Correlation(Generic[_W]):
 
     # -- the server's side -------------------------------------------------------------------
 
-    def owes(self, id: Id) -> bool:
+    def owes(self, id: m.Id) -> bool:
         """Whether a request of this id has no answer yet."""
         return self._owed[id] > 0
 
-    def answer(self, answer: Response | Failure) -> Response | Failure:
+    def answer(self, answer: m.Response | m.Failure) -> m.Response | m.Failure:
         """The answer, if it is to a request of the client that has none yet.
 
         An error without id is about the connection and always allowed.
@@ -151,7 +142,7 @@ class Correlation(Generic[_W]):
         Raises:
             LookupError: no open request has this id.
         """
-        if isinstance(answer, Response) or answer.id is not None:
+        if isinstance(answer, m.Response) or answer.id is not None:
             if not self._owed[answer.id]:
                 raise LookupError(f"no open request has the id {answer.id!r}")
             self._owed[answer.id] -= 1
@@ -166,7 +157,7 @@ class Correlation(Generic[_W]):
 
     # -- both sides --------------------------------------------------------------------------
 
-    def receive(self, message: Message) -> list[Answered[_W] | Request | Notification]:
+    def receive(self, message: m.Message) -> list[Answered[_W] | m.Request | m.Notification]:
         """What a message means here; the items of a batch one by one.
 
         Answers that nobody waits for any more are left out. A malformed message is the answer to
@@ -177,27 +168,27 @@ class Correlation(Generic[_W]):
         """
         if self.violation is not None:
             raise self.violation
-        if isinstance(message, Batch):
+        if isinstance(message, m.Batch):
             return [found for item in message.items for found in self.receive(item)]
         if self.role is Role.SERVER:
             return self._receive_call(message)
         match message:
-            case Notification():
+            case m.Notification():
                 return [message]
-            case Failure(None, RpcError(code=Code.PARSE)):
+            case m.Failure(None, RpcError(code=Code.PARSE)):
                 # The server could not read one of our requests, not even its id, so no other
                 # answer to that one will come; which one it was nobody knows.
                 waiting = [(id, w) for id, w in self._asked.items() if w is not None]
                 self._asked.update((id, None) for id, _ in waiting)
                 return [Answered(waiter, message) for _, waiter in waiting]
-            case Failure(None, error) | Malformed(error, None):
+            case m.Failure(None, error) | m.Malformed(error, None):
                 self.reason = error
-                if isinstance(message, Malformed) and message.fatal:
+                if isinstance(message, m.Malformed) and message.fatal:
                     raise self._violated(error.message)
                 return []
-            case Malformed(error, id):
-                return self._settle(Failure(id, error))
-            case Response() | Failure():
+            case m.Malformed(error, id):
+                return self._settle(m.Failure(id, error))
+            case m.Response() | m.Failure():
                 return self._settle(message)
         raise self._violated(f"the server sent a request ({clip(message.method, 40)})")
 
@@ -205,7 +196,9 @@ class Correlation(Generic[_W]):
         """Note that the peer's bytes break the protocol (see `Connection.receive_end`)."""
         self.violation = violation
 
-    def _settle(self, answer: Response | Failure) -> list[Answered[_W] | Request | Notification]:
+    def _settle(
+        self, answer: m.Response | m.Failure
+    ) -> list[Answered[_W] | m.Request | m.Notification]:
         if answer.id not in self._asked:
             raise self._violated(
                 f"an answer to a request that is not open (id {clip(answer.id, 40)})"
@@ -213,14 +206,14 @@ class Correlation(Generic[_W]):
         waiter = self._asked.pop(answer.id)
         return [] if waiter is None else [Answered(waiter, answer)]
 
-    def _receive_call(self, message: Message) -> list[Answered[_W] | Request | Notification]:
+    def _receive_call(self, message: m.Message) -> list[Answered[_W] | m.Request | m.Notification]:
         match message:
-            case Request(id):
+            case m.Request(id):
                 self._owed[id] += 1
                 return [message]
-            case Notification():
+            case m.Notification():
                 return [message]
-            case Malformed(_, id):
+            case m.Malformed(_, id):
                 self._owed[id] += id is not None
                 return []
         raise self._violated("an answer to a server, which asks nothing")

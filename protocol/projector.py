@@ -16,19 +16,8 @@ from annotated_types import Ge, Le, Len, MaxLen
 from pydantic import BeforeValidator, Field, InstanceOf, model_validator
 from pydantic.json_schema import WithJsonSchema
 
+from flexdt.protocol import fields as f
 from flexdt.protocol import image
-from flexdt.protocol.fields import (
-    Empty,
-    Params,
-    Result,
-    ShortText,
-    Side,
-    Triple,
-    VolumeName,
-    VoxelPitch,
-    VoxelShape,
-    require_extent,
-)
 from flexdt.protocol.method import AnyMethod, Method, read
 from flexdt.protocol.methods.document_messages import Discovery
 from flexdt.protocol.methods.sample_messages import Bytes
@@ -118,7 +107,7 @@ Buffer = Annotated[
 ]
 """Bytes, not copied."""
 
-Detector = Annotated[tuple[Side, Side], Field(strict=False)]
+Detector = Annotated[tuple[f.Side, f.Side], Field(strict=False)]
 """(rows, columns)."""
 
 Coordinate = Annotated[float, Ge(-MAX_MM), Le(MAX_MM)]
@@ -126,11 +115,11 @@ Place = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)
 """(x, y, z) [mm]."""
 
 
-class VoxelGrid(Params):
+class VoxelGrid(f.Params):
     """Voxels without values."""
 
-    shape: VoxelShape
-    voxel_mm: VoxelPitch
+    shape: f.VoxelShape
+    voxel_mm: f.VoxelPitch
     center_mm: Place = (0.0, 0.0, 0.0)
 
     @property
@@ -140,11 +129,11 @@ class VoxelGrid(Params):
 
     @model_validator(mode="after")
     def _extent(self) -> VoxelGrid:
-        require_extent(self.shape, self.voxel_mm)
+        f.require_extent(self.shape, self.voxel_mm)
         return self
 
 
-class MeshSize(Params):
+class MeshSize(f.Params):
     """A closed mesh of triangles without its numbers.
 
     Its bytes are float64 [vertices, 3] in mm, then int32 [triangles, 3], indices of vertices,
@@ -160,14 +149,14 @@ class MeshSize(Params):
         return 24 * self.vertices + 12 * self.triangles
 
 
-class VolumePut(Params):
+class VolumePut(f.Params):
     """A chunk of voxels (float32 [z, y, x], attenuation [1/mm]) or of a mesh, or an analytic scene.
 
     The first chunk has start 0 and begins afresh; the volume replaces its namesake when all bytes
     have come. Projections of a mesh are path lengths [mm].
     """
 
-    name: VolumeName
+    name: f.VolumeName
     scene: dict[str, Any] | None = Field(
         default=None, description="{solids: [{shape: {kind, ...}, material, mu_per_mm}]}"
     )
@@ -185,53 +174,53 @@ class VolumePut(Params):
         return self
 
 
-class VolumeRef(Params):
+class VolumeRef(f.Params):
     """Which volume."""
 
-    name: VolumeName
+    name: f.VolumeName
 
 
-class Project(Params):
+class Project(f.Params):
     """Line integrals of a volume."""
 
-    volume: VolumeName
+    volume: f.VolumeName
     cone_vec: ConeVecs
     detector: Detector
-    key: Annotated[ShortText, MaxLen(300)] | None = Field(
+    key: Annotated[f.ShortText, MaxLen(300)] | None = Field(
         default=None,
         description="interactive: a newer request with this key replaces one that waits",
     )
 
 
-class Backproject(Params):
+class Backproject(f.Params):
     """The adjoint of `project`; with `into` it is added to a named volume instead of answered."""
 
     cone_vec: ConeVecs
     grid: VoxelGrid
-    into: VolumeName | None = None
+    into: f.VolumeName | None = None
     projections: Stack
 
 
-class Cancel(Params):
+class Cancel(f.Params):
     """A request of this connection that is no longer wanted."""
 
     request: Annotated[int, Ge(0), Le(2**64 - 1)] | Annotated[str, Len(0, 1000)]
 
 
-class VolumeInfo(Result):
+class VolumeInfo(f.Result):
     """A named volume."""
 
     name: str
     kind: Literal["voxels", "mesh", "scene"]
     bytes: int = Field(description="memory it takes")
     shape: list[int] | None = Field(default=None, description="(z, y, x)")
-    voxel_mm: Triple | None = None
-    center_mm: Triple | None = None
+    voxel_mm: f.Triple | None = None
+    center_mm: f.Triple | None = None
     solids: int | None = None
     triangles: int | None = None
 
 
-class PutResult(Result):
+class PutResult(f.Result):
     """How much has come."""
 
     name: str
@@ -240,7 +229,7 @@ class PutResult(Result):
     complete: bool
 
 
-class VolumeList(Result):
+class VolumeList(f.Result):
     """What is there and what room is left [bytes]."""
 
     volumes: list[VolumeInfo]
@@ -248,13 +237,13 @@ class VolumeList(Result):
     memory_limit: int
 
 
-class Removed(Result):
+class Removed(f.Result):
     """Whether there was such a volume."""
 
     removed: bool
 
 
-class Array(Result):
+class Array(f.Result):
     """An image value, or (with `parts`) the description of what came in parts."""
 
     dtype: Literal["float32"]
@@ -263,13 +252,13 @@ class Array(Result):
     data: Buffer | None = None
 
 
-class Cancelled(Result):
+class Cancelled(f.Result):
     """Whether the request was still there to be cancelled."""
 
     cancelled: bool
 
 
-class Health(Result):
+class Health(f.Result):
     """How the server is."""
 
     instance: str = Field(description="changes when the server restarts")
@@ -292,13 +281,13 @@ PROJECTOR_METHODS: Final[Mapping[str, AnyMethod]] = {
         read("session.hello", Hello, HelloResult, "introduce the client; bring the token"),
         read("volume.put", VolumePut, PutResult, "store a named volume or scene"),
         read("volume.get", VolumeRef, Array, "read a named volume of voxels back"),
-        read("volume.list", Empty, VolumeList, "the volumes there are"),
+        read("volume.list", f.Empty, VolumeList, "the volumes there are"),
         read("volume.remove", VolumeRef, Removed, "forget a volume"),
         read("project", Project, Array, "line integrals, float32 (n, rows, cols)"),
         Method("backproject", Backproject, Array, "the adjoint of project, float32 (z, y, x)"),
-        read("health", Empty, Health, "how the server is"),
+        read("health", f.Empty, Health, "how the server is"),
         read("cancel", Cancel, Cancelled, "give up a request of this connection"),
-        read("rpc.discover", Empty, Discovery, "this table as an OpenRPC document"),
+        read("rpc.discover", f.Empty, Discovery, "this table as an OpenRPC document"),
     )
 }
 """Every method of the projector server, by name."""

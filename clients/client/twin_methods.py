@@ -29,7 +29,6 @@ from flexdt.protocol.methods import job_messages as scans
 from flexdt.protocol.methods import motion_messages as motion
 from flexdt.protocol.methods import sample_messages as stage
 from flexdt.protocol.methods import session_messages as session
-from flexdt.protocol.methods import setting_messages as settings
 
 if TYPE_CHECKING:
     from flexdt.phantoms import Phantom
@@ -185,7 +184,7 @@ def set_clock(speed_up: SpeedUp) -> Flow[s.ClockState]:
         >>> twin.set_clock("max").speed_up
         'max'
     """
-    return ask(settings.CLOCK_SET, speed_up=speed_up)
+    return ask(motion.CLOCK_SET, speed_up=speed_up)
 
 
 def set_tube(
@@ -198,7 +197,7 @@ def set_tube(
         >>> tube.kV, tube.power_W
         (80.0, 20.0)
     """
-    return ask(settings.TUBE_SET, kV=kV, power_W=power_W, on=on)
+    return ask(motion.TUBE_SET, kV=kV, power_W=power_W, on=on)
 
 
 def set_camera(
@@ -216,7 +215,7 @@ def set_camera(
         200.0
     """
     return ask(
-        settings.CAMERA_SET, exposure_ms=exposure_ms, mode=mode,
+        motion.CAMERA_SET, exposure_ms=exposure_ms, mode=mode,
         roi=None if roi is None else list(roi), averages=averages, frames=frames,
     )  # fmt: skip
 

@@ -16,8 +16,15 @@ from flexdt.clients.datasets.data_set import Counts, DataSet
 from flexdt.clients.extras import package
 from flexdt.runtime.files.dataset_folder import read_image, tiff_bytes
 from flexdt.runtime.files.directory import Directory
-from flexdt.twin.dataset.dataset_errors import DatasetExistsError, DatasetFormatError
-from flexdt.twin.dataset.file_names import DOCUMENT, GEOMETRY, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS
+from flexdt.twin.dataset.dataset_errors import (
+    DOCUMENT,
+    GEOMETRY,
+    SCAN_SETTINGS,
+    SCRIPT,
+    XRE_SETTINGS,
+    DatasetExistsError,
+    DatasetFormatError,
+)
 from flexdt.twin.dataset.flexdt_json import CorrectionEntry
 from flexdt.twin.dataset.rebuild import MATCH_MM
 from flexdt.twin.dataset.scan_settings import ScanSettings, figures_of, poses_of
@@ -25,8 +32,7 @@ from flexdt.twin.dataset.scan_settings_text import format_scan_settings
 from flexdt.twin.dataset.xre import format_settings
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.exchange.geometry import ScanGeometry
-from flexdt.twin.exchange.geometry_json import geometry_text
-from flexdt.twin.exchange.number_tables import VECTOR_NAMES
+from flexdt.twin.exchange.number_tables import VECTOR_NAMES, geometry_text
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.lazy_backend import File
 

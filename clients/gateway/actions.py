@@ -29,7 +29,7 @@ from flexdt.protocol.rpc_errors import RpcError
 from flexdt.protocol.state_model import JobStatus, State
 from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.script import commands as c
-from flexdt.twin.script.planning.image_names import bare_name, image_name
+from flexdt.twin.script.grammar import bare_name, image_name
 
 ARMED_S: Final = 10.0
 """Real seconds that a move with a trigger waits for its image sequence before it moves alone."""

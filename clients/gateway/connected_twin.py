@@ -23,7 +23,7 @@ from flexdt.clients.gateway.recording import Image, Recording
 from flexdt.clients.gateway.vocabulary import Refusal
 from flexdt.protocol.rpc_errors import RpcError
 from flexdt.protocol.state_model import AxisState, JobStatus, State
-from flexdt.twin.dataset.file_names import SCRIPT
+from flexdt.twin.dataset.dataset_errors import SCRIPT
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import Machine, Profile, builtin_machine, profile_of
 from flexdt.twin.script.executed_log import MotorReply, motor_cluster

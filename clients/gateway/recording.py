@@ -24,8 +24,13 @@ import numpy.typing as npt
 from flexdt.protocol.state_model import State
 from flexdt.runtime.files.dataset_folder import free_name, read_document, tiff_bytes
 from flexdt.runtime.files.directory import Directory, open_data
-from flexdt.twin.dataset.dataset_errors import DatasetError
-from flexdt.twin.dataset.file_names import DOCUMENT, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS
+from flexdt.twin.dataset.dataset_errors import (
+    DOCUMENT,
+    SCAN_SETTINGS,
+    SCRIPT,
+    XRE_SETTINGS,
+    DatasetError,
+)
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, FrameEntry
 from flexdt.twin.dataset.record import FrameBlock, FrameKind, ScanRecord
 from flexdt.twin.dataset.scan_settings_text import format_scan_settings
@@ -33,7 +38,7 @@ from flexdt.twin.dataset.xre import format_xre
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.scanner.state import NamedCorrection
-from flexdt.twin.script.planning.image_names import bare_name, kind_of
+from flexdt.twin.script.grammar import bare_name, kind_of
 
 UNNAMED: Final = "gateway"
 """Name of the folder until an output path is set."""

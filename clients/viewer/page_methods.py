@@ -42,7 +42,7 @@ from flexdt.protocol.methods.calibration_messages import CalibrationAlign, Calib
 from flexdt.protocol.rpc_errors import busy, link_down
 from flexdt.protocol.state_model import State
 from flexdt.runtime.wire_errors import explain
-from flexdt.twin.dataset.file_names import plain_name
+from flexdt.twin.dataset.dataset_errors import plain_name
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.machine.description import Machine, Profile

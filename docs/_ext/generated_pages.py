@@ -13,9 +13,9 @@ from typing import Any, Literal, get_args, get_origin
 
 def wire() -> str:
     """Every method of `rpc.discover`, its parameters, result and types, as Markdown."""
-    from flexdt.protocol import openrpc
+    from flexdt.protocol.methods import openrpc_document
 
-    document = openrpc.document()
+    document = openrpc_document()
     schemas = document["components"]["schemas"]
     out = [
         "# Methods of the wire",

@@ -22,9 +22,8 @@ import numpy as np
 
 from flexdt.phantoms import checked_reading as reading
 from flexdt.phantoms.beads import cuboid_with_beads, spiral_positions, worst_overlap
-from flexdt.phantoms.checked_reading import PhantomError
+from flexdt.phantoms.checked_reading import MAX_SOLIDS, PhantomError, shape_from_dict
 from flexdt.phantoms.files.mesh_files import MAX_EXTENT_MM, MAX_FACES, UNITS_MM, mesh_phantom
-from flexdt.phantoms.json_form import MAX_SOLIDS, shape_from_dict
 from flexdt.phantoms.materials import material as material_of
 from flexdt.phantoms.phantom import Phantom, assemble
 from flexdt.phantoms.pieces import size_about_origin

@@ -1,14 +1,18 @@
 """The twin server's methods, a module a topic: parameters, results, and the methods themselves.
 
-`METHODS` is the one table from which handlers, clients and the OpenRPC document follow.
+`METHODS` is the one table from which handlers, clients and the OpenRPC document follow;
+`openrpc_document` makes that document from the pydantic models of a method table.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final
+from typing import Any, Final
 
-from flexdt.protocol.method import AnyMethod, Method
+from pydantic import BaseModel
+from pydantic.json_schema import models_json_schema
+
+from flexdt.protocol.method import PROTOCOL, AnyMethod, Method
 from flexdt.protocol.methods import calibration_messages as calibration
 from flexdt.protocol.methods import dataset_messages as datasets
 from flexdt.protocol.methods import document_messages as documents
@@ -17,12 +21,9 @@ from flexdt.protocol.methods import job_messages as jobs
 from flexdt.protocol.methods import motion_messages as motion
 from flexdt.protocol.methods import sample_messages as samples
 from flexdt.protocol.methods import session_messages as session
-from flexdt.protocol.methods import setting_messages as settings
-from flexdt.protocol.rpc_errors import method_not_found
+from flexdt.protocol.rpc_errors import Code, method_not_found
 
-TOPICS: Final = (
-    session, motion, settings, samples, images, jobs, datasets, calibration, documents,
-)  # fmt: skip
+TOPICS: Final = (session, motion, samples, images, jobs, datasets, calibration, documents)
 
 METHODS: Final[Mapping[str, AnyMethod]] = {
     found.name: found
@@ -42,3 +43,62 @@ def find(name: str, methods: Mapping[str, AnyMethod] = METHODS) -> AnyMethod:
     if name not in methods:
         raise method_not_found(name, methods)
     return methods[name]
+
+
+def openrpc_document(
+    methods: Mapping[str, AnyMethod] = METHODS,
+    *,
+    title: str = "flexdt twin server",
+) -> dict[str, Any]:
+    """The OpenRPC document of a server as plain data (https://spec.open-rpc.org, version 1.3).
+
+    Args:
+        methods: its method table.
+        title: its name.
+    """
+    models: list[type[BaseModel]] = [m.params for m in methods.values()]
+    models += [m.result for m in methods.values()]
+    refs, definitions = models_json_schema(
+        [(model, "validation") for model in dict.fromkeys(models)],
+        ref_template="#/components/schemas/{model}",
+    )
+    schemas = definitions.get("$defs", {})
+    return {
+        "openrpc": "1.3.2",
+        "info": {
+            "title": title,
+            "version": PROTOCOL,
+            "description": "JSON-RPC 2.0 over TCP; JSON lines or length-prefixed MessagePack.",
+            "license": {"name": "Apache-2.0"},
+        },
+        "methods": [
+            _method(m, schemas, refs[m.result, "validation"]["$ref"]) for m in methods.values()
+        ],
+        "components": {
+            "schemas": schemas,
+            "errors": {c.name: {"code": int(c), "message": c.meaning} for c in Code},
+        },
+    }
+
+
+def _method(method: AnyMethod, schemas: Mapping[str, Any], result: str) -> dict[str, Any]:
+    schema = schemas[method.params.__name__]
+    required = schema.get("required", [])
+    params = []
+    for name, field in schema.get("properties", {}).items():
+        entry = {"name": name, "required": name in required, "schema": field}
+        if "description" in field:
+            entry["description"] = field["description"]
+        params.append(entry)
+    limits = {"x-limits": dict(method.limits)} if method.limits else {}
+    return {
+        "name": method.name,
+        "summary": method.summary,
+        "paramStructure": "either",
+        "params": params,
+        "result": {"name": "result", "schema": {"$ref": result}},
+        "x-control": method.control,
+        "x-safe": method.safe,
+        "x-urgent": method.urgent,
+        **limits,
+    }

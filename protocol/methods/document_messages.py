@@ -1,34 +1,112 @@
-"""scene.* and rpc.discover: the whole state, and the wire itself, as documents."""
+"""scene.* and rpc.discover: the whole state, and the wire itself, as documents.
+
+The units of a scene are those of the wire: mm, deg, kV, W, ms. The hidden misalignment is not part
+of it.
+"""
 
 from __future__ import annotations
 
-from pydantic import JsonValue
+from typing import Annotated, Literal
 
-from flexdt.protocol.fields import Empty, Name, Params, Result
+from annotated_types import Ge, Le, MaxLen
+from pydantic import ConfigDict, Field, JsonValue
+
+from flexdt.protocol import fields as f
 from flexdt.protocol.method import by_hand, read
-from flexdt.protocol.scene_document import Scene
 from flexdt.protocol.state_model import State
 
+Averages = Annotated[int, Ge(1), Le(100_000)]
+Frames = Annotated[int, Ge(1), Le(1_000_000)]
+Kept = Annotated[float, Ge(-2e9), Le(2e9)]
+"""A `Deviation` that has been to radians and back."""
+Paces = Annotated[dict[f.AxisName, f.Pace], MaxLen(64), f.few(64)]
 
-class SceneSave(Params):
+
+class Placement(f.Params):
+    """Shift [mm] and turns about x, y, z [deg] of a sample in the object's frame."""
+
+    x: f.Shift = 0.0
+    y: f.Shift = 0.0
+    z: f.Shift = 0.0
+    rx: f.Turn = 0.0
+    ry: f.Turn = 0.0
+    rz: f.Turn = 0.0
+
+
+class TubePart(f.Params):
+    """Tube settings; `on` is kept for the record and never switched by loading."""
+
+    kV: Annotated[float, Ge(0), Le(1e4)]
+    power_W: Annotated[float, Ge(0), Le(1e6)]
+    on: bool = False
+
+
+class CameraPart(f.Params):
+    """Camera settings."""
+
+    mode: f.ShortText
+    roi: f.RoiAsked
+    exposure_ms: f.Exposure
+    averages: Averages
+    frames: Frames
+
+
+class SamplePart(f.Params):
+    """What stood on the stage; the empty name for nothing."""
+
+    name: Literal[""] | f.Name
+    material: f.Material | None = None
+    offset: Placement = Field(default_factory=Placement)
+
+
+class CorrectionPart(f.Params):
+    """The correction in force; parameters in mm and deg."""
+
+    name: f.Name
+    date: f.ShortText
+    parameters: Annotated[dict[f.AxisName, Kept], MaxLen(64), f.few(64)]
+    comment: f.Comment = ""
+
+
+class Scene(f.Params):
+    """The whole state of a scanner as one versioned document: the result of `scene.save`."""
+
+    schema_version: f.Version1 = Field(alias="schema")
+    flexdt: f.ShortText = ""
+    name: f.ShortText = ""
+    saved: f.ShortText = ""
+    machine: f.ShortText
+    profile: f.ShortText
+    positions: Annotated[dict[f.AxisName, f.Position], MaxLen(64), f.few(64)]
+    speeds: Paces = Field(default_factory=dict)
+    accelerations: Paces = Field(default_factory=dict)
+    tube: TubePart
+    camera: CameraPart
+    sample: SamplePart
+    correction: CorrectionPart | None = None
+
+    model_config = ConfigDict(populate_by_name=True)
+
+
+class SceneSave(f.Params):
     """Name and comment for the document."""
 
-    name: Name | None = None
+    name: f.Name | None = None
 
 
-class SceneLoad(Params):
+class SceneLoad(f.Params):
     """A document made by `scene.save`."""
 
     document: Scene
 
 
-class SceneResult(Result):
+class SceneResult(f.Result):
     """The whole state as one versioned document."""
 
     document: dict[str, JsonValue]
 
 
-class Discovery(Result):
+class Discovery(f.Result):
     """An OpenRPC document."""
 
     openrpc: str
@@ -38,4 +116,4 @@ class Discovery(Result):
 
 SCENE_SAVE = read("scene.save", SceneSave, SceneResult, "whole state as one versioned document")
 SCENE_LOAD = by_hand("scene.load", SceneLoad, State, "restore such a document")
-RPC_DISCOVER = read("rpc.discover", Empty, Discovery, "this table as an OpenRPC document")
+RPC_DISCOVER = read("rpc.discover", f.Empty, Discovery, "this table as an OpenRPC document")

@@ -10,8 +10,8 @@ from pydantic import Field
 
 from flexdt.protocol import fields as f
 from flexdt.protocol.method import read
-from flexdt.protocol.methods.setting_messages import CameraSet, TubeSet
-from flexdt.protocol.scene_document import Averages, Frames
+from flexdt.protocol.methods.document_messages import Averages, Frames
+from flexdt.protocol.methods.motion_messages import CameraSet, TubeSet
 from flexdt.protocol.state_model import GeometryResult, ImageFlags
 
 LayerText = Annotated[f.ShortText, MaxLen(100)]

@@ -1,4 +1,4 @@
-"""axes.* and safety.*: motors, stop and emergency stop."""
+"""axes.*, safety.*, clock.set, tube.set and camera.set: motors, stops, and settings."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from annotated_types import Ge, Le
 from pydantic import Field
 
 from flexdt.protocol import fields as f
+from flexdt.protocol.fields import Exposure, Params, Power, RoiAsked, ShortText, SpeedUp, Voltage
 from flexdt.protocol.method import Method, by_hand, command
-from flexdt.protocol.state_model import State, Stopped
+from flexdt.protocol.methods.document_messages import Averages, Frames
+from flexdt.protocol.state_model import CameraState, ClockState, State, Stopped, TubeState
 
 
 class Move(f.Params):
@@ -78,3 +80,35 @@ AXES_SET = by_hand("axes.set", AxisSet, AxisSetResult, "set an axis's speed and 
 AXES_STOP = Method("axes.stop", f.Empty, Stopped, "bring all axes to rest", urgent=True)
 SAFETY_ESTOP = Method("safety.estop", f.Empty, Stopped, "emergency stop; X-rays off", urgent=True)
 SAFETY_RESET = command("safety.reset", Reset, State, "leave the emergency stop")
+
+
+class ClockSet(Params):
+    """How fast the twin's time runs."""
+
+    speed_up: SpeedUp
+
+
+class TubeSet(Params):
+    """X-ray tube settings; what is left out stays."""
+
+    kV: Voltage | None = None
+    power_W: Power | None = None
+    on: bool | None = None
+
+
+class CameraSet(Params):
+    """Camera settings; what is left out stays."""
+
+    exposure_ms: Exposure | None = None
+    mode: ShortText | None = None
+    roi: RoiAsked | None = Field(
+        default=None, description="left, top, right, bottom; inclusive, unbinned"
+    )
+    averages: Averages | None = None
+    frames: Frames | None = None
+
+
+CLOCK_SET = command("clock.set", ClockSet, ClockState, "set how fast the twin's time runs")
+TUBE_SET = by_hand("tube.set", TubeSet, TubeState, "set kV, power and X-rays on or off")
+CAMERA_SET = by_hand("camera.set", CameraSet, CameraState,
+                     "set exposure, mode, ROI, averages, frames")  # fmt: skip

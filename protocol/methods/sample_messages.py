@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from flexdt.protocol import fields as f
 from flexdt.protocol.method import Method, by_hand, read
-from flexdt.protocol.scene_document import Placement
+from flexdt.protocol.methods.document_messages import Placement
 from flexdt.protocol.state_model import SampleState
 
 Bytes = Annotated[int, Ge(0), Le(2**53)]

@@ -22,12 +22,13 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.runtime.files.directory import Directory
-from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
-from flexdt.twin.dataset.file_names import (
+from flexdt.twin.dataset.dataset_errors import (
     DOCUMENT,
     GEOMETRY,
     SCAN_SETTINGS,
     XRE_SETTINGS,
+    DatasetFormatError,
+    DatasetMissingError,
     plain_name,
 )
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, parse_document

@@ -22,8 +22,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from flexdt.twin.dataset.dataset_errors import DatasetNameError, DatasetWriteError, DiskFullError
-from flexdt.twin.dataset.file_names import plain_name
+from flexdt.twin.dataset.dataset_errors import (
+    DatasetNameError,
+    DatasetWriteError,
+    DiskFullError,
+    plain_name,
+)
 
 TEMPORARY: Final = ".part-"
 """Prefix of temporary names; no plain name starts with a dot, so they never collide."""

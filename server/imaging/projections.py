@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import Channel, attenuating, channels, scatter_object
-from flexdt.phantoms.json_form import scene_to_dict
+from flexdt.phantoms.checked_reading import scene_to_dict
 from flexdt.protocol import Code, RpcError
 from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.imaging.truth import TrueGeometry

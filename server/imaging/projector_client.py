@@ -16,7 +16,7 @@ from typing import Final, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.phantoms.json_form import scene_to_dict
+from flexdt.phantoms.checked_reading import scene_to_dict
 from flexdt.protocol import Code, RpcError, hello_params, image, parse_result
 from flexdt.protocol.projector import Health, VolumeList
 from flexdt.runtime.wire_errors import ProjectorUnavailable

@@ -20,10 +20,11 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.phantoms.json_form import scene_from_dict
-from flexdt.protocol import MAX_FRAME, PROTOCOL, Correlation, Notification, Role, image, openrpc
+from flexdt.phantoms.checked_reading import scene_from_dict
+from flexdt.protocol import MAX_FRAME, PROTOCOL, Correlation, Notification, Role, image
 from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Id
+from flexdt.protocol.methods import openrpc_document
 from flexdt.protocol.methods.session_messages import Hello
 from flexdt.protocol.projector import (
     PROJECTOR_METHODS,
@@ -291,7 +292,7 @@ async def discover(context: Context, client: JobClient, id: Id, p: Params) -> ob
 
 @cache
 def _document() -> object:
-    return openrpc.document(PROJECTOR_METHODS, title="flexdt projector server")
+    return openrpc_document(PROJECTOR_METHODS, title="flexdt projector server")
 
 
 def _accumulator(context: Context, name: str | None, grid: VoxelGrid) -> Volume | None:

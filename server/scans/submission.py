@@ -31,8 +31,15 @@ from flexdt.server.scans.stage import Stage
 from flexdt.server.scans.twin_clock import SpeedUp
 from flexdt.server.storage.dataset_writer import RESERVE_BYTES, DatasetWriter
 from flexdt.server.storage.memory import Memory, StateStore, with_job
-from flexdt.twin.dataset.dataset_errors import DatasetError, DiskFullError
-from flexdt.twin.dataset.file_names import DOCUMENT, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS, plain_name
+from flexdt.twin.dataset.dataset_errors import (
+    DOCUMENT,
+    SCAN_SETTINGS,
+    SCRIPT,
+    XRE_SETTINGS,
+    DatasetError,
+    DiskFullError,
+    plain_name,
+)
 from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.geometry.cone_vec import check_cone_vec
 from flexdt.twin.scanner.scanner import ScannerTwin

@@ -16,8 +16,8 @@ from typing import Literal
 from pydantic import Field
 
 from flexdt.protocol.fields import ShortText
+from flexdt.protocol.methods.document_messages import CorrectionPart
 from flexdt.protocol.rpc_errors import invalid_params
-from flexdt.protocol.scene_document import CorrectionPart
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.own_documents import (
     Changes,

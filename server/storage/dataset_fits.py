@@ -17,8 +17,7 @@ from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.wire_errors import from_root
 from flexdt.twin.calibration.fit.covariance_steps import covariance_by_step
 from flexdt.twin.calibration.unknown_markers import UNKNOWN
-from flexdt.twin.dataset.dataset_errors import DatasetMissingError
-from flexdt.twin.dataset.file_names import plain_name
+from flexdt.twin.dataset.dataset_errors import DatasetMissingError, plain_name
 
 SECONDS: Final = float(p.FIT_LIMITS["seconds"])
 MEMORY_BYTES: Final = int(p.FIT_LIMITS["memory_bytes"])

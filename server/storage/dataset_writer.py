@@ -21,13 +21,17 @@ import tifffile
 from flexdt.runtime.files.dataset_folder import read_document, tiff_bytes
 from flexdt.runtime.files.directory import Directory, Write, free_bytes, write_some
 from flexdt.twin.dataset.dataset_errors import (
+    DOCUMENT,
+    SCAN_SETTINGS,
+    SCRIPT,
+    XRE_SETTINGS,
     DatasetError,
     DatasetExistsError,
     DatasetMissingError,
     DatasetWriteError,
     DiskFullError,
+    plain_name,
 )
-from flexdt.twin.dataset.file_names import DOCUMENT, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS, plain_name
 from flexdt.twin.dataset.flexdt_json import DatasetDocument
 from flexdt.twin.dataset.record import ScanRecord
 from flexdt.twin.dataset.scan_settings_text import format_scan_settings

@@ -24,15 +24,14 @@ from annotated_types import Ge, Le
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from flexdt.protocol.fields import SpeedUp
+from flexdt.protocol.methods.document_messages import Scene
 from flexdt.protocol.rpc_errors import RpcError
-from flexdt.protocol.scene_document import Scene
 from flexdt.protocol.state_model import JobPhase
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.own_documents import Changes, read_json, read_or_set_aside
 from flexdt.runtime.log import log
 from flexdt.server.storage.scene import apply_settings, require_fit, sample_of, save_scene
-from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetWriteError
-from flexdt.twin.dataset.file_names import plain_name
+from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetWriteError, plain_name
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.scanner.scanner import ScannerTwin

@@ -41,8 +41,14 @@ from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.wire_errors import from_root
 from flexdt.runtime.workers import Workers
 from flexdt.server.storage import dataset_fits
-from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetMissingError, DatasetNameError
-from flexdt.twin.dataset.file_names import DOCUMENT, SCRIPT, plain_name
+from flexdt.twin.dataset.dataset_errors import (
+    DOCUMENT,
+    SCRIPT,
+    DatasetError,
+    DatasetMissingError,
+    DatasetNameError,
+    plain_name,
+)
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, FrameEntry, parse_document
 from flexdt.twin.dataset.normalise import LineIntegrals, binned_mean
 from flexdt.twin.dataset.record import FrameKind

@@ -1,6 +1,6 @@
 """The whole state as one versioned document, and back.
 
-The document is `protocol.scene_document`; it is validated whole before any of it is applied.
+The document is `Scene` of `document_messages`; it is validated whole before any of it is applied.
 """
 
 from __future__ import annotations
@@ -8,9 +8,15 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
+from flexdt.protocol.methods.document_messages import (
+    CameraPart,
+    CorrectionPart,
+    SamplePart,
+    Scene,
+    TubePart,
+)
+from flexdt.protocol.methods.document_messages import Placement as WirePlacement
 from flexdt.protocol.rpc_errors import invalid_params
-from flexdt.protocol.scene_document import CameraPart, CorrectionPart, SamplePart, Scene, TubePart
-from flexdt.protocol.scene_document import Placement as WirePlacement
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.machine.kinematics import resolve_targets
 from flexdt.twin.scanner.scanner import ScannerTwin

@@ -22,12 +22,12 @@ from flexdt.protocol import (
     RpcError,
     find,
     image,
-    openrpc,
     parse_params,
     parse_result,
 )
 from flexdt.protocol.fields import require_extent
 from flexdt.protocol.method import compatible
+from flexdt.protocol.methods import openrpc_document
 from flexdt.protocol.methods.motion_messages import MoveResult
 from flexdt.protocol.methods.sample_messages import SampleUpload
 from flexdt.protocol.projector import PROJECTOR_METHODS
@@ -195,7 +195,7 @@ def test_dtypes_that_cannot_travel() -> None:
 
 @pytest.mark.parametrize("table", [METHODS, PROJECTOR_METHODS], ids=["twin", "projector"])
 def test_the_openrpc_document_describes_every_method(table: Any) -> None:
-    document = openrpc.document(table)
+    document = openrpc_document(table)
     assert {m["name"] for m in document["methods"]} == set(table)
     schemas = document["components"]["schemas"]
 
@@ -216,7 +216,7 @@ def test_the_openrpc_document_describes_every_method(table: Any) -> None:
 
 
 def test_the_document_gives_types_units_and_defaults() -> None:
-    methods = {m["name"]: m for m in openrpc.document()["methods"]}
+    methods = {m["name"]: m for m in openrpc_document()["methods"]}
     params = {p["name"]: p for p in methods["axes.move"]["params"]}
     assert params["targets"]["required"]
     assert params["wait"]["schema"]["type"] == "boolean"

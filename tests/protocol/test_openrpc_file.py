@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import get_args
 
 from flexdt.protocol import METHODS
+from flexdt.protocol.methods import openrpc_document
 from flexdt.protocol.methods.image_messages import ProjectionGet
 from flexdt.protocol.methods.sample_messages import SampleUpload
-from flexdt.protocol.openrpc import document
 from flexdt.protocol.state_model import JobPhase
 
 PROTOCOL = Path(__file__).parents[2] / "protocol"
@@ -22,7 +22,7 @@ HEAD = "| method | parameters |\n|---|---|\n"
 
 
 def text() -> str:
-    return json.dumps(document(), indent=1) + "\n"
+    return json.dumps(openrpc_document(), indent=1) + "\n"
 
 
 def table() -> str:

@@ -21,7 +21,7 @@ from flexdt.clients.viewer.page_methods import METHODS as PAGE_METHODS
 from flexdt.protocol import METHODS
 from flexdt.protocol.fields import Nothing
 from flexdt.protocol.method import Method
-from flexdt.protocol.openrpc import document
+from flexdt.protocol.methods import openrpc_document
 
 ROOT = Path(__file__).parents[2]
 WEB, BUILT = ROOT / "clients" / "viewer" / "web", ROOT / "clients" / "viewer" / "data"
@@ -44,7 +44,7 @@ def types() -> str:
         for name, (asked, _) in PAGE_METHODS.items()
     }
     table = {name: m for name, m in {**METHODS, **own}.items() if called(name)}
-    schemas = document({**METHODS, **own})["components"]["schemas"]
+    schemas = openrpc_document({**METHODS, **own})["components"]["schemas"]
     answers = [m for m in table.values() if m.name in METHODS]
     asked = within([m.params.__name__ for m in table.values()], schemas)
     schemas = {name: of_page(schema, name in asked) for name, schema in schemas.items()}

@@ -17,8 +17,12 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetNameError
-from flexdt.twin.dataset.file_names import DOCUMENT, plain_name
+from flexdt.twin.dataset.dataset_errors import (
+    DOCUMENT,
+    DatasetFormatError,
+    DatasetNameError,
+    plain_name,
+)
 from flexdt.twin.dataset.record import FrameBlock, FrameKind, NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray

@@ -22,6 +22,7 @@ from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.scanner.state import NamedCorrection
 from flexdt.twin.script import ScanPlan
+from flexdt.twin.script.planning.plan import saved_images
 from flexdt.twin.values import ArrayValue
 
 SAME = 1e-4
@@ -260,16 +261,11 @@ class ScanRecord(ArrayValue):
 
 
 def _blocks(plan: ScanPlan) -> Iterable[FrameBlock]:
-    first = 0
-    for group in plan.groups:
-        rows = slice(first, first + len(group))
-        first += len(group)
-        if group.kind == "preview" or not group.files:
-            continue
-        positions = {n: np.asarray(v)[rows] for n, v in plan.image_positions.items()}
-        yield FrameBlock(
-            group.kind, group.files, group.starts, group.camera, positions, group.xrays_on
-        )
+    for group, positions in saved_images(plan):
+        if group.kind != "preview":
+            yield FrameBlock(
+                group.kind, group.files, group.starts, group.camera, positions, group.xrays_on
+            )
 
 
 def _flat_axis(machine: Machine, blocks: Sequence[FrameBlock]) -> str:

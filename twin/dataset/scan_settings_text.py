@@ -16,8 +16,7 @@ from dataclasses import dataclass, fields
 from datetime import datetime
 from typing import Any, Final
 
-from flexdt.twin.dataset.dataset_errors import DatasetFormatError
-from flexdt.twin.dataset.file_names import SCAN_SETTINGS
+from flexdt.twin.dataset.dataset_errors import SCAN_SETTINGS, DatasetFormatError
 from flexdt.twin.dataset.record import ScanRecord
 from flexdt.twin.dataset.scan_settings import ENTRIES, Kind, MotorLine, ScanSettings, settings_of
 from flexdt.twin.machine.camera import Roi

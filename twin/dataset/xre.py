@@ -17,8 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from flexdt.twin.dataset.dataset_errors import DatasetFormatError
-from flexdt.twin.dataset.file_names import XRE_SETTINGS
+from flexdt.twin.dataset.dataset_errors import XRE_SETTINGS, DatasetFormatError
 from flexdt.twin.dataset.record import ScanRecord
 from flexdt.twin.dataset.scan_settings import ENTRIES, MotorLine, ScanSettings, settings_of
 from flexdt.twin.dataset.scan_settings_text import EOL, clean, parse_number, parse_roi, require_size

@@ -6,7 +6,7 @@ the poses and offsets behind it). A geometry that a format cannot represent is a
 """
 
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
-from flexdt.twin.exchange.geometry_json import read_json
+from flexdt.twin.exchange.number_tables import read_json
 
 __all__ = [
     "ExchangeError",

@@ -17,14 +17,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from flexdt.twin.exchange.geometry import (
-    SAME_MM,
-    CircularScan,
-    ExchangeError,
-    ScanGeometry,
-    circle_of,
-    require_panel,
-)
+from flexdt.twin.exchange import geometry as g
+from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.exchange.number_tables import check_size, cone_vec_of
 from flexdt.twin.geometry.conventions import FloatArray, rotation_x, rotation_y, rotation_z
 
@@ -34,7 +28,7 @@ UNSUPPORTED: Final = ("axs_roll", "axs_pitch", "vol_rot")
 _LISTS: Final = {"vol_tra": 3, "vol_rot": 3, "det_sample": 2, "ang_range": 2, "vol_sample": 3}
 
 
-def flexdata_text(geometry: ScanGeometry, tolerance_mm: float = SAME_MM) -> str:
+def flexdata_text(geometry: ScanGeometry, tolerance_mm: float = g.SAME_MM) -> str:
     """The TOML, for images turned upside down.
 
     Args:
@@ -46,8 +40,8 @@ def flexdata_text(geometry: ScanGeometry, tolerance_mm: float = SAME_MM) -> str:
         ExchangeError: a geometry that the format cannot state.
     """
     up = geometry.rows_up()
-    pitch_u, pitch_v = require_panel(up.cone_vec, "flexDATA")
-    circle = circle_of(up.cone_vec, "flexDATA", tolerance_mm)
+    pitch_u, pitch_v = g.require_panel(up.cone_vec, "flexDATA")
+    circle = g.circle_of(up.cone_vec, "flexDATA", tolerance_mm)
     first, last = _equal_steps(circle, tolerance_mm)
     source, detector = circle.source, circle.detector
     if source[1] >= 0.0 or detector[1] - source[1] <= 0.0:
@@ -87,7 +81,7 @@ def flexdata_text(geometry: ScanGeometry, tolerance_mm: float = SAME_MM) -> str:
     return "".join(f"{name} = {json.dumps(value)}\n" for name, value in values.items())
 
 
-def _equal_steps(circle: CircularScan, tolerance_mm: float) -> tuple[float, float]:
+def _equal_steps(circle: g.CircularScan, tolerance_mm: float) -> tuple[float, float]:
     """First and last angle [rad].
 
     Raises:
@@ -166,7 +160,7 @@ def read_flexdata(
     pixel = get.number("det_pixel")
     first, last = get.list_of("ang_range")
     angles = np.linspace(first, last, count)
-    circle = CircularScan(
+    circle = g.CircularScan(
         np.radians(angles),
         np.array([-moved[1], -moved[2]]),
         np.array([get.number("src_tan", 0.0) - axis, -sod, get.number("src_ort", 0.0)]),

@@ -18,8 +18,7 @@ from flexdt.twin.following.mirror import MOST_WAITING, Alarm, Heard, Mirror, Wai
 from flexdt.twin.machine.description import Machine, Profile, unknown_axis
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.executed_log import MotorReply, log_line, motor_reply
-from flexdt.twin.script.grammar import FIXED, ArgumentError, find, number
-from flexdt.twin.script.planning.describe import describe
+from flexdt.twin.script.grammar import FIXED, ArgumentError, describe, find, number
 from flexdt.twin.script.planning.dry_run import CollisionCheck, check_plan
 from flexdt.twin.script.planning.plan import PlanStep, Range, SampleSize, step_range, total_range
 from flexdt.twin.script.planning.planner import plan_script, simulated
@@ -210,7 +209,7 @@ class Follower:
         about = getattr(command, "component", "") or waiting.heard.words[0]
         if isinstance(command, c.MoveAbsolute):
             mirror = mirror.cleared(about, *_OF_A_MOVE)
-        for p in sim.problems:
+        for p in sim.findings.problems:
             if p.code in _OF_ONE_COMMAND and not (mirror.xrays_on is None and "xray" in p.code):
                 kind = _OF_ONE_COMMAND[p.code]
                 mirror = _alarm(mirror, now, "error", kind, about, p.message)

@@ -1,7 +1,10 @@
 """The vocabulary of Acquila scripts: the commands of each component, and their arguments.
 
 One table serves all components; each command has one function that turns argument text into the
-command's own fields or raises `ArgumentError`.
+command's own fields or raises `ArgumentError`. `describe` gives each command one readable line.
+
+A path in a script names a file inside the data set's folder and nothing else: drives, folders and
+characters that some file system does not allow are dropped, and the file's name is left.
 """
 
 from __future__ import annotations
@@ -10,12 +13,13 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.motion.profiles import LEAST_RATE
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.lexer import encode
+from flexdt.twin.script.planning.plan import ImageKind
 
 MAX_FRAMES: Final = 1_000_000
 MAX_AVERAGES: Final = 100_000
@@ -232,3 +236,81 @@ def match(component: str, words: list[str]) -> tuple[Spec, int] | None:
         if spec is not None:
             return spec, count
     return None
+
+
+_UNSAFE = re.compile(r"[\x00-\x1f\x7f<>:\"|?*\ud800-\udfff]")
+_DEVICE = re.compile(r"(?:con|prn|aux|nul|com\d|lpt\d)(?:\..*)?", re.IGNORECASE)
+_SUFFIX = re.compile(r".*\.tiff?", re.IGNORECASE | re.DOTALL)
+_DARK = re.compile(r"di[_-]?\d*(?:\.tiff?)?", re.IGNORECASE)
+_FLAT = re.compile(r"io[_-]?\d*(?:\.tiff?)?", re.IGNORECASE)
+MAX_NAME = 120
+
+
+def bare_name(path: str) -> str:
+    r"""The last part of `path` (after \ or /) with unsafe characters as `_`; may be empty."""
+    name = re.split(r"[\\/]", path)[-1]
+    name = _UNSAFE.sub("_", name).strip(" .")[:MAX_NAME]
+    return f"_{name}" if _DEVICE.fullmatch(name) else name
+
+
+def image_name(path: str) -> str | None:
+    """File name of one image, with `.tif`; None if the path does not end with a name."""
+    name = bare_name(path)
+    if not name or name.lower() in ("tif", "tiff"):
+        return None
+    return name if _SUFFIX.fullmatch(name) else f"{name}.tif"
+
+
+def sequence_names(prefix: str, first: int, count: int) -> tuple[str, ...]:
+    """File names of a sequence: prefix, six digits, `.tif`."""
+    name = bare_name(prefix) if not prefix.endswith(("\\", "/")) else ""
+    return tuple([f"{name}{i:06d}.tif" for i in range(first, first + count)])
+
+
+def kind_of(name: str) -> ImageKind:
+    """What an image is for, by its name: di* dark, io* flat, everything else a projection."""
+    if _DARK.fullmatch(name):
+        return "dark"
+    return "flat" if _FLAT.fullmatch(name) else "projection"
+
+
+_GOES_ON: Final[Mapping[c.Wait, str]] = {
+    c.Wait.NO_WAIT: ", goes on at once",
+    c.Wait.RCV: ", goes on when received",
+}
+
+
+def _move_line(k: c.MoveAbsolute) -> str:
+    until = f", goes on at {k.trigger:g}" if k.wait is c.Wait.POS and k.trigger is not None else ""
+    return f"{k.component} to {k.target:.10g}{until}"
+
+
+_LINES: Final[Mapping[type[c.Command], Callable[[Any], str]]] = {
+    c.Pause: lambda k: f"pause {k.duration_ms / 1000:g} s",
+    c.SetOutputPath: lambda k: f"output path {shorten(k.path)} (the twin chooses the folder)",
+    c.SetSampleInfo: lambda k: "sample info",
+    c.KeepXrayOn: lambda k: f"keep X-rays on: {'yes' if k.keep else 'no'}",
+    c.WriteSettingsFile: lambda k: "write settings file",
+    c.XrayOn: lambda k: "X-rays on",
+    c.XrayOff: lambda k: "X-rays off",
+    c.SetVoltage: lambda k: f"tube voltage {k.kV:g} kV",
+    c.SetPower: lambda k: f"tube power {k.power_W:g} W",
+    c.WaitXrayReady: lambda k: "wait until X-rays are ready",
+    c.SetMode: lambda k: f"camera mode {shorten(k.mode)}",
+    c.SetExposure: lambda k: f"exposure {k.exposure_ms:g} ms",
+    c.SetFrames: lambda k: f"number of frames {k.frames}",
+    c.SetAverages: lambda k: f"number of averages {k.averages}",
+    c.SetRoi: lambda k: f"ROI {k.roi}",
+    c.TakeImage: lambda k: "take image",
+    c.SaveImage: lambda k: f"save image {bare_name(k.path)}",
+    c.TakeSequence: lambda k: f"take and save sequence {bare_name(k.prefix)}",
+    c.MoveAbsolute: _move_line,
+    c.SetSpeed: lambda k: f"{k.component} speed {k.speed:.10g}",
+    c.SetAcceleration: lambda k: f"{k.component} acceleration {k.acceleration:.10g}",
+    c.Custom: lambda k: shorten(" ".join((k.component, *k.words))),
+}
+
+
+def describe(command: c.Command) -> str:
+    """One readable line for `command`, for reports and progress."""
+    return _LINES[type(command)](command) + _GOES_ON.get(command.wait, "")

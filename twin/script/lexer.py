@@ -27,6 +27,7 @@ _BLOB = re.compile(r"[ \t]*scanner[ \t]+set[ \t]+sample[ \t]+info(?=[ \t]|$)", r
 _BLOB_WAIT = re.compile(r"\t(?:ACK|no\s+wait|POS|RCV)(?:\t[^\t]*){0,2}\s*$", re.IGNORECASE)
 _COMMENT = re.compile(r"\s*(?:#|//|;)")
 _TAIL_COMMENT = re.compile(r"(?<!\S)(?:#|//|;).*$", re.DOTALL)
+"""A comment that starts a word: `# ...`, `// ...` or `; ...`."""
 _WORD = re.compile(r"\S+")
 _BLANK = " \t\ufeff\x1a"
 _MAX_JOINED = 64
@@ -109,11 +110,6 @@ def line_count(data: str | bytes) -> int:
     return len(_END.findall(text)) + (not text.endswith(("\n", "\r")) and bool(text))
 
 
-def strip_comment(text: str) -> str:
-    """The text before a comment that starts a word: `# ...`, `// ...` or `; ...`."""
-    return _TAIL_COMMENT.sub("", text)
-
-
 def _lines(text: str) -> Iterator[tuple[int, str]]:
     """(number, line); a binary argument that holds line ends stays in one piece."""
     parts = _END.split(text)
@@ -151,7 +147,7 @@ def _columns(text: str) -> tuple[Field, ...]:
     fields: list[Field] = []
     start = 0
     for i, piece in enumerate(text.split("\t")):
-        cut = strip_comment(piece) if i >= 4 and piece else piece
+        cut = _TAIL_COMMENT.sub("", piece) if i >= 4 and piece else piece
         fields.append(_field(cut, start))
         if cut is not piece and cut != piece:
             break

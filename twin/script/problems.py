@@ -66,6 +66,22 @@ class ScriptError(TwinError):
         super().__init__(f"the script has {count}:\n{text}", {"problems": told})
 
 
+class Findings:
+    """Collects problems; each is about the command at `place`, its line and column."""
+
+    def __init__(self) -> None:
+        self.problems: list[ScriptProblem] = []
+        self.place = (0, 1)
+
+    def error(self, code: str, message: str) -> None:
+        """Add an error."""
+        self.problems.append(ScriptProblem("error", code, *self.place, message))
+
+    def warn(self, code: str, message: str) -> None:
+        """Add a warning."""
+        self.problems.append(ScriptProblem("warning", code, *self.place, message))
+
+
 def in_order(problems: Iterable[ScriptProblem]) -> tuple[ScriptProblem, ...]:
     """Problems by line and column; those of one place keep their order."""
     return tuple(sorted(problems, key=lambda p: (p.line, p.column)))

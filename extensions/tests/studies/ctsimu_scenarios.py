@@ -38,8 +38,7 @@ import tifffile
 import trimesh
 from scipy.optimize import linprog, minimize_scalar
 
-from flexdt.phantoms.mesh_booleans import cut
-from flexdt.phantoms.pieces import Surface
+from flexdt.phantoms.pieces import Surface, cut
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import TwinError

@@ -7,10 +7,10 @@ from datetime import UTC, datetime
 from functools import cache
 from typing import Any
 
-from flexdt.protocol import openrpc
 from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty
 from flexdt.protocol.methods import document_messages as p
+from flexdt.protocol.methods import openrpc_document
 from flexdt.server.storage.scene import require_fit, sample_of, save_scene
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, answers, change_stage
@@ -70,5 +70,5 @@ def discover(twin: TwinServer, client: Client, params: Empty) -> dict[str, Any]:
     return document()
 
 
-document = cache(openrpc.document)
+document = cache(openrpc_document)
 """Made once: it takes 0.1 s of the loop."""

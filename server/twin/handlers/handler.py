@@ -16,7 +16,7 @@ from flexdt.protocol import Method
 from flexdt.protocol.connection import encoded
 from flexdt.protocol.fields import Params, Result
 from flexdt.protocol.messages import Encoded
-from flexdt.protocol.scene_document import Scene
+from flexdt.protocol.methods.document_messages import Scene
 from flexdt.runtime.files.own_documents import Changes
 from flexdt.server.network.shell_parts import Peer
 from flexdt.server.storage.corrections import History

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from flexdt.protocol import state_model as w
-from flexdt.protocol.methods import setting_messages as p
+from flexdt.protocol.methods import motion_messages as p
 from flexdt.server.twin import wire_values as views
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, answers, change_settings, free

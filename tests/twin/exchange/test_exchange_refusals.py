@@ -16,9 +16,9 @@ from flexdt.twin.exchange.ctsimu import Scenario, scenario_document
 from flexdt.twin.exchange.ctsimu_read import read_ctsimu
 from flexdt.twin.exchange.flexdata import flexdata_text, read_flexdata
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
-from flexdt.twin.exchange.geometry_json import read_geometry_text
 from flexdt.twin.exchange.number_tables import (
     read_csv,
+    read_geometry_text,
     read_tomosipo,
     read_vectors_array,
     read_vectors_text,

@@ -13,10 +13,11 @@ from flexdt.twin.exchange.ctsimu import Scenario, scenario_document
 from flexdt.twin.exchange.ctsimu_read import read_ctsimu
 from flexdt.twin.exchange.flexdata import flexdata_text, read_flexdata
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry, circle_of
-from flexdt.twin.exchange.geometry_json import geometry_text, read_geometry_text
 from flexdt.twin.exchange.number_tables import (
     csv_text,
+    geometry_text,
     read_csv,
+    read_geometry_text,
     read_tomosipo,
     read_vectors_array,
     read_vectors_text,

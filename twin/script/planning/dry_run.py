@@ -24,8 +24,7 @@ from flexdt.twin.script.planning.plan import (
     step_range,
     total_range,
 )
-from flexdt.twin.script.planning.planner import plan_script
-from flexdt.twin.script.planning.sample_in_beam import View, views
+from flexdt.twin.script.planning.planner import View, plan_script, views
 from flexdt.twin.script.problems import ScriptProblem, WithProblems, in_order
 
 Trace = tuple[tuple[float, float], ...]

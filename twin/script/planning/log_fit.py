@@ -25,8 +25,7 @@ from flexdt.twin.errors import MachineFileError
 from flexdt.twin.machine.description import MAX_TIME_S, Axis, Machine, Spread, Timing
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.executed_log import Executed, MotorReply
-from flexdt.twin.script.grammar import own_name
-from flexdt.twin.script.planning.describe import describe
+from flexdt.twin.script.grammar import describe, own_name
 from flexdt.twin.script.planning.plan import Range, StartState, step_range, total_range
 from flexdt.twin.script.planning.planner import simulated
 from flexdt.twin.script.planning.simulated_script import Simulation

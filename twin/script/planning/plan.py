@@ -299,7 +299,8 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
         nowhere = motor_poses(self.machine, self.profile, self.start.camera, {})[:0]
         parts = [
             motor_poses(self.machine, self.profile, group.camera, positions)
-            for group, positions in self._projections()
+            for group, positions in saved_images(self)
+            if group.kind == "projection"
         ]
         return Poses.concatenate([nowhere, *parts])
 
@@ -307,17 +308,8 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
     def geometry(self) -> ConeVec:
         """Nominal geometry of the projections that are saved; it carries the detector's shape where
         all of them have the same."""
-        shapes = {g.camera.shape for g, _ in self._projections()}
+        shapes = {g.camera.shape for g, _ in saved_images(self) if g.kind == "projection"}
         return self.poses.cone_vec().with_shape(shapes.pop() if len(shapes) == 1 else None)
-
-    def _projections(self) -> Iterator[tuple[ExposureGroup, dict[str, FloatArray]]]:
-        """Saved projections, group by group, with the motors' positions."""
-        first = 0
-        for group in self.groups:
-            rows = slice(first, first + len(group))
-            first += len(group)
-            if group.kind == "projection" and group.files:
-                yield group, {n: v[rows] for n, v in self.image_positions.items()}
 
     def check(self, sample: object = None) -> CheckReport:
         """Problems, collisions, clearances, truncation and dose, as `flexdt check` reports them.
@@ -410,6 +402,16 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
                     )
                 )  # fmt: skip
         return tuple(out)
+
+
+def saved_images(plan: ScanPlan) -> Iterator[tuple[ExposureGroup, dict[str, FloatArray]]]:
+    """Images of a plan that are saved, group by group, with the motors' positions."""
+    first = 0
+    for group in plan.groups:
+        rows = slice(first, first + len(group))
+        first += len(group)
+        if group.files:
+            yield group, {n: v[rows] for n, v in plan.image_positions.items()}
 
 
 Range = tuple[float, float]

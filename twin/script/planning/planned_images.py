@@ -7,7 +7,7 @@ warning that names it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -18,20 +18,11 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.camera import CameraSettings, check_roi
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.script import commands as c
-from flexdt.twin.script.grammar import shorten
+from flexdt.twin.script.grammar import image_name, kind_of, sequence_names, shorten
+from flexdt.twin.script.planning import planned_scanner as planned
 from flexdt.twin.script.planning import smooth_scan as smooth
-from flexdt.twin.script.planning.image_names import image_name, kind_of, sequence_names
 from flexdt.twin.script.planning.plan import ExposureGroup, FlyScan, ImageKind
-from flexdt.twin.script.planning.planned_scanner import (
-    Motors,
-    PlannedCamera,
-    PlannedTube,
-    Span,
-    Trigger,
-)
-from flexdt.twin.script.problems import Severity
-
-Note = Callable[[Severity, str, str], None]
+from flexdt.twin.script.problems import Findings
 
 _TIME_EPS = 1e-9
 _POSITION_EPS = 1e-7
@@ -45,15 +36,15 @@ class ImageCollector:
     def __init__(
         self,
         machine: Machine,
-        motors: Motors,
-        tube: PlannedTube,
-        camera: PlannedCamera,
-        note: Note,
+        motors: planned.Motors,
+        tube: planned.PlannedTube,
+        camera: planned.PlannedCamera,
+        findings: Findings,
         averages: int | None,
     ) -> None:
         self.machine, self.motors, self.tube, self.camera = machine, motors, tube, camera
-        self.note = note
-        self.trigger: Trigger | None = None
+        self.findings = findings
+        self.trigger: planned.Trigger | None = None
         self.images: list[ExposureGroup] = []
         self.last: int | None = None
         """Index of the image taken last; while it was taken, `moved` were under way."""
@@ -72,20 +63,20 @@ class ImageCollector:
 
     # commands ------------------------------------------------------------------------------
 
-    def take(self, command: c.TakeImage, now: float, step: int) -> Span:
+    def take(self, command: c.TakeImage, now: float, step: int) -> planned.Span:
         """`take image`: one image; the number of frames is for sequences."""
         self._taken(np.array([now], dtype=np.float64), now, step, command.line)
         settings = self.camera.settings
         length = settings.exposure_ms * settings.averages / 1000.0
         return self._busy(now, length, "take_image_overhead")
 
-    def save(self, command: c.SaveImage, now: float, _step: int) -> Span:
+    def save(self, command: c.SaveImage, now: float, _step: int) -> planned.Span:
         """`save image`: gives the image taken last its name, and with it its kind."""
         name = image_name(command.path)
         if name is None:
-            self.note("error", "path", f"{shorten(command.path)!r} does not end with a file name")
+            self.findings.error("path", f"{shorten(command.path)!r} does not end with a file name")
         elif self.last is None:
-            self.note("error", "nothing_to_save", "no image has been taken since the start")
+            self.findings.error("nothing_to_save", "no image has been taken since the start")
         else:
             taken = self.images[self.last]
             saved = replace(taken, files=(name,), kind=kind_of(name))
@@ -96,10 +87,10 @@ class ImageCollector:
             self._saved(saved)
             if self.moved:
                 what = f"{', '.join(self.moved)} still moves while {name} is taken"
-                self.note("warning", "moving", f"{what} (line {saved.line})")
+                self.findings.warn("moving", f"{what} (line {saved.line})")
         return self._busy(now, 0.0, "save_image")
 
-    def sequence(self, command: c.TakeSequence, start: float, step: int) -> Span:
+    def sequence(self, command: c.TakeSequence, start: float, step: int) -> planned.Span:
         """`take and save image sequence`: back to back, over whatever moves meanwhile."""
         trigger = self._active(start)
         moving = self.motors.moving(start)
@@ -112,8 +103,7 @@ class ImageCollector:
         if trigger is not None and inference is not None:
             starts, exact = self._fly(trigger, inference, start, period, step, command.line)
         elif moving and frames > 1:
-            self.note(
-                "warning",
+            self.findings.warn(
                 "no_trigger",
                 f"{', '.join(moving)} moves during the sequence without a trigger (POS): where "
                 "each image lies depends on the timing of commands",
@@ -121,7 +111,7 @@ class ImageCollector:
         files = sequence_names(command.prefix, command.first, frames)
         draft = self._taken(starts, start, step, command.line, kind_of(files[0]), files, exact)
         if draft.kind == "projection" and frames > 1 and not moving:
-            self.note("warning", "static_sequence", "nothing moves during this sequence")
+            self.findings.warn("static_sequence", "nothing moves during this sequence")
         self._saved(draft)
         self.trigger = None
         length = float(starts[-1] - start) + period
@@ -131,11 +121,11 @@ class ImageCollector:
 
     # time ----------------------------------------------------------------------------------
 
-    def _busy(self, start: float, length: float, kind: str) -> Span:
+    def _busy(self, start: float, length: float, kind: str) -> planned.Span:
         overhead = self.machine.timing.seconds(kind)
         end = start + length + overhead
         self.camera.free_at = end
-        return Span(start, end, overhead, kind)
+        return planned.Span(start, end, overhead, kind)
 
     def _taken(
         self,
@@ -160,7 +150,7 @@ class ImageCollector:
 
     # fly scans -----------------------------------------------------------------------------
 
-    def _active(self, start: float) -> Trigger | None:
+    def _active(self, start: float) -> planned.Trigger | None:
         """The trigger whose motion is still under way, if any."""
         t = self.trigger
         if t is None or t.trajectory.end <= start:
@@ -168,7 +158,7 @@ class ImageCollector:
         moves = self.motors.all[t.motor].moves
         return t if moves and moves[-1][1] is t.trajectory else None
 
-    def _infer(self, trigger: Trigger | None, start: float) -> smooth.Inference | None:
+    def _infer(self, trigger: planned.Trigger | None, start: float) -> smooth.Inference | None:
         """Infer frames and averages that the script leaves out."""
         camera = self.camera
         averages = camera.settings.averages if "averages" in camera.said else None
@@ -184,7 +174,7 @@ class ImageCollector:
         if frames is None:
             count = 1 if found is None else found.frames
             how = "1 is assumed" if found is None else f"inferred from {found.notes['frames']}"
-            self.note("warning", "frames_unsaid", f"the number of frames is not set; {how}")
+            self.findings.warn("frames_unsaid", f"the number of frames is not set; {how}")
             camera.assume("frames", count)
         return found
 
@@ -192,15 +182,16 @@ class ImageCollector:
         if found is not None and "averages" in found.notes:
             self.inferred_averages = found.averages
             self.camera.assume("averages", found.averages)
-            self.note(
-                "warning",
+            self.findings.warn(
                 "averages_unsaid",
                 f"the number of averages is not set; {found.averages} inferred "
                 f"({found.notes['averages']}), and taken for images before this line too",
             )
             self._complained.add("averages")
 
-    def _flight(self, trigger: Trigger, frames: int | None, averages: int | None) -> smooth.Flight:
+    def _flight(
+        self, trigger: planned.Trigger, frames: int | None, averages: int | None
+    ) -> smooth.Flight:
         pieces = trigger.trajectory.pieces
         return smooth.Flight(
             speed=max(abs(p.velocity) for p in pieces),
@@ -215,7 +206,7 @@ class ImageCollector:
 
     def _fly(
         self,
-        trigger: Trigger,
+        trigger: planned.Trigger,
         found: smooth.Inference,
         start: float,
         period: float,
@@ -230,15 +221,13 @@ class ImageCollector:
         count = np.arange(found.frames, dtype=np.float64)
         late = start - trigger.time
         if late > _TIME_EPS:
-            self.note(
-                "warning",
+            self.findings.warn(
                 "late_start",
                 f"the sequence starts {late:.3g} s after {trigger.axis} passed its trigger: image "
                 f"0 is at {trajectory.position(start):.6g}, not {trigger.position:g} {unit}",
             )
         if abs(found.mismatch) > _MISMATCH_STEPS * found.increment and "frames" not in found.notes:
-            self.note(
-                "warning",
+            self.findings.warn(
                 "frame_angles",
                 f"{found.frames} frames of {period * 1000:g} ms at {speed:.9g} {unit}/s cover "
                 f"{found.mismatch:+.4g} {unit} more than whole turns; images are put at steps of "
@@ -269,20 +258,18 @@ class ImageCollector:
         )
         return starts, exact
 
-    def _not_steady(self, trigger: Trigger, off: npt.NDArray[np.bool_], unit: str) -> None:
+    def _not_steady(self, trigger: planned.Trigger, off: npt.NDArray[np.bool_], unit: str) -> None:
         speed = max(abs(p.velocity) for p in trigger.trajectory.pieces)
         velocity = abs(trigger.trajectory.velocity(trigger.time))
         if velocity < speed * (1 - 1e-9):
-            self.note(
-                "warning",
+            self.findings.warn(
                 "run_up",
                 f"{trigger.axis} passes the trigger at {velocity:.4g} of {speed:.4g} {unit}/s: the "
                 f"run-up of {abs(trigger.run_up):.4g} {unit} is too short; images lie where the "
                 "motor is",
             )
         else:
-            self.note(
-                "warning",
+            self.findings.warn(
                 "scan_overrun",
                 f"{trigger.axis} slows down before the last of {len(off)} images (from image "
                 f"{int(np.argmax(off))} on); images lie where the motor is",
@@ -293,15 +280,15 @@ class ImageCollector:
     def _saved(self, draft: ExposureGroup) -> None:
         clash = next((f for f in draft.files if f in self.names), None)
         if clash is not None:
-            self.note("warning", "overwrites", f"{clash} is saved twice; the last one stays")
+            self.findings.warn("overwrites", f"{clash} is saved twice; the last one stays")
         self.names.update(draft.files)
         self._fits(draft.camera)
         self._unsaid(draft)
         if draft.kind == "dark" and draft.xrays_on:
-            self.note("warning", "xrays_on", "a dark image is taken with X-rays on")
+            self.findings.warn("xrays_on", "a dark image is taken with X-rays on")
         if draft.kind != "dark" and not draft.xrays_on:
             what = "a flat image is" if draft.kind == "flat" else "projections are"
-            self.note("warning", "xrays_off", f"{what} taken with X-rays off")
+            self.findings.warn("xrays_off", f"{what} taken with X-rays off")
 
     def _fits(self, camera: CameraSettings) -> None:
         if "roi_fit" in self._complained:
@@ -310,36 +297,27 @@ class ImageCollector:
             check_roi(camera.roi, self.machine.detector.pixels, camera.binning)
         except LimitError as error:
             self._complained.add("roi_fit")
-            self.note("error", "roi", error.message)
+            self.findings.error("roi", error.message)
 
     def _unsaid(self, draft: ExposureGroup) -> None:
         """One warning for each setting that a saved image takes from the machine's defaults."""
         s = draft.camera
-        defaults = [
-            ("mode", "the camera mode", s.mode),
-            ("exposure_ms", "the exposure", f"{s.exposure_ms:g} ms"),
-            ("roi", "the ROI", str(s.roi)),
-        ]
-        for name, what, value in defaults:
-            if name not in self.camera.said:
-                self._default(name, what, value)
+        self._default("mode", "the camera mode", s.mode)
+        self._default("exposure_ms", "the exposure", f"{s.exposure_ms:g} ms")
+        self._default("roi", "the ROI", str(s.roi))
         known = self.hint is not None or "averages" in self.camera.said
         if not known and "averages" not in self._complained:
             self._complained.add("averages")
-            self.note(
-                "warning", "averages_unsaid", "the number of averages is not set; 1 is assumed"
-            )
+            self.findings.warn("averages_unsaid", "the number of averages is not set; 1 is assumed")
         if draft.xrays_on:
-            if not self.tube.kV_said:
-                self._default("kV", "the tube voltage", f"{draft.kV:g} kV")
-            if not self.tube.power_said:
-                self._default("power", "the tube power", f"{draft.power_W:g} W")
+            self._default("kV", "the tube voltage", f"{draft.kV:g} kV")
+            self._default("power_W", "the tube power", f"{draft.power_W:g} W")
 
     def _default(self, name: str, what: str, value: str) -> None:
-        if name not in self._complained:
+        """One warning where the script states no value of a setting."""
+        if name not in self.camera.said | self.tube.said | self._complained:
             self._complained.add(name)
-            self.note(
-                "warning",
+            self.findings.warn(
                 "default_assumed",
                 f"{what} is not set; {value} of the machine file is assumed",
             )

@@ -131,10 +131,9 @@ class PlannedTube:
     """Whether on or off is known; a start that nobody told counts as off without being so."""
     ready_at: float = 0.0
     since: float = 0.0
-    kV_said: bool = False
-    power_said: bool = False
 
     def __post_init__(self) -> None:
+        self.said: set[str] = set()
         self.beam: list[BeamOn] = []
         self.lit_from = 0.0
 
@@ -157,9 +156,11 @@ class PlannedTube:
         """Change a setting at `time`."""
         self._close(time)
         if kV is not None:
-            self.kV, self.kV_said = kV, True
+            self.kV = kV
+            self.said.add("kV")
         if power_W is not None:
-            self.power_W, self.power_said = power_W, True
+            self.power_W = power_W
+            self.said.add("power_W")
 
     def intervals(self, end: float) -> tuple[BeamOn, ...]:
         """When X-rays were on, up to `end`."""

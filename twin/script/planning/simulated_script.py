@@ -2,7 +2,7 @@
 
 There is one method for each type of command. Each returns when the command takes effect and when it
 is complete; the command's wait decides when the script continues. A problem never ends the
-planning: steps and frames are planned all the same. `sample_in_beam` judges the beam's view.
+planning: steps and frames are planned all the same. `planner` judges the beam's view.
 """
 
 from __future__ import annotations
@@ -18,19 +18,11 @@ from flexdt.twin.machine.camera import binning_of, check_roi
 from flexdt.twin.machine.description import Machine, unknown_axis
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.script import commands as c
-from flexdt.twin.script.grammar import is_reserved, own_name
-from flexdt.twin.script.planning.describe import describe
+from flexdt.twin.script.grammar import describe, is_reserved, own_name
+from flexdt.twin.script.planning import planned_scanner as planned
 from flexdt.twin.script.planning.plan import PlanStep, SampleSize, Settings, StartState
 from flexdt.twin.script.planning.planned_images import ImageCollector
-from flexdt.twin.script.planning.planned_scanner import (
-    Motors,
-    PlannedCamera,
-    PlannedTube,
-    Span,
-    Trigger,
-    clamp,
-)
-from flexdt.twin.script.problems import ScriptProblem, Severity
+from flexdt.twin.script.problems import Findings
 
 # The binary argument of `scanner set sample info`: the sample's size and names.
 #
@@ -58,24 +50,17 @@ class Simulation:
     def __init__(self, machine: Machine, start: StartState, averages: int | None = None) -> None:
         self.machine = machine
         self.now = 0.0
-        self.motors = Motors(machine, start)
+        self.motors = planned.Motors(machine, start)
         on = start.xrays_on
-        self.tube = PlannedTube(start.kV, start.power_W, on is True, on is not None)
-        self.camera = PlannedCamera(start.camera)
+        self.tube = planned.PlannedTube(start.kV, start.power_W, on is True, on is not None)
+        self.camera = planned.PlannedCamera(start.camera)
+        self.findings = Findings()
         self.imaging = ImageCollector(
-            machine, self.motors, self.tube, self.camera, self.note, averages
+            machine, self.motors, self.tube, self.camera, self.findings, averages
         )
         self.settings: Settings | None = None
         self.sample: SampleSize | None = None
         self.steps: list[PlanStep] = []
-        self.problems: list[ScriptProblem] = []
-        self.command: c.Command = c.Command()
-
-    def note(self, severity: Severity, code: str, message: str) -> None:
-        """Add a problem at the command in hand."""
-        self.problems.append(
-            ScriptProblem(severity, code, self.command.line, self.command.column, message)
-        )
 
     @property
     def end(self) -> float:
@@ -88,7 +73,7 @@ class Simulation:
         for command in commands:
             if isinstance(command, c.MotorCommand | c.Custom):
                 command = replace(command, component=own_name(command.component, axes))
-            self.command = command
+            self.findings.place = (command.line, command.column)
             before = self.now
             if isinstance(command, _CAMERA):  # a busy camera keeps the script waiting (assumed)
                 self.now = max(self.now, self.camera.free_at)
@@ -110,45 +95,38 @@ class Simulation:
                 )
             )
 
-    def _release(self, command: c.Command, span: Span) -> float:
+    def _release(self, command: c.Command, span: planned.Span) -> float:
         if command.wait is c.Wait.ACK:
             return max(self.now, span.end)
         if command.wait is c.Wait.POS and span.release is not None:
             return max(self.now, span.release)
         return self.now
 
-    def timed(self, kind: str, length: float = 0.0, note: str = "") -> Span:
+    def timed(self, kind: str, length: float = 0.0, note: str = "") -> planned.Span:
         """A command of `length` [s] and the time that the machine's timing has for its kind.
 
         The script's own expected duration (column 7) is no prediction but a bound.
         """
         overhead = self.machine.timing.seconds(kind)
-        return Span(self.now, self.now + length + overhead, overhead, kind, note=note)
+        return planned.Span(self.now, self.now + length + overhead, overhead, kind, note=note)
 
     # scanner -------------------------------------------------------------------------------
 
-    def _instant(self, _command: c.Command) -> Span:
-        return self.timed("command")
-
-    def _custom(self, command: c.Custom) -> Span:
+    def _custom(self, command: c.Custom) -> planned.Span:
         if command.component in self.machine.axes:
-            self.note(
-                "warning",
+            self.findings.warn(
                 "custom_component",
                 f"{command.component}: the twin does not know this command of the axis; no effect",
             )
         return self.timed("command", note=" (no effect)")
 
-    def _pause(self, command: c.Pause) -> Span:
-        return self.timed("command", command.duration_ms / 1000.0)
-
-    def _sample_info(self, command: c.SetSampleInfo) -> Span:
+    def _sample_info(self, command: c.SetSampleInfo) -> planned.Span:
         size = sample_size(command.data)
         if size is not None:
             self.sample = size
         return self.timed("command")
 
-    def _write_settings(self, _command: c.WriteSettingsFile) -> Span:
+    def _write_settings(self, _command: c.WriteSettingsFile) -> planned.Span:
         motors = self.motors.all
         self.settings = Settings(
             self.motors.positions(self.now),
@@ -165,7 +143,7 @@ class Simulation:
 
     # tube ----------------------------------------------------------------------------------
 
-    def _xray_on(self, _command: c.XrayOn) -> Span:
+    def _xray_on(self, _command: c.XrayOn) -> planned.Span:
         if self.tube.on:
             return self.timed("command", note=" (already on)")
         span = self.timed("xrayon")
@@ -173,16 +151,15 @@ class Simulation:
         self.tube.ready_at = span.end + self.machine.timing.xray_ready_s
         return span
 
-    def _xray_off(self, _command: c.XrayOff) -> Span:
+    def _xray_off(self, _command: c.XrayOff) -> planned.Span:
         if not self.tube.on and self.tube.known:
             return self.timed("xrayoff_again", note=" (already off)")
         self.tube.switch(False, self.now)
         return self.timed("xrayoff")
 
-    def _ready(self, _command: c.WaitXrayReady) -> Span:
+    def _ready(self, _command: c.WaitXrayReady) -> planned.Span:
         if not self.tube.on:
-            self.note(
-                "error",
+            self.findings.error(
                 "xray_never_ready",
                 "waits until the X-rays are ready, but they are off: the script would hang here",
             )
@@ -190,15 +167,15 @@ class Simulation:
         left = self.tube.ready_at - self.now
         if left <= 0.0:
             return self.timed("command")
-        return Span(self.now, self.now + left, left, "xray_ready")
+        return planned.Span(self.now, self.now + left, left, "xray_ready")
 
-    def _voltage(self, command: c.SetVoltage) -> Span:
+    def _voltage(self, command: c.SetVoltage) -> planned.Span:
         spec = self.machine.tube
         fits = self._range("tube voltage", command.kV, spec.min_kV, spec.max_kV, "kV")
         self.tube.set(self.now, kV=command.kV if fits else self.tube.kV)
         return self.timed("set_tube")
 
-    def _power(self, command: c.SetPower) -> Span:
+    def _power(self, command: c.SetPower) -> planned.Span:
         fits = self._range("tube power", command.power_W, 0.0, self.machine.tube.max_W, "W")
         self.tube.set(self.now, power_W=command.power_W if fits else self.tube.power_W)
         return self.timed("set_tube")
@@ -207,41 +184,38 @@ class Simulation:
         """Whether a setting can be; if not it is noted, and the plan goes on with the old one."""
         if low <= value <= high:
             return True
-        self.note(
-            "error", "limit", f"{what} {value:g} {unit} is outside [{low:g}, {high:g}] {unit}"
+        self.findings.error(
+            "limit", f"{what} {value:g} {unit} is outside [{low:g}, {high:g}] {unit}"
         )
         return False
 
     # camera --------------------------------------------------------------------------------
 
-    def _set_camera(self) -> Span:
+    def _stated(self, name: str, value: object) -> planned.Span:
+        self.camera.set(name, value)
         span = self.timed("set_camera")
         self.camera.free_at = span.end
         return span
 
-    def _stated(self, name: str, value: object) -> Span:
-        self.camera.set(name, value)
-        return self._set_camera()
-
-    def _mode(self, command: c.SetMode) -> Span:
+    def _mode(self, command: c.SetMode) -> planned.Span:
         try:
             binning_of(command.mode, self.machine.detector.modes)
         except LimitError as error:
-            self.note("error", "mode", error.message)
+            self.findings.error("mode", error.message)
             return self._stated("mode", self.camera.settings.mode)
         return self._stated("mode", command.mode)
 
-    def _exposure(self, command: c.SetExposure) -> Span:
+    def _exposure(self, command: c.SetExposure) -> planned.Span:
         spec, asked = self.machine.detector, command.exposure_ms
         fits = self._range("exposure", asked, spec.min_exposure_ms, spec.max_exposure_ms, "ms")
         return self._stated("exposure_ms", asked if fits else self.camera.settings.exposure_ms)
 
-    def _roi(self, command: c.SetRoi) -> Span:
+    def _roi(self, command: c.SetRoi) -> planned.Span:
         roi = self.camera.settings.roi
         try:
             roi = check_roi(command.roi, self.machine.detector.pixels, 1)
         except LimitError as error:
-            self.note("error", "roi", error.message)
+            self.findings.error("roi", error.message)
         return self._stated("roi", roi)
 
     # motors --------------------------------------------------------------------------------
@@ -252,16 +226,15 @@ class Simulation:
         if self.machine.has(name):
             return True
         if is_reserved(name):
-            self.note("error", "unknown_component", unknown_axis(name, self.machine).message)
+            self.findings.error("unknown_component", unknown_axis(name, self.machine).message)
         else:
-            self.note(
-                "warning",
+            self.findings.warn(
                 "custom_component",
                 f"{name!r} is a custom component: allowed, without effect here",
             )
         return False
 
-    def _set_rate(self, command: c.SetSpeed | c.SetAcceleration) -> Span:
+    def _set_rate(self, command: c.SetSpeed | c.SetAcceleration) -> planned.Span:
         if not self._axis(command):
             return self.timed("command", note=" (no effect)")
         what, per = ("speed", "s") if isinstance(command, c.SetSpeed) else ("acceleration", "s2")
@@ -278,16 +251,16 @@ class Simulation:
 
     def _over(self, message: str) -> None:
         if self.machine.on_limit == "clamp":
-            self.note("warning", "limit_clamped", f"{message}; set to the limit")
+            self.findings.warn("limit_clamped", f"{message}; set to the limit")
         else:
-            self.note("error", "limit", message)
+            self.findings.error("limit", message)
 
-    def _move(self, command: c.MoveAbsolute) -> Span:
+    def _move(self, command: c.MoveAbsolute) -> planned.Span:
         if not self._axis(command):
             return self.timed("command", note=" (no effect)")
         name = command.component
         asked = self.motors.targets(name, command.target, self.now)
-        targets = clamp(self.machine, asked, name)
+        targets = planned.clamp(self.machine, asked, name)
         note = ""
         for motor, target in targets.items():
             if target != asked[motor]:
@@ -307,7 +280,7 @@ class Simulation:
         if command.wait is c.Wait.POS and command.trigger is not None:
             release = self._pass(command, command.trigger, made, begin, end)
         if command.wait is not c.Wait.ACK:
-            return Span(self.now, end, release=release, note=note)
+            return planned.Span(self.now, end, release=release, note=note)
         kind = "move" if end > self.now else "move_standing"
         return self.timed(kind, end - self.now, note)
 
@@ -327,15 +300,14 @@ class Simulation:
         time = trajectory.time_at(position)
         if time is None:
             unit = self.machine.axes[motor].unit
-            self.note(
-                "error",
+            self.findings.error(
                 "unreachable_trigger",
                 f"{command.component} never passes the trigger {trigger:g} {unit} on its way from "
                 f"{begin[motor]:g} to {trajectory.target:g} {unit}: the script would hang here",
             )
             self.imaging.trigger = None
             return end
-        self.imaging.trigger = Trigger(
+        self.imaging.trigger = planned.Trigger(
             command.component,
             motor,
             trajectory,
@@ -348,13 +320,13 @@ class Simulation:
 
 
 _CAMERA: Final = (c.CameraSetting, c.TakeImage, c.SaveImage, c.TakeSequence)
-_Effect = Callable[[Simulation, Any], Span]
+_Effect = Callable[[Simulation, Any], planned.Span]
 
 _EFFECTS: Final[Mapping[type[c.Command], _Effect]] = {
-    c.Pause: Simulation._pause,
-    c.SetOutputPath: Simulation._instant,
+    c.Pause: lambda s, k: s.timed("command", k.duration_ms / 1000.0),
+    c.SetOutputPath: lambda s, _: s.timed("command"),
     c.SetSampleInfo: Simulation._sample_info,
-    c.KeepXrayOn: Simulation._instant,
+    c.KeepXrayOn: lambda s, _: s.timed("command"),
     c.WriteSettingsFile: Simulation._write_settings,
     c.XrayOn: Simulation._xray_on,
     c.XrayOff: Simulation._xray_off,
