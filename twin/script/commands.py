@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from enum import Enum
-from typing import Annotated, Any, dataclass_transform
+from typing import Annotated, Any, Literal, dataclass_transform
 
 from pydantic import BeforeValidator, PlainSerializer, PlainValidator
 
@@ -25,6 +25,8 @@ Binary = Annotated[
     PlainSerializer(lambda value: base64.b64encode(value).decode(), when_used="json"),
 ]
 """Bytes; base64 in JSON."""
+ImageKind = Literal["dark", "flat", "projection", "preview"]
+"""What an image is for."""
 
 
 class Wait(Enum):

@@ -18,8 +18,8 @@ from typing import Any, Final
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.motion.profiles import LEAST_RATE
 from flexdt.twin.script import commands as c
+from flexdt.twin.script.commands import ImageKind
 from flexdt.twin.script.lexer import encode
-from flexdt.twin.script.planning.plan import ImageKind
 
 MAX_FRAMES: Final = 1_000_000
 MAX_AVERAGES: Final = 100_000

@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -29,14 +29,12 @@ from flexdt.twin.machine.description import Machine, Profile, Timing
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.motion.profiles import AxisPath, Trajectory
 from flexdt.twin.scanner.state import StagePlacement
-from flexdt.twin.script.commands import AnyCommand
+from flexdt.twin.script.commands import AnyCommand, ImageKind
 from flexdt.twin.script.problems import ScriptProblem, WithProblems
 from flexdt.twin.values import Array, ArrayValue, JsonValue
 
 if TYPE_CHECKING:
     from flexdt.twin.script.planning.dry_run import CheckReport
-
-ImageKind = Literal["dark", "flat", "projection", "preview"]
 
 
 @dataclass(frozen=True)

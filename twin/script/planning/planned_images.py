@@ -18,10 +18,11 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.camera import CameraSettings, check_roi
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.script import commands as c
+from flexdt.twin.script.commands import ImageKind
 from flexdt.twin.script.grammar import image_name, kind_of, sequence_names, shorten
 from flexdt.twin.script.planning import planned_scanner as planned
 from flexdt.twin.script.planning import smooth_scan as smooth
-from flexdt.twin.script.planning.plan import ExposureGroup, FlyScan, ImageKind
+from flexdt.twin.script.planning.plan import ExposureGroup, FlyScan
 from flexdt.twin.script.problems import Findings
 
 _TIME_EPS = 1e-9

@@ -29,8 +29,9 @@ from flexdt.twin.machine.description import (
 )
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.script import commands as c
+from flexdt.twin.script.commands import ImageKind
 from flexdt.twin.script.parse import Source, parse_script
-from flexdt.twin.script.planning.plan import ImageKind, SampleSize, ScanPlan, StartState
+from flexdt.twin.script.planning.plan import SampleSize, ScanPlan, StartState
 from flexdt.twin.script.planning.simulated_script import Simulation
 from flexdt.twin.script.problems import ScriptProblem, in_order
 
