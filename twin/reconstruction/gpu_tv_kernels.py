@@ -18,6 +18,7 @@ ZERO, ONE = np.float32(0), np.float32(1)
 @cuda.jit(device=True, inline=True)
 def differences(x, i, k, column, counts, stride, scale):
     """Scaled differences of a voxel to the next along z, y and x; 0 behind the last."""
+    # The next along z is the next in memory, along x a column further, along y nx columns.
     nz, ny, nx = counts
     here = x[i]
     dz = scale[0] * (x[i + 1] - here) if k + 1 < nz else ZERO
@@ -47,6 +48,8 @@ def primal_step(z, dual, theta, counts, stride, scale, lowest, allowed, x):
     k, column, size = i % stride, i // stride, z.size
     x[i] = ZERO
     if k < counts[0] and allowed[i] > ZERO:
+        # What this voxel gives less what the voxels before it gave along each axis: see
+        # `tv_kernels.primal_step`. counts[2] columns are a row along x.
         spread = scale[0] * dual[i] + scale[1] * dual[size + i] + scale[2] * dual[2 * size + i]
         if k > 0:
             spread -= scale[0] * dual[i - 1]
@@ -65,6 +68,7 @@ def dual_step(x, ahead, dual, rate, momentum, counts, stride, scale):
     i = cuda.grid(1)
     if i >= x.size or i % stride >= counts[0]:
         return
+    # i, j and k are this voxel's places in the three arrays of a dual variable.
     j, k = i + x.size, i + 2 * x.size
     dz, dy, dx = differences(x, i, i % stride, i // stride, counts, stride, scale)
     a, b, c = ahead[i] + rate * dz, ahead[j] + rate * dy, ahead[k] + rate * dx

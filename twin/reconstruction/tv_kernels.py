@@ -35,7 +35,7 @@ def variation(x, scale, layers):
     """Total variation by layers (nz,) float64, which the caller adds up."""
     nz, ny, nx = x.shape
     for k in prange(nz):
-        total = 0.0
+        total = 0.0  # in double precision: millions of small lengths
         for j in range(ny):
             for i in range(nx):
                 dz, dy, dx = differences(x, k, j, i, scale)
@@ -81,11 +81,13 @@ def dual_step(x, ahead, dual, rate, momentum, scale):
         for j in range(ny):
             for i in range(nx):
                 dz, dy, dx = differences(x, k, j, i, scale)
+                # A step uphill, then back onto the unit ball: the dual of a length is bounded by 1.
                 a = ahead[0, k, j, i] + rate * dz
                 b = ahead[1, k, j, i] + rate * dy
                 c = ahead[2, k, j, i] + rate * dx
                 shorter = one / max(one, np.float32(math.sqrt(a * a + b * b + c * c)))
                 a, b, c = a * shorter, b * shorter, c * shorter
+                # The extrapolated point needs the change, so that `dual` is written last.
                 ahead[0, k, j, i] = a + momentum * (a - dual[0, k, j, i])
                 ahead[1, k, j, i] = b + momentum * (b - dual[1, k, j, i])
                 ahead[2, k, j, i] = c + momentum * (c - dual[2, k, j, i])

@@ -44,6 +44,7 @@ def carry_fan(box, g, grid, found, rays, work, n, buffer, transposed):
     """
     fan = describe(grid, found, n)
     if not fan.together:
+        # Source or pixels inside the box, or rays along a voxel plane: each ray on its own.
         for q in range(n):
             at, r, c = found.slot[q], found.row[q], found.column[q]
             if not transposed:
@@ -51,10 +52,12 @@ def carry_fan(box, g, grid, found, rays, work, n, buffer, transposed):
             elif buffer[at] != ZERO:
                 walk_ray(box, g, r, c, buffer[at], True)
         return
+    # By slope, rays that cross a plane one after the other lie side by side in memory.
     count = sort_by_slope(grid, fan, found, rays, work.bins, n)
     if count == 0 or fan.j1 <= fan.j0:
         return
     start(grid, fan, rays, work, count)
+    # The walk adds up pieces in units of the ray; its length in mm enters once, here.
     acc, slot, length = rays.acc, rays.slot, rays.length
     if transposed:
         for q in range(count):
@@ -95,6 +98,8 @@ def work_on(
 ):
     """A job: fill the columns of one image between two lines; transposed, from the image."""
     rows, cols = image.shape
+    # The job's pixels lie between two slanted lines: each row has a start and an end of its own,
+    # and the buffer holds the rows one behind the other, all `width` long.
     width = columns_of(lines, first, last, cols, starts, ends)
     top, bottom = shadow[0], shadow[1]
     if transposed:
@@ -121,6 +126,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
         views, lines, jobs, room, widest = fans
         rows = out.shape[1]
         counter = np.zeros(1, np.int64)
+        # Each worker keeps its memory and takes the next job when it is free: jobs differ in cost.
         for _ in prange(workers):
             found, rays = make_found(room), make_rays(room)
             work = make_work(max(box.nx, box.ny), box.nz)
@@ -161,6 +167,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                 while item < count:
                     part, unit = item % len(slices), begin + item // len(slices)
                     low, high = slices[part]
+                    # The slice as a box of its own: its first voxel is z = 0 of the piece.
                     piece = Box(
                         box.flat, marks[part], box.base + low, box.hop_x, box.hop_y,
                         box.nx, box.ny, high - low, box.size_x, box.size_y, box.size_z,
@@ -168,7 +175,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                     for job in range(units[unit, 0], units[unit, 1]):
                         view, first, last = jobs[job]
                         g[:] = views[view]
-                        g[2] -= low
+                        g[2] -= low  # the source, seen from the piece
                         work_on(
                             piece, g, lines, first, last, shadows[part, view], values[view],
                             starts, ends, found, rays, work, buffer, True,

@@ -50,10 +50,11 @@ def fold(kind, a, b, parts):
     i = cuda.grid(1)
     if i >= parts.size:
         return
+    # Which numbers a thread adds depends on `parts` alone, and the host adds the parts in order.
     total = -math.inf if kind == LARGEST else 0.0
     for first in range(i * RUN, a.size, parts.size * RUN):
         last = min(first + RUN, a.size)
-        part = a[first]
+        part = a[first]  # single precision within a run
         if kind == DOT:
             part *= b[first]
         for k in range(first + 1, last):

@@ -54,6 +54,7 @@ def walk_jumps(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz):
     ix, left_x, next_x, every_x, hop_x = first_step(sx, dx, nx, enter, step_x)
     iy, left_y, next_y, every_y, hop_y = first_step(sy, dy, ny, enter, step_y)
     iz, left_z, next_z, every_z, hop_z = first_step(sz, dz, nz, enter, 1)
+    # p runs through memory with the ray; `value` is that of the voxel it is in.
     p = base + ix * step_x + iy * step_y + iz
     value = np.float64(flat[p])
     near_x, far_x = faces(sx, dx, nx)
@@ -70,6 +71,8 @@ def walk_jumps(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz):
             jz, mz = -value, -value * enter
     t = enter
     while True:
+        # The nearest of the three next planes ends the piece in this voxel. Its axis gets the jump;
+        # at an edge, where two are equally near, the first one does (see above: a kink).
         upto = min(next_x, min(next_y, next_z))
         if upto >= leave:
             break
@@ -102,7 +105,7 @@ def walk_jumps(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz):
             jump = value - flat[p]
             jz += jump
             mz += jump * t
-        value -= jump
+        value -= jump  # jump = before - behind, so that this is the voxel behind the plane
     total += (leave - t) * value
     # Out through the face that is reached first, a jump to 0; none if the ray ends inside.
     if leave < 1.0:
@@ -171,6 +174,8 @@ def gather(box, views, weights, tile, parts):
         part = parts[job]
         for c in range(first, min(cols, first + tile)):
             across = c - (cols - 1) / 2
+            # Sums of one column: of a source's derivatives, of a pixel's, and of these times the
+            # row, which is what v gets. `across` is the same all along, so that u needs no sums.
             s0 = s1 = s2 = e0 = e1 = e2 = d0 = d1 = d2 = 0.0
             for r in range(rows):
                 w = np.float64(weights[view, r, c])
