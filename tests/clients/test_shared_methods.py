@@ -22,7 +22,7 @@ def lines() -> str:
         f for _, f in functions if f.__module__ == twin_methods.__name__ and f.__name__[0] != "_"
     ]
     own.sort(key=lambda f: f.__code__.co_firstlineno)
-    return "".join(f"    {f.__name__} = Method(m.{f.__name__})\n" for f in own)
+    return "".join(f"    {f.__name__} = ClientMethod(m.{f.__name__})\n" for f in own)
 
 
 def test_the_list_of_methods_is_current() -> None:
