@@ -195,8 +195,10 @@ class Brickwork:
         step = v["stud_pitch_mm"] / 2.0
         roof = v["brick_height_mm"] - v["roof_mm"] - radius_mm
         levels = (v["stud_height_mm"] + radius_mm, v["brick_height_mm"] / 2.0, roof)
-        along = [np.append(_centred(n, step, h), [-h, h]) for n, h in zip(self.studs, half,
-                                                                       strict=True)]  # fmt: skip
+        along: list[FloatArray] = []
+        for n, h in zip(self.studs, half, strict=True):
+            pitched = np.arange(1 - n, n) * step  # those inside the walls, and the walls
+            along.append(np.append(pitched[np.abs(pitched) <= h + 1e-9], [-h, h]))
         rows: list[tuple[float, float, float, int]] = []
         for x in along[0]:
             for y in along[1]:
@@ -295,9 +297,3 @@ def grid_seats(size_mm: Sequence[float], radius_mm: float, step_mm: float) -> Fl
         )
     axes = [np.linspace(-h, h, max(2, round(2.0 * h / step_mm) + 1)) for h in half]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-
-
-def _centred(studs: int, step: float, half: float) -> FloatArray:
-    """Places on half the pitch that stay inside the walls."""
-    places = (np.arange(2 * studs - 1) - (studs - 1)) * step
-    return np.asarray(places[np.abs(places) <= half + 1e-9])

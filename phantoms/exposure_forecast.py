@@ -196,8 +196,7 @@ def expose(
     for what, values, least, most in (
         ("kV", tried, low, high),
         ("power_W", [power], 1e-9, scanner.tube.max_W),
-        ("exposure_ms", [time_ms], spec.min_exposure_ms,
-         spec.max_exposure_ms),
+        ("exposure_ms", [time_ms], spec.min_exposure_ms, spec.max_exposure_ms),
         ("averages", [averages], 1, 10**6), ("images", [images], 1, 10**7),
     ):  # fmt: skip
         for value in values:

@@ -166,6 +166,7 @@ def cut(
 
     Example:
         >>> import trimesh
+        >>> from flexdt.twin.projection.analytic_solids import Scene
         >>> big, small = (trimesh.creation.box((side,) * 3) for side in (4.0, 2.0))
         >>> _, (shell, _) = cut([(Scene(()), [Surface(big.vertices, big.faces, "pmma", 0.02)], 0),
         ...                      (Scene(()), [Surface(small.vertices, small.faces, "Fe", 0.5)], 1)])

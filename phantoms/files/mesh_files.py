@@ -27,13 +27,7 @@ from flexdt.twin.projection.analytic_solids import ConvexPolyhedron, Scene, Soli
 if TYPE_CHECKING:
     import trimesh
 
-UNITS_MM: Final[Mapping[str, float]] = {
-    "um": 1e-3,
-    "mm": 1.0,
-    "cm": 10.0,
-    "m": 1000.0,
-    "inch": 25.4,
-}
+UNITS_MM: Final = {"um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 FORMATS: Final = ("stl", "obj", "ply", "glb", "off")
 DEFAULT_UNIT: Final[Mapping[str, str]] = {"glb": "m"}
 """Unit of the formats that have one; the others are in mm unless a unit is given."""
@@ -430,6 +424,5 @@ def _convex(mesh: trimesh.Trimesh, vertices: FloatArray) -> ConvexPolyhedron | N
     if len(first) > MAX_PLANES:
         return None
     return ConvexPolyhedron(
-        tuple((n[0], n[1], n[2]) for n in normals[first].tolist()),
-        tuple(offsets[first].tolist()),
+        tuple((n[0], n[1], n[2]) for n in normals[first].tolist()), tuple(offsets[first].tolist())
     )

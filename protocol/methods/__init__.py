@@ -46,9 +46,7 @@ def find(name: str, methods: Mapping[str, AnyMethod] = METHODS) -> AnyMethod:
 
 
 def openrpc_document(
-    methods: Mapping[str, AnyMethod] = METHODS,
-    *,
-    title: str = "flexdt twin server",
+    methods: Mapping[str, AnyMethod] = METHODS, *, title: str = "flexdt twin server"
 ) -> dict[str, Any]:
     """The OpenRPC document of a server as plain data (https://spec.open-rpc.org, version 1.3).
 

@@ -69,7 +69,7 @@ class CorrectionPart(f.Params):
 
 
 class Scene(f.Params):
-    """The whole state of a scanner as one versioned document: the result of `scene.save`."""
+    """The document."""
 
     schema_version: f.Version1 = Field(alias="schema")
     flexdt: f.ShortText = ""

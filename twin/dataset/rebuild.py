@@ -110,10 +110,8 @@ def rebuild(
         notes.append(f"profile {profile.name}{why}")
         nominal = motor_poses(machine, profile, camera, positions)
         return Rebuilt(nominal, machine, profile, positions, tuple(notes))
-    fallback = _default(machine, profiles)
-    offsets = fallback
-    if offsets is None:
-        offsets = Profile(name=ZERO, machine=machine.name, source="no offsets")
+    nothing = Profile(name=ZERO, machine=machine.name, source="no offsets")
+    offsets = _default(machine, profiles) or nothing
     heights = motor_poses(machine, offsets, machine.detector.camera, positions)
     why = "no ROI and mode" if camera is None else "no profile reproduces the printed figures"
     note = f"{why}, so these are the geometry; heights come from the motors and {offsets.name}"

@@ -21,7 +21,7 @@ from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.scanner.state import NamedCorrection
-from flexdt.twin.script import ScanPlan
+from flexdt.twin.script import SampleSize, ScanPlan
 from flexdt.twin.script.planning.plan import saved_images
 from flexdt.twin.values import ArrayValue
 
@@ -169,11 +169,8 @@ class ScanRecord(ArrayValue):
             positions = {n: float(v) for n, v in plan.positions(at).items()}
         lit = shown if first is None else first
         if sample is None:
-            size = plan.sample
-            sample = SampleRecord(
-                diameter_mm=0.0 if size is None else size.diameter_mm,
-                height_mm=0.0 if size is None else size.height_mm,
-            )
+            size = plan.sample or SampleSize(0.0)
+            sample = SampleRecord(diameter_mm=size.diameter_mm, height_mm=size.height_mm)
         return cls(
             name=name,
             machine=plan.machine,

@@ -8,8 +8,4 @@ the poses and offsets behind it). A geometry that a format cannot represent is a
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.exchange.number_tables import read_json
 
-__all__ = [
-    "ExchangeError",
-    "ScanGeometry",
-    "read_json",
-]
+__all__ = ["ExchangeError", "ScanGeometry", "read_json"]

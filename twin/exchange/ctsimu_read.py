@@ -139,11 +139,7 @@ class ScenarioReader:
         return u, v
 
     def _poses(
-        self,
-        parts: Mapping[str, PlacedPart],
-        angle: FloatArray,
-        pitch: Sequence[float],
-        real: bool,
+        self, parts: Mapping[str, PlacedPart], angle: FloatArray, pitch: Sequence[float], real: bool
     ) -> list[Pose]:
         still = np.zeros(self._count)
         out: list[Pose] = []

@@ -115,10 +115,7 @@ def _angles(axes: FloatArray) -> tuple[float, float, float]:
 
 
 def read_flexdata(
-    text: str,
-    views: int | None = None,
-    shape: tuple[int, int] | None = None,
-    file: str = "<toml>",
+    text: str, views: int | None = None, shape: tuple[int, int] | None = None, file: str = "<toml>"
 ) -> ScanGeometry:
     """Read a `geometry.toml`; the result is for images as they are, with row 0 on top.
 

@@ -11,13 +11,7 @@ from flexdt.twin.script.planning.dry_run import (
     check_script,
 )
 from flexdt.twin.script.planning.dry_run_report import html_report
-from flexdt.twin.script.planning.plan import (
-    Exposure,
-    PlanStep,
-    SampleSize,
-    ScanPlan,
-    StartState,
-)
+from flexdt.twin.script.planning.plan import Exposure, PlanStep, SampleSize, ScanPlan, StartState
 from flexdt.twin.script.planning.planner import plan_poses, plan_script
 from flexdt.twin.script.problems import ScriptError, ScriptProblem
 

@@ -187,9 +187,7 @@ _CAMERA: Final[Mapping[str, Spec]] = {
         c.SetFrames, lambda a, _: {"frames": whole(a, "number of frames", 1, MAX_FRAMES)}, 1
     ),
     "set number of averages": Spec(
-        c.SetAverages,
-        lambda a, _: {"averages": whole(a, "number of averages", 1, MAX_AVERAGES)},
-        1,
+        c.SetAverages, lambda a, _: {"averages": whole(a, "number of averages", 1, MAX_AVERAGES)}, 1
     ),
     "set ROI": Spec(c.SetRoi, _roi, 1, free=True),
     "take image": Spec(c.TakeImage, _nothing, 0),

@@ -161,8 +161,7 @@ def _blob_columns(text: str) -> tuple[Field, ...]:
     """Columns of a `set sample info` line: its last four columns are found from the right."""
     pieces = text.split("\t")
     tail = next(
-        (k for k in range(len(pieces) - 1, 3, -1) if _BLOB_WAIT.fullmatch("\t" + pieces[k])),
-        None,
+        (k for k in range(len(pieces) - 1, 3, -1) if _BLOB_WAIT.fullmatch("\t" + pieces[k])), None
     )
     if tail is None:
         return _columns(text)

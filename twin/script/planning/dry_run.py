@@ -125,10 +125,6 @@ class Dose:
     charge_mAs: float
     exposing_s: float
 
-    def to_dict(self) -> dict[str, object]:
-        """JSON form."""
-        return dict(vars(self))
-
 
 @dataclass(frozen=True)
 class CheckReport(WithProblems):
@@ -206,7 +202,7 @@ class CheckReport(WithProblems):
             "min_clearance_pair": found.min_clearance_pair and list(found.min_clearance_pair),
             "clearance": [list(p) for p in found.trace],
             "optics": [o.to_dict() for o in self.optics],
-            "dose": self.dose.to_dict(),
+            "dose": dict(vars(self.dose)),
             "start": {"known": self.start_known, "positions": dict(plan.start.positions)},
             "summary": {"sample": self.sample, "start": self.start},
             "sample": size and {**vars(size), "height_mm": size.height_mm or None},
@@ -279,7 +275,9 @@ def check_plan(
     if not start_known:
         found += _start_problems(plan)
     if clearance is not None:
-        found += [_collision_problem(x) for x in clearance.collisions]
+        for x in clearance.collisions:
+            what = f"{x.pair[0]} and {x.pair[1]} come within the safety margin at {x.time_s:.3f} s"
+            found.append(ScriptProblem("error", "collision", x.line, 1, what))
     return CheckReport(plan, in_order(found), clearance, optics, _dose(plan), text, start_known)
 
 
@@ -301,11 +299,6 @@ def _start_problems(plan: ScanPlan) -> list[ScriptProblem]:
     where = ", ".join(f"{name}={x:g}" for name, x in left.items())
     what = f"nothing moves {', '.join(left)} before this image; home is assumed: {where}"
     return [ScriptProblem("warning", "default_assumed", first.line, 1, what)]
-
-
-def _collision_problem(x: Collision) -> ScriptProblem:
-    what = f"{x.pair[0]} and {x.pair[1]} come within the safety margin at {x.time_s:.3f} s"
-    return ScriptProblem("error", "collision", x.line, 1, what)
 
 
 def _optics(view: View) -> Optics:

@@ -319,6 +319,5 @@ class ImageCollector:
         if name not in self.camera.said | self.tube.said | self._complained:
             self._complained.add(name)
             self.findings.warn(
-                "default_assumed",
-                f"{what} is not set; {value} of the machine file is assumed",
+                "default_assumed", f"{what} is not set; {value} of the machine file is assumed"
             )

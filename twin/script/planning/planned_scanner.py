@@ -69,12 +69,8 @@ class Motor:
 
     def move(self, target: float, time: float, speed: float, acceleration: float) -> Trajectory:
         """Start towards `target` at `time`, from whatever the motor is doing."""
-        if self.moves:
-            last = self.moves[-1][1]
-            x, v = last.position(time), last.velocity(time)
-        else:
-            x, v = self.home, 0.0
-        made = motion.move(x, v, target, speed, acceleration, time)
+        v = self.moves[-1][1].velocity(time) if self.moves else 0.0
+        made = motion.move(self.position(time), v, target, speed, acceleration, time)
         if made.end > time:
             self.moves.append((time, made))
         return made

@@ -151,16 +151,10 @@ def plan_poses(
         for axis in pose:
             if not machine.has(axis):
                 raise unknown_axis(axis, machine)
-        moves = [
-            c.MoveAbsolute(component=a, target=float(v), line=line, wait=c.Wait.NO_WAIT)
-            for a, v in pose.items()
-        ]
-        arrivals = [
-            c.MoveAbsolute(component=a, target=float(v), line=line) for a, v in pose.items()
-        ]
+        moves = [c.MoveAbsolute(component=a, target=float(v), line=line) for a, v in pose.items()]
         commands += [
-            *(moves if len(moves) > 1 else ()),
-            *arrivals,
+            *(replace(k, wait=c.Wait.NO_WAIT) for k in moves if len(moves) > 1),
+            *moves,
             c.TakeImage(line=line),
             c.SaveImage(path=f"scan_{i:06d}.tif", line=line),
         ]
@@ -240,7 +234,8 @@ def views(plan: ScanPlan) -> Iterator[View]:
                 camera = replace(g.camera, frames=1, averages=1, exposure_ms=1.0)
                 seen[g.camera] = camera
             index, lines = batches.setdefault((camera, g.kind), ([], []))
-            probes = _probes(len(g)) if g.moving else [0]
+            count = min(len(g), _PROBES) if g.moving else 1
+            probes = np.linspace(0, len(g) - 1, count).round().astype(int).tolist()
             index += [first + i for i in probes]
             lines += [g.line] * len(probes)
         first += len(g)
@@ -287,12 +282,6 @@ def _inside_text(view: View) -> str:
     else:
         where = f"its shadow spans columns {view.left[i]:.0f} to {view.right[i]:.0f}"
     return f"the sample is in the beam in a flat image: {where} of 0 to {view.camera.shape[1] - 1}"
-
-
-def _probes(count: int) -> list[int]:
-    """At most _PROBES of `count` images, spread evenly, first and last among them."""
-    spread: list[int] = np.linspace(0, count - 1, min(count, _PROBES)).round().astype(int).tolist()
-    return spread
 
 
 def _view(

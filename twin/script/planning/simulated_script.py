@@ -229,8 +229,7 @@ class Simulation:
             self.findings.error("unknown_component", unknown_axis(name, self.machine).message)
         else:
             self.findings.warn(
-                "custom_component",
-                f"{name!r} is a custom component: allowed, without effect here",
+                "custom_component", f"{name!r} is a custom component: allowed, without effect here"
             )
         return False
 
