@@ -205,8 +205,10 @@ class StateStore:
                 log("the state was not written", logging.ERROR, reason=str(error))
                 self._changed.set()  # the change is still pending
                 pause = FAR_S
+            # Not `wait_for`, which loses a cancellation that comes together with the event.
             with suppress(TimeoutError):
-                await asyncio.wait_for(self._at_once.wait(), pause)
+                async with asyncio.timeout(pause):
+                    await self._at_once.wait()
 
     async def flush(self) -> None:
         """Write now, so that everything answered later survives a kill.
