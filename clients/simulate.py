@@ -299,6 +299,7 @@ def _chosen_ms(panel: Detector, camera: CameraSettings, beam_e_per_ms: float) ->
     """Exposure that fills `FILLED` of the panel's range with the open beam [ms]."""
     dark_e_per_ms = panel.dark_charge(camera) / 1000.0
     range_e = (FILLED * panel.full_scale - panel.offset_counts) * panel.gain(camera)
+    require_within("offset_counts", panel.offset_counts, 0.0, 0.5 * panel.full_scale, "counts")
     low, high = EXPOSURES_MS
     return min(max(range_e / (beam_e_per_ms + dark_e_per_ms), low), high)
 

@@ -6,6 +6,7 @@ the figures, and says of each default whether it is measured, from the literatur
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 
@@ -132,8 +133,23 @@ class Detector:
     def __post_init__(self) -> None:
         for name, (low, high) in _BOUNDS.items():
             value = getattr(self, name)
-            if value is not None:
+            if value is not None or name not in _OPTIONAL:
                 require_within(f"Detector: {name}", value, low, high)
+        if isinstance(self.pixels, Mapping):  # as JSON has it
+            object.__setattr__(self, "pixels", PixelGrid(**self.pixels))
+        if not isinstance(self.pixels, PixelGrid):
+            raise LimitError(
+                f"Detector: pixels is {self.pixels!r}; allowed: a PixelGrid",
+                {"asked": repr(self.pixels)},
+            )
+        try:
+            response = tuple((float(energy), float(left)) for energy, left in self.response)
+        except (TypeError, ValueError):
+            raise LimitError(
+                f"Detector: response is {self.response!r}; allowed: pairs of energies [keV]",
+                {"asked": repr(self.response)},
+            ) from None
+        object.__setattr__(self, "response", response)
         Substance.parse(self.scintillator)
         for name in ("bits", "averages", "serial"):
             value = getattr(self, name)
@@ -305,6 +321,7 @@ class Detector:
         return mean, square * charge**2 / self.swank + mean
 
 
+_OPTIONAL = {"pixel_mm", "exposure_ms", "electrons_per_count", "dark_e_per_s"}
 _BOUNDS = {
     "pixel_mm": (1e-6, 100.0), "exposure_ms": (1e-6, 1e7), "averages": (1, 1_000_000),
     "bits": (1, 16), "electrons_per_count": (1e-18, 1e18), "electrons_per_keV": (1e-6, 1e6),

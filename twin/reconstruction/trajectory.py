@@ -14,7 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -35,10 +34,13 @@ LEVEL = 1e-3
 """Rise over a scan, relative to the radius, up to which it is a circle."""
 UNSTEADY = 0.05
 """Largest deviation of a helix from a steady rise, relative to the rise in a turn."""
-MOST_UNEVEN = 8.0
-"""Largest step between neighbouring views, relative to the usual one, that is not a gap."""
+UNEVEN, MOST_UNEVEN = 3.0, 8.0
+"""Steps between neighbouring views, relative to the usual one, that are gaps: the first where the
+views behind cover all of these, as of a scan that left some out; else the second, as of views at
+random."""
 RAMP = 0.35
-"""Angle over which the confidence in views falls towards a gap [rad]."""
+"""Angle over which the confidence in views falls towards a gap; a fan of as much on either side is
+wide, so that views behind a gap that covers it do so for any panel [rad]."""
 TURN = 2 * np.pi
 
 
@@ -68,11 +70,6 @@ class Circle:
     def full(self) -> bool:
         """Whether the views see the object from all around."""
         return not len(self.gaps)
-
-    @property
-    def order(self) -> npt.NDArray[np.intp]:
-        """(n,) views along the circle or the helix, whatever their order in the list."""
-        return np.argsort(self.angle, kind="stable")
 
     def from_gap(self, angle: FloatArray) -> FloatArray:
         """Angles from places on the circle to the nearest gap, zero within, else infinite [rad]."""
@@ -110,8 +107,8 @@ def circle_of(cone_vec: ConeVec) -> Circle:
     if worst > FLATNESS * radius:
         raise GeometryError(
             f"the sources leave a horizontal circle of radius {radius:.4g} mm by {worst:.4g} mm; "
-            "FDK needs a circle, or a helix that rises steadily for a turn or more; the iterative "
-            "methods (sirt, sart, cgls, em) take any trajectory",
+            "FDK needs a circle, or a helix that rises steadily for a turn or more and has no gap "
+            "of angles; the iterative methods (sirt, sart, cgls, em) take any trajectory",
             {"asked": worst, "allowed": FLATNESS * radius},
         )
     return helix or _turn(azimuth % TURN, centre, radius)
@@ -122,23 +119,31 @@ def _turn(azimuth: FloatArray, centre: FloatArray, radius: float) -> Circle:
     at, same = np.unique(azimuth.round(9) % TURN, return_inverse=True)
     # From each place to the next one; views at one place share what it stands for.
     ahead = np.diff(at, append=at[0] + TURN)
-    by_width = np.sort(ahead)
-    # Without the widest, which may be the gap of a short scan: a quarter of what the steps cover
-    # together lies in narrower ones, however many turns lie beside each other.
-    covered = np.cumsum(by_width[:-1])
-    usual = by_width[int(np.searchsorted(covered, covered[-1] / 4))] if len(covered) else TURN
-    # No step of a circle of three views or more is a third of it, but a gap may be.
-    open_ = (ahead > MOST_UNEVEN * usual) | (ahead > TURN / 3 + 1e-6)
+    # The widest may be the gap of a short scan, and no step of three views or more is a third of a
+    # circle, but a gap may be.
+    usual = _usual(np.sort(ahead)[:-1])
+    for most in (UNEVEN, MOST_UNEVEN):
+        open_ = (ahead > most * usual) | (ahead > TURN / 3 + 1e-6)
+        gaps = np.column_stack([at, at + ahead])[open_]
+        if _unseen(gaps, RAMP) <= 0.0:
+            break
     ahead_half = np.where(open_, 0.0, ahead / 2)
     step = (ahead_half + np.roll(ahead_half, 1)) / np.bincount(same)
-    gaps = np.column_stack([at, at + ahead])[open_]
     return Circle(centre, radius, azimuth, step[same], gaps)
+
+
+def _usual(steps: FloatArray) -> float:
+    """The usual one of some steps: a third of what they cover together lies in narrower ones,
+    however many turns lie beside each other."""
+    ordered = np.sort(steps)
+    covered = np.cumsum(ordered)
+    return float(ordered[int(np.searchsorted(covered, covered[-1] / 3))]) if len(steps) else TURN
 
 
 def _helix(
     azimuth: FloatArray, height: FloatArray, centre: FloatArray, radius: float
 ) -> Circle | None:
-    """The helix of sources that rise steadily for a turn or more; None for others."""
+    """The helix of sources that rise steadily for a turn or more, without a gap; else None."""
     order = np.argsort(height, kind="stable")
     run = np.empty(len(order))
     run[order] = np.unwrap(azimuth[order])
@@ -152,7 +157,9 @@ def _helix(
     run *= np.sign(slope)
     order = np.argsort(run, kind="stable")
     gaps = np.diff(run[order])
-    usual = float(np.median(gaps[gaps > 1e-9]))
+    usual = _usual(gaps)
+    if gaps.max() > MOST_UNEVEN * usual:
+        return None
     ahead = np.concatenate([[usual], gaps, [usual]]) / 2
     step = np.empty(len(run))
     step[order] = ahead[:-1] + ahead[1:]
@@ -205,11 +212,9 @@ def _check_covered(circle: Circle, widest: float) -> None:
     Raises:
         GeometryError: some are not.
     """
-    width, middle = np.diff(circle.gaps)[:, 0], circle.gaps.mean(axis=1)
-    apart = np.abs((middle[:, None] - middle) % TURN - np.pi)  # of a gap and what is behind another
-    unseen = (width[:, None] + width) / 2 + 2 * widest - apart
-    if unseen.size and unseen.max() > 1e-6:
-        span, need = np.rad2deg([TURN - width.sum(), np.pi + 2 * widest])
+    if _unseen(circle.gaps, widest) > 1e-6:
+        covered = TURN - float(np.diff(circle.gaps).sum())
+        span, need = np.rad2deg([covered, np.pi + 2 * widest])
         listed = ", ".join(
             f"{first:.4g} to {last:.4g}" for first, last in np.rad2deg(circle.gaps[:3])
         )
@@ -220,6 +225,13 @@ def _check_covered(circle: Circle, widest: float) -> None:
             "cgls, em) take any trajectory",
             {"asked": float(span), "allowed": [float(need), 360.0]},
         )
+
+
+def _unseen(gaps: FloatArray, widest: float) -> float:
+    """By how much gaps overlap with what is behind others, up to an angle of the fan [rad]."""
+    width, middle = np.diff(gaps)[:, 0], gaps.mean(axis=1)
+    apart = np.abs((middle[:, None] - middle) % TURN - np.pi)  # of a gap and what is behind another
+    return float(((width[:, None] + width) / 2 + 2 * widest - apart).max(initial=-TURN))
 
 
 def reach(fan: FloatArray) -> tuple[float, float]:
@@ -242,7 +254,9 @@ def columns_beyond(circle: Circle, cone_vec: ConeVec, cols: int) -> tuple[int, i
         ray = inward @ np.array([[c, s], [-s, c]])
         ends.append(-_cross(ray, panel) / _cross(ray, cone_vec.u[:, :2]) + (cols - 1) / 2)
     before, after = -float(np.min(ends)), float(np.max(ends)) - (cols - 1)
-    first, last = np.clip(np.ceil([before - 0.5, after - 0.5]), 0, MOST_COLUMNS * cols)
+    # Rounded first: sources in another order differ in the last bits, which must not decide.
+    needed = np.ceil(np.round([before - 0.5, after - 0.5], 6))
+    first, last = np.clip(needed, 0, MOST_COLUMNS * cols)
     return int(first), int(last)
 
 

@@ -159,10 +159,11 @@ def truncation_of(
     Returns:
         For `fdk_parts`; None where the panel saw the whole object.
     """
-    views = len(cone_vec)
     circle = circle_of(cone_vec)  # of all: fewer may seem to close a turn that is open
+    _, places = np.unique(circle.angle.round(9), return_index=True)
+    views = len(places)  # at different angles
     chosen = np.unique(np.linspace(0, views - 1, min(views, SAMPLES)).round().astype(np.intp))
-    chosen = circle.order[chosen]
+    chosen = places[chosen]
     images = [np.asarray(image(i), dtype=np.float32) for i in chosen.tolist()]
     cone_vec = cone_vec[chosen]
     if on_its_side(cone_vec):

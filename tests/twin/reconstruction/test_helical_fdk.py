@@ -84,6 +84,26 @@ def test_long_objects_come_back_from_any_helix() -> None:
         assert wrong.std() < 1.4 * usual.std() + 0.002, (case, part)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_helix_with_a_gap_is_refused_and_a_slow_drift_with_one_is_a_circle(seed: int) -> None:
+    """A gap of a helix was bridged without a word, and 0.2 mm of drift made a circle a helix."""
+    rng = np.random.default_rng(seed)
+    scan = helix(0.5)
+    first, width = rng.uniform(0.2, 0.6) * len(scan), rng.uniform(0.08, 0.4) * 180
+    left = np.abs(np.arange(len(scan)) - first) > width / 2
+    with pytest.raises(GeometryError, match="no gap of angles"):
+        circle_of(scan[rng.permutation(np.flatnonzero(left))])
+    turn = ConeVec.circular(sod=SOD, sdd=SDD, angles=180, pixel=PITCH, shape=SHAPE, height=0.0)  # type: ignore[arg-type]
+    for rise in (0.5e-3, 3e-3):
+        rows = turn.rows.copy()
+        rows[:, 2::3][:, :2] += np.linspace(0.0, rise * SOD, 180)[:, None]
+        there = np.delete(np.arange(180), np.arange(60, 60 + int(rng.integers(15, 50))))
+        parts = column(rng)
+        seen, whole = (errors(parts, ConeVec(rows[some]), 0.0) for some in (there, slice(None)))
+        assert abs(seen.mean()) < abs(whole.mean()) + 0.002
+        assert seen.std() < 1.3 * whole.std() + 0.002
+
+
 def test_shares_of_a_point_add_up_to_one() -> None:
     """All views that see a point from one side, by projecting it; most counts in the middle."""
     rng = np.random.default_rng(2)

@@ -454,7 +454,9 @@ def covering(rng: np.random.Generator) -> np.ndarray:
     first, width = rng.uniform(0.0, 360.0), rng.uniform(0.0, 120.0)
     angles = angles[(angles - first) % 360.0 > width]
     again = rng.choice(angles, rng.integers(0, 30))
-    return np.asarray(rng.permutation(np.r_[angles, again]))
+    finer = rng.uniform(0.0, 360.0) + np.arange(0.0, rng.uniform(0.0, 80.0), 0.2)
+    finer = finer[(finer - first) % 360.0 > width]
+    return np.asarray(rng.permutation(np.r_[angles, again, finer]))
 
 
 @pytest.mark.parametrize("seed", range(8))
