@@ -81,8 +81,9 @@ def image_doubts(scan: DataSet, *, needed: bool = False) -> list[str]:
             top = float(max(flat.max(), max(int(scan.counts(i).max()) for i in wanted)))
             top = top if np.log2(top + 1.0).is_integer() else np.inf
         few = dark[alive] + FEW_COUNTS
-        each = [(seen >= top, seen < few) for seen in (scan.counts(i)[alive] for i in wanted)]
-        saturated, starved = np.mean([(one.mean(), two.mean()) for one, two in each], axis=0)
+        images = (scan.counts(i)[alive] for i in wanted)
+        each = [((seen >= top).mean(), (seen < few).mean()) for seen in images]
+        saturated, starved = np.mean(each, axis=0)
         shares = {
             "radiographs": float(saturated),
             "flat image": float((flat[alive] >= top).mean()),

@@ -38,7 +38,7 @@ from flexdt.twin.physics.chain import (
     spot_views,
     without_spot,
 )
-from flexdt.twin.physics.detector import Detector, detector_of
+from flexdt.twin.physics.detector import EXPOSURES_MS, Detector, detector_of
 from flexdt.twin.physics.exposure import Counts, ExposureSettings, frame_rng
 from flexdt.twin.physics.radiograph import Radiograph, check_rays, radiographs, within_pixels
 from flexdt.twin.physics.scatter.simulation import (
@@ -59,8 +59,6 @@ BATCH_BYTES: Final = 64 << 20
 MOST_POINTS: Final = 1024
 FILLED: Final = 0.8
 """Part of the panel's range that the open beam fills where the exposure is chosen."""
-EXPOSURES_MS: Final = (1e-6, 1e7)
-"""Exposures that a detector may have [ms]."""
 DOUBTED_PX: Final = 0.25
 """Difference of the spot's blur over a sample from which it is worth a warning [pixels]."""
 SAME_PITCH: Final = 1e-6
@@ -296,10 +294,15 @@ def simulate(
 
 
 def _chosen_ms(panel: Detector, camera: CameraSettings, beam_e_per_ms: float) -> float:
-    """Exposure that fills `FILLED` of the panel's range with the open beam [ms]."""
+    """Exposure that fills `FILLED` of the panel's range with the open beam [ms].
+
+    Raises:
+        LimitError: the panel's offset leaves no range to fill.
+    """
+    # A panel that is half full in the dark has little range left: say so, not an odd exposure.
+    require_within("offset_counts", panel.offset_counts, 0.0, 0.5 * panel.full_scale, "counts")
     dark_e_per_ms = panel.dark_charge(camera) / 1000.0
     range_e = (FILLED * panel.full_scale - panel.offset_counts) * panel.gain(camera)
-    require_within("offset_counts", panel.offset_counts, 0.0, 0.5 * panel.full_scale, "counts")
     low, high = EXPOSURES_MS
     return min(max(range_e / (beam_e_per_ms + dark_e_per_ms), low), high)
 

@@ -31,6 +31,8 @@ DARK_E_PER_S = 2000.0
 """Assumed: of an unbinned pixel."""
 CAMERA_MODE = "HW1SW1High"
 """Reads out the pixels as they are."""
+EXPOSURES_MS = 1e-6, 1e7
+"""Of one read-out [ms]."""
 USUAL_MS = 100.0
 """Exposure of a `Detector` that states none, where no tube says how bright its images are [ms]."""
 
@@ -323,7 +325,7 @@ class Detector:
 
 _OPTIONAL = {"pixel_mm", "exposure_ms", "electrons_per_count", "dark_e_per_s"}
 _BOUNDS = {
-    "pixel_mm": (1e-6, 100.0), "exposure_ms": (1e-6, 1e7), "averages": (1, 1_000_000),
+    "pixel_mm": (1e-6, 100.0), "exposure_ms": EXPOSURES_MS, "averages": (1, 1_000_000),
     "bits": (1, 16), "electrons_per_count": (1e-18, 1e18), "electrons_per_keV": (1e-6, 1e6),
     "scintillator_mm": (1e-6, 100.0), "packing": (1e-3, 1.0), "swank": (1e-3, 1.0),
     "read_noise_e": (0.0, 1e9), "offset_counts": (0.0, 65535.0), "dark_e_per_s": (0.0, 1e18),

@@ -55,7 +55,7 @@ class Circle:
             2 pi; on a helix since its lowest view.
         step: (n,) angle each view stands for [rad].
         gaps: (k, 2) first and last angle of the arcs that no view stands for [rad]; the last may
-            lie beyond 2 pi. None for a helix.
+            lie beyond 2 pi. A helix has none.
         rise: of a helix in a turn [mm]; 0 for a circle.
     """
 
@@ -119,9 +119,9 @@ def _turn(azimuth: FloatArray, centre: FloatArray, radius: float) -> Circle:
     at, same = np.unique(azimuth.round(9) % TURN, return_inverse=True)
     # From each place to the next one; views at one place share what it stands for.
     ahead = np.diff(at, append=at[0] + TURN)
-    # The widest may be the gap of a short scan, and no step of three views or more is a third of a
-    # circle, but a gap may be.
-    usual = _usual(np.sort(ahead)[:-1])
+    # The widest may be the gap of a short scan, so that it does not say what is usual. A step of
+    # more than a third of the circle is a gap even of few views: three even ones just reach it.
+    usual = _usual(np.delete(ahead, ahead.argmax()))
     for most in (UNEVEN, MOST_UNEVEN):
         open_ = (ahead > most * usual) | (ahead > TURN / 3 + 1e-6)
         gaps = np.column_stack([at, at + ahead])[open_]
