@@ -56,6 +56,9 @@ class Guest(Protocol):
     def end(self) -> None:
         """Cut the connection off."""
 
+    def displace(self) -> None:
+        """Say that there is no place, and close the connection."""
+
 
 class Room:
     """Connections without a place, in the order in which they came.
@@ -78,7 +81,7 @@ class Room:
             [(crowd, _)] = Counter(g.address for g in self.guests).most_common(1)
             oldest = next(g for g in self.guests if g.address == crowd)
             self.leave(oldest)
-            oldest.end()
+            oldest.displace()
 
     def leave(self, guest: Guest) -> None:
         """A connection has a place now, or has ended; it need not be here."""

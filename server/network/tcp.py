@@ -336,8 +336,17 @@ class _Link(asyncio.Protocol):
         self.deadlines.start("send", self.limits.send_timeout_s)
 
     def end(self) -> None:
-        """The server ends, or others need the room."""
+        """The server ends."""
         self.transport.abort()
+
+    def displace(self) -> None:
+        """A newer connection needs the room: a client learns why it ends, a stranger does not."""
+        if self.let_in:
+            self.out.reply(Failure(None, self._no_place()))
+        if self.let_in and not self.transport.get_write_buffer_size():
+            self.close("displaced by a newer connection")
+        else:  # a client that does not read would stay until a time-out
+            self.end()
 
     def log(
         self, event: str, level: int = logging.INFO, *, error: bool = False, **facts: object
