@@ -28,11 +28,13 @@ BAND: Final = 100
 def windowed(
     image: npt.NDArray[Any], like: npt.NDArray[Any] | None = None
 ) -> npt.NDArray[np.uint8]:
-    """8-bit view of an image: percentiles, of `like` if given, to black and white."""
-    low, high = np.percentile(image if like is None else like, PERCENTILES)
+    """8-bit view of an image: percentiles, of `like` if given, to black and white; NaN is black."""
+    seen = np.asarray(image if like is None else like, dtype=np.float64)
+    seen = seen[np.isfinite(seen)]
+    low, high = np.percentile(seen, PERCENTILES) if seen.size else (0.0, 0.0)
     if high <= low:
         return np.zeros(image.shape, dtype=np.uint8)
-    scaled = (image.astype(np.float64) - low) * (255.0 / (high - low))
+    scaled = (np.nan_to_num(image.astype(np.float64), nan=low) - low) * (255.0 / (high - low))
     return np.asarray(np.clip(np.rint(scaled), 0, 255), dtype=np.uint8)
 
 

@@ -49,6 +49,7 @@ from flexdt.twin.reconstruction import (
     sirt,
     truncation_of,
     tv,
+    unseen_layers,
 )
 from flexdt.twin.reconstruction.scatter_correction import scatterer_of, subtracted
 
@@ -296,6 +297,7 @@ def _here(
             write(_iterative(views, grid, request, tell).data)
             return []
         slabs, truncation = grid.slabs(SLAB_BYTES), views.truncation()
+        doubts = _doubts(truncation)
         for k, (first, last) in enumerate(slabs):
 
             def part(done: float, k: int = k) -> None:
@@ -306,7 +308,8 @@ def _here(
                 views.parts, views.cone_vec, views.shape, like, request.window, part, truncation
             )
             write(slab.data)
-    return _doubts(truncation)
+            doubts += unseen_layers(slab.data)
+    return doubts
 
 
 def _doubts(truncation: Truncation | None) -> list[str]:
@@ -328,10 +331,13 @@ def reconstruct_volume(
         warnings.warn(doubt, stacklevel=2)
     if wanted.algorithm != "fdk":
         return _iterative(views, grid, wanted, _untold)
-    like = grid.blank()
-    return fdk_parts(
-        views.parts, views.cone_vec, views.shape, like, wanted.window, truncation=truncation
-    )
+    volume = fdk_parts(
+        views.parts, views.cone_vec, views.shape, grid.blank(), wanted.window,
+        truncation=truncation,
+    )  # fmt: skip
+    for doubt in unseen_layers(volume.data):
+        warnings.warn(doubt, stacklevel=2)
+    return volume
 
 
 def _task(

@@ -58,6 +58,11 @@ GROUP: Final = 8
 """Views that the processor weighs and filters at a time: they stay in its caches."""
 STACKS: Final = 6
 """Stacks of so many images that a device holds: twice what came, and made wider, of three steps."""
+LEAST_SEEN: Final = 0.4
+"""Part of the weight of all views that must see a voxel. At the panel's upper and lower edge it is
+about half in a whole turn."""
+MADE_UP_BY: Final = 360
+"""Views by which that part is judged, of as many or more."""
 MOST_ASIDE: Final = 0.1
 """By how much of its width the panel may go sideways between the views: jitter, not tiles."""
 
@@ -346,7 +351,8 @@ def fdk(
         progress: called with the fraction done.
 
     Returns:
-        Volume [1/mm]; its data is a (nz, ny, nx) view with z contiguous.
+        Volume [1/mm]; its data is a (nz, ny, nx) view with z contiguous. Voxels that too few views
+        see, above or below the panel, are NaN.
 
     Raises:
         GeometryError: no circle and no helix, too short a scan, too steep a helix, or shapes that
@@ -354,7 +360,8 @@ def fdk(
         UnknownNameError: no such window.
 
     Warns:
-        UserWarning: the panel cuts the object off, and its outline is not understood.
+        UserWarning: the panel cuts the object off, and its outline is not understood; layers of the
+            grid lie above or below what the panel sees.
 
     Examples:
         A cube of 0.02 / mm, projected and reconstructed:
@@ -388,7 +395,21 @@ def fdk(
         truncation = truncation_of(lambda view: values[view], geometry, shape)
         if truncation is not None and truncation.doubt:
             warnings.warn(truncation.doubt, stacklevel=2)
-    return fdk_parts(parts, geometry, shape, like, window, progress, truncation)
+    volume = fdk_parts(parts, geometry, shape, like, window, progress, truncation)
+    for doubt in unseen_layers(volume.data):
+        warnings.warn(doubt, stacklevel=2)
+    return volume
+
+
+def unseen_layers(data: Float32Array) -> list[str]:
+    """What is to be said of layers of a volume (nz, ny, nx) without a single voxel from data."""
+    lost = int(np.isnan(data[:, ::4, ::4]).all(axis=(1, 2)).sum())
+    if not lost:
+        return []
+    return [
+        f"{lost} of {len(data)} layers of the grid lie above or below what the panel sees; their "
+        "voxels are NaN"
+    ]
 
 
 def fdk_parts(
@@ -501,9 +522,6 @@ def _fdk(
             "rows of 1 pixel, which cannot be filtered; allowed: 2 or more",
             {"asked": shape[1], "allowed": 2},
         )
-    if shape[0] == 1:  # A row of detectors sees as high as it is, not only its middle's plane.
-        parts = (part.repeat(2, axis=1) for part in parts)
-        cone_vec, shape = ConeVec(cone_vec.rows), (2, shape[1])
     tilted, seen = not is_upright(cone_vec), shape
     if leans(cone_vec):
         shape = (shape[0], round(FINER * shape[1]))
@@ -542,7 +560,8 @@ def _fdk(
         images = rectified(part, cone_vec[views], panels[views], shape[1]) if tilted else part
         top = first
         if before or after:
-            images, top = np.pad(images[:, first:last], ((0, 0), (0, 0), (before, after))), 0
+            rows = np.arange(first, last).clip(0, shape[0] - 1)
+            images, top = np.pad(images[:, rows], ((0, 0), (0, 0), (before, after))), 0
         if truncation is not None:
             panel = slice(before, before + shape[1])
             truncation.continue_rows(images, level[views], first, panel)
@@ -560,7 +579,35 @@ def _fdk(
             f"{done} projections for {len(cone_vec)} views",
             {"asked": done, "allowed": len(cone_vec)},
         )
-    return replace(like, data=target.volume().transpose(2, 0, 1))
+    data = target.volume()
+    if sharing is None:
+        _make_up(data, like, circle, table, weights[:, kept], last - first)
+    return replace(like, data=data.transpose(2, 0, 1))
+
+
+def _make_up(
+    data: Float32Array,
+    like: Volume,
+    circle: Circle,
+    table: FloatArray,
+    weights: FloatArray,
+    rows: int,
+) -> None:
+    """Make voxels up for views that see them above or below the panel; see `fdk_kernels.make_up`.
+
+    Where there are many views, one stands for some neighbours.
+    """
+    from flexdt.twin.reconstruction import fdk_kernels
+
+    order = np.argsort(circle.angle, kind="stable")
+    starts = np.arange(0, len(order), -(-len(order) // MADE_UP_BY))
+    middle = order[(starts + np.append(starts[1:], len(order))) // 2]
+    step = np.add.reduceat(circle.step[order], starts)
+    first, size = _grid(like)
+    fdk_kernels.make_up(
+        np.ascontiguousarray(table[middle]), weights[middle] * step[:, None], rows, *first, *size,
+        LEAST_SEEN, data,
+    )  # fmt: skip
 
 
 def _weighing(

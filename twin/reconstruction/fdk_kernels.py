@@ -123,6 +123,60 @@ def _entry_point(key: int, lanes: int):  # type: ignore[no-untyped-def]
 backproject = _entry_point(sources(resample_kernels), LANES)
 
 
+@kernel
+def _covered(g, weights, rows, x, y, z0, dz, seen):
+    """Add a view's weight to what sees the voxels above one another at (x, y), whose differences
+    `seen` holds; see `make_up`. Returns that weight, whatever the height.
+    """
+    x -= g[0]
+    y -= g[1]
+    depth = x * g[3] + y * g[4]
+    if depth <= 0.0:
+        return 0.0
+    inverse = 1.0 / depth
+    c = g[8] + (x * g[5] + y * g[6]) * inverse * g[7]
+    if c < 0.0 or c > weights.size - 1:
+        return 0.0
+    every = -1.0 / (dz * g[9] * inverse)
+    start = g[10] - (z0 - g[2]) * g[9] * inverse
+    lowest = max(0, math.ceil((rows - 1 - start) * every))
+    highest = min(seen.size - 2, math.floor(-start * every))
+    weight = weights[int(c)] * inverse * math.sqrt(inverse)
+    if lowest <= highest:
+        seen[lowest] += weight
+        seen[highest + 1] -= weight
+    return weight
+
+
+@parallel
+def make_up(views, weights, rows, x0, y0, z0, dx, dy, dz, least, volume):
+    """Make voxels up for the views on which they lie above or below the panel.
+
+    What the others gave is divided by their part of the weight; voxels of which that is less than
+    `least` become NaN.
+
+    views: float64 (n, 11) and weights: float64 (n, cols), of `backproject`.
+    volume: float32 (ny, nx, nz).
+    """
+    ny, nx, nz = volume.shape
+    for iy in prange(ny):
+        seen = np.zeros(nz + 1, np.float64)
+        for ix in range(nx):
+            seen[:] = 0.0
+            total = 0.0
+            for view in range(len(views)):
+                total += _covered(
+                    views[view], weights[view], rows, x0 + ix * dx, y0 + iy * dy, z0, dz, seen
+                )
+            part = 0.0
+            for iz in range(nz):
+                part += seen[iz]
+                if part < least * total:
+                    volume[iy, ix, iz] = np.nan
+                elif part < 0.999999 * total:
+                    volume[iy, ix, iz] *= total / part
+
+
 def room(n: int, cols: int, rows: int) -> Float32Array:
     """Memory for images, (n, cols, rows and more): columns of whole registers, aligned to them."""
     shape = (n, cols, -(-rows // LANES) * LANES)
@@ -133,7 +187,8 @@ def room(n: int, cols: int, rows: int) -> Float32Array:
 def weigh(images, first, factors, across, up, out):
     """out[n, r, c] = images[n, first + r, c] * factors[n, c] / length of the ray to (r, c).
 
-    images: float32 (n, rows of the panel, cols); out: float32 (n, rows, cols).
+    images: float32 (n, rows of the panel, cols), whose outermost rows go on; out: float32 (n, rows,
+    cols).
     factors: float64 (n, cols).
     across, up: squares of the ray's horizontal and vertical parts, (n, cols) and (n, rows) [mm^2].
     """
@@ -142,9 +197,10 @@ def weigh(images, first, factors, across, up, out):
         view = job // rows
         r = job % rows
         high = up[view, r]
+        seen = min(max(first + r, 0), images.shape[1] - 1)
         for c in range(cols):
             weight = np.float32(factors[view, c] / math.sqrt(across[view, c] + high))
-            out[view, r, c] = images[view, first + r, c] * weight
+            out[view, r, c] = images[view, seen, c] * weight
 
 
 @parallel

@@ -50,7 +50,7 @@ def weigh(images, top, factors, across, up, out):
     view = cuda.blockIdx.z
     if c < out.shape[1] and r < out.shape[2]:
         weight = factors[view, c] / math.sqrt(across[view, c] + up[view, r])
-        out[view, c, r] = images[view, top + r, c] * weight
+        out[view, c, r] = images[view, min(max(top + r, 0), images.shape[1] - 1), c] * weight
 
 
 @cuda.jit

@@ -81,7 +81,8 @@ class Sharing:
         span = float(self.circle.step.sum())
         since = (self.circle.angle + 0.5 * self.circle.step)[views]
         until = span - since
-        row = (np.arange(*rows) - (self.rows - 1) / 2).astype(np.float32)
+        inside = np.arange(*rows).clip(0, self.rows - 1)  # rows off the panel repeat its edge
+        row = (inside - (self.rows - 1) / 2).astype(np.float32)
         most = int(min(span / (2 * np.pi), self.rows / np.abs(turn).min())) + 1
         own = total = np.zeros((len(since), DEPTHS, len(row)), np.float32)
         for k in range(-most, most + 1):

@@ -152,19 +152,22 @@ def field_of_view(cone_vec: ConeVec, shape: tuple[int, int], voxel_mm: float | N
     up = float((centre[:, 1] + 0.5).max()) * pitch * scale
     down = float((rows - 0.5 - centre[:, 1]).max()) * pitch * scale
     wide = max(1, math.ceil(2 * reach * pitch * scale / voxel_mm))
-    high = max(1, math.ceil((up + down) / voxel_mm))
+    high = max(1, round((up + down) / voxel_mm))
     return Grid((high, wide, wide), voxel_mm, (0.0, 0.0, (up - down) / 2))
 
 
 def rows_needed(cone_vec: ConeVec, shape: tuple[int, int], like: Volume) -> tuple[int, int]:
-    """Rows first <= r < last in which the volume's shadow lies in some view (a few to spare)."""
+    """Rows first <= r < last in which the volume's shadow lies in some view (a few to spare).
+
+    There is one more above the panel and one below it: pixels see beyond their centres.
+    """
     signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     corners = np.array(like.center_mm) + signs * np.array(like.size_mm) / 2
     at = cone_vec.project_points(corners, shape)[..., 1]
     if not np.isfinite(at).all():
-        return 0, shape[0]
-    first = int(np.clip(np.floor(at.min()) - 2, 0, shape[0] - 2))
-    last = int(np.clip(np.ceil(at.max()) + 3, first + 2, shape[0]))
+        return -1, shape[0] + 1
+    first = int(np.clip(np.floor(at.min()) - 2, -1, shape[0] - 1))
+    last = int(np.clip(np.ceil(at.max()) + 3, first + 2, shape[0] + 1))
     return first, last
 
 
