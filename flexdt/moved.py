@@ -26,6 +26,8 @@ MOVED: Final = {
     "flexdt.twin.calibration.design": "flexdt_extensions.phantom_design",
     "flexdt.twin.calibration.online": "flexdt_extensions.online",
     "flexdt.twin.calibration.studies": "flexdt_extensions.studies",
+    "flexdt.twin.exchange.ctsimu": "flexdt_extensions.ctsimu.ctsimu_write",
+    "flexdt.twin.exchange.ctsimu_read": "flexdt_extensions.ctsimu.ctsimu_read",
     "flexdt.twin.exchange.ctsimu_scan": "flexdt_extensions.ctsimu.ctsimu_scan",
     "flexdt.twin.physics.apparatus": "flexdt.twin.physics.detector",
     "flexdt.twin.physics.panel": "flexdt.twin.physics.detector",
