@@ -29,6 +29,7 @@ MOVED: Final = {
     "flexdt.twin.exchange.ctsimu": "flexdt_extensions.ctsimu.ctsimu_write",
     "flexdt.twin.exchange.ctsimu_read": "flexdt_extensions.ctsimu.ctsimu_read",
     "flexdt.twin.exchange.ctsimu_scan": "flexdt_extensions.ctsimu.ctsimu_scan",
+    "flexdt.twin.projection.gpu_astra": "flexdt_extensions.bench.gpu_astra",
     "flexdt.twin.physics.apparatus": "flexdt.twin.physics.detector",
     "flexdt.twin.physics.panel": "flexdt.twin.physics.detector",
     "flexdt.clients.lab": "flexdt_extensions.bluesky",
