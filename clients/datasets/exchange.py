@@ -21,7 +21,7 @@ from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.extras import extension
 from flexdt.clients.whole_files import write_whole
 from flexdt.twin.exchange.flexdata import flexdata_text, read_flexdata
-from flexdt.twin.exchange.geometry import SAME_MM, ExchangeError, ScanGeometry
+from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.exchange.number_tables import (
     csv_text,
     geometry_text,
@@ -92,12 +92,12 @@ def geometry_of(dataset: DataSet, parameters: Offsets | None = None) -> ScanGeom
     return ScanGeometry(cone_vec, dataset.shape, name=dataset.name, files=files)
 
 
-WRITERS: Final[Mapping[str, Callable[[ScanGeometry, float], str]]] = {
-    "rtk": lambda geometry, _: rtk_text(geometry),
+WRITERS: Final[Mapping[str, Callable[[ScanGeometry], str]]] = {
+    "rtk": rtk_text,
     "flexdata": flexdata_text,
-    "csv": lambda geometry, _: csv_text(geometry),
+    "csv": csv_text,
 }
-"""Formats that are a text made of the geometry (and what it may differ) alone."""
+"""Formats that are a text made of the geometry alone."""
 FORMATS: Final = ("ctsimu", "rtk", "astra", "tomosipo", "flexdata", "csv")
 ENDINGS: Final = {
     "ctsimu": (".json",),
@@ -118,7 +118,6 @@ def export_dataset(
     parameters: Offsets | None = None,
     real: Offsets | None = None,
     rows_up: bool = False,
-    tolerance_mm: float = SAME_MM,
 ) -> ScanGeometry:
     """Write a data set's geometry in a peer's format.
 
@@ -129,7 +128,6 @@ def export_dataset(
         parameters: correction; None is the one in force during the scan, if any.
         real: CTSimU only: what is so and a reconstruction does not know.
         rows_up: the images are turned upside down before use: v upwards.
-        tolerance_mm: flexDATA only: how far a view may lie beside what the format states.
 
     Returns:
         The geometry that was written.
@@ -153,16 +151,14 @@ def export_dataset(
         scenario = extension("ctsimu.export", "the format ctsimu")(dataset, parameters, real)
         content: Content = json.dumps(scenario, indent=1) + "\n"
     else:
-        content = _content(geometry.rows_up() if rows_up else geometry, format, out, tolerance_mm)
+        content = _content(geometry.rows_up() if rows_up else geometry, format, out)
     write_whole(out, content)
     return geometry
 
 
-def _content(
-    geometry: ScanGeometry, format: str, out: Path, tolerance_mm: float = SAME_MM
-) -> Content:
+def _content(geometry: ScanGeometry, format: str, out: Path) -> Content:
     if format in WRITERS:
-        return WRITERS[format](geometry, tolerance_mm)
+        return WRITERS[format](geometry)
     buffer = io.BytesIO()
     if format == "tomosipo":
         np.savez(buffer, **tomosipo_arrays(geometry))  # type: ignore[arg-type]
