@@ -37,7 +37,8 @@ from flexdt.twin.exchange.rtk_xml import read_rtk, rtk_text
 from flexdt.twin.geometry.offsets import Offsets
 
 Content = str | bytes
-MAX_BYTES: Final = 1 << 30
+MAX_BYTES: Final = 256 << 20
+"""Of a text; no geometry is longer."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ import numpy as np
 
 from flexdt.twin.exchange import geometry as g
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
-from flexdt.twin.exchange.number_tables import check_size, cone_vec_of
+from flexdt.twin.exchange.number_tables import cone_vec_of
 from flexdt.twin.geometry.conventions import FloatArray, rotation_x, rotation_y, rotation_z
 
 VERSION: Final = "0.1.0"
@@ -129,7 +129,6 @@ def read_flexdata(
     Raises:
         ExchangeError: not such a file, or something of it that is not understood.
     """
-    check_size(text, file)
     records = _records(text, file)
     get = _Getter(records, file)
     for name in UNSUPPORTED:
