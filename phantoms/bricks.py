@@ -14,13 +14,12 @@ import tomllib
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
 from flexdt.phantoms.materials import Material, material
 from flexdt.phantoms.phantom import Phantom
-from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import FloatArray, stage_rotation
 from flexdt.twin.projection import analytic_solids as analytic
 
@@ -104,10 +103,6 @@ def brick_shapes(
     return out
 
 
-MOST_BRICKS: Final = 20
-MOST_STUDS: Final = 8
-
-
 @dataclass(frozen=True)
 class Brickwork:
     """A straight stack of equal bricks about the rotation axis.
@@ -120,15 +115,6 @@ class Brickwork:
 
     studs: tuple[int, int] = (3, 2)
     bricks: int = 5
-
-    def __post_init__(self) -> None:
-        for what, value, low, high in (
-            ("studs along x", self.studs[0], 2, MOST_STUDS),
-            ("studs along y", self.studs[1], 2, MOST_STUDS),
-            ("bricks", self.bricks, 1, MOST_BRICKS),
-        ):
-            if not low <= value <= high:
-                raise LimitError.instead(f"{value} {what}", value, f"{low} to {high}")
 
     @cached_property
     def measures(self) -> dict[str, float]:

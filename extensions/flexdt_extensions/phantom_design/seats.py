@@ -21,6 +21,8 @@ from flexdt.phantoms.bricks import Brickwork, lego_data
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import FloatArray
 
+MOST_BRICKS: Final = 20
+MOST_STUDS: Final = 8
 HEIGHTS: Final = ("rim", "middle", "roof")
 """Where in a brick a seat is: just above the studs below, half way up, against the roof."""
 
@@ -41,6 +43,22 @@ class Seats:
 
     def __len__(self) -> int:
         return len(self.places)
+
+
+def stack_of(studs: tuple[int, int], bricks: int) -> Brickwork:
+    """A stack that can be built.
+
+    Raises:
+        LimitError: too few or too many studs or bricks.
+    """
+    for what, value, low, high in (
+        ("studs along x", studs[0], 2, MOST_STUDS),
+        ("studs along y", studs[1], 2, MOST_STUDS),
+        ("bricks", bricks, 1, MOST_BRICKS),
+    ):
+        if not low <= value <= high:
+            raise LimitError.instead(f"{value} {what}", value, f"{low} to {high}")
+    return Brickwork(studs, bricks)
 
 
 def tubes_at(work: Brickwork) -> FloatArray:

@@ -8,7 +8,13 @@ import pytest
 from flexdt.phantoms import PhantomError
 from flexdt.phantoms.bricks import Brickwork, lego_phantom
 from flexdt.twin.errors import LimitError
-from flexdt_extensions.phantom_design.seats import HEIGHTS, grid_seats, seats_of, stack_phantom
+from flexdt_extensions.phantom_design.seats import (
+    HEIGHTS,
+    grid_seats,
+    seats_of,
+    stack_of,
+    stack_phantom,
+)
 
 
 def plastic(work: Brickwork, points: np.ndarray) -> np.ndarray:
@@ -60,7 +66,7 @@ def test_stack_is_the_thesis_phantom_but_for_its_beads() -> None:
 
 def test_what_cannot_be_built_is_refused() -> None:
     with pytest.raises(LimitError, match="bricks"):
-        Brickwork((3, 2), 0)
+        stack_of((3, 2), 0)
     with pytest.raises(LimitError, match="does not fit"):
         seats_of(Brickwork(), 4.0)
     with pytest.raises(PhantomError, match="not on a seat"):
