@@ -3,7 +3,7 @@
 Kernels change with every version; a program that imports them is written for one.
 """
 
-from flexdt.twin.projection import gpu, gpu_astra
+from flexdt.twin.projection import gpu
 from flexdt.twin.projection.cpu import threads
 from flexdt.twin.projection.kernels import siddon_kernels
 from flexdt.twin.projection.operators import box_of, voxel_rays
@@ -13,7 +13,6 @@ from flexdt.twin.reconstruction.fdk import view_table
 __all__ = [
     "box_of",
     "gpu",
-    "gpu_astra",
     "gpu_fdk_kernels",
     "siddon_kernels",
     "threads",

@@ -1,33 +1,25 @@
-"""Stacks of hollow LEGO bricks with beads in their cavities: the seats there are, and the phantom.
+"""Stacks of hollow LEGO bricks, and the LEGO bead phantom of thesis 6.5.1.
 
-A seat is a position where a bead can be glued: touching the roof of the cavity anywhere on half the
-stud pitch, or touching a wall at one of three heights. Seats inside a tube, through a wall or where
-a stud of the brick below comes up are left out. Bricks are at least two studs wide. The choice
-among the seats is `flexdt_extensions.phantom_design.bead_search`.
-
-The LEGO bead phantom of thesis 6.5.1 is five hollow 3 x 2 bricks with one 2 mm bead in each.
-Dimensions come from `data/lego.toml`, which labels each as thesis, literature or assumed; they must
-add up to the thesis's height and footprint. Solids are additive: a brick is its outer box minus its
-cavity plus tubes and studs, none overlapping.
+The phantom is five hollow 3 x 2 bricks with one 2 mm bead in each. Dimensions come from
+`data/lego.toml`, which labels each as thesis, literature or assumed; they must add up to the
+thesis's height and footprint. Solids are additive: a brick is its outer box minus its cavity plus
+tubes and studs, none overlapping. `flexdt_extensions.phantom_design` chooses other places for
+beads.
 """
 
 from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from flexdt.phantoms.checked_reading import PhantomError
 from flexdt.phantoms.materials import Material, material
 from flexdt.phantoms.phantom import Phantom
-from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import FloatArray, stage_rotation
 from flexdt.twin.projection import analytic_solids as analytic
 
@@ -111,30 +103,6 @@ def brick_shapes(
     return out
 
 
-MOST_BRICKS: Final = 20
-MOST_STUDS: Final = 8
-HEIGHTS: Final = ("rim", "middle", "roof")
-"""Where in a brick a seat is: just above the studs below, half way up, against the roof."""
-
-
-@dataclass(frozen=True, eq=False)
-class Seats:
-    """Places for beads in a stack, lowest brick first.
-
-    Attributes:
-        places: (m, 3) bead centres [mm, object frame].
-        brick: (m,) number of the brick, 0 the lowest.
-        height: (m,) index into HEIGHTS.
-    """
-
-    places: FloatArray
-    brick: npt.NDArray[np.int64]
-    height: npt.NDArray[np.int64]
-
-    def __len__(self) -> int:
-        return len(self.places)
-
-
 @dataclass(frozen=True)
 class Brickwork:
     """A straight stack of equal bricks about the rotation axis.
@@ -147,15 +115,6 @@ class Brickwork:
 
     studs: tuple[int, int] = (3, 2)
     bricks: int = 5
-
-    def __post_init__(self) -> None:
-        for what, value, low, high in (
-            ("studs along x", self.studs[0], 2, MOST_STUDS),
-            ("studs along y", self.studs[1], 2, MOST_STUDS),
-            ("bricks", self.bricks, 1, MOST_BRICKS),
-        ):
-            if not low <= value <= high:
-                raise LimitError.instead(f"{value} {what}", value, f"{low} to {high}")
 
     @cached_property
     def measures(self) -> dict[str, float]:
@@ -178,55 +137,6 @@ class Brickwork:
         """Height of a brick's lower edge in the object's frame [mm]."""
         return -self.size_mm[2] / 2.0 + brick * self.measures["brick_height_mm"]
 
-    def tubes_at(self) -> FloatArray:
-        """(t, 2) axes of the tubes inside [mm]."""
-        pitch = self.measures["stud_pitch_mm"]
-        x, y = ((np.arange(n - 1) - (n - 2) / 2.0) * pitch for n in self.studs)
-        return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-
-    def seats(self, radius_mm: float) -> Seats:
-        """Every seat for beads of this radius.
-
-        Raises:
-            LimitError: no bead of that radius fits.
-        """
-        v = self.measures
-        half = np.asarray(self.size_mm[:2]) / 2.0 - v["wall_mm"] - radius_mm
-        step = v["stud_pitch_mm"] / 2.0
-        roof = v["brick_height_mm"] - v["roof_mm"] - radius_mm
-        levels = (v["stud_height_mm"] + radius_mm, v["brick_height_mm"] / 2.0, roof)
-        along: list[FloatArray] = []
-        for n, h in zip(self.studs, half, strict=True):
-            pitched = np.arange(1 - n, n) * step  # those inside the walls, and the walls
-            along.append(np.append(pitched[np.abs(pitched) <= h + 1e-9], [-h, h]))
-        rows: list[tuple[float, float, float, int]] = []
-        for x in along[0]:
-            for y in along[1]:
-                at_wall = math.isclose(abs(x), half[0]) or math.isclose(abs(y), half[1])
-                near = np.linalg.norm(self.tubes_at() - [x, y], axis=1)
-                if (near < v["tube_outer_diameter_mm"] / 2.0 + radius_mm - 1e-9).any():
-                    continue
-                rows += [
-                    (float(x), float(y), z, level)
-                    for level, z in enumerate(levels)
-                    if at_wall or level == len(levels) - 1
-                ]
-        if not rows or roof < levels[0]:
-            raise LimitError(
-                f"a bead of radius {radius_mm:g} mm does not fit into the cavity of a brick",
-                {"asked": radius_mm, "allowed": (roof + radius_mm - v["stud_height_mm"]) / 2.0},
-            )
-        local = np.array(rows)
-        count = len(local)
-        places = np.concatenate(
-            [local[:, :3] + [0.0, 0.0, self.floor(b)] for b in range(self.bricks)]
-        )
-        return Seats(
-            places,
-            np.repeat(np.arange(self.bricks), count),
-            np.tile(local[:, 3].astype(np.int64), self.bricks),
-        )
-
     def scene(
         self, beads: FloatArray, radius_mm: float, metal: Material, turn_deg: float = 0.0
     ) -> analytic.Scene:
@@ -245,55 +155,3 @@ class Brickwork:
             for x, y, z in beads.tolist()
         ]
         return analytic.Scene(tuple(solids))
-
-    def phantom(
-        self, name: str, beads: npt.ArrayLike, radius_mm: float, bead_material: str = "steel"
-    ) -> Phantom:
-        """The stack with beads in its cavities.
-
-        Args:
-            name: of the phantom.
-            beads: (k, 3) centres that touch no plastic's inside: seats [mm, object frame].
-            radius_mm: of every bead.
-            bead_material: of every bead.
-
-        Raises:
-            PhantomError: a bead lies in plastic or outside.
-        """
-        centers = np.asarray(beads, dtype=np.float64).reshape(-1, 3)
-        seats = self.seats(radius_mm)
-        for k, center in enumerate(centers):
-            if np.linalg.norm(seats.places - center, axis=1).min() > 1e-6:
-                raise PhantomError(
-                    f"bead {k} at {center.tolist()} mm is not on a seat of the stack",
-                    {"bead": k, "asked": center.tolist()},
-                )
-        assumed = lego_data()["assumed"]
-        plastic, metal = material(assumed["material"]), material(bead_material)
-        return Phantom(
-            name,
-            f"{self.bricks} hollow {self.studs[0]} x {self.studs[1]} LEGO bricks of "
-            f"{plastic.name} with {len(centers)} {metal.name} beads of {2 * radius_mm:g} mm "
-            "diameter where they determine most",
-            self.scene(centers, radius_mm, metal),
-            self.size_mm,
-            centers,
-            np.full(len(centers), radius_mm),
-            tuple(f"{k} = {v}" for k, v in assumed.items() if not k.startswith(("bead_h", "spir"))),
-        )
-
-
-def grid_seats(size_mm: Sequence[float], radius_mm: float, step_mm: float) -> FloatArray:
-    """(m, 3) a grid of bead centres inside a cuboid about the origin, its faces included [mm].
-
-    Raises:
-        LimitError: the cuboid is smaller than a bead.
-    """
-    half = np.asarray(size_mm, dtype=np.float64) / 2.0 - radius_mm
-    if not (half >= 0).all():
-        raise LimitError(
-            f"a bead of radius {radius_mm:g} mm does not fit into {list(size_mm)} mm",
-            {"asked": radius_mm, "allowed": float(min(size_mm)) / 2.0},
-        )
-    axes = [np.linspace(-h, h, max(2, round(2.0 * h / step_mm) + 1)) for h in half]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

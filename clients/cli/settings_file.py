@@ -53,14 +53,6 @@ class CalibrateSettings(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportSettings(Settings):
-    """`flexdt export`."""
-
-    command = "export"
-    tolerance: float = option(1e-9, "Let a view be so far from what flexDATA states.", min=0.0)
-
-
-@dataclass(frozen=True, kw_only=True)
 class MachineNewSettings(Settings):
     """`flexdt machine new`."""
 
@@ -119,7 +111,7 @@ TABLES: Final[Mapping[str, type[Settings]]] = {
     kind.command.replace(" ", "_"): kind
     for kind in (
         UpSettings, TwinSettings, ProjectorSettings, ViewerSettings, GatewaySettings,
-        CalibrateSettings, ExportSettings, MachineNewSettings, PhantomMakeSettings,
+        CalibrateSettings, MachineNewSettings, PhantomMakeSettings,
         ReconstructSettings, ScriptNewSettings,
     )
 }  # fmt: skip

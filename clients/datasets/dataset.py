@@ -55,6 +55,8 @@ from flexdt.twin.machine.description import (
 AGREE_MM: Final = 1e-6
 """How far the cone_vec of a file may lie from what its motor positions give [mm]."""
 NO_DARK: Final = "no dark image"
+MAX_SETTINGS_BYTES: Final = 16 << 20
+"""Of a settings text; a larger file is none."""
 
 
 def load_dataset(
@@ -359,7 +361,7 @@ def _settings(content: Folder, warnings: list[str]) -> ScanSettings | None:
             continue
         path = content.path / file
         try:
-            settings = parse(read_text(path), str(path))
+            settings = parse(read_text(path, MAX_SETTINGS_BYTES), str(path))
         except DatasetError as error:
             errors.append(error)
         else:
@@ -381,7 +383,7 @@ def _require_one_circle(content: Folder) -> None:
         return
     path = content.path / content.xre_settings
     try:
-        one = parse_xre(read_text(path), str(path)).one_circle
+        one = parse_xre(read_text(path, MAX_SETTINGS_BYTES), str(path)).one_circle
     except DatasetError:
         return
     if not one:

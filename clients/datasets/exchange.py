@@ -18,11 +18,10 @@ from typing import Any, Final
 import numpy as np
 
 from flexdt.clients.datasets.data_set import DataSet
+from flexdt.clients.extras import extension
 from flexdt.clients.whole_files import write_whole
-from flexdt.twin.exchange.ctsimu import Scenario, scenario_document
-from flexdt.twin.exchange.ctsimu_read import read_ctsimu
 from flexdt.twin.exchange.flexdata import flexdata_text, read_flexdata
-from flexdt.twin.exchange.geometry import SAME_MM, ExchangeError, ScanGeometry
+from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.exchange.number_tables import (
     csv_text,
     geometry_text,
@@ -35,10 +34,11 @@ from flexdt.twin.exchange.number_tables import (
     vectors_text,
 )
 from flexdt.twin.exchange.rtk_xml import read_rtk, rtk_text
-from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.geometry.offsets import Offsets
 
 Content = str | bytes
-MAX_BYTES: Final = 1 << 30
+MAX_BYTES: Final = 256 << 20
+"""Of a text; no geometry is longer."""
 
 
 @dataclass(frozen=True)
@@ -93,48 +93,12 @@ def geometry_of(dataset: DataSet, parameters: Offsets | None = None) -> ScanGeom
     return ScanGeometry(cone_vec, dataset.shape, name=dataset.name, files=files)
 
 
-def scenario_of(
-    dataset: DataSet, parameters: Offsets | None = None, real: Offsets | None = None
-) -> dict[str, Any]:
-    """A data set as a CTSimU scenario.
-
-    Args:
-        dataset: from `load_dataset`.
-        parameters: correction, known to reconstruction; None is the one in force, if any.
-        real: what is so, unknown to reconstruction where it differs; None: as `parameters`.
-    """
-    if parameters is None:
-        parameters = NOMINAL if dataset.correction is None else dataset.correction.parameters
-    doc, machine = dataset.document, dataset.machine
-    geometry_of(dataset, NOMINAL)  # raises for frames of several shapes
-    scan = Scenario(
-        dataset.poses,
-        dataset.shape,
-        parameters,
-        real,
-        name=dataset.name,
-        description="written by flexdt; deviations are named after its parameters",
-        date=None if doc is None else f"{doc.started:%Y-%m-%d}",
-        kV=None if doc is None else doc.tube.kV,
-        power_W=None if doc is None else doc.tube.power_W,
-        exposure_s=None if doc is None else doc.detector.exposure_ms / 1000.0,
-        averages=1 if doc is None else doc.detector.averages,
-        bits=None if machine is None else machine.detector.bits,
-        detector_model=None if machine is None else machine.detector.model,
-        machine=None if machine is None else machine.name,
-        darks=len(dataset.darks),
-        flats=len(dataset.flats),
-        smooth=False if doc is None else doc.smooth,
-    )
-    return scenario_document(scan)
-
-
-WRITERS: Final[Mapping[str, Callable[[ScanGeometry, float], str]]] = {
-    "rtk": lambda geometry, _: rtk_text(geometry),
+WRITERS: Final[Mapping[str, Callable[[ScanGeometry], str]]] = {
+    "rtk": rtk_text,
     "flexdata": flexdata_text,
-    "csv": lambda geometry, _: csv_text(geometry),
+    "csv": csv_text,
 }
-"""Formats that are a text made of the geometry (and what it may differ) alone."""
+"""Formats that are a text made of the geometry alone."""
 FORMATS: Final = ("ctsimu", "rtk", "astra", "tomosipo", "flexdata", "csv")
 ENDINGS: Final = {
     "ctsimu": (".json",),
@@ -155,7 +119,6 @@ def export_dataset(
     parameters: Offsets | None = None,
     real: Offsets | None = None,
     rows_up: bool = False,
-    tolerance_mm: float = SAME_MM,
 ) -> ScanGeometry:
     """Write a data set's geometry in a peer's format.
 
@@ -166,7 +129,6 @@ def export_dataset(
         parameters: correction; None is the one in force during the scan, if any.
         real: CTSimU only: what is so and a reconstruction does not know.
         rows_up: the images are turned upside down before use: v upwards.
-        tolerance_mm: flexDATA only: how far a view may lie beside what the format states.
 
     Returns:
         The geometry that was written.
@@ -187,18 +149,17 @@ def export_dataset(
         (whole if parameters is None else whole.with_correction(parameters)).to_nxtomo(out)
         return geometry
     if format == "ctsimu":
-        content: Content = json.dumps(scenario_of(dataset, parameters, real), indent=1) + "\n"
+        scenario = extension("ctsimu.export", "the format ctsimu")(dataset, parameters, real)
+        content: Content = json.dumps(scenario, indent=1) + "\n"
     else:
-        content = _content(geometry.rows_up() if rows_up else geometry, format, out, tolerance_mm)
+        content = _content(geometry.rows_up() if rows_up else geometry, format, out)
     write_whole(out, content)
     return geometry
 
 
-def _content(
-    geometry: ScanGeometry, format: str, out: Path, tolerance_mm: float = SAME_MM
-) -> Content:
+def _content(geometry: ScanGeometry, format: str, out: Path) -> Content:
     if format in WRITERS:
-        return WRITERS[format](geometry, tolerance_mm)
+        return WRITERS[format](geometry)
     buffer = io.BytesIO()
     if format == "tomosipo":
         np.savez(buffer, **tomosipo_arrays(geometry))  # type: ignore[arg-type]
@@ -256,7 +217,8 @@ def _read(path: Path, format: str, given: Given) -> ScanGeometry:
     name = str(path)
     match format:
         case "ctsimu":
-            return read_ctsimu(text_of(path), name, lambda other: text_of(path.parent / other))
+            read: Callable[..., ScanGeometry] = extension("ctsimu.import", "the format ctsimu")
+            return read(text_of(path), name, lambda other: text_of(path.parent / other))
         case "csv":
             return read_csv(text_of(path), name)
         case "flexdata":

@@ -31,7 +31,6 @@ from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.projection import TriangleMesh
 from flexdt.twin.projection.analytic_solids import Scene, Solid
 
-MAX_TEXT_BYTES: Final = 256 << 20
 CHECKED_ALONG: Final = 96
 """Voxels along the longest side in which `require_replaced` looks."""
 ABSENT: Final = 0.25
@@ -65,8 +64,6 @@ def load_phantom_file(text: str, file: str = "<phantom>", folder: Path | None = 
     Raises:
         PhantomError: names file, key path, value and what is allowed.
     """
-    if len(text) > MAX_TEXT_BYTES:
-        raise PhantomError(f"{file}: {len(text)} characters; allowed: {MAX_TEXT_BYTES}")
     try:
         document = json.loads(text) if text.lstrip()[:1] == "{" else tomllib.loads(text)
     except (json.JSONDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:

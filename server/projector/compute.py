@@ -275,10 +275,8 @@ def projection_steps(
 
 
 def views_a_block(shape: tuple[int, int]) -> int:
-    """How many views a turn computes; on devices, so many that each has its share."""
-    view = 4 * shape[0] * shape[1]
-    devices = min(gpu.views_for_all(), gpu.CHUNK_BYTES // view)
-    return max(1, devices, min(BLOCK_VIEWS, BLOCK_BYTES // view))
+    """How many views a turn computes."""
+    return max(1, min(BLOCK_VIEWS, BLOCK_BYTES // (4 * shape[0] * shape[1])))
 
 
 def begin(threads: int) -> None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from flexdt.server.scans.stage import Stage
 from flexdt.server.scans.twin_clock import TwinClock
-from flexdt.twin.collision.obstacle_path import direct_contact, free_moves
+from flexdt.twin.collision.obstacle_path import free_moves
 from flexdt.twin.errors import CollisionError, SafetyError, TwinError
 from flexdt.twin.motion import profiles as motion
 from flexdt.twin.scanner.safety import require_ready
@@ -79,13 +79,11 @@ class ObstacleMoves:
         scene = await asyncio.to_thread(self.stage.scene, scanner.sample, scanner.parameters)
         if scene is None:
             return self._way(start, [goal])
-        paces = scanner.paces
-        found = await asyncio.to_thread(free_moves, scene, scanner.machine, start, goal, paces)
+        found, contact = await asyncio.to_thread(
+            free_moves, scene, scanner.machine, start, goal, scanner.paces
+        )
         if found is not None and len(found) <= 1:
             return self._way(start, found)
-        contact = await asyncio.to_thread(
-            direct_contact, scene, scanner.machine, start, goal, paces
-        )
         pair = ("?", "?") if contact is None else contact.pair
         if found is None:
             raise CollisionError(

@@ -158,8 +158,6 @@ def test_an_option_that_went_to_the_file_names_its_key(
                                     ("inf", 3, "height_mm is inf; allowed"),
                                     ('"high"', 1, "[script_new] Invalid value for '--height'"))
         ),
-        ("[export]\ntolerance = -1.0", "export . --format csv --out x", 1,
-         "[export] Invalid value for '--tolerance'"),
         ('[reconstruct]\nwindow = "square"', "reconstruct . --out x.tif", 1,
          "[reconstruct] Invalid value for '--window': "),
         ('[phantom_make]\nbead = "cheese"', "phantom make p.json --like normal", 1, "cheese"),

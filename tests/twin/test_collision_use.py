@@ -15,7 +15,7 @@ from flexdt.phantoms import load_phantom
 from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.collision.convex_solids import box
 from flexdt.twin.collision.guard import SceneGuard
-from flexdt.twin.collision.obstacle_path import _Planner, direct_contact, free_moves
+from flexdt.twin.collision.obstacle_path import _Planner, free_moves
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.collision.sample_hull import Mesh, _clip, convex_pieces
 from flexdt.twin.collision.scene_search import clearance, touching
@@ -421,8 +421,7 @@ def walk(scene: object, start: dict[str, float], moves: list[dict[str, float]],
 )  # fmt: skip
 def test_a_free_way_is_found_and_is_free(sample, start, targets, paces) -> None:
     scene = build_scene(M, P, [sample])
-    blocked = direct_contact(scene, M, start, targets, paces)
-    moves = free_moves(scene, M, start, targets, paces)
+    moves, blocked = free_moves(scene, M, start, targets, paces)
     assert moves is not None
     assert (len(moves) == 1) == (blocked is None)
     end = walk(scene, start, moves, paces)
@@ -436,10 +435,12 @@ def test_a_free_way_is_found_and_is_free(sample, start, targets, paces) -> None:
 def test_no_way_where_there_is_none() -> None:
     scene = build_scene(M, P, [LEGO])
     # The detector cannot jump over the sample, nor stand inside it.
-    assert free_moves(scene, M, {"mag_obj": 600.0, "mag_det": 700.0},
-                     {"mag_obj": 900.0, "mag_det": 300.0}) is None  # fmt: skip
-    assert free_moves(scene, M, {}, {"mag_det": 570.0}) is None
-    assert free_moves(scene, M, {}, {"mag_obj": 600.0}) == []
+    moves, blocked = free_moves(scene, M, {"mag_obj": 600.0, "mag_det": 700.0},
+                                {"mag_obj": 900.0, "mag_det": 300.0})  # fmt: skip
+    assert moves is None
+    assert blocked is not None
+    assert free_moves(scene, M, {}, {"mag_det": 570.0})[0] is None
+    assert free_moves(scene, M, {}, {"mag_obj": 600.0}) == ([], None)
 
 
 def test_an_excursion_is_shortened_by_halves_where_nothing_is_in_the_way() -> None:

@@ -37,7 +37,7 @@ def free_moves(
     start: Mapping[str, float],
     targets: Mapping[str, float],
     paces: Mapping[str, Pace] | None = None,
-) -> list[dict[str, float]] | None:
+) -> tuple[list[dict[str, float]] | None, Contact | None]:
     """Moves that lead from `start` to `targets` without a contact, each from rest to rest.
 
     Args:
@@ -49,33 +49,24 @@ def free_moves(
 
     Returns:
         Moves one after the other, each motor -> position, the motors of one move together; one
-        move if the direct way is free. None if no free way was found.
+        move if the direct way is free. None if no free way was found. And what stands in the way
+        when all motors go at once, or None.
     """
     search = _Planner(scene, machine, dict(start), dict(paces or {}))
     goal = {axis: value for axis, value in targets.items() if value != search.at(axis)}
     if not goal:
-        return []
+        return [], None
+    contact = search.contact({}, goal)
     if touching(scene, {**start, **goal}):
-        return None
-    if search.contact({}, goal) is None:
-        return [goal]
+        return None, contact
+    if contact is None:
+        return [goal], None
     way = search.shortest({axis: [search.at(axis), goal[axis]] for axis in goal}, goal)
     if way is None:
         way = search.shortest(search.stations(goal), goal)
         if way is not None:
             way = search.shortened(way, goal)
-    return None if way is None else search.joined(way)
-
-
-def direct_contact(
-    scene: CollisionScene,
-    machine: Machine,
-    start: Mapping[str, float],
-    targets: Mapping[str, float],
-    paces: Mapping[str, Pace] | None = None,
-) -> Contact | None:
-    """What stands in the way when all motors go at once, or None."""
-    return _Planner(scene, machine, dict(start), dict(paces or {})).contact({}, targets)
+    return None if way is None else search.joined(way), contact
 
 
 @dataclass(eq=False)

@@ -65,35 +65,6 @@ class Path:
         times = np.concatenate([[time], self.times[first + 1 :]])
         return Path(self.axes, times, q, v, self.a[first:])
 
-    def where_turned_round(self, turns: FloatArray) -> FloatArray:
-        """When something that several motors turn together changes its sense within a segment.
-
-        Args:
-            turns: (axes,) its turn per unit of each motor.
-        """
-        rate, growth, length = self.v @ turns, self.a @ turns, np.diff(self.times)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            after = np.where(rate * growth < 0.0, -rate / growth, 0.0)
-        return (self.times[:-1] + after)[(after > ROUNDING) & (after < length - ROUNDING)]
-
-    def cut(self, times: FloatArray) -> Path:
-        """The same path with segments that also begin at `times`, which lie within it."""
-        new = np.setdiff1d(times, self.times)
-        i = np.searchsorted(self.times, new, side="right") - 1
-        speeds = self.v[i] + (new - self.times[i])[:, None] * self.a[i]
-        order = np.argsort(np.concatenate([self.times[:-1], new]))
-
-        def merged(old: FloatArray, added: FloatArray) -> FloatArray:
-            return np.concatenate([old, added])[order]
-
-        return Path(
-            self.axes,
-            np.append(merged(self.times[:-1], new), self.times[-1]),
-            np.concatenate([merged(self.q[:-1], self.vectors(new)), self.q[-1:]]),
-            merged(self.v, speeds),
-            merged(self.a, self.a[i]),
-        )
-
     @property
     def moving(self) -> npt.NDArray[np.bool_]:
         """(axes,) whether each motor ever moves."""

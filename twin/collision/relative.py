@@ -99,6 +99,7 @@ class _Turn:
     """The turning of one body over the segments: angle, rate, acceleration [rad].
 
     `side` is the sign of the direction to the other body along the normal: -1 for a, +1 for b.
+    `nearing` is how far it turns in either sense.
     """
 
     body: Body
@@ -106,17 +107,27 @@ class _Turn:
     angle: FloatArray
     rate: FloatArray
     acceleration: FloatArray
-    signs: FloatArray
-    """Sense of the turning in each segment, which is one: a path is cut where a motor turns round,
-    and where what several turntables carry does. There rounding may leave a velocity that still
-    points the old way; the acceleration tells."""
+    nearing: _Bound
+    sense: float
+    """Of all turns; 0 if they differ."""
 
     @classmethod
     def of(cls, body: Body, side: float, path: Path, kept: Kept) -> _Turn:
         angle, rate, growth = path.q[:-1] @ body.turns, path.v @ body.turns, path.a @ body.turns
+        after = rate + growth * np.diff(path.times)
+        # A path is cut where a motor turns round. There rounding may leave a velocity that still
+        # points the old way; the acceleration tells.
         rounding = np.abs(growth) * (ROUNDING + coarseness(path.times[:-1]))
         signs = np.sign(np.where(np.abs(rate) > rounding, rate, growth))
-        return cls(body, side, angle[kept], rate[kept], growth[kept], signs[kept])
+        # What several turntables carry may turn round within a segment: it turns no faster there.
+        both = (rate * after < 0.0) & (np.minimum(np.abs(rate), np.abs(after)) > rounding)
+        fastest = np.maximum(np.abs(rate), np.abs(after))
+        nearing = _Bound(
+            np.where(both, fastest, signs * rate)[kept], np.where(both, 0.0, signs * growth)[kept]
+        )
+        senses = set(signs[kept].tolist()) - {0.0}
+        sense = senses.pop() if len(senses) == 1 and not both[kept].any() else 0.0
+        return cls(body, side, angle[kept], rate[kept], growth[kept], nearing, sense)
 
     def orientation(self, at: Moment) -> FloatArray:
         i, dt = at.segment, at.dt
@@ -129,20 +140,9 @@ class _Turn:
         return bool(self.rate.any() or self.acceleration.any())
 
     @cached_property
-    def nearing(self) -> _Bound:
-        """How far it turns, either way; it turns round in no segment."""
-        return _Bound(self.signs * self.rate, self.signs * self.acceleration)
-
-    @cached_property
     def left(self) -> _Bound:
         """A turn that is used up."""
         return _Bound(-self.nearing.rate, -self.nearing.growth)
-
-    @cached_property
-    def sense(self) -> float:
-        """Sense of all turns, 0 if they differ."""
-        low, high = float(self.signs.min()), float(self.signs.max())
-        return high if low >= 0.0 else low if high <= 0.0 else 0.0
 
     def lever(
         self, normal: FloatArray, orientation: FloatArray, allowance: float
@@ -169,10 +169,6 @@ class RelativeMotion:
     """
 
     def __init__(self, a: Body, b: Body, path: Path) -> None:
-        for body in (a, b):
-            if body.spins and np.count_nonzero(body.turns) > 1:
-                # Turntables on each other: what they carry turns round when none of them does.
-                path = path.cut(path.where_turned_round(body.turns))
         slides = a.slides - b.slides
         velocity, acceleration = path.v @ slides, path.a @ slides
         changes = [velocity, acceleration]

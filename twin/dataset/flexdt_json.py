@@ -34,7 +34,6 @@ from flexdt.twin.scanner.state import NamedCorrection
 from flexdt.twin.values import message_of
 
 SCHEMA: Final = 1
-MAX_CHARS: Final = 1 << 30
 _M = TypeVar("_M", bound=BaseModel)
 
 
@@ -252,8 +251,6 @@ def parse_document(text: str, file: str = DOCUMENT) -> DatasetDocument:
     Raises:
         DatasetFormatError: names file, key path, value and what is allowed.
     """
-    if len(text) > MAX_CHARS:
-        raise DatasetFormatError(f"{file}: {len(text)} characters; allowed: {MAX_CHARS}")
     try:
         content = json.loads(text)
     except (json.JSONDecodeError, RecursionError) as error:

@@ -23,7 +23,6 @@ from flexdt.twin.machine.camera import Roi
 
 EOL: Final = "\r\n"
 CANCELLED: Final = "SCRIPT CANCELLED!"
-MAX_CHARS: Final = 16 << 20
 
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f\x85\u2028\u2029]+")
 
@@ -39,17 +38,6 @@ class _Form:
 
     write: Callable[[Any], str]
     read: Callable[[str], object]
-
-
-def require_size(text: str, file: str) -> None:
-    """Check that a text is no longer than a settings file can be.
-
-    Raises:
-        DatasetFormatError: it has too many characters.
-    """
-    if len(text) > MAX_CHARS:
-        said = f"{file}: {len(text)} characters is no settings file"
-        raise DatasetFormatError.instead(said, len(text), MAX_CHARS, path=file)
 
 
 def parse_number(text: str) -> float:
@@ -176,7 +164,6 @@ def parse_scan_settings(text: str, file: str = SCAN_SETTINGS) -> ScanSettings:
         DatasetFormatError: a figure is not a number, or it is no settings file at all; names
             file, line and value.
     """
-    require_size(text, file)
     values: dict[str, Any] = {}
     motors: dict[str, MotorLine] = {}
     lines = [line.strip() for line in text.splitlines()]

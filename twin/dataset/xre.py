@@ -20,7 +20,7 @@ import numpy as np
 from flexdt.twin.dataset.dataset_errors import XRE_SETTINGS, DatasetFormatError
 from flexdt.twin.dataset.record import ScanRecord
 from flexdt.twin.dataset.scan_settings import ENTRIES, MotorLine, ScanSettings, settings_of
-from flexdt.twin.dataset.scan_settings_text import EOL, clean, parse_number, parse_roi, require_size
+from flexdt.twin.dataset.scan_settings_text import EOL, clean, parse_number, parse_roi
 from flexdt.twin.geometry.conventions import BEAM, RIGHT, UP, FloatArray, stage_rotation
 from flexdt.twin.geometry.poses import Poses
 
@@ -378,7 +378,6 @@ def parse_xre(text: str, file: str = XRE_SETTINGS) -> XreSettings:
     Raises:
         DatasetFormatError: there is no `[section]` in it.
     """
-    require_size(text, file)
     sections: dict[str, dict[str, str]] = {}
     current: dict[str, str] | None = None
     for raw in text.splitlines():

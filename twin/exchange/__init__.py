@@ -1,11 +1,18 @@
 """Geometry in the formats of other programs, and back: text and numbers in, text and numbers out.
 
-Every reader returns a `ScanGeometry` in the project's frame, every writer takes one (CTSimU's takes
-the poses and offsets behind it). A geometry that a format cannot represent is an error.
-`flexdt.clients.datasets.exchange` reads and writes the files.
+Every reader returns a `ScanGeometry` in the project's frame, every writer takes one. A geometry
+that a format cannot represent is an error. `flexdt.clients.datasets.exchange` reads and writes the
+files.
 """
 
-from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
-from flexdt.twin.exchange.number_tables import read_json
+from flexdt.twin.exchange.geometry import SAME_MM, ExchangeError, ScanGeometry, require_panel
+from flexdt.twin.exchange.number_tables import cone_vec_of, read_json
 
-__all__ = ["ExchangeError", "ScanGeometry", "read_json"]
+__all__ = [
+    "SAME_MM",
+    "ExchangeError",
+    "ScanGeometry",
+    "cone_vec_of",
+    "read_json",
+    "require_panel",
+]

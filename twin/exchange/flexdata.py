@@ -19,30 +19,31 @@ import numpy as np
 
 from flexdt.twin.exchange import geometry as g
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
-from flexdt.twin.exchange.number_tables import check_size, cone_vec_of
+from flexdt.twin.exchange.number_tables import cone_vec_of
 from flexdt.twin.geometry.conventions import FloatArray, rotation_x, rotation_y, rotation_z
 
 VERSION: Final = "0.1.0"
+ROUNDED_MM: Final = 1e-4
+"""How far any number of a view may lie beside what the format states: scripts of step scans write
+angles with six decimals, which is some 1e-5 mm."""
 UNSUPPORTED: Final = ("axs_roll", "axs_pitch", "vol_rot")
 """Numbers of the format that must be zero to be read: see the documentation."""
 _LISTS: Final = {"vol_tra": 3, "vol_rot": 3, "det_sample": 2, "ang_range": 2, "vol_sample": 3}
 
 
-def flexdata_text(geometry: ScanGeometry, tolerance_mm: float = g.SAME_MM) -> str:
+def flexdata_text(geometry: ScanGeometry) -> str:
     """The TOML, for images turned upside down.
 
     Args:
         geometry: of the images as they are.
-        tolerance_mm: how far any number of a view may lie beside what the format states; scripts
-            of step scans write angles with six decimals, which is some 1e-5 mm.
 
     Raises:
         ExchangeError: a geometry that the format cannot state.
     """
     up = geometry.rows_up()
     pitch_u, pitch_v = g.require_panel(up.cone_vec, "flexDATA")
-    circle = g.circle_of(up.cone_vec, "flexDATA", tolerance_mm)
-    first, last = _equal_steps(circle, tolerance_mm)
+    circle = g.circle_of(up.cone_vec, "flexDATA", ROUNDED_MM)
+    first, last = _equal_steps(circle)
     source, detector = circle.source, circle.detector
     if source[1] >= 0.0 or detector[1] - source[1] <= 0.0:
         raise ExchangeError("flexDATA: the source must stand before axis and detector")
@@ -81,7 +82,7 @@ def flexdata_text(geometry: ScanGeometry, tolerance_mm: float = g.SAME_MM) -> st
     return "".join(f"{name} = {json.dumps(value)}\n" for name, value in values.items())
 
 
-def _equal_steps(circle: g.CircularScan, tolerance_mm: float) -> tuple[float, float]:
+def _equal_steps(circle: g.CircularScan) -> tuple[float, float]:
     """First and last angle [rad].
 
     Raises:
@@ -92,12 +93,12 @@ def _equal_steps(circle: g.CircularScan, tolerance_mm: float) -> tuple[float, fl
     if len(angle) > 1:
         reach = float(np.linalg.norm(circle.source) + np.linalg.norm(circle.detector))
         miss = np.abs(np.linspace(first, last, len(angle)) - angle)
-        if miss.max() * reach > tolerance_mm:
+        if miss.max() * reach > ROUNDED_MM:
             view = int(np.argmax(miss))
             raise ExchangeError(
                 f"flexDATA's geometry.toml has no list of angles, only first and last; view {view} "
                 f"lies {math.degrees(miss[view]):.3g} deg, up to {miss[view] * reach:.3g} mm, "
-                f"beside equal steps (allowed: {tolerance_mm:g} mm)",
+                f"beside equal steps (allowed: {ROUNDED_MM:g} mm)",
                 {"row": view, "asked": math.degrees(miss[view])},
             )
     return first, last
@@ -128,7 +129,6 @@ def read_flexdata(
     Raises:
         ExchangeError: not such a file, or something of it that is not understood.
     """
-    check_size(text, file)
     records = _records(text, file)
     get = _Getter(records, file)
     for name in UNSUPPORTED:

@@ -21,7 +21,6 @@ from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.poses import Poses
 
-MAX_CHARS: Final = 256 << 20
 VECTOR_NAMES: Final = tuple(f"{part}_{axis}" for part in ("source", "detector", "u", "v")
                             for axis in "xyz")  # fmt: skip
 TOMOSIPO_NAMES: Final = ("shape", "src_pos", "det_pos", "det_v", "det_u")
@@ -38,7 +37,6 @@ def read_vectors_text(text: str, file: str = "<text>") -> ConeVec:
     Raises:
         ExchangeError: names the line.
     """
-    check_size(text, file)
     rows = []
     for number, line in enumerate(text.splitlines(), 1):
         content = line.split("#", 1)[0].strip()
@@ -84,7 +82,6 @@ def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
     Raises:
         ExchangeError: names the line and what is missing.
     """
-    check_size(text, file)
     shape = None
     lines: list[tuple[int, str]] = []
     for number, line in enumerate(text.splitlines(), 1):
@@ -201,16 +198,6 @@ def _numbers(words: Sequence[str], file: str, line: int) -> list[float]:
     return out
 
 
-def check_size(text: str, file: str) -> None:
-    """Check that a text is no longer than a geometry can be.
-
-    Raises:
-        ExchangeError: it has too many characters.
-    """
-    if len(text) > MAX_CHARS:
-        raise ExchangeError(f"{file}: {len(text)} characters; allowed: {MAX_CHARS}")
-
-
 def _real(array: npt.NDArray[np.generic]) -> bool:
     return np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)
 
@@ -284,7 +271,6 @@ def read_json(text: str, file: str, kind: type[dict[str, Any]] = dict) -> dict[s
     Raises:
         ExchangeError: not one.
     """
-    check_size(text, file)
     try:
         document = json.loads(text, object_pairs_hook=kind)
     except (ValueError, RecursionError) as error:

@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry, require_panel
-from flexdt.twin.exchange.number_tables import check_size, cone_vec_of
+from flexdt.twin.exchange.number_tables import cone_vec_of
 from flexdt.twin.geometry.conventions import FloatArray, rotation_x, rotation_y, rotation_z
 
 TO_RTK: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -108,7 +108,6 @@ def read_rtk(
     Raises:
         ExchangeError: no such XML, another version, a curved detector.
     """
-    check_size(text, file)
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:

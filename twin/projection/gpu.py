@@ -14,12 +14,10 @@ import ctypes
 import logging
 import math
 import sys
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -37,10 +35,7 @@ CHUNK_BYTES = 256 * 2**20
 SPARE_BYTES = 256 * 2**20
 """What must stay free on a device: for the driver, and for whoever else uses it."""
 VIEWS_A_DEVICE = 8
-"""So many views are worth another device."""
-VOXELS_A_PIXEL = 32
-"""So many voxels for each pixel of a view are worth another device in the adjoint, to which all
-images go again: on an H200 a view of 512^3 takes 1.0 ms, and the way there 17 GB/s."""
+"""So many views of FDK are worth another device."""
 VIEWS_A_THREAD = 7 / 16
 """A volume of the host is worth its way to the device and back from so many views on, for each
 thread of the processor (measured: about 7 views beside 16 threads)."""
@@ -117,7 +112,7 @@ def _project_one_ray() -> None:
     box = Box(np.array([1, 3], np.float32), None, 0, 1, 2, 2, 1, 1, 0.5, 0.5, 0.5)
     views = np.array([[-1.0, 0.5, 0.5, 4.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0]])
     image = np.zeros((1, 1, 1), np.float32)
-    project(box, [upload(box.flat)], views, image)
+    project(box, upload(box.flat), views, image)
     if not np.isclose(image[0, 0, 0], 2.0, rtol=1e-5):
         raise ArithmeticError(f"found {image[0, 0, 0]} instead of 2.0")
 
@@ -149,31 +144,25 @@ def attempt(work: Callable[[], object]) -> bool:
     return True
 
 
-def upload(flat: Float32Array, device: int = 0) -> Any:
-    """Copy voxels to a device, where they stay as long as the result is referenced."""
+def upload(flat: Float32Array) -> Any:
+    """Copy voxels to the device, where they stay as long as the result is referenced."""
     from numba import cuda
 
-    with on(device):
-        return cuda.to_device(flat)
+    return cuda.to_device(flat)
 
 
 def devices_for(views: int) -> int:
-    """How many devices are worth it; at least 1."""
-    return max(1, min(views_for_all(), views) // VIEWS_A_DEVICE)
-
-
-def views_for_all() -> int:
-    """So many views a call that every device has its share; 0 where no device computes."""
+    """How many devices are worth it for FDK; at least 1."""
     counts = [0]
 
     def ask() -> None:
         from numba import cuda
 
-        counts[0] = VIEWS_A_DEVICE * len(cuda.gpus)
+        counts[0] = len(cuda.gpus)
 
     if availability().present:
         attempt(ask)
-    return counts[0]
+    return max(1, min(counts[0], views // VIEWS_A_DEVICE))
 
 
 def free_bytes() -> int | None:
@@ -282,29 +271,17 @@ def project_there(box: Box, voxels: Any, views: FloatArray, shape: tuple[int, ..
     return images.reshape(len(views), *shape)
 
 
-def project(box: Box, voxels: Sequence[Any], views: FloatArray, out: Float32Array) -> None:
-    """Fill out (n, rows, cols) with line integrals.
-
-    Portions are dealt to the devices in turn, and fetched as late as that leaves one for each.
+def project(box: Box, voxels: Any, views: FloatArray, out: Float32Array) -> None:
+    """Fill out (n, rows, cols) with line integrals, in portions of views.
 
     Args:
         box: the volume; its flat array is not touched.
-        voxels: the same array as `upload` returned it, on each device that takes part.
+        voxels: the same array as `upload` returned it.
         views: (n, 12) source, first pixel minus source, u, v in voxel units.
         out: C-ordered float32.
     """
-    under_way: deque[tuple[int, Any, slice]] = deque()
-    portions = _chunks(out, len(voxels))
-    for turn in range(len(portions) + len(voxels)):
-        if turn >= len(voxels) and under_way:
-            device, images, part = under_way.popleft()
-            with on(device):
-                images.copy_to_host(out[part])
-        if turn < len(portions):
-            device, part = turn % len(voxels), portions[turn]
-            with on(device):
-                images = project_there(box, voxels[device], views[part], out.shape[1:])
-            under_way.append((device, images, part))
+    for part in _chunks(out):
+        project_there(box, voxels, views[part], out.shape[1:]).copy_to_host(out[part])
 
 
 def spread_there(
@@ -349,38 +326,10 @@ def spread(
     clean: bool = False,
     deterministic: bool = False,
 ) -> None:
-    """`spread_there` onto box.flat, of the host; clean: it holds zeros, which are not moved.
-
-    Several devices have layers of the volume each, of all views: no sums are left to be added. What
-    box.flat holds is overwritten then.
-    """
-    pixels = values.shape[1] * values.shape[2]
-    count = min(
-        devices_for(len(views)), box.nz, box.nx * box.ny * box.nz // (VOXELS_A_PIXEL * pixels)
-    )
-    if count <= 1:
-        voxels = zeros(box.flat.size) if clean else upload(box.flat)
-        spread_there(box, voxels, views, values, deterministic=deterministic)
-        voxels.copy_to_host(box.flat)
-        return
-    layers = list(pairwise(box.nz * i // count for i in range(count + 1)))
-    rooms = []
-    for device, (low, high) in enumerate(layers):
-        with on(device):
-            rooms.append(zeros(box.ny * box.nx * (high - low)))
-    for part in [slice(None)] if deterministic else _chunks(values):
-        for device, (low, high) in enumerate(layers):
-            deep = high - low
-            room = rooms[device]
-            piece = Box(room, None, 0, deep, deep * box.nx, box.nx, box.ny, deep, *box[8:])
-            lowered = views[part] - low * (np.arange(12) == 2)  # source's z
-            with on(device):
-                spread_there(piece, room, lowered, values[part], deterministic=deterministic)
-    steps = [4 * hop for hop in (box.hop_y, box.hop_x, 1)]
-    columns = np.lib.stride_tricks.as_strided(box.flat[box.base :], (box.ny, box.nx, box.nz), steps)
-    for device, (low, high) in enumerate(layers):
-        with on(device):
-            columns[:, :, low:high] = rooms[device].copy_to_host().reshape(box.ny, box.nx, -1)
+    """`spread_there` onto box.flat, of the host; clean: it holds zeros, which are not moved."""
+    voxels = zeros(box.flat.size) if clean else upload(box.flat)
+    spread_there(box, voxels, views, values, deterministic=deterministic)
+    voxels.copy_to_host(box.flat)
 
 
 def whole_factor(box: Box, values: Any) -> float:
@@ -472,8 +421,7 @@ def launcher(
     return launch
 
 
-def _chunks(images: Float32Array, devices: int = 1) -> list[slice]:
-    """Views in portions that fit a device, and at least one for each."""
+def _chunks(images: Float32Array) -> list[slice]:
+    """Views in portions that fit a device."""
     count = max(1, CHUNK_BYTES // max(1, images[:1].nbytes))
-    count = min(count, max(1, -(-len(images) // devices)))
     return [slice(i, i + count) for i in range(0, len(images), count)]

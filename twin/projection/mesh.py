@@ -2,6 +2,8 @@
 
 A mesh is a value: vertices and outward-turning triangles. One that does not close is an error,
 because its path lengths mean nothing.
+
+`project_body` chooses the projection that suits solids, voxels or a mesh.
 """
 
 from __future__ import annotations
@@ -14,8 +16,11 @@ import numpy.typing as npt
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.projection.analytic import project_scene
+from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.projection.cpu import threads
-from flexdt.twin.projection.operators import Shape2, as_cone_vec, check_out
+from flexdt.twin.projection.operators import Shape2, as_cone_vec, check_out, forward
+from flexdt.twin.projection.volume import Volume
 
 IntArray = npt.NDArray[np.int64]
 
@@ -126,9 +131,9 @@ def _check_closed(faces: IntArray, vertices: int) -> None:
     end = faces[:, [1, 2, 0]].ravel()
     there, back = start * vertices + end, end * vertices + start
     values, counts = np.unique(np.concatenate([there, back]), return_counts=True)
-    ways, forward = np.unique(there, return_counts=True)
+    ways, along = np.unique(there, return_counts=True)
     runs = np.zeros(len(values), np.int64)
-    runs[np.searchsorted(values, ways)] = forward
+    runs[np.searchsorted(values, ways)] = along
     open_edges = values[2 * runs != counts]
     if len(open_edges):
         a, b = divmod(int(open_edges[0]), vertices)
@@ -137,3 +142,32 @@ def _check_closed(faces: IntArray, vertices: int) -> None:
             "edges); merge equal vertices and fill holes first",
             {"edge": [a, b], "open_edges": len(open_edges) // 2},
         )
+
+
+Body = Scene | Volume | TriangleMesh
+"""Analytic solids, voxels, or a closed mesh."""
+
+
+def project_body(body: Body, cone_vec: ConeVec | npt.ArrayLike, shape: Shape2) -> Float32Array:
+    """Line integrals through solids or voxels, path lengths [mm] through a mesh.
+
+    Args:
+        body: what is projected.
+        cone_vec: ConeVec or (n, 12) [mm], in the body's frame.
+        shape: detector (rows, cols).
+
+    Returns:
+        float32 (n, rows, cols).
+
+    Example:
+        >>> import numpy as np
+        >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
+        >>> cube = Volume(np.full((8, 8, 8), 0.02, np.float32), 1.0)
+        >>> round(float(project_body(cube, view, (5, 5))[0, 2, 2]), 3)
+        0.16
+    """
+    if isinstance(body, Scene):
+        return project_scene(body, cone_vec, shape)
+    if isinstance(body, Volume):
+        return forward(body, cone_vec, shape)
+    return project_mesh(body, cone_vec, shape)

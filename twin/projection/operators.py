@@ -95,11 +95,11 @@ def _on_device(volume: Volume, geometry: ConeVec, shape: Shape2, out: Float32Arr
         return False
     layout = volume.layout
     views, box = voxel_rays(geometry, layout, shape), box_of(layout)
-    copies = layout.copies
-    to_move = 0 if copies.there else layout.flat.nbytes
-    before, copies.views = copies.views, copies.views + len(views)
+    copy = layout.device_copy
+    to_move = layout.flat.nbytes if copy.there is None else 0
+    before, copy.views = copy.views, copy.views + len(views)
     return gpu.usable(to_move, out, cpu.threads(), before) and gpu.attempt(
-        lambda: gpu.project(box, copies.first(gpu.devices_for(len(views))), views, out)
+        lambda: gpu.project(box, copy.uploaded(), views, out)
     )
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import operator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
@@ -58,32 +58,32 @@ class Layout:
         return min(self.counts) == 0
 
     @cached_property
-    def copies(self) -> DeviceCopies:
-        """The storage on CUDA devices."""
-        return DeviceCopies(self.flat)
+    def device_copy(self) -> DeviceCopy:
+        """The storage on the CUDA device."""
+        return DeviceCopy(self.flat)
 
 
 @dataclass(eq=False)
-class DeviceCopies:
-    """What of a storage is on CUDA devices, and how much it would have been used there.
+class DeviceCopy:
+    """A storage on the CUDA device, and how much it would have been used there.
 
     Attributes:
         flat: the storage.
-        there: on each of the first devices.
+        there: the same on the device, or None.
         views: asked for so far.
     """
 
     flat: Float32Array
-    there: list[Any] = field(default_factory=list)
+    there: Any = None
     views: int = 0
 
-    def first(self, count: int = 1) -> list[Any]:
-        """Those on the first devices, uploaded once."""
+    def uploaded(self) -> Any:
+        """The storage on the device, moved there once."""
         from flexdt.twin.projection import gpu
 
-        for device in range(len(self.there), count):
-            self.there.append(gpu.upload(self.flat, device))
-        return self.there[:count]
+        if self.there is None:
+            self.there = gpu.upload(self.flat)
+        return self.there
 
 
 def room_like(volume: Volume) -> Float32Array:
@@ -226,7 +226,7 @@ class Volume:
                 {"asked": device, "allowed": ["cpu", "cuda"]},
             )
         layout = self.layout
-        there = replace(layout, flat=gpu.demand(lambda: layout.copies.first()[0]))
+        there = replace(layout, flat=gpu.demand(layout.device_copy.uploaded))
         return DeviceVolume(there, self.shape, self.voxel_xyz, self.center_mm)
 
     def save(self, file: File) -> None:

@@ -3,9 +3,9 @@
 The text has the scanner's own form (TAB separated, seven columns, CRLF) and follows the smooth-scan
 rule: image i of n is taken at i * 360 / (n - 1) after the trigger, and the run-up holds the
 acceleration and four images. Motor targets follow from the machine's linear map and the profile's
-offsets, so source, detector and sample come out centred; motors that share a quantity are solved
-for together. Where no motor moves source or detector, the sample moves instead. The result is
-checked by planning it.
+offsets, so source, detector and sample come out centred. Where no motor moves source or detector,
+the sample moves instead. A motor that moves two of these things can set one of them only. The
+result is checked by planning it.
 """
 
 from __future__ import annotations
@@ -17,9 +17,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from typing import Final, Literal
-
-import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import (
@@ -40,7 +37,7 @@ FREE_MM: Final = 60.0
 
 MAX_FRAMES: Final = 100_000
 _ROUNDED_MM: Final = 1e-4
-"""What scripts with six decimals may miss of a quantity that several motors share."""
+"""What scripts with six decimals may miss of a quantity."""
 
 
 @dataclass(frozen=True)
@@ -162,19 +159,17 @@ class _Request(ScanRequest):
     placements: tuple[ScanPosition, ...] = ()
 
 
-_OF_STAGES: Final = {
+_QUANTITIES: Final = {
     "object_y": "the source-object distance",
     "detector_y": "the source-detector distance",
     "source_z": "the height of the beam",
     "object_x": "the sample sideways",
     "detector_x": "the detector sideways",
-}
-_QUANTITIES: Final = {
-    **_OF_STAGES,
     "detector_z": "the height of the detector",
     "source_x": "the source sideways",
     "object_z": "the height of the sample",
 }
+"""What motors set, the most important first."""
 BESIDE: Final = 0.1
 """How far beside the beam may stand what no motor moves, as part of the field of view: zero offsets
 are of that kind, a machine built otherwise is not (assumed)."""
@@ -211,49 +206,33 @@ class _Places:
 
     @cached_property
     def drivers(self) -> dict[str, str]:
-        """Quantity -> the motor that sets it; no motor sets two, those of `_OF_STAGES` come first.
+        """Quantity -> the motor that sets it: the one of its motors that moves it most.
 
-        The other motors of a quantity stay at home.
+        No motor sets two quantities. The other motors of a quantity stay at home.
         """
-        geometry = self.machine.geometry
-        quantities = [*_OF_STAGES, "detector_z", "source_x", "object_z"]
-        if self.has("source_z"):
-            quantities.remove("object_z")  # the beam goes to the sample
-        motors = list(self.machine.axes)
-        worth = np.zeros((len(quantities), len(motors)))
-        for i, quantity in enumerate(quantities):
-            for motor, factor in geometry.get(quantity, {}).items():
-                # The first weighs more than all factors, so that as many quantities as can are set.
-                first = 1e6 if quantity in _OF_STAGES else 1e3
-                worth[i, motors.index(motor)] = first + math.log2(abs(factor))
-        chosen = zip(*linear_sum_assignment(worth, maximize=True), strict=True)
-        return {quantities[i]: motors[j] for i, j in chosen if worth[i, j]}
+        out: dict[str, str] = {}
+        for quantity in _QUANTITIES:
+            factors = self.machine.geometry.get(quantity, {})
+            free = [motor for motor in factors if motor not in out.values()]
+            if quantity == "object_z" and self.has("source_z"):
+                continue  # the beam goes to the sample
+            if free:
+                out[quantity] = max(free, key=lambda motor: abs(factors[motor]))
+        return out
 
     def solved(self, wanted: Mapping[str, float]) -> dict[str, float]:
-        """Positions of `drivers` that make quantities what is `wanted` [mm].
+        """Motors of quantities -> where `drivers` bring them to what is `wanted` [mm], or home."""
+        geometry = self.machine.geometry
+        moved = (motor for quantity in wanted for motor in geometry.get(quantity, {}))
+        out = {motor: self.machine.axis(motor).home for motor in moved}
+        for quantity, asked in wanted.items():
+            if motor := self.drivers.get(quantity):
+                rest = self.value(quantity, {motor: 0.0})
+                out[motor] = round((asked - rest) / geometry[quantity][motor], 6)
+        return out
 
-        Raises:
-            LimitError: motors that depend on each other cannot do it, or no motor does.
-        """
-        moved = [quantity for quantity in wanted if quantity in self.drivers]
-        motors = [self.drivers[quantity] for quantity in moved]
-        factors = [[self.machine.geometry[q].get(m, 0.0) for m in motors] for q in moved]
-        rest = [wanted[q] - self.value(q, dict.fromkeys(motors, 0.0)) for q in moved]
-        with suppress(np.linalg.LinAlgError):
-            found = np.linalg.solve(np.array(factors).reshape(len(moved), len(moved)), rest)
-            out = {motor: round(at, 6) for motor, at in zip(motors, found.tolist(), strict=True)}
-            still = (m for q in wanted for m in self.machine.geometry.get(q, {}) if m not in out)
-            out |= {motor: self.machine.axis(motor).home for motor in still}
-            if all(abs(self.value(q, out) - wanted[q]) <= _ROUNDED_MM for q in moved):
-                return out
-        raise LimitError(
-            f"the motors of {self.machine.name} that set {', '.join(moved)} depend on each other; "
-            "they cannot be set together",
-            {"asked": dict(wanted), "axes": motors},
-        )
-
-    def coupled(self, quantity: str) -> tuple[str, ...]:
-        """The motors that move when a quantity changes alone.
+    def driver(self, quantity: str) -> str:
+        """The motor that sets a quantity.
 
         Raises:
             LimitError: no motor is left for it.
@@ -263,13 +242,7 @@ class _Places:
                 f"{self.machine.name} has no motor of its own for {_QUANTITIES[quantity]}",
                 {"missing": quantity},
             )
-        out = {self.drivers[quantity]}
-        while True:
-            more = out | {own for q, own in self.drivers.items()
-                          if out & set(self.machine.geometry[q])}  # fmt: skip
-            if more == out:
-                return tuple(motor for motor in self.drivers.values() if motor in out)
-            out = more
+        return self.drivers[quantity]
 
     def need(self, what: str, *quantities: str) -> None:
         """Check that motors move all of `quantities`.
@@ -472,7 +445,7 @@ class _Writer(_Places):
         """Move only the motors of `quantities` to their station."""
         at = ScanPosition(self.request.sod_mm) if place is None else place
         every = self.station(at.sod_mm, at.lateral_mm, shift)
-        names = [name for quantity in quantities for name in self.coupled(quantity)]
+        names = map(self.driver, quantities)
         yield from self.moves({name: every[name] for name in names})
 
     def station(
@@ -550,8 +523,7 @@ class _Writer(_Places):
         sign = -1.0 if (centre - axis.lower > axis.upper - centre) == (factor > 0.0) else 1.0
         step = sign * min(away, room)
         lateral, lift = (step, 0.0) if across else (0.0, step)
-        out = self.station(w.sod_mm, lateral, 0.0, lift)
-        return {motor: out[motor] for motor in self.coupled(quantity)}
+        return {name: self.station(w.sod_mm, lateral, 0.0, lift)[name]}
 
     def image(self, file: str, averages: int) -> Iterator[str]:
         yield _row("camera", "set number of averages", str(averages))

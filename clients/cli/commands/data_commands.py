@@ -17,7 +17,7 @@ import typer
 from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.console import ProgressBar, duration, note, size, warn
 from flexdt.clients.cli.options import Answer, Twin, argument, option
-from flexdt.clients.cli.settings_file import ExportSettings, ReconstructSettings, chosen
+from flexdt.clients.cli.settings_file import ReconstructSettings, chosen
 from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
@@ -288,7 +288,6 @@ def export(
     from flexdt.clients.launch.random_truth import read
     from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 
-    tolerance = chosen(ExportSettings).tolerance
     report = None if correction is None else read_report(correction)
     parameters = report.parameters if report else None if corrected else NOMINAL
     data = scan_of(dataset, texts, report)
@@ -301,7 +300,6 @@ def export(
         parameters=parameters,
         real=real,
         rows_up=rows == "up",
-        tolerance_mm=tolerance,
     )
     height, width = written.shape or (0, 0)
     yield {

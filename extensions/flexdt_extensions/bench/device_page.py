@@ -16,9 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from flexdt.measuring import box_of, gpu, gpu_astra, voxel_rays
+from flexdt.measuring import box_of, gpu, voxel_rays
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Volume, back, forward
+from flexdt_extensions.bench import gpu_astra
 from flexdt_extensions.bench.cases import BINNED, C1_SHAPE, circle, noise
 from flexdt_extensions.bench.measure import errors, exact_images, interleaved
 

@@ -15,7 +15,9 @@ import numpy as np
 from flexdt.twin.attenuation import Substance, mass_fractions, parse_formula, tables
 from flexdt.twin.errors import TwinError
 from flexdt.twin.exchange import ExchangeError, ScanGeometry, read_json
-from flexdt.twin.exchange.ctsimu_read import (
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.physics import Filter, Spectrum, TubeModel, deposited, monochromatic, tube_spectrum
+from flexdt_extensions.ctsimu.ctsimu_read import (
     MM,
     MOST,
     NUMBER,
@@ -28,8 +30,6 @@ from flexdt.twin.exchange.ctsimu_read import (
     place,
     seen_from,
 )
-from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.physics import Filter, Spectrum, TubeModel, deposited, monochromatic, tube_spectrum
 
 _KV: Final = {"kV": 1.0, "V": 1e-3, "MV": 1e3}
 _MA: Final = {"mA": 1.0, "uA": 1e-3, "A": 1e3}

@@ -2,7 +2,7 @@
 
 Beads are exchanged between seats one at a time, from several random starts, until no exchange
 helps. A set that looks like itself turned, or whose spots fit at a second start angle, is
-discarded. Seats are plain points (see `flexdt.phantoms.bricks` for those of a LEGO stack), and
+discarded. Seats are plain points (see `seats` for those of a LEGO stack), and
 `information_table` scores a set of them.
 """
 

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.clients.figures import COLOURS, DPI, blank, svg
+from flexdt_extensions.phantom_design.seats import tubes_at
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -68,7 +69,7 @@ def brick_drawings(
         # Seen from below with +x to the right, the source's side (-y) is at the top.
         axes = _sheet(wide, deep, top="towards the source", bottom="towards the detector")
         _rectangle(axes, wide - 2 * v["wall_mm"], deep - 2 * v["wall_mm"], HOLE)
-        for x, y in work.tubes_at().tolist():
+        for x, y in tubes_at(work).tolist():
             _disc(axes, x, y, v["tube_outer_diameter_mm"] / 2, TUBE)
             _disc(axes, x, y, v["tube_inner_diameter_mm"] / 2, HOLE)
         steps = []

@@ -51,10 +51,10 @@ def design(
     """Choose bead places that determine the geometry best, and say how to build it."""
     from flexdt.machines import machine as find_machine
     from flexdt.machines import profile as find_profile
-    from flexdt.phantoms.bricks import Brickwork
     from flexdt.twin.calibration import SIX
     from flexdt_extensions.phantom_design import phantom_design as work
     from flexdt_extensions.phantom_design.information_table import PlannedScans
+    from flexdt_extensions.phantom_design.seats import stack_of
 
     scanner = find_machine(machine)
     if plan is not None:
@@ -72,7 +72,7 @@ def design(
         beads, radius, bead, per_brick, criterion, seed=seed, trials=trials
     )
     if grid == "lego":
-        stack = Brickwork(_studs(studs), bricks)
+        stack = stack_of(_studs(studs), bricks)
         holder = work.BeadHolder(stack, stack.size_mm)
     else:
         holder = work.BeadHolder(None, _size(size), body)

@@ -19,7 +19,7 @@ import numpy as np
 from flexdt.clients.figures import page, require_plots, table
 from flexdt.extending import CommandError
 from flexdt.phantoms import Phantom, cuboid_with_beads, spiral_positions
-from flexdt.phantoms.bricks import Brickwork, grid_seats, lego_phantom
+from flexdt.phantoms.bricks import Brickwork, lego_phantom
 from flexdt.twin.calibration import BeadModel
 from flexdt.twin.calibration.fit.weak_directions import BOUND, TOLERANCE, unit_of
 from flexdt.twin.geometry.poses import Poses
@@ -27,6 +27,7 @@ from flexdt.twin.machine.camera import CameraSettings
 from flexdt_extensions.phantom_design.bead_search import Design, design, forecast
 from flexdt_extensions.phantom_design.build_sheet import brick_drawings, level_drawings
 from flexdt_extensions.phantom_design.information_table import CRITERIA, Criterion, PlannedScans
+from flexdt_extensions.phantom_design.seats import grid_seats, seats_of, stack_phantom
 from flexdt_extensions.phantom_design.trials import measured_spread, share_identified
 
 if TYPE_CHECKING:
@@ -240,7 +241,7 @@ def write(
 def _search(body: BeadHolder, scans: PlannedScans, request: DesignRequest) -> Design:
     radius, where = request.radius_mm, dict[str, Any]()
     if body.bricks is not None:
-        seats = body.bricks.seats(radius)
+        seats = seats_of(body.bricks, radius)
         places, where = seats.places, {"slots": seats.brick, "per_slot": request.per_brick}
     else:
         # A skin of a bead's radius stays round the beads, so that they are held.
@@ -255,7 +256,9 @@ def _search(body: BeadHolder, scans: PlannedScans, request: DesignRequest) -> De
 def _phantom(body: BeadHolder, found: Design, request: DesignRequest) -> Phantom:
     name = f"designed-{request.beads}"
     if body.bricks is not None:
-        return body.bricks.phantom(name, found.beads, request.radius_mm, request.bead_material)
+        return stack_phantom(
+            body.bricks, name, found.beads, request.radius_mm, request.bead_material
+        )
     made = cuboid_with_beads(
         name,
         body.size_mm,

@@ -15,6 +15,7 @@ from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.poses import Poses
 from flexdt_extensions.phantom_design.bead_search import design, forecast, turned_likeness
 from flexdt_extensions.phantom_design.information_table import PlannedScans
+from flexdt_extensions.phantom_design.seats import seats_of
 from flexdt_extensions.phantom_design.trials import measured_spread, share_identified
 
 SHAPE = (760, 956)
@@ -71,7 +72,7 @@ def test_exchange_finds_the_best_of_all_sets() -> None:
 
 def test_design_on_bricks_beats_the_spiral_and_fits_agree() -> None:
     planned = PlannedScans(circle(60), SHAPE)
-    seats = Brickwork().seats(1.0)
+    seats = seats_of(Brickwork(), 1.0)
     found = design(seats.places, 1.0, 5, planned, slots=seats.brick, starts=2)
     again = design(seats.places, 1.0, 5, planned, slots=seats.brick, starts=2)
     assert np.array_equal(found.beads, again.beads)

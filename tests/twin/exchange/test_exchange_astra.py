@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from random_scans import PITCH, SHAPE, worst
 
 from flexdt.twin.exchange.geometry import ScanGeometry
 from flexdt.twin.exchange.number_tables import read_vectors_text, vectors_text
 from flexdt.twin.geometry.poses import Poses
-from tests.twin.exchange.scans import PITCH, SHAPE, worst
 
 astra = pytest.importorskip("astra", reason="astra-toolbox is not installed", exc_type=ImportError)
 

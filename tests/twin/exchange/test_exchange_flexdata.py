@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_scans import SHAPE, some_parameters, some_poses, worst
 from scipy.spatial.transform import Rotation
 
 from flexdt.twin.exchange.flexdata import flexdata_text, read_flexdata
 from flexdt.twin.exchange.geometry import ScanGeometry
 from flexdt.twin.geometry.conventions import FloatArray
-from tests.twin.exchange.scans import SHAPE, some_parameters, some_poses, worst
 
 
 def orbit(toml: dict[str, Any], count: int) -> FloatArray:

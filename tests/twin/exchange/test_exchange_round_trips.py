@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_scans import CHIRAL, SHAPE, some_parameters, some_poses, worst
 
-from flexdt.twin.exchange.ctsimu import Scenario, scenario_document
-from flexdt.twin.exchange.ctsimu_read import read_ctsimu
 from flexdt.twin.exchange.flexdata import flexdata_text, read_flexdata
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry, circle_of
 from flexdt.twin.exchange.number_tables import (
@@ -25,9 +22,7 @@ from flexdt.twin.exchange.number_tables import (
     vectors_text,
 )
 from flexdt.twin.exchange.rtk_xml import read_rtk, rtk_text
-from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
-from tests.twin.exchange.scans import CHIRAL, SHAPE, some_parameters, some_poses, worst
 
 SEEDS = st.integers(0, 2**32 - 1)
 SAME = 1e-9
@@ -73,39 +68,6 @@ def test_flexdata_keeps_any_circle_in_equal_steps(seed: int) -> None:
     back = read_flexdata(flexdata_text(geometry))
     assert worst(back.cone_vec.rows, geometry.cone_vec.rows) < SAME
     assert back.shape == geometry.shape
-
-
-@settings(max_examples=40, deadline=None)
-@given(seed=SEEDS, still=st.booleans(), even=st.booleans())
-def test_ctsimu_keeps_any_motion_and_tells_known_from_real(
-    seed: int, still: bool, even: bool
-) -> None:
-    rng = np.random.default_rng(seed)
-    poses = some_poses(rng, int(rng.integers(1, 9)), even=even, still=still)
-    known, real = some_parameters(rng), some_parameters(rng)
-    text = json.dumps(scenario_document(Scenario(poses, SHAPE, known, real, name="x")))
-    back = read_ctsimu(text)
-    assert back.real is not None
-    assert worst(back.cone_vec.rows, poses.cone_vec(known).rows) < SAME
-    assert worst(back.real.rows, poses.cone_vec(real).rows) < SAME
-    assert (back.shape, back.name) == (SHAPE, "x")
-
-
-@pytest.mark.parametrize("name", Offsets().to_edge())
-def test_ctsimu_each_parameter_alone(name: str) -> None:
-    poses = some_poses(np.random.default_rng(5))
-    value = 1.01 if name == "angle_scale" else 0.8
-    known = Offsets.from_edge({name: value})
-    document = scenario_document(Scenario(poses, SHAPE, known))
-    assert name in json.dumps(document["geometry"])
-    back = read_ctsimu(json.dumps(document))
-    assert back.real is None
-    assert worst(back.cone_vec.rows, poses.cone_vec(known).rows) < SAME
-    hidden = read_ctsimu(json.dumps(scenario_document(Scenario(poses, SHAPE, NOMINAL, known))))
-    assert hidden.real is not None
-    assert worst(hidden.cone_vec.rows, poses.cone_vec().rows) < SAME
-    assert worst(hidden.real.rows, poses.cone_vec(known).rows) < SAME
-    assert np.abs(hidden.real.rows - hidden.cone_vec.rows).max() > 1e-3
 
 
 @settings(max_examples=40, deadline=None)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_scans import CHIRAL, PITCH, SHAPE, some_parameters, some_poses, worst
 from required import required
 from rtk_process import ANGLES, Rtk, Seen, joseph, read, rtk_process, write_circle
 
@@ -18,7 +19,6 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection import Volume, forward
-from tests.twin.exchange.scans import CHIRAL, PITCH, SHAPE, some_parameters, some_poses, worst
 
 # Loading RTK's wrappers takes longer than all that these tests ask of it.
 pytestmark = pytest.mark.slow

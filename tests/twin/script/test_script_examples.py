@@ -63,7 +63,8 @@ def test_the_demo_s_script(check: CheckReport, flexray: Machine, profile: Profil
     column = p.cone_vec().project_points([[0.0, 0.0, 0.0]], image.camera.shape)[0, 0, 0]
     assert column == pytest.approx((956 - 1) / 2, abs=1e-2)
     assert plan.settings is not None
-    assert plan.settings.positions["rot_obj"] == pytest.approx(plan.fly_scans[0].run_up * -1)
+    begun, turn = plan.trajectories["rot_obj"][-1]
+    assert plan.settings.positions["rot_obj"] == pytest.approx(turn.position(begun))
 
 
 def test_scripts_keep_the_scanner_s_line_ends() -> None:

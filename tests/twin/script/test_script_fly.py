@@ -49,10 +49,9 @@ def test_listing_1_warnings_are_the_right_ones(listing: ScanPlan) -> None:
 def test_listing_1_plan(listing: ScanPlan) -> None:
     assert listing.ok
     assert listing.frames == 2866
-    (fly,) = listing.fly_scans
-    assert fly.averages == 10
-    assert fly.run_up == pytest.approx(0.503017)
-    assert set(fly.inferred) == {"averages", "frames"}
+    assert listing.exposures[-1].averages == 10
+    begun, turn = listing.trajectories["rot_obj"][-1]
+    assert turn.position(begun) == pytest.approx(-0.503017)
     dark, flat, *projections = listing.exposures
     # What was set before the script holds for its first images too.
     assert dark.averages == flat.averages == 10
@@ -119,11 +118,10 @@ def test_what_is_unsaid_is_inferred(
     rule = smooth_scan(frames, 0.1, averages, 22.5)
     lines = [x for x in fly_lines(100, averages, frames) if not any(u in x for u in unsaid)]
     plan = fly(planned, lines, rule.speed, rule.start, rule.end)
-    (scan,) = plan.fly_scans
-    assert (scan.frames, scan.averages) == (frames, averages)
-    assert set(scan.inferred) == unsaid
+    last = plan.exposures[-1]
+    assert (plan.frames, last.averages) == (frames, averages)
     assert {p.code for p in plan.problems} == {f"{u}_unsaid" for u in unsaid}
-    assert scan.last == pytest.approx(360.0)
+    assert last.positions["rot_obj"] == pytest.approx(360.0)
 
 
 @pytest.mark.parametrize(("longer", "frames"), [(0.9, 1441), (-0.9, 1441), (1.1, 1445)])
@@ -133,7 +131,7 @@ def test_a_scan_within_a_degree_of_whole_turns_is_one_of_them(
     rule = smooth_scan(1441, 0.1, 1, 22.5)
     lines = [x for x in fly_lines(100, 1, 1441) if "frames" not in x]
     plan = fly(planned, lines, rule.speed, rule.start, rule.end + longer)
-    assert [scan.frames for scan in plan.fly_scans] == [frames]
+    assert plan.frames == frames
 
 
 def test_without_a_rule_to_infer_from_the_documented_default_is_taken(planned: Planner) -> None:
@@ -167,7 +165,7 @@ def test_averages_follow_from_the_frames_before_the_run_up(planned: Planner) -> 
     rule = smooth_scan(361, 0.1, 3, 22.5)
     lines = [x for x in fly_lines(100, 3, 361) if "averages" not in x]
     plan = fly(planned, lines, rule.speed, rule.start - 10.0, rule.end + 10.0)
-    assert [scan.averages for scan in plan.fly_scans] == [3]
+    assert {e.averages for e in plan.exposures if e.kind == "projection"} == {3}
 
 
 @pytest.mark.parametrize(
@@ -179,7 +177,7 @@ def test_averages_are_a_whole_number_within_two_percent_or_not_inferred(
     rule = smooth_scan(361, 0.1 * ratio, 1, 22.5)
     lines = [x for x in fly_lines(100, 1, 361) if "number" not in x]
     plan = fly(planned, lines, rule.speed, rule.start, rule.end)
-    assert [scan.averages for scan in plan.fly_scans] == [averages]
+    assert {e.averages for e in plan.exposures if e.kind == "projection"} == {averages}
 
 
 def test_averages_that_are_inferred_hold_for_previews_too(planned: Planner) -> None:
@@ -246,6 +244,9 @@ def test_subframe_samples_spread_evenly_about_the_nominal_pose(listing: ScanPlan
     assert samples.shape == (2868, 5)
     centre = np.array([e.positions["rot_obj"] for e in listing.exposures])
     assert_allclose(samples.mean(axis=1), centre, atol=1e-9)
-    fly_scan = listing.fly_scans[0]
-    assert_allclose(np.ptp(samples[2:], axis=1), fly_scan.speed * fly_scan.period_s * 4 / 5)
+    first, second = listing.exposures[2:4]
+    speed = (second.positions["rot_obj"] - first.positions["rot_obj"]) / (
+        second.start_s - first.start_s
+    )
+    assert_allclose(np.ptp(samples[2:], axis=1), speed * first.duration_s * 4 / 5)
     assert_allclose(np.ptp(samples[:2], axis=1), 0.0)

@@ -162,30 +162,6 @@ class ExposureGroup(ArrayValue):
         return 2 * rows * cols * len(self.files)
 
 
-@dataclass(frozen=True)
-class FlyScan:
-    """A sequence over a moving axis as planned [deg or mm, s]."""
-
-    axis: str
-    step: int
-    line: int
-    frames: int
-    averages: int
-    trigger: float
-    increment: float
-    speed: float
-    period_s: float
-    run_up: float
-    """Signed distance from the start of the motion to the trigger."""
-    inferred: tuple[str, ...] = ()
-    """Names of the settings that the script leaves out and that were inferred."""
-
-    @property
-    def last(self) -> float:
-        """Position of the last image."""
-        return self.trigger + (self.frames - 1) * self.increment
-
-
 @dataclass(frozen=True, kw_only=True)
 class Settings(StartState):
     """The scanner at the moment of `write settings file`, and when that was."""
@@ -239,7 +215,6 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
         trajectories: axis -> (time, trajectory), each in force until the next; axes that never
             move have none.
         groups: all images, in the order in which they are taken.
-        fly_scans: sequences over a moving axis.
         settings: at the last `write settings file`, or None.
         beam: when X-rays are on.
         sample: its size, if known.
@@ -253,7 +228,6 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
     steps: tuple[PlanStep, ...]
     trajectories: Mapping[str, tuple[tuple[float, Trajectory], ...]]
     groups: tuple[ExposureGroup, ...]
-    fly_scans: tuple[FlyScan, ...]
     settings: Settings | None
     beam: tuple[BeamOn, ...]
     sample: SampleSize | None

@@ -22,7 +22,7 @@ from flexdt.twin.script.commands import ImageKind
 from flexdt.twin.script.grammar import image_name, kind_of, sequence_names, shorten
 from flexdt.twin.script.planning import planned_scanner as planned
 from flexdt.twin.script.planning import smooth_scan as smooth
-from flexdt.twin.script.planning.plan import ExposureGroup, FlyScan
+from flexdt.twin.script.planning.plan import ExposureGroup
 from flexdt.twin.script.problems import Findings
 
 _TIME_EPS = 1e-9
@@ -50,7 +50,6 @@ class ImageCollector:
         self.last: int | None = None
         """Index of the image taken last; while it was taken, `moved` were under way."""
         self.moved: list[str] = []
-        self.fly_scans: list[FlyScan] = []
         self.names: set[str] = set()
         self.hint = averages
         self.inferred_averages: int | None = None
@@ -102,7 +101,7 @@ class ImageCollector:
         starts = start + period * np.arange(frames, dtype=np.float64)
         exact: dict[str, FloatArray] = {}
         if trigger is not None and inference is not None:
-            starts, exact = self._fly(trigger, inference, start, period, step, command.line)
+            starts, exact = self._fly(trigger, inference, start, period)
         elif moving and frames > 1:
             self.findings.warn(
                 "no_trigger",
@@ -211,8 +210,6 @@ class ImageCollector:
         found: smooth.Inference,
         start: float,
         period: float,
-        step: int,
-        line: int,
     ) -> tuple[FloatArray, dict[str, FloatArray]]:
         """Nominal moments of the images, and their positions where the rule gives them."""
         trajectory = trigger.trajectory
@@ -242,21 +239,6 @@ class ImageCollector:
         if off.any():
             self._not_steady(trigger, off, unit)
             starts, exact = start + period * count, {}
-        self.fly_scans.append(
-            FlyScan(
-                trigger.axis,
-                step,
-                line,
-                found.frames,
-                self.camera.settings.averages,
-                float(first),
-                sign * found.increment,
-                speed,
-                period,
-                trigger.run_up,
-                tuple(found.notes),
-            )
-        )
         return starts, exact
 
     def _not_steady(self, trigger: planned.Trigger, off: npt.NDArray[np.bool_], unit: str) -> None:

@@ -85,7 +85,6 @@ def plan_script(
         steps=tuple(s.steps),
         trajectories={n: tuple(m.moves) for n, m in s.motors.all.items() if m.moves},
         groups=s.imaging.groups(),
-        fly_scans=tuple(s.imaging.fly_scans),
         settings=s.settings,
         beam=s.tube.intervals(end),
         sample=sample if sample is not None else s.sample,

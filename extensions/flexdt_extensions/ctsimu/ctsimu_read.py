@@ -16,8 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
-from flexdt.twin.exchange.number_tables import cone_vec_of, read_json
+from flexdt.twin.exchange import ExchangeError, ScanGeometry, cone_vec_of, read_json
 from flexdt.twin.geometry.conventions import FloatArray, rotation_about
 
 MOST: Final = 1_000_000

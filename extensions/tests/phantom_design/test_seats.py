@@ -5,9 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flexdt.phantoms.bricks import HEIGHTS, Brickwork, grid_seats, lego_phantom
-from flexdt.phantoms.pieces import PhantomError
+from flexdt.phantoms import PhantomError
+from flexdt.phantoms.bricks import Brickwork, lego_phantom
 from flexdt.twin.errors import LimitError
+from flexdt_extensions.phantom_design.seats import (
+    HEIGHTS,
+    grid_seats,
+    seats_of,
+    stack_of,
+    stack_phantom,
+)
 
 
 def plastic(work: Brickwork, points: np.ndarray) -> np.ndarray:
@@ -39,7 +46,7 @@ def plastic(work: Brickwork, points: np.ndarray) -> np.ndarray:
 
 def test_no_seat_lies_in_plastic_and_each_touches_some() -> None:
     work = Brickwork()
-    seats = work.seats(1.0)
+    seats = seats_of(work, 1.0)
     directions = np.random.default_rng(3).normal(size=(400, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     axes = np.concatenate([np.eye(3), -np.eye(3)])
@@ -52,17 +59,17 @@ def test_no_seat_lies_in_plastic_and_each_touches_some() -> None:
 
 def test_stack_is_the_thesis_phantom_but_for_its_beads() -> None:
     thesis, work = lego_phantom(), Brickwork()
-    made = work.phantom("mine", work.seats(1.0).places[[0, 100]], 1.0)
+    made = stack_phantom(work, "mine", seats_of(work, 1.0).places[[0, 100]], 1.0)
     assert made.size_mm == thesis.size_mm
     assert len(made.scene.solids) - 2 == len(thesis.scene.solids) - 5
 
 
 def test_what_cannot_be_built_is_refused() -> None:
     with pytest.raises(LimitError, match="bricks"):
-        Brickwork((3, 2), 0)
+        stack_of((3, 2), 0)
     with pytest.raises(LimitError, match="does not fit"):
-        Brickwork().seats(4.0)
+        seats_of(Brickwork(), 4.0)
     with pytest.raises(PhantomError, match="not on a seat"):
-        Brickwork().phantom("x", [[0.0, 0.0, 0.0]], 1.0)
+        stack_phantom(Brickwork(), "x", [[0.0, 0.0, 0.0]], 1.0)
     with pytest.raises(LimitError):
         grid_seats((1.0, 10.0, 10.0), 1.0, 2.0)

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_scans import CHIRAL, SHAPE, some_parameters, some_poses, worst
 from required import required
 
-from flexdt.twin.exchange.ctsimu import Scenario, scenario_document
-from flexdt.twin.exchange.ctsimu_read import read_ctsimu
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL
-from tests.twin.exchange.scans import CHIRAL, SHAPE, some_parameters, some_poses, worst
+from flexdt_extensions.ctsimu.ctsimu_read import read_ctsimu
+from flexdt_extensions.ctsimu.ctsimu_write import Scenario, scenario_document
 
 ctsimu = required("ctsimu.scenario")
 

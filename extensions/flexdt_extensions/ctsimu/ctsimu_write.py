@@ -15,7 +15,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from flexdt.twin.exchange.geometry import SAME_MM, ExchangeError, require_panel
+from flexdt import DataSet
+from flexdt.clients.datasets.exchange import geometry_of
+from flexdt.twin.exchange import SAME_MM, ExchangeError, require_panel
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
@@ -61,6 +63,42 @@ class Scenario:
     darks: int = 0
     flats: int = 0
     smooth: bool = False
+
+
+def scenario_of(
+    dataset: DataSet, parameters: Offsets | None = None, real: Offsets | None = None
+) -> dict[str, Any]:
+    """A data set as a CTSimU scenario.
+
+    Args:
+        dataset: from `load_dataset`.
+        parameters: correction, known to reconstruction; None is the one in force, if any.
+        real: what is so, unknown to reconstruction where it differs; None: as `parameters`.
+    """
+    if parameters is None:
+        parameters = NOMINAL if dataset.correction is None else dataset.correction.parameters
+    doc, machine = dataset.document, dataset.machine
+    geometry_of(dataset, NOMINAL)  # raises for frames of several shapes
+    scan = Scenario(
+        dataset.poses,
+        dataset.shape,
+        parameters,
+        real,
+        name=dataset.name,
+        description="written by flexdt; deviations are named after its parameters",
+        date=None if doc is None else f"{doc.started:%Y-%m-%d}",
+        kV=None if doc is None else doc.tube.kV,
+        power_W=None if doc is None else doc.tube.power_W,
+        exposure_s=None if doc is None else doc.detector.exposure_ms / 1000.0,
+        averages=1 if doc is None else doc.detector.averages,
+        bits=None if machine is None else machine.detector.bits,
+        detector_model=None if machine is None else machine.detector.model,
+        machine=None if machine is None else machine.name,
+        darks=len(dataset.darks),
+        flats=len(dataset.flats),
+        smooth=False if doc is None else doc.smooth,
+    )
+    return scenario_document(scan)
 
 
 def scenario_document(scan: Scenario) -> dict[str, Any]:

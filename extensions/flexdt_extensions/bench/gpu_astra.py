@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from flexdt.measuring import gpu
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.projection import gpu
-from flexdt.twin.projection.volume import Volume
+from flexdt.twin.projection import Volume
 
 
 def geometries(
