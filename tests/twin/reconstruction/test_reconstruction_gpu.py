@@ -50,16 +50,17 @@ for case in range(4):
         assert not device_takes(like, shape)
         told = []
         slabs = fdk_parts(parts, scan, shape, like, window, told.append).data
-        assert np.abs(slabs - there).max() < 1e-6 * np.abs(there).max()
+        assert np.nanmax(np.abs(slabs - there)) < 1e-6 * np.nanmax(np.abs(there))
         assert len(told) >= 2 * 3 and told[-1] == 1.0
         assert told == sorted(told)
         gpu.free_bytes = lambda: None
     with gpu.switched_off():
         assert not device_takes(like, shape)
         here = made()
-    assert (here != 0).mean() > 0.05 and ((here == 0).any() or case > 0), case
-    assert ((here != 0) == (there != 0)).all(), case
-    worst = np.abs(here - there).max() / np.abs(here).max()
+    seen = ~np.isnan(here)  # voxels that few views see, above or below the panel, are NaN
+    assert seen.mean() > 0.05 and (not seen.all() or case > 0), case
+    assert (seen == ~np.isnan(there)).all(), case
+    worst = np.abs(here - there)[seen].max() / np.abs(here[seen]).max()
     assert worst < 3e-6, (case, worst)
 """
 
