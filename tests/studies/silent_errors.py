@@ -139,7 +139,8 @@ def truth(call: Call) -> tuple[float, float]:
         chord = 0.05 / through(1.0, call)
     thin = float(np.clip(0.05 / through(chord, call), 0.02, 0.5)) * chord
     slope = (through(chord, call) - through(0.95 * chord, call)) / (0.05 * chord)
-    return slope, through(thin, call) / thin
+    # Few counts are whole numbers: a slope of those may be above the mean.
+    return min(slope, through(chord, call) / chord), through(thin, call) / thin
 
 
 def through(thick: float, call: Call) -> float:

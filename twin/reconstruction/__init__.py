@@ -1,7 +1,8 @@
 """Volumes back from projections."""
 
 from flexdt.twin.projection.volume import Grid
-from flexdt.twin.reconstruction.fdk import fdk, fdk_parts, unseen_layers
+from flexdt.twin.reconstruction.coverage import unseen_layers
+from flexdt.twin.reconstruction.fdk import fdk, fdk_parts
 from flexdt.twin.reconstruction.iterative import Step, cgls, em, sart, sirt
 from flexdt.twin.reconstruction.rectify import field_of_view
 from flexdt.twin.reconstruction.scatter_correction import (

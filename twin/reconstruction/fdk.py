@@ -30,6 +30,7 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Grid, Volume, as_volume, gpu
 from flexdt.twin.projection.cpu import threads
 from flexdt.twin.projection.operators import as_cone_vec, check_projections, require_finite
+from flexdt.twin.reconstruction.coverage import first_and_steps, make_up, unseen_layers
 from flexdt.twin.reconstruction.helix import Sharing
 from flexdt.twin.reconstruction.rectify import (
     FINER,
@@ -58,11 +59,6 @@ GROUP: Final = 8
 """Views that the processor weighs and filters at a time: they stay in its caches."""
 STACKS: Final = 6
 """Stacks of so many images that a device holds: twice what came, and made wider, of three steps."""
-LEAST_SEEN: Final = 0.4
-"""Part of the weight of all views that must see a voxel. At the panel's upper and lower edge it is
-about half in a whole turn."""
-MADE_UP_BY: Final = 360
-"""Views by which that part is judged, of as many or more."""
 MOST_ASIDE: Final = 0.1
 """By how much of its width the panel may go sideways between the views: jitter, not tiles."""
 
@@ -113,7 +109,7 @@ class OnProcessor:
 
     def __init__(self, like: Volume) -> None:
         nz, ny, nx = like.shape
-        self._first, self._size = _grid(like)
+        self._first, self._size = first_and_steps(like)
         self._data = np.zeros((ny, nx, nz), np.float32)
         self._sizes, self._columns = (0, 0, 0, 0), self._data
 
@@ -180,7 +176,7 @@ class OnDevice:
             for device, (low, high) in enumerate(_cut(nz, min(devices, nz))):
                 with gpu.on(device):
                     part = like if high - low == nz else _layers(like, low, high)
-                    grid = [cuda.to_device(np.array(numbers)) for numbers in _grid(part)]
+                    grid = [cuda.to_device(np.array(numbers)) for numbers in first_and_steps(part)]
                     flat = gpu.zeros(ny * nx * (high - low))
                     self._parts.append(_Layers(device, low, high, grid, flat, cuda.stream()))
 
@@ -273,11 +269,6 @@ def _taps(response: Float32Array, wide: int, more: int) -> FloatArray:
     length = fft.next_fast_len(2 * wide, real=True)
     taps = np.fft.irfft(response.astype(np.float64), length)[:wide]
     return np.pad(taps, (0, more))
-
-
-def _grid(like: Volume) -> tuple[list[float], list[float]]:
-    """Centre of the first voxel and steps (x, y, z) [mm]."""
-    return [float(places[0]) for places in like.centers()], list(like.voxel_xyz)
 
 
 Backprojector = OnProcessor | OnDevice
@@ -399,17 +390,6 @@ def fdk(
     for doubt in unseen_layers(volume.data):
         warnings.warn(doubt, stacklevel=2)
     return volume
-
-
-def unseen_layers(data: Float32Array) -> list[str]:
-    """What is to be said of layers of a volume (nz, ny, nx) without a single voxel from data."""
-    lost = int(np.isnan(data[:, ::4, ::4]).all(axis=(1, 2)).sum())
-    if not lost:
-        return []
-    return [
-        f"{lost} of {len(data)} layers of the grid lie above or below what the panel sees; their "
-        "voxels are NaN"
-    ]
 
 
 def fdk_parts(
@@ -581,33 +561,10 @@ def _fdk(
         )
     data = target.volume()
     if sharing is None:
-        _make_up(data, like, circle, table, weights[:, kept], last - first)
+        own = near[0], near[0] + shape[1] - 1
+        cut_off, rays = truncation is not None, weights[:, kept]
+        make_up(data, like, circle, table, rays, last - first, own, cut_off=cut_off)
     return replace(like, data=data.transpose(2, 0, 1))
-
-
-def _make_up(
-    data: Float32Array,
-    like: Volume,
-    circle: Circle,
-    table: FloatArray,
-    weights: FloatArray,
-    rows: int,
-) -> None:
-    """Make voxels up for views that see them above or below the panel; see `fdk_kernels.make_up`.
-
-    Where there are many views, one stands for some neighbours.
-    """
-    from flexdt.twin.reconstruction import fdk_kernels
-
-    order = np.argsort(circle.angle, kind="stable")
-    starts = np.arange(0, len(order), -(-len(order) // MADE_UP_BY))
-    middle = order[(starts + np.append(starts[1:], len(order))) // 2]
-    step = np.add.reduceat(circle.step[order], starts)
-    first, size = _grid(like)
-    fdk_kernels.make_up(
-        np.ascontiguousarray(table[middle]), weights[middle] * step[:, None], rows, *first, *size,
-        LEAST_SEEN, data,
-    )  # fmt: skip
 
 
 def _weighing(

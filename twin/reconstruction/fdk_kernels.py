@@ -124,38 +124,50 @@ backproject = _entry_point(sources(resample_kernels), LANES)
 
 
 @kernel
-def _covered(g, weights, rows, x, y, z0, dz, seen):
+def _covered(g, weights, rows, on_panel, radius, x, y, z0, dz, seen):
     """Add a view's weight to what sees the voxels above one another at (x, y), whose differences
-    `seen` holds; see `make_up`. Returns that weight, whatever the height.
+    `seen` holds; see `make_up`. Returns that weight, whatever the height, and the angle of lines
+    through the voxels that the panel's columns see in this view.
     """
     x -= g[0]
     y -= g[1]
     depth = x * g[3] + y * g[4]
     if depth <= 0.0:
-        return 0.0
+        return 0.0, 0.0
     inverse = 1.0 / depth
-    c = g[8] + (x * g[5] + y * g[6]) * inverse * g[7]
+    aside = x * g[5] + y * g[6]
+    c = g[8] + aside * inverse * g[7]
     if c < 0.0 or c > weights.size - 1:
-        return 0.0
+        return 0.0, 0.0
     every = -1.0 / (dz * g[9] * inverse)
     start = g[10] - (z0 - g[2]) * g[9] * inverse
     lowest = max(0, math.ceil((rows - 1 - start) * every))
     highest = min(seen.size - 2, math.floor(-start * every))
-    weight = weights[int(c)] * inverse * math.sqrt(inverse)
+    weight = weights[int(c)]
+    # A source that moves on by an angle turns the line to a voxel by radius cos(fan) / distance.
+    angle = 0.0
+    if on_panel[0] <= c <= on_panel[1]:
+        angle = weight * radius * depth / (depth * depth + aside * aside)
+    weight *= inverse * math.sqrt(inverse)
     if lowest <= highest:
         seen[lowest] += weight
         seen[highest + 1] -= weight
-    return weight
+    return weight, angle
 
 
 @parallel
-def make_up(views, weights, rows, x0, y0, z0, dx, dy, dz, least, volume):
+def make_up(
+    views, weights, rows, on_panel, radius, x0, y0, z0, dx, dy, dz, least, half_turn, volume
+):
     """Make voxels up for the views on which they lie above or below the panel.
 
     What the others gave is divided by their part of the weight; voxels of which that is less than
-    `least` become NaN.
+    `least` become NaN. So do those that are not seen in lines of all directions, of `half_turn`.
 
     views: float64 (n, 11) and weights: float64 (n, cols), of `backproject`.
+    on_panel: first and last column of the panel.
+    radius: from the axis to the source [mm].
+    half_turn: pi, or what is nearly that [rad]; 0 where nothing lies beside the panel.
     volume: float32 (ny, nx, nz).
     """
     ny, nx, nz = volume.shape
@@ -164,14 +176,18 @@ def make_up(views, weights, rows, x0, y0, z0, dx, dy, dz, least, volume):
         for ix in range(nx):
             seen[:] = 0.0
             total = 0.0
+            angles = 0.0
             for view in range(len(views)):
-                total += _covered(
-                    views[view], weights[view], rows, x0 + ix * dx, y0 + iy * dy, z0, dz, seen
-                )
+                weight, angle = _covered(
+                    views[view], weights[view], rows, on_panel, radius, x0 + ix * dx,
+                    y0 + iy * dy, z0, dz, seen,
+                )  # fmt: skip
+                total += weight
+                angles += angle
             part = 0.0
             for iz in range(nz):
                 part += seen[iz]
-                if part < least * total:
+                if angles < half_turn or part < least * total:
                     volume[iy, ix, iz] = np.nan
                 elif part < 0.999999 * total:
                     volume[iy, ix, iz] *= total / part
