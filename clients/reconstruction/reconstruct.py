@@ -44,6 +44,7 @@ from flexdt.twin.reconstruction import (
     fdk_parts,
     field_of_view,
     hardening,
+    missing_wedge,
     ring_errors,
     sart,
     sirt,
@@ -297,7 +298,7 @@ def _here(
             write(_iterative(views, grid, request, tell).data)
             return []
         slabs, truncation = grid.slabs(SLAB_BYTES), views.truncation()
-        doubts = _doubts(truncation)
+        doubts = [*missing_wedge(views.cone_vec), *_doubts(truncation)]
         for k, (first, last) in enumerate(slabs):
 
             def part(done: float, k: int = k) -> None:
@@ -335,7 +336,7 @@ def reconstruct_volume(
         views.parts, views.cone_vec, views.shape, grid.blank(), wanted.window,
         truncation=truncation,
     )  # fmt: skip
-    for doubt in unseen_layers(volume.data):
+    for doubt in (*missing_wedge(views.cone_vec), *unseen_layers(volume.data)):
         warnings.warn(doubt, stacklevel=2)
     return volume
 

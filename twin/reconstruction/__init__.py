@@ -1,7 +1,7 @@
 """Volumes back from projections."""
 
 from flexdt.twin.projection.volume import Grid
-from flexdt.twin.reconstruction.coverage import unseen_layers
+from flexdt.twin.reconstruction.coverage import missing_wedge, unseen_layers
 from flexdt.twin.reconstruction.fdk import fdk, fdk_parts
 from flexdt.twin.reconstruction.iterative import Step, cgls, em, sart, sirt
 from flexdt.twin.reconstruction.rectify import field_of_view
@@ -27,6 +27,7 @@ __all__ = [
     "field_of_view",
     "hardening",
     "minimise_tv",
+    "missing_wedge",
     "ring_errors",
     "sart",
     "sirt",

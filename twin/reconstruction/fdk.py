@@ -30,7 +30,12 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Grid, Volume, as_volume, gpu
 from flexdt.twin.projection.cpu import threads
 from flexdt.twin.projection.operators import as_cone_vec, check_projections, require_finite
-from flexdt.twin.reconstruction.coverage import first_and_steps, make_up, unseen_layers
+from flexdt.twin.reconstruction.coverage import (
+    first_and_steps,
+    make_up,
+    missing_wedge,
+    unseen_layers,
+)
 from flexdt.twin.reconstruction.helix import Sharing
 from flexdt.twin.reconstruction.rectify import (
     FINER,
@@ -352,7 +357,7 @@ def fdk(
 
     Warns:
         UserWarning: the panel cuts the object off, and its outline is not understood; layers of the
-            grid lie above or below what the panel sees.
+            grid lie above or below what the panel sees; no lines of some directions were seen.
 
     Examples:
         A cube of 0.02 / mm, projected and reconstructed:
@@ -387,7 +392,7 @@ def fdk(
         if truncation is not None and truncation.doubt:
             warnings.warn(truncation.doubt, stacklevel=2)
     volume = fdk_parts(parts, geometry, shape, like, window, progress, truncation)
-    for doubt in unseen_layers(volume.data):
+    for doubt in (*missing_wedge(geometry), *unseen_layers(volume.data)):
         warnings.warn(doubt, stacklevel=2)
     return volume
 

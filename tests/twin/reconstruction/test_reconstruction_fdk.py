@@ -30,7 +30,14 @@ from flexdt.twin.projection.analytic_solids import (
     Solid,
     Sphere,
 )
-from flexdt.twin.reconstruction import Grid, fdk, fdk_parts, field_of_view, truncation_of
+from flexdt.twin.reconstruction import (
+    Grid,
+    fdk,
+    fdk_parts,
+    field_of_view,
+    missing_wedge,
+    truncation_of,
+)
 from flexdt.twin.reconstruction.fdk import WINDOWS, filtered, ramp
 from flexdt.twin.reconstruction.rectify import (
     homography,
@@ -211,6 +218,32 @@ def test_what_some_views_see_above_or_below_the_panel_is_right_or_nan(span, many
             values = found[inside & (seen >= lowest) & ~lost] / 0.02
             assert values.size > 100
             assert values.mean() == pytest.approx(1.0, abs=within)
+
+
+@pytest.mark.parametrize("kind", ["even", "half left out", "random", "arcs"])
+def test_a_wedge_of_directions_that_no_view_sees_is_said(kind):
+    """Drawn lists of views; the widest wedge is found here by trying directions."""
+    rng = np.random.default_rng(29)
+    for _ in range(12):
+        n = int(rng.integers(36, 200))
+        whole = np.arange(n) * 360.0 / n
+        degrees = {
+            "even": whole,
+            "half left out": np.delete(whole, rng.choice(n, n // 2, replace=False)),
+            "random": rng.uniform(0.0, 360.0, n),
+            "arcs": np.concatenate([whole[:8] * 72 / n + k for k in range(0, 360, 30)]),
+        }[kind]
+        scan = circle(len(degrees), angles=np.deg2rad(degrees), pixel=6.0)
+        tried = np.arange(0.0, 180.0, 0.05)
+        near = np.abs((tried[:, None] - degrees + 90.0) % 180.0 - 90.0).min(axis=1)
+        widest = 2.0 * near.max()
+        said = missing_wedge(scan)
+        if widest < 4.8:
+            assert not said
+        if kind in ("random", "arcs") and widest > max(5.2, 12.0 * 180.0 / n):
+            assert float(said[0].split()[7]) == pytest.approx(widest, abs=0.2)
+        if kind == "even":
+            assert not said
 
 
 @pytest.mark.parametrize(
