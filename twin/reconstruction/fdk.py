@@ -50,8 +50,10 @@ from flexdt.twin.reconstruction.rectify import (
 from flexdt.twin.reconstruction.rectify import window as window_of
 from flexdt.twin.reconstruction.trajectory import (
     Circle,
+    axis_between,
     circle_of,
     columns_beyond,
+    narrow_overlap,
     redundancy,
 )
 from flexdt.twin.reconstruction.truncation import Truncation, truncation_of
@@ -512,6 +514,9 @@ def _fdk(
         shape = (shape[0], round(FINER * shape[1]))
     level = panels = upright(cone_vec, shape[1] / seen[1]) if tilted else cone_vec
     _check_steady(circle, level, shape)
+    narrow = narrow_overlap(circle, level, shape[1])
+    if narrow:
+        level = panels = axis_between(circle, level, shape)
     beyond = truncation is not None and truncation.beyond
     weights = redundancy(circle, level, shape[1], beyond=beyond)
     # Columns off the panel whose filtered values are needed, and those that go into the filter.
@@ -542,7 +547,9 @@ def _fdk(
                 f"{len(cone_vec)} views of {seen}",
                 {"asked": list(part.shape), "allowed": [len(cone_vec), *seen]},
             )
-        images = rectified(part, cone_vec[views], panels[views], shape[1]) if tilted else part
+        images = (
+            rectified(part, cone_vec[views], panels[views], shape[1]) if tilted or narrow else part
+        )
         top = first
         if before or after:
             rows = np.arange(first, last).clip(0, shape[0] - 1)

@@ -182,7 +182,8 @@ def redundancy(circle: Circle, cone_vec: ConeVec, cols: int, *, beyond: bool = F
     low, high = reach(fan)
     if min(low, high) <= 0:
         raise GeometryError(
-            "the shadow of the rotation axis does not fall on the detector; FDK needs it to",
+            "the shadow of the rotation axis does not fall on the detector, or within half a column of "
+            "its edge; FDK needs it to",
             {"fan_deg": np.rad2deg([-low, high]).tolist()},
         )
     _check_covered(circle, float(np.abs(fan).max()))
@@ -198,6 +199,26 @@ def redundancy(circle: Circle, cone_vec: ConeVec, cols: int, *, beyond: bool = F
     own = (1.0 + alone) * _confidence(circle, angle)
     other = (1.0 - alone) * _confidence(circle, angle + np.pi + 2 * fan)
     return np.asarray(own / (own + other))
+
+
+def narrow_overlap(circle: Circle, cone_vec: ConeVec, cols: int) -> bool:
+    """Whether a panel moved aside sees few columns beyond the axis."""
+    low, high = reach(fan_angles(circle, cone_vec, cols))
+    column = (low + high) / cols
+    return abs(high - low) > column and min(low, high) < 2 * NARROWEST * column
+
+
+def axis_between(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> ConeVec:
+    """Panels moved by up to a quarter of a column: the axis falls on a column or between two.
+
+    Where the weights of a ray and its opposite change within few columns, what they add to the
+    filtered rows is large, odd about the axis, and cancels only if both are sampled alike.
+    """
+    at = cone_vec.project_points([[*circle.centre, 0.0]], shape)[:, 0, 0]
+    moved = np.round(2.0 * at) / 2.0 - at
+    return ConeVec.from_vectors(
+        cone_vec.source, cone_vec.detector - moved[:, None] * cone_vec.u, cone_vec.u, cone_vec.v
+    )
 
 
 def _confidence(circle: Circle, angle: FloatArray) -> FloatArray:

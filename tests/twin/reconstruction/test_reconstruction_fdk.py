@@ -220,6 +220,18 @@ def test_what_some_views_see_above_or_below_the_panel_is_right_or_nan(span, many
             assert values.mean() == pytest.approx(1.0, abs=within)
 
 
+def test_a_narrow_overlap_leaves_no_mark_on_the_axis():
+    """A panel moved aside sees few columns beyond the axis, which falls anywhere between two."""
+    rng = np.random.default_rng(31)
+    for overlap in [1.01, *np.exp(rng.uniform(np.log(1.0), np.log(24.0), 5))]:
+        scan = circle(240, pixel=1.0, aside=64.0 - overlap, sod=300.0, sdd=600.0)
+        field = 300.0 * np.sin(max(reach(fan_angles(circle_of(scan), scan, 128))))
+        parts = [(0.2 * field, -0.1 * field, 0.5 * field, 0.6 * field, 0.4, 0.02)]
+        data = ellipses(parts, scan, (4, 128))
+        found = fdk(data, scan, Grid((1, 9, 9), 0.5).blank()).data[0]
+        assert np.abs(found / 0.02 - 1.0).max() < 0.04  # -160 to 210 % unless sampled alike
+
+
 @pytest.mark.parametrize("kind", ["even", "half left out", "random", "arcs"])
 def test_a_wedge_of_directions_that_no_view_sees_is_said(kind):
     """Drawn lists of views; the widest wedge is found here by trying directions."""
