@@ -514,8 +514,7 @@ def _fdk(
         shape = (shape[0], round(FINER * shape[1]))
     level = panels = upright(cone_vec, shape[1] / seen[1]) if tilted else cone_vec
     _check_steady(circle, level, shape)
-    narrow = narrow_overlap(circle, level, shape[1])
-    if narrow:
+    if narrow_overlap(circle, level, shape[1]):
         level = panels = axis_between(circle, level, shape)
     beyond = truncation is not None and truncation.beyond
     weights = redundancy(circle, level, shape[1], beyond=beyond)
@@ -547,10 +546,9 @@ def _fdk(
                 f"{len(cone_vec)} views of {seen}",
                 {"asked": list(part.shape), "allowed": [len(cone_vec), *seen]},
             )
-        images = (
-            rectified(part, cone_vec[views], panels[views], shape[1]) if tilted or narrow else part
-        )
-        top = first
+        images, top = part, first
+        if panels is not cone_vec:
+            images = rectified(part, cone_vec[views], panels[views], shape[1])
         if before or after:
             rows = np.arange(first, last).clip(0, shape[0] - 1)
             images, top = np.pad(images[:, rows], ((0, 0), (0, 0), (before, after))), 0

@@ -182,8 +182,8 @@ def redundancy(circle: Circle, cone_vec: ConeVec, cols: int, *, beyond: bool = F
     low, high = reach(fan)
     if min(low, high) <= 0:
         raise GeometryError(
-            "the shadow of the rotation axis does not fall on the detector, or within half a column of "
-            "its edge; FDK needs it to",
+            "the shadow of the rotation axis does not fall on the detector, or within half a "
+            "column of its edge; FDK needs it to",
             {"fan_deg": np.rad2deg([-low, high]).tolist()},
         )
     _check_covered(circle, float(np.abs(fan).max()))
