@@ -31,7 +31,7 @@ from numba.core.compiler import Compiler
 from numba.extending import intrinsic
 
 
-class _LinkedLibrary(JITCodeLibrary):
+class _LinkedLibrary(JITCodeLibrary):  # type: ignore[misc]
     """Code to be linked into that of callers, as it is."""
 
     def _optimize_final_module(self) -> None:
@@ -65,7 +65,7 @@ def _linking(codegen: Any) -> Iterator[None]:
         del codegen._library_class, codegen.set_env
 
 
-class _Linked(Compiler):
+class _Linked(Compiler):  # type: ignore[misc]
     def _compile_core(self) -> Any:
         with _linking(self.state.targetctx.codegen()):
             return super()._compile_core()
@@ -85,8 +85,8 @@ parallel = partial(
     njit, cache=True, error_model="numpy", parallel=True, nogil=True, pipeline_class=_EntryPoint
 )
 serial = partial(njit, cache=True, nogil=True, pipeline_class=_EntryPoint)
-inner = partial(njit, pipeline_class=_Linked, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-maker = partial(inner, error_model="numpy")
+linked = partial(njit, pipeline_class=_Linked, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+maker = partial(linked, error_model="numpy")
 # No reference counting: in loops of 100 ns it would cost as much as the work. Such functions may
 # slice arrays, but not make new ones.
 kernel = partial(maker, _nrt=False)
