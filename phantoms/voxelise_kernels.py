@@ -6,13 +6,14 @@ fraction of its height that is inside.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from flexdt.twin.projection.kernels.compiling import linked, serial
 
 # mypy: disable-error-code="no-untyped-def,untyped-decorator,no-untyped-call,misc"
 
 
-@numba.njit(cache=True, nogil=True)
+@linked
 def _add_interval(data, iy, ix, low, high, value):
     """Add `value` times the covered fraction to the voxels of one column; heights in voxels."""
     nz = data.shape[0]
@@ -30,7 +31,7 @@ def _add_interval(data, iy, ix, low, high, value):
     data[last, iy, ix] += value * (high - last)
 
 
-@numba.njit(cache=True, nogil=True)
+@serial
 def add_convex(data, low, high, x0, y0, oversample, value):
     """Add one convex solid given by its interval in each sub-column.
 
@@ -45,7 +46,7 @@ def add_convex(data, low, high, x0, y0, oversample, value):
                 )
 
 
-@numba.njit(cache=True, nogil=True)
+@linked
 def _side(ax, ay, bx, by, px, py):
     """Signed crossing of the ray from (px, py) towards +x with the edge a -> b: -1, 0 or +1.
 
@@ -63,7 +64,7 @@ def _side(ax, ay, bx, by, px, py):
     return 0
 
 
-@numba.njit(cache=True, nogil=True)
+@linked
 def _winding(t, px, py):
     """Winding number of the projected triangle t (3, 3) about (px, py): -1, 0 or +1."""
     return (
@@ -73,7 +74,7 @@ def _winding(t, px, py):
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@linked
 def _height(t, px, py):
     """Height of the plane of triangle t above (px, py), kept within the triangle's heights."""
     ux, uy, uz = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
@@ -86,13 +87,13 @@ def _height(t, px, py):
     return min(max(z, low), high)
 
 
-@numba.njit(cache=True, nogil=True)
+@linked
 def _span(low, high, n):
     """Sub-column indices whose centres i + 0.5 can lie in [low, high]."""
     return max(int(np.floor(low - 0.5)), 0), min(int(np.ceil(high - 0.5)) + 1, n)
 
 
-@numba.njit(cache=True, nogil=True)
+@serial
 def cross(triangles, starts, counts, heights, signs):
     """Count the surface crossings of every sub-column; write their heights and signs, too, unless
     `heights` is empty.
@@ -118,7 +119,7 @@ def cross(triangles, starts, counts, heights, signs):
                     counts[j, i] += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@serial
 def add_surface(data, starts, counts, heights, signs, oversample, value):
     """Fill between crossings wherever the winding number is not zero.
 

@@ -527,6 +527,8 @@ def bring_over(
     """Copy or add data[z, y, x] to flat[y * stride_y + x * stride_x + z]."""
     from flexdt.twin.projection.kernels import layout_kernels
 
+    data = data.view()
+    data.flags.writeable = False  # a kernel is compiled for each type of its arguments
     if data.strides[1] < data.strides[2]:  # blocks are of z and of what is contiguous in data
         layout_kernels.transpose(data.transpose(0, 2, 1), flat, stride_y, stride_x, adding)
     else:

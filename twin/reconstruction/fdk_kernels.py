@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection.kernels.compiling import fetch_next, fused, kernel, parallel, sources
@@ -258,7 +258,7 @@ def lanczos() -> Float32Array:
     return np.asarray(weights / weights.sum(axis=1, keepdims=True), dtype=np.float32)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@parallel
 def warp(images, maps, weights, out):
     """out[n, r, c] = images[n] at maps[n] @ (c, r, 1); edges go on as their last pixel.
 

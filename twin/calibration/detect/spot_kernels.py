@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from flexdt.twin.projection.kernels.compiling import linked, serial
 
 X, Y, RADIUS, PEAK, NOISE, SCORE, BIAS, VAR_X, COV_XY, VAR_Y, OK = range(11)
 """Places in the result of `measure` and `fit_ball`."""
@@ -24,7 +25,7 @@ FLOOR_PX = 0.0015
 """Error a centroid keeps even without noise: sampling on pixels (measured on clean images)."""
 
 
-@njit(cache=True, nogil=True)
+@linked
 def bias_factor(ratio, power):  # type: ignore[no-untyped-def]
     """Sphere-centre bias of a centroid weighted by chord^power, chords capped at `ratio`.
 
@@ -39,7 +40,7 @@ def bias_factor(ratio, power):  # type: ignore[no-untyped-def]
     return above / (1.0 / p - c2 / (p + 2.0))
 
 
-@njit(cache=True, nogil=True)
+@linked
 def weight_power(noise):  # type: ignore[no-untyped-def]
     """Power of the line integral that weighs the centroid, for a given noise of it.
 
@@ -57,7 +58,7 @@ def weight_power(noise):  # type: ignore[no-untyped-def]
     return 2.0
 
 
-@njit(cache=True, nogil=True)
+@linked
 def weight_cap(noise, peak, cap):  # type: ignore[no-untyped-def]
     """Line integral at which the weight stops growing: the middle of a bead is the noisiest.
 
@@ -71,7 +72,7 @@ def weight_cap(noise, peak, cap):  # type: ignore[no-untyped-def]
     return min(limit, max(2.0, share * peak))
 
 
-@njit(cache=True, nogil=True)
+@linked
 def raised(value, power):  # type: ignore[no-untyped-def]
     """value^power with its sign, for the powers of `weight_power`."""
     size = abs(value)
@@ -84,7 +85,69 @@ def raised(value, power):  # type: ignore[no-untyped-def]
     return value * size * math.sqrt(size)
 
 
-@njit(cache=True, nogil=True)
+@linked
+def median(values, n):  # type: ignore[no-untyped-def]
+    """Median of the first n > 0 values, which it brings into another order (Hoare's quickselect).
+
+    numba's own takes three times as long to compile.
+    """
+    middle, low, high = n // 2, 0, n - 1
+    while low < high:
+        pivot = values[(low + high) // 2]
+        i, j = low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if middle <= j:
+            high = j
+        elif middle >= i:
+            low = i
+        else:
+            break
+    if n % 2 == 1:
+        return values[middle]
+    below = values[0]
+    for i in range(1, middle):
+        below = max(below, values[i])
+    return (below + values[middle]) / 2
+
+
+@linked
+def solve(matrix, right, out):  # type: ignore[no-untyped-def]
+    """Fill out with matrix @ out = right for a few unknowns: elimination with partial pivoting.
+
+    LAPACK's, and the checks that numba puts before it, take seconds to compile.
+    """
+    n = out.size
+    a = matrix.copy()
+    for i in range(n):
+        out[i] = right[i]
+    for k in range(n):
+        best = k
+        for i in range(k + 1, n):
+            if abs(a[i, k]) > abs(a[best, k]):
+                best = i
+        for c in range(n):
+            a[k, c], a[best, c] = a[best, c], a[k, c]
+        out[k], out[best] = out[best], out[k]
+        for i in range(k + 1, n):
+            share = a[i, k] / a[k, k]
+            for c in range(k, n):
+                a[i, c] -= share * a[k, c]
+            out[i] -= share * out[k]
+    for k in range(n - 1, -1, -1):
+        for c in range(k + 1, n):
+            out[k] -= a[k, c] * out[c]
+        out[k] /= a[k, k]
+
+
+@linked
 def background(image, x0, y0, inner, outer, plane):  # type: ignore[no-untyped-def]
     """Robust plane through the ring around (x0, y0): plane = (value, d/dx, d/dy); its noise.
 
@@ -111,9 +174,15 @@ def background(image, x0, y0, inner, outer, plane):  # type: ignore[no-untyped-d
     if n < 12:
         return -1.0
     # A third of the pixels tells well enough which of them to use.
-    some = values[: n : 3 if n > 300 else 1]
-    middle = np.median(some)
-    spread = 1.4826 * np.median(np.abs(some - middle)) + 1e-9
+    every = 3 if n > 300 else 1
+    few = (n + every - 1) // every
+    some = np.empty(few)
+    for i in range(few):
+        some[i] = values[i * every]
+    middle = median(some, few)
+    for i in range(few):
+        some[i] = abs(some[i] - middle)
+    spread = 1.4826 * median(some, few) + 1e-9
     plane[0], plane[1], plane[2] = middle, 0.0, 0.0
     a = np.zeros((3, 3))
     b = np.zeros(3)
@@ -148,8 +217,7 @@ def background(image, x0, y0, inner, outer, plane):  # type: ignore[no-untyped-d
         )
         if abs(det) < 1e-9 * a[0, 0] * (a[1, 1] + 1e-12) * (a[2, 2] + 1e-12):
             return spread
-        solution = np.linalg.solve(a, b)
-        plane[0], plane[1], plane[2] = solution[0], solution[1], solution[2]
+        solve(a, b, plane)
         total = 0.0
         count = 0
         for i in range(n):
@@ -161,7 +229,7 @@ def background(image, x0, y0, inner, outer, plane):  # type: ignore[no-untyped-d
     return spread
 
 
-@njit(cache=True, nogil=True)
+@serial
 def measure(image, x0, y0, radius0, cap, least, result):  # type: ignore[no-untyped-def]
     """Centroid of a whole spot near (x0, y0).
 
@@ -189,18 +257,18 @@ def measure(image, x0, y0, radius0, cap, least, result):  # type: ignore[no-unty
                 return
             noise = max(noise, least)
             centre_x, centre_y = x, y
-        inner = np.empty(int((0.7 * radius + 2) ** 2) + 4)
+        core = np.empty(int((0.7 * radius + 2) ** 2) + 4)
         n = 0
         for i in range(int(y - 0.3 * radius), int(y + 0.3 * radius) + 2):
             for j in range(int(x - 0.3 * radius), int(x + 0.3 * radius) + 2):
                 part = 1.0 - ((j - x) ** 2 + (i - y) ** 2) / (radius * radius)
-                if n < inner.shape[0] and part > 0.3:
+                if n < core.shape[0] and part > 0.3:
                     value = plane[0] + plane[1] * (j - centre_x) + plane[2] * (i - centre_y)
-                    inner[n] = (image[i, j] - value) / math.sqrt(part)
+                    core[n] = (image[i, j] - value) / math.sqrt(part)
                     n += 1
         if n == 0:
             return
-        peak = np.median(inner[:n])
+        peak = median(core, n)
         if peak <= 0:
             return
         limit = weight_cap(noise, peak, cap)
@@ -246,7 +314,7 @@ def measure(image, x0, y0, radius0, cap, least, result):  # type: ignore[no-unty
     result[OK] = 1.0
 
 
-@njit(cache=True, nogil=True)
+@linked
 def _variance(image, x, y, reach, limit, noise, power, plane, cx, cy, mass, result):  # type: ignore[no-untyped-def]
     """Covariance of a capped centroid: photon noise of a logarithm grows as exp(L / 2)."""
     vx, vxy, vy = 0.0, 0.0, 0.0
@@ -265,7 +333,7 @@ def _variance(image, x, y, reach, limit, noise, power, plane, cx, cy, mass, resu
     result[VAR_Y] = vy / (mass * mass) + FLOOR_PX * FLOOR_PX
 
 
-@njit(cache=True, nogil=True)
+@linked
 def _likeness(image, x, y, radius, peak, cap, plane, cx, cy):  # type: ignore[no-untyped-def]
     """Correlation of the spot with a ball's profile within 1.3 radii."""
     limit = min(cap, peak)
@@ -289,7 +357,7 @@ def _likeness(image, x, y, radius, peak, cap, plane, cx, cy):  # type: ignore[no
     return (sab - sa * sb / n) / math.sqrt(va * vb)
 
 
-@njit(cache=True, nogil=True)
+@linked
 def ball_table(radius, peak, blur, table, slope):  # type: ignore[no-untyped-def]
     """Line integrals of a blurred ball along its radius in steps of 1/8 px, and their slope.
 
@@ -322,7 +390,7 @@ def ball_table(radius, peak, blur, table, slope):  # type: ignore[no-untyped-def
         slope[k] = (above - below) * (4.0 if 0 < k < n - 1 else 8.0)
 
 
-@njit(cache=True, nogil=True)
+@linked
 def _level(image, mask, masked, x, y, inner, outer):  # type: ignore[no-untyped-def]
     """Median of the usable pixels in a ring, 0 if there are none."""
     rows, cols = image.shape
@@ -337,10 +405,10 @@ def _level(image, mask, masked, x, y, inner, outer):  # type: ignore[no-untyped-
             if inner * inner <= d2 <= outer * outer and n < values.shape[0]:
                 values[n] = image[i, j]
                 n += 1
-    return np.median(values[:n]) if n > 0 else 0.0
+    return median(values, n) if n > 0 else 0.0
 
 
-@njit(cache=True, nogil=True)
+@serial
 def fit_ball(  # type: ignore[no-untyped-def]
     image, mask, x0, y0, radius, stretch, peak, blur, sloped, free_radius, result
 ):
@@ -384,6 +452,7 @@ def fit_ball(  # type: ignore[no-untyped-def]
     h = np.zeros((4, 4))
     g = np.zeros(4)
     j = np.zeros(4)
+    step = np.zeros(4)
     for _ in range(25):
         left, right = max(0, math.ceil(x - reach)), min(cols - 1, math.floor(x + reach))
         top, bottom = max(0, math.ceil(y - reach)), min(rows - 1, math.floor(y + reach))
@@ -428,7 +497,7 @@ def fit_ball(  # type: ignore[no-untyped-def]
                 j[2] = pull
                 j[3] = -pull * rise * d / scale if free_radius else 0.0
                 for a in range(4):
-                    g[a] += j[a] * r
+                    g[a] -= j[a] * r
                     for b in range(4):
                         h[a, b] += j[a] * j[b]
         if count < 20 or used < 0.15 * math.pi * radius * radius:
@@ -438,7 +507,7 @@ def fit_ball(  # type: ignore[no-untyped-def]
         minor = h[0, 0] * h[1, 1] - h[0, 1] ** 2
         if h[2, 2] <= 0 or h[3, 3] <= 0 or minor < 1e-6 * h[0, 0] * h[1, 1] or minor <= 0:
             return
-        step = np.linalg.solve(h, -g)
+        solve(h, g, step)
         length = math.sqrt(step[0] ** 2 + step[1] ** 2)
         damp = min(1.0, 0.35 * radius / (length + 1e-12))
         if total > before * 1.2:
@@ -452,7 +521,10 @@ def fit_ball(  # type: ignore[no-untyped-def]
             return
         if length < 1e-4:
             break
-    inverse = np.linalg.inv(h)
+    inverse, unit = np.zeros((2, 4)), np.zeros((2, 4))  # its first two rows are all that is used
+    for a in range(2):
+        unit[a, a] = 1.0
+        solve(h, unit[a], inverse[a])
     variance = total / max(count - 4, 1)
     share = used / (math.pi * radius * radius)
     # What is missing of a spot makes its centre depend on its radius and blur.

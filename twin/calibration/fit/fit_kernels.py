@@ -27,9 +27,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.projection.kernels.compiling import linked, serial
 
 PARAMETERS = 17
 # Places of the parameters in a row of `params`: the order of `offsets.NAMES`. Unity's axes are in
@@ -45,12 +45,12 @@ _DETECTOR = 2  # changes P, Q and n alone
 _SOURCE = 3  # adds a constant to w and changes P, Q and n
 
 
-@njit(cache=True, nogil=True, inline="always")
+@linked(forceinline=True)
 def _cross(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
-@njit(cache=True, nogil=True)
+@linked
 def _rodrigues(axis, angle, vector, out):  # type: ignore[no-untyped-def]
     """Turn `vector` about the direction `axis` by `angle` into `out`, which may be itself."""
     x, y, z = axis[0], axis[1], axis[2]
@@ -65,7 +65,7 @@ def _rodrigues(axis, angle, vector, out):  # type: ignore[no-untyped-def]
     out[2] = c * d + s * cz + (1.0 - c) * dot * z
 
 
-@njit(cache=True, nogil=True)
+@linked
 def _turned(u, v, p, tu, tv, axes):  # type: ignore[no-untyped-def]
     """Detector steps after yaw, pitch, roll, as `conventions.turn_detector` has them.
 
@@ -117,7 +117,7 @@ class Data(NamedTuple):
     bead_col: int
 
 
-@njit(cache=True, nogil=True)
+@serial
 def evaluate(  # type: ignore[no-untyped-def]
     data, params, beads, use, huber, want, predicted, norms, jac, hess, grad
 ):

@@ -13,12 +13,13 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import prange
 
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.projection.kernels.compiling import parallel
 
 
-@njit(cache=True, parallel=True, error_model="numpy", fastmath=True)
+@parallel(fastmath=True)
 def sum_planes(
     sums: Float32Array, views: FloatArray, pairs: npt.NDArray[np.intp], inwards: FloatArray,
     edges: FloatArray, columns: npt.NDArray[np.intp], integrals: FloatArray, ones: FloatArray,

@@ -46,7 +46,8 @@ def carry_fan(box, g, grid, found, rays, work, n, buffer, transposed):
     if not fan.together:
         # Source or pixels inside the box, or rays along a voxel plane: each ray on its own.
         for q in range(n):
-            at, r, c = found.slot[q], found.row[q], found.column[q]
+            # As integers: single rays come with such, and one form of `walk_ray` serves both.
+            at, r, c = found.slot[q], np.int64(found.row[q]), np.int64(found.column[q])
             if not transposed:
                 buffer[at] = walk_ray(box, g, r, c, ZERO, False)
             elif buffer[at] != ZERO:
