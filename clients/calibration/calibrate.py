@@ -66,7 +66,7 @@ class DatasetFrames:
         rows, cols = dataset.shape
         self._keep = 2 * rows * cols * len(dataset) <= KEEP_BYTES
         self._kept: dict[int, Counts] = {}
-        self.unreadable: list[str] = []
+        self._unreadable: dict[int, str] = {}
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -83,7 +83,8 @@ class DatasetFrames:
         def one(index: int) -> FrameSpots:
             counts = self._counts(index)
             if counts is None:
-                return FrameSpots(nothing(self.shape), FrameState.MISSING)
+                why = self._unreadable.get(index, "")
+                return FrameSpots(nothing(self.shape), FrameState.MISSING, why)
             return look_at(normalise(counts), detector)
 
         return self._each(one)
@@ -114,7 +115,7 @@ class DatasetFrames:
         try:
             counts = self._dataset.counts(index)
         except DatasetError as error:
-            self.unreadable.append(error.message)
+            self._unreadable[index] = error.message
             return None
         if self._keep:
             self._kept[index] = counts
@@ -257,9 +258,8 @@ def calibrate_datasets(
                 for f, d in zip(frames, datasets, strict=True)
             ]
             result = calibrate(scans, target, want, detector=sought)
-    named = [_with_files(f, frames, datasets) for f in result.findings]
     saturated = [f for d in datasets if (f := saturation(d)) is not None]
-    result = replace(result, findings=(*named, *saturated))
+    result = replace(result, findings=(*result.findings, *saturated))
     seconds = time.perf_counter() - start
     document = calibration_document(result, seconds) | told
     if result.identifiable and result.motions:
@@ -269,28 +269,6 @@ def calibrate_datasets(
     document["phantom"] = target.name
     document["dataset_warnings"] = [w for d in datasets for w in d.warnings]
     return Outcome(result, document, tuple(datasets), target)
-
-
-def _with_files(
-    finding: Finding, frames: Sequence[DatasetFrames], datasets: Sequence[DataSet]
-) -> Finding:
-    """A finding about missing frames, with the files that are there and cannot be used."""
-    if finding.code != "frames_missing":
-        return finding
-    told = [
-        why
-        for some, dataset in zip(frames, datasets, strict=True)
-        if finding.text.startswith(f"{dataset.name}: ")
-        for why in sorted(set(some.unreadable))
-    ]
-    if not told:
-        return finding
-    more = f" (and {len(told) - SHOWN} more)" if len(told) > SHOWN else ""
-    return replace(finding, text=f"{finding.text}; unusable: {'; '.join(told[:SHOWN])}{more}")
-
-
-SHOWN: Final = 5
-"""Most unusable files that a finding names."""
 
 
 def saturation(dataset: DataSet) -> Finding | None:

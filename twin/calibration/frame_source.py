@@ -35,10 +35,11 @@ class FrameState(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class FrameSpots:
-    """What was found in one frame."""
+    """What was found in one frame, and why its file cannot be used where it is there."""
 
     detections: Detections
     state: FrameState
+    unusable: str = ""
 
 
 def without_repeats(looks: Sequence[FrameSpots]) -> tuple[FrameSpots, ...]:
