@@ -150,8 +150,9 @@ def reconstruct(
     """
     names = [scatter_correction] if isinstance(scatter_correction, str) else scatter_correction
     request = VolumeRequest(
-        algorithm, voxel, shape, binning, every, iterations, window, center, False, material,
-        weight=weight, tube=tube,
+        algorithm=algorithm, voxel_mm=voxel, shape=shape, binning=binning, every=every,
+        iterations=iterations, window=window, center_mm=center, material=material, weight=weight,
+        tube=tube,
         scatter_correction=None if names is None else tuple(names),
     )  # fmt: skip
     return reconstruct_volume(_opened(data), request, parameters=parameters)

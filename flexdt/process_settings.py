@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import math
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -82,6 +83,24 @@ def memory_size(text: str) -> int:
     if size <= 0:
         raise typer.BadParameter(f"{text!r} is not a size such as 512M or 4GiB")
     return size
+
+
+def speed_up(text: str | float) -> float | Literal["max"]:
+    """Read how many times as fast as yours the twin's time runs: a positive number, or max.
+
+    Raises:
+        typer.BadParameter: neither.
+    """
+    word = str(text).strip().lower()
+    if word == "max":
+        return "max"
+    try:
+        factor = float(word)
+    except ValueError:
+        factor = math.nan
+    if not 0 < factor < math.inf:
+        raise typer.BadParameter(f"the speed-up {text} must be positive, or 'max'")
+    return factor
 
 
 def scatter_method(text: str) -> str:
@@ -220,9 +239,10 @@ class ScannerSettings(ServerSettings):
     sample: str | None = option(
         None, "Put this sample on the stage at the start, or 'empty'.", metavar="NAME"
     )
-    speed_up: str = option(
-        "1", "Let the twin's time run X times as fast as yours.", metavar="X or max"
-    )
+    speed_up: Any = option(
+        1.0, "Let the twin's time run X times as fast as yours.", metavar="X or max",
+        parser=speed_up,
+    )  # fmt: skip
     physics: Physics = option("ideal", "Make images this way (docs/physics.md).")
     scatter: Scatter = option(
         "off", "Simulate scattered radiation, with physics mono and poly.", metavar="off or mc",

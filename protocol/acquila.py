@@ -155,22 +155,15 @@ class Exchange:
         command: what was asked; its UUID is already given.
         comp_type: of the component, for the replies.
         now: real time [s].
-        period: between FDB events [s].
 
     Raises:
         AcquilaError: `command` is a reply itself.
     """
 
-    def __init__(
-        self,
-        command: AcquilaEvent,
-        comp_type: ComponentType,
-        now: float,
-        period: float = FEEDBACK_S,
-    ) -> None:
+    def __init__(self, command: AcquilaEvent, comp_type: ComponentType, now: float) -> None:
         if not command.is_command:
             raise AcquilaError(f"{command.reply_type.value} is a reply and no command")
-        self.command, self._type, self._period = command, comp_type, period
+        self.command, self._type = command, comp_type
         self._last, self._received, self._ended = now, False, False
 
     @property
@@ -181,7 +174,7 @@ class Exchange:
     @property
     def next_feedback(self) -> float:
         """When the next FDB is due [s]."""
-        return self._last + self._period
+        return self._last + FEEDBACK_S
 
     def received(self, now: float) -> AcquilaEvent:
         """RCV; the first event of every exchange."""

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Final, TypeVar
@@ -30,17 +29,17 @@ from flexdt.clients.calibration.markers import (
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.phantoms import Phantom, load_phantom
 from flexdt.phantoms.files.phantom_files import read_phantom_file
-from flexdt.twin.calibration.detect.detection import SpotFinder, coarseness, coarser
-from flexdt.twin.calibration.detect.windows import Windows
+from flexdt.twin.calibration.detect.detection import SpotFinder
+from flexdt.twin.calibration.detect.windows import Windows, overlap
 from flexdt.twin.calibration.diagnose.finding import Finding, Severity
 from flexdt.twin.calibration.fit.image_quantities import image_quantities
 from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.fit.problem import SIX, from_printed_reading
-from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, look_in_parts, nothing
+from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, look_at, nothing
 from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
 from flexdt.twin.calibration.unknown_markers import UNKNOWN
 from flexdt.twin.dataset.dataset_errors import DatasetError
-from flexdt.twin.dataset.normalise import MIN_COUNTS, LineIntegrals
+from flexdt.twin.dataset.normalise import MIN_COUNTS
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import NAMES, Offsets
@@ -59,63 +58,6 @@ _T = TypeVar("_T")
 Counts = npt.NDArray[np.uint16]
 
 
-@dataclass(frozen=True, eq=False)
-class _Light:
-    """Counts to line integrals, of parts of an image and of coarse pixels.
-
-    Attributes:
-        normalise: the data set's normalisation.
-        factor: coarse pixels are factor x factor.
-        alive: 1 where a pixel sees the beam, or None if all do.
-        dark, log_open: of coarse pixels, dead ones left out.
-        source: flat index of the pixel whose value each one takes, or None if its own.
-    """
-
-    normalise: LineIntegrals
-    factor: int
-    alive: Float32Array | None
-    dark: Float32Array
-    log_open: Float32Array
-    source: npt.NDArray[np.intp] | None
-
-    @classmethod
-    def of(cls, normalise: LineIntegrals, factor: int) -> _Light:
-        opened = np.where(normalise.dead, np.float32(0.0), np.exp(normalise.log_open))
-        alive: Float32Array | None = None
-        source: npt.NDArray[np.intp] | None = None
-        dark = normalise.dark
-        if len(normalise.nearest):
-            alive = (~normalise.dead).astype(np.float32)
-            dark = dark * alive
-            source = np.arange(dark.size).reshape(dark.shape)
-            source[normalise.dead] = normalise.nearest
-        few = np.float32(1e-3)
-        log_open = np.log(np.maximum(coarser(opened, factor), few))
-        return cls(normalise, factor, alive, coarser(dark, factor), log_open, source)
-
-    def coarse(self, counts: Counts) -> Float32Array:
-        """Line integrals of coarse pixels."""
-        bright = counts.astype(np.float32)
-        if self.alive is not None:
-            bright *= self.alive
-        signal = coarser(bright, self.factor) - self.dark
-        lowest = np.minimum(np.float32(MIN_COUNTS), np.exp(self.log_open))
-        return np.asarray(self.log_open - np.log(np.maximum(signal, lowest)), dtype=np.float32)
-
-    def part(self, counts: Counts, rows: slice, cols: slice) -> Float32Array:
-        """Line integrals of some rows and columns, finite."""
-        n = self.normalise
-        if self.source is None:
-            seen, dark, log_open = counts[rows, cols], n.dark[rows, cols], n.log_open[rows, cols]
-        else:
-            places = self.source[rows, cols]
-            seen = counts.reshape(-1)[places]
-            dark, log_open = n.dark.reshape(-1)[places], n.log_open.reshape(-1)[places]
-        signal = np.subtract(seen, dark, dtype=np.float32)
-        np.maximum(signal, np.float32(MIN_COUNTS), out=signal)
-        return np.asarray(log_open - np.log(signal), dtype=np.float32)
-
-
 class DatasetFrames:
     """The projections of a data set; see `flexdt.twin.calibration.frame_source.Frames`."""
 
@@ -124,8 +66,7 @@ class DatasetFrames:
         rows, cols = dataset.shape
         self._keep = 2 * rows * cols * len(dataset) <= KEEP_BYTES
         self._kept: dict[int, Counts] = {}
-        self._states: list[FrameState] = []
-        self.unreadable: list[str] = []
+        self._unreadable: dict[int, str] = {}
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -135,52 +76,32 @@ class DatasetFrames:
     def __len__(self) -> int:
         return len(self._dataset)
 
-    def preload(self) -> None:
-        """Read all counts now, whatever they take."""
-        self._keep = True
-        self._each(self._counts)
-
     def look(self, detector: SpotFinder) -> list[FrameSpots]:
-        """Detect the beads of every frame; only what may hold one is normalised."""
-        factor = coarseness(detector)
-        light = _Light.of(self._dataset.normalisation, factor)
+        """Detect the beads of every frame."""
+        normalise = self._dataset.normalisation
 
         def one(index: int) -> FrameSpots:
             counts = self._counts(index)
             if counts is None:
-                return FrameSpots(nothing(self.shape), FrameState.MISSING)
-            return look_in_parts(
-                light.coarse(counts), factor, self.shape, partial(light.part, counts), detector
-            )
+                why = self._unreadable.get(index, "")
+                return FrameSpots(nothing(self.shape), FrameState.MISSING, why)
+            return look_at(normalise(counts), detector)
 
-        looks = self._each(one)
-        self._states = [look.state for look in looks]
-        return looks
+        return self._each(one)
 
     def windows(self, plan: Windows) -> Float32Array:
         """Cut the windows of every frame; only their pixels are normalised."""
         normalise = self._dataset.normalisation
         log_open = np.where(normalise.dead, np.float32(np.nan), normalise.log_open)
         n, k = plan.corner.shape[:2]
-        side = plan.side
-        rows, cols = self.shape
-        out = np.full((n, k, side, side), np.nan, dtype=np.float32)
+        out = np.full((n, k, plan.side, plan.side), np.nan, dtype=np.float32)
 
         def one(index: int) -> None:
-            if self._states and self._states[index] is not FrameState.USABLE:
-                return
             counts = self._counts(index)
-            if counts is None:
-                return
-            for bead, (x, y) in enumerate(plan.corner[index].tolist()):
-                left, right = max(x, 0), min(x + side, cols)
-                top, bottom = max(y, 0), min(y + side, rows)
-                if left >= right or top >= bottom:
-                    continue
-                part = (slice(top, bottom), slice(left, right))
-                signal = np.maximum(counts[part] - normalise.dark[part], np.float32(0.5))
-                window = out[index, bead, top - y : bottom - y, left - x : right - x]
-                np.subtract(log_open[part], np.log(signal), out=window)
+            for bead in range(0 if counts is None else k):
+                inside, there = overlap(plan, index, bead)
+                signal = np.maximum(counts[there] - normalise.dark[there], np.float32(MIN_COUNTS))
+                out[index, bead][inside] = log_open[there] - np.log(signal)
 
         self._each(one)
         return out
@@ -194,7 +115,7 @@ class DatasetFrames:
         try:
             counts = self._dataset.counts(index)
         except DatasetError as error:
-            self.unreadable.append(error.message)
+            self._unreadable[index] = error.message
             return None
         if self._keep:
             self._kept[index] = counts
@@ -337,9 +258,8 @@ def calibrate_datasets(
                 for f, d in zip(frames, datasets, strict=True)
             ]
             result = calibrate(scans, target, want, detector=sought)
-    named = [_with_files(f, frames, datasets) for f in result.findings]
     saturated = [f for d in datasets if (f := saturation(d)) is not None]
-    result = replace(result, findings=(*named, *saturated))
+    result = replace(result, findings=(*result.findings, *saturated))
     seconds = time.perf_counter() - start
     document = calibration_document(result, seconds) | told
     if result.identifiable and result.motions:
@@ -349,28 +269,6 @@ def calibrate_datasets(
     document["phantom"] = target.name
     document["dataset_warnings"] = [w for d in datasets for w in d.warnings]
     return Outcome(result, document, tuple(datasets), target)
-
-
-def _with_files(
-    finding: Finding, frames: Sequence[DatasetFrames], datasets: Sequence[DataSet]
-) -> Finding:
-    """A finding about missing frames, with the files that are there and cannot be used."""
-    if finding.code != "frames_missing":
-        return finding
-    told = [
-        why
-        for some, dataset in zip(frames, datasets, strict=True)
-        if finding.text.startswith(f"{dataset.name}: ")
-        for why in sorted(set(some.unreadable))
-    ]
-    if not told:
-        return finding
-    more = f" (and {len(told) - SHOWN} more)" if len(told) > SHOWN else ""
-    return replace(finding, text=f"{finding.text}; unusable: {'; '.join(told[:SHOWN])}{more}")
-
-
-SHOWN: Final = 5
-"""Most unusable files that a finding names."""
 
 
 def saturation(dataset: DataSet) -> Finding | None:

@@ -1,4 +1,4 @@
-"""Words of the command line to values: AXIS=VALUE, HOST:PORT, a speed-up, lists.
+"""Words of the command line to values: AXIS=VALUE, HOST:PORT, lists.
 
 Invalid words become usage errors (exit code 2) that quote the word and state what is allowed. The
 twin, not this module, knows the names of the axes.
@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Literal
 
 import typer
 
@@ -78,20 +77,6 @@ def server(word: str) -> tuple[str, int]:
         text += f":{DEFAULT_PORT}"
     found = address(f"{LOOPBACK}{text}" if text.startswith(":") else text)
     return found.host, found.port
-
-
-def speed_up(word: str) -> float | Literal["max"]:
-    """A positive factor, or "max".
-
-    Raises:
-        typer.BadParameter: neither.
-    """
-    if word.strip().lower() == "max":
-        return "max"
-    value = number(word, "the speed-up")
-    if value <= 0:
-        raise typer.BadParameter(f"the speed-up {word} must be positive, or 'max'")
-    return value
 
 
 def numbers(

@@ -47,7 +47,6 @@ def bench(folder: Path, phantom: str, repeats: int = 7) -> dict[str, object]:
     problem = fit.problem
     model = find_phantom(phantom)
     frames = DatasetFrames(dataset)
-    frames.preload()
     start = problem.start
 
     def alone() -> None:

@@ -107,7 +107,7 @@ class Jobs:
         runner = job.runner
         return runner is None or not runner.idle or self._clock.speed_up == "max"
 
-    def require_free(self, what: str) -> None:
+    def require_idle(self, what: str) -> None:
         """Refuse what would disturb a job that runs, is being opened, or was told to go on.
 
         Raises:
@@ -215,7 +215,7 @@ class Jobs:
         self._notify(job)
         return job
 
-    def pause(self, job: Job, error: Exception | None = None) -> None:
+    def pause(self, job: Job) -> None:
         """Pause a running job; nothing to do for one that is paused.
 
         Raises:
@@ -223,7 +223,7 @@ class Jobs:
         """
         runner = self._runner(job, "pause", ("running", "paused"))
         self._take_over()
-        runner.pause(error)
+        runner.pause()
         self._notify(job)
 
     def resume(self, job: Job) -> None:

@@ -57,34 +57,30 @@ TIMEOUT_S = 180.0
 MEMORY_BYTES = 3 << 30
 
 
-def mesh_apart(
-    raw: bytes, *, unit: str, material: str, file_type: str, name: str, timeout_s: float = TIMEOUT_S
-) -> Phantom:
+def mesh_apart(raw: bytes, *, unit: str, material: str, file_type: str, name: str) -> Phantom:
     """`flexdt.phantoms.mesh_phantom` of a stranger's bytes; blocks, so call it from a thread.
 
     Raises:
         PhantomError: as there, unknown material, or reading it takes too much time or memory.
     """
     how = {"unit": unit, "material": material, "file_type": file_type, "name": name}
-    return _apart(mesh_phantom, how, raw, timeout_s)
+    return _apart(mesh_phantom, how, raw)
 
 
-def scene_apart(raw: bytes, *, name: str, timeout_s: float = TIMEOUT_S) -> Phantom:
+def scene_apart(raw: bytes, *, name: str) -> Phantom:
     """The phantom of a stranger's phantom or scene file (TOML or JSON), as `mesh_apart`.
 
     Raises:
         PhantomError: its content does not hold, it is larger than is allowed, names files or an
             unknown material, or reading it takes too much time or memory.
     """
-    return _apart(sent_scene, {"name": name}, raw, timeout_s)
+    return _apart(sent_scene, {"name": name}, raw)
 
 
-def _apart(
-    read: Callable[..., Phantom], how: dict[str, str], raw: bytes, timeout_s: float
-) -> Phantom:
+def _apart(read: Callable[..., Phantom], how: dict[str, str], raw: bytes) -> Phantom:
     worker = Worker(MEMORY_BYTES)
     try:
-        [document] = worker.ask(_document, (read, how), [raw], timeout_s)
+        [document] = worker.ask(_document, (read, how), [raw], TIMEOUT_S)
     except RpcError as error:
         prefix = f"{how['name']!r} cannot be read: " if error.code == Code.TOO_LARGE else ""
         data = error.data if isinstance(error.data, dict) else None

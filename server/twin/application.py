@@ -49,7 +49,7 @@ class TwinSession:
                 self._take_control(method.name)
             by_hand: AbstractContextManager[None] = nullcontext()
             if method.by_hand:
-                twin.jobs.require_free(method.name)
+                twin.jobs.require_idle(method.name)
                 by_hand = twin.jobs.manual_control()
             with by_hand:
                 result = HANDLERS[method.name](twin, client, params)

@@ -24,25 +24,12 @@ from flexdt.runtime.access import (
 )
 from flexdt.runtime.log import LEVELS, set_up
 from flexdt.runtime.process import FAILED, OK, announce, first_of, run_process, stop_signal
-from flexdt.server.scans.twin_clock import SpeedUp, check_speed_up
 
 DEFAULT_SAMPLE = "lego"
 SWITCH_S = 0.001
 """How long a worker thread may keep the interpreter while the event loop wants it [s]."""
 PATIENCE_S = 10.0
 """How long the projector may be away before a scan pauses [s]."""
-
-
-def speed_up_of(text: str) -> SpeedUp:
-    """The clock's speed-up.
-
-    Raises:
-        LimitError: not a positive number and not "max".
-    """
-    try:
-        return check_speed_up("max" if text.strip().lower() == "max" else float(text))
-    except ValueError:
-        return check_speed_up(text)
 
 
 async def run(options: TwinSettings) -> int:
@@ -87,7 +74,7 @@ async def run(options: TwinSettings) -> int:
         projector,
         directory,
         truth=truth,
-        speed_up=speed_up_of(options.speed_up),
+        speed_up=options.speed_up,
         seed=(lambda: None) if options.no_noise else fresh_seed,
         physics=options.physics,
         scatter=options.scatter,

@@ -9,6 +9,7 @@ import typer
 from hypothesis import given
 from hypothesis import strategies as st
 
+from flexdt import process_settings
 from flexdt.clients.cli import console, option_values
 from flexdt.clients.cli.console import PLAIN_INTERVAL_S, ProgressBar
 
@@ -64,11 +65,11 @@ def test_bad_server_addresses(word: str) -> None:
 
 
 def test_speed_up() -> None:
-    assert option_values.speed_up("max") == "max"
-    assert option_values.speed_up("2.5") == 2.5
+    assert process_settings.speed_up("max") == "max"
+    assert process_settings.speed_up("2.5") == 2.5
     for word in ("0", "-1", "inf", "fast"):
         with pytest.raises(typer.BadParameter):
-            option_values.speed_up(word)
+            process_settings.speed_up(word)
 
 
 def test_plain_progress_counts_and_estimates(capsys: pytest.CaptureFixture[str]) -> None:

@@ -32,18 +32,18 @@ def test_nothing_is_changed_while_a_job_is_being_opened(tmp_path: Path) -> None:
             raise LimitError("it does not hold after all")
 
         work = asyncio.create_task(jobs.work())
-        jobs.require_free("a move")
+        jobs.require_idle("a move")
         plan = plan_poses([{"rot_obj": 5.0}], M, P)
         job = jobs.draft("scan", str(tmp_path / "scan"), plan, prepare)
         jobs.enqueue(job)
         await asyncio.wait_for(asked.wait(), 60)
         with pytest.raises(RpcError, match="a move is refused while job-1 begins") as refused:
-            jobs.require_free("a move")
+            jobs.require_idle("a move")
         assert refused.value.code == -32003
         answer.set()
         while job.phase != "failed":
             await asyncio.sleep(0.001)
-        jobs.require_free("a move")
+        jobs.require_idle("a move")
 
         asked.clear()
         answer.clear()
@@ -51,7 +51,7 @@ def test_nothing_is_changed_while_a_job_is_being_opened(tmp_path: Path) -> None:
         jobs.enqueue(given_up)
         await asyncio.wait_for(asked.wait(), 60)
         jobs.abort(given_up)
-        jobs.require_free("a move")  # at once: it will not run any more
+        jobs.require_idle("a move")  # at once: it will not run any more
         work.cancel()
 
     asyncio.run(asyncio.wait_for(main(), 100))

@@ -202,7 +202,7 @@ def test_sigterm_in_mid_scan_ends_cleanly_and_the_data_set_says_incomplete(
         (["--machine", "missing.toml"], 1, "missing.toml: No such file"),
         (["--profile", "missing.toml"], 1, "missing.toml: No such file"),
         (["--machine", "xyzr_cabinet", "--profile", "thesis"], 1, "for machine 'flexray'"),
-        (["--speed-up", "-3"], 1, "speed-up"),
+        (["--speed-up", "-3"], 2, "speed-up"),
         (["--sample", "unicorn"], 1, "lego"),
     ],
 )

@@ -14,13 +14,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.calibration.detect.detection import (
-    Detections,
-    Part,
-    SpotFinder,
-    detect_beads,
-    detect_in_parts,
-)
+from flexdt.twin.calibration.detect.detection import Detections, SpotFinder, detect_beads
 from flexdt.twin.calibration.detect.windows import Windows, crop
 from flexdt.twin.calibration.fit.priors import ASSUMED
 from flexdt.twin.geometry.conventions import Float32Array
@@ -41,10 +35,11 @@ class FrameState(enum.Enum):
 
 @dataclass(frozen=True, eq=False)
 class FrameSpots:
-    """What was found in one frame."""
+    """What was found in one frame, and why its file cannot be used where it is there."""
 
     detections: Detections
     state: FrameState
+    unusable: str = ""
 
 
 def without_repeats(looks: Sequence[FrameSpots]) -> tuple[FrameSpots, ...]:
@@ -90,16 +85,6 @@ def look_at(image: Float32Array, detector: SpotFinder) -> FrameSpots:
     if float(np.median(image[::16, ::16])) > DARK:
         return FrameSpots(nothing(shape), FrameState.DARK)
     return FrameSpots(detect_beads(image, detector), FrameState.USABLE)
-
-
-def look_in_parts(
-    coarse: Float32Array, factor: int, shape: tuple[int, int], part: Part, detector: SpotFinder
-) -> FrameSpots:
-    """The same where only parts of the image need be made; see `detect.detect_in_parts`."""
-    step = max(16 // factor, 1)
-    if float(np.median(coarse[::step, ::step])) > DARK:
-        return FrameSpots(nothing(shape), FrameState.DARK)
-    return FrameSpots(detect_in_parts(coarse, factor, shape, part, detector), FrameState.USABLE)
 
 
 @dataclass(frozen=True, eq=False)

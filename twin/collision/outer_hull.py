@@ -25,12 +25,11 @@ LIFT: Final = 1e-9
 """By what part of its size the body is larger, so that rounding leaves no point outside."""
 
 
-def outer_hull(points: npt.ArrayLike, most: int = MAX_POINTS) -> Polytope:
-    """A convex body that contains points and has few corners.
+def outer_hull(points: npt.ArrayLike) -> Polytope:
+    """A convex body that contains points and has at most `MAX_POINTS` corners.
 
     Args:
         points: (k, 3) [mm].
-        most: corners; with fewer corners of its own, the points' hull is returned as it is.
 
     Example:
         >>> ball = np.random.default_rng(1).normal(size=(3000, 3))
@@ -40,7 +39,7 @@ def outer_hull(points: npt.ArrayLike, most: int = MAX_POINTS) -> Polytope:
         (True, True)
     """
     exact = hull(points)
-    if len(exact.vertices) <= most:
+    if len(exact.vertices) <= MAX_POINTS:
         return exact
     planes = _planes(exact)
     low, high = exact.bounds()
@@ -57,7 +56,7 @@ def outer_hull(points: npt.ArrayLike, most: int = MAX_POINTS) -> Polytope:
             far[out[:, taken[-1]] > 0.0] = 0.0  # what a plane cuts off needs no second one
         chosen += list(planes[taken] - [0.0, 0.0, 0.0, lift])
         cut = _corners(chosen, inside)
-        if not taken or len(cut) > most:
+        if not taken or len(cut) > MAX_POINTS:
             return hull(corners)
         corners = cut
 

@@ -84,12 +84,15 @@ def reconstruct(
     from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_dataset
     from flexdt.clients.reconstruction.reconstruct import preview as quick_look
 
+    voxels = None if shape is None else _shape(shape)
+    scattering = None if scatter_correction is None else option_values.names(scatter_correction)
+    middle = "X,Y,Z, e.g. 0,0,-5.5"
     request = VolumeRequest(
-        algorithm or "fdk", voxel, None if shape is None else _shape(shape), binning or 1,
-        every or 1, iterations, chosen(ReconstructSettings).window,
-        None if center is None else option_values.triple(center, "center", "X,Y,Z, e.g. 0,0,-5.5"),
-        rings, material, kv, png, weight,
-        None if scatter_correction is None else option_values.names(scatter_correction),
+        algorithm=algorithm or "fdk", voxel_mm=voxel, shape=voxels, binning=binning or 1,
+        every=every or 1, iterations=iterations, weight=weight,
+        window=chosen(ReconstructSettings).window,
+        center_mm=None if center is None else option_values.triple(center, "center", middle),
+        rings=rings, material=material, kV=kv, scatter_correction=scattering, png=png,
     )  # fmt: skip
     option_values.require_folder(out)
     parameters, report = _correction(correction, twin)

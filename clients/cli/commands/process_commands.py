@@ -17,7 +17,6 @@ from typing import Annotated, Any, Final, Literal
 
 import typer
 
-from flexdt.clients.cli import option_values
 from flexdt.clients.cli.options import Answer
 from flexdt.clients.cli.settings_file import TABLES, chosen, settings_of
 from flexdt.process_settings import UpSettings, has_parameters, parameters, words
@@ -96,8 +95,6 @@ def _check(given: Mapping[str, Any]) -> None:
         raise typer.BadParameter("--tls-cert and --tls-key go together")
     if given.get("projector") is not None and given["projector_port"] is not None:
         raise typer.BadParameter("give --projector or --projector-port, not both")
-    if "speed_up" in given:
-        option_values.speed_up(given["speed_up"])
 
 
 def become(module: str, given: Mapping[str, object], more: Sequence[str] = ()) -> None:

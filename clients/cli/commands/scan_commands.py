@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
-from flexdt import machines
+from flexdt import machines, process_settings
 from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.boundary import (
     INTERRUPTED,
@@ -172,8 +172,11 @@ def run(
     script: ScriptFile,
     out: str | None = option(None, "Give the data set this name.", metavar="NAME"),
     sample: str | None = option(None, "Put this sample on the stage first.", metavar="NAME"),
-    speed_up: str | None = option(
-        None, "Let the twin's time run X times as fast as yours.", metavar="X or max"
+    speed_up: Any = option(
+        None,
+        "Let the twin's time run X times as fast as yours.",
+        metavar="X or max",
+        parser=process_settings.speed_up,
     ),
     detach: bool = option(False, "Return once the script is submitted.", "--detach"),
 ) -> Answer:
@@ -184,13 +187,12 @@ def run(
     from flexdt.protocol.rpc_errors import RpcError
 
     data = script.read_bytes()
-    factor = None if speed_up is None else option_values.speed_up(speed_up)
     with twin() as client:
         if sample is not None:
             client.set_sample(sample)
         began = client.state().time
         try:
-            made = client.submit_script(data, name=out, speed_up=factor)
+            made = client.submit_script(data, name=out, speed_up=speed_up)
         except RpcError as error:
             places = positions(error.data, str(script))
             if not places:

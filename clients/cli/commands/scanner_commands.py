@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
+from flexdt import process_settings
 from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.boundary import REFUSED
 from flexdt.clients.cli.console import duration, note, table, warn
@@ -117,7 +118,7 @@ def camera(
 
 def clock(twin: Twin, speed_up: str = argument(..., "X or max")) -> Answer:
     """Set how fast the twin's time runs."""
-    wanted = option_values.speed_up(speed_up)
+    wanted = process_settings.speed_up(speed_up)
     with twin() as client:
         now = client.set_clock(wanted)
     yield now

@@ -13,7 +13,7 @@ from flexdt.protocol.methods import document_messages as p
 from flexdt.protocol.methods import openrpc_document
 from flexdt.server.storage.scene import require_fit, sample_of, save_scene
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, answers, change_stage
+from flexdt.server.twin.handlers.handler import Client, answers, change_stage, ensure_idle
 from flexdt.twin.errors import SafetyError
 
 
@@ -46,8 +46,7 @@ async def load(twin: TwinServer, client: Client, params: p.SceneLoad) -> w.State
                 "the scene is not loaded: motion was stopped meanwhile",
                 {"asked": "scene.load", "allowed": "asking again"},
             )
-        twin.control.ensure_allowed(client.name, "scene.load")
-        twin.jobs.require_free("a scene")
+        ensure_idle(twin, client, "scene.load", "a scene")()
 
     ready()
     async with twin.stage_turn:

@@ -75,12 +75,12 @@ def ensure_allowed(twin: TwinServer, client: Client, what: str) -> Callable[[], 
     return lambda: twin.control.ensure_allowed(client.name, what)
 
 
-def free(twin: TwinServer, client: Client, method: str, what: str) -> Callable[[], None]:
+def ensure_idle(twin: TwinServer, client: Client, method: str, what: str) -> Callable[[], None]:
     """Checks that neither control has changed hands nor a job begun since the request."""
 
     def check() -> None:
         twin.control.ensure_allowed(client.name, method)
-        twin.jobs.require_free(what)
+        twin.jobs.require_idle(what)
 
     return check
 

@@ -79,7 +79,7 @@ async def resume(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobSta
         return twin.jobs.status(job)
     twin.jobs.resume(job)
     status = await _when(twin, job, lambda: job.phase != "paused" or job.error is not None)
-    return _free(job, status)
+    return _unless_obstructed(job, status)
 
 
 @answers(p.JOB_STEP)
@@ -88,7 +88,9 @@ async def step(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatu
     job = twin.jobs.get(params.job)
     twin.jobs.step(job)
     runner = job.runner
-    return _free(job, await _when(twin, job, lambda: runner is None or not runner.stepping))
+    return _unless_obstructed(
+        job, await _when(twin, job, lambda: runner is None or not runner.stepping)
+    )
 
 
 @answers(p.JOB_ABORT)
@@ -117,7 +119,7 @@ async def _when(twin: TwinServer, job: Job, condition: Callable[[], bool]) -> w.
     return twin.jobs.status(job)
 
 
-def _free(job: Job, status: w.JobStatus) -> w.JobStatus:
+def _unless_obstructed(job: Job, status: w.JobStatus) -> w.JobStatus:
     """The status of a job that is to go on, unless an obstacle is in its path."""
     error = job.runner.progress.error if job.runner is not None else None
     if status.state == "paused" and isinstance(error, CollisionError):

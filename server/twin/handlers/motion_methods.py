@@ -11,7 +11,7 @@ from flexdt.protocol.fields import Empty
 from flexdt.protocol.methods import motion_messages as p
 from flexdt.server.twin import wire_values as views
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, answers, change_settings, free
+from flexdt.server.twin.handlers.handler import Client, answers, change_settings, ensure_idle
 from flexdt.server.twin.obstacle_move import finished
 from flexdt.twin.scanner.scanner import ScannerTwin
 
@@ -98,7 +98,7 @@ async def set_axis(twin: TwinServer, client: Client, params: p.AxisSet) -> p.Axi
     def change(scanner: ScannerTwin) -> None:
         scanner.set_axis(params.axis, speed=params.speed, acceleration=params.acceleration)
 
-    await change_settings(twin, change, free(twin, client, "axes.set", "axes.set"))
+    await change_settings(twin, change, ensure_idle(twin, client, "axes.set", "axes.set"))
     axis = twin.scanner.state(twin.clock.now()).axes[params.axis]
     return p.AxisSetResult(axis=params.axis, speed=axis.speed, acceleration=axis.acceleration)
 

@@ -17,7 +17,7 @@ from flexdt.server.twin.handlers.handler import (
     answers,
     change_stage,
     encoded_apart,
-    free,
+    ensure_idle,
     in_turns,
 )
 from flexdt.twin.errors import LimitError, UnknownNameError
@@ -41,7 +41,7 @@ async def set_sample(twin: TwinServer, client: Client, params: p.SampleSet) -> p
         async with twin.samples.turn:
             await asyncio.to_thread(twin.samples.load, name, params.material)
         sample = Sample(name, offset, params.material)
-    ready = free(twin, client, "sample.set", "a sample")
+    ready = ensure_idle(twin, client, "sample.set", "a sample")
     ready()
     async with twin.stage_turn:
         warnings = await change_stage(twin, sample, twin.scanner.correction, ready)
@@ -91,12 +91,12 @@ async def mesh(twin: TwinServer, client: Client, params: p.SampleMesh) -> p.Samp
 async def upload(twin: TwinServer, client: Client, params: p.SampleUpload) -> p.UploadResult:
     """One chunk; the last one makes the sample."""
     head = UploadHead.of(params)
-    _require_free(twin, client, head.name)
+    _ensure_idle_if_used(twin, client, head.name)
     received = await asyncio.to_thread(twin.samples.receive, head, params.start, params.data)
     if received < head.total:
         return p.UploadResult(name=head.name, received=received, complete=False)
     async with twin.samples.turn, twin.stage_turn:
-        _require_free(twin, client, head.name)
+        _ensure_idle_if_used(twin, client, head.name)
         stands = twin.scanner.sample
         there = stands.name == head.name
         if head.kind != "mesh":
@@ -107,7 +107,7 @@ async def upload(twin: TwinServer, client: Client, params: p.SampleUpload) -> p.
         if there:
             warnings += await change_stage(
                 twin, stands, twin.scanner.correction,
-                lambda: _require_free(twin, client, head.name), upload=upload,
+                lambda: _ensure_idle_if_used(twin, client, head.name), upload=upload,
             )  # fmt: skip
         else:
             await twin.keeper.keep(
@@ -125,14 +125,15 @@ async def upload(twin: TwinServer, client: Client, params: p.SampleUpload) -> p.
     )
 
 
-def _require_free(twin: TwinServer, client: Client, name: str) -> None:
-    """Check that the sample may change: under this connection's control, and in no scan.
+def _ensure_idle_if_used(twin: TwinServer, client: Client, name: str) -> None:
+    """Check that a sample may change: if it is on the stage, under this connection's control and in
+    no scan.
 
     Raises:
         RpcError: -32003, names the controller or the job.
     """
     if name == twin.scanner.sample.name:
-        free(twin, client, "sample.upload", "sample.upload")()
+        ensure_idle(twin, client, "sample.upload", "sample.upload")()
 
 
 def _info(name: str, phantom: Phantom, head: UploadHead | None = None) -> p.SampleInfo:

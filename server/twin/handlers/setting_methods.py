@@ -6,7 +6,7 @@ from flexdt.protocol import state_model as w
 from flexdt.protocol.methods import motion_messages as p
 from flexdt.server.twin import wire_values as views
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, answers, change_settings, free
+from flexdt.server.twin.handlers.handler import Client, answers, change_settings, ensure_idle
 from flexdt.twin.errors import SafetyError
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.scanner.scanner import ScannerTwin
@@ -40,7 +40,7 @@ async def set_tube(twin: TwinServer, client: Client, params: p.TubeSet) -> w.Tub
         change(twin.scanner)  # X-rays never come on by themselves, so nothing must be remembered
         twin.changed()
     else:
-        await change_settings(twin, change, free(twin, client, "tube.set", "tube.set"))
+        await change_settings(twin, change, ensure_idle(twin, client, "tube.set", "tube.set"))
     return views.tube_view(twin.scanner.tube, twin.clock.now())
 
 
@@ -51,7 +51,7 @@ async def set_camera(twin: TwinServer, client: Client, params: p.CameraSet) -> w
     def change(scanner: ScannerTwin) -> None:
         scanner.set_camera(**camera_change(params))
 
-    await change_settings(twin, change, free(twin, client, "camera.set", "camera.set"))
+    await change_settings(twin, change, ensure_idle(twin, client, "camera.set", "camera.set"))
     return views.camera_view(twin.scanner.camera, twin.machine)
 
 

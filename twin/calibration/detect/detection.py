@@ -11,7 +11,7 @@ is dropped. A bead that is cut by the image's edge is fitted as a ball with the 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -125,15 +125,12 @@ def detect_beads(
         raise TwinError.of_shape("an image", data.shape, ("rows", "cols"))
     if not np.isfinite(data).all():
         data = np.nan_to_num(data, nan=0.0, posinf=16.0, neginf=0.0)
-    factor = coarseness(how)
-    shape = (data.shape[0], data.shape[1])
-    return detect_in_parts(coarser(data, factor), factor, shape, lambda r, c: data[r, c], how)
-
-
-def coarseness(how: SpotFinder) -> int:
-    """Pixels along a side of one of the coarse image in which candidates are sought."""
     low = how.radius_px[0]
-    return 4 if low >= 4.5 else 2 if low >= 2.5 else 1
+    factor = 4 if low >= 4.5 else 2 if low >= 2.5 else 1
+    whole, cut = _candidates(coarser(data, factor), factor, how)
+    found = [r for r in (_measure(data, c, how) for c in whole) if r is not None]
+    found = _alike(_distinct(found), how)
+    return _pack(found, _cut_beads(data, cut, found), (data.shape[0], data.shape[1]))
 
 
 def coarser(image: Float32Array, factor: int) -> Float32Array:
@@ -145,29 +142,6 @@ def coarser(image: Float32Array, factor: int) -> Float32Array:
         return np.zeros((rows, cols), dtype=np.float32)
     part = image[: rows * factor, : cols * factor]
     return np.asarray(cv2.resize(part, (cols, rows), interpolation=cv2.INTER_AREA))
-
-
-Part = Callable[[slice, slice], Float32Array]
-"""Line integrals of some rows and columns of an image, finite."""
-
-
-def detect_in_parts(
-    coarse: Float32Array, factor: int, shape: tuple[int, int], part: Part, how: SpotFinder
-) -> Detections:
-    """`detect_beads` where only the parts of an image that hold candidates need to be made.
-
-    Args:
-        coarse: line integrals of factor x factor pixels each.
-        factor: as `coarseness` gives it.
-        shape: (rows, cols) of the image.
-        part: its line integrals at full resolution.
-        how: what to look for.
-    """
-    whole, cut = _candidates(coarse, factor, how)
-    found = [r for r in (_measure(part, shape, c, how) for c in whole) if r is not None]
-    found = _alike(_distinct(found), how)
-    cut_found = _cut_beads(part, shape, cut, found)
-    return _pack(found, cut_found, shape)
 
 
 _Candidate = tuple[float, float, float]
@@ -238,22 +212,20 @@ def _merged(spots: Sequence[_Candidate]) -> list[_Candidate]:
 
 
 def _window(
-    part: Part, shape: tuple[int, int], x: float, y: float, reach: float
+    image: Float32Array, x: float, y: float, reach: float
 ) -> tuple[Float32Array, float, float]:
     """Pixels within `reach` of a place, and the column and row of the first."""
     left, top = max(int(x - reach), 0), max(int(y - reach), 0)
-    right, bottom = min(int(x + reach) + 2, shape[1]), min(int(y + reach) + 2, shape[0])
-    return np.ascontiguousarray(part(slice(top, bottom), slice(left, right))), left, top
+    part = image[top : int(y + reach) + 2, left : int(x + reach) + 2]
+    return np.ascontiguousarray(part), left, top
 
 
-def _measure(
-    part: Part, shape: tuple[int, int], spot: _Candidate, how: SpotFinder
-) -> FloatArray | None:
+def _measure(image: Float32Array, spot: _Candidate, how: SpotFinder) -> FloatArray | None:
     x, y, radius = spot
     result = np.zeros(kernels.RESULTS)
     # What is measured may lie beside the spot or be larger; then a larger window is needed.
     for reach in (2.0 * radius + 8.0, 4.2 * radius + 8.0):
-        window, left, top = _window(part, shape, x, y, reach)
+        window, left, top = _window(image, x, y, reach)
         kernels.measure(window, x - left, y - top, radius, CAP, 0.0, result)
         result[kernels.X] += left
         result[kernels.Y] += top
@@ -299,7 +271,7 @@ def _alike(found: list[FloatArray], how: SpotFinder) -> list[FloatArray]:
 
 
 def _cut_beads(
-    part: Part, shape: tuple[int, int], spots: list[_Candidate], found: list[FloatArray]
+    image: Float32Array, spots: list[_Candidate], found: list[FloatArray]
 ) -> list[FloatArray]:
     """Balls fitted to spots at the edge, with the radius and contrast of the whole ones.
 
@@ -314,7 +286,7 @@ def _cut_beads(
     round_ = np.array([1.0, 0.0, 1.0])
     for x, y, _ in spots:
         result = np.zeros(kernels.RESULTS)
-        window, left, top = _window(part, shape, x, y, 2.8 * radius + 8.0)
+        window, left, top = _window(image, x, y, 2.8 * radius + 8.0)
         kernels.fit_ball(
             window, none, x - left, y - top, radius, round_, peak, BLUR_PX, False, False, result
         )

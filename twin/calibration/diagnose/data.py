@@ -56,10 +56,12 @@ SAMPLED = 8
 """Frames that are looked at one by one."""
 
 
+SHOWN = 5
+"""Files that cannot be used and are named."""
 _STATES = {
-    FrameState.MISSING: "missing",
-    FrameState.DARK: "dark",
-    FrameState.REPEATED: "copies of the frame before",
+    FrameState.MISSING: ("frames_missing", "missing"),
+    FrameState.DARK: ("frames_dark", "dark"),
+    FrameState.REPEATED: ("frames_repeated", "copies of the frame before"),
 }
 
 
@@ -67,20 +69,15 @@ def judge_frames(name: str, looks: Sequence[FrameSpots], sought: SpotFinder) -> 
     """Missing and dark frames, and frames without any spot like those that were `sought`."""
     out = []
     n = len(looks)
-    for state, code in (
-        (FrameState.MISSING, "frames_missing"),
-        (FrameState.DARK, "frames_dark"),
-        (FrameState.REPEATED, "frames_repeated"),
-    ):
-        count = sum(look.state is state for look in looks)
-        if count:
-            out.append(
-                Finding(
-                    code,
-                    Severity.ERROR if count == n else Severity.WARNING,
-                    f"{name}: {count} of {n} frames are {_STATES[state]}; the others are used",
-                )
-            )
+    for state, (code, what) in _STATES.items():
+        some = [look for look in looks if look.state is state]
+        files = sorted({look.unusable for look in some if look.unusable})
+        text = f"{name}: {len(some)} of {n} frames are {what}; the others are used"
+        if files:
+            more = f" (and {len(files) - SHOWN} more)" if len(files) > SHOWN else ""
+            text += f"; unusable: {'; '.join(files[:SHOWN])}{more}"
+        if some:
+            out.append(Finding(code, Severity.ERROR if len(some) == n else Severity.WARNING, text))
     usable = [look for look in looks if look.state is FrameState.USABLE]
     empty = sum(len(look.detections) == 0 for look in usable)
     if usable and empty == len(usable):

@@ -146,8 +146,8 @@ def estimate_geometry(
         bead_tolerance_mm: the standard deviation of their prior; None is the phantom's own.
         start: where to start, and the value of what is not free.
         reading: of eq. 5.4.
-        centre: what the positions are: projected centres, weighted centroids, outline centres; or
-            the bias factor of each position, (n, k).
+        centre: what the positions are: projected centres or outline centres; or the bias factor of
+            each position, (n, k), such as 0.8 for a centroid weighted by chord length.
         sampling_px: see `certify`; 0 for points, about 0.001 for centroids in images.
         solver: None is Huber, trimming, then least squares.
         priors: parameter -> standard deviation of what is known of it beforehand [mm, deg, 1]; 0

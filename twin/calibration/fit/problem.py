@@ -60,8 +60,6 @@ class Centre(enum.Enum):
 
     POINT = 0.0
     """The projection of the bead's centre itself (simulated points)."""
-    CENTROID = 0.8
-    """Centroid of the spot weighted by chord length."""
     OUTLINE = 1.0
     """Centre of the spot's elliptic outline."""
 
