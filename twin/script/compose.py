@@ -19,7 +19,6 @@ from itertools import product
 from typing import Final, Literal
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import (
@@ -215,6 +214,8 @@ class _Places:
 
         The other motors of a quantity stay at home.
         """
+        from scipy.optimize import linear_sum_assignment
+
         geometry = self.machine.geometry
         quantities = [*_OF_STAGES, "detector_z", "source_x", "object_z"]
         if self.has("source_z"):
