@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import trimesh
-from lab import Process, Wire, projector, twin
+from lab import Process, Wire, twin
 
 from flexdt.clients.client.client import TwinClient
 from flexdt.clients.client.uploads import MESH_FORMATS
@@ -20,12 +20,10 @@ from flexdt.server.scans.stage import Shapes
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Process]:
-    rays = projector()
+def server(rays: Process, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Process]:
     process = twin(rays.port, tmp_path_factory.mktemp("data"), "--sample", "empty")
     yield process
     process.end()
-    rays.end()
 
 
 def angle(height: float) -> Any:
