@@ -114,6 +114,7 @@ def script(frames: int) -> str:
     return "\r\n".join(rows)
 
 
+@pytest.mark.slow  # daily in tests/journeys/test_plain_sockets.py
 def test_move_projection_and_script_over_plain_lines(rays: Any, tmp_path: Path) -> None:
     process = twin(rays, tmp_path / "data", "--speed-up", "max")
     try:
