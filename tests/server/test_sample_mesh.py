@@ -131,6 +131,7 @@ def test_another_file_under_the_same_name_is_what_stands_and_collides(server: Pr
     with TwinClient(port=server.port) as client:
         box(client, 10.0)
         client.set_sample(file="thing")
+        client.set_clock("max")
         client.move({"mag_obj": 300.0}, wait=True)
         assert box(client, 20.0) == []
         assert client.state().sample.size_mm == pytest.approx((20.0, 20.0, 20.0))
@@ -141,6 +142,7 @@ def test_another_file_under_the_same_name_is_what_stands_and_collides(server: Pr
         assert client.state().sample.size_mm == pytest.approx((20.0, 20.0, 20.0))
         client.move({"mag_obj": 310.0}, wait=True)
         assert box(client, 10.0) == []
+        client.set_clock(1.0)
         client.move({"mag_obj": 290.0})
         client.set_sample("empty")
 
