@@ -16,8 +16,9 @@ import struct
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from typing import Any
 
 Parts = Sequence[bytes | bytearray | memoryview]
 
@@ -102,6 +103,15 @@ def answer(request: Sequence[bytes]) -> list[bytes]:
             e = explain(error)
             return [b"refused", json.dumps([e.code, e.message, e.data], default=repr).encode()]
         return [b"failed", traceback.format_exc().encode("utf-8", "replace")]
+
+
+def document(read: Callable[..., Any], how: Mapping[str, str], raw: bytes) -> list[bytes]:
+    """In the worker: what `read` makes of a stranger's bytes, as JSON; no file may be written.
+
+    Here, and not beside the server's store, so that the process loads only what `read` needs.
+    """
+    limit("RLIMIT_FSIZE", 0)
+    return [json.dumps(read(raw, **how).to_dict()).encode()]
 
 
 def main() -> int:

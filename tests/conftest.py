@@ -5,7 +5,9 @@ from suite import (
     pytest_collection_modifyitems,
     pytest_runtest_makereport,
     pytest_runtest_setup,
+    rays,
     servers,
+    shared_servers,
 )
 
 __all__ = [
@@ -13,5 +15,7 @@ __all__ = [
     "pytest_collection_modifyitems",
     "pytest_runtest_makereport",
     "pytest_runtest_setup",
+    "rays",
     "servers",
+    "shared_servers",
 ]

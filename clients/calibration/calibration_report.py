@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
+from scipy.special import fdtri
 
 from flexdt.clients.calibration.calibrate import Outcome
 from flexdt.clients.figures import (
@@ -138,7 +138,7 @@ def _ellipses(c: Certificate) -> list[str]:
     """Joint 95 % ellipses of the most correlated pairs."""
     names = list(c.estimates)
     pairs = [(abs(c.correlation[i, j]), i, j) for i in range(len(names)) for j in range(i)]
-    scale = math.sqrt(2.0 * float(stats.f.ppf(0.95, 2, c.dof)))
+    scale = math.sqrt(2.0 * float(fdtri(2, c.dof, 0.95)))
     out = ["<h2>Joint 95 % ellipses about the estimate</h2>"]
     for _, i, j in sorted(pairs, reverse=True)[:ELLIPSES]:
         part = c.covariance[np.ix_([j, i], [j, i])]

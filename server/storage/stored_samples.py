@@ -42,7 +42,7 @@ from flexdt.runtime.files.own_documents import (
     read_or_set_aside,
     set_aside,
 )
-from flexdt.runtime.worker import limit
+from flexdt.runtime.worker import document
 from flexdt.runtime.workers import Worker
 from flexdt.server.storage.unfinished_uploads import Incoming, UploadHead
 from flexdt.twin.errors import LimitError, UnknownNameError
@@ -80,19 +80,14 @@ def scene_apart(raw: bytes, *, name: str) -> Phantom:
 def _apart(read: Callable[..., Phantom], how: dict[str, str], raw: bytes) -> Phantom:
     worker = Worker(MEMORY_BYTES)
     try:
-        [document] = worker.ask(_document, (read, how), [raw], TIMEOUT_S)
+        [text] = worker.ask(document, (read, how), [raw], TIMEOUT_S)
     except RpcError as error:
         prefix = f"{how['name']!r} cannot be read: " if error.code == Code.TOO_LARGE else ""
         data = error.data if isinstance(error.data, dict) else None
         raise PhantomError(prefix + error.message, data) from None
     finally:
         worker.kill()
-    return Phantom.from_dict(json.loads(document))
-
-
-def _document(read: Callable[..., Phantom], how: dict[str, str], raw: bytes) -> list[bytes]:
-    limit("RLIMIT_FSIZE", 0)
-    return [json.dumps(read(raw, **how).to_dict()).encode()]
+    return Phantom.from_dict(json.loads(text))
 
 
 MAX_UPLOAD_BYTES = 512 << 20

@@ -36,6 +36,14 @@ async def run(options: TwinSettings) -> int:
     """Serve until SIGTERM or SIGINT; returns the exit code."""
     from flexdt.runtime.files.directory import open_data
     from flexdt.runtime.files.own_documents import lock_folder
+
+    machine = machines.machine(options.machine)
+    profile = machines.profile(options.profile, machine, options.machine)
+    root = options.data.absolute()
+    check_bind(options.host, read_token(options.token_file))
+    directory = open_data(root)
+    release = lock_folder(directory)
+
     from flexdt.runtime.http_pages import served_pages
     from flexdt.runtime.metrics import Requests
     from flexdt.server.imaging.projector_client import ProjectorClient
@@ -49,12 +57,6 @@ async def run(options: TwinSettings) -> int:
     from flexdt.server.twin.message_reading import Reader
     from flexdt.twin.scanner.state import Sample
 
-    machine = machines.machine(options.machine)
-    profile = machines.profile(options.profile, machine, options.machine)
-    root = options.data.absolute()
-    check_bind(options.host, read_token(options.token_file))
-    directory = open_data(root)
-    release = lock_folder(directory)
     truth = None if options.truth is None else load_truth(options.truth, root)
     token = read_token(options.projector_token_file)
     secure = client_tls(options.projector_tls_ca)

@@ -152,6 +152,7 @@ def aligned(k: int, photons: float, column: float, roll: float) -> tuple[object,
     return found, scanner
 
 
+@pytest.mark.daily(1)
 @pytest.mark.parametrize("k", range(3))
 def test_column_and_roll_are_where_they_are(k: int) -> None:
     found, scanner = aligned(k, 1e4, 0.04, 0.06)

@@ -168,9 +168,8 @@ def test_both_clients_do_every_method_of_the_wire(shell: Shell, tmp_path: Path) 
     assert twin.dataset(done.name).info.projections == 3
     assert twin.dataset_frame(done.name, 0)[0].shape == (160, 200)
     job_events = (shell.wait(events.next(60.0)) for _ in itertools.count())
-    assert (
-        next(e for e in job_events if e.topic == "job" and e.data.state == "done").data.job == job
-    )
+    told_done = (e.data for e in job_events if e.topic == "job" and e.data.job == job)
+    assert next(status for status in told_done if status.state == "done").frames_done == 3
     shell.wait(events.close())
 
     bad = twin.check_script("tube\tset kV\tmany\t\tACK\t\t\r\n")

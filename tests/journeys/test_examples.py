@@ -55,6 +55,7 @@ def test_submit_a_script_then_read_the_data_set(
 STUDIES = [p for p in sorted(EXAMPLES.glob("*.py")) if "argparse" in p.read_text()]
 
 
+@pytest.mark.daily(3)
 @pytest.mark.parametrize("path", STUDIES, ids=lambda p: p.name)
 def test_every_study_explains_itself(path: Path) -> None:
     assert "usage:" in run(path.name, "--help")

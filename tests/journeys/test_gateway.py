@@ -101,6 +101,11 @@ class Program:
 
 
 @pytest.fixture(scope="module")
+def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("data")
+
+
+@pytest.fixture(scope="module")
 def servers(data_dir: Path) -> Iterator[Servers]:
     options = {"data": data_dir, "speed-up": "max", "gateway-port": 0}
     with Servers(options, data_dir.parent / "servers.log") as running:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import math
 import os
+from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from bead_scan import bead_scan
-from in_process import Lab, M, run
+from in_process import PATIENCE_S, Lab, M
 
 import flexdt as fx
 from flexdt.phantoms import load_phantom
@@ -37,7 +38,20 @@ def own(data: Path) -> Any:
     return fx.calibrate(data / "lego", "lego")
 
 
-def called(root: Path, method: str, **params: object) -> Any:
+Served = Callable[[Callable[[Lab], Awaitable[None]]], None]
+"""Runs a body with the twin of all tests, whose worker has loaded what a fit needs."""
+
+
+@pytest.fixture(scope="module")
+def served(data: Path) -> Iterator[Served]:
+    with asyncio.Runner() as runner:
+        lab = Lab(data)
+        runner.run(lab.__aenter__())
+        yield lambda body: runner.run(asyncio.wait_for(body(lab), 2 * PATIENCE_S))
+        runner.run(lab.__aexit__())
+
+
+def called(served: Served, method: str, **params: object) -> Any:
     """The answer of a twin server in this process."""
     told = []
 
@@ -47,14 +61,15 @@ def called(root: Path, method: str, **params: object) -> Any:
         if told[0].get("correction"):
             applied = await client.call("calibration.apply", parameters=told[0]["correction"])
             assert applied["correction"]["parameters"] == pytest.approx(told[0]["correction"])
+        client.close()
 
-    run(root, body)
+    served(body)
     return told[0]
 
 
-def test_a_fit_over_the_wire_is_that_of_the_package(data: Path, own: Any) -> None:
+def test_a_fit_over_the_wire_is_that_of_the_package(served: Served, own: Any) -> None:
     told = called(
-        data, "calibration.fit", datasets=["lego"], phantom="lego", steps=4, residuals=True,
+        served, "calibration.fit", datasets=["lego"], phantom="lego", steps=4, residuals=True,
         tracks=True,
     )  # fmt: skip
     fit = own.calibration.fit
@@ -96,10 +111,10 @@ def marks(views: range, truth: dict[str, float], noise_px: float) -> list[dict[s
     return told
 
 
-def test_marks_take_the_place_of_what_is_in_the_images(data: Path) -> None:
+def test_marks_take_the_place_of_what_is_in_the_images(served: Served) -> None:
     other = {"dO_x": -1.4, "dO_y": 0.8, "dO_z": -3.0, "alpha": 71.0}
     seen = marks(range(0, 25, 3), other, 0.2)
-    told = called(data, "calibration.fit", datasets=["lego"], phantom="lego", markers=seen,
+    told = called(served, "calibration.fit", datasets=["lego"], phantom="lego", markers=seen,
                   tracks=True)  # fmt: skip
     assert told["identifiable"]
     assert told["rms_px"] == pytest.approx(0.2, rel=0.3)
@@ -115,7 +130,7 @@ def test_marks_take_the_place_of_what_is_in_the_images(data: Path) -> None:
     )
 
 
-def test_markers_of_which_nobody_knows_where_they_are(data: Path) -> None:
+def test_markers_of_which_nobody_knows_where_they_are(served: Served) -> None:
     other = {"dO_x": -1.4, "dO_y": 0.0, "dO_z": -3.0, "alpha": 0.0}
     seen = marks(range(0, 25, 3), other, 0.2)
     for mark in seen:
@@ -123,7 +138,7 @@ def test_markers_of_which_nobody_knows_where_they_are(data: Path) -> None:
     beads = load_phantom("lego").beads
     apart = float(np.linalg.norm(beads[1] - beads[3]))
     told = called(
-        data, "calibration.fit", datasets=["lego"], phantom="unknown", markers=seen, tracks=True,
+        served, "calibration.fit", datasets=["lego"], phantom="unknown", markers=seen, tracks=True,
         scale=f"ball 1-ball 3={apart:.3f}", residuals=True, steps=2,
     )  # fmt: skip
     assert told["identifiable"]
@@ -137,11 +152,11 @@ def test_markers_of_which_nobody_knows_where_they_are(data: Path) -> None:
     really = np.linalg.norm(beads[:, None] - beads, axis=2)
     assert np.abs(between - really).max() < 0.5
     assert len(told["residuals_px"]) == 9
-    free = called(data, "calibration.fit", datasets=["lego"], phantom="unknown", markers=seen)
+    free = called(served, "calibration.fit", datasets=["lego"], phantom="unknown", markers=seen)
     assert free["scale"] == "free"
 
 
-def test_marks_that_do_not_hold_are_refused(data: Path) -> None:
+def test_marks_that_do_not_hold_are_refused(served: Served) -> None:
     mark: dict[str, Any] = {"frame": 0, "marker": "0", "column": 200.0, "row": 180.0}
     wrong = [
         ([mark, mark], "mark 1: marker '0' in frame 0"),
@@ -187,19 +202,19 @@ def test_marks_that_do_not_hold_are_refused(data: Path) -> None:
         assert not few["identifiable"]
         assert few["problems"]
 
-    run(data, body)
+    served(body)
 
 
-def test_an_alignment_over_the_wire_is_that_of_the_package(data: Path) -> None:
+def test_an_alignment_over_the_wire_is_that_of_the_package(data: Path, served: Served) -> None:
     own = fx.align(data / "lego", per_frame=True)
-    told = called(data, "calibration.align", name="lego", per_frame=True)
+    told = called(served, "calibration.align", name="lego", per_frame=True)
     assert own.identifiable
     assert told["motion"] == own.document["motion"]
     assert told["refused"] == own.document["refused"]
     assert set(told["parameters"]) == set(own.parameters)
 
 
-def test_what_is_not_there_is_refused(data: Path, tmp_path: Path) -> None:
+def test_what_is_not_there_is_refused(data: Path, served: Served, tmp_path: Path) -> None:
     os.symlink(tmp_path, data / "linked")
     wrong = [
         (["gone"], "lego", "no data set 'gone'"),
@@ -220,7 +235,7 @@ def test_what_is_not_there_is_refused(data: Path, tmp_path: Path) -> None:
         free = await client.error("calibration.fit", datasets=["lego"], phantom="lego", free=["up"])
         assert (free.code, "up" in free.message) == (-32602, True)
 
-    run(data, body)
+    served(body)
 
 
 def test_a_fit_that_nobody_waits_for_ends(data: Path) -> None:

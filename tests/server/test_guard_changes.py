@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 import trimesh
-from lab import Process, Refused, Wire, projector, twin
+from lab import Process, Refused, Wire, twin
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -27,8 +27,7 @@ TURN = [{"rot_obj": float(max(0, angle))} for angle in range(-240, 181, 4)]
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Process]:
-    rays = projector()
+def server(rays: Process, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Process]:
     process = twin(rays.port, tmp_path_factory.mktemp("data"))
     wire = Wire(process.port)
     stl = trimesh.creation.box((300.0, 20.0, 20.0)).export(file_type="stl")
@@ -37,7 +36,6 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Process]:
     wire.close()
     yield process
     process.end()
-    rays.end()
     assert not process.logged("error", "critical", "unstructured")
 
 

@@ -48,7 +48,7 @@ def test_a_stop_and_a_resume_at_once_return_to_the_plan(tmp_path: Path, stop: st
         assert lab.twin.scanner.tube.on
         await client.call("job.abort", job=job)
 
-    run(tmp_path, body, speed_up=20.0)
+    run(tmp_path, body, virtual=True, speed_up=20.0)
 
 
 @pytest.mark.parametrize("stop", ["axes.stop", "safety.estop"])
@@ -75,7 +75,7 @@ def test_a_stop_while_the_rest_of_a_scan_is_swept_pauses_it(
         await resumed
         await client.call("job.abort", job=job)
 
-    run(tmp_path, body, speed_up=20.0)
+    run(tmp_path, body, virtual=True, speed_up=20.0)
 
 
 def test_nothing_is_moved_or_set_while_the_rest_of_a_scan_is_swept(
@@ -104,7 +104,7 @@ def test_nothing_is_moved_or_set_while_the_rest_of_a_scan_is_swept(
         assert lab.twin.scanner.tube.kV == 90.0
         await client.call("job.abort", job=job)
 
-    run(tmp_path, body, speed_up=20.0)
+    run(tmp_path, body, virtual=True, speed_up=20.0)
 
 
 @pytest.mark.parametrize("stop", ["axes.stop", "safety.estop"])
@@ -126,7 +126,7 @@ def test_a_scene_that_is_being_loaded_moves_nothing_after_a_stop(tmp_path: Path,
                 await client.call("scene.load", document=document)
             assert lab.twin.scanner.targets(lab.twin.clock.now())["rot_obj"] == 0.0
 
-    run(tmp_path, body, speed_up=1.0)
+    run(tmp_path, body, virtual=True, speed_up=1.0)
 
 
 @pytest.mark.parametrize("end", ["scene", "gone"])
@@ -150,7 +150,7 @@ def test_later_legs_of_a_planned_way_end_with_other_motion_and_with_the_controll
         await asyncio.sleep(0.2)
         assert scanner.targets(clock.now())["mag_det"] == 1059.0
 
-    run(tmp_path, body, speed_up=50.0)
+    run(tmp_path, body, virtual=True, speed_up=50.0)
 
 
 def test_a_stop_before_a_scan_goes_on_sets_nothing(tmp_path: Path) -> None:
@@ -176,4 +176,4 @@ def test_a_stop_before_a_scan_goes_on_sets_nothing(tmp_path: Path) -> None:
         assert lab.twin.scanner.tube.on
         await client.call("job.abort", job=name)
 
-    run(tmp_path, body, speed_up=20.0)
+    run(tmp_path, body, virtual=True, speed_up=20.0)

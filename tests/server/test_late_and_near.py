@@ -7,16 +7,14 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from lab import Process, Wire, projector, twin
+from lab import Process, Wire, twin
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Process]:
-    rays = projector()
+def server(rays: Process, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Process]:
     process = twin(rays.port, tmp_path_factory.mktemp("data"), "--speed-up", "max")
     yield process
     process.end()
-    rays.end()
 
 
 def logged(wire: Wire, count: int) -> list[dict[str, Any]]:

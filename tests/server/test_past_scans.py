@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from lab import Process, fly_script, projector, twin
+from lab import Process, fly_script, twin
 
 from flexdt.clients.client.client import TwinClient
 from flexdt.protocol import Codec, RpcError
@@ -43,15 +43,13 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def server(data: Path) -> Iterator[Process]:
-    rays = projector()
+def server(rays: Process, data: Path) -> Iterator[Process]:
     process = twin(rays.port, data, "--sample", "lego", "--speed-up", "max")
     with TwinClient(port=process.port) as client:
         client.submit_script(fly_script(frames=FRAMES), "first scan")
         assert client.wait_job().state == "done"
     yield process
     process.end()
-    rays.end()
 
 
 def asked(root: Path, params: Params, running: str = "") -> Any:

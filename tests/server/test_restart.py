@@ -7,21 +7,14 @@ import json
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from lab import Process, Refused, Wire, digests, fly_script, projector, twin
+from lab import Process, Refused, Wire, digests, fly_script, twin
 
 pytestmark = pytest.mark.timeout(240)
-
-
-@pytest.fixture(scope="module")
-def rays() -> Iterator[Process]:
-    process = projector()
-    yield process
-    process.end()
 
 
 def restarted(process: Process, rays: Process, data: Path, *options: object) -> Process:

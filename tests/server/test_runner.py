@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import random
 from collections.abc import Awaitable, Callable, Sequence
+from functools import partial
 
 import numpy as np
 import pytest
+from simulated_loop import SimulatedLoop
 
 from flexdt.server.scans.runner import JobAborted, ScanRunner, rejoin
 from flexdt.server.scans.twin_clock import TwinClock
@@ -59,7 +62,8 @@ class Lab:
 
     def __init__(self, plan: ScanPlan, speed_up: float | str = "max", **options: object) -> None:
         self.plan = plan
-        self.clock = TwinClock(speed_up)  # type: ignore[arg-type]
+        wall = asyncio.get_running_loop().time
+        self.clock = TwinClock(speed_up, wall=wall)  # type: ignore[arg-type]
         self.scanner = ScannerTwin(M, P)
         self.made: dict[str, bytes] = {}
         self.before: Callable[[Sequence[Exposure]], Awaitable[None]] | None = None
@@ -103,10 +107,9 @@ class Lab:
 
 
 def run(body: Callable[[], Awaitable[None]]) -> None:
-    async def main() -> None:
-        await asyncio.wait_for(body(), 180)
-
-    asyncio.run(main())
+    """Run `body` on virtual time: nobody waits for a scan at the speed of the machine."""
+    with asyncio.Runner(loop_factory=partial(SimulatedLoop, random.Random(0))) as runner:
+        runner.run(asyncio.wait_for(body(), 3600))
 
 
 def reference() -> dict[str, bytes]:

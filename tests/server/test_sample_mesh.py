@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import trimesh
-from lab import Process, Wire, projector, twin
+from lab import Process, Wire, twin
 
 from flexdt.clients.client.client import TwinClient
 from flexdt.clients.client.uploads import MESH_FORMATS
@@ -20,12 +20,10 @@ from flexdt.server.scans.stage import Shapes
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Process]:
-    rays = projector()
+def server(rays: Process, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Process]:
     process = twin(rays.port, tmp_path_factory.mktemp("data"), "--sample", "empty")
     yield process
     process.end()
-    rays.end()
 
 
 def angle(height: float) -> Any:
@@ -133,6 +131,7 @@ def test_another_file_under_the_same_name_is_what_stands_and_collides(server: Pr
     with TwinClient(port=server.port) as client:
         box(client, 10.0)
         client.set_sample(file="thing")
+        client.set_clock("max")
         client.move({"mag_obj": 300.0}, wait=True)
         assert box(client, 20.0) == []
         assert client.state().sample.size_mm == pytest.approx((20.0, 20.0, 20.0))
@@ -143,6 +142,7 @@ def test_another_file_under_the_same_name_is_what_stands_and_collides(server: Pr
         assert client.state().sample.size_mm == pytest.approx((20.0, 20.0, 20.0))
         client.move({"mag_obj": 310.0}, wait=True)
         assert box(client, 10.0) == []
+        client.set_clock(1.0)
         client.move({"mag_obj": 290.0})
         client.set_sample("empty")
 

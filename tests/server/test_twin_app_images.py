@@ -67,7 +67,7 @@ def test_projections_flow_while_an_axis_moves_and_the_last_is_the_final_pose(
             before = lab.projector.views
             await asyncio.sleep(0.1)
 
-    run(tmp_path, body, speed_up=3.0)
+    run(tmp_path, body, virtual=True, speed_up=3.0)
 
 
 def test_truth_reaches_images_and_nothing_else(tmp_path: Path) -> None:

@@ -77,7 +77,7 @@ def test_moves_are_refused_during_a_scan_and_allowed_in_a_pause(tmp_path: Path) 
         assert state["axes"]["tra_obj"]["position"] == 0.0
         assert (await c.error("job.pause", job=job)).code == -32003
 
-    run(tmp_path, body, speed_up=150.0)
+    run(tmp_path, body, virtual=True, speed_up=150.0)
 
 
 def test_stop_during_a_scan_pauses_it_and_abort_leaves_it_incomplete(tmp_path: Path) -> None:
@@ -97,7 +97,7 @@ def test_stop_during_a_scan_pauses_it_and_abort_leaves_it_incomplete(tmp_path: P
         assert not list((lab.root / "cut").glob(".*"))
         assert lab.twin.jobs.current is None
 
-    run(tmp_path, body, speed_up=50.0)
+    run(tmp_path, body, virtual=True, speed_up=50.0)
 
 
 def test_an_interrupted_scan_is_taken_up_by_name_even_by_another_server(tmp_path: Path) -> None:
@@ -117,7 +117,7 @@ def test_an_interrupted_scan_is_taken_up_by_name_even_by_another_server(tmp_path
             "4 frames",
         )
 
-    run(tmp_path, first, speed_up=150.0)  # the server is stopped in the midst of it
+    run(tmp_path, first, virtual=True, speed_up=150.0)  # the server is stopped in the midst of it
     cut = tmp_path / "cut"
     document = json.loads((cut / "flexdt.json").read_text())
     assert document["complete"] is False
@@ -304,4 +304,4 @@ def test_a_scan_that_is_being_prepared_can_be_aborted_and_stopped(tmp_path: Path
         await c.call("job.resume", job=job)
         assert (await lab.ended(c, job))["state"] == "done"
 
-    run(tmp_path, body)
+    run(tmp_path, body, virtual=True)

@@ -11,7 +11,6 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -82,15 +81,8 @@ class Wire:
             time.sleep(0.02)
 
 
-@pytest.fixture(scope="module")
-def projector() -> Iterator[Process]:
-    process = Process("flexdt.server.projector.main", "--port", "0", "--threads", "1")
-    yield process
-    process.end()
-
-
-def twin(projector: Process, data: Path, *options: str) -> Process:
-    address = f"127.0.0.1:{projector.ready['port']}"
+def twin(rays: Any, data: Path, *options: str) -> Process:
+    address = f"127.0.0.1:{rays.ready['port']}"
     return Process(
         "flexdt.server.twin.main",
         *("--port", "0", "--projector", address, "--data", str(data), *options),
@@ -122,8 +114,9 @@ def script(frames: int) -> str:
     return "\r\n".join(rows)
 
 
-def test_move_projection_and_script_over_plain_lines(projector: Process, tmp_path: Path) -> None:
-    process = twin(projector, tmp_path / "data", "--speed-up", "max")
+@pytest.mark.slow  # daily in tests/journeys/test_plain_sockets.py
+def test_move_projection_and_script_over_plain_lines(rays: Any, tmp_path: Path) -> None:
+    process = twin(rays, tmp_path / "data", "--speed-up", "max")
     try:
         wire = Wire(process.ready["port"])
         assert wire.call("axes.move", targets={"mag_obj": 500}, wait=True)["duration_s"] == 3.0
@@ -175,9 +168,9 @@ def test_a_projector_killed_in_mid_scan_comes_back_and_nothing_is_lost(tmp_path:
 
 
 def test_sigterm_in_mid_scan_ends_cleanly_and_the_data_set_says_incomplete(
-    projector: Process, tmp_path: Path
+    rays: Any, tmp_path: Path
 ) -> None:
-    process = twin(projector, tmp_path / "data", "--speed-up", "2")
+    process = twin(rays, tmp_path / "data", "--speed-up", "2")
     wire = Wire(process.ready["port"])
     wire.call("script.submit", text=script(361), name="cut", speed_up=20)
     while wire.call("job.status")["frames_done"] < 3:

@@ -22,19 +22,17 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
-from lab import Process, Wire, projector, twin
+from lab import Process, Wire, twin
 
 pytestmark = pytest.mark.timeout(280)
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Process]:
-    rays = projector()
+def server(rays: Process, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Process]:
     data = tmp_path_factory.mktemp("machine")
     process = twin(rays.port, data, "--sample", "empty", "--speed-up", "max")
     yield process
     process.end()
-    rays.end()
     assert not process.logged("error", "critical", "unstructured")
 
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import json
+import random
 from collections.abc import Awaitable, Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from simulated_loop import SimulatedLoop
 
 from flexdt.protocol import METHODS, Codec, Connection, Message, Prepared, RpcError, parse_params
 from flexdt.protocol.messages import Encoded
@@ -140,12 +143,26 @@ class Lab:
             await asyncio.sleep(0.002)
 
 
-def run(root: Path, body: Callable[[Lab], Awaitable[None]], **options: Any) -> None:
+def run(
+    root: Path, body: Callable[[Lab], Awaitable[None]], *, virtual: bool = False, **options: Any
+) -> None:
+    """Run `body` with a lab of its own.
+
+    Args:
+        root: its data directory.
+        virtual: on a loop whose time jumps over every wait, its threads' work among it.
+        options: of `TwinServer`.
+    """
+
     async def main() -> None:
+        if virtual:
+            options["wall"] = asyncio.get_running_loop().time
         async with Lab(root, **options) as lab:
             await asyncio.wait_for(body(lab), 2 * PATIENCE_S)
 
-    asyncio.run(main())
+    factory = partial(SimulatedLoop, random.Random(0)) if virtual else None
+    with asyncio.Runner(loop_factory=factory) as runner:
+        runner.run(main())
 
 
 def script(frames: int = 9, speed: float = 22.5, exposure: float = 2000.0) -> str:

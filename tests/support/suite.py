@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -80,14 +83,65 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
         item.user_properties.append(("processor_s", round(processor_s() - item.stash[BEGUN], 2)))
 
 
-@pytest.fixture(scope="module")
-def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("data")
+@dataclass
+class SharedServers:
+    """Twin and projector under their supervisor, shared by all modules of a worker."""
+
+    running: Servers
+    data_dir: Path
+    scene: dict[str, Any]
+    """As they started."""
+
+    def as_new(self) -> None:
+        """No scan, stop, correction or data set is left, and everything stands where it stood."""
+        from flexdt.clients import TwinClient
+        from flexdt.clients.client.twin_methods import FINAL_STATES
+
+        with TwinClient(*self.running.address) as twin:
+            twin.control("force")
+            twin.set_clock("max")
+            for job in twin.jobs().jobs:
+                if job.state not in FINAL_STATES:
+                    twin.abort_job(job.job)
+            twin.stop()
+            if twin.state().safety.estop:
+                twin.reset()
+            twin.load_scene(self.scene)
+            twin.control("release")
+        for folder in self.data_dir.iterdir():
+            if (folder / "flexdt.json").exists():
+                shutil.rmtree(folder)
+
+
+@pytest.fixture(scope="session")
+def shared_servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SharedServers]:
+    from flexdt.clients import TwinClient
+
+    data = tmp_path_factory.mktemp("shared") / "data"
+    with Servers({"data": data, "speed-up": "max"}, data.parent / "servers.log") as running:
+        with TwinClient(*running.address) as twin:
+            scene = twin.save_scene()
+        yield SharedServers(running, data, scene)
+
+
+@pytest.fixture(scope="session")
+def rays() -> Iterator[Any]:
+    """A projector for twins that a module starts itself; twins leave nothing in it."""
+    from lab import projector
+
+    process = projector()
+    yield process
+    process.end()
 
 
 @pytest.fixture(scope="module")
-def servers(data_dir: Path) -> Iterator[Servers]:
-    """Twin and projector under their supervisor, shared by a module's tests."""
-    options = {"data": data_dir, "speed-up": "max"}
-    with Servers(options, data_dir.parent / "servers.log") as running:
-        yield running
+def servers(shared_servers: SharedServers) -> Servers:
+    """The shared servers, as they were when they started."""
+    shared_servers.as_new()
+    return shared_servers.running
+
+
+@pytest.fixture(scope="module")
+def data_dir(shared_servers: SharedServers) -> Path:
+    """The data directory of `servers`."""
+    return shared_servers.data_dir

@@ -173,6 +173,7 @@ def test_what_browsers_get_is_what_the_source_says(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("tools")
 def test_eslint_finds_nothing() -> None:
     lint()

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import linear_sum_assignment
 
 from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model, spot_radii
 from flexdt.twin.calibration.detect.detection import Detections
@@ -298,6 +297,8 @@ def assign(
     Returns:
         (n, k) index of the spot, -1 where none.
     """
+    from scipy.optimize import linear_sum_assignment
+
     out = np.full(predicted.shape[:2], -1, dtype=np.int64)
     with np.errstate(invalid="ignore", over="ignore"):
         d2 = np.sum((predicted[:, :, None, :] - points[:, None, :, :]) ** 2, axis=3)

@@ -23,12 +23,12 @@ def outcome(kind: str, seed: int = 0) -> Outcome:
         # Named from spots alone in test_calibration_causes.py: endpoint, renumbered.
         pytest.param("angle_endpoint", "angle_endpoint", marks=pytest.mark.slow),
         ("mirrored_phantom", "mirrored_phantom"),
-        ("wrong_phantom", "wrong_phantom"),
+        pytest.param("wrong_phantom", "wrong_phantom", marks=pytest.mark.slow),
         ("no_beads", "no_beads"),
-        ("one_bead", "one_bead"),
+        pytest.param("one_bead", "one_bead", marks=pytest.mark.slow),
         pytest.param("frames_renumbered", "frame_numbers", marks=pytest.mark.slow),
         ("scaled_phantom", "bead_size"),
-        ("image_mirrored", "image_mirrored"),
+        pytest.param("image_mirrored", "image_mirrored", marks=pytest.mark.slow),
         # Named from annotated markers in test_calibrate_anybody.py.
         pytest.param("not_turning", "not_turning", marks=pytest.mark.slow),
     ],

@@ -74,6 +74,7 @@ def test_beads_on_a_line_parallel_to_the_axis_do_not_fix_the_angle() -> None:
         fit_geometry(exact_tracks(poses, truth, model), model, poses, shape=SHAPE)
 
 
+@pytest.mark.daily(1)
 @pytest.mark.parametrize(("beads", "frames"), [(3, 36), (2, 3)])
 def test_joint_95_ellipsoid_covers_95_percent(beads: int, frames: int) -> None:
     poses, truth = scenario("G0", frames)

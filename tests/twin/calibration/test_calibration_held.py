@@ -73,6 +73,7 @@ def calibrated(scan: tuple[Poses, Float32Array], request: CalibrationRequest) ->
     return calibrate([Scan(ArrayFrames(list(images), SHAPE), poses)], LEGO, request)
 
 
+@pytest.mark.daily(4)
 @pytest.mark.parametrize("tolerance", [None, 0.0, 0.005])
 @pytest.mark.parametrize(
     ("free", "says"),

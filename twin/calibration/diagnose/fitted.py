@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri
 
 from flexdt.twin.calibration.detect.refine import Refined
 from flexdt.twin.calibration.diagnose.finding import Finding, Severity, error, warning
@@ -325,7 +325,7 @@ def _beads(fit: FitResult, refit: Refit) -> tuple[FitResult, Finding] | None:
             break
         tolerance = fresh
     # A scatter estimated from few beads may be twice as large: the intervals have to hold then.
-    tolerance *= float(np.sqrt(observable / stats.chi2.ppf(0.05, observable)))
+    tolerance *= float(np.sqrt(observable / chdtri(observable, 0.95)))
     better = refit(bead_tolerance_mm=tolerance)
     moved = np.linalg.norm(better.beads - fit.problem.model.beads, axis=1)
     # A bead further off than its own radius is no bead of this phantom a little displaced.

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtrc, chdtri
 
 from flexdt.twin.calibration.diagnose.finding import Finding, error, warning
 from flexdt.twin.calibration.fit.certificate import widened
@@ -60,7 +60,7 @@ def held_distance(free: FitResult, held: Mapping[str, float]) -> dict[str, float
     at = [names.index(n) for n in some]
     off = np.array([free.values[n] - held[n] for n in some])
     square = float(off @ np.linalg.solve(free.covariance[np.ix_(at, at)], off))
-    together = _deviate(float(stats.chi2.sf(square, len(some))))
+    together = _deviate(float(chdtrc(len(some), max(square, 0.0))))
     return {n: abs(o) / free.sigmas[n] for n, o in zip(some, off.tolist(), strict=True)} | {
         "": together
     }
@@ -183,7 +183,7 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     spread = kept * (kept / LOOSE**2 + values[some])
     square = float(np.sum((vectors.T @ moved)[some] ** 2 / spread))
     count = int(some.sum())
-    chance = float(stats.chi2.sf(square, count))
+    chance = float(chdtrc(count, square))
     scores = np.abs(moved) / np.sqrt(
         1.0 / LOOSE**2 + np.array([e.sigma for *_, e in known]) ** 2 / width**2
     )
@@ -257,4 +257,4 @@ def narrow_priors(judged: PriorsJudged) -> Finding:
 
 def _deviate(chance: float) -> float:
     """The normal deviate that is as improbable."""
-    return float(np.sqrt(stats.chi2.isf(max(chance, 1e-300), 1)))
+    return float(np.sqrt(chdtri(1, max(chance, 1e-300))))

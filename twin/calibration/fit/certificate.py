@@ -15,7 +15,7 @@ from functools import partial
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
+from scipy.special import fdtri, stdtrit
 
 from flexdt.twin.calibration.fit.problem import FitProblem, edge_factor
 from flexdt.twin.calibration.fit.residual_structure import (
@@ -292,7 +292,7 @@ class Certificate:
         """Whether `truth`, arguments as `mahalanobis2`, lies in the joint 95 % ellipsoid of its
         columns (Hotelling: F distribution)."""
         p = len(truth)
-        return self.mahalanobis2(truth) <= p * float(stats.f.ppf(0.95, p, self.dof))
+        return self.mahalanobis2(truth) <= p * float(fdtri(p, self.dof, 0.95))
 
 
 def widened(certificate: Certificate, more: FloatArray | Mapping[str, float]) -> Certificate:
@@ -311,7 +311,7 @@ def widened(certificate: Certificate, more: FloatArray | Mapping[str, float]) ->
         images = np.sqrt(np.maximum(images**2 + np.diag(more), 0.0))
     covariance = certificate.covariance + more
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    t = float(stats.t.ppf(0.975, certificate.dof))
+    t = float(stdtrit(certificate.dof, 0.975))
     estimates = {
         n: replace(e, sigma=s, low=e.value - t * s, high=e.value + t * s, images=i)
         for (n, e), s, i in zip(
@@ -401,7 +401,7 @@ def certify(
     sigma = np.sqrt(np.diag(covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = covariance / np.outer(sigma, sigma)
-    t = float(stats.t.ppf(0.975, effective))
+    t = float(stdtrit(effective, 0.975))
     estimates = {}
     for i, name in enumerate(names[:reported]):
         value = float(x[i] * factor[i])

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 
 from flexdt.twin.calibration.fit.certificate import Estimate
 from flexdt.twin.calibration.fit.fit import FitResult
@@ -40,7 +40,7 @@ def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:
     names = list(fit.certificate.estimates)
     factor = np.array([edge_factor(n) for n in names])
     x = fit.solution.x
-    t = float(stats.t.ppf(0.975, fit.certificate.dof))
+    t = float(stdtrit(fit.certificate.dof, 0.975))
     out = []
     for group in range(len(fit.group_parameters)):
         here = _at(fit, x, group)

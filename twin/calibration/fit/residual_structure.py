@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
+from scipy.special import chdtri
 
 from flexdt.twin.calibration.fit.problem import FitProblem
 from flexdt.twin.geometry.conventions import FloatArray
@@ -271,7 +271,7 @@ def _excess(
     inside = float(np.sum((directions[:, free].T @ push[which]) ** 2 / values[free]))
     rest = (float(residual @ residual) - inside) / max(len(residual) - rank - parameters, 1)
     # An energy of `rank` is expected; its chi-square tail at the level of the other tests.
-    if inside / max(rest, 1e-30) < stats.chi2.isf(1e-3, rank):
+    if inside / max(rest, 1e-30) < chdtri(rank, 1e-3):
         return None
     return np.asarray(np.maximum((push[which] / power) ** 2 - rest / power, 0.0))
 
