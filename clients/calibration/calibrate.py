@@ -98,7 +98,9 @@ class DatasetFrames:
 
         def one(index: int) -> None:
             counts = self._counts(index)
-            for bead in range(0 if counts is None else k):
+            if counts is None:
+                return
+            for bead in range(k):
                 inside, there = overlap(plan, index, bead)
                 signal = np.maximum(counts[there] - normalise.dark[there], np.float32(MIN_COUNTS))
                 out[index, bead][inside] = log_open[there] - np.log(signal)
