@@ -26,6 +26,7 @@ install: $(STAMP) $(TYPES)
 $(STAMP): pyproject.toml extensions/pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]' -e extensions
+	$(BIN)/python -P -m flexdt.runtime.compile_ahead
 	touch $@
 
 # The third-party packages that tests check flexdt against: nothing a user of the twin needs.

@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.protocol.rpc_errors import RpcError, internal, invalid_params, too_large
+from flexdt.runtime.compile_ahead import PROJECTOR, compile_ahead
 from flexdt.runtime.log import log
 from flexdt.twin.errors import TwinError
 from flexdt.twin.projection import Body, gpu, project_body, warm_up
@@ -280,12 +281,14 @@ def views_a_block(shape: tuple[int, int]) -> int:
 
 
 def begin(threads: int) -> None:
-    """Set the thread count of this thread's kernels and compile (or load) all that a server runs.
+    """Set the thread count of this thread's kernels and load all that a server runs; what has not
+    been compiled on this machine is, on all cores.
 
     Raises:
         ValueError: more threads than numba was started with.
     """
     numba.set_num_threads(threads)
+    compile_ahead(PROJECTOR, log)
     warm_up()
 
 

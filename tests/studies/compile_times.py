@@ -118,7 +118,7 @@ def run(case: str, cache: Path | None) -> None:
         command = [part.replace("{}", name) for part in CASES[case]]
         before, begun = used_s(), time.monotonic()
         process = subprocess.Popen(
-            [sys.executable, *command],
+            [sys.executable, "-P", *command],
             env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         )  # fmt: skip
         assert process.stdout is not None

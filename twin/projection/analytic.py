@@ -18,7 +18,6 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import cpu
 from flexdt.twin.projection.analytic_solids import Box, Cylinder, Scene, Solid, Sphere
 from flexdt.twin.projection.convex import encode, shadows
-from flexdt.twin.projection.level_axis import ORDERS
 from flexdt.twin.projection.operators import (
     Shape2,
     as_cone_vec,
@@ -133,23 +132,43 @@ def _project(
 
 
 def warm_up() -> None:
-    """Run what `forward`, `project_scene` and `back` into new memory do, on tiny problems."""
-    level = ConeVec.from_vectors((0, -10, 0), (0, 10, 0), (1, 0, 0), (0, 0, -1))
-    end_on = ConeVec.from_vectors((0, 0, -10), (0, 0, 10), (1, 0, 0), (0, 1, 0))
-    data = np.ones((4, 3, 2), np.float32)
-    images = np.ones((1, 5, 6), np.float32)
-    for source in (data, np.ascontiguousarray(data.transpose(1, 2, 0)).transpose(2, 0, 1)):
-        volume = Volume(source, 0.5)
-        forward(volume, end_on, (5, 6))
-        back(images, end_on, volume)
-        for order in ORDERS:  # so small a problem would not be walked in fans
-            layout = volume.in_order(order).layout
-            views = voxel_rays(level, layout, (5, 6))
-            cpu.project(box_of(layout), views, images)
-            target = blank_layout(volume.in_order(order))
-            cpu.spread(box_of(target), views, images)
-            bring_over(
-                layout_data(layout), target.flat, target.stride_x, target.stride_y, adding=True
-            )
+    """Run what `project_scene`, `forward` and `back` into new memory do, on tiny problems."""
+    warm_up_scenes()
+    warm_up_forward()
+    warm_up_back()
+
+
+def warm_up_scenes() -> None:
+    """Run `project_scene`."""
     shapes = (Sphere((0, 0, 0), 1.0), Box((0, 0, 0), (1, 1, 1)), Cylinder((0, 0, 0), 1.0, 1.0))
-    project_scene(Scene(tuple(Solid(s, "water", 0.02) for s in shapes)), level, (5, 6))
+    project_scene(Scene(tuple(Solid(s, "water", 0.02) for s in shapes)), LEVEL, (5, 6))
+
+
+def warm_up_forward() -> None:
+    """Run `forward`, with rays in fans and alone."""
+    for volume in _tiny_volumes():
+        forward(volume, END_ON, (5, 6))
+        layout = volume.layout  # so small a problem would not be walked in fans
+        images = np.empty((1, 5, 6), np.float32)
+        cpu.project(box_of(layout), voxel_rays(LEVEL, layout, (5, 6)), images)
+
+
+def warm_up_back() -> None:
+    """Run `back` into new memory, with rays in fans and alone."""
+    images = np.ones((1, 5, 6), np.float32)
+    for volume in _tiny_volumes():
+        back(images, END_ON, volume)
+        target = blank_layout(volume)
+        cpu.spread(box_of(target), voxel_rays(LEVEL, target, (5, 6)), images)
+        bring_over(layout_data(target), target.flat, target.stride_x, target.stride_y, adding=True)
+
+
+LEVEL = ConeVec.from_vectors((0, -10, 0), (0, 10, 0), (1, 0, 0), (0, 0, -1))
+END_ON = ConeVec.from_vectors((0, 0, -10), (0, 0, 10), (1, 0, 0), (0, 1, 0))
+
+
+def _tiny_volumes() -> tuple[Volume, Volume]:
+    """In C order, and with z contiguous."""
+    data = np.ones((4, 3, 2), np.float32)
+    turned = np.ascontiguousarray(data.transpose(1, 2, 0)).transpose(2, 0, 1)
+    return Volume(data, 0.5), Volume(turned, 0.5)

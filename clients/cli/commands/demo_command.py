@@ -7,6 +7,7 @@ from the document.
 
 from __future__ import annotations
 
+import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Mapping
@@ -93,6 +94,8 @@ def run_demo(
     Raises:
         CommandError: a stage did not do what it should; the line says which and what.
     """
+    from flexdt.runtime import compile_ahead
+
     out.mkdir(parents=True, exist_ok=True)
     data = out / "data"
     data.mkdir(exist_ok=True)
@@ -104,12 +107,16 @@ def run_demo(
         truth = hidden.read(path)
         options = {"data": data.absolute(), "truth": path.absolute(), "speed-up": "max"}
         tell("starting the servers; the very first start compiles the projector's kernels")
-        with Servers(options, out / "servers.log", viewer=stay is not None) as servers:
+        with (
+            Servers(options, out / "servers.log", viewer=stay is not None) as servers,
+            # While the scan runs: what calibration and reconstruction need.
+            compile_ahead.start(compile_ahead.ANALYSIS) as compiling,
+        ):
             host, port = servers.address
             tell(f"twin on {host}:{port}, projector beside it, log in {out / 'servers.log'}")
             if servers.viewer_url is not None:
                 tell(f"viewer: {servers.viewer_url}")
-            document = _stages(servers, name, data, truth, tell)
+            document = _stages(servers, compiling, name, data, truth, tell)
             write_json(out / "demo.json", document)
             tell(f"summary: {out / 'demo.json'}")
             if stay is not None and servers.viewer_url is not None:
@@ -118,7 +125,12 @@ def run_demo(
 
 
 def _stages(
-    servers: Servers, name: str, data: Path, truth: Mapping[str, float], tell: Tell
+    servers: Servers,
+    compiling: subprocess.Popen[bytes],
+    name: str,
+    data: Path,
+    truth: Mapping[str, float],
+    tell: Tell,
 ) -> dict[str, object]:
     from flexdt.clients.client.client import TwinClient
 
@@ -130,6 +142,9 @@ def _stages(
             "frames": len(dataset.frames),
             "scan_s": round(seconds, 3),
         }
+        if compiling.poll() is None:
+            tell("the kernels of calibration and reconstruction are still being compiled (once)")
+            compiling.wait()
         outcome, seconds = calibrate(dataset, tell)
         push(client, outcome, tell)
         document |= {

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import ctypes
 import inspect
+import logging
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -29,6 +30,9 @@ from numba.core import cgutils
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.extending import intrinsic
+
+SLOW = "flexdt: compiling %s (once on this machine; some seconds, and perhaps other kernels)"
+"""What a process says when it first compiles, instead of loading from the disk cache."""
 
 
 class _LinkedLibrary(JITCodeLibrary):  # type: ignore[misc]
@@ -72,8 +76,15 @@ class _Linked(Compiler):  # type: ignore[misc]
 
 
 class _EntryPoint(_Linked):
+    silent = False
+
     def _compile_core(self) -> Any:
-        library = JITCodeLibrary(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
+        name = self.state.func_id.func_name
+        if not _EntryPoint.silent:
+            # To standard error, unless the program has set up logging.
+            logging.getLogger("flexdt").warning(SLOW, name)
+            _EntryPoint.silent = True
+        library = JITCodeLibrary(self.state.targetctx.codegen(), name)
         library.enable_object_caching()
         self.state.library = library
         return super()._compile_core()

@@ -1,0 +1,124 @@
+"""Kernels compiled before they are needed, on all cores: `python -m flexdt.runtime.compile_ahead`.
+
+numba compiles under one lock, so each group of kernels has a process of its own, which runs it on a
+tiny problem and leaves it in numba's disk cache. Groups that are there already cost nothing; what
+is not compiled here compiles at its first use. Names of groups may follow the command.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Final
+
+import numpy as np
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.projection import Grid
+from flexdt.twin.projection.analytic import warm_up_back, warm_up_forward, warm_up_scenes
+
+MODULE: Final = "flexdt.runtime.compile_ahead"
+
+
+def _detection() -> None:
+    from flexdt.twin.calibration.detect import spot_kernels
+
+    image, mask = np.zeros((9, 9), np.float32), np.zeros((9, 9), np.uint8)
+    at, one, result = np.float64(4.0), np.ones(3), np.zeros(spot_kernels.RESULTS)
+    spot_kernels.measure(image, at, at, at, 1.0, at, result)
+    spot_kernels.fit_ball(image, mask, at, at, at, one, at, 0.5, np.bool_(True), True, result)
+
+
+def _fit() -> None:
+    from flexdt.twin.calibration.fit import fit_kernels
+
+    ints, floats, views = np.zeros(1, np.int64), np.zeros(1), np.zeros((0, 1))  # of no view
+    sets, radii = np.zeros((1, fit_kernels.PARAMETERS)), np.zeros(1)
+    radii.flags.writeable = False  # as a phantom's
+    data = fit_kernels.Data(
+        np.zeros((0, 18)), ints[:0], 1.0, radii, views, np.zeros((0, 1, 2)), np.zeros((0, 1, 3)),
+        ints, sets.astype(np.int64), -1,
+    )  # fmt: skip
+    fit_kernels.evaluate(
+        data, sets, np.zeros((1, 3)), np.zeros((0, 1), np.bool_), math.inf, 0, np.zeros((0, 1, 2)),
+        views, views, np.zeros((1, 1)), floats,
+    )  # fmt: skip
+
+
+def _reconstruction() -> None:
+    from flexdt.twin.reconstruction import fdk, fdk_kernels
+
+    scan = ConeVec.circular(sod=10, sdd=20, angles=8, shape=(4, 6), pixel=1.0)
+    images = np.ones((8, 4, 6), np.float32)
+    fdk(images, scan, Grid((2, 3, 4), 0.5).blank())
+    fdk_kernels.warp(images, np.ones((8, 3, 3)), fdk_kernels.lanczos(), images.copy())
+
+
+GROUPS: Final[dict[str, tuple[Callable[[], None], str]]] = {
+    "back projection": (warm_up_back, "projection.kernels.fan_kernels:spread_fans"),
+    "projection": (warm_up_forward, "projection.kernels.fan_kernels:project_fans"),
+    "calibration": (_fit, "calibration.fit.fit_kernels:evaluate"),
+    "bead detection": (_detection, "calibration.detect.spot_kernels:fit_ball"),
+    "FDK": (_reconstruction, "reconstruction.fdk_kernels:warp"),
+    "scenes": (warm_up_scenes, "projection.kernels.analytic_kernels:project_convex"),
+}
+"""What compiles it, and the entry point that it compiles last; those that take longest first."""
+PROJECTOR: Final = ("back projection", "projection", "scenes")
+ANALYSIS: Final = ("calibration", "bead detection", "FDK")
+
+
+def is_compiled(group: str) -> bool:
+    """Whether numba's disk cache holds a group's last entry point for this processor."""
+    from importlib import import_module
+
+    module, _, name = GROUPS[group][1].partition(":")
+    entry = getattr(import_module(f"flexdt.twin.{module}"), name)
+    processor = entry.targetctx.codegen().magic_tuple()
+    return any(key[1] == processor for key in entry._cache._cache_file._load_index())
+
+
+def compile_ahead(groups: Sequence[str], note: Callable[[str], None]) -> None:
+    """Compile what is missing, as many groups at a time as there are cores.
+
+    Args:
+        groups: names, of `GROUPS`.
+        note: told what is compiled, if anything is, and when a group is done.
+    """
+    missing = [group for group in groups if not is_compiled(group)]
+    if not missing:
+        return
+    note(f"compiling kernels (once): {', '.join(missing)}")
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, len(missing))) as pool:
+        for at, group in enumerate(pool.map(_elsewhere, missing), 1):
+            note(f"compiled {at} of {len(missing)}: {group}")
+
+
+def _elsewhere(group: str) -> str:
+    """Compile a group in a process that ends with this one; what fails is told at its first use."""
+    with start(["--here", group]) as process:
+        process.wait()
+    return group
+
+
+def start(words: Sequence[str], **streams: Any) -> subprocess.Popen[bytes]:
+    """This module as a process that ends with the one that starts it."""
+    command = [sys.executable, "-P", "-m", "flexdt.runtime.child", MODULE, *words]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    return subprocess.Popen(command, stdin=subprocess.PIPE, **{**quiet, **streams})
+
+
+def main() -> None:
+    """Compile the groups named on the command line, or all."""
+    match sys.argv[1:]:
+        case ["--here", group]:
+            GROUPS[group][0]()
+        case groups:
+            compile_ahead(groups or list(GROUPS), lambda line: print(f"flexdt: {line}", flush=True))
+
+
+if __name__ == "__main__":
+    main()
