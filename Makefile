@@ -56,15 +56,16 @@ lint: install
 typecheck: install $(TEST_STAMP)
 	$(BIN)/mypy -p flexdt -p flexdt_extensions
 
-# The kernels that most tests run: compiled once, not by both workers and by each server they start.
+# The kernels that most tests run: compiled once, not by all workers and by each server they start.
 kernels: $(TEST_STAMP)
 	$(BIN)/python tests/support/compile_kernels.py
 
 quick: lint typecheck
 	$(BIN)/pytest -q -n 2 --dist loadfile -m 'not slow' $(QUICK)
 
+# Three workers on two cores: they wait for processes, clocks and disks a quarter of their time.
 test: lint typecheck kernels $(WEB_STAMP)
-	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m 'not slow and not browser' \
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'not slow and not browser' \
 	  --junitxml=build/durations/test.xml
 
 # The second distribution's own tests, the long ones included.
