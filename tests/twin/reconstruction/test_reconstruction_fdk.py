@@ -194,15 +194,15 @@ def layer_of(parts: list[Ellipse], at: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def test_what_some_views_see_above_or_below_the_panel_is_right_or_nan(span, many):
     """Prisms longer than the panel is high. How many views see a voxel is counted here anew."""
     rng = np.random.default_rng(17)
-    for _ in range(4):
+    for _ in range(3):
         sod, rows = rng.uniform(110.0, 400.0), int(rng.integers(24, 50))
-        scan = circle(180, span, pixel=1.6, sod=sod, sdd=2 * sod)
+        scan = circle(96, span, pixel=1.6, sod=sod, sdd=2 * sod)
         scan = ConeVec(
             scan.rows + np.array([0, 0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0]) * rng.uniform(-9, 9)
         )
         parts = [(*rng.uniform(-6, 6, 2), *rng.uniform(8, 16, 2), 1.0, 0.02)]
-        size = 1.6 * rng.uniform(0.4, 0.6)
-        like = Grid((rows + 10, 50, 50), size).blank()
+        size = 1.6 * rng.uniform(0.8, 1.2)
+        like = Grid((rows // 2 + 6, 25, 25), size).blank()
         with pytest.warns(UserWarning, match="layers of the grid lie"):
             found = fdk(ellipses(parts, scan, (rows, 80)), scan, like).data
         x, y, z = (places.ravel() for places in like.centers())
@@ -216,7 +216,7 @@ def test_what_some_views_see_above_or_below_the_panel_is_right_or_nan(span, many
         assert not lost[seen > many].any()
         for lowest, within in ((0.5, 0.05), (1.0, 0.01)):
             values = found[inside & (seen >= lowest) & ~lost] / 0.02
-            assert values.size > 100
+            assert values.size > 40
             assert values.mean() == pytest.approx(1.0, abs=within)
 
 
