@@ -55,11 +55,19 @@ def make_up(
     """
     from flexdt.twin.reconstruction import fdk_kernels
 
+    first, size = first_and_steps(like)
+    x, y, z = (np.array([places[0], places[-1]]) for places in like.centers())
+    corner = np.hypot(x[:, None] - circle.centre[0], y - circle.centre[1]).max()
+    depth = np.array([max(circle.radius - corner, 1e-9), circle.radius + corner])
+    # The rows between which the grid's voxels lie: highest and lowest, nearest and farthest.
+    high = ((z - table[:, 2, None]) * table[:, 9, None])[:, :, None] / depth
+    row = table[:, 10, None, None] - high
+    if not cut_off and row.min() >= 0.0 and row.max() <= rows - 1:
+        return
     order = np.argsort(circle.angle, kind="stable")
     starts = np.arange(0, len(order), -(-len(order) // MADE_UP_BY))
     middle = order[(starts + np.append(starts[1:], len(order))) // 2]
     step = np.add.reduceat(circle.step[order], starts)
-    first, size = first_and_steps(like)
     fdk_kernels.make_up(
         np.ascontiguousarray(table[middle]), weights[middle] * step[:, None], rows,
         np.array(panel) + (-0.5, 0.5), circle.radius, *first, *size, LEAST_SEEN,

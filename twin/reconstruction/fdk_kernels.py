@@ -18,6 +18,9 @@ from flexdt.twin.reconstruction import resample_kernels
 from flexdt.twin.reconstruction.resample_kernels import LANES, MARGIN, add_column, mix_columns
 
 TILE = 8
+FEW_ROWS = 4
+"""Of a fan beam's one or two rows, and one beyond them on either side. Slabs of taller panels,
+which are the whole volume's to the bit, have more."""
 
 
 @fused
@@ -75,6 +78,33 @@ def _add_view(acc, image, rows, shares, g, x, y, z0, dz, line):
 
 
 @kernel
+def _add_few(acc, image, rows, g, x, y, z0, dz):
+    """As `_add_view`, of few rows: whole registers cost more there than they bring."""
+    x -= g[0]
+    y -= g[1]
+    depth = x * g[3] + y * g[4]
+    if depth <= 0.0:
+        return
+    inverse = 1.0 / depth
+    c = g[8] + (x * g[5] + y * g[6]) * inverse * g[7]
+    if c < 0.0 or c > len(image) - 1:
+        return
+    i = min(int(c), len(image) - 2)
+    across = np.float32(c - i)
+    left, right, weight = image[i], image[i + 1], np.float32(inverse * inverse)
+    step = dz * g[9] * inverse
+    row = g[10] - (z0 - g[2]) * g[9] * inverse
+    for k in range(acc.size):
+        if 0.0 <= row <= rows - 1:
+            j = min(int(row), rows - 2)
+            down = np.float32(row - j)
+            upper = left[j] + across * (right[j] - left[j])
+            lower = left[j + 1] + across * (right[j + 1] - left[j + 1])
+            acc[k] += weight * (upper + down * (lower - upper))
+        row -= step
+
+
+@kernel
 def _add_tile(images, rows, shares, views, first_x, first_y, x0, y0, z0, dx, dy, dz, line, volume):
     """Add all views to one tile of voxel columns."""
     ny, nx = volume.shape[:2]
@@ -84,7 +114,10 @@ def _add_tile(images, rows, shares, views, first_x, first_y, x0, y0, z0, dx, dy,
             y = y0 + iy * dy
             for ix in range(first_x, min(nx, first_x + TILE)):
                 x = x0 + ix * dx
-                _add_view(volume[iy, ix], images[view], rows, share, g, x, y, z0, dz, line)
+                if rows <= FEW_ROWS:
+                    _add_few(volume[iy, ix], images[view], rows, g, x, y, z0, dz)
+                else:
+                    _add_view(volume[iy, ix], images[view], rows, share, g, x, y, z0, dz, line)
 
 
 def _entry_point(key: int, lanes: int):  # type: ignore[no-untyped-def]
