@@ -1,0 +1,71 @@
+"""Kernels compiled ahead serve what needs them, and are compiled by nobody else."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from flexdt.runtime import compile_ahead
+from flexdt.twin.projection.kernels.siddon_kernels import clip
+
+USERS = """
+import numba.core.event as event
+import numpy as np
+import flexdt as fx
+from flexdt.phantoms import load_phantom
+from flexdt.twin.calibration import detect_beads
+from flexdt.twin.projection import warm_up
+seen = []
+class Watch(event.Listener):
+    def on_start(self, event):
+        seen.append(str(event.data["dispatcher"].py_func))
+    def on_end(self, event):
+        pass
+event.register("numba:compile", Watch())
+warm_up()
+scan = fx.ConeVec.circular(sod=600, sdd=1059, angles=12, shape=(96, 120), pixel=1.0)
+data = fx.simulate("lego", scan, noise=1)
+detect_beads(data.line_integrals()[0])
+data.reconstruct(voxel=4.0, shape=(4, 8, 8))
+at = scan.project_points(load_phantom("lego").beads)
+marks = [(i, str(k), *at[i, k].tolist(), None) for i, k in np.ndindex(at.shape[:2])]
+fx.calibrate(None, "lego", geometry=scan, markers=marks)
+assert not seen, seen
+"""
+
+
+@pytest.mark.slow  # half a minute of processor time: it begins with an empty cache
+def test_nothing_compiles_after_it_was_compiled_ahead(tmp_path: Path) -> None:
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    ahead = [sys.executable, "-P", "-m", "flexdt.runtime.compile_ahead"]
+    for told in (len(compile_ahead.GROUPS) + 1, 0):
+        done = subprocess.run(ahead, env=environment, capture_output=True, text=True, check=True)
+        assert len(done.stdout.splitlines()) == told
+    users = [sys.executable, "-P", "-c", USERS]
+    done = subprocess.run(users, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "compiling" not in done.stderr
+
+
+def test_what_is_missing_is_named_and_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    compiled: list[str] = []
+    monkeypatch.setattr(compile_ahead, "is_compiled", lambda group: group == "FDK")
+    monkeypatch.setattr(compile_ahead, "_elsewhere", lambda group: compiled.append(group) or group)
+    told: list[str] = []
+    compile_ahead.compile_ahead(["FDK"], told.append)
+    assert (compiled, told) == ([], [])
+    compile_ahead.compile_ahead(["FDK", "scenes"], told.append)
+    assert compiled == ["scenes"]
+    assert "scenes" in told[0]
+    assert "FDK" not in told[0]
+
+
+def test_a_kernel_that_has_code_in_its_callers_only_is_refused_to_python() -> None:
+    for _ in range(2):  # compiled, and compiled before
+        with pytest.raises(TypeError):
+            clip(0.5, 1.0, 3, 0.0, 1.0)
+    assert clip.py_func(0.5, 1.0, 3, 0.0, 1.0) == (0.0, 1.0)
