@@ -14,7 +14,6 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.phantoms import voxelise_kernels as kernels
 from flexdt.phantoms.checked_reading import PhantomError
 from flexdt.phantoms.pieces import Surface, Voxels, bounds
 from flexdt.twin.geometry.conventions import FloatArray
@@ -72,6 +71,8 @@ def as_volume(voxels: Voxels) -> Volume:
 def _add_solid(
     data: npt.NDArray[np.float32], shape: Shape, mu: float, voxel_mm: float, oversample: int
 ) -> None:
+    from flexdt.phantoms import voxelise_kernels as kernels
+
     nz, ny, nx = data.shape
     low, high = bounds(shape)
     x0, x1 = _range(low[0], high[0], nx, voxel_mm)
@@ -97,6 +98,8 @@ def _add_solid(
 def _add_surface(
     data: npt.NDArray[np.float32], surface: Surface, voxel_mm: float, oversample: int
 ) -> None:
+    from flexdt.phantoms import voxelise_kernels as kernels
+
     nz, ny, nx = data.shape
     scale = np.array([oversample, oversample, 1.0]) / voxel_mm
     shift = np.array([nx * oversample, ny * oversample, nz]) / 2.0

@@ -15,8 +15,6 @@ from flexdt.protocol.methods import calibration_messages as p
 from flexdt.runtime.files.dataset_folder import read_text
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.wire_errors import from_root
-from flexdt.twin.calibration.fit.covariance_steps import covariance_by_step
-from flexdt.twin.calibration.unknown_markers import UNKNOWN
 from flexdt.twin.dataset.dataset_errors import DatasetMissingError, plain_name
 
 SECONDS: Final = float(p.FIT_LIMITS["seconds"])
@@ -30,6 +28,10 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
     Raises:
         TwinError: there is no such data set or phantom, or nothing can be fitted.
     """
+    # Here: the server's own process fits nothing, and these load what fits.
+    from flexdt.twin.calibration.fit.covariance_steps import covariance_by_step
+    from flexdt.twin.calibration.unknown_markers import UNKNOWN
+
     phantom: Any = asked.phantom
     if not is_shipped(phantom) and Path(phantom).suffix in FILES:
         phantom = load_phantom_file(_text(root, phantom), phantom)
