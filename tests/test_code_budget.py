@@ -1,6 +1,7 @@
 """The house's size is a budget: whoever needs more lines in a room says so in `code_budget.toml`.
 
-`PYTHONPATH=tests/studies python tests/test_code_budget.py` writes the numbers of today into it; the reasons are yours.
+`PYTHONPATH=tests/studies python tests/test_code_budget.py` writes the numbers of today into it;
+the reasons are yours.
 """
 
 from __future__ import annotations
