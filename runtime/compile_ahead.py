@@ -19,7 +19,7 @@ import numpy as np
 
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Grid
-from flexdt.twin.projection.analytic import warm_up_back, warm_up_forward, warm_up_scenes
+from flexdt.twin.projection.analytic import warm_up_back, warm_up_forward
 
 MODULE: Final = "flexdt.runtime.compile_ahead"
 
@@ -64,10 +64,9 @@ GROUPS: Final[dict[str, tuple[Callable[[], None], str]]] = {
     "calibration": (_fit, "calibration.fit.fit_kernels:evaluate"),
     "bead detection": (_detection, "calibration.detect.spot_kernels:fit_ball"),
     "FDK": (_reconstruction, "reconstruction.fdk_kernels:warp"),
-    "scenes": (warm_up_scenes, "projection.kernels.analytic_kernels:project_convex"),
 }
 """What compiles it, and the entry point that it compiles last; those that take longest first."""
-PROJECTOR: Final = ("back projection", "projection", "scenes")
+PROJECTOR: Final = ("back projection", "projection")
 ANALYSIS: Final = ("calibration", "bead detection", "FDK")
 
 

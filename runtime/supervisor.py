@@ -29,7 +29,7 @@ from flexdt.runtime.process import session_seconds, stop_signal
 STALLED_S = 300.0
 """A service that is not ready and has used no processor time for so long waits for something that
 will not come."""
-SILENT_S = 5.0
+SILENT_S = 2.0
 """After so long without a `ready` line, somebody who waits is told for what."""
 STILL_S = 60.0
 """How often somebody who waits is told how much work a start has done so far."""

@@ -133,19 +133,14 @@ def _project(
 
 def warm_up() -> None:
     """Run what `project_scene`, `forward` and `back` into new memory do, on tiny problems."""
-    warm_up_scenes()
     warm_up_forward()
     warm_up_back()
 
 
-def warm_up_scenes() -> None:
-    """Run `project_scene`."""
+def warm_up_forward() -> None:
+    """Run `project_scene`, and `forward` with rays in fans and alone."""
     shapes = (Sphere((0, 0, 0), 1.0), Box((0, 0, 0), (1, 1, 1)), Cylinder((0, 0, 0), 1.0, 1.0))
     project_scene(Scene(tuple(Solid(s, "water", 0.02) for s in shapes)), LEVEL, (5, 6))
-
-
-def warm_up_forward() -> None:
-    """Run `forward`, with rays in fans and alone."""
     for volume in _tiny_volumes():
         forward(volume, END_ON, (5, 6))
         layout = volume.layout  # so small a problem would not be walked in fans
