@@ -542,7 +542,8 @@ def test_reconstruct_by_jobs_of_a_stand_in_for_slurm(
     assert run([*words, "v.mha", "--slurm", "slurm.toml"]) == 0, capsys.readouterr().err
     assert run([*words, "here.mha"]) == 0
     made, here = (fx.Volume.load(f"{n}.mha").data for n in ("v", "here"))
-    assert np.abs(made - here).max() <= 1e-6 * here.max()
+    most = float(np.nanmax(here))  # layers that the panel does not see are NaN
+    np.testing.assert_allclose(made, here, rtol=0.0, atol=1e-6 * most)
 
 
 @pytest.mark.skipif(os.path.exists("/usr/bin/sbatch"), reason="there is a sbatch here")
