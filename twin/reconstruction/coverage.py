@@ -20,7 +20,8 @@ LEAST_SEEN: Final = 0.4
 """Part of the weight of all views that must see a voxel. At the panel's upper and lower edge it is
 about half in a whole turn."""
 ALL_LINES: Final = 0.97
-"""Part of the directions in which a voxel must be seen where the panel cuts the object off."""
+"""Part of the directions in which a voxel must be seen where the panel cuts the object off, less
+the arc that a view stands for."""
 WEDGE: Final = np.deg2rad(5.0)
 """Angle without lines that is worth a word: it leaves 2 % of a part's contrast in the others."""
 MADE_UP_BY: Final = 360
@@ -71,7 +72,7 @@ def make_up(
     fdk_kernels.make_up(
         np.ascontiguousarray(table[middle]), weights[middle] * step[:, None], rows,
         np.array(panel) + (-0.5, 0.5), circle.radius, *first, *size, LEAST_SEEN,
-        ALL_LINES * np.pi * cut_off, data,
+        (ALL_LINES * np.pi - circle.step.max()) * cut_off, data,
     )  # fmt: skip
 
 

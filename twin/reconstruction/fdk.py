@@ -408,6 +408,8 @@ def fdk_parts(
     progress: Progress | None = None,
     truncation: Truncation | None = None,
     target: Backprojector | None = None,
+    *,
+    outside: bool = False,
 ) -> Volume:
     """As `fdk`, with the views coming in parts, in order.
 
@@ -422,11 +424,13 @@ def fdk_parts(
         progress: called with the fraction done.
         truncation: what lies beyond the panel's edges (`truncation_of`); None for nothing.
         target: adds the views up, and may be looked at meanwhile; None for one of its own.
+        outside: of an object wider than the panel keep what the continued rows say of voxels that
+            are not seen from all sides, instead of NaN.
     """
     like = as_volume(like)
 
     def onto(target: Backprojector, part: Volume, tell: Progress | None) -> Volume:
-        return _fdk(parts(), cone_vec, shape, target, part, window, tell, truncation)
+        return _fdk(parts(), cone_vec, shape, target, part, window, tell, truncation, outside)
 
     if target is None and not circle_of(cone_vec).rise:
         devices = gpu.devices_for(len(cone_vec))
@@ -498,6 +502,7 @@ def _fdk(
     window: str,
     progress: Progress | None,
     truncation: Truncation | None,
+    outside: bool,
 ) -> Volume:
     shape = cone_vec.of_shape(shape)
     circle = circle_of(cone_vec)
@@ -572,7 +577,7 @@ def _fdk(
     data = target.volume()
     if sharing is None:
         own = near[0], near[0] + shape[1] - 1
-        cut_off, rays = truncation is not None, weights[:, kept]
+        cut_off, rays = truncation is not None and not outside, weights[:, kept]
         make_up(data, like, circle, table, rays, last - first, own, cut_off=cut_off)
     return replace(like, data=data.transpose(2, 0, 1))
 

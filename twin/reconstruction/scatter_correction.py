@@ -286,7 +286,9 @@ def volume_of(stack: Float32Array, cone_vec: ConeVec, grid: Grid) -> Volume:
     """FDK of straightened line integrals, smoothed."""
     shape = shape_of(stack)
     truncation = truncation_of(stack.__getitem__, cone_vec, shape)
-    volume = fdk_parts(lambda: [stack], cone_vec, shape, grid, "hann", None, truncation)
+    volume = fdk_parts(
+        lambda: [stack], cone_vec, shape, grid, "hann", None, truncation, outside=True
+    )
     return replace(volume, data=np.nan_to_num(volume.data))  # what no view sees scatters nothing
 
 

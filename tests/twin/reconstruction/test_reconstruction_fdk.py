@@ -720,7 +720,7 @@ from scans import circle
 from flexdt.twin.projection import Volume
 from flexdt.twin.reconstruction import fdk
 like = Volume(np.zeros((8, 8, 8), np.float32), 1.0)
-print(float(fdk(np.ones((12, 16, 16), np.float32), circle(12), like).data.mean()))
+print(np.nanmean(fdk(np.ones((12, 16, 16), np.float32), circle(12), like).data))
 """
     plain = {"NUMBA_CPU_NAME": "x86-64", "NUMBA_CPU_FEATURES": ""}
     lesser = [plain]
