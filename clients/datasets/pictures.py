@@ -29,7 +29,7 @@ def windowed(
     image: npt.NDArray[Any], like: npt.NDArray[Any] | None = None
 ) -> npt.NDArray[np.uint8]:
     """8-bit view of an image: percentiles, of `like` if given, to black and white; NaN is black."""
-    seen = np.asarray(image if like is None else like, dtype=np.float64)
+    seen = image if like is None else like
     seen = seen[np.isfinite(seen)]
     low, high = np.percentile(seen, PERCENTILES) if seen.size else (0.0, 0.0)
     if high <= low:

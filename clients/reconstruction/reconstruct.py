@@ -44,13 +44,14 @@ from flexdt.twin.reconstruction import (
     fdk_parts,
     field_of_view,
     hardening,
+    layer_warnings,
+    lost_layers,
     missing_wedge,
     ring_errors,
     sart,
     sirt,
     truncation_of,
     tv,
-    unseen_layers,
 )
 from flexdt.twin.reconstruction.scatter_correction import scatterer_of, subtracted
 
@@ -135,7 +136,7 @@ class ScanFrames:
         rings: (rows, cols) to subtract from the line integrals, or None.
         harden: straightens line integrals of one material, or None.
         scatter: of each of the m frames, to subtract, or None.
-        doubts: what is doubtful about the images and the corrections.
+        doubts: what is doubtful about the images, the trajectory and the corrections.
     """
 
     dataset: DataSet
@@ -298,7 +299,7 @@ def _here(
             write(_iterative(views, grid, request, tell).data)
             return []
         slabs, truncation = grid.slabs(SLAB_BYTES), views.truncation()
-        doubts = [*missing_wedge(views.cone_vec), *_doubts(truncation)]
+        lost = 0
         for k, (first, last) in enumerate(slabs):
 
             def part(done: float, k: int = k) -> None:
@@ -309,8 +310,8 @@ def _here(
                 views.parts, views.cone_vec, views.shape, like, request.window, part, truncation
             )
             write(slab.data)
-            doubts += unseen_layers(slab.data)
-    return doubts
+            lost += lost_layers(slab.data)
+    return [*_doubts(truncation), *layer_warnings(lost, grid.shape[0])]
 
 
 def _doubts(truncation: Truncation | None) -> list[str]:
@@ -336,7 +337,7 @@ def reconstruct_volume(
         views.parts, views.cone_vec, views.shape, grid.blank(), wanted.window,
         truncation=truncation,
     )  # fmt: skip
-    for doubt in (*missing_wedge(views.cone_vec), *unseen_layers(volume.data)):
+    for doubt in layer_warnings(lost_layers(volume.data), grid.shape[0]):
         warnings.warn(doubt, stacklevel=2)
     return volume
 
@@ -350,7 +351,10 @@ def _task(
     if name not in ALGORITHMS:
         raise UnknownNameError.among(f"unknown algorithm {name!r}; allowed", name, ALGORITHMS)
     views = views_of(dataset, parameters, binning=wanted.binning, every=wanted.every)
-    views = replace(views, doubts=tuple(image_doubts(dataset, needed=True)))
+    doubts = image_doubts(dataset, needed=True)
+    if name == "fdk":  # iterative methods need no lines of all directions
+        doubts += missing_wedge(views.cone_vec)
+    views = replace(views, doubts=tuple(doubts))
     return wanted, views, grid_of(views, wanted)
 
 

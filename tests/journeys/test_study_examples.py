@@ -1,6 +1,6 @@
 """The studies behind docs/physics.md and docs/reconstruction.md, small, with what they must show:
 physics_figures, detector_figures, reference_scan, and, where the peers are installed, compare_fdk
-and compare_gvxr.
+and compare_gvxr; and silent_errors of tests/studies.
 """
 
 from __future__ import annotations
@@ -37,6 +37,17 @@ def run(name: str, *words: object) -> dict[str, Any]:
     begin, end = done.stdout.index("{\n"), done.stdout.rindex("}") + 1
     document: dict[str, Any] = json.loads(done.stdout[begin:end])
     return document
+
+
+@pytest.mark.slow
+def test_drawn_scans_are_right_or_said() -> None:
+    study = EXAMPLES.parent / "tests" / "studies" / "silent_errors.py"
+    done = subprocess.run(
+        [sys.executable, str(study), "--count", "60"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
+    assert "right" in done.stdout
 
 
 def test_physics_figures() -> None:

@@ -1,7 +1,7 @@
 """Volumes back from projections."""
 
 from flexdt.twin.projection.volume import Grid
-from flexdt.twin.reconstruction.coverage import missing_wedge, unseen_layers
+from flexdt.twin.reconstruction.coverage import layer_warnings, lost_layers, missing_wedge
 from flexdt.twin.reconstruction.fdk import fdk, fdk_parts
 from flexdt.twin.reconstruction.iterative import Step, cgls, em, sart, sirt
 from flexdt.twin.reconstruction.rectify import field_of_view
@@ -26,6 +26,8 @@ __all__ = [
     "fdk_parts",
     "field_of_view",
     "hardening",
+    "layer_warnings",
+    "lost_layers",
     "minimise_tv",
     "missing_wedge",
     "ring_errors",
@@ -33,6 +35,5 @@ __all__ = [
     "sirt",
     "truncation_of",
     "tv",
-    "unseen_layers",
     "without_scatter",
 ]

@@ -23,12 +23,12 @@ ALL_LINES: Final = 0.97
 """Part of the directions in which a voxel must be seen where the panel cuts the object off, less
 the arc that a view stands for."""
 WEDGE: Final = np.deg2rad(5.0)
-"""Angle without lines that is worth a word: it leaves 2 % of a part's contrast in the others."""
-MADE_UP_BY: Final = 360
-"""Views by which that part is judged, of as many or more."""
+"""Smallest wedge that is warned of [rad]: a thirty-sixth of all directions."""
+MOST_VIEWS: Final = 360
+"""Coverage is judged by so many of the views at most, evenly over the circle."""
 
 
-def make_up(
+def normalise_coverage(
     data: Float32Array,
     like: Volume,
     circle: Circle,
@@ -39,18 +39,18 @@ def make_up(
     *,
     cut_off: bool,
 ) -> None:
-    """Make voxels up for views that see them above or below the panel; see `fdk_kernels.make_up`.
+    """Scale voxels that lie above or below the panel in some views; those seen too little are NaN.
 
-    Where there are many views, one stands for some neighbours.
+    See `fdk_kernels.normalise_coverage`. Of many views, one stands for some neighbours.
 
     Args:
-        data: of the volume, (ny, nx, nz), changed in place.
+        data: the volume's, (ny, nx, nz), changed in place.
         like: its grid.
         circle: of the views.
         table: what the kernel needs of each view, (n, 11).
         weights: of rays, (n, cols).
-        rows: that the table's rows count.
-        panel: of these columns the first and the last that are the panel's.
+        rows: of the images.
+        panel: first and last column of the panel, among the images' columns.
         cut_off: whether the panel cuts the object off, so that voxels which are not seen in lines
             of all directions become NaN.
     """
@@ -66,10 +66,10 @@ def make_up(
     if not cut_off and row.min() >= 0.0 and row.max() <= rows - 1:
         return
     order = np.argsort(circle.angle, kind="stable")
-    starts = np.arange(0, len(order), -(-len(order) // MADE_UP_BY))
+    starts = np.arange(0, len(order), -(-len(order) // MOST_VIEWS))
     middle = order[(starts + np.append(starts[1:], len(order))) // 2]
     step = np.add.reduceat(circle.step[order], starts)
-    fdk_kernels.make_up(
+    fdk_kernels.normalise_coverage(
         np.ascontiguousarray(table[middle]), weights[middle] * step[:, None], rows,
         np.array(panel) + (-0.5, 0.5), circle.radius, *first, *size, LEAST_SEEN,
         (ALL_LINES * np.pi - circle.step.max()) * cut_off, data,
@@ -82,7 +82,7 @@ def first_and_steps(like: Volume) -> tuple[list[float], list[float]]:
 
 
 def missing_wedge(cone_vec: ConeVec) -> list[str]:
-    """What is to be said of directions in which neither views nor their opposites saw a line.
+    """A warning where neither views nor their opposites see lines of some directions.
 
     Raises:
         GeometryError: neither a circle nor a helix.
@@ -94,16 +94,21 @@ def missing_wedge(cone_vec: ConeVec) -> list[str]:
         return []
     return [
         f"no view sees lines within a wedge of {np.rad2deg(widest):.3g} deg (the usual step is "
-        f"{np.rad2deg(usual):.3g} deg): streaks, and values some per cent off near edges along it"
+        f"{np.rad2deg(usual):.3g} deg): expect streaks, and values some per cent off near edges "
+        "along it"
     ]
 
 
-def unseen_layers(data: Float32Array) -> list[str]:
-    """What is to be said of layers of a volume (nz, ny, nx) without a single voxel from data."""
-    lost = int(np.isnan(data[:, ::4, ::4]).all(axis=(1, 2)).sum())
+def lost_layers(data: Float32Array) -> int:
+    """Layers of a volume (nz, ny, nx) without a value, judged by every fourth voxel of a side."""
+    return int(np.isnan(data[:, ::4, ::4]).all(axis=(1, 2)).sum())
+
+
+def layer_warnings(lost: int, layers: int) -> list[str]:
+    """A warning where some of a grid's layers are lost."""
     if not lost:
         return []
     return [
-        f"{lost} of {len(data)} layers of the grid lie above or below what the panel sees; their "
-        "voxels are NaN"
+        f"{lost} of {layers} layers of the grid lie outside what the panel sees; their voxels are "
+        "NaN"
     ]

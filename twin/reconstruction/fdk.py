@@ -32,9 +32,10 @@ from flexdt.twin.projection.cpu import threads
 from flexdt.twin.projection.operators import as_cone_vec, check_projections, require_finite
 from flexdt.twin.reconstruction.coverage import (
     first_and_steps,
-    make_up,
+    layer_warnings,
+    lost_layers,
     missing_wedge,
-    unseen_layers,
+    normalise_coverage,
 )
 from flexdt.twin.reconstruction.helix import Sharing
 from flexdt.twin.reconstruction.rectify import (
@@ -394,7 +395,8 @@ def fdk(
         if truncation is not None and truncation.doubt:
             warnings.warn(truncation.doubt, stacklevel=2)
     volume = fdk_parts(parts, geometry, shape, like, window, progress, truncation)
-    for doubt in (*missing_wedge(geometry), *unseen_layers(volume.data)):
+    layers = layer_warnings(lost_layers(volume.data), len(volume.data))
+    for doubt in (*missing_wedge(geometry), *layers):
         warnings.warn(doubt, stacklevel=2)
     return volume
 
@@ -578,7 +580,7 @@ def _fdk(
     if sharing is None:
         own = near[0], near[0] + shape[1] - 1
         cut_off, rays = truncation is not None and not outside, weights[:, kept]
-        make_up(data, like, circle, table, rays, last - first, own, cut_off=cut_off)
+        normalise_coverage(data, like, circle, table, rays, last - first, own, cut_off=cut_off)
     return replace(like, data=data.transpose(2, 0, 1))
 
 

@@ -12,7 +12,14 @@ import numpy as np
 from numba import prange
 
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.projection.kernels.compiling import fetch_next, fused, kernel, parallel, sources
+from flexdt.twin.projection.kernels.compiling import (
+    fetch_next,
+    fused,
+    inline,
+    kernel,
+    parallel,
+    sources,
+)
 from flexdt.twin.projection.volume import aligned_zeros
 from flexdt.twin.reconstruction import resample_kernels
 from flexdt.twin.reconstruction.resample_kernels import LANES, MARGIN, add_column, mix_columns
@@ -30,21 +37,30 @@ def _times(line, left, right, part):
         line[r] *= left[r] + part * (right[r] - left[r])
 
 
-@kernel
-def _add_view(acc, image, rows, shares, g, x, y, z0, dz, line):
-    """Add one view to the voxels above one another at (x, y); see `backproject`."""
-    cols = len(image)
-    # Along the panel's normal; the same for all voxels above one another, as is the column c.
+@inline
+def _column(g, cols, x, y):
+    """Where a view sees all voxels above one another at (x, y): their depth along the panel's
+    normal [mm], 0 where it does not see them, and the column.
+    """
     x -= g[0]
     y -= g[1]
     depth = x * g[3] + y * g[4]
     if depth <= 0.0:
+        return 0.0, 0.0
+    c = g[8] + (x * g[5] + y * g[6]) * (1.0 / depth) * g[7]
+    if c < 0.0 or c > cols - 1:
+        return 0.0, 0.0
+    return depth, c
+
+
+@kernel
+def _add_view(acc, image, rows, shares, g, x, y, z0, dz, line):
+    """Add one view to the voxels above one another at (x, y); see `backproject`."""
+    depth, c = _column(g, len(image), x, y)
+    if depth == 0.0:
         return
     inverse = 1.0 / depth
-    c = g[8] + (x * g[5] + y * g[6]) * inverse * g[7]
-    if c < 0.0 or c > cols - 1:
-        return
-    i = min(int(c), cols - 2)
+    i = min(int(c), len(image) - 2)
     # The row of voxel k is start + k step.
     step = -dz * g[9] * inverse
     start = g[10] - (z0 - g[2]) * g[9] * inverse
@@ -79,16 +95,11 @@ def _add_view(acc, image, rows, shares, g, x, y, z0, dz, line):
 
 @kernel
 def _add_few(acc, image, rows, g, x, y, z0, dz):
-    """As `_add_view`, of few rows: whole registers cost more there than they bring."""
-    x -= g[0]
-    y -= g[1]
-    depth = x * g[3] + y * g[4]
-    if depth <= 0.0:
+    """As `_add_view` for few rows, where whole registers cost more than they bring."""
+    depth, c = _column(g, len(image), x, y)
+    if depth == 0.0:
         return
     inverse = 1.0 / depth
-    c = g[8] + (x * g[5] + y * g[6]) * inverse * g[7]
-    if c < 0.0 or c > len(image) - 1:
-        return
     i = min(int(c), len(image) - 2)
     across = np.float32(c - i)
     left, right, weight = image[i], image[i + 1], np.float32(inverse * inverse)
@@ -157,21 +168,15 @@ backproject = _entry_point(sources(resample_kernels), LANES)
 
 
 @kernel
-def _covered(g, weights, rows, on_panel, radius, x, y, z0, dz, seen):
-    """Add a view's weight to what sees the voxels above one another at (x, y), whose differences
-    `seen` holds; see `make_up`. Returns that weight, whatever the height, and the angle of lines
-    through the voxels that the panel's columns see in this view.
+def _cover(g, weights, rows, on_panel, radius, x, y, z0, dz, seen):
+    """Add a view's weight to the voxels above one another at (x, y) that its rows see; `seen` holds
+    the differences from one to the next. Returns that weight, and the angle of the lines through
+    the voxels that the panel's columns see in this view; see `normalise_coverage`.
     """
-    x -= g[0]
-    y -= g[1]
-    depth = x * g[3] + y * g[4]
-    if depth <= 0.0:
+    depth, c = _column(g, weights.size, x, y)
+    if depth == 0.0:
         return 0.0, 0.0
     inverse = 1.0 / depth
-    aside = x * g[5] + y * g[6]
-    c = g[8] + aside * inverse * g[7]
-    if c < 0.0 or c > weights.size - 1:
-        return 0.0, 0.0
     every = -1.0 / (dz * g[9] * inverse)
     start = g[10] - (z0 - g[2]) * g[9] * inverse
     lowest = max(0, math.ceil((rows - 1 - start) * every))
@@ -180,7 +185,9 @@ def _covered(g, weights, rows, on_panel, radius, x, y, z0, dz, seen):
     # A source that moves on by an angle turns the line to a voxel by radius cos(fan) / distance.
     angle = 0.0
     if on_panel[0] <= c <= on_panel[1]:
-        angle = weight * radius * depth / (depth * depth + aside * aside)
+        slope = (c - g[8]) / g[7]
+        angle = weight * radius * inverse / (1.0 + slope * slope)
+    # Between what a wide object's filtered rows fall with (depth^2) and a small one's (depth).
     weight *= inverse * math.sqrt(inverse)
     if lowest <= highest:
         seen[lowest] += weight
@@ -189,18 +196,18 @@ def _covered(g, weights, rows, on_panel, radius, x, y, z0, dz, seen):
 
 
 @parallel
-def make_up(
+def normalise_coverage(
     views, weights, rows, on_panel, radius, x0, y0, z0, dx, dy, dz, least, half_turn, volume
 ):
-    """Make voxels up for the views on which they lie above or below the panel.
+    """Divide each voxel by the part of the views' weight that saw it.
 
-    What the others gave is divided by their part of the weight; voxels of which that is less than
-    `least` become NaN. So do those that are not seen in lines of all directions, of `half_turn`.
+    In the other views it lies above or below the panel. Voxels of which that part is less than
+    `least` become NaN, as do those that are not seen along lines of all directions (`half_turn`).
 
     views: float64 (n, 11) and weights: float64 (n, cols), of `backproject`.
     on_panel: first and last column of the panel.
     radius: from the axis to the source [mm].
-    half_turn: pi, or what is nearly that [rad]; 0 where nothing lies beside the panel.
+    half_turn: pi, or nearly so [rad]; 0 where nothing lies beside the panel.
     volume: float32 (ny, nx, nz).
     """
     ny, nx, nz = volume.shape
@@ -211,7 +218,7 @@ def make_up(
             total = 0.0
             angles = 0.0
             for view in range(len(views)):
-                weight, angle = _covered(
+                weight, angle = _cover(
                     views[view], weights[view], rows, on_panel, radius, x0 + ix * dx,
                     y0 + iy * dy, z0, dz, seen,
                 )  # fmt: skip
@@ -222,7 +229,7 @@ def make_up(
                 part += seen[iz]
                 if angles < half_turn or part < least * total:
                     volume[iy, ix, iz] = np.nan
-                elif part < 0.999999 * total:
+                elif part < 0.999999 * total:  # not by rounding alone
                     volume[iy, ix, iz] *= total / part
 
 
@@ -236,8 +243,8 @@ def room(n: int, cols: int, rows: int) -> Float32Array:
 def weigh(images, first, factors, across, up, out):
     """out[n, r, c] = images[n, first + r, c] * factors[n, c] / length of the ray to (r, c).
 
-    images: float32 (n, rows of the panel, cols), whose outermost rows go on; out: float32 (n, rows,
-    cols).
+    images: float32 (n, rows of the panel, cols); rows beyond the panel repeat its outermost ones.
+    out: float32 (n, rows, cols).
     factors: float64 (n, cols).
     across, up: squares of the ray's horizontal and vertical parts, (n, cols) and (n, rows) [mm^2].
     """
