@@ -6,6 +6,7 @@ import importlib
 import importlib.util
 import json
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -69,7 +70,7 @@ def test_all_folders_are_typed() -> None:
 
 
 def built(out: Path, place: str) -> Path:
-    """The wheel of the project in the folder `place` of the repository."""
+    """The wheel of the project in the folder `place` of the repository, made from its sdist."""
     # A copy, because setuptools writes build/ and egg-info beside the sources.
     source = out / "source"
     tracked = subprocess.run(
@@ -83,7 +84,7 @@ def built(out: Path, place: str) -> Path:
             if (ROOT / name).is_file():
                 target.write_bytes((ROOT / name).read_bytes())
     subprocess.run(
-        [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), "."],
+        [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), "."],
         cwd=source / place, check=True, capture_output=True,
     )  # fmt: skip
     return next(out.glob("*.whl"))
@@ -326,6 +327,30 @@ def test_one_version_everywhere() -> None:
     assert str(citation["version"]) == version
     changelog = (ROOT / "CHANGELOG.md").read_text()
     assert f"## {version} ({citation['date-released']})" in changelog
+
+
+CONDA = {
+    "msgpack": "msgpack-python",
+    "opencv-python-headless": "py-opencv",
+    "prometheus-client": "prometheus_client",
+}
+"""conda-forge's names of distributions that have another one."""
+
+
+def test_the_conda_recipe_is_that_of_this_version() -> None:
+    with (ROOT / "pyproject.toml").open("rb") as file:
+        project = tomllib.load(file)["project"]
+    recipe = yaml.safe_load((ROOT / "conda" / "recipe.yaml").read_text())
+    assert recipe["context"]["version"] == project["version"]
+    name = re.compile(r"[\w-]+")
+    wanted = [f"python {project['requires-python']}"]
+    for text in project["dependencies"]:
+        found = name.match(text)
+        assert found is not None
+        wanted.append(f"{CONDA.get(found[0], found[0])} {text[found.end() :]}")
+    assert recipe["requirements"]["run"] == wanted
+    ((command, point),) = project["scripts"].items()
+    assert recipe["build"]["python"]["entry_points"] == [f"{command} = {point}"]
 
 
 def test_bounds_are_no_tighter_than_those_of_our_dependencies() -> None:

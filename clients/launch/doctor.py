@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from flexdt.clients.whole_files import free_bytes, nearest_there
+from flexdt.runtime.files.directory import memory_bytes
 
 Verdict = Literal["ok", "warning", "error"]
 WORST_ERROR: Final = 1e-5
@@ -122,7 +123,7 @@ def threads() -> CheckOutcome:
 
 def memory() -> CheckOutcome:
     """What the projector may fill."""
-    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    total = memory_bytes()
     found = f"{total / 2**30:.1f} GiB; the projector holds volumes up to half of it"
     return CheckOutcome("memory", "ok" if total > 3 << 30 else "warning", found)
 

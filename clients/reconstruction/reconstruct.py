@@ -30,6 +30,7 @@ from flexdt.clients.reconstruction.volume_files import (
     write_slices,
 )
 from flexdt.clients.whole_files import free_bytes
+from flexdt.runtime.files.directory import memory_bytes
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import LimitError, TwinError, UnknownNameError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -326,7 +327,7 @@ def reconstruct_volume(
 ) -> Volume:
     """Reconstruct a data set in memory; arguments and errors as for `reconstruct_dataset`."""
     wanted, views, grid = _task(dataset, request, parameters)
-    _require("of memory", 3 * grid.bytes, _memory(), grid)
+    _require("of memory", 3 * grid.bytes, memory_bytes(), grid)
     views = _corrected(views, wanted)
     truncation = views.truncation() if wanted.algorithm == "fdk" else None
     for doubt in (*views.doubts, *_doubts(truncation)):
@@ -479,7 +480,7 @@ def _require_room(out: Path, grid: Grid) -> None:
     folder = out.absolute().parent
     _require(f"free in {folder}", grid.bytes, free_bytes(folder), grid)
     layer = 3 * grid.bytes // grid.shape[0]
-    _require("of memory for a layer and its filling", layer, _memory(), grid)
+    _require("of memory for a layer and its filling", layer, memory_bytes(), grid)
 
 
 def _require(where: str, need: int, free: int, grid: Grid) -> None:
@@ -493,15 +494,11 @@ def _require(where: str, need: int, free: int, grid: Grid) -> None:
         )
 
 
-def _memory() -> int:
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-
-
 def _iterative(views: ScanFrames, grid: Grid, request: VolumeRequest, tell: Progress) -> Volume:
     # Stacks of images and grids of voxels that the algorithm holds at a time.
     stacks, grids = (6, 13) if request.algorithm == "tv" else (3, 5)
     need = stacks * 4 * len(views.indices) * math.prod(views.shape) + grids * grid.bytes
-    memory = _memory()
+    memory = memory_bytes()
     if need > 0.8 * memory:
         raise LimitError(
             f"{request.algorithm} would need about {need / 2**30:.1f} GiB of the machine's "

@@ -36,6 +36,9 @@ BEFORE: Final = ".before-"
 LARGEST: Final = 256 << 20
 """Bytes of a file that is read whole, where its size is not known. The record of a scan of 200 000
 poses has about 50 MB; a sparse file may claim any size."""
+CGROUP_LIMIT: Final = Path("/sys/fs/cgroup/memory.max")
+FALLBACK_MEMORY: Final = 4 << 30
+"""Assumed where the system does not say how much memory it has (Windows) [bytes]."""
 
 _NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _RELATIVE: Final = hasattr(os, "O_DIRECTORY")
@@ -396,6 +399,16 @@ def free_bytes(path: Path) -> int | None:
     except (OSError, AttributeError):
         return None
     return usage.f_bavail * usage.f_frsize
+
+
+def memory_bytes() -> int:
+    """The machine's memory, or the container's where that is less [bytes]."""
+    memory = FALLBACK_MEMORY
+    with suppress(AttributeError, ValueError):
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    with suppress(OSError, ValueError):  # no container, or none with a limit ("max")
+        return min(memory, int(CGROUP_LIMIT.read_text(encoding="ascii")))
+    return memory
 
 
 def open_data(root: Path) -> Directory:

@@ -6,31 +6,15 @@ it cleanly. Only this module chooses the implementation and touches the process.
 
 from __future__ import annotations
 
-import contextlib
-import os
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 from flexdt.process_settings import ProjectorSettings, parse
 from flexdt.runtime.access import ConnectionLimits, read_token, server_tls, with_limits
+from flexdt.runtime.files.directory import memory_bytes
 from flexdt.runtime.log import LEVELS, set_up
 from flexdt.runtime.metrics import Requests
 from flexdt.runtime.process import OK, announce, run_process, stop_signal
-
-CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
-FALLBACK_MEMORY = 4 << 30
-"""Assumed where the system does not say how much memory it has (Windows) [bytes]."""
-
-
-def default_memory() -> int:
-    """Half of the memory there is: the machine's, or the container's where that is less [bytes]."""
-    memory = FALLBACK_MEMORY
-    with contextlib.suppress(AttributeError, ValueError):
-        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    with contextlib.suppress(OSError, ValueError):  # no container, or none with a limit ("max")
-        memory = min(memory, int(CGROUP_LIMIT.read_text(encoding="ascii")))
-    return memory // 2
 
 
 async def run(options: ProjectorSettings) -> int:
@@ -41,7 +25,7 @@ async def run(options: ProjectorSettings) -> int:
     from flexdt.twin.projection.cpu import threads as all_threads
 
     threads = options.threads or all_threads()
-    limit = options.memory_limit or default_memory()
+    limit = options.memory_limit or memory_bytes() // 2
     requests = Requests()
     server = await serve_projector(
         options.host,

@@ -24,10 +24,10 @@ from flexdt.process_settings import (
     words,
 )
 from flexdt.runtime import process
+from flexdt.runtime.files import directory
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.own_documents import lock_folder
 from flexdt.runtime.loop import ServerLoop
-from flexdt.server.projector import main as projector_main
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 
 PROCESSES = (UpSettings, TwinSettings, ProjectorSettings, ViewerSettings, GatewaySettings)
@@ -192,5 +192,5 @@ def test_a_system_that_does_not_say_its_memory_is_taken_to_have_some(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delattr(os, "sysconf")
-    monkeypatch.setattr(projector_main, "CGROUP_LIMIT", tmp_path / "none")
-    assert projector_main.default_memory() == projector_main.FALLBACK_MEMORY // 2
+    monkeypatch.setattr(directory, "CGROUP_LIMIT", tmp_path / "none")
+    assert directory.memory_bytes() == directory.FALLBACK_MEMORY
