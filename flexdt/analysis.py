@@ -6,7 +6,7 @@ line calls too.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 
@@ -116,6 +116,8 @@ def reconstruct(
     scatter_correction: str | Sequence[str] | None = None,
     tube: Tube | None = None,
     parameters: Offsets | None = None,
+    progress: Callable[[float], None] | None = None,
+    errors: bool = True,
 ) -> Volume:
     """Reconstruct a data set into a volume in memory.
 
@@ -136,6 +138,9 @@ def reconstruct(
             scatter and subtract it (a circular scan).
         tube: of the scan, for the two corrections; default: what the data set says.
         parameters: correction; default: the one in force during the scan, if any.
+        progress: called with the fraction done.
+        errors: find the noise, too: `volume.sigma` (FDK of a circle on the processor, of three
+            rows or more).
 
     Returns:
         Volume of attenuation [1/mm].
@@ -155,7 +160,10 @@ def reconstruct(
         tube=tube,
         scatter_correction=None if names is None else tuple(names),
     )  # fmt: skip
-    return reconstruct_volume(_opened(data), request, parameters=parameters)
+    tell = None if progress is None else lambda done, whole: progress(done / whole)
+    return reconstruct_volume(
+        _opened(data), request, parameters=parameters, progress=tell, errors=errors
+    )
 
 
 def align(data: Data, *, per_frame: bool = False) -> Aligned:

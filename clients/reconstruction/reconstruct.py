@@ -324,8 +324,13 @@ def reconstruct_volume(
     request: VolumeRequest | None = None,
     *,
     parameters: Offsets | None = None,
+    progress: Progress | None = None,
+    errors: bool = False,
 ) -> Volume:
-    """Reconstruct a data set in memory; arguments and errors as for `reconstruct_dataset`."""
+    """Reconstruct a data set in memory; arguments and errors as for `reconstruct_dataset`, and
+    `errors` as for `fdk_parts`.
+    """
+    tell = progress or _untold
     wanted, views, grid = _task(dataset, request, parameters)
     _require("of memory", 3 * grid.bytes, memory_bytes(), grid)
     views = _corrected(views, wanted)
@@ -333,10 +338,10 @@ def reconstruct_volume(
     for doubt in (*views.doubts, *_doubts(truncation)):
         warnings.warn(doubt, stacklevel=2)
     if wanted.algorithm != "fdk":
-        return _iterative(views, grid, wanted, _untold)
+        return _iterative(views, grid, wanted, tell)
     volume = fdk_parts(
         views.parts, views.cone_vec, views.shape, grid.blank(), wanted.window,
-        truncation=truncation,
+        lambda done: tell(done, 1.0), truncation, errors=errors,
     )  # fmt: skip
     for doubt in layer_warnings(lost_layers(volume.data), grid.shape[0]):
         warnings.warn(doubt, stacklevel=2)

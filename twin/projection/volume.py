@@ -12,7 +12,7 @@ import operator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,9 @@ import numpy.typing as npt
 from flexdt.twin.errors import GeometryError, NotBuiltError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray, as_numbers
 from flexdt.twin.lazy_backend import File, lazy_backend
+
+if TYPE_CHECKING:
+    from flexdt.twin.reconstruction.noise import Noise
 
 Vector3 = tuple[float, float, float]
 IntArray = npt.NDArray[np.int32]
@@ -264,6 +267,20 @@ class Volume:
         """
         volume: Volume = lazy_backend("clients.reconstruction.volume_files").read_volume(file)
         return volume
+
+    @property
+    def sigma(self) -> Float32Array | None:
+        """Standard deviation of the noise in each voxel, (nz, ny, nx) [1/mm], as the images show it
+        (`reconstruct("fdk")`); None where it was not found. It is computed at each call.
+        """
+        noise = getattr(self, "_noise", None)
+        return None if noise is None else noise.sigma(self)
+
+    def with_noise(self, noise: Noise | None) -> Volume:
+        """The same volume, whose `sigma` is that of `noise`; other volumes made of it have none."""
+        found = replace(self)
+        object.__setattr__(found, "_noise", noise)
+        return found
 
     @property
     def voxel_xyz(self) -> Vector3:

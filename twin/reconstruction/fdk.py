@@ -38,6 +38,7 @@ from flexdt.twin.reconstruction.coverage import (
     normalise_coverage,
 )
 from flexdt.twin.reconstruction.helix import Sharing
+from flexdt.twin.reconstruction.noise import NoiseMeter
 from flexdt.twin.reconstruction.rectify import (
     FINER,
     is_upright,
@@ -120,6 +121,7 @@ class OnProcessor:
         self._first, self._size = first_and_steps(like)
         self._data = np.zeros((ny, nx, nz), np.float32)
         self._sizes, self._columns = (0, 0, 0, 0), self._data
+        self.meter: NoiseMeter | None = None
 
     def add(self, views: Views) -> None:
         """Weigh and filter views, and add them to the volume."""
@@ -142,6 +144,8 @@ class OnProcessor:
             self._columns, rows, views.shares, views.table, *self._first, *self._size, self._data,
             threads(),
         )  # fmt: skip
+        if self.meter is not None:
+            self.meter.add(views, self._columns)
 
     def volume(self) -> Float32Array:
         """What has been added up, (ny, nx, nz)."""
@@ -412,6 +416,7 @@ def fdk_parts(
     target: Backprojector | None = None,
     *,
     outside: bool = False,
+    errors: bool = False,
 ) -> Volume:
     """As `fdk`, with the views coming in parts, in order.
 
@@ -428,11 +433,14 @@ def fdk_parts(
         target: adds the views up, and may be looked at meanwhile; None for one of its own.
         outside: of an object wider than the panel keep what the continued rows say of voxels that
             are not seen from all sides, instead of NaN.
+        errors: give the volume its `sigma` (circles, on the processor).
     """
     like = as_volume(like)
 
     def onto(target: Backprojector, part: Volume, tell: Progress | None) -> Volume:
-        return _fdk(parts(), cone_vec, shape, target, part, window, tell, truncation, outside)
+        return _fdk(
+            parts(), cone_vec, shape, target, part, window, tell, truncation, outside, errors
+        )
 
     if target is None and not circle_of(cone_vec).rise:
         devices = gpu.devices_for(len(cone_vec))
@@ -505,6 +513,7 @@ def _fdk(
     progress: Progress | None,
     truncation: Truncation | None,
     outside: bool,
+    errors: bool,
 ) -> Volume:
     shape = cone_vec.of_shape(shape)
     circle = circle_of(cone_vec)
@@ -544,6 +553,10 @@ def _fdk(
     pitch = np.linalg.norm(level.u, axis=1)
     response = ramp(wide, float(pitch[0]), window)
     weights = weights * (pitch[0] / pitch)[:, None]
+    meter = None
+    if errors and sharing is None and isinstance(target, OnProcessor):
+        panel = slice(before, before + shape[1])
+        meter = target.meter = NoiseMeter(like, circle, table, panel)
     done = 0
     for part in parts:
         views = slice(done, done + len(part))
@@ -581,7 +594,12 @@ def _fdk(
         own = near[0], near[0] + shape[1] - 1
         cut_off, rays = truncation is not None and not outside, weights[:, kept]
         normalise_coverage(data, like, circle, table, rays, last - first, own, cut_off=cut_off)
-    return replace(like, data=data.transpose(2, 0, 1))
+        if meter is not None:
+            normalise_coverage(
+                meter.data, meter.grid, circle, table, rays, last - first, own, cut_off=cut_off
+            )
+    volume = replace(like, data=data.transpose(2, 0, 1))
+    return volume if meter is None else volume.with_noise(meter.found())
 
 
 def _weighing(

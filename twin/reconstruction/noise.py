@@ -1,0 +1,220 @@
+"""The standard deviation of the noise in a volume of FDK, from the images themselves.
+
+Nothing has to be known of the camera. What differs from view to view: the views are added up once
+more, every second one with a minus (in the order of their angles). What the object gives to
+neighbouring views cancels, what noise gives does not, and has the variance that it has in the
+volume. What all views share, the noise of the flat and dark images: its spectrum is that of the
+views' mean, less that of their alternating mean. A voxel's variance follows from where the views
+see it. On a grid of every few voxels, both cost little.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.projection.cpu import threads
+from flexdt.twin.projection.volume import Volume
+from flexdt.twin.reconstruction.trajectory import Circle
+
+if TYPE_CHECKING:
+    from flexdt.twin.reconstruction.fdk import Views
+
+NODES: Final = 32
+"""Nodes of the coarse grid along the longest side, at most: noise changes smoothly."""
+APART: Final = 3
+"""Rows of the panel, at least, between two that are compared: blur ties neighbours together."""
+BANDS: Final = 16
+"""Bands of the spectrum, over which it is averaged."""
+AROUND: Final = 8
+POINTS: Final = 32 * AROUND
+"""Places at which the variance of what all views share is computed, and how many are averaged."""
+SIDE: Final = 5
+"""Side of the window about a node whose values are compared [nodes]."""
+MEDIAN: Final = 0.67449
+"""Median of the sizes of normal deviates."""
+TINY: Final = float(np.finfo(np.float32).tiny)
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Variances of the noise in a volume.
+
+    Attributes:
+        views: of what differs between the views, on a coarse grid [1/mm^2].
+        centre: of the circle [mm].
+        radii: about it, growing [mm].
+        shared: at these radii, of what all views share [1/mm^2].
+    """
+
+    views: Volume
+    centre: tuple[float, float]
+    radii: FloatArray
+    shared: FloatArray
+
+    def sigma(self, grid: Volume) -> Float32Array:
+        """Standard deviation at each voxel of a grid, (nz, ny, nx) [1/mm]."""
+        from scipy.ndimage import map_coordinates
+
+        x, y, z = grid.centers()
+        at = [
+            np.interp(places, nodes, np.arange(len(nodes)))
+            for places, nodes in zip((z, y, x), self.views.centers()[::-1], strict=True)
+        ]
+        flat = np.hypot(x - self.centre[0], (y - self.centre[1])[:, None])
+        shared = np.interp(flat, self.radii, self.shared)
+        out = np.empty(grid.shape, np.float32)
+        across = np.meshgrid(at[1], at[2], indexing="ij")
+        for layer, k in enumerate(at[0]):
+            where = [np.full(flat.shape, k), *across]
+            out[layer] = np.sqrt(map_coordinates(self.views.data, where, order=1) + shared)
+        return np.where(np.isnan(grid.data), np.float32(np.nan), out)
+
+
+class NoiseMeter:
+    """Adds up, beside a volume, what its noise is found from.
+
+    Args:
+        like: the volume's grid.
+        circle: of the views.
+        table: of all views, of `fdk_kernels.backproject`.
+        panel: the panel's columns among those of the images.
+    """
+
+    def __init__(self, like: Volume, circle: Circle, table: FloatArray, panel: slice) -> None:
+        self._circle, self._table, self._panel = circle, table, panel
+        rows_per_mm = float(table[:, 9].mean()) / circle.radius
+        size = np.array(like.voxel_xyz)
+        steps = np.maximum(2, -(-np.array(like.shape[::-1]) // NODES))
+        steps[2] = max(steps[2], np.ceil(APART / (rows_per_mm * size[2])))
+        counts = np.maximum(1, np.array(like.shape[::-1]) // steps)
+        nx, ny, nz = (int(n) for n in counts)
+        dx, dy, dz = (float(s) for s in steps * size)
+        self.grid = Volume(np.zeros((nz, ny, nx), np.float32), (dx, dy, dz), like.center_mm)
+        self.data = np.zeros((ny, nx, nz), np.float32)
+        order = np.argsort(circle.angle % (2.0 * np.pi), kind="stable")
+        self._signs = np.zeros(len(order), np.float32)
+        self._signs[order] = np.where(np.arange(len(order)) % 2, -1.0, 1.0)
+        if len(order) % 2:  # the last has no neighbour to cancel
+            self._signs[order[-1]] = 0.0
+        self._hits: list[tuple[FloatArray, FloatArray]] = []
+        self._means: Float32Array | None = None
+        self._done = 0
+        self._response: FloatArray = np.zeros(0)
+
+    def add(self, views: Views, columns: Float32Array) -> None:
+        """Add views whose filtered columns are at hand, (n, cols, rows); the columns are lost."""
+        from flexdt.twin.reconstruction import fdk_kernels
+        from flexdt.twin.reconstruction.coverage import first_and_steps
+
+        n, _, _, rows = views.sizes
+        signs = self._signs[self._done : self._done + n]
+        seen = np.arange(views.top, views.top + rows).clip(0, views.images.shape[1] - 1)
+        images = views.images[:, seen, self._panel]
+        sums = np.tensordot(np.stack([np.ones(n, np.float32), signs]), images, 1)
+        self._means = sums if self._means is None else self._means + sums
+        self._hits.append(self._seen_at(views))
+        self._response = views.response.astype(np.float64)
+        columns[:n] *= signs[:, None, None]
+        first, size = first_and_steps(self.grid)
+        fdk_kernels.backproject(
+            columns, rows, views.shares, views.table, *first, *size, self.data, threads()
+        )
+        self._done += n
+
+    def _points(self) -> tuple[FloatArray, FloatArray]:
+        """Places on a spiral about the centre, radii (POINTS,) and (POINTS, 2) [mm]."""
+        x, y, _ = self.grid.centers()
+        farthest = float(np.hypot(*(np.abs([x[[0, -1]], y[[0, -1]]]).max(axis=1))))
+        pitch = self._circle.radius / float(self._table[:, 7].mean())
+        radii = np.append(0.0, np.geomspace(0.25 * pitch, max(farthest, pitch), POINTS - 1))
+        turn = np.arange(POINTS) * np.pi * (3.0 - np.sqrt(5.0))  # even at every few radii
+        around = np.stack([np.cos(turn), np.sin(turn)], 1)
+        return radii, radii[:, None] * around + self._circle.centre
+
+    def _seen_at(self, views: Views) -> tuple[FloatArray, FloatArray]:
+        """In which column, before the filter, views see the points, and what it counts there."""
+        points = self._points()[1]
+        g = views.table[:, :, None]
+        x, y = points[:, 0] - g[:, 0], points[:, 1] - g[:, 1]
+        depth = x * g[:, 3] + y * g[:, 4]
+        column = g[:, 8] + (x * g[:, 5] + y * g[:, 6]) / depth * g[:, 7] + views.kept.start
+        inside = (depth > 0.0) & (column >= 0.0) & (column <= views.factors.shape[1] - 1.0)
+        nearest = np.where(inside, column, 0.0).round().astype(int)
+        factors = np.take_along_axis(views.factors / np.sqrt(views.across), nearest, axis=1)
+        return np.where(inside, column, 0.0), np.where(inside, factors / depth**2, 0.0)
+
+    def found(self) -> Noise | None:
+        """The noise, once all views have been added; None where there are too few rows."""
+        assert self._means is not None
+        if self._means.shape[1] <= APART:
+            return None
+        alternating = self.data
+        if alternating.shape[2] > 2:  # without what few views cause, which layers have in common
+            alternating = np.diff(alternating, axis=2, append=alternating[:, :, -2:-1])
+            alternating = alternating / np.float32(np.sqrt(2.0))
+        variance = _local_variance(alternating.transpose(2, 0, 1))
+        radii = self._points()[0].reshape(-1, AROUND).mean(axis=1)
+        shared = self._shared_variance().reshape(-1, AROUND).mean(axis=1)
+        centre = (float(self._circle.centre[0]), float(self._circle.centre[1]))
+        return Noise(self.grid.like(variance), centre, radii, shared)
+
+    def _shared_variance(self) -> FloatArray:
+        """Variance at the points of what all views share, (points,) [1/mm^2]."""
+        assert self._means is not None
+        length = 2 * (len(self._response) - 1)
+        column = np.concatenate([columns for columns, _ in self._hits])
+        counts = np.concatenate([factors for _, factors in self._hits])
+        first = np.floor(column).astype(int)
+        part, row = column - first, np.arange(column.shape[1]) * length
+        hits = np.bincount((row + first).ravel(), (counts * (1.0 - part)).ravel(), row[-1] + length)
+        hits += np.bincount((row + first + 1).ravel(), (counts * part).ravel(), row[-1] + length)
+        power = np.abs(np.fft.rfft(hits.reshape(-1, length))) ** 2 * self._response**2
+        mean, alternating = (_spectrum(image / self._done, length) for image in self._means)
+        # The object is in the mean, blurred as it turned: its finest details are not.
+        fine = slice(len(mean) // 2, None)
+        share = max(mean[fine].sum() / max(alternating[fine].sum(), TINY) - 1.0, 0.0)
+        twice = np.full(len(self._response), 2.0)
+        twice[[0, -1]] = 1.0  # frequencies without a negative one
+        found: FloatArray = power @ (twice * share * alternating) / length
+        return found
+
+
+def _local_variance(values: Float32Array) -> Float32Array:
+    """Variance of values of zero mean about each of them, from the median of their sizes, which few
+    strong edges do not change; (nz, ny, nx).
+    """
+    from scipy.ndimage import distance_transform_edt, gaussian_filter, median_filter
+
+    unseen = np.isnan(values)
+    if unseen.any():
+        nearest = distance_transform_edt(unseen, return_distances=False, return_indices=True)
+        values = values[tuple(nearest)]
+    typical = median_filter(np.abs(values), SIDE, mode="nearest") / MEDIAN
+    out: Float32Array = gaussian_filter(typical**2, 1.0, mode="nearest")
+    return out
+
+
+def _spectrum(image: Float32Array, length: int) -> FloatArray:
+    """Power of an image's noise along its rows, of a length of `length`, where the volume's voxels
+    lie anywhere between two rows, (length / 2 + 1,).
+
+    Rows a few apart are compared, so that the object drops out but for its edges, which the median
+    over all pairs of rows does not see.
+    """
+    between = 0.5 * (image[1:] + image[:-1])
+    power = [
+        np.median(np.abs(np.fft.rfft(rows[APART:] - rows[:-APART])) ** 2, axis=0)
+        for rows in (image, between)
+    ]
+    # Of an exponential distribution the median is log 2 times the mean; linear interpolation at any
+    # place is a third of what it is on the rows and two thirds of what it is between them.
+    mean = (power[0] + 2.0 * power[1]) / 3.0 / np.log(2.0) / 2.0 / image.shape[1]
+    bands = np.array_split(np.arange(len(mean)), BANDS)
+    middle = [band.mean() / (len(mean) - 1) for band in bands if len(band)]
+    averaged = [mean[band].mean() for band in bands if len(band)]
+    out: FloatArray = np.interp(np.linspace(0.0, 1.0, length // 2 + 1), middle, averaged)
+    return out
