@@ -236,7 +236,9 @@ def heard(data: bytes, axes: Collection[str], mirror: Mirror, stamp: str) -> Hea
     command, asks = _read(event, axes, mirror)
     words = (event.component, event.command, event.arg1, event.arg2)
     what = event.reply_type.value or "SEND"
-    return Heard(event.key, what, words, command, event.reply, asks, stamp)  # type: ignore[arg-type]
+    return Heard(  # type: ignore[arg-type]
+        event.key, what, words, command, event.reply, asks, stamp, event.tick_count
+    )
 
 
 def _read(

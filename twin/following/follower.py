@@ -4,11 +4,17 @@ Every function returns another `Mirror`; sockets, files and clocks belong to who
 is predicted when it is heard, from the machine as it is known at that moment, by the simulation
 that plans scripts. A reading of a moving motor is compared with the predicted path as a delay: when
 the path passes that position, and how long ago. A motor that starts late has a constant delay, one
-that is slow a growing one, whatever the machine's overhead.
+that is slow a growing one, whatever the machine's overhead. What may have come before it was read
+counts as early or as late as is better for the machine.
+
+Servers differ in what they tell. Replies belong to commands by their UUID; what comes twice, or
+after the end, changes nothing; an end that a server never tells, and feedback that it never gives,
+are missed once.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -39,6 +45,9 @@ SILENT_S: Final = 2.5
 """The interface's rules ask for one message a second of a command that lasts."""
 FORGET_S: Final = 60.0
 """A command that has said nothing for so long, and beyond its range, has no end any more."""
+WIDER: Final = 3.0
+"""By how many widths of a 90 % range a time lies beyond it that is worth telling: a good machine's
+lies there less than once a day, for a normal or log-normal spread of up to 50 %."""
 _OF_A_MOVE: Final = ("limit", "limit_near", "slow", "fast", "off_path", "offset", "moved")
 """What was told of an axis's last move is told anew of its next."""
 _OF_ONE_COMMAND: Final = {
@@ -86,32 +95,38 @@ class Follower:
         """
         mirror = replace(mirror, heard_s=now, lines=(), connected=True)
         mirror = mirror.cleared("link")
-        if heard.key in mirror.waiting:
-            told = replace(mirror.waiting[heard.key], told_s=now)
-            mirror = replace(mirror, waiting={**mirror.waiting, heard.key: told})
-            mirror = mirror.cleared(heard.words[0], "silent")
-        match heard.what:
-            case "SEND":
-                return self._sent(mirror, heard, now)
-            case "FDB":
-                return self._read(mirror, heard, now)
-            case "ACK" | "ERR":
-                return self._ended(mirror, heard, now)
-        return mirror
+        if heard.what == "SEND":
+            return self._sent(mirror, heard, now)
+        asked = mirror.asked(heard)
+        if asked is None and any(key == heard.key for key, *_ in mirror.ended):
+            return mirror
+        waiting = None if asked is None else mirror.waiting[asked]
+        if asked is not None and waiting is not None:
+            about = waiting.heard.words[0]
+            if ("silent", about) in mirror.active and now - waiting.told_s > SILENT_S:
+                mirror = replace(mirror, speaks=False)
+            told = replace(waiting, told_s=now)
+            mirror = replace(mirror, waiting={**mirror.waiting, asked: told}).cleared(about, "silent")
+        if heard.what == "FDB":
+            spoken = True if mirror.speaks is None else mirror.speaks
+            return self._read(replace(mirror, speaks=spoken), heard, waiting, now)
+        return mirror if heard.what == "RCV" else self._ended(mirror, heard, waiting, now)
 
     def tick(self, mirror: Mirror, now: float) -> Mirror:
         """The machine after time has passed without a message: what is overdue is told."""
-        for key, waiting in mirror.waiting.items():
-            took, quiet = now - waiting.sent_s, now - waiting.told_s
-            if waiting.predicted_s is not None and took > waiting.p95_s + SLACK_S:
+        for identity, waiting in mirror.waiting.items():
+            took, quiet, about = now - waiting.sent_s, now - waiting.told_s, waiting.heard.words[0]
+            expected = waiting.predicted_s is not None and not waiting.superseded
+            if expected and took > waiting.most_s + SLACK_S and mirror.ends is not False:
                 mirror = self._outside(mirror, waiting, took, now)
-            if quiet > SILENT_S and waiting.predicted_s is not None:
+                mirror = replace(mirror, ends=mirror.ends or False)
+            if expected and quiet > SILENT_S and mirror.speaks is not False:
                 what = f"{waiting.heard.text!r} is under way and has said nothing for {quiet:.1f} s"
-                about = waiting.heard.words[0]
                 mirror = _alarm(mirror, now, "warning", "silent", about, what)
-            if quiet > max(FORGET_S, waiting.p95_s):
-                left = {k: w for k, w in mirror.waiting.items() if k != key}
-                mirror = self._rests(replace(mirror, waiting=left), waiting)
+                mirror = replace(mirror, speaks=mirror.speaks or False)
+            if quiet > max(FORGET_S, waiting.most_s):
+                left = {i: w for i, w in mirror.waiting.items() if i != identity}
+                mirror = _rests(replace(mirror, waiting=left), waiting)
         if mirror.due_s is not None and now > mirror.due_s + SLACK_S:
             what = (
                 f"the script is late: {self._next(mirror)} was due {now - mirror.due_s:.1f} s ago"
@@ -123,7 +138,7 @@ class Follower:
         """The machine after the link has come up or gone down, which forgets commands under way."""
         if connected:
             return replace(mirror.cleared("link"), connected=True)
-        axes = {n: replace(a, path=None, behind_s=None) for n, a in mirror.axes.items()}
+        axes = {n: a.at_rest for n, a in mirror.axes.items()}
         mirror = replace(mirror, connected=False, waiting={}, axes=axes, due_s=None)
         what = f"the link is lost: {why}; positions are those heard last"
         return _alarm(mirror, now, "error", "lost", "link", what)
@@ -174,23 +189,38 @@ class Follower:
     # -- commands ----------------------------------------------------------------------------
 
     def _sent(self, mirror: Mirror, heard: Heard, now: float) -> Mirror:
-        if heard.key in mirror.waiting:
+        again = (i for i in mirror.waiting if (i[0], i[2]) == (heard.key, heard.words))
+        if any(again) or heard.identity in mirror.ended:
             return mirror
+        before = [i for i, e in mirror.ended.items()
+                  if e and i[0] == heard.key and i[2][:2] == heard.words[:2]]  # fmt: skip
+        if before:  # its end was heard before it
+            return _after(mirror.finished(heard), heard.command, self.machine, now)
         if not heard.asks:
-            mirror = _flushed(mirror, now)
+            mirror = self._superseded(_flushed(mirror, now), heard, now)
         name, asked = heard.words[:2]
         if not (name in FIXED or self.machine.has(name)) and find(name, asked) is not None:
             what = f"{heard.text!r} is not followed: {unknown_axis(name, self.machine).message}"
             mirror = _alarm(mirror, now, "error", "unknown_axis", name, what)
         if asked.lower() == "stop":
-            axes = {n: replace(a, path=None, behind_s=None) for n, a in mirror.axes.items()}
-            mirror = replace(mirror, axes=axes)
+            mirror = replace(mirror, axes={n: a.at_rest for n, a in mirror.axes.items()})
         waiting = Waiting(heard, now, now)
         if heard.command is not None:
             mirror = self._on_script(mirror, heard.command, now)
             mirror, waiting = self._predicted(mirror, waiting, heard.command, now)
         kept = dict(list(mirror.waiting.items())[1 - MOST_WAITING :])
-        return replace(mirror, waiting={**kept, heard.key: waiting})
+        return replace(mirror, waiting={**kept, heard.identity: waiting})
+
+    def _superseded(self, mirror: Mirror, heard: Heard, now: float) -> Mirror:
+        """A component gets a command: those before whose time is over have ended, untold or not."""
+        for identity, waiting in mirror.waiting.items():
+            over = now + waiting.heard.late_s - waiting.sent_s > (waiting.predicted_s or 0.0)
+            if waiting.heard.words[0] != heard.words[0] or waiting.superseded or not over:
+                continue
+            mirror = _after(mirror, waiting.heard.command, self.machine, now)
+            kept = {**mirror.waiting, identity: replace(waiting, superseded=True)}
+            mirror = replace(mirror, waiting=kept)
+        return mirror
 
     def _predicted(
         self, mirror: Mirror, waiting: Waiting, command: c.Command, now: float
@@ -198,7 +228,9 @@ class Follower:
         """The prediction of one command, from the machine as it is now."""
         if isinstance(command, c.MoveAbsolute):
             command = replace(command, trigger=None)
-        sim = Simulation(self.machine, mirror.start)
+        arrived = {n: a.path.target for n, a in mirror.axes.items() if a.path and a.path.end <= now}
+        start = replace(mirror.start, positions={**mirror.positions, **arrived})
+        sim = Simulation(self.machine, start)
         sim.now, sim.tube.ready_at = now, mirror.ready_s
         for name, axis in mirror.axes.items():
             if axis.path is not None and axis.path.end > now:
@@ -215,18 +247,21 @@ class Follower:
                 mirror = _alarm(mirror, now, "error", kind, about, p.message)
         for name in moved:
             path = sim.motors.all[name].moves[-1][1]
-            mirror = mirror.with_axis(name, path=path, target=path.target, behind_s=None)
+            mirror = mirror.with_axis(
+                name, path=path, target=path.target, mover=waiting.heard.identity,
+                begun_s=waiting.heard.late_s, passed_s=-math.inf, behind_s=None,
+            )  # fmt: skip
             mirror = self._near_limit(mirror, name, path.target, now)
-        low, high = _range(step, self.machine)
+        low, high = _bounds(step, self.machine)
         known = waiting.heard.words[0] in (*self.machine.axes, *self.machine.virtual_axes)
         moving = isinstance(command, c.MoveAbsolute) and known
-        motors = tuple(self.machine.moves(about)) if moving else ()
+        motors = self.machine.moves(about) if moving else ()
         return mirror, replace(
             waiting,
             predicted_s=step.holds_s,
-            p5_s=low,
-            p95_s=high,
-            motors=motors,
+            least_s=low,
+            most_s=high,
+            targets={name: mirror.axes[name].target for name in motors},
             delay_s=max(0.0, high - step.computed_s),
         )
 
@@ -250,7 +285,9 @@ class Follower:
             steps = self._steps[: at + 1]
             holds = sum(s.holds_s for s in steps)
             found = total_range(steps, holds, self.machine.timing)
-            high = sum(_range(s, self.machine)[1] for s in steps) if found is None else found[1]
+            high = sum(_bounds(s, self.machine)[1] for s in steps)
+            if found is not None:
+                high = _wider(found)[1]
             due = began + high if at + 1 < len(lines) else None
             mirror = mirror.cleared("script")
             return replace(mirror, next_line=at + 1, began_s=began, due_s=due)
@@ -278,53 +315,61 @@ class Follower:
 
     # -- replies -----------------------------------------------------------------------------
 
-    def _ended(self, mirror: Mirror, heard: Heard, now: float) -> Mirror:
-        waiting = mirror.waiting.get(heard.key)
-        left = {k: w for k, w in mirror.waiting.items() if k != heard.key}
-        mirror = replace(mirror, waiting=left)
+    def _ended(
+        self, mirror: Mirror, heard: Heard, waiting: Waiting | None, now: float
+    ) -> Mirror:
+        command = heard if waiting is None else waiting.heard
+        unheard = waiting is None and heard.what == "ACK"
+        mirror = replace(mirror.finished(command, unheard), ends=True)
         if heard.what == "ERR":
             mirror = _alarm(
                 mirror, now, "error", "failed", heard.words[0],
                 f"{heard.text}: the machine says {heard.reply[:200]!r}",
             )  # fmt: skip
-            return self._rests(mirror, waiting)
+            return _rests(mirror, waiting)
         mirror = mirror.cleared(heard.words[0], "failed")
         if waiting is None:
-            return self._read(mirror, heard, now)
+            mirror = _after(mirror, heard.command, self.machine, now)
+            return self._read(mirror, heard, None, now)
         took = now - waiting.sent_s
         trigger = getattr(waiting.heard.command, "trigger", None)
         passed = trigger is not None and heard.reply.startswith("POS")
         lines = _line(waiting, "POS" if passed else "ACK", took, heard.reply)
         mirror = replace(mirror, lines=lines)
-        if passed:  # the motor goes on, and nothing tells when it arrives
-            return mirror
-        if waiting.predicted_s is not None:
-            if not waiting.p5_s - SLACK_S <= took <= waiting.p95_s + SLACK_S:
-                mirror = self._outside(mirror, waiting, took, now)
+        if passed:  # the motor goes on, and its reply at the end may come or not
+            ended = {i: e for i, e in mirror.ended.items() if i != command.identity}
+            return replace(mirror, ended=ended)
+        if waiting.predicted_s is not None and not waiting.superseded:
+            longest = took + waiting.heard.late_s
+            if longest < waiting.least_s - SLACK_S:
+                mirror = self._outside(mirror, waiting, longest, now)
+            elif took - heard.late_s > waiting.most_s + SLACK_S:
+                mirror = self._outside(mirror, waiting, took - heard.late_s, now)
             else:
                 mirror = mirror.cleared(waiting.heard.words[0], "range")
-        if waiting.motors:
+        if waiting.targets:
             return self._arrived(mirror, waiting, heard, now)
-        if waiting.heard.asks:
-            return self._read(mirror, replace(heard, asks=waiting.heard.asks), now)
+        if waiting.heard.asks or waiting.superseded:
+            return self._read(mirror, heard, waiting, now)
         return _after(mirror, waiting.heard.command, self.machine, now)
 
     def _arrived(self, mirror: Mirror, waiting: Waiting, heard: Heard, now: float) -> Mirror:
         """A move has ended: where, and with which limits, as its reply says."""
-        axis = heard.words[0]
+        axis = waiting.heard.words[0]
         motor = motor_reply(_bytes(heard.reply))
         at = motor.position if motor is not None else _number(heard.reply)
-        mirror = self._rests(mirror, waiting)
-        for name in waiting.motors:
-            mirror = mirror.with_axis(name, position=mirror.axes[name].target, heard_s=now)
+        own = [n for n in waiting.targets if _stays(mirror, n, waiting)]
+        mirror = _rests(mirror, waiting)
+        for name in own:
+            mirror = mirror.with_axis(name, position=waiting.targets[name], heard_s=now)
         if at is None:
             return mirror
         name, there = self._motor(axis, at)
-        unit, meant = self.machine.axes[name].unit, mirror.axes[name].target
+        unit, meant = self.machine.axes[name].unit, waiting.targets[name]
         if abs(there - meant) > AT_TARGET:
             what = f"{name} stands at {there:.6g} {unit} after a move to {meant:.6g}"
             mirror = _alarm(mirror, now, "error", "offset", name, what)
-        mirror = mirror.with_axis(name, position=there)
+        mirror = mirror.with_axis(name, position=there) if name in own else mirror
         return mirror if motor is None else self._compared(mirror, name, motor, now)
 
     def _compared(self, mirror: Mirror, name: str, motor: MotorReply, now: float) -> Mirror:
@@ -346,49 +391,49 @@ class Follower:
                 mirror = _alarm(mirror, now, "error", what, name, text)
         return mirror.with_axis(name, speed=motor.speed, acceleration=motor.acceleration)
 
-    def _rests(self, mirror: Mirror, waiting: Waiting | None) -> Mirror:
-        for name in () if waiting is None else waiting.motors:
-            mirror = mirror.with_axis(name, path=None, behind_s=None)
-        return mirror
-
-    def _read(self, mirror: Mirror, heard: Heard, now: float) -> Mirror:
+    def _read(self, mirror: Mirror, heard: Heard, waiting: Waiting | None, now: float) -> Mirror:
         """Feedback, or the answer to a question: a motor's position is compared with its path."""
-        waiting = mirror.waiting.get(heard.key)
         asks = heard.asks or (waiting.heard.asks if waiting is not None else "")
         axis, motor = heard.words[0], motor_reply(_bytes(heard.reply))
         at = motor.position if motor is not None else _number(heard.reply)
-        moves = waiting is not None and bool(waiting.motors)
+        moves = waiting is not None and bool(waiting.targets)
         known = self.machine.has(axis) and (moves or asks == "position" or motor is not None)
         if at is None or not known:
             return mirror
         name, x = self._motor(axis, at)
+        if waiting is not None and moves and not _stays(mirror, name, waiting):
+            return mirror
         seen, path = mirror.axes[name], mirror.axes[name].path
-        mirror = mirror.with_axis(name, position=x, heard_s=now)
         unit = self.machine.axes[name].unit
         if path is None:
-            if seen.heard_s is not None and abs(x - seen.position) > AT_TARGET:
+            mirror = mirror.with_axis(name, position=x, target=x, heard_s=now)
+            moved = waiting is None and heard.words[1].startswith("move")
+            if seen.heard_s is not None and abs(x - seen.position) > AT_TARGET and not moved:
                 what = (
                     f"{name} stands at {x:.6g} {unit}, not at {seen.position:.6g}, and no move of "
                     "it was heard"
                 )
                 mirror = _alarm(mirror, now, "error", "moved", name, what)
-            return mirror.with_axis(name, target=x)
-        if abs(x - path.pieces[0].position) <= AT_TARGET or abs(x - path.target) <= AT_TARGET:
             return mirror
-        passes = path.time_at(x)
+        passes, here = path.time_at(x), mirror.with_axis(name, position=x, heard_s=now)
+        if passes is not None and passes < seen.passed_s:  # older than one that was read before
+            return mirror
+        if abs(x - path.pieces[0].position) <= AT_TARGET or abs(x - path.target) <= AT_TARGET:
+            return here
         if passes is None:
             what = f"{name} is at {x:.6g} {unit}, on no way to {path.target:.6g}"
-            return _alarm(mirror, now, "error", "off_path", name, what)
-        behind = now - passes
-        longest = waiting.delay_s if waiting is not None else 0.0
-        before = seen.behind_s
-        if behind > longest + SLACK_S or (before is not None and behind - before > DRIFT_S):
-            what = f"{name} is slow: {behind:.2f} s behind the predicted path at {x:.6g} {unit}"
-            mirror = _alarm(mirror, now, "error", "slow", name, what)
-        elif behind < -SLACK_S or (before is not None and before - behind > DRIFT_S):
-            what = f"{name} is fast: {-behind:.2f} s ahead of the predicted path at {x:.6g} {unit}"
-            mirror = _alarm(mirror, now, "error", "fast", name, what)
-        return mirror.with_axis(name, behind_s=behind if before is None else before)
+            return _alarm(here, now, "error", "off_path", name, what)
+        least, most = now - heard.late_s - passes, now - passes
+        delay = waiting.delay_s if waiting is not None else 0.0
+        first = seen.behind_s or (least, most)
+        if least > delay + SLACK_S or least - first[1] > DRIFT_S:
+            what = f"{name} is slow: {least:.2f} s behind the predicted path at {x:.6g} {unit}"
+            here = _alarm(here, now, "error", "slow", name, what)
+        elif most + seen.begun_s < -SLACK_S or (most < 0.0 and first[0] - most > DRIFT_S):
+            what = f"{name} is fast: {-most:.2f} s ahead of the predicted path at {x:.6g} {unit}"
+            here = _alarm(here, now, "error", "fast", name, what)
+        promptest = min(first, (least, most), key=lambda behind: behind[1])
+        return here.with_axis(name, behind_s=promptest, passed_s=passes)
 
     def _motor(self, axis: str, at: float) -> tuple[str, float]:
         """The motor that a reading is of; of a virtual axis, the one that it is read from."""
@@ -398,10 +443,10 @@ class Follower:
         return virtual.of, (at - virtual.constant) / virtual.factor
 
     def _outside(self, mirror: Mirror, waiting: Waiting, took: float, now: float) -> Mirror:
-        longer = "more" if took > waiting.p95_s else "less"
+        longer = "more" if took > waiting.most_s else "less"
         what = (
             f"{waiting.heard.text} has taken {took:.2f} s, {longer} than its range of "
-            f"{waiting.p5_s:.2f} to {waiting.p95_s:.2f} s"
+            f"{waiting.least_s:.2f} to {waiting.most_s:.2f} s"
         )
         return _alarm(mirror, now, "warning", "range", waiting.heard.words[0], what)
 
@@ -412,10 +457,31 @@ def _alarm(
     return mirror.alarmed(Alarm(now, severity, kind, about, message))
 
 
-def _range(step: PlanStep, machine: Machine) -> Range:
-    """(5 %, 95 %) of a step; a time that is only assumed may be anything up to twice itself."""
+def _bounds(step: PlanStep, machine: Machine) -> Range:
+    """Between what times a step of a good machine lies, not once a day excepted [s].
+
+    A time that is only assumed may be anything up to twice itself.
+    """
     found = step_range(step, machine.timing)
-    return (step.computed_s, step.holds_s + step.assumed_s) if found is None else found
+    return (step.computed_s, step.holds_s + step.assumed_s) if found is None else _wider(found)
+
+
+def _wider(found: Range) -> Range:
+    more = WIDER * (found[1] - found[0])
+    return max(0.0, found[0] - more), found[1] + more
+
+
+def _rests(mirror: Mirror, waiting: Waiting | None) -> Mirror:
+    """The same with the motors of a move at rest, but for those that another has sent on."""
+    for name in () if waiting is None else waiting.targets:
+        if waiting is not None and _stays(mirror, name, waiting):
+            mirror = replace(mirror, axes={**mirror.axes, name: mirror.axes[name].at_rest})
+    return mirror
+
+
+def _stays(mirror: Mirror, name: str, waiting: Waiting) -> bool:
+    """Whether a motor has got no other move since."""
+    return mirror.axes[name].mover in (None, waiting.heard.identity)
 
 
 def _bare(command: c.Command) -> c.Command:
