@@ -19,8 +19,9 @@ import zmq.asyncio
 
 from flexdt.clients.cli.entry import run
 from flexdt.clients.client.async_client import AsyncTwinClient
+from flexdt.clients.following.listening import endpoint
 from flexdt.clients.following.read_only_twin import ReadOnlyTwin
-from flexdt.clients.following.session import FollowSession, FramesBeside, endpoint
+from flexdt.clients.following.session import FollowSession, FramesBeside, executed_script
 from flexdt.phantoms import load_phantom
 from flexdt.protocol import RpcError
 from flexdt.runtime.access import AccessError
@@ -77,7 +78,8 @@ def test_it_mirrors_records_and_comes_back_and_sends_nothing(tmp_path: Path) -> 
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
             again.close(linger=0)
-        lines, problems = read_log((tmp_path / "log").read_bytes())
+        recording = (tmp_path / "log").read_bytes()
+        lines, problems = read_log(executed_script(recording, FLEXRAY))
         assert [x.line for x in lines] == [1]
         assert not [p for p in problems if p.severity == "error"]
 
