@@ -14,7 +14,6 @@ are missed once.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -98,7 +97,7 @@ class Follower:
         if heard.what == "SEND":
             return self._sent(mirror, heard, now)
         asked = mirror.asked(heard)
-        if asked is None and any(key == heard.key for key, *_ in mirror.ended):
+        if asked is None and mirror.over(heard):
             return mirror
         waiting = None if asked is None else mirror.waiting[asked]
         if asked is not None and waiting is not None:
@@ -106,7 +105,9 @@ class Follower:
             if ("silent", about) in mirror.active and now - waiting.told_s > SILENT_S:
                 mirror = replace(mirror, speaks=False)
             told = replace(waiting, told_s=now)
-            mirror = replace(mirror, waiting={**mirror.waiting, asked: told}).cleared(about, "silent")
+            mirror = replace(mirror, waiting={**mirror.waiting, asked: told}).cleared(
+                about, "silent"
+            )
         if heard.what == "FDB":
             spoken = True if mirror.speaks is None else mirror.speaks
             return self._read(replace(mirror, speaks=spoken), heard, waiting, now)
@@ -117,16 +118,21 @@ class Follower:
         for identity, waiting in mirror.waiting.items():
             took, quiet, about = now - waiting.sent_s, now - waiting.told_s, waiting.heard.words[0]
             expected = waiting.predicted_s is not None and not waiting.superseded
-            if expected and took > waiting.most_s + SLACK_S and mirror.ends is not False:
+            overdue = took > waiting.most_s + SLACK_S
+            if expected and overdue and mirror.ends is not False:
                 mirror = self._outside(mirror, waiting, took, now)
                 mirror = replace(mirror, ends=mirror.ends or False)
-            if expected and quiet > SILENT_S and mirror.speaks is not False:
+            if expected and not overdue and quiet > SILENT_S and mirror.speaks is not False:
                 what = f"{waiting.heard.text!r} is under way and has said nothing for {quiet:.1f} s"
                 mirror = _alarm(mirror, now, "warning", "silent", about, what)
                 mirror = replace(mirror, speaks=mirror.speaks or False)
             if quiet > max(FORGET_S, waiting.most_s):
                 left = {i: w for i, w in mirror.waiting.items() if i != identity}
                 mirror = _rests(replace(mirror, waiting=left), waiting)
+        for name, axis in () if mirror.ends else mirror.axes.items():
+            late = 0.0 if axis.mover not in mirror.waiting else mirror.waiting[axis.mover].delay_s
+            if axis.path is not None and axis.path.end < (axis.heard_s or 0.0) < now - late - SLACK_S:
+                mirror = self._compared_to(mirror, name, axis.position, axis.path.target, now)
         if mirror.due_s is not None and now > mirror.due_s + SLACK_S:
             what = (
                 f"the script is late: {self._next(mirror)} was due {now - mirror.due_s:.1f} s ago"
@@ -190,10 +196,10 @@ class Follower:
 
     def _sent(self, mirror: Mirror, heard: Heard, now: float) -> Mirror:
         again = (i for i in mirror.waiting if (i[0], i[2]) == (heard.key, heard.words))
-        if any(again) or heard.identity in mirror.ended:
+        if any(again) or (heard.named and heard.identity in mirror.ended):
             return mirror
         before = [i for i, e in mirror.ended.items()
-                  if e and i[0] == heard.key and i[2][:2] == heard.words[:2]]  # fmt: skip
+                  if e and heard.named and i[0] == heard.key and i[2][:2] == heard.words[:2]]
         if before:  # its end was heard before it
             return _after(mirror.finished(heard), heard.command, self.machine, now)
         if not heard.asks:
@@ -247,10 +253,9 @@ class Follower:
                 mirror = _alarm(mirror, now, "error", kind, about, p.message)
         for name in moved:
             path = sim.motors.all[name].moves[-1][1]
-            mirror = mirror.with_axis(
-                name, path=path, target=path.target, mover=waiting.heard.identity,
-                begun_s=waiting.heard.late_s, passed_s=-math.inf, behind_s=None,
-            )  # fmt: skip
+            rests = replace(mirror.axes[name].at_rest, begun_s=waiting.heard.late_s)
+            axis = replace(rests, path=path, target=path.target, mover=waiting.heard.identity)
+            mirror = replace(mirror, axes={**mirror.axes, name: axis})
             mirror = self._near_limit(mirror, name, path.target, now)
         low, high = _bounds(step, self.machine)
         known = waiting.heard.words[0] in (*self.machine.axes, *self.machine.virtual_axes)
@@ -315,9 +320,7 @@ class Follower:
 
     # -- replies -----------------------------------------------------------------------------
 
-    def _ended(
-        self, mirror: Mirror, heard: Heard, waiting: Waiting | None, now: float
-    ) -> Mirror:
+    def _ended(self, mirror: Mirror, heard: Heard, waiting: Waiting | None, now: float) -> Mirror:
         command = heard if waiting is None else waiting.heard
         unheard = waiting is None and heard.what == "ACK"
         mirror = replace(mirror.finished(command, unheard), ends=True)
@@ -365,12 +368,19 @@ class Follower:
         if at is None:
             return mirror
         name, there = self._motor(axis, at)
-        unit, meant = self.machine.axes[name].unit, waiting.targets[name]
-        if abs(there - meant) > AT_TARGET:
-            what = f"{name} stands at {there:.6g} {unit} after a move to {meant:.6g}"
-            mirror = _alarm(mirror, now, "error", "offset", name, what)
+        mirror = self._compared_to(mirror, name, there, waiting.targets[name], now)
         mirror = mirror.with_axis(name, position=there) if name in own else mirror
         return mirror if motor is None else self._compared(mirror, name, motor, now)
+
+    def _compared_to(
+        self, mirror: Mirror, name: str, there: float, meant: float, now: float
+    ) -> Mirror:
+        """Where a motor stands beside where its move led."""
+        if abs(there - meant) <= AT_TARGET:
+            return mirror
+        unit = self.machine.axes[name].unit
+        what = f"{name} stands at {there:.6g} {unit} after a move to {meant:.6g}"
+        return _alarm(mirror, now, "error", "offset", name, what)
 
     def _compared(self, mirror: Mirror, name: str, motor: MotorReply, now: float) -> Mirror:
         """Limits and rates of a motor's own reply beside those of the machine file."""
@@ -403,6 +413,7 @@ class Follower:
         name, x = self._motor(axis, at)
         if waiting is not None and moves and not _stays(mirror, name, waiting):
             return mirror
+        mirror = mirror if motor is None else self._compared(mirror, name, motor, now)
         seen, path = mirror.axes[name], mirror.axes[name].path
         unit = self.machine.axes[name].unit
         if path is None:
@@ -415,11 +426,16 @@ class Follower:
                 )
                 mirror = _alarm(mirror, now, "error", "moved", name, what)
             return mirror
-        passes, here = path.time_at(x), mirror.with_axis(name, position=x, heard_s=now)
-        if passes is not None and passes < seen.passed_s:  # older than one that was read before
-            return mirror
-        if abs(x - path.pieces[0].position) <= AT_TARGET or abs(x - path.target) <= AT_TARGET:
-            return here
+        arrived = abs(x - path.target) <= AT_TARGET
+        passes = path.end if arrived else path.time_at(x)
+        older = passes is not None and passes < seen.passed_s
+        if older and (mirror.ends or now < path.end or seen.passed_s == path.end):
+            return mirror  # older than one that was read before
+        if passes == seen.passed_s and now - (seen.heard_s or now) < SILENT_S:
+            return mirror  # that one once more
+        here = mirror.with_axis(name, position=x, heard_s=now)
+        if arrived or abs(x - path.pieces[0].position) <= AT_TARGET:
+            return here if passes is None else here.with_axis(name, passed_s=passes)
         if passes is None:
             what = f"{name} is at {x:.6g} {unit}, on no way to {path.target:.6g}"
             return _alarm(here, now, "error", "off_path", name, what)

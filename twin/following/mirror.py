@@ -64,6 +64,11 @@ class Heard:
         """Whether it has a UUID."""
         return self.key != " ".join(self.words[:2])
 
+    def may_answer(self, command: Identity) -> bool:
+        """Whether this can be a reply to a command, by its UUID, or else by its words."""
+        same = self.words[2:] in (command[2][2:], ("", ""))
+        return command[0] == self.key and (self.named or same)
+
     @property
     def text(self) -> str:
         """The command in one line."""
@@ -122,7 +127,7 @@ class SeenAxis:
     @property
     def at_rest(self) -> SeenAxis:
         """The same without a path."""
-        return replace(self, path=None, mover=None, begun_s=0.0, passed_s=-math.inf, behind_s=None)
+        return replace(self, path=None, mover=None, passed_s=-math.inf, behind_s=None)
 
 
 @dataclass(frozen=True)
@@ -225,19 +230,23 @@ class Mirror:
     def asked(self, reply: Heard) -> Identity | None:
         """The waiting command that this is a reply to: the one of its key.
 
-        Of several it is that of the same words, then that of the same tick, then the oldest.
+        Of several it is that of the same words, then that of the same tick, then the oldest. Where
+        there is no UUID, the arguments are the same, too, or left out.
         """
-        found = [i for i, w in self.waiting.items() if w.heard.key == reply.key]
+        found = [i for i in self.waiting if reply.may_answer(i)]
         alike = lambda i: (i[2][:2] == reply.words[:2], i[1] == reply.tick)  # noqa: E731
         return max(found, key=alike, default=None)
+
+    def over(self, reply: Heard) -> bool:
+        """Whether the command that this is a reply to has ended."""
+        return any(reply.may_answer(i) for i in self.ended)
 
     def finished(self, command: Heard, unheard: bool = False) -> Mirror:
         """The same after the end of a command, which may come again."""
         left = {i: w for i, w in self.waiting.items() if i != command.identity}
         kept = {i: e for i, e in self.ended.items() if i != command.identity}
         kept = dict(list(kept.items())[1 - MOST_WAITING :])
-        ended = {**kept, command.identity: unheard} if command.named else self.ended
-        return replace(self, waiting=left, ended=ended)
+        return replace(self, waiting=left, ended={**kept, command.identity: unheard})
 
     def age_s(self, now: float) -> float | None:
         """How old the last message is [s]; None where there was none."""
