@@ -24,7 +24,7 @@ from flexdt.protocol.acquila import MAX_BYTES
 TICK_S: Final = 0.1
 PORT: Final = 50000
 LOST: Final = "the scanner has ended the connection, or does not answer"
-POLL_MS: Final = 20
+POLL_S: Final = 0.02
 HEARTBEAT_MS: Final = 200
 SILENT_MS: Final = 500
 """A scanner whose ZeroMQ does not answer a heartbeat for so long is not there."""
@@ -51,13 +51,12 @@ def endpoint(address: str) -> str:
     return f"tcp://{match[1]}:{port}"
 
 
-Hear = Callable[[bytes, float, float], None]
-Pass = Callable[[float], None]
-Link = Callable[[bool, str], None]
-
-
 async def listen(
-    address: str, message: Hear, passed: Pass, link: Link, clock: Callable[[], float]
+    address: str,
+    message: Callable[[bytes, float, float], None],
+    passed: Callable[[float], None],
+    link: Callable[[bool, str], None],
+    clock: Callable[[], float],
 ) -> None:
     """Listen until cancelled.
 
@@ -71,17 +70,41 @@ async def listen(
     Raises:
         ValueError, zmq.ZMQError: no address that can be connected to.
     """
-    loop, ended = asyncio.get_running_loop(), threading.Event()
+    tell, ended = asyncio.get_running_loop().call_soon_threadsafe, threading.Event()
 
-    def tell(call: Callable[..., None], *told: object) -> None:
-        with suppress(RuntimeError):  # the loop has gone
-            loop.call_soon_threadsafe(call, *told)
+    def read(socket: zmq.Socket[bytes], monitor: zmq.Socket[bytes]) -> None:
+        told = clock()
+        while not ended.is_set():
+            none_before = clock()  # whatever is found from here on was not there before
+            if none_before - told >= TICK_S:
+                told = none_before
+                tell(passed, told)
+            found = zmq.select([socket, monitor], [], [], POLL_S)[0]
+            if monitor in found:
+                happened = parse_monitor_message(monitor.recv_multipart())["event"]
+                up = happened == zmq.EVENT_HANDSHAKE_SUCCEEDED
+                tell(link, up, "" if up else LOST)
+            with suppress(zmq.Again):
+                while True:
+                    data = socket.recv_multipart(zmq.NOBLOCK)[-1]
+                    now = clock()
+                    tell(message, data, now, now - none_before)
 
     def work() -> None:
         with zmq.Context() as context, context.socket(zmq.SUB) as socket:
-            monitor = _connected(socket, address)
+            for option, value in (
+                (zmq.LINGER, 0), (zmq.RCVHWM, MAX_HELD), (zmq.MAXMSGSIZE, MAX_BYTES),
+                (zmq.HEARTBEAT_IVL, HEARTBEAT_MS), (zmq.HEARTBEAT_TIMEOUT, SILENT_MS),
+                (zmq.RECONNECT_IVL, RETRY_MS), (zmq.RECONNECT_IVL_MAX, MOST_RETRY_MS),
+                (zmq.IPV6, int("[" in address)),
+            ):  # fmt: skip
+                socket.setsockopt(option, value)
+            socket.subscribe(b"")
+            events = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED
+            monitor = socket.get_monitor_socket(events)
             try:
-                _receive(socket, monitor, tell, message, passed, link, clock, ended)
+                socket.connect(endpoint(address))
+                read(socket, monitor)
             finally:
                 socket.disable_monitor()
                 monitor.close(linger=0)
@@ -92,51 +115,3 @@ async def listen(
     finally:
         ended.set()
         await asyncio.wait({reading})
-
-
-def _connected(socket: zmq.Socket[bytes], address: str) -> zmq.Socket[bytes]:
-    """Connect; returns the socket that tells of the link."""
-    for option, value in (
-        (zmq.LINGER, 0), (zmq.RCVHWM, MAX_HELD), (zmq.MAXMSGSIZE, MAX_BYTES),
-        (zmq.HEARTBEAT_IVL, HEARTBEAT_MS), (zmq.HEARTBEAT_TIMEOUT, SILENT_MS),
-        (zmq.RECONNECT_IVL, RETRY_MS), (zmq.RECONNECT_IVL_MAX, MOST_RETRY_MS),
-        (zmq.IPV6, int("[" in address)),
-    ):  # fmt: skip
-        socket.setsockopt(option, value)
-    socket.subscribe(b"")
-    events = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED
-    monitor = socket.get_monitor_socket(events)
-    socket.connect(endpoint(address))
-    return monitor
-
-
-def _receive(
-    socket: zmq.Socket[bytes],
-    monitor: zmq.Socket[bytes],
-    tell: Callable[..., None],
-    message: Hear,
-    passed: Pass,
-    link: Link,
-    clock: Callable[[], float],
-    ended: threading.Event,
-) -> None:
-    poller, told = zmq.Poller(), clock()
-    poller.register(socket, zmq.POLLIN)
-    poller.register(monitor, zmq.POLLIN)
-    while not ended.is_set():
-        none_before = clock()  # whatever is found from here on was not there before
-        if none_before - told >= TICK_S:
-            told = none_before
-            tell(passed, told)
-        found = dict(poller.poll(POLL_MS))
-        while monitor in found and monitor.poll(0):
-            up = parse_monitor_message(monitor.recv_multipart())["event"]
-            up = up == zmq.EVENT_HANDSHAKE_SUCCEEDED
-            tell(link, up, "" if up else LOST)
-        while socket in found:
-            try:
-                frames = socket.recv_multipart(zmq.NOBLOCK)
-            except zmq.Again:
-                break
-            now = clock()
-            tell(message, frames[-1], now, now - none_before)

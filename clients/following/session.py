@@ -25,14 +25,7 @@ import cv2
 import numpy as np
 
 from flexdt.clients.datasets.pictures import png
-from flexdt.clients.following.recording import (
-    LINK,
-    UP,
-    Recorded,
-    format_recorded,
-    read_recording,
-    time_of_day,
-)
+from flexdt.clients.following import recording as r
 from flexdt.clients.gateway.vocabulary import MoveRelative, Question, Refusal, read_command
 from flexdt.clients.whole_files import write_whole
 from flexdt.phantoms import Phantom
@@ -42,7 +35,7 @@ from flexdt.runtime.files.dataset_folder import list_folder, mean_image, read_im
 from flexdt.twin.dataset.normalise import LineIntegrals
 from flexdt.twin.errors import TwinError
 from flexdt.twin.following.follower import Follower
-from flexdt.twin.following.mirror import Alarm, Heard, Mirror
+from flexdt.twin.following.mirror import Alarm, Heard, Mirror, What
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.description import ZERO, Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses
@@ -170,18 +163,9 @@ def heard(
     event = replace(event, component=own_name(event.component, axes))
     command, asks = _read(event, axes, mirror)
     words = (event.component, event.command, event.arg1, event.arg2)
-    what = event.reply_type.value or "SEND"
-    return Heard(  # type: ignore[arg-type]
-        event.key,
-        what,
-        words,
-        command,
-        event.reply,
-        asks,
-        stamp,
-        event.tick_count,
-        late_s,
-    )
+    what: What = event.reply_type.value or "SEND"  # type: ignore[assignment]
+    tick, reply = event.tick_count, event.reply
+    return Heard(event.key, what, words, command, reply, asks, stamp, tick, late_s)
 
 
 def _read(
@@ -260,7 +244,7 @@ class FollowSession:
     def link(self, connected: bool, why: str) -> None:
         """The connection has come up or gone down."""
         now = self.clock()
-        self._keep(UP if connected else LINK + why.encode(), now, 0.0)
+        self._keep(r.UP if connected else r.LINK + why.encode(), now, 0.0)
         self._take(self.follower.linked(self.mirror, connected, now, why))
 
     def tick(self, now: float) -> None:
@@ -269,11 +253,11 @@ class FollowSession:
 
     def time_of_day(self, at: float) -> str:
         """hh:mm:ss.mmm of a time of the clock."""
-        return time_of_day(at - self._midnight)
+        return r.time_of_day(at - self._midnight)
 
     def _keep(self, data: bytes, at: float, late_s: float) -> None:
         if self.record is not None:
-            self.record.write(format_recorded(Recorded(at - self._midnight, late_s, data)))
+            self.record.write(r.format_recorded(r.Recorded(at - self._midnight, late_s, data)))
             self.record.flush()
 
     def _take(self, mirror: Mirror) -> None:
@@ -304,15 +288,15 @@ class FollowSession:
         """
         now = self._midnight = 0.0
         self.clock = lambda: now
-        for message in read_recording(recording):
+        for message in r.read_recording(recording):
             now = now or message.at_s
             while now + TICK_S < message.at_s:
                 busy = self.mirror.waiting or self.mirror.due_s is not None
                 now = now + TICK_S if busy else message.at_s
                 self.tick(now)
             now = max(now, message.at_s)
-            if message.data.startswith(LINK):
-                self.link(message.data == UP, message.data.removeprefix(LINK).decode())
+            if message.data.startswith(r.LINK):
+                self.link(message.data == r.UP, message.data.removeprefix(r.LINK).decode())
             else:
                 self.message(message.data, message.at_s, message.late_s)
             if ahead and self._is_new():

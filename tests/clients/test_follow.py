@@ -18,13 +18,9 @@ import zmq
 import zmq.asyncio
 
 from flexdt.clients.cli.entry import run
-from flexdt.clients.client.async_client import AsyncTwinClient
 from flexdt.clients.following.listening import endpoint
-from flexdt.clients.following.read_only_twin import ReadOnlyTwin
 from flexdt.clients.following.session import FollowSession, FramesBeside, executed_script
 from flexdt.phantoms import load_phantom
-from flexdt.protocol import RpcError
-from flexdt.runtime.access import AccessError
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Alarm
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
@@ -84,40 +80,6 @@ def test_it_mirrors_records_and_comes_back_and_sends_nothing(tmp_path: Path) -> 
         assert not [p for p in problems if p.severity == "error"]
 
     asyncio.run(work())
-
-
-def test_it_is_shown_as_a_twin_that_nobody_commands() -> None:
-    made, _ = session()
-
-    async def work() -> None:
-        twin = ReadOnlyTwin(made.follower, lambda: made.mirror, made.clock, "tcp://scanner:50000")
-        server = await twin.serve("127.0.0.1", 0)
-        port = server.sockets[0].getsockname()[1]
-        made.link(True, "")
-        for data in (event(1, MOVE), event(1, MOVE, "ACK", "50.3")):
-            made.message(data)
-        async with AsyncTwinClient("127.0.0.1", port) as client:
-            state = await client.state()
-            assert state.axes["tra_obj"].position == 50.3
-            said = " ".join(state.safety.warnings)
-            assert "tcp://scanner:50000: connected, last message" in said
-            assert "tra_obj stands at 50.3 mm after a move to 50" in said
-            assert "assumed at home, never heard" in said
-            assert "mag_obj" in said
-            with pytest.raises(RpcError, match="nothing commands it"):
-                await client.move({"tra_obj": 1.0})
-            assert made.mirror.positions["tra_obj"] == 50.3
-        server.close()
-
-    asyncio.run(work())
-
-
-@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
-def test_it_is_not_shown_to_others(host: str) -> None:
-    made, _ = session()
-    twin = ReadOnlyTwin(made.follower, lambda: made.mirror, made.clock, "tcp://scanner:50000")
-    with pytest.raises(AccessError):
-        asyncio.run(twin.serve(host, 0))
 
 
 def test_a_real_frame_stands_beside_the_radiograph_of_the_mirrored_pose(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Drawn conversations run through a follower: what of them is told as it must be, and what is not."""
+"""Drawn conversations run through a follower: what of them is told, and what is not."""
 
 from __future__ import annotations
 

@@ -140,7 +140,9 @@ class Conversation:
             target = upper + rng.uniform(0.01, 50.0)
             self.faults.append(Fault(self.now, frozenset({"limit"}), axis))
         factor = rng.uniform(0.3, 0.7) if fault == "slow" else 1.0
-        ends_at = target + (rng.choice((-1, 1)) * rng.uniform(0.05, 3.0) if fault == "offset" else 0.0)
+        ends_at = target + (
+            rng.choice((-1, 1)) * rng.uniform(0.05, 3.0) if fault == "offset" else 0.0
+        )
         stated = upper + (rng.uniform(1, 50) if fault == "limits" else 0.0)
         way, begun = abs(target - start), self.now
         nominal = trapezium(way, speed, acceleration)
@@ -245,7 +247,9 @@ class Conversation:
         if dialect.received:
             self._say(said, self.now + 0.0005, "RCV", "")
         if dialect.raw and rng.random() < 0.05:
-            self.messages.append((self.now, rng.choice((b"hello", b"<xml/>", b"\xff\xfe", b"[1, 2]"))))
+            self.messages.append(
+                (self.now, rng.choice((b"hello", b"<xml/>", b"\xff\xfe", b"[1, 2]")))
+            )
         return said
 
     def _feedback(self, said: dict[str, Any], at: float, position: float | None) -> None:

@@ -96,18 +96,14 @@ class Follower:
         mirror = mirror.cleared("link")
         if heard.what == "SEND":
             return self._sent(mirror, heard, now)
-        asked = mirror.asked(heard)
-        if asked is None and mirror.over(heard):
+        waiting = mirror.asked(heard)
+        if waiting is None and any(map(heard.may_answer, mirror.ended)):  # doubled, or late
             return mirror
-        waiting = None if asked is None else mirror.waiting[asked]
-        if asked is not None and waiting is not None:
+        if waiting is not None:
             about = waiting.heard.words[0]
             if ("silent", about) in mirror.active and now - waiting.told_s > SILENT_S:
                 mirror = replace(mirror, speaks=False)
-            told = replace(waiting, told_s=now)
-            mirror = replace(mirror, waiting={**mirror.waiting, asked: told}).cleared(
-                about, "silent"
-            )
+            mirror = mirror.with_waiting(waiting, told_s=now).cleared(about, "silent")
         if heard.what == "FDB":
             spoken = True if mirror.speaks is None else mirror.speaks
             return self._read(replace(mirror, speaks=spoken), heard, waiting, now)
@@ -115,7 +111,7 @@ class Follower:
 
     def tick(self, mirror: Mirror, now: float) -> Mirror:
         """The machine after time has passed without a message: what is overdue is told."""
-        for identity, waiting in mirror.waiting.items():
+        for waiting in mirror.waiting.values():
             took, quiet, about = now - waiting.sent_s, now - waiting.told_s, waiting.heard.words[0]
             expected = waiting.predicted_s is not None and not waiting.superseded
             overdue = took > waiting.most_s + SLACK_S
@@ -127,12 +123,11 @@ class Follower:
                 mirror = _alarm(mirror, now, "warning", "silent", about, what)
                 mirror = replace(mirror, speaks=mirror.speaks or False)
             if quiet > max(FORGET_S, waiting.most_s):
-                left = {i: w for i, w in mirror.waiting.items() if i != identity}
-                mirror = _rests(replace(mirror, waiting=left), waiting)
-        for name, axis in () if mirror.ends else mirror.axes.items():
-            late = 0.0 if axis.mover not in mirror.waiting else mirror.waiting[axis.mover].delay_s
-            if axis.path is not None and axis.path.end < (axis.heard_s or 0.0) < now - late - SLACK_S:
-                mirror = self._compared_to(mirror, name, axis.position, axis.path.target, now)
+                mirror = _rests(mirror.finished(waiting.heard), waiting)
+        for name, axis in mirror.axes.items() if mirror.ends is False else ():
+            told, path = axis.heard_s or 0.0, axis.path
+            if path is not None and path.end < told < now - axis.delay_s - SLACK_S:
+                mirror = self._arrival(mirror, name, axis.position, path.target, now)
         if mirror.due_s is not None and now > mirror.due_s + SLACK_S:
             what = (
                 f"the script is late: {self._next(mirror)} was due {now - mirror.due_s:.1f} s ago"
@@ -198,9 +193,8 @@ class Follower:
         again = (i for i in mirror.waiting if (i[0], i[2]) == (heard.key, heard.words))
         if any(again) or (heard.named and heard.identity in mirror.ended):
             return mirror
-        before = [i for i, e in mirror.ended.items()
-                  if e and heard.named and i[0] == heard.key and i[2][:2] == heard.words[:2]]
-        if before:  # its end was heard before it
+        ends = [(i[0], i[2][:2]) for i, unheard in mirror.ended.items() if unheard]
+        if heard.named and (heard.key, heard.words[:2]) in ends:  # its end was heard before it
             return _after(mirror.finished(heard), heard.command, self.machine, now)
         if not heard.asks:
             mirror = self._superseded(_flushed(mirror, now), heard, now)
@@ -219,13 +213,12 @@ class Follower:
 
     def _superseded(self, mirror: Mirror, heard: Heard, now: float) -> Mirror:
         """A component gets a command: those before whose time is over have ended, untold or not."""
-        for identity, waiting in mirror.waiting.items():
+        for waiting in mirror.waiting.values():
             over = now + waiting.heard.late_s - waiting.sent_s > (waiting.predicted_s or 0.0)
             if waiting.heard.words[0] != heard.words[0] or waiting.superseded or not over:
                 continue
             mirror = _after(mirror, waiting.heard.command, self.machine, now)
-            kept = {**mirror.waiting, identity: replace(waiting, superseded=True)}
-            mirror = replace(mirror, waiting=kept)
+            mirror = mirror.with_waiting(waiting, superseded=True)
         return mirror
 
     def _predicted(
@@ -251,23 +244,21 @@ class Follower:
             if p.code in _OF_ONE_COMMAND and not (mirror.xrays_on is None and "xray" in p.code):
                 kind = _OF_ONE_COMMAND[p.code]
                 mirror = _alarm(mirror, now, "error", kind, about, p.message)
+        low, high = _bounds(step, self.machine)
+        delay = max(0.0, high - step.computed_s)
         for name in moved:
             path = sim.motors.all[name].moves[-1][1]
-            rests = replace(mirror.axes[name].at_rest, begun_s=waiting.heard.late_s)
+            rests = mirror.axes[name].at_rest
+            rests = replace(rests, begun_s=waiting.heard.late_s, delay_s=delay)
             axis = replace(rests, path=path, target=path.target, mover=waiting.heard.identity)
             mirror = replace(mirror, axes={**mirror.axes, name: axis})
             mirror = self._near_limit(mirror, name, path.target, now)
-        low, high = _bounds(step, self.machine)
         known = waiting.heard.words[0] in (*self.machine.axes, *self.machine.virtual_axes)
         moving = isinstance(command, c.MoveAbsolute) and known
         motors = self.machine.moves(about) if moving else ()
+        targets = {n: mirror.axes[n].target for n in motors}
         return mirror, replace(
-            waiting,
-            predicted_s=step.holds_s,
-            least_s=low,
-            most_s=high,
-            targets={name: mirror.axes[name].target for name in motors},
-            delay_s=max(0.0, high - step.computed_s),
+            waiting, predicted_s=step.holds_s, least_s=low, most_s=high, targets=targets
         )
 
     def _near_limit(self, mirror: Mirror, name: str, target: float, now: float) -> Mirror:
@@ -290,9 +281,8 @@ class Follower:
             steps = self._steps[: at + 1]
             holds = sum(s.holds_s for s in steps)
             found = total_range(steps, holds, self.machine.timing)
-            high = sum(_bounds(s, self.machine)[1] for s in steps)
-            if found is not None:
-                high = _wider(found)[1]
+            bounds = [_bounds(s, self.machine) for s in steps] if found is None else [_wider(found)]
+            high = sum(b[1] for b in bounds)
             due = began + high if at + 1 < len(lines) else None
             mirror = mirror.cleared("script")
             return replace(mirror, next_line=at + 1, began_s=began, due_s=due)
@@ -340,14 +330,11 @@ class Follower:
         lines = _line(waiting, "POS" if passed else "ACK", took, heard.reply)
         mirror = replace(mirror, lines=lines)
         if passed:  # the motor goes on, and its reply at the end may come or not
-            ended = {i: e for i, e in mirror.ended.items() if i != command.identity}
-            return replace(mirror, ended=ended)
+            return mirror.with_waiting(waiting, superseded=True, written=True)
         if waiting.predicted_s is not None and not waiting.superseded:
-            longest = took + waiting.heard.late_s
-            if longest < waiting.least_s - SLACK_S:
-                mirror = self._outside(mirror, waiting, longest, now)
-            elif took - heard.late_s > waiting.most_s + SLACK_S:
-                mirror = self._outside(mirror, waiting, took - heard.late_s, now)
+            least, most = took - heard.late_s, took + waiting.heard.late_s
+            if most < waiting.least_s - SLACK_S or least > waiting.most_s + SLACK_S:
+                mirror = self._outside(mirror, waiting, took, now)
             else:
                 mirror = mirror.cleared(waiting.heard.words[0], "range")
         if waiting.targets:
@@ -368,13 +355,11 @@ class Follower:
         if at is None:
             return mirror
         name, there = self._motor(axis, at)
-        mirror = self._compared_to(mirror, name, there, waiting.targets[name], now)
+        mirror = self._arrival(mirror, name, there, waiting.targets[name], now)
         mirror = mirror.with_axis(name, position=there) if name in own else mirror
         return mirror if motor is None else self._compared(mirror, name, motor, now)
 
-    def _compared_to(
-        self, mirror: Mirror, name: str, there: float, meant: float, now: float
-    ) -> Mirror:
+    def _arrival(self, mirror: Mirror, name: str, there: float, meant: float, now: float) -> Mirror:
         """Where a motor stands beside where its move led."""
         if abs(there - meant) <= AT_TARGET:
             return mirror
@@ -387,12 +372,9 @@ class Follower:
         axis = self.machine.axes[name]
         for what, theirs, ours in (
             ("limits", (motor.lower, motor.upper), (axis.lower, axis.upper)),
-            (
-                "rates",
-                (motor.max_speed, motor.max_acceleration),
-                (axis.max_speed, axis.max_acceleration),
-            ),
-        ):
+            ("rates", (motor.max_speed, motor.max_acceleration),
+             (axis.max_speed, axis.max_acceleration)),
+        ):  # fmt: skip
             if any(abs(a - b) > 1e-6 * (1.0 + abs(b)) for a, b in zip(theirs, ours, strict=True)):
                 text = (
                     f"{name}: the motor's own {what} are {theirs[0]:g} and {theirs[1]:g}, machine "
@@ -420,10 +402,8 @@ class Follower:
             mirror = mirror.with_axis(name, position=x, target=x, heard_s=now)
             moved = waiting is None and heard.words[1].startswith("move")
             if seen.heard_s is not None and abs(x - seen.position) > AT_TARGET and not moved:
-                what = (
-                    f"{name} stands at {x:.6g} {unit}, not at {seen.position:.6g}, and no move of "
-                    "it was heard"
-                )
+                stood = f"not at {seen.position:.6g}, and no move of it was heard"
+                what = f"{name} stands at {x:.6g} {unit}, {stood}"
                 mirror = _alarm(mirror, now, "error", "moved", name, what)
             return mirror
         arrived = abs(x - path.target) <= AT_TARGET
@@ -440,9 +420,8 @@ class Follower:
             what = f"{name} is at {x:.6g} {unit}, on no way to {path.target:.6g}"
             return _alarm(here, now, "error", "off_path", name, what)
         least, most = now - heard.late_s - passes, now - passes
-        delay = waiting.delay_s if waiting is not None else 0.0
         first = seen.behind_s or (least, most)
-        if least > delay + SLACK_S or least - first[1] > DRIFT_S:
+        if least > seen.delay_s + SLACK_S or least - first[1] > DRIFT_S:
             what = f"{name} is slow: {least:.2f} s behind the predicted path at {x:.6g} {unit}"
             here = _alarm(here, now, "error", "slow", name, what)
         elif most + seen.begun_s < -SLACK_S or (most < 0.0 and first[0] - most > DRIFT_S):
@@ -460,10 +439,8 @@ class Follower:
 
     def _outside(self, mirror: Mirror, waiting: Waiting, took: float, now: float) -> Mirror:
         longer = "more" if took > waiting.most_s else "less"
-        what = (
-            f"{waiting.heard.text} has taken {took:.2f} s, {longer} than its range of "
-            f"{waiting.least_s:.2f} to {waiting.most_s:.2f} s"
-        )
+        bounds = f"{waiting.least_s:.2f} to {waiting.most_s:.2f} s"
+        what = f"{waiting.heard.text} has taken {took:.2f} s, {longer} than its range of {bounds}"
         return _alarm(mirror, now, "warning", "range", waiting.heard.words[0], what)
 
 
@@ -510,14 +487,13 @@ def _bare(command: c.Command) -> c.Command:
 
 def _flushed(mirror: Mirror, now: float) -> Mirror:
     """The next command is sent, so whoever sends has not waited for those before it."""
-    for key, waiting in mirror.waiting.items():
+    for waiting in mirror.waiting.values():
         if waiting.written or waiting.heard.asks:
             continue
         trigger = getattr(waiting.heard.command, "trigger", None)
         wait, took = ("no wait", 0.0) if trigger is None else ("POS", now - waiting.sent_s)
         lines = (*mirror.lines, *_line(waiting, wait, took, "command sent"))
-        kept = {**mirror.waiting, key: replace(waiting, written=True)}
-        mirror = replace(mirror, lines=lines, waiting=kept)
+        mirror = replace(mirror, lines=lines).with_waiting(waiting, written=True)
     return mirror
 
 

@@ -109,6 +109,7 @@ class SeenAxis:
         path: predicted motion, in the listener's time; None at rest.
         mover: the command that `path` is of.
         begun_s: how much earlier than `path` it may have begun [s].
+        delay_s: by how much it may be behind `path`: the most that a move takes beyond its motion.
         passed_s: the latest moment of `path` that a reading has shown.
         behind_s: (at least, at most) by how much the promptest reading was behind `path`.
     """
@@ -121,6 +122,7 @@ class SeenAxis:
     path: Trajectory | None = None
     mover: Identity | None = None
     begun_s: float = 0.0
+    delay_s: float = 0.0
     passed_s: float = -math.inf
     behind_s: tuple[float, float] | None = None
 
@@ -141,8 +143,6 @@ class Waiting:
     predicted_s: float | None = None
     least_s: float = 0.0
     most_s: float = 0.0
-    delay_s: float = 0.0
-    """By how much a motor may be behind its path: the most that a move takes beyond its motion."""
     targets: Mapping[str, float] = field(default_factory=dict)
     """Of a move: where it leads its motors."""
     written: bool = False
@@ -227,25 +227,28 @@ class Mirror:
             self.xrays_on,
         )
 
-    def asked(self, reply: Heard) -> Identity | None:
+    def asked(self, reply: Heard) -> Waiting | None:
         """The waiting command that this is a reply to: the one of its key.
 
         Of several it is that of the same words, then that of the same tick, then the oldest. Where
         there is no UUID, the arguments are the same, too, or left out.
         """
-        found = [i for i in self.waiting if reply.may_answer(i)]
-        alike = lambda i: (i[2][:2] == reply.words[:2], i[1] == reply.tick)  # noqa: E731
+
+        def alike(asked: Waiting) -> tuple[bool, bool]:
+            return asked.heard.words[:2] == reply.words[:2], asked.heard.tick == reply.tick
+
+        found = (w for i, w in self.waiting.items() if reply.may_answer(i))
         return max(found, key=alike, default=None)
 
-    def over(self, reply: Heard) -> bool:
-        """Whether the command that this is a reply to has ended."""
-        return any(reply.may_answer(i) for i in self.ended)
+    def with_waiting(self, asked: Waiting, **changes: object) -> Mirror:
+        """The same with a waiting command changed."""
+        changed = replace(asked, **changes)  # type: ignore[arg-type]
+        return replace(self, waiting={**self.waiting, asked.heard.identity: changed})
 
     def finished(self, command: Heard, unheard: bool = False) -> Mirror:
         """The same after the end of a command, which may come again."""
         left = {i: w for i, w in self.waiting.items() if i != command.identity}
-        kept = {i: e for i, e in self.ended.items() if i != command.identity}
-        kept = dict(list(kept.items())[1 - MOST_WAITING :])
+        kept = dict(list(self.ended.items())[1 - MOST_WAITING :])
         return replace(self, waiting=left, ended={**kept, command.identity: unheard})
 
     def age_s(self, now: float) -> float | None:

@@ -27,25 +27,12 @@ def follow(
     address: str | None = argument(None, "ADDRESS", "tcp://HOST[:PORT] of its outgoing events."),
     machine: options.MachineName = None,
     profile: options.ProfileName = None,
-    script: Path | None = option(
-        None, "Predict this script, which the scanner will run.", metavar="FILE"
-    ),
+    script: Path | None = option(None, "Predict this script, which will run.", metavar="FILE"),
     sample: str | None = option(None, "Put this phantom on the stage.", metavar="NAME or FILE"),
-    record: Path | None = option(
-        None, "Record the raw messages, for --replay and flexdt machine fit.", metavar="FILE"
-    ),
+    record: Path | None = option(None, "Append the raw messages to this file.", metavar="FILE"),
     replay: Path | None = option(None, "Hear this recording instead of a scanner.", metavar="FILE"),
-    frames: Path | None = option(
-        None, "Compare the images that appear here; needs --sample.", metavar="DIR"
-    ),
+    frames: Path | None = option(None, "Compare images that appear here.", metavar="DIR"),
     out: Path = option(Path(), "Write beside.png and beside.json of --frames here.", metavar="DIR"),
-    port: int | None = option(
-        None,
-        "Show the machine to clients on this port, as a twin without control.",
-        metavar="PORT",
-        min=0,
-        max=65535,
-    ),
     seconds: float | None = option(None, "End after this time.", "--for", metavar="S", min=0.0),
     json: bool = False,
 ) -> Answer:
@@ -55,25 +42,22 @@ def follow(
     no connection.
     """
     from flexdt.clients.following.recording import STAMP
-    from flexdt.clients.following.session import FollowSession
+    from flexdt.clients.following.session import FollowSession, FramesBeside
 
     if (address is None) == (replay is None):
         raise CommandError("give either ADDRESS or --replay FILE", USAGE)
     follower = _follower(machine, profile, script, sample)
+    session = FollowSession(follower)
+    session.tell = (lambda alarm: None) if json else partial(_say, session)
     if replay is not None:
         recording = replay.read_bytes()
         if STAMP.match(recording) is None:
-            raise CommandError(
-                f"{replay}: no message of the form [hh:mm:ss.ffffff] {{...}}", INVALID
-            )
-        session = FollowSession(follower)
-        session.tell = (lambda alarm: None) if json else partial(_say, session)
+            raise CommandError(f"{replay}: no message [hh:mm:ss] {{...}}", INVALID)
         session.replay(recording)
         yield from _told(session, str(replay))
         return
     beside = None
     if frames is not None:
-        from flexdt.clients.following.session import FramesBeside
         from flexdt.phantoms.samples import as_phantom
 
         if sample is None or not frames.is_dir():
@@ -89,13 +73,11 @@ def follow(
     except ValueError as error:
         raise CommandError(str(error), USAGE) from None
     with ExitStack() as files:
-        log = None if record is None else files.enter_context(record.open("ab"))
-        session = FollowSession(follower, record=log)
-        session.tell = (lambda alarm: None) if json else partial(_say, session)
+        session.record = None if record is None else files.enter_context(record.open("ab"))
         note(f"following {at}, compared with machine {follower.machine.name}; Ctrl-C ends it")
         try:
             with suppress(KeyboardInterrupt):
-                asyncio.run(_run(session, at, seconds, port, beside))
+                asyncio.run(_run(session, at, seconds, beside))
         except* zmq.ZMQError as group:
             why = "; ".join(map(str, group.exceptions))
             raise CommandError(f"{at}: {why}", REFUSED) from None
@@ -105,18 +87,14 @@ def follow(
 
 
 def _told(session: FollowSession, source: str) -> Answer:
-    if session.unread:
-        note(_unread(session))
-    yield {
-        "address": source,
-        "unread": session.unread,
-        "unread_example": session.unread_example,
-        **session.mirror.to_dict(session.clock()),
-    }
+    note(f"{session.mirror.raised} alarms{_unread(session)}")
+    unread = {"unread": session.unread, "unread_example": session.unread_example}
+    yield {"address": source, **unread, **session.mirror.to_dict(session.clock())}
 
 
 def _unread(session: FollowSession) -> str:
-    return f"{session.unread} messages in no known form, the first: {session.unread_example}"
+    found = f"; {session.unread} messages in no known form, the first: {session.unread_example}"
+    return found if session.unread else ""
 
 
 def _follower(
@@ -142,16 +120,8 @@ async def _run(
     session: FollowSession,
     address: str,
     seconds: float | None,
-    port: int | None,
     beside: tuple[Path, FramesBeside] | None,
 ) -> None:
-    if port is not None:
-        from flexdt.clients.following.read_only_twin import ReadOnlyTwin
-
-        twin = ReadOnlyTwin(session.follower, lambda: session.mirror, session.clock, address)
-        server = await twin.serve("127.0.0.1", port)
-        shown = server.sockets[0].getsockname()[1]
-        note(f"shown to clients: flexdt viewer --twin 127.0.0.1:{shown}")
     work = asyncio.create_task(session.run(address))
     more = [asyncio.create_task(_status(session))]
     if beside is not None:
@@ -173,9 +143,7 @@ async def _status(session: FollowSession) -> None:
         link = "connected" if mirror.connected else "NOT CONNECTED"
         old = "nothing heard yet" if age is None else f"last message {age:.1f} s ago"
         under_way = ", ".join(w.heard.text for w in mirror.waiting.values()) or "nothing under way"
-        note(f"{link}, {old}; {under_way}; {mirror.raised} alarms")
-        if session.unread:
-            note(_unread(session))
+        note(f"{link}, {old}; {under_way}; {mirror.raised} alarms{_unread(session)}")
 
 
 def _say(session: FollowSession, alarm: Alarm) -> None:
