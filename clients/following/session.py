@@ -234,8 +234,7 @@ class FollowSession:
             said = heard(data, self._axes, self.mirror, self.time_of_day(at), late_s)
         except AcquilaError as error:
             self.unread += 1
-            example = f"{error}: {data[:200].decode('latin-1')!r}"
-            self.unread_example = self.unread_example or example
+            self.unread_example = self.unread_example or f"{error}: {data[:200].decode('latin-1')}"
             return
         self._take(self.follower.hear(self.mirror, said, at))
         for line in self.mirror.lines:
@@ -291,8 +290,8 @@ class FollowSession:
         for message in r.read_recording(recording):
             now = now or message.at_s
             while now + TICK_S < message.at_s:
-                busy = self.mirror.waiting or self.mirror.due_s is not None
-                now = now + TICK_S if busy else message.at_s
+                idle = not self.mirror.waiting and self.mirror.due_s is None
+                now = message.at_s if idle else now + TICK_S
                 self.tick(now)
             now = max(now, message.at_s)
             if message.data.startswith(r.LINK):

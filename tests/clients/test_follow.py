@@ -7,6 +7,7 @@ import json
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,6 +20,7 @@ import zmq.asyncio
 
 from flexdt.clients.cli.entry import run
 from flexdt.clients.following.listening import endpoint
+from flexdt.clients.following.recording import read_recording
 from flexdt.clients.following.session import FollowSession, FramesBeside, executed_script
 from flexdt.phantoms import load_phantom
 from flexdt.twin.following.follower import Follower
@@ -27,7 +29,7 @@ from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.projection import project_scene
 from flexdt.twin.script.executed_log import read_log
-from tests.support.scanner_traffic import event
+from tests.support.scanner_traffic import Motor, event
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "faulty_scanner.py"
 FLEXRAY = builtin_machine("flexray")
@@ -131,6 +133,85 @@ def test_a_real_frame_stands_beside_the_radiograph_of_the_mirrored_pose(tmp_path
     assert picture.shape == (160, 320)
     assert "scan_000001.tif" in alarms[-1].message
     assert (alarms[-1].kind, alarms[-1].severity) == ("frame", "warning")
+
+
+def test_a_recording_is_heard_again_byte_for_byte(tmp_path: Path) -> None:
+    """Messages with line ends, bytes that are no text, and a link that is lost in between."""
+    made, _ = session()
+    raw = [
+        json.dumps(json.loads(event(1, MOVE)), indent=4).encode(),
+        b"[no stamp] \xff\n[12:00] neither",
+        event(1, MOVE, "ACK", "50.0000000000"),
+    ]
+    with (tmp_path / "log").open("wb") as made.record:
+        made.link(True, "")
+        for data, after in zip(raw, (0.0, 0.1, 2.1), strict=True):
+            made.message(data, made.clock() + after, 0.25)
+        made.link(False, "cable")
+    recording = (tmp_path / "log").read_bytes()
+    found = list(read_recording(recording))
+    assert [m.data for m in found][1:-1] == raw
+    assert {m.late_s for m in found[1:-1]} == {0.25}
+    again, alarms = session()
+    again.replay(recording)
+    assert again.unread == made.unread == 1
+    assert [(a.kind, a.message) for a in alarms] == [
+        ("lost", "the link is lost: cable; positions are those heard last")
+    ]
+    assert again.mirror.positions == made.mirror.positions
+
+
+def test_a_log_of_the_public_monitor_is_heard(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its form: seconds without parts, past midnight; its times are no finer than that."""
+    offset = json.dumps(
+        {"component": "tra_obj", "command": "move absolute", "arg1": "50", "UUID": "0a-1",
+         "reply type": "SENT", "tick count": 1767600381331}
+    )  # fmt: skip
+    ended = offset.replace("SENT", "ACK").replace('"UUID"', '"reply": "50.4", "UUID"')
+    lines = f"[23:59:58] {offset}\n[23:59:59] hello\n[00:00:00] {ended}\n"
+    (tmp_path / "zmq_monitor.log").write_text(lines)
+    assert run(["follow", "--replay", str(tmp_path / "zmq_monitor.log"), "--json"]) == 0
+    told = capsys.readouterr()
+    document = json.loads(told.out)
+    assert [a["kind"] for a in document["alarms"]] == ["offset"]
+    assert document["axes"]["tra_obj"]["position"] == 50.4
+    assert document["unread"] == 1
+    assert "hello" in document["unread_example"]
+    assert "1 messages in no known form" in told.err
+    assert run(["follow", "--replay", str(EXAMPLE)]) != 0
+    assert run(["follow", "tcp://x", "--replay", str(EXAMPLE)]) == 2
+
+
+def test_a_follower_that_is_busy_for_seconds_finds_a_healthy_machine_healthy() -> None:
+    """Its loop stands still while a motor moves and tells of it: times are those of arrival."""
+    made, alarms = session()
+    axis = FLEXRAY.axes["mag_obj"]
+    moved = Motor("mag_obj", axis.home, axis.home - 100.0, axis.speed, axis.acceleration)
+
+    def scanner(out: zmq.Socket[bytes]) -> None:
+        began = time.monotonic()
+        for at, data in moved.messages(1, 0.0):
+            time.sleep(max(0.0, began + at - time.monotonic()))
+            out.send(data)
+
+    async def work() -> None:
+        with zmq.Context() as context, context.socket(zmq.XPUB) as out:
+            out.linger = 0
+            port = out.bind_to_random_port("tcp://127.0.0.1")
+            task = asyncio.create_task(made.run(f"tcp://127.0.0.1:{port}"))
+            assert await asyncio.to_thread(out.recv) == b"\x01"
+            sending = asyncio.create_task(asyncio.to_thread(scanner, out))
+            await asyncio.sleep(0.4)
+            time.sleep(1.2)
+            await sending
+            await until(lambda: made.mirror.positions["mag_obj"] == moved.target)
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+    asyncio.run(work())
+    assert alarms == []
 
 
 @pytest.mark.slow

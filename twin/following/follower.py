@@ -105,8 +105,8 @@ class Follower:
                 mirror = replace(mirror, speaks=False)
             mirror = mirror.with_waiting(waiting, told_s=now).cleared(about, "silent")
         if heard.what == "FDB":
-            spoken = True if mirror.speaks is None else mirror.speaks
-            return self._read(replace(mirror, speaks=spoken), heard, waiting, now)
+            mirror = replace(mirror, speaks=mirror.speaks is not False)
+            return self._read(mirror, heard, waiting, now)
         return mirror if heard.what == "RCV" else self._ended(mirror, heard, waiting, now)
 
     def tick(self, mirror: Mirror, now: float) -> Mirror:
@@ -529,8 +529,6 @@ def _after(mirror: Mirror, command: c.Command | None, machine: Machine, now: flo
             return replace(mirror, camera=replace(mirror.camera, **command.arguments))
         case c.TubeSetting():
             return replace(mirror, **command.arguments)
-        case c.TakeImage() | c.TakeSequence():
-            return replace(mirror, taken=mirror.taken + 1)
         case c.XrayOn():
             return replace(mirror, xrays_on=True, ready_s=now + machine.timing.xray_ready_s)
         case c.XrayOff():

@@ -172,7 +172,6 @@ class Mirror:
         next_line: index of the script's next command; `began_s` when its first was heard, and
             `due_s` by when the next is sent, nine of ten times.
         lines: what the last message adds to the record.
-        taken: images that were taken.
     """
 
     axes: Mapping[str, SeenAxis]
@@ -194,7 +193,6 @@ class Mirror:
     began_s: float | None = None
     due_s: float | None = None
     lines: tuple[bytes, ...] = ()
-    taken: int = 0
 
     @classmethod
     def of(cls, machine: Machine) -> Mirror:
@@ -251,6 +249,11 @@ class Mirror:
         kept = dict(list(self.ended.items())[1 - MOST_WAITING :])
         return replace(self, waiting=left, ended={**kept, command.identity: unheard})
 
+    @property
+    def under_way(self) -> tuple[str, ...]:
+        """Commands that have not ended, as far as is known."""
+        return tuple(w.heard.text for w in self.waiting.values() if not w.superseded)
+
     def age_s(self, now: float) -> float | None:
         """How old the last message is [s]; None where there was none."""
         return None if self.heard_s is None else max(0.0, now - self.heard_s)
@@ -294,7 +297,7 @@ class Mirror:
             },
             "tube": {"on": self.xrays_on, "kV": self.kV, "power_W": self.power_W},
             "camera": {**self.camera.stated, "roi": list(self.camera.roi.edges)},
-            "waiting": [w.heard.text for w in self.waiting.values()],
+            "waiting": list(self.under_way),
             "next_line": self.next_line,
             "alarms": [
                 {"age_s": ago(a.at_s), "severity": a.severity, "kind": a.kind, "about": a.about,

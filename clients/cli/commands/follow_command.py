@@ -142,7 +142,7 @@ async def _status(session: FollowSession) -> None:
         age = mirror.age_s(session.clock())
         link = "connected" if mirror.connected else "NOT CONNECTED"
         old = "nothing heard yet" if age is None else f"last message {age:.1f} s ago"
-        under_way = ", ".join(w.heard.text for w in mirror.waiting.values()) or "nothing under way"
+        under_way = ", ".join(mirror.under_way) or "nothing under way"
         note(f"{link}, {old}; {under_way}; {mirror.raised} alarms{_unread(session)}")
 
 
