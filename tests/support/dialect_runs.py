@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from math import exp
 
 from flexdt.clients.following.session import FollowSession
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Alarm
-from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.machine.description import Machine, builtin_machine, builtin_profile
 from tests.support.dialects import TOLD_S, Conversation, Message
 
 FLEXRAY = builtin_machine("flexray")
@@ -20,12 +21,15 @@ class Listener:
 
     Args:
         stalls: (from, to) in which the listener does not read: what comes then is read at its end.
+        machine: what is known.
     """
 
-    def __init__(self, stalls: Iterable[tuple[float, float]] = ()) -> None:
+    def __init__(
+        self, stalls: Iterable[tuple[float, float]] = (), machine: Machine = FLEXRAY
+    ) -> None:
         self.alarms: list[Alarm] = []
         self.now = 0.0
-        follower = Follower(FLEXRAY, builtin_profile(FLEXRAY.default_profile))
+        follower = Follower(machine, builtin_profile(FLEXRAY.default_profile))
         self.session = FollowSession(follower, self.alarms.append, clock=lambda: self.now)
         self.stalls = list(stalls)
 
@@ -44,6 +48,17 @@ class Listener:
             self.session.tick(self.now)
         self.now = max(self.now, until)
         return self
+
+
+def measured(overhead: tuple[float, float], n: int = 30) -> Machine:
+    """The machine with times of this median and spread, as known from n of each kind."""
+    median, spread = overhead
+    ends = {"p5_s": median * exp(-1.645 * spread), "p95_s": median * exp(1.645 * spread), "n": n}
+    kinds = ("move", "move_standing", "set_tube", "set_camera", "command")
+    timing = {**{f"{kind}_s": median for kind in kinds}, "source": "measured",
+              "spread": dict.fromkeys(kinds, ends)}  # fmt: skip
+    made = FLEXRAY.model_dump() | {"timing": FLEXRAY.timing.model_dump() | timing}
+    return Machine.model_validate(made)
 
 
 def missed(made: Conversation, stalls: Iterable[tuple[float, float]] = ()) -> list[str]:

@@ -87,7 +87,8 @@ class Conversation:
     Attributes:
         messages: (when [s], bytes), in the order of the commands.
         faults: of the machine and of the server.
-        warned: how many warnings may come beside.
+        overhead: (median [s], spread of its logarithm) of what each command takes beside; None for
+            a few hundredths of a second.
     """
 
     dialect: Dialect
@@ -95,6 +96,7 @@ class Conversation:
     now: float = 1.0
     messages: list[Message] = field(default_factory=list)
     faults: list[Fault] = field(default_factory=list)
+    overhead: tuple[float, float] | None = None
     positions: dict[str, float] = field(default_factory=lambda: {n: a[2] for n, a in AXES.items()})
     _count: int = 0
     _ticks: int = 1_380_210_404
@@ -146,7 +148,7 @@ class Conversation:
         stated = upper + (rng.uniform(1, 50) if fault == "limits" else 0.0)
         way, begun = abs(target - start), self.now
         nominal = trapezium(way, speed, acceleration)
-        starts = rng.uniform(0.0, 0.08)
+        starts = self._more()
         took = starts + trapezium(way, speed * factor, acceleration)
         say = self._begin(axis, "move absolute", repr(target))
         late_at = math.inf
@@ -175,7 +177,7 @@ class Conversation:
         if fault == "hangs":
             silent = self.messages[-1][0] + 2.5
             first = overdue if dialect.end != "none" else silent
-            if first <= overdue:  # a server that tells no end has no more to tell after it
+            if dialect.end != "none" or first < begun + nominal:  # else untold
                 self.faults.append(Fault(first, frozenset({"range", "silent"}), axis))
             self.now = first + 30.0
             return
@@ -209,7 +211,7 @@ class Conversation:
 
     def _short(self, component: str, command: str, argument: str, reply: str = "") -> None:
         say = self._begin(component, command, argument)
-        self.now += self.rng.uniform(0.001, 0.08)
+        self.now += self._more()
         if self.dialect.end != "none":
             self._say(say, self.now, "ACK", reply)
         self.now += 0.002
@@ -218,10 +220,15 @@ class Conversation:
         say, begun = self._begin(component, command, str(round(1000 * seconds))), self.now
         for k in range(1, math.ceil(seconds / FEEDBACK_S)):
             self._feedback(say, begun + k * FEEDBACK_S, None)
-        self.now += seconds + 0.01
+        self.now += seconds + self._more()
         if self.dialect.end != "none":
             self._say(say, self.now, "ACK", "")
         self.now += 0.002
+
+    def _more(self) -> float:
+        if self.overhead is None:
+            return self.rng.uniform(0.001, 0.08)
+        return self.overhead[0] * math.exp(self.rng.gauss(0.0, self.overhead[1]))
 
     # -- how it is written -------------------------------------------------------------------
 
@@ -301,9 +308,11 @@ def conversation(dialect: Dialect, seed: int, commands: int = 8) -> Conversation
     return made
 
 
-def healthy(dialect: Dialect, seed: int, seconds: float) -> Iterator[Message]:
-    """So many seconds of a machine and a server without a fault."""
-    made = Conversation(dialect, random.Random(f"{dialect.name} healthy {seed}"))
+def healthy(
+    dialect: Dialect, seed: int, seconds: float, overhead: tuple[float, float] | None = None
+) -> Iterator[Message]:
+    """So many seconds of a machine and a server without a fault, nearly in order."""
+    made = Conversation(dialect, random.Random(f"{dialect.name} healthy {seed}"), overhead=overhead)
     while made.now < seconds:
         made.command()
         made.now += made.rng.choice((0.0, 0.0, made.rng.uniform(0.0, 20.0)))

@@ -118,6 +118,7 @@ class Follower:
             if expected and overdue and mirror.ends is not False:
                 mirror = self._outside(mirror, waiting, took, now)
                 mirror = replace(mirror, ends=mirror.ends or False)
+            overdue = overdue or (mirror.ends is False and took > (waiting.predicted_s or 0.0))
             if expected and not overdue and quiet > SILENT_S and mirror.speaks is not False:
                 what = f"{waiting.heard.text!r} is under way and has said nothing for {quiet:.1f} s"
                 mirror = _alarm(mirror, now, "warning", "silent", about, what)
