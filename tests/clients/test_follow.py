@@ -25,12 +25,13 @@ from flexdt.clients.following.session import FollowSession, FramesBeside, execut
 from flexdt.phantoms import load_phantom
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Alarm
-from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.machine.description import builtin_machine, builtin_profile, parse_machine
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.projection import project_scene
 from flexdt.twin.script.executed_log import read_log
-from tests.support.scanner_traffic import Motor, event
+from tests.support.scanner_traffic import Motor, event, replay
 
+LOG = Path(__file__).parents[1] / "data" / "logs" / "unitom_xl_201106_001.txt"
 EXAMPLE = Path(__file__).parents[2] / "examples" / "faulty_scanner.py"
 FLEXRAY = builtin_machine("flexray")
 MOVE = ("tra_obj", "move absolute", "50.0")
@@ -159,6 +160,26 @@ def test_a_recording_is_heard_again_byte_for_byte(tmp_path: Path) -> None:
         ("lost", "the link is lost: cable; positions are those heard last")
     ]
     assert again.mirror.positions == made.mirror.positions
+
+
+def test_a_machine_is_fitted_to_a_recording_as_to_the_log_of_the_same_scan(tmp_path: Path) -> None:
+    lines, _ = read_log(LOG.read_bytes())
+    with (tmp_path / "traffic").open("wb") as out:
+        for at, data in replay(LOG.read_bytes(), lines):
+            hours, seconds = divmod(at, 3600.0)
+            clock = f"[{int(hours):02d}:{int(seconds // 60):02d}:{seconds % 60:09.6f} 0.0] "
+            out.write(clock.encode() + data + b"\n")
+    fitted = {}
+    for name, source in (("log", LOG), ("traffic", tmp_path / "traffic")):
+        made = tmp_path / f"{name}.toml"
+        assert run(["machine", "fit", str(source), "--base", "unitom_xl", "--out", str(made)]) == 0
+        fitted[name] = parse_machine(made.read_text("utf-8"), str(made))
+    log, traffic = fitted["log"], fitted["traffic"]
+    for name in ("tra_obj", "mag_det", "rot_obj"):
+        assert traffic.axes[name].lower == log.axes[name].lower
+        assert traffic.axes[name].max_speed == log.axes[name].max_speed
+    assert traffic.timing.xray_ready_s == pytest.approx(log.timing.xray_ready_s, abs=0.002)
+    assert traffic.timing.move_s == pytest.approx(log.timing.move_s, abs=0.002)
 
 
 def test_a_log_of_the_public_monitor_is_heard(
