@@ -111,6 +111,7 @@ class Follower:
 
     def tick(self, mirror: Mirror, now: float) -> Mirror:
         """The machine after time has passed without a message: what is overdue is told."""
+        mirror = self._over(mirror, "", now) if mirror.ends is False else mirror
         for waiting in mirror.waiting.values():
             took, quiet, about = now - waiting.sent_s, now - waiting.told_s, waiting.heard.words[0]
             expected = waiting.predicted_s is not None and not waiting.superseded
@@ -118,7 +119,6 @@ class Follower:
             if expected and overdue and mirror.ends is not False:
                 mirror = self._outside(mirror, waiting, took, now)
                 mirror = replace(mirror, ends=mirror.ends or False)
-            overdue = overdue or (mirror.ends is False and took > (waiting.predicted_s or 0.0))
             if expected and not overdue and quiet > SILENT_S and mirror.speaks is not False:
                 what = f"{waiting.heard.text!r} is under way and has said nothing for {quiet:.1f} s"
                 mirror = _alarm(mirror, now, "warning", "silent", about, what)
@@ -198,7 +198,7 @@ class Follower:
         if heard.named and (heard.key, heard.words[:2]) in ends:  # its end was heard before it
             return _after(mirror.finished(heard), heard.command, self.machine, now)
         if not heard.asks:
-            mirror = self._superseded(_flushed(mirror, now), heard, now)
+            mirror = self._over(_flushed(mirror, now), heard.words[0], now)
         name, asked = heard.words[:2]
         if not (name in FIXED or self.machine.has(name)) and find(name, asked) is not None:
             what = f"{heard.text!r} is not followed: {unknown_axis(name, self.machine).message}"
@@ -212,14 +212,13 @@ class Follower:
         kept = dict(list(mirror.waiting.items())[1 - MOST_WAITING :])
         return replace(mirror, waiting={**kept, heard.identity: waiting})
 
-    def _superseded(self, mirror: Mirror, heard: Heard, now: float) -> Mirror:
-        """A component gets a command: those before whose time is over have ended, untold or not."""
+    def _over(self, mirror: Mirror, component: str, now: float) -> Mirror:
+        """The commands of a component, or of all, whose time is over have ended, told or not."""
         for waiting in mirror.waiting.values():
             over = now + waiting.heard.late_s - waiting.sent_s > (waiting.predicted_s or 0.0)
-            if waiting.heard.words[0] != heard.words[0] or waiting.superseded or not over:
-                continue
-            mirror = _after(mirror, waiting.heard.command, self.machine, now)
-            mirror = mirror.with_waiting(waiting, superseded=True)
+            if over and not waiting.superseded and component in ("", waiting.heard.words[0]):
+                mirror = _after(mirror, waiting.heard.command, self.machine, now)
+                mirror = mirror.with_waiting(waiting, superseded=True)
         return mirror
 
     def _predicted(
@@ -409,12 +408,12 @@ class Follower:
             return mirror
         arrived = abs(x - path.target) <= AT_TARGET
         passes = path.end if arrived else path.time_at(x)
-        older = passes is not None and passes < seen.passed_s
-        if older and (mirror.ends or now < path.end or seen.passed_s == path.end):
-            return mirror  # older than one that was read before
+        here = mirror.with_axis(name, position=x, heard_s=now)
+        if passes is not None and passes < seen.passed_s:  # older, unless it stays the last
+            last = mirror.ends is False and now > path.end > seen.passed_s
+            return here if last else mirror
         if passes == seen.passed_s and now - (seen.heard_s or now) < SILENT_S:
             return mirror  # that one once more
-        here = mirror.with_axis(name, position=x, heard_s=now)
         if arrived or abs(x - path.pieces[0].position) <= AT_TARGET:
             return here if passes is None else here.with_axis(name, passed_s=passes)
         if passes is None:

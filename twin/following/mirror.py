@@ -148,7 +148,7 @@ class Waiting:
     written: bool = False
     """Whether the record has it already."""
     superseded: bool = False
-    """Whether its component got another command after its time, so that no end is expected."""
+    """Whether it counts as over without an end: its time is, and its component goes on."""
 
 
 @dataclass(frozen=True)
