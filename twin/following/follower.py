@@ -227,13 +227,14 @@ class Follower:
         """The prediction of one command, from the machine as it is now."""
         if isinstance(command, c.MoveAbsolute):
             command = replace(command, trigger=None)
-        arrived = {n: a.path.target for n, a in mirror.axes.items() if a.path and a.path.end <= now}
+        paths = {n: a.path for n, a in mirror.axes.items() if a.path is not None}
+        moving = {n: p for n, p in paths.items() if p.end - mirror.axes[n].begun_s > now}
+        arrived = {n: p.target for n, p in paths.items() if n not in moving}
         start = replace(mirror.start, positions={**mirror.positions, **arrived})
         sim = Simulation(self.machine, start)
         sim.now, sim.tube.ready_at = now, mirror.ready_s
-        for name, axis in mirror.axes.items():
-            if axis.path is not None and axis.path.end > now:
-                sim.motors.all[name].moves.append((axis.path.start, axis.path))
+        for name, path in moving.items():
+            sim.motors.all[name].moves.append((path.start, path))
         sim.run((replace(command, wait=c.Wait.ACK),))
         step = sim.steps[0]
         moved = tuple(n for n, m in sim.motors.all.items() if m.moves and m.moves[-1][0] == now)
@@ -254,8 +255,7 @@ class Follower:
             mirror = replace(mirror, axes={**mirror.axes, name: axis})
             mirror = self._near_limit(mirror, name, path.target, now)
         known = waiting.heard.words[0] in (*self.machine.axes, *self.machine.virtual_axes)
-        moving = isinstance(command, c.MoveAbsolute) and known
-        motors = self.machine.moves(about) if moving else ()
+        motors = self.machine.moves(about) if isinstance(command, c.MoveAbsolute) and known else ()
         targets = {n: mirror.axes[n].target for n in motors}
         return mirror, replace(
             waiting, predicted_s=step.holds_s, least_s=low, most_s=high, targets=targets
