@@ -409,10 +409,10 @@ class Follower:
         arrived = abs(x - path.target) <= AT_TARGET
         passes = path.end if arrived else path.time_at(x)
         here = mirror.with_axis(name, position=x, heard_s=now)
-        if passes is not None and passes < seen.passed_s:  # older, unless it stays the last
+        if moves and passes is not None and passes < seen.passed_s:  # old, if not the last
             last = mirror.ends is False and now > path.end > seen.passed_s
             return here if last else mirror
-        if passes == seen.passed_s and now - (seen.heard_s or now) < SILENT_S:
+        if moves and passes == seen.passed_s and now - (seen.heard_s or now) < SILENT_S:
             return mirror  # that one once more
         if arrived or abs(x - path.pieces[0].position) <= AT_TARGET:
             return here if passes is None else here.with_axis(name, passed_s=passes)
