@@ -3,7 +3,8 @@
     python examples/faulty_scanner.py 50123 &
     flexdt follow tcp://127.0.0.1:50123 --for 12
 
-It needs pyzmq and nothing of flexdt. The first move is sound; the second is of a motor of half the
+It needs pyzmq and nothing of flexdt. Every message has a tick of its own, as in the last pages of the
+interface's description; `flexdt follow` goes by the UUID. The first move is sound; the second is of a motor of half the
 speed; the third ends 0.4 mm from its target, and its reply states another limit.
 """
 
@@ -33,7 +34,7 @@ def event(axis: str, target: float, uuid: int, what: str, reply: str = "") -> st
         {
             "component": axis, "comp_phys": "", "command": "move absolute", "arg1": str(target),
             "arg2": "", "reply": reply, "reply type": what, "comp_type": "motor",
-            "tick count": 1, "UUID": uuid,
+            "tick count": int(time.time() * 1000) % 2**32, "UUID": uuid,
         }
     )  # fmt: skip
 

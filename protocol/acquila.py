@@ -1,8 +1,9 @@
 """Events of the scanner software's own socket interface: JSON objects that say RCV, FDB, ACK, ERR.
 
 A command is an event whose `reply type` is empty (some programs write SEND or SENT). Whoever
-executes it answers with events that bear the same UUID and tick count: RCV at once, FDB while it
-lasts, then one ACK or ERR. `Exchange` keeps that order for one command; time is an argument.
+executes it answers with events that bear the same UUID: RCV at once, FDB while it lasts, then one
+ACK or ERR. The interface's description asks replies for the command's tick count too, but programs
+renew it or leave it out. `Exchange` keeps that order for one command; time is an argument.
 """
 
 from __future__ import annotations
@@ -91,15 +92,21 @@ class AcquilaEvent:
         return self.uuid in (0, "", "0")
 
     @property
-    def key(self) -> tuple[float | str, int]:
-        """What a command and its replies have in common, even where a reply's UUID became a float.
+    def key(self) -> float | str:
+        """What a command and its replies have in common: the UUID, even where it became a float.
+
+        Of events without a UUID it is component and command.
 
         Example:
             >>> a, b = (AcquilaEvent("tube", "xrayon", uuid=u) for u in (2**63 + 1, float(2**63)))
             >>> a.key == b.key, a.uuid == b.uuid
             (True, False)
         """
-        return self.uuid if isinstance(self.uuid, str) else float(self.uuid), self.tick_count
+        if self.anonymous:
+            return f"{self.component} {self.command}"
+        if isinstance(self.uuid, str) and re.fullmatch(r"-?\d+", self.uuid) is None:
+            return self.uuid
+        return float(self.uuid)
 
     def answer(self, reply_type: ReplyType, reply: str = "", comp_type: str = "") -> AcquilaEvent:
         """The event that replies to this one: same UUID, same tick count."""

@@ -1,8 +1,7 @@
 """A session of `flexdt follow`: messages in; alarms, a record and a mirror in the twin out.
 
 It decides nothing: `flexdt.twin.following` says what a message changes. Time is this machine's
-monotonic clock when a message came. The only socket is a SUB socket, which cannot send a message;
-ZeroMQ's own heartbeats tell within a second that a cable is out.
+monotonic clock when a message came, or that of a recording, which takes the same way.
 
 With a folder of frames, the last real one is written beside the twin's radiograph of the mirrored
 machine: its positions and camera when the frame appeared, the profile's offsets and the phantom on
@@ -13,9 +12,7 @@ correlation; Kuglin and Hines 1975).
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
-import re
 import time
 from collections.abc import Callable, Collection
 from contextlib import suppress
@@ -26,98 +23,24 @@ from typing import BinaryIO, Final
 
 import cv2
 import numpy as np
-import zmq
-import zmq.asyncio
-from zmq.utils.monitor import parse_monitor_message
 
 from flexdt.clients.datasets.pictures import png
+from flexdt.clients.following import recording as r
 from flexdt.clients.gateway.vocabulary import MoveRelative, Question, Refusal, read_command
 from flexdt.clients.whole_files import write_whole
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import line_integrals as projected
-from flexdt.protocol.acquila import MAX_BYTES, AcquilaError, AcquilaEvent, parse_event
+from flexdt.protocol.acquila import AcquilaError, AcquilaEvent, parse_event
 from flexdt.runtime.files.dataset_folder import list_folder, mean_image, read_image
 from flexdt.twin.dataset.normalise import LineIntegrals
 from flexdt.twin.errors import TwinError
 from flexdt.twin.following.follower import Follower
-from flexdt.twin.following.mirror import Alarm, Heard, Mirror
+from flexdt.twin.following.mirror import Alarm, Heard, Mirror, What
 from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.machine.description import ZERO, Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.grammar import own_name
-
-PORT: Final = 50000
-HEARTBEAT_MS: Final = 200
-SILENT_MS: Final = 500
-"""A scanner whose ZeroMQ does not answer a heartbeat for so long is not there."""
-RETRY_MS: Final = 100
-MOST_RETRY_MS: Final = 1000
-MAX_HELD: Final = 10_000
-_ADDRESS: Final = re.compile(r"(?:tcp://)?(\[[0-9a-fA-F:.]+\]|[^\s:/\[\]]+)(?::(\d{1,5}))?/?")
-
-
-def endpoint(address: str) -> str:
-    """ZeroMQ's name of `tcp://HOST[:PORT]`.
-
-    Raises:
-        ValueError: it is none.
-
-    Example:
-        >>> endpoint("tcp://scanner"), endpoint("10.0.0.7:5555")
-        ('tcp://scanner:50000', 'tcp://10.0.0.7:5555')
-    """
-    match = _ADDRESS.fullmatch(address.strip())
-    port = PORT if match is None or match[2] is None else int(match[2])
-    if match is None or not 0 < port < 65536:
-        raise ValueError(f"{address!r} is no address; allowed: tcp://HOST[:PORT], PORT 1 to 65535")
-    return f"tcp://{match[1]}:{port}"
-
-
-async def listen(
-    address: str, message: Callable[[bytes], None], link: Callable[[bool, str], None]
-) -> None:
-    """Listen until cancelled.
-
-    Args:
-        address: see `endpoint`.
-        message: called with every message.
-        link: called with whether there is a connection, and why not, when that changes.
-
-    Raises:
-        ValueError, zmq.ZMQError: no address that can be connected to.
-    """
-    with zmq.asyncio.Context() as context, context.socket(zmq.SUB) as socket:
-        for option, value in (
-            (zmq.LINGER, 0), (zmq.RCVHWM, MAX_HELD), (zmq.MAXMSGSIZE, MAX_BYTES),
-            (zmq.HEARTBEAT_IVL, HEARTBEAT_MS), (zmq.HEARTBEAT_TIMEOUT, SILENT_MS),
-            (zmq.RECONNECT_IVL, RETRY_MS), (zmq.RECONNECT_IVL_MAX, MOST_RETRY_MS),
-            (zmq.IPV6, int("[" in address)),
-        ):  # fmt: skip
-            socket.setsockopt(option, value)
-        socket.subscribe(b"")
-        events = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED
-        monitor = socket.get_monitor_socket(events)
-        watching = asyncio.create_task(_watch(monitor, link))
-        try:
-            socket.connect(endpoint(address))
-            while True:
-                frames = await socket.recv_multipart()
-                message(frames[0] if len(frames) == 1 else b"")
-        finally:
-            watching.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await watching
-            socket.disable_monitor()
-            monitor.close(linger=0)
-
-
-async def _watch(monitor: zmq.asyncio.Socket, link: Callable[[bool, str], None]) -> None:
-    while True:
-        event = parse_monitor_message(await monitor.recv_multipart())
-        if event["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED:
-            link(True, "")
-        else:
-            link(False, "the scanner has ended the connection, or does not answer")
 
 
 def newest_frame(folder: Path) -> tuple[Path, float] | None:
@@ -216,18 +139,23 @@ def shift(virtual: Float32Array, real: Float32Array) -> tuple[float, float]:
 # Bytes of the scanner's interface to what a follower hears: no socket, no clock.
 
 
-def heard(data: bytes, axes: Collection[str], mirror: Mirror, stamp: str) -> Heard:
+def heard(
+    data: bytes, axes: Collection[str], mirror: Mirror, stamp: str, late_s: float = 0.0
+) -> Heard:
     """One message.
 
     Args:
-        data: as it came; UTF-8, or one byte for each character where a cluster makes it none.
+        data: as it came; UTF-8, or one byte for each character where a cluster makes it none. What
+            stands before the object, such as a topic, is left out.
         axes: motors and virtual axes of the machine.
         mirror: says where a relative move begins.
         stamp: time of day, hh:mm:ss.mmm.
+        late_s: by how much earlier it may have come than it was read [s].
 
     Raises:
         AcquilaError: the bytes are no event.
     """
+    data = data[max(0, data.find(b"{")) :]
     try:
         event = parse_event(data)
     except AcquilaError:
@@ -235,8 +163,9 @@ def heard(data: bytes, axes: Collection[str], mirror: Mirror, stamp: str) -> Hea
     event = replace(event, component=own_name(event.component, axes))
     command, asks = _read(event, axes, mirror)
     words = (event.component, event.command, event.arg1, event.arg2)
-    what = event.reply_type.value or "SEND"
-    return Heard(event.key, what, words, command, event.reply, asks, stamp)  # type: ignore[arg-type]
+    what: What = event.reply_type.value or "SEND"  # type: ignore[assignment]
+    tick, reply = event.tick_count, event.reply
+    return Heard(event.key, what, words, command, reply, asks, stamp, tick, late_s)
 
 
 def _read(
@@ -269,13 +198,14 @@ class FollowSession:
     Args:
         follower: compares.
         tell: called with each new alarm.
-        record: gets the executed script's lines; None for none.
+        record: gets the raw messages; None for none.
         changed: called whenever the mirror has changed, a message came or time has passed.
         clock: monotonic [s].
+        executed: called with the lines of the executed script.
 
     Attributes:
         mirror: the machine as it is known now.
-        unread: messages that were no events.
+        unread: messages that were no events, and `unread_example` the first of them.
     """
 
     follower: Follower
@@ -283,35 +213,51 @@ class FollowSession:
     record: BinaryIO | None = None
     changed: Callable[[Mirror], None] = lambda mirror: None
     clock: Callable[[], float] = time.monotonic
+    executed: Callable[[bytes], None] = lambda line: None
     mirror: Mirror = field(init=False)
     unread: int = 0
+    unread_example: str = ""
 
     def __post_init__(self) -> None:
-        machine = self.follower.machine
+        machine, now = self.follower.machine, datetime.now()
         self.mirror = Mirror.of(machine)
         self._axes = (*machine.axes, *machine.virtual_axes)
         self._looked: object = None
+        midnight = now.replace(hour=0, minute=0, second=0, microsecond=0)
+        self._midnight = self.clock() - (now - midnight).total_seconds()
 
-    def message(self, data: bytes) -> None:
-        """One message has come."""
-        stamp = datetime.now().strftime("%H:%M:%S.%f")[:-3]
+    def message(self, data: bytes, at: float | None = None, late_s: float = 0.0) -> None:
+        """One message has come, between `late_s` before `at` and `at`, or now."""
+        at = self.clock() if at is None else at
+        self._keep(data, at, late_s)
         try:
-            said = heard(data, self._axes, self.mirror, stamp)
-        except AcquilaError:
+            said = heard(data, self._axes, self.mirror, self.time_of_day(at), late_s)
+        except AcquilaError as error:
             self.unread += 1
+            self.unread_example = self.unread_example or f"{error}: {data[:200].decode('latin-1')}"
             return
-        self._take(self.follower.hear(self.mirror, said, self.clock()))
-        if self.record is not None and self.mirror.lines:
-            self.record.writelines(self.mirror.lines)
-            self.record.flush()
+        self._take(self.follower.hear(self.mirror, said, at))
+        for line in self.mirror.lines:
+            self.executed(line)
 
     def link(self, connected: bool, why: str) -> None:
         """The connection has come up or gone down."""
-        self._take(self.follower.linked(self.mirror, connected, self.clock(), why))
+        now = self.clock()
+        self._keep(r.UP if connected else r.LINK + why.encode(), now, 0.0)
+        self._take(self.follower.linked(self.mirror, connected, now, why))
 
-    def tick(self) -> None:
-        """Time has passed."""
-        self._take(self.follower.tick(self.mirror, self.clock()))
+    def tick(self, now: float) -> None:
+        """Time has passed up to `now`, and every message until then was told."""
+        self._take(self.follower.tick(self.mirror, now))
+
+    def time_of_day(self, at: float) -> str:
+        """hh:mm:ss.mmm of a time of the clock."""
+        return r.time_of_day(at - self._midnight)
+
+    def _keep(self, data: bytes, at: float, late_s: float) -> None:
+        if self.record is not None:
+            self.record.write(r.format_recorded(r.Recorded(at - self._midnight, late_s, data)))
+            self.record.flush()
 
     def _take(self, mirror: Mirror) -> None:
         new, self.mirror = mirror.raised - self.mirror.raised, mirror
@@ -325,15 +271,35 @@ class FollowSession:
         Raises:
             ValueError, zmq.ZMQError: no address that can be connected to.
         """
+        from flexdt.clients.following.listening import listen  # pyzmq is an extra
+
         async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(listen(address, self.message, self.link))
-            tasks.create_task(self._ticks())
+            hear = listen(address, self.message, self.tick, self.link, self.clock)
+            tasks.create_task(hear)
             tasks.create_task(self._look_ahead())
 
-    async def _ticks(self) -> None:
-        while True:
-            await asyncio.sleep(TICK_S)
-            self.tick()
+    def replay(self, recording: bytes, ahead: bool = True) -> None:
+        """Hear a recording as if it came now; the clock is the recording's.
+
+        Args:
+            recording: see `flexdt.clients.following.recording`.
+            ahead: whether what is under way, and the rest of the script, are checked as well.
+        """
+        now = self._midnight = 0.0
+        self.clock = lambda: now
+        for message in r.read_recording(recording):
+            now = now or message.at_s
+            while now + TICK_S < message.at_s:
+                idle = not self.mirror.waiting and self.mirror.due_s is None
+                now = message.at_s if idle else now + TICK_S
+                self.tick(now)
+            now = max(now, message.at_s)
+            if message.data.startswith(r.LINK):
+                self.link(message.data == r.UP, message.data.removeprefix(r.LINK).decode())
+            else:
+                self.message(message.data, message.at_s, message.late_s)
+            if ahead and self._is_new():
+                self._take(self.follower.told(self.mirror, self.follower.ahead(self.mirror, now)))
 
     async def show_frames(self, folder: Path, beside: FramesBeside) -> None:
         """Write each new frame of a folder beside its radiograph, until cancelled."""
@@ -356,10 +322,20 @@ class FollowSession:
         """Check what is under way and the rest of the script, again whenever either changes."""
         while True:
             await asyncio.sleep(TICK_S)
-            mirror = self.mirror
-            key = (mirror.next_line, tuple(a.target for a in mirror.axes.values()))
-            if key == self._looked or mirror.heard_s is None:
-                continue
-            self._looked = key
-            found = await asyncio.to_thread(self.follower.ahead, mirror, self.clock())
-            self._take(self.follower.told(self.mirror, found))
+            if self._is_new():
+                found = await asyncio.to_thread(self.follower.ahead, self.mirror, self.clock())
+                self._take(self.follower.told(self.mirror, found))
+
+    def _is_new(self) -> bool:
+        """Whether what lies ahead has changed since this was asked last."""
+        key = (self.mirror.next_line, tuple(a.target for a in self.mirror.axes.values()))
+        before, self._looked = self._looked, key if self.mirror.heard_s is not None else None
+        return self._looked not in (None, before)
+
+
+def executed_script(recording: bytes, machine: Machine) -> bytes:
+    """The executed script in a recording of raw messages, as the scanner would have written it."""
+    lines: list[bytes] = []
+    follower = Follower(machine, Profile(name=ZERO, machine=machine.name, source="no offsets"))
+    FollowSession(follower, executed=lines.append).replay(recording, ahead=False)
+    return b"".join(lines)

@@ -82,7 +82,7 @@ class Gateway:
             raise
         self._tasks: set[asyncio.Task[None]] = set()
         self._locks: dict[str, asyncio.Lock] = {}
-        self._awaited: dict[tuple[float | str, int], asyncio.Event] = {}
+        self._awaited: dict[float | str, asyncio.Event] = {}
         self._running: set[tuple[object, int]] = set()
         self._rejected = self._failed = 0
         self._uuids = random.Random()

@@ -7,6 +7,7 @@ import json
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,20 +19,19 @@ import zmq
 import zmq.asyncio
 
 from flexdt.clients.cli.entry import run
-from flexdt.clients.client.async_client import AsyncTwinClient
-from flexdt.clients.following.read_only_twin import ReadOnlyTwin
-from flexdt.clients.following.session import FollowSession, FramesBeside, endpoint
+from flexdt.clients.following.listening import endpoint
+from flexdt.clients.following.recording import read_recording
+from flexdt.clients.following.session import FollowSession, FramesBeside, executed_script
 from flexdt.phantoms import load_phantom
-from flexdt.protocol import RpcError
-from flexdt.runtime.access import AccessError
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Alarm
-from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.machine.description import builtin_machine, builtin_profile, parse_machine
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.projection import project_scene
 from flexdt.twin.script.executed_log import read_log
-from tests.support.scanner_traffic import event
+from tests.support.scanner_traffic import Motor, event, replay
 
+LOG = Path(__file__).parents[1] / "data" / "logs" / "unitom_xl_201106_001.txt"
 EXAMPLE = Path(__file__).parents[2] / "examples" / "faulty_scanner.py"
 FLEXRAY = builtin_machine("flexray")
 MOVE = ("tra_obj", "move absolute", "50.0")
@@ -77,45 +77,12 @@ def test_it_mirrors_records_and_comes_back_and_sends_nothing(tmp_path: Path) -> 
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
             again.close(linger=0)
-        lines, problems = read_log((tmp_path / "log").read_bytes())
+        recording = (tmp_path / "log").read_bytes()
+        lines, problems = read_log(executed_script(recording, FLEXRAY))
         assert [x.line for x in lines] == [1]
         assert not [p for p in problems if p.severity == "error"]
 
     asyncio.run(work())
-
-
-def test_it_is_shown_as_a_twin_that_nobody_commands() -> None:
-    made, _ = session()
-
-    async def work() -> None:
-        twin = ReadOnlyTwin(made.follower, lambda: made.mirror, made.clock, "tcp://scanner:50000")
-        server = await twin.serve("127.0.0.1", 0)
-        port = server.sockets[0].getsockname()[1]
-        made.link(True, "")
-        for data in (event(1, MOVE), event(1, MOVE, "ACK", "50.3")):
-            made.message(data)
-        async with AsyncTwinClient("127.0.0.1", port) as client:
-            state = await client.state()
-            assert state.axes["tra_obj"].position == 50.3
-            said = " ".join(state.safety.warnings)
-            assert "tcp://scanner:50000: connected, last message" in said
-            assert "tra_obj stands at 50.3 mm after a move to 50" in said
-            assert "assumed at home, never heard" in said
-            assert "mag_obj" in said
-            with pytest.raises(RpcError, match="nothing commands it"):
-                await client.move({"tra_obj": 1.0})
-            assert made.mirror.positions["tra_obj"] == 50.3
-        server.close()
-
-    asyncio.run(work())
-
-
-@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
-def test_it_is_not_shown_to_others(host: str) -> None:
-    made, _ = session()
-    twin = ReadOnlyTwin(made.follower, lambda: made.mirror, made.clock, "tcp://scanner:50000")
-    with pytest.raises(AccessError):
-        asyncio.run(twin.serve(host, 0))
 
 
 def test_a_real_frame_stands_beside_the_radiograph_of_the_mirrored_pose(tmp_path: Path) -> None:
@@ -167,6 +134,105 @@ def test_a_real_frame_stands_beside_the_radiograph_of_the_mirrored_pose(tmp_path
     assert picture.shape == (160, 320)
     assert "scan_000001.tif" in alarms[-1].message
     assert (alarms[-1].kind, alarms[-1].severity) == ("frame", "warning")
+
+
+def test_a_recording_is_heard_again_byte_for_byte(tmp_path: Path) -> None:
+    """Messages with line ends, bytes that are no text, and a link that is lost in between."""
+    made, _ = session()
+    raw = [
+        json.dumps(json.loads(event(1, MOVE)), indent=4).encode(),
+        b"[no stamp] \xff\n[12:00] neither",
+        event(1, MOVE, "ACK", "50.0000000000"),
+    ]
+    with (tmp_path / "log").open("wb") as made.record:
+        made.link(True, "")
+        for data, after in zip(raw, (0.0, 0.1, 2.1), strict=True):
+            made.message(data, made.clock() + after, 0.25)
+        made.link(False, "cable")
+    recording = (tmp_path / "log").read_bytes()
+    found = list(read_recording(recording))
+    assert [m.data for m in found][1:-1] == raw
+    assert {m.late_s for m in found[1:-1]} == {0.25}
+    again, alarms = session()
+    again.replay(recording)
+    assert again.unread == made.unread == 1
+    assert [(a.kind, a.message) for a in alarms] == [
+        ("lost", "the link is lost: cable; positions are those heard last")
+    ]
+    assert again.mirror.positions == made.mirror.positions
+
+
+def test_a_machine_is_fitted_to_a_recording_as_to_the_log_of_the_same_scan(tmp_path: Path) -> None:
+    lines, _ = read_log(LOG.read_bytes())
+    with (tmp_path / "traffic").open("wb") as out:
+        for at, data in replay(LOG.read_bytes(), lines):
+            hours, seconds = divmod(at, 3600.0)
+            clock = f"[{int(hours):02d}:{int(seconds // 60):02d}:{seconds % 60:09.6f} 0.0] "
+            out.write(clock.encode() + data + b"\n")
+    fitted = {}
+    for name, source in (("log", LOG), ("traffic", tmp_path / "traffic")):
+        made = tmp_path / f"{name}.toml"
+        assert run(["machine", "fit", str(source), "--base", "unitom_xl", "--out", str(made)]) == 0
+        fitted[name] = parse_machine(made.read_text("utf-8"), str(made))
+    log, traffic = fitted["log"], fitted["traffic"]
+    for name in ("tra_obj", "mag_det", "rot_obj"):
+        assert traffic.axes[name].lower == log.axes[name].lower
+        assert traffic.axes[name].max_speed == log.axes[name].max_speed
+    assert traffic.timing.xray_ready_s == pytest.approx(log.timing.xray_ready_s, abs=0.002)
+    assert traffic.timing.move_s == pytest.approx(log.timing.move_s, abs=0.002)
+
+
+def test_a_log_of_the_public_monitor_is_heard(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its form: seconds without parts, past midnight; its times are no finer than that."""
+    offset = json.dumps(
+        {"component": "tra_obj", "command": "move absolute", "arg1": "50", "UUID": "0a-1",
+         "reply type": "SENT", "tick count": 1767600381331}
+    )  # fmt: skip
+    ended = offset.replace("SENT", "ACK").replace('"UUID"', '"reply": "50.4", "UUID"')
+    lines = f"[23:59:58] {offset}\n[23:59:59] hello\n[00:00:00] {ended}\n"
+    (tmp_path / "zmq_monitor.log").write_text(lines)
+    assert run(["follow", "--replay", str(tmp_path / "zmq_monitor.log"), "--json"]) == 0
+    told = capsys.readouterr()
+    document = json.loads(told.out)
+    assert [a["kind"] for a in document["alarms"]] == ["offset"]
+    assert document["axes"]["tra_obj"]["position"] == 50.4
+    assert document["unread"] == 1
+    assert "hello" in document["unread_example"]
+    assert "1 messages in no known form" in told.err
+    assert run(["follow", "--replay", str(EXAMPLE)]) != 0
+    assert run(["follow", "tcp://x", "--replay", str(EXAMPLE)]) == 2
+
+
+def test_a_follower_that_is_busy_for_seconds_finds_a_healthy_machine_healthy() -> None:
+    """Its loop stands still while a motor moves and tells of it: times are those of arrival."""
+    made, alarms = session()
+    axis = FLEXRAY.axes["mag_obj"]
+    moved = Motor("mag_obj", axis.home, axis.home - 100.0, axis.speed, axis.acceleration)
+
+    def scanner(out: zmq.Socket[bytes]) -> None:
+        began = time.monotonic()
+        for at, data in moved.messages(1, 0.0):
+            time.sleep(max(0.0, began + at - time.monotonic()))
+            out.send(data)
+
+    async def work() -> None:
+        with zmq.Context() as context, context.socket(zmq.XPUB) as out:
+            out.linger = 0
+            port = out.bind_to_random_port("tcp://127.0.0.1")
+            task = asyncio.create_task(made.run(f"tcp://127.0.0.1:{port}"))
+            assert await asyncio.to_thread(out.recv) == b"\x01"
+            sending = asyncio.create_task(asyncio.to_thread(scanner, out))
+            await asyncio.sleep(0.4)
+            time.sleep(1.2)
+            await sending
+            await until(lambda: made.mirror.positions["mag_obj"] == moved.target)
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+    asyncio.run(work())
+    assert alarms == []
 
 
 @pytest.mark.slow

@@ -4,7 +4,12 @@ Every function returns another `Mirror`; sockets, files and clocks belong to who
 is predicted when it is heard, from the machine as it is known at that moment, by the simulation
 that plans scripts. A reading of a moving motor is compared with the predicted path as a delay: when
 the path passes that position, and how long ago. A motor that starts late has a constant delay, one
-that is slow a growing one, whatever the machine's overhead.
+that is slow a growing one, whatever the machine's overhead. What may have come before it was read
+counts as early or as late as is better for the machine.
+
+Servers differ in what they tell. Replies belong to commands by their UUID; what comes twice, or
+after the end, changes nothing; an end that a server never tells, and feedback that it never gives,
+are missed once.
 """
 
 from __future__ import annotations
@@ -39,6 +44,9 @@ SILENT_S: Final = 2.5
 """The interface's rules ask for one message a second of a command that lasts."""
 FORGET_S: Final = 60.0
 """A command that has said nothing for so long, and beyond its range, has no end any more."""
+WIDER: Final = 3.0
+"""By how many widths of a 90 % range a time lies beyond it that is worth telling: a good machine's
+lies there less than once a day, for a normal or log-normal spread of up to 50 %."""
 _OF_A_MOVE: Final = ("limit", "limit_near", "slow", "fast", "off_path", "offset", "moved")
 """What was told of an axis's last move is told anew of its next."""
 _OF_ONE_COMMAND: Final = {
@@ -86,32 +94,41 @@ class Follower:
         """
         mirror = replace(mirror, heard_s=now, lines=(), connected=True)
         mirror = mirror.cleared("link")
-        if heard.key in mirror.waiting:
-            told = replace(mirror.waiting[heard.key], told_s=now)
-            mirror = replace(mirror, waiting={**mirror.waiting, heard.key: told})
-            mirror = mirror.cleared(heard.words[0], "silent")
-        match heard.what:
-            case "SEND":
-                return self._sent(mirror, heard, now)
-            case "FDB":
-                return self._read(mirror, heard, now)
-            case "ACK" | "ERR":
-                return self._ended(mirror, heard, now)
-        return mirror
+        if heard.what == "SEND":
+            return self._sent(mirror, heard, now)
+        waiting = mirror.asked(heard)
+        if waiting is None and any(map(heard.may_answer, mirror.ended)):  # doubled, or late
+            return mirror
+        if waiting is not None:
+            about = waiting.heard.words[0]
+            if ("silent", about) in mirror.active and now - waiting.told_s > SILENT_S:
+                mirror = replace(mirror, speaks=False)
+            mirror = mirror.with_waiting(waiting, told_s=now).cleared(about, "silent")
+        if heard.what == "FDB":
+            mirror = replace(mirror, speaks=mirror.speaks is not False)
+            return self._read(mirror, heard, waiting, now)
+        return mirror if heard.what == "RCV" else self._ended(mirror, heard, waiting, now)
 
     def tick(self, mirror: Mirror, now: float) -> Mirror:
         """The machine after time has passed without a message: what is overdue is told."""
-        for key, waiting in mirror.waiting.items():
-            took, quiet = now - waiting.sent_s, now - waiting.told_s
-            if waiting.predicted_s is not None and took > waiting.p95_s + SLACK_S:
+        mirror = self._over(mirror, "", now) if mirror.ends is False else mirror
+        for waiting in mirror.waiting.values():
+            took, quiet, about = now - waiting.sent_s, now - waiting.told_s, waiting.heard.words[0]
+            expected = waiting.predicted_s is not None and not waiting.superseded
+            overdue = took > waiting.most_s + SLACK_S
+            if expected and overdue and mirror.ends is not False:
                 mirror = self._outside(mirror, waiting, took, now)
-            if quiet > SILENT_S and waiting.predicted_s is not None:
+                mirror = replace(mirror, ends=mirror.ends or False)
+            if expected and not overdue and quiet > SILENT_S and mirror.speaks is not False:
                 what = f"{waiting.heard.text!r} is under way and has said nothing for {quiet:.1f} s"
-                about = waiting.heard.words[0]
                 mirror = _alarm(mirror, now, "warning", "silent", about, what)
-            if quiet > max(FORGET_S, waiting.p95_s):
-                left = {k: w for k, w in mirror.waiting.items() if k != key}
-                mirror = self._rests(replace(mirror, waiting=left), waiting)
+                mirror = replace(mirror, speaks=mirror.speaks or False)
+            if quiet > max(FORGET_S, waiting.most_s):
+                mirror = _rests(mirror.finished(waiting.heard), waiting)
+        for name, axis in mirror.axes.items() if mirror.ends is False else ():
+            told, path = axis.heard_s or 0.0, axis.path
+            if path is not None and path.end < told < now - axis.delay_s - SLACK_S:
+                mirror = self._arrival(mirror, name, axis.position, path.target, now)
         if mirror.due_s is not None and now > mirror.due_s + SLACK_S:
             what = (
                 f"the script is late: {self._next(mirror)} was due {now - mirror.due_s:.1f} s ago"
@@ -123,7 +140,7 @@ class Follower:
         """The machine after the link has come up or gone down, which forgets commands under way."""
         if connected:
             return replace(mirror.cleared("link"), connected=True)
-        axes = {n: replace(a, path=None, behind_s=None) for n, a in mirror.axes.items()}
+        axes = {n: a.at_rest for n, a in mirror.axes.items()}
         mirror = replace(mirror, connected=False, waiting={}, axes=axes, due_s=None)
         what = f"the link is lost: {why}; positions are those heard last"
         return _alarm(mirror, now, "error", "lost", "link", what)
@@ -174,23 +191,35 @@ class Follower:
     # -- commands ----------------------------------------------------------------------------
 
     def _sent(self, mirror: Mirror, heard: Heard, now: float) -> Mirror:
-        if heard.key in mirror.waiting:
+        again = (i for i in mirror.waiting if (i[0], i[2]) == (heard.key, heard.words))
+        if any(again) or (heard.named and heard.identity in mirror.ended):
             return mirror
+        ends = [(i[0], i[2][:2]) for i, unheard in mirror.ended.items() if unheard]
+        if heard.named and (heard.key, heard.words[:2]) in ends:  # its end was heard before it
+            return _after(mirror.finished(heard), heard.command, self.machine, now)
         if not heard.asks:
-            mirror = _flushed(mirror, now)
+            mirror = self._over(_flushed(mirror, now), heard.words[0], now)
         name, asked = heard.words[:2]
         if not (name in FIXED or self.machine.has(name)) and find(name, asked) is not None:
             what = f"{heard.text!r} is not followed: {unknown_axis(name, self.machine).message}"
             mirror = _alarm(mirror, now, "error", "unknown_axis", name, what)
         if asked.lower() == "stop":
-            axes = {n: replace(a, path=None, behind_s=None) for n, a in mirror.axes.items()}
-            mirror = replace(mirror, axes=axes)
+            mirror = replace(mirror, axes={n: a.at_rest for n, a in mirror.axes.items()})
         waiting = Waiting(heard, now, now)
         if heard.command is not None:
             mirror = self._on_script(mirror, heard.command, now)
             mirror, waiting = self._predicted(mirror, waiting, heard.command, now)
         kept = dict(list(mirror.waiting.items())[1 - MOST_WAITING :])
-        return replace(mirror, waiting={**kept, heard.key: waiting})
+        return replace(mirror, waiting={**kept, heard.identity: waiting})
+
+    def _over(self, mirror: Mirror, component: str, now: float) -> Mirror:
+        """The commands of a component, or of all, whose time is over have ended, told or not."""
+        for waiting in mirror.waiting.values():
+            over = now + waiting.heard.late_s - waiting.sent_s > (waiting.predicted_s or 0.0)
+            if over and not waiting.superseded and component in ("", waiting.heard.words[0]):
+                mirror = _after(mirror, waiting.heard.command, self.machine, now)
+                mirror = mirror.with_waiting(waiting, superseded=True)
+        return mirror
 
     def _predicted(
         self, mirror: Mirror, waiting: Waiting, command: c.Command, now: float
@@ -198,11 +227,14 @@ class Follower:
         """The prediction of one command, from the machine as it is now."""
         if isinstance(command, c.MoveAbsolute):
             command = replace(command, trigger=None)
-        sim = Simulation(self.machine, mirror.start)
+        paths = {n: a.path for n, a in mirror.axes.items() if a.path is not None}
+        moving = {n: p for n, p in paths.items() if p.end - mirror.axes[n].begun_s > now}
+        arrived = {n: p.target for n, p in paths.items() if n not in moving}
+        start = replace(mirror.start, positions={**mirror.positions, **arrived})
+        sim = Simulation(self.machine, start)
         sim.now, sim.tube.ready_at = now, mirror.ready_s
-        for name, axis in mirror.axes.items():
-            if axis.path is not None and axis.path.end > now:
-                sim.motors.all[name].moves.append((axis.path.start, axis.path))
+        for name, path in moving.items():
+            sim.motors.all[name].moves.append((path.start, path))
         sim.run((replace(command, wait=c.Wait.ACK),))
         step = sim.steps[0]
         moved = tuple(n for n, m in sim.motors.all.items() if m.moves and m.moves[-1][0] == now)
@@ -213,21 +245,20 @@ class Follower:
             if p.code in _OF_ONE_COMMAND and not (mirror.xrays_on is None and "xray" in p.code):
                 kind = _OF_ONE_COMMAND[p.code]
                 mirror = _alarm(mirror, now, "error", kind, about, p.message)
+        low, high = _bounds(step, self.machine)
+        delay = max(0.0, high - step.computed_s)
         for name in moved:
             path = sim.motors.all[name].moves[-1][1]
-            mirror = mirror.with_axis(name, path=path, target=path.target, behind_s=None)
+            rests = mirror.axes[name].at_rest
+            rests = replace(rests, begun_s=waiting.heard.late_s, delay_s=delay)
+            axis = replace(rests, path=path, target=path.target, mover=waiting.heard.identity)
+            mirror = replace(mirror, axes={**mirror.axes, name: axis})
             mirror = self._near_limit(mirror, name, path.target, now)
-        low, high = _range(step, self.machine)
         known = waiting.heard.words[0] in (*self.machine.axes, *self.machine.virtual_axes)
-        moving = isinstance(command, c.MoveAbsolute) and known
-        motors = tuple(self.machine.moves(about)) if moving else ()
+        motors = self.machine.moves(about) if isinstance(command, c.MoveAbsolute) and known else ()
+        targets = {n: mirror.axes[n].target for n in motors}
         return mirror, replace(
-            waiting,
-            predicted_s=step.holds_s,
-            p5_s=low,
-            p95_s=high,
-            motors=motors,
-            delay_s=max(0.0, high - step.computed_s),
+            waiting, predicted_s=step.holds_s, least_s=low, most_s=high, targets=targets
         )
 
     def _near_limit(self, mirror: Mirror, name: str, target: float, now: float) -> Mirror:
@@ -250,7 +281,8 @@ class Follower:
             steps = self._steps[: at + 1]
             holds = sum(s.holds_s for s in steps)
             found = total_range(steps, holds, self.machine.timing)
-            high = sum(_range(s, self.machine)[1] for s in steps) if found is None else found[1]
+            bounds = [_bounds(s, self.machine) for s in steps] if found is None else [_wider(found)]
+            high = sum(b[1] for b in bounds)
             due = began + high if at + 1 < len(lines) else None
             mirror = mirror.cleared("script")
             return replace(mirror, next_line=at + 1, began_s=began, due_s=due)
@@ -278,66 +310,71 @@ class Follower:
 
     # -- replies -----------------------------------------------------------------------------
 
-    def _ended(self, mirror: Mirror, heard: Heard, now: float) -> Mirror:
-        waiting = mirror.waiting.get(heard.key)
-        left = {k: w for k, w in mirror.waiting.items() if k != heard.key}
-        mirror = replace(mirror, waiting=left)
+    def _ended(self, mirror: Mirror, heard: Heard, waiting: Waiting | None, now: float) -> Mirror:
+        command = heard if waiting is None else waiting.heard
+        unheard = waiting is None and heard.what == "ACK"
+        mirror = replace(mirror.finished(command, unheard), ends=True)
         if heard.what == "ERR":
             mirror = _alarm(
                 mirror, now, "error", "failed", heard.words[0],
                 f"{heard.text}: the machine says {heard.reply[:200]!r}",
             )  # fmt: skip
-            return self._rests(mirror, waiting)
+            return _rests(mirror, waiting)
         mirror = mirror.cleared(heard.words[0], "failed")
         if waiting is None:
-            return self._read(mirror, heard, now)
+            mirror = _after(mirror, heard.command, self.machine, now)
+            return self._read(mirror, heard, None, now)
         took = now - waiting.sent_s
         trigger = getattr(waiting.heard.command, "trigger", None)
         passed = trigger is not None and heard.reply.startswith("POS")
         lines = _line(waiting, "POS" if passed else "ACK", took, heard.reply)
         mirror = replace(mirror, lines=lines)
-        if passed:  # the motor goes on, and nothing tells when it arrives
-            return mirror
-        if waiting.predicted_s is not None:
-            if not waiting.p5_s - SLACK_S <= took <= waiting.p95_s + SLACK_S:
+        if passed:  # the motor goes on, and its reply at the end may come or not
+            return mirror.with_waiting(waiting, superseded=True, written=True)
+        if waiting.predicted_s is not None and not waiting.superseded:
+            least, most = took - heard.late_s, took + waiting.heard.late_s
+            if most < waiting.least_s - SLACK_S or least > waiting.most_s + SLACK_S:
                 mirror = self._outside(mirror, waiting, took, now)
             else:
                 mirror = mirror.cleared(waiting.heard.words[0], "range")
-        if waiting.motors:
+        if waiting.targets:
             return self._arrived(mirror, waiting, heard, now)
-        if waiting.heard.asks:
-            return self._read(mirror, replace(heard, asks=waiting.heard.asks), now)
+        if waiting.heard.asks or waiting.superseded:
+            return self._read(mirror, heard, waiting, now)
         return _after(mirror, waiting.heard.command, self.machine, now)
 
     def _arrived(self, mirror: Mirror, waiting: Waiting, heard: Heard, now: float) -> Mirror:
         """A move has ended: where, and with which limits, as its reply says."""
-        axis = heard.words[0]
+        axis = waiting.heard.words[0]
         motor = motor_reply(_bytes(heard.reply))
         at = motor.position if motor is not None else _number(heard.reply)
-        mirror = self._rests(mirror, waiting)
-        for name in waiting.motors:
-            mirror = mirror.with_axis(name, position=mirror.axes[name].target, heard_s=now)
+        own = [n for n in waiting.targets if _stays(mirror, n, waiting)]
+        mirror = _rests(mirror, waiting)
+        for name in own:
+            mirror = mirror.with_axis(name, position=waiting.targets[name], heard_s=now)
         if at is None:
             return mirror
         name, there = self._motor(axis, at)
-        unit, meant = self.machine.axes[name].unit, mirror.axes[name].target
-        if abs(there - meant) > AT_TARGET:
-            what = f"{name} stands at {there:.6g} {unit} after a move to {meant:.6g}"
-            mirror = _alarm(mirror, now, "error", "offset", name, what)
-        mirror = mirror.with_axis(name, position=there)
+        mirror = self._arrival(mirror, name, there, waiting.targets[name], now)
+        mirror = mirror.with_axis(name, position=there) if name in own else mirror
         return mirror if motor is None else self._compared(mirror, name, motor, now)
+
+    def _arrival(self, mirror: Mirror, name: str, there: float, meant: float, now: float) -> Mirror:
+        """Where a motor stands beside where its move led."""
+        if abs(there - meant) <= AT_TARGET:
+            return mirror
+        unit = self.machine.axes[name].unit
+        what = f"{name} stands at {there:.6g} {unit} after a move to {meant:.6g}"
+        return _alarm(mirror, now, "error", "offset", name, what)
 
     def _compared(self, mirror: Mirror, name: str, motor: MotorReply, now: float) -> Mirror:
         """Limits and rates of a motor's own reply beside those of the machine file."""
         axis = self.machine.axes[name]
         for what, theirs, ours in (
             ("limits", (motor.lower, motor.upper), (axis.lower, axis.upper)),
-            (
-                "rates",
-                (motor.max_speed, motor.max_acceleration),
-                (axis.max_speed, axis.max_acceleration),
-            ),
-        ):
+            ("rates", (motor.max_speed, motor.max_acceleration),
+             (axis.max_speed, axis.max_acceleration)),
+        ):  # fmt: skip
             if any(abs(a - b) > 1e-6 * (1.0 + abs(b)) for a, b in zip(theirs, ours, strict=True)):
                 text = (
                     f"{name}: the motor's own {what} are {theirs[0]:g} and {theirs[1]:g}, machine "
@@ -346,49 +383,52 @@ class Follower:
                 mirror = _alarm(mirror, now, "error", what, name, text)
         return mirror.with_axis(name, speed=motor.speed, acceleration=motor.acceleration)
 
-    def _rests(self, mirror: Mirror, waiting: Waiting | None) -> Mirror:
-        for name in () if waiting is None else waiting.motors:
-            mirror = mirror.with_axis(name, path=None, behind_s=None)
-        return mirror
-
-    def _read(self, mirror: Mirror, heard: Heard, now: float) -> Mirror:
+    def _read(self, mirror: Mirror, heard: Heard, waiting: Waiting | None, now: float) -> Mirror:
         """Feedback, or the answer to a question: a motor's position is compared with its path."""
-        waiting = mirror.waiting.get(heard.key)
         asks = heard.asks or (waiting.heard.asks if waiting is not None else "")
         axis, motor = heard.words[0], motor_reply(_bytes(heard.reply))
         at = motor.position if motor is not None else _number(heard.reply)
-        moves = waiting is not None and bool(waiting.motors)
+        moves = waiting is not None and bool(waiting.targets)
         known = self.machine.has(axis) and (moves or asks == "position" or motor is not None)
         if at is None or not known:
             return mirror
         name, x = self._motor(axis, at)
+        if waiting is not None and moves and not _stays(mirror, name, waiting):
+            return mirror
+        mirror = mirror if motor is None else self._compared(mirror, name, motor, now)
         seen, path = mirror.axes[name], mirror.axes[name].path
-        mirror = mirror.with_axis(name, position=x, heard_s=now)
         unit = self.machine.axes[name].unit
         if path is None:
-            if seen.heard_s is not None and abs(x - seen.position) > AT_TARGET:
-                what = (
-                    f"{name} stands at {x:.6g} {unit}, not at {seen.position:.6g}, and no move of "
-                    "it was heard"
-                )
+            mirror = mirror.with_axis(name, position=x, target=x, heard_s=now)
+            moved = waiting is None and heard.words[1].startswith("move")
+            if seen.heard_s is not None and abs(x - seen.position) > AT_TARGET and not moved:
+                stood = f"not at {seen.position:.6g}, and no move of it was heard"
+                what = f"{name} stands at {x:.6g} {unit}, {stood}"
                 mirror = _alarm(mirror, now, "error", "moved", name, what)
-            return mirror.with_axis(name, target=x)
-        if abs(x - path.pieces[0].position) <= AT_TARGET or abs(x - path.target) <= AT_TARGET:
             return mirror
-        passes = path.time_at(x)
+        arrived = abs(x - path.target) <= AT_TARGET
+        passes = path.end if arrived else path.time_at(x)
+        here = mirror.with_axis(name, position=x, heard_s=now)
+        if moves and passes is not None and passes < seen.passed_s:  # old, if not the last
+            last = mirror.ends is False and now > path.end > seen.passed_s
+            return here if last else mirror
+        if moves and passes == seen.passed_s and now - (seen.heard_s or now) < SILENT_S:
+            return mirror  # that one once more
+        if arrived or abs(x - path.pieces[0].position) <= AT_TARGET:
+            return here if passes is None else here.with_axis(name, passed_s=passes)
         if passes is None:
             what = f"{name} is at {x:.6g} {unit}, on no way to {path.target:.6g}"
-            return _alarm(mirror, now, "error", "off_path", name, what)
-        behind = now - passes
-        longest = waiting.delay_s if waiting is not None else 0.0
-        before = seen.behind_s
-        if behind > longest + SLACK_S or (before is not None and behind - before > DRIFT_S):
-            what = f"{name} is slow: {behind:.2f} s behind the predicted path at {x:.6g} {unit}"
-            mirror = _alarm(mirror, now, "error", "slow", name, what)
-        elif behind < -SLACK_S or (before is not None and before - behind > DRIFT_S):
-            what = f"{name} is fast: {-behind:.2f} s ahead of the predicted path at {x:.6g} {unit}"
-            mirror = _alarm(mirror, now, "error", "fast", name, what)
-        return mirror.with_axis(name, behind_s=behind if before is None else before)
+            return _alarm(here, now, "error", "off_path", name, what)
+        least, most = now - heard.late_s - passes, now - passes
+        first = seen.behind_s or (least, most)
+        if least > seen.delay_s + SLACK_S or least - first[1] > DRIFT_S:
+            what = f"{name} is slow: {least:.2f} s behind the predicted path at {x:.6g} {unit}"
+            here = _alarm(here, now, "error", "slow", name, what)
+        elif most + seen.begun_s < -SLACK_S or (most < 0.0 and first[0] - most > DRIFT_S):
+            what = f"{name} is fast: {-most:.2f} s ahead of the predicted path at {x:.6g} {unit}"
+            here = _alarm(here, now, "error", "fast", name, what)
+        promptest = min(first, (least, most), key=lambda behind: behind[1])
+        return here.with_axis(name, behind_s=promptest, passed_s=passes)
 
     def _motor(self, axis: str, at: float) -> tuple[str, float]:
         """The motor that a reading is of; of a virtual axis, the one that it is read from."""
@@ -398,11 +438,9 @@ class Follower:
         return virtual.of, (at - virtual.constant) / virtual.factor
 
     def _outside(self, mirror: Mirror, waiting: Waiting, took: float, now: float) -> Mirror:
-        longer = "more" if took > waiting.p95_s else "less"
-        what = (
-            f"{waiting.heard.text} has taken {took:.2f} s, {longer} than its range of "
-            f"{waiting.p5_s:.2f} to {waiting.p95_s:.2f} s"
-        )
+        longer = "more" if took > waiting.most_s else "less"
+        bounds = f"{waiting.least_s:.2f} to {waiting.most_s:.2f} s"
+        what = f"{waiting.heard.text} has taken {took:.2f} s, {longer} than its range of {bounds}"
         return _alarm(mirror, now, "warning", "range", waiting.heard.words[0], what)
 
 
@@ -412,10 +450,31 @@ def _alarm(
     return mirror.alarmed(Alarm(now, severity, kind, about, message))
 
 
-def _range(step: PlanStep, machine: Machine) -> Range:
-    """(5 %, 95 %) of a step; a time that is only assumed may be anything up to twice itself."""
+def _bounds(step: PlanStep, machine: Machine) -> Range:
+    """Between what times a step of a good machine lies, not once a day excepted [s].
+
+    A time that is only assumed may be anything up to twice itself.
+    """
     found = step_range(step, machine.timing)
-    return (step.computed_s, step.holds_s + step.assumed_s) if found is None else found
+    return (step.computed_s, step.holds_s + step.assumed_s) if found is None else _wider(found)
+
+
+def _wider(found: Range) -> Range:
+    more = WIDER * (found[1] - found[0])
+    return max(0.0, found[0] - more), found[1] + more
+
+
+def _rests(mirror: Mirror, waiting: Waiting | None) -> Mirror:
+    """The same with the motors of a move at rest, but for those that another has sent on."""
+    for name in () if waiting is None else waiting.targets:
+        if waiting is not None and _stays(mirror, name, waiting):
+            mirror = replace(mirror, axes={**mirror.axes, name: mirror.axes[name].at_rest})
+    return mirror
+
+
+def _stays(mirror: Mirror, name: str, waiting: Waiting) -> bool:
+    """Whether a motor has got no other move since."""
+    return mirror.axes[name].mover in (None, waiting.heard.identity)
 
 
 def _bare(command: c.Command) -> c.Command:
@@ -428,14 +487,13 @@ def _bare(command: c.Command) -> c.Command:
 
 def _flushed(mirror: Mirror, now: float) -> Mirror:
     """The next command is sent, so whoever sends has not waited for those before it."""
-    for key, waiting in mirror.waiting.items():
+    for waiting in mirror.waiting.values():
         if waiting.written or waiting.heard.asks:
             continue
         trigger = getattr(waiting.heard.command, "trigger", None)
         wait, took = ("no wait", 0.0) if trigger is None else ("POS", now - waiting.sent_s)
         lines = (*mirror.lines, *_line(waiting, wait, took, "command sent"))
-        kept = {**mirror.waiting, key: replace(waiting, written=True)}
-        mirror = replace(mirror, lines=lines, waiting=kept)
+        mirror = replace(mirror, lines=lines).with_waiting(waiting, written=True)
     return mirror
 
 
@@ -471,8 +529,6 @@ def _after(mirror: Mirror, command: c.Command | None, machine: Machine, now: flo
             return replace(mirror, camera=replace(mirror.camera, **command.arguments))
         case c.TubeSetting():
             return replace(mirror, **command.arguments)
-        case c.TakeImage() | c.TakeSequence():
-            return replace(mirror, taken=mirror.taken + 1)
         case c.XrayOn():
             return replace(mirror, xrays_on=True, ready_s=now + machine.timing.xray_ready_s)
         case c.XrayOff():

@@ -7,6 +7,7 @@ was heard.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final, Literal
@@ -21,9 +22,10 @@ from flexdt.twin.script.problems import Severity
 KEPT: Final = 100
 """Alarms that a mirror keeps, the newest; all are counted."""
 MOST_WAITING: Final = 256
-"""Commands of which no end has come; the oldest are forgotten."""
+"""Commands of which no end has come, and of which one has; the oldest are forgotten."""
 
 What = Literal["SEND", "RCV", "FDB", "ACK", "ERR"]
+Identity = tuple[Hashable, int, tuple[str, str, str, str]]
 
 
 @dataclass(frozen=True)
@@ -31,13 +33,15 @@ class Heard:
     """One message of the scanner's interface.
 
     Attributes:
-        key: a command and its replies have the same.
+        key: a command and its replies have the same, and seldom other commands.
         what: SEND is a command, the others reply to one.
         words: component, command, argument 1 and 2, as they came.
         command: the same, typed; None where it is none of a script.
         reply: text of a reply; of a cluster one character for each byte.
         asks: of a question, what its answer is: `position`, `kV`...
         stamp: time of day at which it came, hh:mm:ss.mmm, for the record.
+        tick: the sender's clock, copied into replies by some programs and renewed by others.
+        late_s: by how much earlier it may have come than it was read [s].
     """
 
     key: Hashable
@@ -47,6 +51,23 @@ class Heard:
     reply: str = ""
     asks: str = ""
     stamp: str = "00:00:00.000"
+    tick: int = 0
+    late_s: float = 0.0
+
+    @property
+    def identity(self) -> Identity:
+        """What tells a command from others, and is the same where it is heard twice."""
+        return self.key, self.tick, self.words
+
+    @property
+    def named(self) -> bool:
+        """Whether it has a UUID."""
+        return self.key != " ".join(self.words[:2])
+
+    def may_answer(self, command: Identity) -> bool:
+        """Whether this can be a reply to a command, by its UUID, or else by its words."""
+        same = self.words[2:] in (command[2][2:], ("", ""))
+        return command[0] == self.key and (self.named or same)
 
     @property
     def text(self) -> str:
@@ -86,7 +107,11 @@ class SeenAxis:
         speed, acceleration: in force for moves to come.
         heard_s: when the position was heard; None: never, so it is assumed.
         path: predicted motion, in the listener's time; None at rest.
-        behind_s: by how much the last reading was behind `path`.
+        mover: the command that `path` is of.
+        begun_s: how much earlier than `path` it may have begun [s].
+        delay_s: by how much it may be behind `path`: the most that a move takes beyond its motion.
+        passed_s: the latest moment of `path` that a reading has shown.
+        behind_s: (at least, at most) by how much the promptest reading was behind `path`.
     """
 
     position: float
@@ -95,7 +120,16 @@ class SeenAxis:
     acceleration: float
     heard_s: float | None = None
     path: Trajectory | None = None
-    behind_s: float | None = None
+    mover: Identity | None = None
+    begun_s: float = 0.0
+    delay_s: float = 0.0
+    passed_s: float = -math.inf
+    behind_s: tuple[float, float] | None = None
+
+    @property
+    def at_rest(self) -> SeenAxis:
+        """The same without a path."""
+        return replace(self, path=None, mover=None, passed_s=-math.inf, behind_s=None)
 
 
 @dataclass(frozen=True)
@@ -107,13 +141,14 @@ class Waiting:
     told_s: float
     """When something was last heard of it."""
     predicted_s: float | None = None
-    p5_s: float = 0.0
-    p95_s: float = 0.0
-    delay_s: float = 0.0
-    """By how much a motor may be behind its path: the most that a move takes beyond its motion."""
-    motors: tuple[str, ...] = ()
+    least_s: float = 0.0
+    most_s: float = 0.0
+    targets: Mapping[str, float] = field(default_factory=dict)
+    """Of a move: where it leads its motors."""
     written: bool = False
     """Whether the record has it already."""
+    superseded: bool = False
+    """Whether it counts as over without an end: its time is, and its component goes on."""
 
 
 @dataclass(frozen=True)
@@ -126,6 +161,10 @@ class Mirror:
         xrays_on: None until heard.
         ready_s: when X-rays are predicted to be ready.
         waiting: commands without an end yet, oldest first.
+        ended: commands that have ended, oldest first, and whether only their end was heard.
+        ends: whether commands are told to end; None until one has been heard to, False once one
+            was overdue before.
+        speaks: whether commands that last are told of once a second; False once one was not.
         heard_s: when the last message came.
         connected: whether there is a link.
         alarms: the newest, oldest first; `raised` counts all.
@@ -133,7 +172,6 @@ class Mirror:
         next_line: index of the script's next command; `began_s` when its first was heard, and
             `due_s` by when the next is sent, nine of ten times.
         lines: what the last message adds to the record.
-        taken: images that were taken.
     """
 
     axes: Mapping[str, SeenAxis]
@@ -142,7 +180,10 @@ class Mirror:
     power_W: float
     xrays_on: bool | None = None
     ready_s: float = 0.0
-    waiting: Mapping[Hashable, Waiting] = field(default_factory=dict)
+    waiting: Mapping[Identity, Waiting] = field(default_factory=dict)
+    ended: Mapping[Identity, bool] = field(default_factory=dict)
+    ends: bool | None = None
+    speaks: bool | None = None
     heard_s: float | None = None
     connected: bool = False
     alarms: tuple[Alarm, ...] = ()
@@ -152,7 +193,6 @@ class Mirror:
     began_s: float | None = None
     due_s: float | None = None
     lines: tuple[bytes, ...] = ()
-    taken: int = 0
 
     @classmethod
     def of(cls, machine: Machine) -> Mirror:
@@ -184,6 +224,35 @@ class Mirror:
             self.power_W,
             self.xrays_on,
         )
+
+    def asked(self, reply: Heard) -> Waiting | None:
+        """The waiting command that this is a reply to: the one of its key.
+
+        Of several it is that of the same words, then that of the same tick, then the oldest. Where
+        there is no UUID, the arguments are the same, too, or left out.
+        """
+
+        def alike(asked: Waiting) -> tuple[bool, bool]:
+            return asked.heard.words[:2] == reply.words[:2], asked.heard.tick == reply.tick
+
+        found = (w for i, w in self.waiting.items() if reply.may_answer(i))
+        return max(found, key=alike, default=None)
+
+    def with_waiting(self, asked: Waiting, **changes: object) -> Mirror:
+        """The same with a waiting command changed."""
+        changed = replace(asked, **changes)  # type: ignore[arg-type]
+        return replace(self, waiting={**self.waiting, asked.heard.identity: changed})
+
+    def finished(self, command: Heard, unheard: bool = False) -> Mirror:
+        """The same after the end of a command, which may come again."""
+        left = {i: w for i, w in self.waiting.items() if i != command.identity}
+        kept = dict(list(self.ended.items())[1 - MOST_WAITING :])
+        return replace(self, waiting=left, ended={**kept, command.identity: unheard})
+
+    @property
+    def under_way(self) -> tuple[str, ...]:
+        """Commands that have not ended, as far as is known."""
+        return tuple(w.heard.text for w in self.waiting.values() if not w.superseded)
 
     def age_s(self, now: float) -> float | None:
         """How old the last message is [s]; None where there was none."""
@@ -228,7 +297,7 @@ class Mirror:
             },
             "tube": {"on": self.xrays_on, "kV": self.kV, "power_W": self.power_W},
             "camera": {**self.camera.stated, "roi": list(self.camera.roi.edges)},
-            "waiting": [w.heard.text for w in self.waiting.values()],
+            "waiting": list(self.under_way),
             "next_line": self.next_line,
             "alarms": [
                 {"age_s": ago(a.at_s), "severity": a.severity, "kind": a.kind, "about": a.about,

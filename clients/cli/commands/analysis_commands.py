@@ -145,7 +145,7 @@ def _pair(word: str, what: str, *, whole: bool = False) -> tuple[float, float]:
 
 
 def fit(
-    logs: list[Path] = argument(..., "LOG...", "Logs, oldest first."),
+    logs: list[Path] = argument(..., "LOG...", "Logs, or recordings of follow; oldest first."),
     out: Path = option(..., "Write the machine to this file.", metavar="FILE"),
     base: str = option(
         machines.DEFAULT_MACHINE,
@@ -160,7 +160,7 @@ def fit(
 
     machine = machines.machine(base)
     text = Path(base).read_text("utf-8") if machines.is_file(base) else builtin_machine_text(base)
-    commands = [read_log_file(log) for log in logs]
+    commands = [read_log_file(log, machine) for log in logs]
     names = ", ".join(log.name for log in logs).encode("utf-8", "replace").decode()
     source = f"measured: {names} ({sum(map(len, commands))} lines)"
     found = fit_machine(commands, machine, source)

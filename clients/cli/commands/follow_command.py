@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flexdt import machines
 from flexdt.clients.cli import options
-from flexdt.clients.cli.boundary import REFUSED, USAGE
+from flexdt.clients.cli.boundary import INVALID, REFUSED, USAGE
 from flexdt.clients.cli.console import note, say
 from flexdt.clients.cli.options import Answer, argument, option
 from flexdt.clients.failure import CommandError
@@ -24,27 +24,15 @@ STATUS_S = 5.0
 
 
 def follow(
-    address: str = argument(..., "ADDRESS", "tcp://HOST[:PORT] of its outgoing events."),
+    address: str | None = argument(None, "ADDRESS", "tcp://HOST[:PORT] of its outgoing events."),
     machine: options.MachineName = None,
     profile: options.ProfileName = None,
-    script: Path | None = option(
-        None, "Predict this script, which the scanner will run.", metavar="FILE"
-    ),
+    script: Path | None = option(None, "Predict this script, which will run.", metavar="FILE"),
     sample: str | None = option(None, "Put this phantom on the stage.", metavar="NAME or FILE"),
-    record: Path | None = option(
-        None, "Record the executed script, for flexdt machine fit.", metavar="FILE"
-    ),
-    frames: Path | None = option(
-        None, "Compare the images that appear here; needs --sample.", metavar="DIR"
-    ),
+    record: Path | None = option(None, "Append the raw messages to this file.", metavar="FILE"),
+    replay: Path | None = option(None, "Hear this recording instead of a scanner.", metavar="FILE"),
+    frames: Path | None = option(None, "Compare images that appear here.", metavar="DIR"),
     out: Path = option(Path(), "Write beside.png and beside.json of --frames here.", metavar="DIR"),
-    port: int | None = option(
-        None,
-        "Show the machine to clients on this port, as a twin without control.",
-        metavar="PORT",
-        min=0,
-        max=65535,
-    ),
     seconds: float | None = option(None, "End after this time.", "--for", metavar="S", min=0.0),
     json: bool = False,
 ) -> Answer:
@@ -53,38 +41,60 @@ def follow(
     Nothing is ever sent to the scanner. Ends with Ctrl-C or after --for. Exit code 4 if there was
     no connection.
     """
-    from flexdt.clients.extras import package
+    from flexdt.clients.following.recording import STAMP
+    from flexdt.clients.following.session import FollowSession, FramesBeside
 
-    zmq = package("zmq", "flexdt follow", "gateway")
-    from flexdt.clients.following.session import FollowSession, endpoint
-
-    try:
-        at = endpoint(address)
-    except ValueError as error:
-        raise CommandError(str(error), USAGE) from None
+    if (address is None) == (replay is None):
+        raise CommandError("give either ADDRESS or --replay FILE", USAGE)
     follower = _follower(machine, profile, script, sample)
+    session = FollowSession(follower)
+    session.tell = (lambda alarm: None) if json else partial(_say, session)
+    if replay is not None:
+        recording = replay.read_bytes()
+        if STAMP.match(recording) is None:
+            raise CommandError(f"{replay}: no message [hh:mm:ss] {{...}}", INVALID)
+        session.replay(recording)
+        yield from _told(session, str(replay))
+        return
     beside = None
     if frames is not None:
-        from flexdt.clients.following.session import FramesBeside
         from flexdt.phantoms.samples import as_phantom
 
         if sample is None or not frames.is_dir():
             raise CommandError("--frames needs --sample, and a folder that is there", USAGE)
         beside = (frames, FramesBeside(follower, as_phantom(sample), out))
+    from flexdt.clients.extras import package
+
+    zmq = package("zmq", "flexdt follow", "gateway")
+    from flexdt.clients.following.listening import endpoint
+
+    try:
+        at = endpoint(address or "")
+    except ValueError as error:
+        raise CommandError(str(error), USAGE) from None
     with ExitStack() as files:
-        log = None if record is None else files.enter_context(record.open("ab"))
-        tell = (lambda alarm: None) if json else _say
-        session = FollowSession(follower, tell, log)
+        session.record = None if record is None else files.enter_context(record.open("ab"))
         note(f"following {at}, compared with machine {follower.machine.name}; Ctrl-C ends it")
         try:
             with suppress(KeyboardInterrupt):
-                asyncio.run(_run(session, at, seconds, port, beside))
+                asyncio.run(_run(session, at, seconds, beside))
         except* zmq.ZMQError as group:
             why = "; ".join(map(str, group.exceptions))
             raise CommandError(f"{at}: {why}", REFUSED) from None
-    yield {"address": at, "unread": session.unread, **session.mirror.to_dict(session.clock())}
+    yield from _told(session, at)
     if session.mirror.heard_s is None and not session.mirror.connected:
         raise CommandError(f"{at}: there has been no connection", REFUSED)
+
+
+def _told(session: FollowSession, source: str) -> Answer:
+    note(f"{session.mirror.raised} alarms{_unread(session)}")
+    unread = {"unread": session.unread, "unread_example": session.unread_example}
+    yield {"address": source, **unread, **session.mirror.to_dict(session.clock())}
+
+
+def _unread(session: FollowSession) -> str:
+    found = f"; {session.unread} messages in no known form, the first: {session.unread_example}"
+    return found if session.unread else ""
 
 
 def _follower(
@@ -110,16 +120,8 @@ async def _run(
     session: FollowSession,
     address: str,
     seconds: float | None,
-    port: int | None,
     beside: tuple[Path, FramesBeside] | None,
 ) -> None:
-    if port is not None:
-        from flexdt.clients.following.read_only_twin import ReadOnlyTwin
-
-        twin = ReadOnlyTwin(session.follower, lambda: session.mirror, session.clock, address)
-        server = await twin.serve("127.0.0.1", port)
-        shown = server.sockets[0].getsockname()[1]
-        note(f"shown to clients: flexdt viewer --twin 127.0.0.1:{shown}")
     work = asyncio.create_task(session.run(address))
     more = [asyncio.create_task(_status(session))]
     if beside is not None:
@@ -140,10 +142,10 @@ async def _status(session: FollowSession) -> None:
         age = mirror.age_s(session.clock())
         link = "connected" if mirror.connected else "NOT CONNECTED"
         old = "nothing heard yet" if age is None else f"last message {age:.1f} s ago"
-        under_way = ", ".join(w.heard.text for w in mirror.waiting.values()) or "nothing under way"
-        note(f"{link}, {old}; {under_way}; {mirror.raised} alarms")
+        under_way = ", ".join(mirror.under_way) or "nothing under way"
+        note(f"{link}, {old}; {under_way}; {mirror.raised} alarms{_unread(session)}")
 
 
-def _say(alarm: Alarm) -> None:
-    at = time.strftime("%H:%M:%S")
+def _say(session: FollowSession, alarm: Alarm) -> None:
+    at = session.time_of_day(alarm.at_s)[:8]
     say(f"{at} {alarm.severity} {alarm.kind} ({alarm.about}): {alarm.message}")

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from flexdt.clients.client.client import TwinClient
     from flexdt.clients.expose import Forecast, Measured, Transmission
     from flexdt.protocol.state_model import JobStatus
+    from flexdt.twin.machine.description import Machine
     from flexdt.twin.script import CheckReport, ScriptProblem
     from flexdt.twin.script.executed_log import Executed
 
@@ -103,13 +104,14 @@ def compare(script: Path, log: Path, machine: str | None, html: Path | None) -> 
     from flexdt.twin.script.planning.dry_run_report import against_html, against_summary
     from flexdt.twin.script.planning.log_fit import LogComparison, first_difference
 
-    lines = read_log_file(log)
+    known = machines.machine(machine)
+    lines = read_log_file(log, known)
     data = script.read_bytes()
     if not is_log(data):
         different = first_difference(parse_script(data).commands, lines)
         if different is not None:
             raise CommandError(f"{script}: {different}; {log} is not a log of it", INVALID)
-    found = LogComparison.of(lines, machines.machine(machine))
+    found = LogComparison.of(lines, known)
     tell(found.problems, str(log))
     if html is not None:
         html.write_text(against_html(found, script.name), encoding="utf-8")
@@ -118,16 +120,23 @@ def compare(script: Path, log: Path, machine: str | None, html: Path | None) -> 
     yield table([(f"{label}:", value) for label, value in against_summary(found)])
 
 
-def read_log_file(log: Path) -> tuple[Executed, ...]:
-    """The lines of an executed script; what is worth knowing about them goes to standard error.
+def read_log_file(log: Path, machine: Machine) -> tuple[Executed, ...]:
+    """The lines of an executed script, or of one in a recording of `flexdt follow`.
+
+    What is worth knowing about them goes to standard error.
 
     Raises:
         CommandError: it is no log, or a line of it does not hold.
     """
+    from flexdt.clients.following.recording import STAMP
     from flexdt.twin.script.executed_log import COLUMNS, read_log
     from flexdt.twin.script.lexer import is_log
 
     data = log.read_bytes()
+    if STAMP.match(data):
+        from flexdt.clients.following.session import executed_script
+
+        data = executed_script(data, machine)
     if not is_log(data):
         raise CommandError(f"{log}: no line of an executed script in it; {COLUMNS}", INVALID)
     lines, problems = read_log(data)
