@@ -389,7 +389,7 @@ def test_a_slow_projector_holds_the_clock_and_not_the_scan() -> None:
 
         lab.before = before
         await lab.runner.run()
-        assert len(lab.made) == 61
+        assert len(lab.made) == 62
         assert max(waiting) == 4
         factor = lab.clock.real_time_factor
         assert factor is None or factor < 1e5

@@ -27,6 +27,7 @@ from flexdt.twin.geometry.conventions import (
 )
 from flexdt.twin.machine.camera import CameraSettings, Roi, check_roi
 from flexdt.twin.machine.description import Axis, Machine, Profile, check_target
+from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.script.planning.smooth_scan import MARGIN_IMAGES, run_up
 
 Kind = Literal["fly", "step", "tiled", "helical", "calibration"]
@@ -34,6 +35,9 @@ Kind = Literal["fly", "step", "tiled", "helical", "calibration"]
 KINDS: Final[tuple[Kind, ...]] = ("fly", "step", "tiled", "helical", "calibration")
 FREE_MM: Final = 60.0
 """How far beyond the field of view the sample goes for the flat field (assumed: any sample)."""
+
+REFERENCES: Final = 10
+"""Images averaged for a dark and a flat: their noise is then little beside a projection's."""
 
 MAX_FRAMES: Final = 100_000
 _ROUNDED_MM: Final = 1e-4
@@ -86,8 +90,8 @@ class ScanRequest:
     roi: Roi | None = None
     kV: float | None = None
     power_W: float | None = None
-    darks: int = 10
-    flats: int = 10
+    darks: int = REFERENCES
+    flats: int = REFERENCES
     folder: str = "E:\\flexdt\\scan"
 
 
@@ -257,6 +261,57 @@ class _Places:
                     "needs",
                     {"asked": what, "missing": quantity},
                 )
+
+    @property
+    def aside(self) -> tuple[str, ...]:
+        """The quantity by which the sample leaves the beam."""
+        return tuple(q for q in ("object_x", "object_z") if q in self.drivers)[:1]
+
+
+def beside_beam(
+    machine: Machine,
+    profile: Profile,
+    camera: CameraSettings,
+    positions: Mapping[str, float],
+    radius_mm: float = 0.0,
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Where the sample's stage goes from `positions` so that the beam is free, as far as it can.
+
+    Args:
+        machine: whose motors these are.
+        profile: zero offsets.
+        camera: decides how wide the beam is that reaches the image.
+        positions: motors [mm, deg]; those left out stand at home.
+        radius_mm: of the sample, if known.
+
+    Returns:
+        Motor -> target, to either side of the beam, the freer one first.
+
+    Raises:
+        LimitError: no motor takes the sample out of the beam.
+    """
+    places = _Places(machine, profile)
+    if not places.aside:
+        raise LimitError(
+            f"{machine.name} has no motor that takes the sample out of the beam, so no flat image "
+            "can be taken",
+            {"asked": "a flat field", "missing": ["object_x", "object_z"]},
+        )
+    [quantity] = places.aside
+    name = places.drivers[quantity]
+    axis, factor = machine.axis(name), machine.geometry[quantity][name]
+    p = motor_poses(machine, profile, camera, positions)
+    k = 0 if quantity == "object_x" else 1
+    beam, sample = (p.detector - p.source)[0], (p.axis - p.source)[0]
+    share = float(sample[1] / beam[1])
+    off = float((share * beam - sample)[2 * k])
+    middle = positions.get(name, axis.home) + off / factor
+    size = camera.shape[1 - k] * camera.pixels_mm(machine.detector.pixels)[k]
+    away = (abs(share) * size / 2 + FREE_MM + radius_mm) / abs(factor)
+    upper = {name: round(min(max(middle + away, axis.lower), axis.upper), 6)}
+    lower = {name: round(min(max(middle - away, axis.lower), axis.upper), 6)}
+    freer = middle - axis.lower > axis.upper - middle
+    return (lower, upper) if freer else (upper, lower)
 
 
 @dataclass(frozen=True)
@@ -497,33 +552,10 @@ class _Writer(_Places):
             )
         return {name: check_target(self.machine, name, value) for name, value in found.items()}
 
-    @property
-    def aside(self) -> tuple[str, ...]:
-        """The quantity by which the sample leaves the beam."""
-        return tuple(q for q in ("object_x", "object_z") if q in self.drivers)[:1]
-
     def out_of_beam(self) -> dict[str, float]:
         """Where the stage goes for the flat field: as far as the beam asks, to the freer side."""
-        w, camera = self.request, self.camera
-        if not self.aside:
-            raise LimitError(
-                f"{self.machine.name} has no motor that takes the sample out of the beam, so a "
-                "script cannot take its flat field",
-                {"asked": "a flat field", "missing": ["object_x", "object_z"]},
-            )
-        [quantity] = self.aside
-        name = self.drivers[quantity]
-        axis, factor = self.machine.axis(name), self.machine.geometry[quantity][name]
-        centre = self.station(w.sod_mm)[name]
-        across = quantity == "object_x"
-        size = camera.shape[1 if across else 0]
-        pixel = camera.pixels_mm(self.machine.detector.pixels)[0 if across else 1]
-        away = size * pixel * w.sod_mm / w.sdd_mm / 2 + FREE_MM
-        room = max(centre - axis.lower, axis.upper - centre) * abs(factor)
-        sign = -1.0 if (centre - axis.lower > axis.upper - centre) == (factor > 0.0) else 1.0
-        step = sign * min(away, room)
-        lateral, lift = (step, 0.0) if across else (0.0, step)
-        return {name: self.station(w.sod_mm, lateral, 0.0, lift)[name]}
+        station = self.station(self.request.sod_mm)
+        return beside_beam(self.machine, self.profile, self.camera, station)[0]
 
     def image(self, file: str, averages: int) -> Iterator[str]:
         yield _row("camera", "set number of averages", str(averages))
