@@ -453,6 +453,8 @@ def predict_exposure(
     filter: str = "",
     exposure_ms: float | None = None,
     averages: int | None = None,
+    mode: str | None = None,
+    roi: tuple[int, int, int, int] | None = None,
     frames: int = 361,
     sod_mm: float | None = None,
     sdd_mm: float | None = None,
@@ -462,7 +464,7 @@ def predict_exposure(
 
     Args:
         sample: a shipped phantom or an upload; default: the one on the stage.
-        kV, power_W, exposure_ms, averages: default: as they are set.
+        kV, power_W, exposure_ms, averages, mode, roi: default: as they are set.
         filter: MATERIAL:MM beside the machine's own.
         frames: of the scan.
         sod_mm, sdd_mm: distances; default: the present ones.
@@ -479,7 +481,7 @@ def predict_exposure(
     return ask(
         images.EXPOSURE_PREDICT, sample=sample, kV=kV, power_W=power_W,
         filter=filter, exposure_ms=exposure_ms, averages=averages, frames=frames, detail=detail,
-        sod_mm=sod_mm, sdd_mm=sdd_mm,
+        mode=mode, roi=None if roi is None else list(roi), sod_mm=sod_mm, sdd_mm=sdd_mm,
     )  # fmt: skip
 
 

@@ -466,7 +466,7 @@ def test_the_beam_at_home_goes_through_the_middle_of_the_sample() -> None:
             r"axes.tilt: must be in .geometry. with what it moves; .*stages that tilt",
         ),
         ('without = ["nix"]', "without: must be axes and components of xyzr_cabinet: X, Y, Z, R"),
-        ('[detector]\nmode = "fast"', "mode 'fast' is not known; allowed: 1x1, 2x2, 4x4, HWaSWb"),
+        ('[detector]\nmode = "fast"', "mode: must be 1x1, 2x2, 4x4, HWaSWb"),
     ],
 )
 def test_what_stays_outside_is_refused_in_words(text: str, said: str) -> None:

@@ -13,6 +13,7 @@ import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from importlib import resources
+from itertools import product
 from typing import Annotated, Any, Final, Literal, TypeVar
 
 from pydantic import (
@@ -28,7 +29,15 @@ from pydantic_core import PydanticCustomError
 
 from flexdt.twin.errors import LimitError, MachineFileError, TwinError, UnknownNameError
 from flexdt.twin.geometry.offsets import NAMES
-from flexdt.twin.machine.camera import CameraSettings, PixelGrid, Roi, binning_of, check_roi
+from flexdt.twin.machine.camera import (
+    CameraSettings,
+    PixelGrid,
+    Roi,
+    binning_of,
+    check_roi,
+    no_mode,
+    without_number,
+)
 from flexdt.twin.values import message_of
 
 Positive = Annotated[float, Field(gt=0, le=1e6)]
@@ -43,6 +52,7 @@ def _one_word(name: str) -> str:
 
 Name = Annotated[str, AfterValidator(_one_word)]
 """Scripts separate their columns by tabs, and people theirs by spaces."""
+Binning = Annotated[int, Field(ge=1, le=64)]
 Factor = Annotated[float, Field(ge=-1e6, le=1e6)]
 Pace = Annotated[float, Field(ge=1e-6, le=1e6)]
 Vector3 = tuple[Length, Length, Length]
@@ -148,8 +158,14 @@ class DetectorSpec(_Frozen):
     """From row to row; None: the same."""
     bits: int = Field(ge=8, le=16)
     """Images are 16 bit files, so a deeper converter has no place to go."""
-    modes: dict[str, Annotated[int, Field(ge=1, le=64)]] = Field(default_factory=dict)
+    modes: dict[str, Binning] = Field(default_factory=dict)
     """Binning of the camera modes whose names are not HWaSWb{High,Low}."""
+    hardware_binning: tuple[Binning, ...] = (1, 2, 4)
+    """Factors a of the modes HWaSWb{High,Low}; the default is the Dexela 1512NDT's (data sheet)."""
+    software_binning: tuple[Binning, ...] = (1, 2, 4)
+    """Factors b (default assumed)."""
+    gains: tuple[Literal["High", "Low"], ...] = ("High", "Low")
+    """Full wells that they end with."""
     mode: str
     roi: tuple[int, int, int, int]
     exposure_ms: Positive = 100.0
@@ -174,12 +190,30 @@ class DetectorSpec(_Frozen):
         modes = tuple(self.modes.items())
         return CameraSettings(self.mode, Roi(*self.roi), self.exposure_ms, modes=modes)
 
+    @property
+    def mode_names(self) -> tuple[str, ...]:
+        """The camera modes that exist; the one at start is among them."""
+        every = product(self.hardware_binning, self.software_binning, self.gains)
+        own = [f"HW{a}SW{b}{gain}" for a, b, gain in every]
+        return tuple(dict.fromkeys([self.mode, *self.modes, *own]))
+
+    def check_mode(self, mode: str) -> str:
+        """`mode` if it exists; case and the number that some machines prefix do not matter.
+
+        Raises:
+            LimitError: lists the modes that exist.
+        """
+        own = {without_number(name) for name in self.mode_names if name not in self.modes}
+        if mode.strip() not in self.modes and without_number(mode) not in own:
+            raise no_mode(mode, self.mode_names)
+        return mode
+
     @model_validator(mode="after")
     def _fits(self) -> DetectorSpec:
         try:
             binning = binning_of(self.mode, self.modes)
         except LimitError as error:
-            raise _refused("mode", self.mode, error.message) from None
+            raise _refused("mode", self.mode, ", ".join(error.data["allowed"])) from None
         try:
             check_roi(Roi(*self.roi), self.pixels, binning)
         except LimitError as error:

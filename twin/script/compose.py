@@ -25,9 +25,10 @@ from flexdt.twin.geometry.conventions import (
     FloatArray,
     turn_detector,
 )
-from flexdt.twin.machine.camera import CameraSettings, Roi, check_roi
+from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Axis, Machine, Profile, check_target
 from flexdt.twin.machine.kinematics import motor_poses
+from flexdt.twin.scanner.settings import CameraChange, changed_camera
 from flexdt.twin.script.planning.smooth_scan import MARGIN_IMAGES, run_up
 
 Kind = Literal["fly", "step", "tiled", "helical", "calibration"]
@@ -107,10 +108,8 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
         LimitError: a count, distance or speed that the machine does not allow, or a motion for
             which it has no motor; says which.
     """
-    if request.roi is not None:
-        camera = machine.detector.camera
-        binning = replace(camera, mode=request.mode or camera.mode).binning
-        check_roi(request.roi, machine.detector.pixels, binning)
+    change: CameraChange = {"mode": request.mode, "roi": request.roi}
+    changed_camera(machine.detector, machine.detector.camera, change)
     attempts = list(_usual(request, _Places(machine, profile)))
     for sod, sdd, height in attempts:
         placed = (ScanPosition(sod),) if request.placements is None else request.placements

@@ -429,6 +429,8 @@ def expose(
     filter: str = option("", "Put this filter beside the machine's own.", metavar="MATERIAL:MM"),
     exposure: float | None = option(None, "Expose each image so long.", metavar="MS"),
     averages: int = option(1, "Average so many read-outs in an image."),
+    mode: str | None = option(None, "Set the camera's mode.", metavar="NAME"),
+    roi: options.Roi = None,
     frames: int = option(361, "Take so many images of the scan."),
     sod: float = option(600.0, "Set the distance from source to axis.", metavar="MM"),
     sdd: float = option(1059.0, "Set the distance from source to panel.", metavar="MM"),
@@ -440,6 +442,7 @@ def expose(
     """Predict transmission, contrast to noise, dose and the best voltage and filter."""
     from flexdt.clients import expose as of
     from flexdt.clients.datasets.dataset import load_dataset
+    from flexdt.twin.machine.camera import Roi
 
     if dataset is not None:
         data = load_dataset(dataset)
@@ -455,6 +458,8 @@ def expose(
         filter=filter,
         exposure_ms=exposure,
         averages=averages,
+        mode=mode,
+        roi=None if roi is None else Roi(*roi),
         images=frames,
         sod=sod,
         sdd=sdd,

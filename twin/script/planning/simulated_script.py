@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from flexdt.twin.errors import LimitError
-from flexdt.twin.machine.camera import binning_of, check_roi
+from flexdt.twin.machine.camera import check_roi
 from flexdt.twin.machine.description import Machine, unknown_axis
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.script import commands as c
@@ -198,12 +198,15 @@ class Simulation:
         return span
 
     def _mode(self, command: c.SetMode) -> planned.Span:
+        mode, now, panel = command.mode, self.camera.settings, self.machine.detector
         try:
-            binning_of(command.mode, self.machine.detector.modes)
+            binning = replace(now, mode=panel.check_mode(mode)).binning
+            if "roi" in self.camera.said:
+                check_roi(now.roi, panel.pixels, binning)
         except LimitError as error:
-            self.findings.error("mode", error.message)
-            return self._stated("mode", self.camera.settings.mode)
-        return self._stated("mode", command.mode)
+            self.findings.error("roi" if "binning" in error.data else "mode", error.message)
+            mode = now.mode
+        return self._stated("mode", mode)
 
     def _exposure(self, command: c.SetExposure) -> planned.Span:
         spec, asked = self.machine.detector, command.exposure_ms
@@ -211,9 +214,10 @@ class Simulation:
         return self._stated("exposure_ms", asked if fits else self.camera.settings.exposure_ms)
 
     def _roi(self, command: c.SetRoi) -> planned.Span:
-        roi = self.camera.settings.roi
+        now = self.camera.settings
+        roi = now.roi
         try:
-            roi = check_roi(command.roi, self.machine.detector.pixels, 1)
+            roi = check_roi(command.roi, self.machine.detector.pixels, now.binning)
         except LimitError as error:
             self.findings.error("roi", error.message)
         return self._stated("roi", roi)
