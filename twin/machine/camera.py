@@ -10,11 +10,13 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 from flexdt.twin.errors import LimitError
 
 _MODE = re.compile(r"(?:\d+_)?HW(\d+)SW(\d+)(High|Low)", re.IGNORECASE)
+
+FORM: Final = "HWaSWbHigh or HWaSWbLow with binning factors a, b"
 
 
 @dataclass(frozen=True)
@@ -144,7 +146,7 @@ def binning_of(mode: str, modes: Mapping[str, int] | None = None) -> int:
         return named[mode.strip()]
     match = _MODE.fullmatch(mode.strip())
     if match is None or int(match[1]) * int(match[2]) == 0:
-        raise no_mode(mode, [*named, "HWaSWbHigh or HWaSWbLow with binning factors a, b"])
+        raise no_mode(mode, [*named, FORM])
     return int(match[1]) * int(match[2])
 
 

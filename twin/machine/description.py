@@ -30,6 +30,7 @@ from pydantic_core import PydanticCustomError
 from flexdt.twin.errors import LimitError, MachineFileError, TwinError, UnknownNameError
 from flexdt.twin.geometry.offsets import NAMES
 from flexdt.twin.machine.camera import (
+    FORM,
     CameraSettings,
     PixelGrid,
     Roi,
@@ -212,8 +213,8 @@ class DetectorSpec(_Frozen):
     def _fits(self) -> DetectorSpec:
         try:
             binning = binning_of(self.mode, self.modes)
-        except LimitError as error:
-            raise _refused("mode", self.mode, ", ".join(error.data["allowed"])) from None
+        except LimitError:
+            raise _refused("mode", self.mode, ", ".join([*self.modes, FORM])) from None
         try:
             check_roi(Roi(*self.roi), self.pixels, binning)
         except LimitError as error:
@@ -862,7 +863,8 @@ def _inherited(own: Raw) -> Raw:
         if key == "components" and not all(isinstance(part, dict) for part in parts):
             raise UnknownNameError(f"components must be tables, [[components]] (value: {value!r})")
         if isinstance(base.get(key), dict) and not isinstance(value, dict):
-            raise UnknownNameError(f"{key} must be a table, [{key}] (value: {value!r})")
+            most = f"must be a table, [{key}]{_limit(key)}"
+            raise UnknownNameError(f"{key} {most} (value: {value!r})")
     if "name" in own:
         base["default_profile"] = ""  # the base's zero offsets are of that machine alone
     for gone in without if isinstance(without, list) else [without]:
@@ -955,9 +957,31 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
                 data.append({"path": path, "message": "is missing"})
                 continue
             value = e["input"] if at is None else e["ctx"]["value"]
-            lines.append(f"{file}: {path}: {message_of(e)} (value: {value!r})")
-            data.append({"path": path, "message": message_of(e), "value": repr(value)})
+            said = "there is no such key" if e["type"] == "extra_forbidden" else message_of(e)
+            if e["type"] in ("extra_forbidden", "literal_error", "model_type"):
+                said += _limit(path)
+            lines.append(f"{file}: {path}: {said} (value: {value!r})")
+            data.append({"path": path, "message": said, "value": repr(value)})
         raise MachineFileError("\n".join(lines), {"file": file, "problems": data}) from None
+
+
+_ONE: Final = "a machine has one tube and one flat panel, [tube] and [detector]"
+_LIMITS: Final = {
+    "beam": "the beam is a cone from one focal spot; parallel and fan beams are not modelled",
+    "tube": _ONE,
+    "source": _ONE,
+    "detector": _ONE,
+    "shape": "curved panels and line detectors are not modelled",
+    "unit": 'linear axes are in mm, axes with kind = "rotation" in deg',
+    "kind": "axes slide or turn about the vertical; what tilts is not modelled",
+}
+
+
+def _limit(path: str) -> str:
+    """What docs/limits.md says of a key, to end an error with."""
+    last = path.rpartition(".")[2].lower()
+    said = next((text for key, text in _LIMITS.items() if last.startswith(key)), None)
+    return f"; {said} (docs/limits.md)" if said else ""
 
 
 def _require(

@@ -28,7 +28,8 @@ from flexdt.twin.geometry.conventions import (
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Axis, Machine, Profile, check_target
 from flexdt.twin.machine.kinematics import motor_poses
-from flexdt.twin.scanner.settings import CameraChange, changed_camera
+from flexdt.twin.scanner.settings import CameraChange, changed_camera, changed_tube
+from flexdt.twin.scanner.state import TubeSettings
 from flexdt.twin.script.planning.smooth_scan import MARGIN_IMAGES, run_up
 
 Kind = Literal["fly", "step", "tiled", "helical", "calibration"]
@@ -64,7 +65,7 @@ class ScanRequest:
         sod_mm, sdd_mm: source-object and source-detector distance; None is 600 and 1059 where the
             machine gets there, else its home, or its only one.
         frames: images of one fly scan, of the whole for step and helical.
-        exposure_ms, averages: of one image.
+        exposure_ms, averages: of one image; None is 100 ms, or as near as the camera gets.
         height_mm: of source and detector centre above the origin; None is the sample's, or as for
             sod_mm.
         turns, rise_mm: of a helical scan, in total.
@@ -80,7 +81,7 @@ class ScanRequest:
     sod_mm: float | None = None
     sdd_mm: float | None = None
     frames: int = 361
-    exposure_ms: float = 100.0
+    exposure_ms: float | None = None
     averages: int = 1
     height_mm: float | None = None
     turns: float = 3.0
@@ -108,13 +109,18 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
         LimitError: a count, distance or speed that the machine does not allow, or a motion for
             which it has no motor; says which.
     """
-    change: CameraChange = {"mode": request.mode, "roi": request.roi}
-    changed_camera(machine.detector, machine.detector.camera, change)
+    panel, tube = machine.detector, machine.tube
+    exposure = min(max(100.0, panel.min_exposure_ms), panel.max_exposure_ms)
+    if request.exposure_ms is not None:
+        exposure = request.exposure_ms
+    change: CameraChange = {"mode": request.mode, "roi": request.roi, "exposure_ms": exposure}
+    changed_camera(panel, panel.camera, change)
+    changed_tube(tube, TubeSettings(tube.kV, tube.power_W), request.kV, request.power_W)
     attempts = list(_usual(request, _Places(machine, profile)))
     for sod, sdd, height in attempts:
         placed = (ScanPosition(sod),) if request.placements is None else request.placements
         full = _Request(**{**vars(request), "sod_mm": sod, "sdd_mm": sdd, "height_mm": height,
-                           "placements": placed})  # fmt: skip
+                           "exposure_ms": exposure, "placements": placed})  # fmt: skip
         try:
             _check_counts(full)
             writer = _Writer(machine, profile, full)
@@ -159,6 +165,7 @@ class _Request(ScanRequest):
     sod_mm: float = 0.0
     sdd_mm: float = 0.0
     height_mm: float = 0.0
+    exposure_ms: float = 100.0
     placements: tuple[ScanPosition, ...] = ()
 
 
@@ -307,8 +314,8 @@ def beside_beam(
     middle = positions.get(name, axis.home) + off / factor
     size = camera.shape[1 - k] * camera.pixels_mm(machine.detector.pixels)[k]
     away = (abs(share) * size / 2 + FREE_MM + radius_mm) / abs(factor)
-    upper = {name: round(min(max(middle + away, axis.lower), axis.upper), 6)}
-    lower = {name: round(min(max(middle - away, axis.lower), axis.upper), 6)}
+    least, most = math.ceil(axis.lower * 1e6) / 1e6, math.floor(axis.upper * 1e6) / 1e6
+    upper, lower = ({name: round(min(max(middle + way, least), most), 6)} for way in (away, -away))
     freer = middle - axis.lower > axis.upper - middle
     return (lower, upper) if freer else (upper, lower)
 
@@ -366,7 +373,8 @@ class _Writer(_Places):
         yield _row("camera", "set number of averages", str(w.averages))
         yield _row("scanner", "write settings file")
         for i in range(w.frames):
-            yield _row(name, "move absolute", _f(i * 360.0 / w.frames))
+            angle = check_target(self.machine, name, i * 360.0 / w.frames)
+            yield _row(name, "move absolute", _f(angle))
             yield _row("camera", "take image")
             yield _row("camera", "save image", f"{w.folder}\\scan_{i:06d}.tif")
 
@@ -619,7 +627,6 @@ def _check_counts(request: _Request) -> None:
         ("flats", request.flats, 1, 10_000),
         ("tiles", request.tiles, 1, 100),
         ("placements", len(request.placements), 1, 100),
-        ("exposure_ms", request.exposure_ms, 1e-3, 1e7),
         ("turns", request.turns, 1e-3, 40.0),
         ("rise_mm", request.rise_mm, 1e-3, 1e6),
         ("height_mm", request.height_mm, -1e6, 1e6),

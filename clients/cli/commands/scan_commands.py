@@ -271,7 +271,11 @@ def new(
     sod: float | None = option(None, USUAL, metavar="MM"),
     sdd: float | None = option(None, USUAL, metavar="MM"),
     frames: int = option(361, "Take so many images in a turn, or in all."),
-    exposure: float = option(100.0, "Expose each image so long.", metavar="MS"),
+    exposure: float | None = option(
+        None,
+        "Expose each image so long; default: 100, or as near as the camera gets.",
+        metavar="MS",
+    ),
     averages: int = option(1, "Average so many read-outs in an image."),
     position: list[str] | None = option(
         None, "Put a calibration scan there; once for each scan.", metavar="SOD[:LATERAL]"
