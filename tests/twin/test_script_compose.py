@@ -80,8 +80,8 @@ def test_what_a_request_leaves_out_is_what_its_description_says(kind: Kind) -> N
     ("field", "least", "most"),
     [
         ("frames", 2, 100_000), ("averages", 1, 10_000), ("darks", 1, 10_000),
-        ("flats", 1, 10_000), ("tiles", 1, 100), ("exposure_ms", 1.0, 60_000.0), ("turns", 1e-3, 40.0),
-        ("rise_mm", 1e-3, 1e6), ("height_mm", -1e6, 1e6), ("sdd_mm", 1e-3, 1e6),
+        ("flats", 1, 10_000), ("tiles", 1, 100), ("exposure_ms", 1.0, 60_000.0),
+        ("turns", 1e-3, 40.0), ("rise_mm", 1e-3, 1e6), ("height_mm", -1e6, 1e6), ("sdd_mm", 1e-3, 1e6),
         ("sod_mm", 1e-3, 1000.0), ("placements", 1, 100), ("lateral", -1e6, 1e6),
     ],
 )  # fmt: skip
@@ -502,24 +502,24 @@ def drawn_machine(rng: np.random.Generator) -> Machine:
     return parse_machine(f"{text}exposure_ms = {min(most, 500.0)}\n")
 
 
-@pytest.mark.daily(6)
-@pytest.mark.parametrize("seed", range(30))
-def test_no_machine_is_proposed_what_its_own_check_refuses(seed: int) -> None:
+@pytest.mark.parametrize("block", range(3))
+def test_no_machine_is_proposed_what_its_own_check_refuses(block: int) -> None:
     """With collisions; what a machine cannot do is refused before there is a script."""
-    machine = drawn_machine(np.random.default_rng(8000 + seed))
-    profile, made = profile_of(machine), 0
-    for kind in KINDS:
-        try:
-            text = compose_script(ScanRequest(kind=kind), machine, profile)
-        except LimitError:
-            continue
-        made += 1
-        sweep = collision_check() if machine.components else None
-        report = check_script(text, machine, profile, collision=sweep)
-        assert report.ok, (kind, [p.where_and_what for p in report.problems])
-        assert {p.code for p in report.problems} <= {"default_assumed", "sample_in_flat"}
-    if seed == 0:
-        assert made
+    made = 0
+    for seed in range(10 * block, 10 * block + 10):
+        machine = drawn_machine(np.random.default_rng(8000 + seed))
+        profile = profile_of(machine)
+        for kind in KINDS:
+            try:
+                text = compose_script(ScanRequest(kind=kind), machine, profile)
+            except LimitError:
+                continue
+            made += 1
+            sweep = collision_check() if machine.components else None
+            report = check_script(text, machine, profile, collision=sweep)
+            assert report.ok, (seed, kind, [p.where_and_what for p in report.problems])
+            assert {p.code for p in report.problems} <= {"default_assumed", "sample_in_flat"}
+    assert made > 5
 
 
 @pytest.mark.parametrize(
