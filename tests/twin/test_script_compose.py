@@ -81,8 +81,9 @@ def test_what_a_request_leaves_out_is_what_its_description_says(kind: Kind) -> N
     [
         ("frames", 2, 100_000), ("averages", 1, 10_000), ("darks", 1, 10_000),
         ("flats", 1, 10_000), ("tiles", 1, 100), ("exposure_ms", 1.0, 60_000.0),
-        ("turns", 1e-3, 40.0), ("rise_mm", 1e-3, 1e6), ("height_mm", -1e6, 1e6), ("sdd_mm", 1e-3, 1e6),
-        ("sod_mm", 1e-3, 1000.0), ("placements", 1, 100), ("lateral", -1e6, 1e6),
+        ("turns", 1e-3, 40.0), ("rise_mm", 1e-3, 1e6), ("height_mm", -1e6, 1e6),
+        ("sdd_mm", 1e-3, 1e6), ("sod_mm", 1e-3, 1000.0), ("placements", 1, 100),
+        ("lateral", -1e6, 1e6),
     ],
 )  # fmt: skip
 def test_figures_of_a_request_have_bounds(field: str, least: float, most: float) -> None:

@@ -14,9 +14,9 @@ from dataclasses import replace
 from typing import Any, Final
 
 from flexdt.twin.errors import LimitError
-from flexdt.twin.machine.camera import check_roi
 from flexdt.twin.machine.description import Machine, unknown_axis
 from flexdt.twin.motion.profiles import Trajectory
+from flexdt.twin.scanner.settings import CameraChange, changed_camera
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.grammar import describe, is_reserved, own_name
 from flexdt.twin.script.planning import planned_scanner as planned
@@ -191,36 +191,21 @@ class Simulation:
 
     # camera --------------------------------------------------------------------------------
 
-    def _stated(self, name: str, value: object) -> planned.Span:
+    def _stated(self, change: CameraChange) -> planned.Span:
+        """One setting of the camera; what the panel does not allow is noted and stays as it was."""
+        [(name, value)] = change.items()
+        now = self.camera.settings
+        try:
+            changed_camera(self.machine.detector, now, change)
+        except LimitError as error:
+            region = "edge" in error.data or "binning" in error.data
+            code = "limit" if "setting" in error.data else "roi" if region else "mode"
+            self.findings.error(code, error.message)
+            value = getattr(now, name)
         self.camera.set(name, value)
         span = self.timed("set_camera")
         self.camera.free_at = span.end
         return span
-
-    def _mode(self, command: c.SetMode) -> planned.Span:
-        mode, now, panel = command.mode, self.camera.settings, self.machine.detector
-        try:
-            binning = replace(now, mode=panel.check_mode(mode)).binning
-            if "roi" in self.camera.said:
-                check_roi(now.roi, panel.pixels, binning)
-        except LimitError as error:
-            self.findings.error("roi" if "binning" in error.data else "mode", error.message)
-            mode = now.mode
-        return self._stated("mode", mode)
-
-    def _exposure(self, command: c.SetExposure) -> planned.Span:
-        spec, asked = self.machine.detector, command.exposure_ms
-        fits = self._range("exposure", asked, spec.min_exposure_ms, spec.max_exposure_ms, "ms")
-        return self._stated("exposure_ms", asked if fits else self.camera.settings.exposure_ms)
-
-    def _roi(self, command: c.SetRoi) -> planned.Span:
-        now = self.camera.settings
-        roi = now.roi
-        try:
-            roi = check_roi(command.roi, self.machine.detector.pixels, now.binning)
-        except LimitError as error:
-            self.findings.error("roi", error.message)
-        return self._stated("roi", roi)
 
     # motors --------------------------------------------------------------------------------
 
@@ -336,11 +321,11 @@ _EFFECTS: Final[Mapping[type[c.Command], _Effect]] = {
     c.WaitXrayReady: Simulation._ready,
     c.SetVoltage: Simulation._voltage,
     c.SetPower: Simulation._power,
-    c.SetMode: Simulation._mode,
-    c.SetExposure: Simulation._exposure,
-    c.SetFrames: lambda s, k: s._stated("frames", k.frames),
-    c.SetAverages: lambda s, k: s._stated("averages", k.averages),
-    c.SetRoi: Simulation._roi,
+    c.SetMode: lambda s, k: s._stated({"mode": k.mode}),
+    c.SetExposure: lambda s, k: s._stated({"exposure_ms": k.exposure_ms}),
+    c.SetFrames: lambda s, k: s._stated({"frames": k.frames}),
+    c.SetAverages: lambda s, k: s._stated({"averages": k.averages}),
+    c.SetRoi: lambda s, k: s._stated({"roi": k.roi}),
     c.TakeImage: lambda s, k: s.imaging.take(k, s.now, len(s.steps)),
     c.SaveImage: lambda s, k: s.imaging.save(k, s.now, len(s.steps)),
     c.TakeSequence: lambda s, k: s.imaging.sequence(k, s.now, len(s.steps)),
