@@ -58,6 +58,10 @@ def plan_poses(
         >>> plan_poses([{"rot_obj": 0.0}, {"rot_obj": 90.0}], machine, profile, 100.0)
         <ScanPlan on flexray: 25 steps, 2 projections, 21.5 s, 0 errors, 0 warnings>
     """
+    asked: Pose = flat if isinstance(flat, Mapping) else {}
+    for axis in (name for pose in (*poses, asked) for name in pose):
+        if not machine.has(axis):
+            raise unknown_axis(axis, machine)
     begin = StartState.of(machine) if start is None else start
     camera = begin.camera
     exposure = camera.exposure_ms if exposure_ms is None else exposure_ms
@@ -81,22 +85,22 @@ def plan_poses(
             sides = beside_beam(machine, profile, camera, first, radius)
             places = [{**first, **side} for side in sides]
         else:
-            places = [_arrival(begin.positions, flat, machine, begin)]
+            places = [_arrival(begin.positions, asked, machine, begin)]
         ways = ((place, _legs(begin.positions, place, route)) for place in places)
         place, out = next((way for way in ways if way[1] is not None), (places[0], None))
         if out is None:
             told = [ScriptProblem("warning", "flat_path", 0, 1, _NO_PATH)]
             out = _legs(begin.positions, place) or ()
         back = _legs(place, first, route) or _legs(place, first) or ()
-        for leg in (*out, *([flat] if isinstance(flat, Mapping) else ())):
-            commands += _moves(leg, machine, 0)
+        for leg in (*out, asked):
+            commands += _moves(leg)
         references += _image("io000000.tif")
     commands += [c.XrayOff(), c.SetAverages(averages=REFERENCES), *references]
     commands.append(c.SetAverages(averages=camera.averages))
     for i, pose in enumerate(poses):
         line = i + 1
         for leg in (*back, pose) if i == 0 else (pose,):
-            commands += _moves(leg, machine, line)
+            commands += _moves(leg, line)
         if i == 0:
             commands.append(c.WriteSettingsFile(line=line))
         commands += _image(f"scan_{i:06d}.tif", line)
@@ -118,11 +122,8 @@ def _image(file: str, line: int = 0) -> list[c.Command]:
     return [c.TakeImage(line=line), c.SaveImage(path=file, line=line)]
 
 
-def _moves(pose: Pose, machine: Machine, line: int) -> list[c.Command]:
+def _moves(pose: Pose, line: int = 0) -> list[c.Command]:
     """Moves that start together; asking each again waits until all have arrived."""
-    for axis in pose:
-        if not machine.has(axis):
-            raise unknown_axis(axis, machine)
     moves = [c.MoveAbsolute(component=a, target=float(v), line=line) for a, v in pose.items()]
     return [*(replace(k, wait=c.Wait.NO_WAIT) for k in moves if len(moves) > 1), *moves]
 
@@ -132,8 +133,6 @@ def _arrival(positions: Pose, pose: Pose, machine: Machine, start: StartState) -
     motors = Motors(machine, replace(start, positions=positions))
     out = dict(positions)
     for axis, value in pose.items():
-        if not machine.has(axis):
-            raise unknown_axis(axis, machine)
         out |= clamp(machine, motors.targets(axis, value, 0.0), axis)
     return out
 
