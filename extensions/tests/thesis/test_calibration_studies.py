@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.entry import run as command
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import bead_model
 from flexdt.twin.errors import UnknownNameError
@@ -124,7 +124,7 @@ def test_experiment_4_on_images_does_not_depend_on_the_number_of_projections() -
 
 
 def test_exact_points_say_why_one_placement_succeeds(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["study", "detector", "--jobs", "1"]) == 0
+    assert command(["study", "detector", "--jobs", "1"]) == 0
     assert "because exact points have no noise" in capsys.readouterr().out
-    assert run(["study", "detector", "--jobs", "1", "--json"]) == 0
+    assert command(["study", "detector", "--jobs", "1", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["experiment"] == "detector"
