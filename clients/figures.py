@@ -96,7 +96,7 @@ def plot(
         equal: one unit is as long in x as in y.
     """
     figure = blank(width, height)
-    axes = _axes(figure, title, x_label, y_label)
+    axes = axes_of(figure, title, x_label, y_label)
     for s, colour in zip(series, cycle(COLOURS), strict=False):
         style = {"lw": 1.2} if s.line else {"ls": "", "marker": ".", "ms": 3.2}
         x, y = np.asarray(s.x, dtype=np.float64), np.asarray(s.y, dtype=np.float64)
@@ -126,7 +126,7 @@ def arrows(
     """
     rows, cols = size
     figure = blank(730, 60 + 570 * rows / cols)
-    axes = _axes(figure, title, "column (px)", "row (px)")
+    axes = axes_of(figure, title, "column (px)", "row (px)")
     axes.set(xlim=(0, cols), ylim=(rows, 0), aspect="equal")
     for (name, places, vectors), colour in zip(groups, cycle(COLOURS), strict=False):
         keep = np.isfinite(places).all(axis=1) & np.isfinite(vectors).all(axis=1)
@@ -137,48 +137,6 @@ def arrows(
         axes.plot(*ends.T, color=colour, lw=1.0, clip_on=False, gid=gid)
         axes.plot(*start.T, ".", color=colour, ms=2.2, label=name, gid=f"{gid}-places")
     _legend(figure, groups)
-    return svg(figure)
-
-
-def heat_map(
-    values: npt.ArrayLike,
-    rows: Sequence[str],
-    columns: Sequence[str],
-    *,
-    title: str,
-    x_label: str,
-    good_below: float | None = None,
-    good_from: float | None = None,
-) -> str:
-    """A table of numbers coloured by their logarithm.
-
-    Args:
-        values: (rows, columns); nan is grey.
-        rows, columns: names.
-        title, x_label: texts.
-        good_below: smaller values are green, others red.
-        good_from: values from here on are green, others red.
-    """
-    data = np.asarray(values, dtype=np.float64)
-    figure = blank(110 + 52 * len(columns), 80 + 24 * len(rows))
-    axes = _axes(figure, title, x_label, "")
-    with np.errstate(divide="ignore", invalid="ignore"):
-        log = np.log10(np.where(data > 0, data, np.nan))
-    some = log[np.isfinite(log)]
-    low, high = (float(some.min()), float(some.max())) if some.size else (-1.0, 0.0)
-    dark = np.nan_to_num((log - low) / max(high - low, 1e-12)).clip(0.0, 1.0)
-    good = np.zeros(data.shape, dtype=bool)
-    if good_from is not None:
-        good, dark = data >= good_from, np.zeros_like(dark)
-    elif good_below is not None:
-        good = data < good_below
-    tint = np.where(good[..., None], (-50.0, 0.0, -40.0), (0.0, -50.0, -55.0))
-    colours = (235.0 - 90.0 * dark[..., None] + tint) / 255.0
-    axes.imshow(np.where(np.isfinite(data)[..., None], colours, 0.87), aspect="auto")
-    axes.set_xticks(range(len(columns)), columns)
-    axes.set_yticks(range(len(rows)), rows)
-    for (i, j), value in np.ndenumerate(data):
-        axes.text(j, i, _short(float(value)), ha="center", va="center", size=9)
     return svg(figure)
 
 
@@ -201,7 +159,7 @@ def image_under(
     """A grey image (rows, cols) with points over it; their x and y are its columns and rows."""
     data = np.asarray(values, dtype=np.float64)
     figure = blank(width, 26 + (width - 90 * bool(points)) * data.shape[0] / data.shape[1])
-    axes = _axes(figure, title, "", "")
+    axes = axes_of(figure, title, "", "")
     low, high = np.percentile(data, [0.5, 99.7])
     axes.imshow(data, cmap="gray_r", vmin=low, vmax=high)
     axes.set_axis_off()
@@ -211,7 +169,8 @@ def image_under(
     return svg(figure)
 
 
-def _axes(figure: Figure, title: str, x_label: str, y_label: str) -> Axes:
+def axes_of(figure: Figure, title: str, x_label: str, y_label: str) -> Axes:
+    """Axes that fill a figure, titled."""
     axes = figure.add_subplot()
     axes.set_title(title, size=10, weight="bold", loc="left")
     axes.set_xlabel(x_label, size=9)
@@ -223,12 +182,6 @@ def _axes(figure: Figure, title: str, x_label: str, y_label: str) -> Axes:
 def _legend(figure: Figure, series: Sequence[Series | tuple[str, Floats, Floats]]) -> None:
     if any(s.name if isinstance(s, Series) else s[0] for s in series):
         figure.legend(loc="outside right upper", fontsize=8, frameon=False)
-
-
-def _short(value: float) -> str:
-    if not math.isfinite(value):
-        return "-"
-    return f"{value:.2g}" if 0 < abs(value) < 0.01 or abs(value) >= 1e4 else f"{value:.4g}"
 
 
 PAGE = """<!doctype html>
@@ -268,7 +221,9 @@ def cell_text(value: object) -> str:
             return "-"
         case bool():
             return "yes" if value else "no"
+        case float() if not math.isfinite(value):
+            return "-"
         case float():
-            return _short(value)
+            return f"{value:.2g}" if 0 < abs(value) < 0.01 or abs(value) >= 1e4 else f"{value:.4g}"
         case _:
             return str(value)

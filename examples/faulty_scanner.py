@@ -3,9 +3,10 @@
     python examples/faulty_scanner.py 50123 &
     flexdt follow tcp://127.0.0.1:50123 --for 12
 
-It needs pyzmq and nothing of flexdt. Every message has a tick of its own, as in the last pages of the
-interface's description; `flexdt follow` goes by the UUID. The first move is sound; the second is of a motor of half the
-speed; the third ends 0.4 mm from its target, and its reply states another limit.
+It needs pyzmq and nothing of flexdt. Every message has a tick of its own, as in the last pages of
+the interface's description; `flexdt follow` goes by the UUID. The first move is sound; the second
+is of a motor of half the speed; the third ends 0.4 mm from its target, and its reply states another
+limit.
 """
 
 from __future__ import annotations

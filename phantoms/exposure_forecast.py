@@ -22,7 +22,7 @@ from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine, builtin_machine
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.physics.chain import Chain, flux_of
@@ -32,6 +32,7 @@ from flexdt.twin.physics.prediction import air_kerma_mGy, contrast_to_noise, pix
 from flexdt.twin.physics.radiograph import radiographs
 from flexdt.twin.physics.spectrum import Filter, tube_of, voltages
 from flexdt.twin.projection import project_body
+from flexdt.twin.scanner.settings import CameraChange, changed_camera
 from flexdt.twin.script.planning.plan import ScanPlan
 from flexdt.twin.script.problems import ScriptProblem
 
@@ -142,6 +143,8 @@ def expose(
     filter: str = "",
     exposure_ms: float | None = None,
     averages: int = 1,
+    mode: str | None = None,
+    roi: Roi | None = None,
     images: int = 361,
     sod: float = 600.0,
     sdd: float = 1059.0,
@@ -160,6 +163,7 @@ def expose(
         filter: MATERIAL:MM beside the filters of the machine file, "" for none.
         exposure_ms: of one read-out; default: the machine's.
         averages: read-outs averaged into an image.
+        mode, roi: camera mode and region of interest; default: the machine's.
         images: of the scan.
         sod, sdd: distances [mm].
         detail: MATERIAL:MM, a detail of so much of that material on the darkest ray, or void:MM,
@@ -212,7 +216,10 @@ def expose(
     wanted = (None if missing == VOID else material_of(missing).substance, size)
     phantom = as_phantom(sample, material=material, voxel_mm=voxel_mm)
     parts = channels(phantom)
-    camera = replace(spec.camera, exposure_ms=time_ms, averages=averages)
+    change: CameraChange = {
+        "exposure_ms": time_ms, "averages": averages, "mode": mode, "roi": roi,
+    }  # fmt: skip
+    camera = changed_camera(spec, spec.camera, change)
     cone = ConeVec.circular(
         sod=sod, sdd=sdd, angles=VIEWS, shape=camera.shape, pixel=camera.pixel_mm(spec.pixels)
     )

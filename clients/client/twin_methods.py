@@ -453,6 +453,8 @@ def predict_exposure(
     filter: str = "",
     exposure_ms: float | None = None,
     averages: int | None = None,
+    mode: str | None = None,
+    roi: tuple[int, int, int, int] | None = None,
     frames: int = 361,
     sod_mm: float | None = None,
     sdd_mm: float | None = None,
@@ -462,7 +464,7 @@ def predict_exposure(
 
     Args:
         sample: a shipped phantom or an upload; default: the one on the stage.
-        kV, power_W, exposure_ms, averages: default: as they are set.
+        kV, power_W, exposure_ms, averages, mode, roi: default: as they are set.
         filter: MATERIAL:MM beside the machine's own.
         frames: of the scan.
         sod_mm, sdd_mm: distances; default: the present ones.
@@ -479,7 +481,7 @@ def predict_exposure(
     return ask(
         images.EXPOSURE_PREDICT, sample=sample, kV=kV, power_W=power_W,
         filter=filter, exposure_ms=exposure_ms, averages=averages, frames=frames, detail=detail,
-        sod_mm=sod_mm, sdd_mm=sdd_mm,
+        mode=mode, roi=None if roi is None else list(roi), sod_mm=sod_mm, sdd_mm=sdd_mm,
     )  # fmt: skip
 
 
@@ -527,17 +529,22 @@ def submit_script(
 
 
 def check_trajectory(
-    poses: Sequence[Positions], exposure_ms: float | None = None
+    poses: Sequence[Positions],
+    exposure_ms: float | None = None,
+    *,
+    flat: bool | Positions = True,
 ) -> Flow[scans.CheckResult]:
-    """Plan and check poses, one image each; nothing moves.
+    """Plan and check poses, one image each; nothing moves. `flat` as in `submit_trajectory`.
 
     Example:
         >>> poses = [{"rot_obj": 0.0}, {"rot_obj": 90.0}]
         >>> twin.check_trajectory(poses, 100.0).frames
         2
     """
-    places = [dict(p) for p in poses]
-    return ask(scans.TRAJECTORY_CHECK, poses=places, exposure_ms=exposure_ms)
+    return ask(
+        scans.TRAJECTORY_CHECK, poses=[dict(p) for p in poses], exposure_ms=exposure_ms,
+        flat=flat if isinstance(flat, bool) else dict(flat),
+    )  # fmt: skip
 
 
 def submit_trajectory(
@@ -547,8 +554,19 @@ def submit_trajectory(
     speed_up: SpeedUp | None = None,
     *,
     seed: int | None = None,
+    flat: bool | Positions = True,
 ) -> Flow[scans.SubmitResult]:
-    """Run poses as a job, one image each; the rest as in `submit_script`.
+    """Run poses as a job: a dark and a flat, then one image each.
+
+    Args:
+        poses: axis -> position [mm, deg]; axes left out stay where they are.
+        exposure_ms: of each image; None keeps the camera's.
+        name, speed_up, seed: as in `submit_script`.
+        flat: where the sample is out of the beam; True lets the server find a place and a free
+            path, False takes no flat.
+
+    Raises:
+        RpcError: as `submit_script`.
 
     Example:
         >>> poses = [{"rot_obj": 0.0}, {"rot_obj": 90.0}]
@@ -559,6 +577,7 @@ def submit_trajectory(
     return ask(
         scans.TRAJECTORY_SUBMIT, poses=[dict(p) for p in poses],
         exposure_ms=exposure_ms, name=name, speed_up=speed_up, seed=seed,
+        flat=flat if isinstance(flat, bool) else dict(flat),
     )  # fmt: skip
 
 
@@ -727,7 +746,7 @@ def dataset(
         >>> twin.wait_job(job).state
         'done'
         >>> twin.dataset("looked-at").positions["rot_obj"]
-        [90.0, 0.0, 90.0]
+        [0.0, 0.0, 0.0, 90.0]
     """
     return ask(past_scans.DATASET_GET, name=name, points=points, measure=measure, script=script)
 

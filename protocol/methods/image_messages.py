@@ -55,6 +55,8 @@ class ExposurePredict(f.Params):
     filter: LayerText = Field(default="", description="MATERIAL:MM beside the machine's own")
     exposure_ms: f.Exposure | None = None
     averages: Averages | None = None
+    mode: f.ShortText | None = None
+    roi: f.RoiAsked | None = None
     frames: Frames = Field(default=361, description="of the scan")
     sod_mm: f.Distance | None = Field(default=None, description="default: as it stands")
     sdd_mm: f.Distance | None = Field(default=None, description="default: as it stands")

@@ -56,6 +56,11 @@ class TrajectoryInput(f.Params):
         description="each: axis -> value [mm or deg]; axes left out stay"
     )
     exposure_ms: f.Exposure | None = None
+    flat: bool | f.Targets = Field(
+        default=True,
+        description="the flat image: at a place beside the beam that the server finds (true), at "
+        "this pose, or not at all (false)",
+    )
     name: f.Name | None = None
     speed_up: f.SpeedUp | None = None
     motion_samples: Moments = 1

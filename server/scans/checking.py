@@ -11,7 +11,7 @@ import asyncio
 import gc
 import json
 import pickle
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final, TypeVar
@@ -24,7 +24,9 @@ from flexdt.protocol.rpc_errors import Code, RpcError, too_large
 from flexdt.runtime.loop import ServerLoop
 from flexdt.runtime.workers import Workers
 from flexdt.server.scans.scan_record import PoseList, ScanSource
+from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.collision.convex_solids import Polytope
+from flexdt.twin.collision.obstacle_path import free_moves
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import Machine, Profile
@@ -89,20 +91,29 @@ class CheckInput:
         Raises:
             RpcError: -32008, the report would be larger than that; nothing is swept then.
         """
-        wish = self.wish
+        wish, machine = self.wish, self.machine
         sweep: CollisionCheck | None = None
-        if self.machine.components:
+        if machine.components:
             sweep = _bounded(collision_check(self.pieces, self.parameters), bytes_at_most)
         if wish.poses is None:
             return check_script(
-                wish.script, self.machine, self.profile,
+                wish.script, machine, self.profile,
                 start=self.start, sample=self.size, collision=sweep,
             )  # fmt: skip
         plan = plan_poses(
-            wish.poses.decoded(), self.machine, self.profile, wish.exposure_ms,
-            start=self.start, sample=self.size,
+            wish.poses.decoded(), machine, self.profile, wish.exposure_ms, start=self.start,
+            sample=self.size, flat=wish.flat, route=self.free_moves if sweep else None,
         )  # fmt: skip
         return check_plan(plan, (), sweep)
+
+    def free_moves(
+        self, start: Mapping[str, float], goal: Mapping[str, float]
+    ) -> list[dict[str, float]] | None:
+        """Moves without a contact, one after the other; None if there are none."""
+        scene = build_scene(self.machine, self.profile, self.pieces, self.parameters)
+        begin = self.start
+        paces = {axis: (begin.speeds[axis], begin.accelerations[axis]) for axis in begin.speeds}
+        return free_moves(scene, self.machine, start, goal, paces)[0]
 
 
 @dataclass(frozen=True, eq=False)

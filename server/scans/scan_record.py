@@ -65,6 +65,7 @@ class ScanSource:
         script: byte for byte, for a script; for poses a text that lists them.
         poses: for a trajectory.
         exposure_ms: of a trajectory's images.
+        flat: of a trajectory, as `plan_poses` takes it.
         moments: poses averaged within the exposure of an image taken in motion.
         seed: of the noise; None for a fresh one.
     """
@@ -74,6 +75,7 @@ class ScanSource:
     exposure_ms: float | None = None
     moments: int = 1
     seed: int | None = None
+    flat: bool | Mapping[str, float] = True
 
     @classmethod
     def of_poses(
@@ -82,11 +84,12 @@ class ScanSource:
         exposure_ms: float | None,
         moments: int = 1,
         seed: int | None = None,
+        flat: bool | Mapping[str, float] = True,
     ) -> ScanSource:
         """A trajectory; its `script.txt` is a comment for each pose."""
         poses = poses if isinstance(poses, PoseList) else PoseList.of(poses)
-        head = f"# trajectory, exposure_ms {exposure_ms}\r\n".encode()
-        return cls(head + poses.listing, poses, exposure_ms, moments, seed)
+        head = f"# trajectory, exposure_ms {exposure_ms}, flat {json.dumps(flat)}\r\n".encode()
+        return cls(head + poses.listing, poses, exposure_ms, moments, seed, flat)
 
 
 @dataclass(frozen=True)
@@ -110,6 +113,7 @@ class StartConditions:
 BEGINNING: Final = TypeAdapter(StartConditions)
 """Reads what `asdict` of a beginning made; raises ValueError if it did not."""
 _EXPOSURE: TypeAdapter[float | None] = TypeAdapter(float | None)
+_FLAT: TypeAdapter[bool | dict[str, float]] = TypeAdapter(bool | dict[str, float])
 
 
 @dataclass(frozen=True)
@@ -147,6 +151,7 @@ class JobRecord:
                 "script": base64.b64encode(wish.script).decode("ascii"),
                 "poses": None if wish.poses is None else wish.poses.text.decode("ascii"),
                 "exposure_ms": wish.exposure_ms,
+                "flat": wish.flat,
             },
             "speed_up": self.speed_up,
             "operator": self.operator,
@@ -184,6 +189,7 @@ class JobRecord:
                 _EXPOSURE.validate_python(wish["exposure_ms"]),
                 begin.moments,
                 begin.seed,
+                _FLAT.validate_python(wish.get("flat", False)),  # servers before took none
             ),
             begin,
             None if speed_up is None else check_speed_up(speed_up),

@@ -225,7 +225,7 @@ def test_script_new_refuses_the_impossible(
     assert run(["script", "new", "--kind", "fly", "--roi", "1 2 3"]) == 2
     assert run(["script", "new", "--kind", "sideways"]) == 2
     assert run(["script", "new", "--kind", "fly", "--roi", "0 0 5000 100"]) == 3
-    assert run(["script", "new", "--kind", "fly", "--kv", "-1", "--out", str(path)]) == 1
+    assert run(["script", "new", "--kind", "fly", "--kv", "-1", "--out", str(path)]) == 3
     assert run(["script", "new", "--kind", "fly", "--kv", "1000", "--out", str(path)]) == 3
     capsys.readouterr()
     close = ["--sod", "600", "--sdd", "600"]
@@ -247,7 +247,7 @@ def test_script_new_refuses_the_impossible(
         (["--kind", "fly", "--sdd", "nan"], "sdd_mm is nan; allowed"),
         (["--kind", "fly", "--roi", "10 10 0 0"], "ROI 10 10 0 0 holds no pixel at binning"),
         (["--kind", "fly", "--mode", "HW9"], "HW9"),
-        (["--kind", "fly", "--kv", "1e6"], "tube voltage 1e+06 kV is outside [0, 90] kV"),
+        (["--kind", "fly", "--kv", "1e6"], "tube kV 1e+06 is outside [0, 90]"),
     ],
 )
 def test_script_new_names_what_was_asked(

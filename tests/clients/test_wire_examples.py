@@ -7,13 +7,18 @@ import re
 import shutil
 import socket
 import subprocess
+import sys
+import uuid
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 
 from flexdt.clients import TwinClient
+from flexdt.clients.cli.entry import run
 from flexdt.clients.launch.processes import Servers
+from flexdt.clients.reconstruction.volume_files import read_volume
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -101,3 +106,64 @@ def test_what_the_matlab_example_sends_is_understood(servers: Servers) -> None:
     for field in re.findall(r"answer\.(\w+)", text):
         if field not in ("error", "result"):
             assert field in results[3], field
+
+
+def scanned(done: subprocess.CompletedProcess[str], volume: Path) -> None:
+    """What a trajectory example leaves is a data set that `flexdt reconstruct` takes."""
+    assert done.returncode == 0, done.stderr
+    said, folder = done.stdout.splitlines()
+    assert said == "done: 24 of 24 projections"
+    words = ["--out", str(volume), "--voxel", "1", "--shape", "40,40,40"]
+    assert run(["reconstruct", folder, *words]) == 0
+    read_reference(Path(folder))
+    data = read_volume(volume).data
+    inside, corner = data[10:30, 10:30, 10:30].max(), np.abs(data[:4, :4, :4]).max()
+    assert inside > 4 * corner > 0
+
+
+def read_reference(folder: Path) -> None:
+    """The flat is an empty beam: counts of no sample, brighter than the dark everywhere."""
+    dark, flat, first = (
+        tifffile.imread(folder / f"{name}.tif").astype(float)
+        for name in ("di000000", "io000000", "scan_000000")
+    )
+    assert flat.min() > dark.max()
+    assert flat.max() < 2**14 - 1
+    assert (first - dark).min() < 0.9 * (flat - dark).min()  # the sample is in the projections only
+
+
+def test_the_python_example_ends_in_a_volume(servers: Servers, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-I", WIRE / "trajectory.py", *words(servers), f"py-{uuid.uuid4().hex}"],
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    scanned(done, tmp_path / "volume.tif")
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no g++ here to compile the example with")
+def test_the_cpp_trajectory_ends_in_a_volume(servers: Servers, tmp_path: Path) -> None:
+    program, source = tmp_path / "trajectory", WIRE / "trajectory.cpp"
+    flags = ["-std=c++17", "-Wall", "-Wextra", "-Werror"]
+    subprocess.run(["g++", *flags, "-o", program, source], check=True, timeout=120)
+    done = subprocess.run(
+        [program, *words(servers), f"cpp-{uuid.uuid4().hex}"],
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    scanned(done, tmp_path / "volume.tif")
+
+
+def test_what_the_matlab_trajectory_sends_is_understood(servers: Servers) -> None:
+    """Its poses as `jsonencode` writes a struct array; the fields of answers that it reads."""
+    text = (WIRE / "trajectory.m").read_text("utf-8")
+    poses = [{"rot_obj": i * 15, "mag_obj": 600, "tra_obj": 0} for i in range(24)]
+    assert re.findall(r"'(\w+_obj)', (\w+)", text) == [
+        ("rot_obj", "angles"), ("mag_obj", "600"), ("tra_obj", "0")
+    ]  # fmt: skip
+    with TwinClient(*servers.address) as twin:
+        twin.set_camera(mode="HW4SW1High")
+        job = twin.submit_trajectory(poses, 20.0, f"m-{uuid.uuid4().hex}")
+        status = twin.wait_job(job.job)
+    for name in re.findall(r"job\.(job|dataset)\b", text):
+        assert getattr(job, name)
+    for name in re.findall(r"status\.(?!result)(\w+)", text):
+        assert hasattr(status, name) or name == "status"

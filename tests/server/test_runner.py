@@ -19,7 +19,8 @@ from flexdt.twin.physics.exposure import ExposureSettings, IdealResponse, expose
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.script import Exposure, ScanPlan
 from flexdt.twin.script.parse import parse_script
-from flexdt.twin.script.planning.planner import plan_poses, plan_script
+from flexdt.twin.script.planning.planner import plan_script
+from flexdt.twin.script.poses import plan_poses
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)
@@ -389,7 +390,7 @@ def test_a_slow_projector_holds_the_clock_and_not_the_scan() -> None:
 
         lab.before = before
         await lab.runner.run()
-        assert len(lab.made) == 61
+        assert len(lab.made) == 62
         assert max(waiting) == 4
         factor = lab.clock.real_time_factor
         assert factor is None or factor < 1e5

@@ -305,8 +305,10 @@ def test_poses_of_a_beginning_come_back(tmp_path: Path) -> None:
     wish = ScanSource.of_poses([{"rot_obj": 1.0}, {"mag_obj": 2.5}], 10.0)
     text = wish.script.decode()
     assert text.splitlines() == [
-        "# trajectory, exposure_ms 10.0", '# pose 0: {"rot_obj": 1.0}', '# pose 1: {"mag_obj": 2.5}'
-    ]  # fmt: skip
+        "# trajectory, exposure_ms 10.0, flat true",
+        '# pose 0: {"rot_obj": 1.0}',
+        '# pose 1: {"mag_obj": 2.5}',
+    ]
     from flexdt.server.scans.scan_record import StartConditions
     from flexdt.twin.scanner.state import Sample
 

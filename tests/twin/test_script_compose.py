@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import CameraSettings, Roi
@@ -22,7 +23,7 @@ from flexdt.twin.machine.description import (
     profile_of,
 )
 from flexdt.twin.machine.kinematics import poses
-from flexdt.twin.script import ScanPlan, parse_script, plan_script
+from flexdt.twin.script import ScanPlan, check_script, parse_script, plan_script
 from flexdt.twin.script.compose import KINDS, Kind, ScanPosition, ScanRequest, compose_script
 
 MACHINE = builtin_machine()
@@ -79,9 +80,10 @@ def test_what_a_request_leaves_out_is_what_its_description_says(kind: Kind) -> N
     ("field", "least", "most"),
     [
         ("frames", 2, 100_000), ("averages", 1, 10_000), ("darks", 1, 10_000),
-        ("flats", 1, 10_000), ("tiles", 1, 100), ("exposure_ms", 1e-3, 1e7), ("turns", 1e-3, 40.0),
-        ("rise_mm", 1e-3, 1e6), ("height_mm", -1e6, 1e6), ("sdd_mm", 1e-3, 1e6),
-        ("sod_mm", 1e-3, 1000.0), ("placements", 1, 100), ("lateral", -1e6, 1e6),
+        ("flats", 1, 10_000), ("tiles", 1, 100), ("exposure_ms", 1.0, 60_000.0),
+        ("turns", 1e-3, 40.0), ("rise_mm", 1e-3, 1e6), ("height_mm", -1e6, 1e6),
+        ("sdd_mm", 1e-3, 1e6), ("sod_mm", 1e-3, 1000.0), ("placements", 1, 100),
+        ("lateral", -1e6, 1e6),
     ],
 )  # fmt: skip
 def test_figures_of_a_request_have_bounds(field: str, least: float, most: float) -> None:
@@ -477,3 +479,61 @@ def test_a_region_of_a_rolled_panel_is_centred(roll: float) -> None:
     rows, cols = image.camera.shape
     [[centre]] = cone.project_points([[0.0, 0.0, 0.0]], (rows, cols))
     np.testing.assert_allclose(centre, [(cols - 1) / 2, (rows - 1) / 2], atol=1e-3)
+
+
+def drawn_machine(rng: np.random.Generator) -> Machine:
+    """One that ships, with other ends of travel, speeds and exposures."""
+    name = str(rng.choice(["flexray", "unitom_xl", "xyzr_cabinet", "micro_ct"]))
+    text = f'base = "{name}"\nname = "drawn"\n'
+    for axis, a in builtin_machine(name).axes.items():
+        if rng.random() < 0.6:
+            continue
+        if a.kind == "rotation":
+            pace, acceleration = float(rng.choice([5, 20, 45])), float(rng.choice([5, 20]))
+            ends = -float(rng.choice([0, 10, 400])), float(rng.choice([200, 360, 400, 7200]))
+            text += f"[axes.{axis}]\nspeed = {pace}\nmax_speed = {pace}\n"
+            text += f"acceleration = {acceleration}\n"
+        else:
+            down, up = (float(x) for x in rng.uniform(0, 0.9, 2))
+            ends = a.lower + down * (a.home - a.lower), a.upper - up * (a.upper - a.home)
+            text += f"[axes.{axis}]\n"
+        text += f"lower = {ends[0]}\nupper = {ends[1]}\n"
+    least, most = [(1.0, 60.0), (60.0, 900.0), (400.0, 60_000.0)][int(rng.integers(3))]
+    text += f"[detector]\nmin_exposure_ms = {least}\nmax_exposure_ms = {most}\n"
+    return parse_machine(f"{text}exposure_ms = {min(most, 500.0)}\n")
+
+
+@pytest.mark.parametrize("block", range(3))
+def test_no_machine_is_proposed_what_its_own_check_refuses(block: int) -> None:
+    """With collisions; what a machine cannot do is refused before there is a script."""
+    made = 0
+    for seed in range(10 * block, 10 * block + 10):
+        machine = drawn_machine(np.random.default_rng(8000 + seed))
+        profile = profile_of(machine)
+        for kind in KINDS:
+            try:
+                text = compose_script(ScanRequest(kind=kind), machine, profile)
+            except LimitError:
+                continue
+            made += 1
+            sweep = collision_check() if machine.components else None
+            report = check_script(text, machine, profile, collision=sweep)
+            assert report.ok, (seed, kind, [p.where_and_what for p in report.problems])
+            assert {p.code for p in report.problems} <= {"default_assumed", "sample_in_flat"}
+    assert made > 5
+
+
+@pytest.mark.parametrize(
+    ("wish", "says"),
+    [
+        (ScanRequest(exposure_ms=0.5), "exposure_ms 0.5 is outside"),
+        (ScanRequest(kV=500.0), "kV 500 is outside"),
+        (ScanRequest(power_W=500.0), "power_W 500 is outside"),
+        (ScanRequest(mode="HW3SW1High"), "does not exist; allowed: HW"),
+        (ScanRequest(roi=Roi(0, 0, 0, 99)), "holds no pixel"),
+    ],
+)
+def test_settings_beyond_the_machine_s_are_refused(wish: ScanRequest, says: str) -> None:
+    machine = builtin_machine()
+    with pytest.raises(LimitError, match=says):
+        compose_script(wish, machine, profile_of(machine))

@@ -8,13 +8,15 @@ in `physics.exposure`.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 from flexdt.twin.errors import LimitError
 
 _MODE = re.compile(r"(?:\d+_)?HW(\d+)SW(\d+)(High|Low)", re.IGNORECASE)
+
+FORM: Final = "HWaSWbHigh or HWaSWbLow with binning factors a, b"
 
 
 @dataclass(frozen=True)
@@ -144,16 +146,21 @@ def binning_of(mode: str, modes: Mapping[str, int] | None = None) -> int:
         return named[mode.strip()]
     match = _MODE.fullmatch(mode.strip())
     if match is None or int(match[1]) * int(match[2]) == 0:
-        own = "".join(f"{name}, " for name in named) + "HWaSWbHigh or HWaSWbLow"
-        raise LimitError(
-            f"camera mode {mode!r} is not known; allowed: {own} with binning factors a, b, such as "
-            "HW1SW1High or HW2SW1Low",
-            {
-                "asked": mode,
-                "allowed": [*named, "HWaSWb{High,Low}"] if named else "HWaSWb{High,Low}",
-            },
-        )
+        raise no_mode(mode, [*named, FORM])
     return int(match[1]) * int(match[2])
+
+
+def no_mode(mode: str, allowed: Sequence[str]) -> LimitError:
+    """The error for a camera mode that is not among those `allowed`."""
+    return LimitError(
+        f"camera mode {mode!r} does not exist; allowed: {', '.join(allowed)}",
+        {"asked": mode, "allowed": list(allowed)},
+    )
+
+
+def without_number(mode: str) -> str:
+    """A mode's name without the number that some machines prefix, in lower case."""
+    return re.sub(r"^\d+_", "", mode.strip()).lower()
 
 
 def check_roi(roi: Roi, grid: PixelGrid, binning: int) -> Roi:

@@ -13,6 +13,7 @@ import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from importlib import resources
+from itertools import product
 from typing import Annotated, Any, Final, Literal, TypeVar
 
 from pydantic import (
@@ -28,7 +29,16 @@ from pydantic_core import PydanticCustomError
 
 from flexdt.twin.errors import LimitError, MachineFileError, TwinError, UnknownNameError
 from flexdt.twin.geometry.offsets import NAMES
-from flexdt.twin.machine.camera import CameraSettings, PixelGrid, Roi, binning_of, check_roi
+from flexdt.twin.machine.camera import (
+    FORM,
+    CameraSettings,
+    PixelGrid,
+    Roi,
+    binning_of,
+    check_roi,
+    no_mode,
+    without_number,
+)
 from flexdt.twin.values import message_of
 
 Positive = Annotated[float, Field(gt=0, le=1e6)]
@@ -43,6 +53,7 @@ def _one_word(name: str) -> str:
 
 Name = Annotated[str, AfterValidator(_one_word)]
 """Scripts separate their columns by tabs, and people theirs by spaces."""
+Binning = Annotated[int, Field(ge=1, le=64)]
 Factor = Annotated[float, Field(ge=-1e6, le=1e6)]
 Pace = Annotated[float, Field(ge=1e-6, le=1e6)]
 Vector3 = tuple[Length, Length, Length]
@@ -148,8 +159,14 @@ class DetectorSpec(_Frozen):
     """From row to row; None: the same."""
     bits: int = Field(ge=8, le=16)
     """Images are 16 bit files, so a deeper converter has no place to go."""
-    modes: dict[str, Annotated[int, Field(ge=1, le=64)]] = Field(default_factory=dict)
+    modes: dict[str, Binning] = Field(default_factory=dict)
     """Binning of the camera modes whose names are not HWaSWb{High,Low}."""
+    hardware_binning: tuple[Binning, ...] = (1, 2, 4)
+    """Factors a of the modes HWaSWb{High,Low}; the default is the Dexela 1512NDT's (data sheet)."""
+    software_binning: tuple[Binning, ...] = (1, 2, 4)
+    """Factors b (default assumed)."""
+    gains: tuple[Literal["High", "Low"], ...] = ("High", "Low")
+    """Full wells that they end with."""
     mode: str
     roi: tuple[int, int, int, int]
     exposure_ms: Positive = 100.0
@@ -174,12 +191,30 @@ class DetectorSpec(_Frozen):
         modes = tuple(self.modes.items())
         return CameraSettings(self.mode, Roi(*self.roi), self.exposure_ms, modes=modes)
 
+    @property
+    def mode_names(self) -> tuple[str, ...]:
+        """The camera modes that exist; the one at start is among them."""
+        every = product(self.hardware_binning, self.software_binning, self.gains)
+        own = [f"HW{a}SW{b}{gain}" for a, b, gain in every]
+        return tuple(dict.fromkeys([self.mode, *self.modes, *own]))
+
+    def check_mode(self, mode: str) -> str:
+        """`mode` if it exists; case and the number that some machines prefix do not matter.
+
+        Raises:
+            LimitError: lists the modes that exist.
+        """
+        own = {without_number(name) for name in self.mode_names if name not in self.modes}
+        if mode.strip() not in self.modes and without_number(mode) not in own:
+            raise no_mode(mode, self.mode_names)
+        return mode
+
     @model_validator(mode="after")
     def _fits(self) -> DetectorSpec:
         try:
             binning = binning_of(self.mode, self.modes)
-        except LimitError as error:
-            raise _refused("mode", self.mode, error.message) from None
+        except LimitError:
+            raise _refused("mode", self.mode, ", ".join([*self.modes, FORM])) from None
         try:
             check_roi(Roi(*self.roi), self.pixels, binning)
         except LimitError as error:
@@ -828,7 +863,8 @@ def _inherited(own: Raw) -> Raw:
         if key == "components" and not all(isinstance(part, dict) for part in parts):
             raise UnknownNameError(f"components must be tables, [[components]] (value: {value!r})")
         if isinstance(base.get(key), dict) and not isinstance(value, dict):
-            raise UnknownNameError(f"{key} must be a table, [{key}] (value: {value!r})")
+            most = f"must be a table, [{key}]{_limit(key)}"
+            raise UnknownNameError(f"{key} {most} (value: {value!r})")
     if "name" in own:
         base["default_profile"] = ""  # the base's zero offsets are of that machine alone
     for gone in without if isinstance(without, list) else [without]:
@@ -921,9 +957,31 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
                 data.append({"path": path, "message": "is missing"})
                 continue
             value = e["input"] if at is None else e["ctx"]["value"]
-            lines.append(f"{file}: {path}: {message_of(e)} (value: {value!r})")
-            data.append({"path": path, "message": message_of(e), "value": repr(value)})
+            said = "there is no such key" if e["type"] == "extra_forbidden" else message_of(e)
+            if e["type"] in ("extra_forbidden", "literal_error", "model_type"):
+                said += _limit(path)
+            lines.append(f"{file}: {path}: {said} (value: {value!r})")
+            data.append({"path": path, "message": said, "value": repr(value)})
         raise MachineFileError("\n".join(lines), {"file": file, "problems": data}) from None
+
+
+_ONE: Final = "a machine has one tube and one flat panel, [tube] and [detector]"
+_LIMITS: Final = {
+    "beam": "the beam is a cone from one focal spot; parallel and fan beams are not modelled",
+    "tube": _ONE,
+    "source": _ONE,
+    "detector": _ONE,
+    "shape": "curved panels and line detectors are not modelled",
+    "unit": 'linear axes are in mm, axes with kind = "rotation" in deg',
+    "kind": "axes slide or turn about the vertical; what tilts is not modelled",
+}
+
+
+def _limit(path: str) -> str:
+    """What docs/limits.md says of a key, to end an error with."""
+    last = path.rpartition(".")[2].lower()
+    said = next((text for key, text in _LIMITS.items() if last.startswith(key)), None)
+    return f"; {said} (docs/limits.md)" if said else ""
 
 
 def _require(

@@ -83,6 +83,7 @@ def changed_camera(
     """
     stated: dict[str, Any] = {name: x for name, x in change.items() if x is not None}
     new = replace(camera, **stated)
+    spec.check_mode(new.mode)
     check_roi(new.roi, spec.pixels, new.binning)
     least, most = spec.min_exposure_ms, spec.max_exposure_ms
     _require_within("camera", "exposure_ms", new.exposure_ms, least, most)

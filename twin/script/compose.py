@@ -25,8 +25,11 @@ from flexdt.twin.geometry.conventions import (
     FloatArray,
     turn_detector,
 )
-from flexdt.twin.machine.camera import CameraSettings, Roi, check_roi
+from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Axis, Machine, Profile, check_target
+from flexdt.twin.machine.kinematics import motor_poses
+from flexdt.twin.scanner.settings import CameraChange, changed_camera, changed_tube
+from flexdt.twin.scanner.state import TubeSettings
 from flexdt.twin.script.planning.smooth_scan import MARGIN_IMAGES, run_up
 
 Kind = Literal["fly", "step", "tiled", "helical", "calibration"]
@@ -34,6 +37,9 @@ Kind = Literal["fly", "step", "tiled", "helical", "calibration"]
 KINDS: Final[tuple[Kind, ...]] = ("fly", "step", "tiled", "helical", "calibration")
 FREE_MM: Final = 60.0
 """How far beyond the field of view the sample goes for the flat field (assumed: any sample)."""
+
+REFERENCES: Final = 10
+"""Images averaged for a dark and a flat: their noise is then little beside a projection's."""
 
 MAX_FRAMES: Final = 100_000
 _ROUNDED_MM: Final = 1e-4
@@ -59,7 +65,7 @@ class ScanRequest:
         sod_mm, sdd_mm: source-object and source-detector distance; None is 600 and 1059 where the
             machine gets there, else its home, or its only one.
         frames: images of one fly scan, of the whole for step and helical.
-        exposure_ms, averages: of one image.
+        exposure_ms, averages: of one image; None is 100 ms, or as near as the camera gets.
         height_mm: of source and detector centre above the origin; None is the sample's, or as for
             sod_mm.
         turns, rise_mm: of a helical scan, in total.
@@ -75,7 +81,7 @@ class ScanRequest:
     sod_mm: float | None = None
     sdd_mm: float | None = None
     frames: int = 361
-    exposure_ms: float = 100.0
+    exposure_ms: float | None = None
     averages: int = 1
     height_mm: float | None = None
     turns: float = 3.0
@@ -86,8 +92,8 @@ class ScanRequest:
     roi: Roi | None = None
     kV: float | None = None
     power_W: float | None = None
-    darks: int = 10
-    flats: int = 10
+    darks: int = REFERENCES
+    flats: int = REFERENCES
     folder: str = "E:\\flexdt\\scan"
 
 
@@ -103,15 +109,18 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
         LimitError: a count, distance or speed that the machine does not allow, or a motion for
             which it has no motor; says which.
     """
-    if request.roi is not None:
-        camera = machine.detector.camera
-        binning = replace(camera, mode=request.mode or camera.mode).binning
-        check_roi(request.roi, machine.detector.pixels, binning)
+    panel, tube = machine.detector, machine.tube
+    exposure = min(max(100.0, panel.min_exposure_ms), panel.max_exposure_ms)
+    if request.exposure_ms is not None:
+        exposure = request.exposure_ms
+    change: CameraChange = {"mode": request.mode, "roi": request.roi, "exposure_ms": exposure}
+    changed_camera(panel, panel.camera, change)
+    changed_tube(tube, TubeSettings(tube.kV, tube.power_W), request.kV, request.power_W)
     attempts = list(_usual(request, _Places(machine, profile)))
     for sod, sdd, height in attempts:
         placed = (ScanPosition(sod),) if request.placements is None else request.placements
         full = _Request(**{**vars(request), "sod_mm": sod, "sdd_mm": sdd, "height_mm": height,
-                           "placements": placed})  # fmt: skip
+                           "exposure_ms": exposure, "placements": placed})  # fmt: skip
         try:
             _check_counts(full)
             writer = _Writer(machine, profile, full)
@@ -156,6 +165,7 @@ class _Request(ScanRequest):
     sod_mm: float = 0.0
     sdd_mm: float = 0.0
     height_mm: float = 0.0
+    exposure_ms: float = 100.0
     placements: tuple[ScanPosition, ...] = ()
 
 
@@ -258,6 +268,57 @@ class _Places:
                     {"asked": what, "missing": quantity},
                 )
 
+    @property
+    def aside(self) -> tuple[str, ...]:
+        """The quantity by which the sample leaves the beam."""
+        return tuple(q for q in ("object_x", "object_z") if q in self.drivers)[:1]
+
+
+def beside_beam(
+    machine: Machine,
+    profile: Profile,
+    camera: CameraSettings,
+    positions: Mapping[str, float],
+    radius_mm: float = 0.0,
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Where the sample's stage goes from `positions` so that the beam is free, as far as it can.
+
+    Args:
+        machine: whose motors these are.
+        profile: zero offsets.
+        camera: decides how wide the beam is that reaches the image.
+        positions: motors [mm, deg]; those left out stand at home.
+        radius_mm: of the sample, if known.
+
+    Returns:
+        Motor -> target, to either side of the beam, the freer one first.
+
+    Raises:
+        LimitError: no motor takes the sample out of the beam.
+    """
+    places = _Places(machine, profile)
+    if not places.aside:
+        raise LimitError(
+            f"{machine.name} has no motor that takes the sample out of the beam, so no flat image "
+            "can be taken",
+            {"asked": "a flat field", "missing": ["object_x", "object_z"]},
+        )
+    [quantity] = places.aside
+    name = places.drivers[quantity]
+    axis, factor = machine.axis(name), machine.geometry[quantity][name]
+    p = motor_poses(machine, profile, camera, positions)
+    k = 0 if quantity == "object_x" else 1
+    beam, sample = (p.detector - p.source)[0], (p.axis - p.source)[0]
+    share = float(sample[1] / beam[1])
+    off = float((share * beam - sample)[2 * k])
+    middle = positions.get(name, axis.home) + off / factor
+    size = camera.shape[1 - k] * camera.pixels_mm(machine.detector.pixels)[k]
+    away = (abs(share) * size / 2 + FREE_MM + radius_mm) / abs(factor)
+    least, most = math.ceil(axis.lower * 1e6) / 1e6, math.floor(axis.upper * 1e6) / 1e6
+    upper, lower = ({name: round(min(max(middle + way, least), most), 6)} for way in (away, -away))
+    freer = middle - axis.lower > axis.upper - middle
+    return (lower, upper) if freer else (upper, lower)
+
 
 @dataclass(frozen=True)
 class _Writer(_Places):
@@ -312,7 +373,8 @@ class _Writer(_Places):
         yield _row("camera", "set number of averages", str(w.averages))
         yield _row("scanner", "write settings file")
         for i in range(w.frames):
-            yield _row(name, "move absolute", _f(i * 360.0 / w.frames))
+            angle = check_target(self.machine, name, i * 360.0 / w.frames)
+            yield _row(name, "move absolute", _f(angle))
             yield _row("camera", "take image")
             yield _row("camera", "save image", f"{w.folder}\\scan_{i:06d}.tif")
 
@@ -497,33 +559,10 @@ class _Writer(_Places):
             )
         return {name: check_target(self.machine, name, value) for name, value in found.items()}
 
-    @property
-    def aside(self) -> tuple[str, ...]:
-        """The quantity by which the sample leaves the beam."""
-        return tuple(q for q in ("object_x", "object_z") if q in self.drivers)[:1]
-
     def out_of_beam(self) -> dict[str, float]:
         """Where the stage goes for the flat field: as far as the beam asks, to the freer side."""
-        w, camera = self.request, self.camera
-        if not self.aside:
-            raise LimitError(
-                f"{self.machine.name} has no motor that takes the sample out of the beam, so a "
-                "script cannot take its flat field",
-                {"asked": "a flat field", "missing": ["object_x", "object_z"]},
-            )
-        [quantity] = self.aside
-        name = self.drivers[quantity]
-        axis, factor = self.machine.axis(name), self.machine.geometry[quantity][name]
-        centre = self.station(w.sod_mm)[name]
-        across = quantity == "object_x"
-        size = camera.shape[1 if across else 0]
-        pixel = camera.pixels_mm(self.machine.detector.pixels)[0 if across else 1]
-        away = size * pixel * w.sod_mm / w.sdd_mm / 2 + FREE_MM
-        room = max(centre - axis.lower, axis.upper - centre) * abs(factor)
-        sign = -1.0 if (centre - axis.lower > axis.upper - centre) == (factor > 0.0) else 1.0
-        step = sign * min(away, room)
-        lateral, lift = (step, 0.0) if across else (0.0, step)
-        return {name: self.station(w.sod_mm, lateral, 0.0, lift)[name]}
+        station = self.station(self.request.sod_mm)
+        return beside_beam(self.machine, self.profile, self.camera, station)[0]
 
     def image(self, file: str, averages: int) -> Iterator[str]:
         yield _row("camera", "set number of averages", str(averages))
@@ -588,7 +627,6 @@ def _check_counts(request: _Request) -> None:
         ("flats", request.flats, 1, 10_000),
         ("tiles", request.tiles, 1, 100),
         ("placements", len(request.placements), 1, 100),
-        ("exposure_ms", request.exposure_ms, 1e-3, 1e7),
         ("turns", request.turns, 1e-3, 40.0),
         ("rise_mm", request.rise_mm, 1e-3, 1e6),
         ("height_mm", request.height_mm, -1e6, 1e6),

@@ -280,7 +280,11 @@ def new(
     sod: float | None = option(None, USUAL, metavar="MM"),
     sdd: float | None = option(None, USUAL, metavar="MM"),
     frames: int = option(361, "Take so many images in a turn, or in all."),
-    exposure: float = option(100.0, "Expose each image so long.", metavar="MS"),
+    exposure: float | None = option(
+        None,
+        "Expose each image so long; default: 100, or as near as the camera gets.",
+        metavar="MS",
+    ),
     averages: int = option(1, "Average so many read-outs in an image."),
     position: list[str] | None = option(
         None, "Put a calibration scan there; once for each scan.", metavar="SOD[:LATERAL]"
@@ -438,6 +442,8 @@ def expose(
     filter: str = option("", "Put this filter beside the machine's own.", metavar="MATERIAL:MM"),
     exposure: float | None = option(None, "Expose each image so long.", metavar="MS"),
     averages: int = option(1, "Average so many read-outs in an image."),
+    mode: str | None = option(None, "Set the camera's mode.", metavar="NAME"),
+    roi: options.Roi = None,
     frames: int = option(361, "Take so many images of the scan."),
     sod: float = option(600.0, "Set the distance from source to axis.", metavar="MM"),
     sdd: float = option(1059.0, "Set the distance from source to panel.", metavar="MM"),
@@ -449,6 +455,7 @@ def expose(
     """Predict transmission, contrast to noise, dose and the best voltage and filter."""
     from flexdt.clients import expose as of
     from flexdt.clients.datasets.dataset import load_dataset
+    from flexdt.twin.machine.camera import Roi
 
     if dataset is not None:
         data = load_dataset(dataset)
@@ -464,6 +471,8 @@ def expose(
         filter=filter,
         exposure_ms=exposure,
         averages=averages,
+        mode=mode,
+        roi=None if roi is None else Roi(*roi),
         images=frames,
         sod=sod,
         sdd=sdd,

@@ -210,6 +210,8 @@ export type ExposurePredict = {
   filter?: string;
   exposure_ms?: number | null;
   averages?: number | null;
+  mode?: string | null;
+  roi?: [number, number, number, number] | null;
   frames?: number;
   sod_mm?: number | null;
   sdd_mm?: number | null;

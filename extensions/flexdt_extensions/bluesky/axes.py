@@ -69,7 +69,8 @@ class AxisLogic(MovableLogic[float]):
             )
         if not self.collisions or abs(new_position - axis.position) <= ARRIVED:
             return
-        report = await self.link.client.check_trajectory([{self.axis: new_position}])
+        poses = [{self.axis: new_position}]
+        report = await self.link.client.check_trajectory(poses, flat=False)
         if report.collisions:
             first = report.collisions[0]
             raise LimitsExceeded(

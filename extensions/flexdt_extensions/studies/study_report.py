@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from flexdt.clients.figures import Series, cell_text, heat_map, page, plot, table
+from flexdt.clients.figures import Series, cell_text, page, plot, table
 from flexdt.extending import write_whole
 from flexdt.twin.geometry.offsets import UNITS
 from flexdt_extensions.studies.experiment_4 import ENOUGH
+from flexdt_extensions.studies.heat_map import heat_map
 from flexdt_extensions.studies.runs import Run, grid
 from flexdt_extensions.studies.thesis_tables import thesis
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flexdt.clients.cli.entry import run as command
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import bead_model
 from flexdt.twin.errors import UnknownNameError
@@ -120,3 +121,10 @@ def test_experiment_4_on_images_does_not_depend_on_the_number_of_projections() -
         assert run["identifiable"]
         assert max(run["errors"][n] / run["sigmas"][n] for n in run["errors"]) < 5.0
     assert abs(few["errors"]["alpha"] - many["errors"]["alpha"]) < 0.05
+
+
+def test_exact_points_say_why_one_placement_succeeds(capsys: pytest.CaptureFixture[str]) -> None:
+    assert command(["study", "detector", "--jobs", "1"]) == 0
+    assert "because exact points have no noise" in capsys.readouterr().out
+    assert command(["study", "detector", "--jobs", "1", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["experiment"] == "detector"

@@ -25,6 +25,7 @@ from flexdt.server.twin.hub import ImageWish
 from flexdt.server.twin.live import Shot, image_of
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.machine.camera import Roi
 from flexdt.twin.scanner.settings import changed_camera, changed_tube, switched
 
 
@@ -131,6 +132,7 @@ async def predict(twin: TwinServer, client: Client, params: p.ExposurePredict) -
         "power_W": lit.power_W if params.power_W is None else params.power_W,
         "exposure_ms": params.exposure_ms or camera.exposure_ms,
         "averages": params.averages or camera.averages,
+        "mode": params.mode or camera.mode, "roi": Roi(*(params.roi or camera.roi.edges)),
         "filter": params.filter, "images": params.frames, "detail": params.detail,
         "sod": params.sod_mm or at.SOD_mm, "sdd": params.sdd_mm or at.SDD_mm,
     }  # fmt: skip

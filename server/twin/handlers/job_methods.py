@@ -130,7 +130,7 @@ def _unless_obstructed(job: Job, status: w.JobStatus) -> w.JobStatus:
 def _source(params: ScanInput) -> ScanSource:
     if isinstance(params, p.TrajectoryInput):
         return ScanSource.of_poses(
-            params.poses, params.exposure_ms, params.motion_samples, params.seed
+            params.poses, params.exposure_ms, params.motion_samples, params.seed, params.flat
         )
     if params.text is not None:
         script = params.text.encode("utf-8")

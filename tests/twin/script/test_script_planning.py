@@ -428,8 +428,8 @@ def test_streamed_poses(flexray: Machine, profile: Profile) -> None:
     poses = [{"rot_obj": 30.0 * i, "tra_obj": float(i)} for i in range(4)] + [{"rot_obj": 0.0}]
     plan = plan_poses(poses, flexray, profile, 250.0)
     assert codes(plan) == []
-    dark, *images = plan.exposures
-    assert dark.kind == "dark"
+    dark, flat, *images = plan.exposures
+    assert (dark.kind, flat.kind) == ("dark", "flat")
     assert [e.file for e in images] == [f"scan_{i:06d}.tif" for i in range(5)]
     assert [e.positions["rot_obj"] for e in images] == [0, 30, 60, 90, 0]
     assert [e.positions["tra_obj"] for e in images] == [0, 1, 2, 3, 3]

@@ -13,9 +13,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.machine.camera import CameraSettings, check_roi
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.commands import ImageKind
@@ -265,22 +263,12 @@ class ImageCollector:
         if clash is not None:
             self.findings.warn("overwrites", f"{clash} is saved twice; the last one stays")
         self.names.update(draft.files)
-        self._fits(draft.camera)
         self._unsaid(draft)
         if draft.kind == "dark" and draft.xrays_on:
             self.findings.warn("xrays_on", "a dark image is taken with X-rays on")
         if draft.kind != "dark" and not draft.xrays_on:
             what = "a flat image is" if draft.kind == "flat" else "projections are"
             self.findings.warn("xrays_off", f"{what} taken with X-rays off")
-
-    def _fits(self, camera: CameraSettings) -> None:
-        if "roi_fit" in self._complained:
-            return
-        try:
-            check_roi(camera.roi, self.machine.detector.pixels, camera.binning)
-        except LimitError as error:
-            self._complained.add("roi_fit")
-            self.findings.error("roi", error.message)
 
     def _unsaid(self, draft: ExposureGroup) -> None:
         """One warning for each setting that a saved image takes from the machine's defaults."""

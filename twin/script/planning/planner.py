@@ -10,7 +10,7 @@ truncation is about the cylinder that holds the sample at every angle of a full 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,7 +25,6 @@ from flexdt.twin.machine.description import (
     Profile,
     builtin_machine,
     profile_of,
-    unknown_axis,
 )
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.script import commands as c
@@ -93,72 +92,6 @@ def plan_script(
     )
     extra = beam_problems(plan)
     return replace(plan, problems=in_order((*script.warnings, *extra, *s.findings.problems)))
-
-
-def plan_poses(
-    poses: Sequence[Mapping[str, float]],
-    machine: Machine,
-    profile: Profile,
-    exposure_ms: float | None = None,
-    *,
-    start: StartState | None = None,
-    sample: SampleSize | None = None,
-) -> ScanPlan:
-    """Streamed poses (thesis 4.6.2) as a plan: a dark, X-rays on, then one projection a pose.
-
-    The axes of a pose start together and all arrive before its image. No flat is taken, because
-    that needs a motion that was not requested. Line i + 1 of problems and steps is pose i.
-
-    Args:
-        poses: axis -> position [mm, deg]; axes left out stay where they are.
-        machine: whose axes these are.
-        profile: zero offsets.
-        exposure_ms: of every image; None keeps the camera's current exposure.
-        start: the scanner before; the machine's homes if None.
-        sample: its size, if known.
-
-    Raises:
-        UnknownNameError: a pose names an axis that the machine does not have.
-
-    Example:
-        >>> from flexdt.twin.machine.description import builtin_machine, builtin_profile
-        >>> machine = builtin_machine("flexray")
-        >>> profile = builtin_profile(machine.default_profile)
-        >>> plan_poses([{"rot_obj": 0.0}, {"rot_obj": 90.0}], machine, profile, 100.0)
-        <ScanPlan on flexray: 20 steps, 2 projections, 13.2 s, 0 errors, 0 warnings>
-    """
-    begin = StartState.of(machine) if start is None else start
-    camera = begin.camera
-    exposure = camera.exposure_ms if exposure_ms is None else exposure_ms
-    commands: list[c.Command] = [
-        c.SetMode(mode=camera.mode),
-        c.SetRoi(roi=camera.roi),
-        c.SetExposure(exposure_ms=exposure),
-        c.SetFrames(frames=1),
-        c.SetAverages(averages=camera.averages),
-        c.SetVoltage(kV=begin.kV),
-        c.SetPower(power_W=begin.power_W),
-        c.XrayOff(),
-        c.TakeImage(),
-        c.SaveImage(path="di000000.tif"),
-        c.XrayOn(),
-        c.WaitXrayReady(),
-        c.WriteSettingsFile(),
-    ]
-    for i, pose in enumerate(poses):
-        line = i + 1
-        for axis in pose:
-            if not machine.has(axis):
-                raise unknown_axis(axis, machine)
-        moves = [c.MoveAbsolute(component=a, target=float(v), line=line) for a, v in pose.items()]
-        commands += [
-            *(replace(k, wait=c.Wait.NO_WAIT) for k in moves if len(moves) > 1),
-            *moves,
-            c.TakeImage(line=line),
-            c.SaveImage(path=f"scan_{i:06d}.tif", line=line),
-        ]
-    commands.append(c.XrayOff(line=len(poses)))
-    return plan_script(c.Script.of(commands), machine, profile, start=begin, sample=sample)
 
 
 def simulated(commands: tuple[c.Command, ...], machine: Machine, start: StartState) -> Simulation:

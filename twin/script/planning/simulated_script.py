@@ -14,9 +14,10 @@ from dataclasses import replace
 from typing import Any, Final
 
 from flexdt.twin.errors import LimitError
-from flexdt.twin.machine.camera import binning_of, check_roi
 from flexdt.twin.machine.description import Machine, unknown_axis
 from flexdt.twin.motion.profiles import Trajectory
+from flexdt.twin.scanner.settings import CameraChange, changed_camera, changed_tube
+from flexdt.twin.scanner.state import TubeSettings
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.grammar import describe, is_reserved, own_name
 from flexdt.twin.script.planning import planned_scanner as planned
@@ -169,54 +170,36 @@ class Simulation:
             return self.timed("command")
         return planned.Span(self.now, self.now + left, left, "xray_ready")
 
-    def _voltage(self, command: c.SetVoltage) -> planned.Span:
-        spec = self.machine.tube
-        fits = self._range("tube voltage", command.kV, spec.min_kV, spec.max_kV, "kV")
-        self.tube.set(self.now, kV=command.kV if fits else self.tube.kV)
+    def _tube(self, kV: float | None = None, power_W: float | None = None) -> planned.Span:
+        """Voltage or power; what the tube does not allow is noted and stays as it was."""
+        now = TubeSettings(self.tube.kV, self.tube.power_W)
+        try:
+            changed_tube(self.machine.tube, now, kV, power_W)
+        except LimitError as error:
+            self.findings.error("limit", error.message)
+            kV, power_W = (
+                None if x is None else y for x, y in ((kV, now.kV), (power_W, now.power_W))
+            )
+        self.tube.set(self.now, kV=kV, power_W=power_W)
         return self.timed("set_tube")
-
-    def _power(self, command: c.SetPower) -> planned.Span:
-        fits = self._range("tube power", command.power_W, 0.0, self.machine.tube.max_W, "W")
-        self.tube.set(self.now, power_W=command.power_W if fits else self.tube.power_W)
-        return self.timed("set_tube")
-
-    def _range(self, what: str, value: float, low: float, high: float, unit: str) -> bool:
-        """Whether a setting can be; if not it is noted, and the plan goes on with the old one."""
-        if low <= value <= high:
-            return True
-        self.findings.error(
-            "limit", f"{what} {value:g} {unit} is outside [{low:g}, {high:g}] {unit}"
-        )
-        return False
 
     # camera --------------------------------------------------------------------------------
 
-    def _stated(self, name: str, value: object) -> planned.Span:
+    def _stated(self, change: CameraChange) -> planned.Span:
+        """One setting of the camera; what the panel does not allow is noted and stays as it was."""
+        [(name, value)] = change.items()
+        now = self.camera.settings
+        try:
+            changed_camera(self.machine.detector, now, change)
+        except LimitError as error:
+            region = "edge" in error.data or "binning" in error.data
+            code = "limit" if "setting" in error.data else "roi" if region else "mode"
+            self.findings.error(code, error.message)
+            value = getattr(now, name)
         self.camera.set(name, value)
         span = self.timed("set_camera")
         self.camera.free_at = span.end
         return span
-
-    def _mode(self, command: c.SetMode) -> planned.Span:
-        try:
-            binning_of(command.mode, self.machine.detector.modes)
-        except LimitError as error:
-            self.findings.error("mode", error.message)
-            return self._stated("mode", self.camera.settings.mode)
-        return self._stated("mode", command.mode)
-
-    def _exposure(self, command: c.SetExposure) -> planned.Span:
-        spec, asked = self.machine.detector, command.exposure_ms
-        fits = self._range("exposure", asked, spec.min_exposure_ms, spec.max_exposure_ms, "ms")
-        return self._stated("exposure_ms", asked if fits else self.camera.settings.exposure_ms)
-
-    def _roi(self, command: c.SetRoi) -> planned.Span:
-        roi = self.camera.settings.roi
-        try:
-            roi = check_roi(command.roi, self.machine.detector.pixels, 1)
-        except LimitError as error:
-            self.findings.error("roi", error.message)
-        return self._stated("roi", roi)
 
     # motors --------------------------------------------------------------------------------
 
@@ -330,13 +313,13 @@ _EFFECTS: Final[Mapping[type[c.Command], _Effect]] = {
     c.XrayOn: Simulation._xray_on,
     c.XrayOff: Simulation._xray_off,
     c.WaitXrayReady: Simulation._ready,
-    c.SetVoltage: Simulation._voltage,
-    c.SetPower: Simulation._power,
-    c.SetMode: Simulation._mode,
-    c.SetExposure: Simulation._exposure,
-    c.SetFrames: lambda s, k: s._stated("frames", k.frames),
-    c.SetAverages: lambda s, k: s._stated("averages", k.averages),
-    c.SetRoi: Simulation._roi,
+    c.SetVoltage: lambda s, k: s._tube(kV=k.kV),
+    c.SetPower: lambda s, k: s._tube(power_W=k.power_W),
+    c.SetMode: lambda s, k: s._stated({"mode": k.mode}),
+    c.SetExposure: lambda s, k: s._stated({"exposure_ms": k.exposure_ms}),
+    c.SetFrames: lambda s, k: s._stated({"frames": k.frames}),
+    c.SetAverages: lambda s, k: s._stated({"averages": k.averages}),
+    c.SetRoi: lambda s, k: s._stated({"roi": k.roi}),
     c.TakeImage: lambda s, k: s.imaging.take(k, s.now, len(s.steps)),
     c.SaveImage: lambda s, k: s.imaging.save(k, s.now, len(s.steps)),
     c.TakeSequence: lambda s, k: s.imaging.sequence(k, s.now, len(s.steps)),
