@@ -11,7 +11,7 @@ import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Final, get_args
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,7 @@ from flexdt.phantoms.samples import as_phantom
 from flexdt.twin.errors import GeometryError, LimitError, require_within
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.geometry.plausibility import geometry_doubts
 from flexdt.twin.machine.camera import CameraSettings, PixelGrid, Roi
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.physics.chain import (
@@ -53,6 +54,7 @@ from flexdt.twin.physics.tube import Tube
 from flexdt.twin.projection import project_body
 from flexdt.twin.projection.analytic_solids import Vector
 from flexdt.twin.projection.operators import as_cone_vec
+from flexdt.twin.signatures import public
 
 BATCH_BYTES: Final = 64 << 20
 """Path lengths in memory at a time."""
@@ -147,6 +149,7 @@ class Truth:
         return np.stack([image.integrals for image in self.radiographs()])
 
 
+@public
 def simulate(
     sample: object,
     geometry: ConeVec | npt.ArrayLike | None = None,
@@ -180,7 +183,8 @@ def simulate(
             states one, so long that the brightest pixel of the open beam reaches 80 % of the
             largest count. `truth` says it.
         scatter: "mc" adds the radiation that the sample scatters, by Monte Carlo with the seed of
-            `noise`. `ScatterSettings` state more. It is in the data set's `truth.scatter`.
+            `noise`; 'first' has been removed, use 'mc'. `ScatterSettings` state more. It is in the
+            data set's `truth.scatter`.
         machine: a machine, its name or file, whose tube and detector are taken where `tube` and
             `detector` leave them open.
         shape: detector (rows, cols), where the geometry does not say.
@@ -224,18 +228,11 @@ def simulate(
         made: DataSet = scenario(sample, noise, 3 if rays is None else rays)
         return made
     rays = 1 if rays is None else rays
-    if not isinstance(scatter, ScatterSettings) and scatter not in get_args(Scatter):
-        asked = str(scatter)
-        gone = "; 'first' has been removed, use 'mc'" if asked == "first" else ""
-        raise LimitError(
-            f"scatter is {asked!r}; allowed: {', '.join(get_args(Scatter))}{gone}",
-            {"asked": asked, "allowed": list(get_args(Scatter))},
-        )
-    if noise is not None and (not isinstance(noise, int | np.integer) or noise < 0):
+    if noise is not None and noise < 0:
         raise LimitError(f"noise is {noise}; allowed: a seed >= 0, or None", {"asked": noise})
     check_rays(rays)
     allowed = (1, *range(3, MOST_POINTS + 1))
-    if not isinstance(spot_points, int | np.integer) or spot_points not in allowed:
+    if spot_points not in allowed:
         raise LimitError(
             f"spot_points is {spot_points}; allowed: 1, or 3 to {MOST_POINTS}",
             {"asked": spot_points, "allowed": [1, 3, MOST_POINTS]},
@@ -287,9 +284,10 @@ def simulate(
             progress((i + 1) / len(cone))
     made = DataSet.from_arrays(counts, cone, dark=dark, flat=flat, name=phantom.name, truth=truth)
     made = replace(made, full_scale=panel.full_scale)
-    told = *image_doubts(made), *_flat_doubt(size, cone), *_spot_doubt(truth)
+    placed = geometry_doubts(cone, size, phantom.boxes)
+    told = *placed, *image_doubts(made), *_flat_doubt(size, cone), *_spot_doubt(truth)
     for doubt in told:
-        warnings.warn(doubt, stacklevel=2)
+        warnings.warn(doubt, stacklevel=3)
     return replace(made, warnings=(*truth.assumed, *told))
 
 

@@ -4,21 +4,21 @@
 
 Every public name is here, and each is found on first use: `import flexdt` itself loads none of the
 heavy libraries. To add a name, write it in `_HOMES` and among the imports for type checkers; a test
-compares the two and asks each name for a docstring with an example.
+compares the two and asks each name for a docstring with an example. Whatever else is here begins
+with an underscore, so that completers show the public names alone.
 """
 
-from __future__ import annotations
+import os as _os
+import typing as _typing
 
-import os
-from typing import TYPE_CHECKING, Any, Final
+from flexdt import moved as _moved
 
-from flexdt import moved
-
-if TYPE_CHECKING:
+if _typing.TYPE_CHECKING:
     from flexdt import phantoms as phantoms
     from flexdt.analysis import align as align
     from flexdt.analysis import calibrate as calibrate
     from flexdt.analysis import reconstruct as reconstruct
+    from flexdt.checked_machine import machine as machine
     from flexdt.clients import AsyncTwinClient as AsyncTwinClient
     from flexdt.clients import TwinClient as TwinClient
     from flexdt.clients.datasets.data_set import DataSet as DataSet
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from flexdt.clients.expose import expose as expose
     from flexdt.clients.launch.local_twin import LocalTwin as LocalTwin
     from flexdt.clients.simulate import simulate as simulate
-    from flexdt.machines import machine as machine
     from flexdt.projecting import project as project
     from flexdt.scripts import plan as plan
     from flexdt.twin.errors import NotBuiltError as NotBuiltError
@@ -49,13 +48,13 @@ if TYPE_CHECKING:
     open = load_dataset
     __version__: str
 
-if not os.path.isdir(os.path.join(__path__[0], "twin")):
+if not _os.path.isdir(_os.path.join(__path__[0], "twin")):
     # In a clone the other parts lie beside this folder, and Python that is started there finds it
     # before any flexdt that is installed.
-    __path__.append(os.path.dirname(__path__[0]))
-moved.watch()
+    __path__.append(_os.path.dirname(__path__[0]))
+_moved.watch()
 
-_HOMES: Final = {
+_HOMES: _typing.Final = {
     "AsyncTwinClient": "flexdt.clients",
     "ConeVec": "flexdt.twin.geometry.cone_vec",
     "DataSet": "flexdt.clients.datasets.data_set",
@@ -76,7 +75,7 @@ _HOMES: Final = {
     "expose": "flexdt.clients.expose",
     "fdk": "flexdt.twin.reconstruction.fdk",
     "forward": "flexdt.twin.projection.operators",
-    "machine": "flexdt.machines",
+    "machine": "flexdt.checked_machine",
     "open": "flexdt.clients.datasets.dataset:load_dataset",
     "phantoms": "flexdt.phantoms:",
     "plan": "flexdt.scripts",
@@ -92,9 +91,11 @@ _HOMES: Final = {
 __all__ = sorted(["__version__", *_HOMES])
 
 
-if not TYPE_CHECKING:  # with a `__getattr__`, type checkers would take any name for one of ours
+if (
+    not _typing.TYPE_CHECKING
+):  # with a `__getattr__`, type checkers would take any name for one of ours
 
-    def __getattr__(name: str) -> Any:
+    def __getattr__(name: str) -> _typing.Any:
         if name == "__version__":
             from importlib.metadata import version  # 10 ms that few imports need
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 from flexdt.clients.calibration.align_dataset import Aligned, align_dataset
 from flexdt.clients.calibration.calibrate import Outcome, calibrate_datasets
-from flexdt.clients.calibration.markers import Mark, Scale, markers_alone
+from flexdt.clients.calibration.markers import Scale, markers_alone
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.datasets.dataset import load_dataset, read_tiffs
 from flexdt.clients.datasets.exchange import with_geometry
@@ -27,10 +28,12 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.physics.tube import Tube
 from flexdt.twin.projection import Volume
+from flexdt.twin.signatures import public
 
 Data = DataSet | str | PathLike[str]
 
 
+@public
 def calibrate(
     data: Data | Sequence[Data] | None,
     phantom: str | Phantom,
@@ -39,7 +42,7 @@ def calibrate(
     priors: Mapping[str, float] | None = None,
     start: Mapping[str, float] | None = None,
     geometry: ConeVec | str | PathLike[str] | None = None,
-    markers: str | PathLike[str] | Sequence[Mark] | None = None,
+    markers: str | PathLike[str] | Sequence[Any] | None = None,
     scale: str | None = None,
     radius: float | None = None,
     per_frame: Sequence[str] = (),
@@ -100,6 +103,7 @@ def calibrate(
     )  # fmt: skip
 
 
+@public
 def reconstruct(
     data: Data,
     algorithm: str = "fdk",
@@ -166,6 +170,7 @@ def reconstruct(
     )
 
 
+@public
 def align(data: Data, *, per_frame: bool = False) -> Aligned:
     """Find axis and source plane of an ordinary full-turn scan without a phantom.
 

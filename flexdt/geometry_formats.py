@@ -30,8 +30,8 @@ from flexdt.twin.exchange.number_tables import (
     read_tomosipo,
     tomosipo_arrays,
 )
-from flexdt.twin.geometry.cone_vec import ConeVec, Shape2
-from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.cone_vec import ConeVec, Shape2, check_spread
+from flexdt.twin.geometry.conventions import FloatArray, as_numbers
 from flexdt.twin.lazy_backend import File
 
 BY_ENDING: Final = {
@@ -42,7 +42,7 @@ BY_ENDING: Final = {
 def from_astra(geometry: Any, shape: Shape2 | None) -> ConeVec:
     """See `ConeVec.from_astra`."""
     if not isinstance(geometry, Mapping):
-        return ConeVec(np.asarray(geometry, dtype=np.float64), shape)
+        return check_spread(ConeVec(as_numbers("cone_vec", geometry), shape))
     try:
         kind = geometry["type"]
         counted = (geometry["DetectorRowCount"], geometry["DetectorColCount"])
@@ -63,7 +63,7 @@ def from_astra(geometry: Any, shape: Shape2 | None) -> ConeVec:
         if isinstance(error, GeometryError):
             raise
         raise GeometryError(f"ASTRA's geometry: {error}", {"asked": repr(error)}) from None
-    own = ConeVec(rows, counted)
+    own = check_spread(ConeVec(rows, counted))
     own.of_shape(shape)
     return own
 

@@ -12,6 +12,7 @@ import numpy as np
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.figures import require_plots
 from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.projection.volume import Volume
 from flexdt.twin.script import CheckReport, ScanPlan
 
 SAMPLES = 2000
@@ -48,6 +49,18 @@ def plot_projection(data: DataSet, index: int, axes: Any = None) -> Any:
     shown = axes.imshow(data.line_integrals(index), cmap="gray")
     axes.figure.colorbar(shown, ax=axes, label="line integral")
     axes.set(xlabel="column", ylabel="row", title=f"{data.name}: {data.frames[index].file}")
+    return axes
+
+
+def plot_volume(volume: Volume, axes: Any = None) -> Any:
+    """The layer in the middle of a volume, from above."""
+    axes = _pyplot().figure().add_subplot() if axes is None else axes
+    x, y, z = volume.centers()
+    middle, half = len(z) // 2, volume.voxel_xyz[0] / 2
+    ends = (x[0] - half, x[-1] + half, y[0] - half, y[-1] + half)
+    shown = axes.imshow(volume.data[middle], cmap="gray", origin="lower", extent=ends)
+    axes.figure.colorbar(shown, ax=axes, label="attenuation [1/mm]")
+    axes.set(xlabel="x [mm]", ylabel="y [mm]", title=f"z = {z[middle]:g} mm")
     return axes
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
+from typing import Any
 
 import numpy.typing as npt
 
@@ -10,11 +12,14 @@ from flexdt.phantoms.channels import line_integrals
 from flexdt.phantoms.samples import as_phantom
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.geometry.plausibility import geometry_doubts
 from flexdt.twin.projection import Volume, forward
 from flexdt.twin.projection.analytic_solids import Vector
 from flexdt.twin.projection.operators import as_cone_vec
+from flexdt.twin.signatures import public
 
 
+@public
 def project(
     sample: object,
     geometry: ConeVec | npt.ArrayLike,
@@ -39,6 +44,9 @@ def project(
     Returns:
         float32 (n, rows, cols), dimensionless.
 
+    Warns:
+        UserWarning: a geometry that fits no scan of the sample: the source inside it, ...
+
     Raises:
         TwinError: a sample or a geometry that does not hold; says what is allowed.
 
@@ -51,7 +59,8 @@ def project(
     """
     cone = as_cone_vec(geometry)
     size = cone.of_shape(shape)
-    if isinstance(sample, Volume) and material is None:
-        return forward(sample, cone, size)
-    phantom = as_phantom(sample, material=material, voxel_mm=voxel_mm)
-    return line_integrals(phantom, cone, size)
+    plain = isinstance(sample, Volume) and material is None
+    body: Any = sample if plain else as_phantom(sample, material=material, voxel_mm=voxel_mm)
+    for doubt in geometry_doubts(cone, size, body.boxes):
+        warnings.warn(doubt, stacklevel=3)
+    return (forward if plain else line_integrals)(body, cone, size)

@@ -22,8 +22,10 @@ from flexdt.twin.script import (
 )
 from flexdt.twin.script.planning.dry_run import CollisionCheck, check_plan
 from flexdt.twin.script.planning.plan import StartState
+from flexdt.twin.signatures import public
 
 
+@public
 def plan(
     script: Script | str | bytes | PathLike[str],
     machine: Machine | str | PathLike[str] | None = None,

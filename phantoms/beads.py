@@ -18,6 +18,7 @@ from flexdt.phantoms.phantom import Phantom
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.geometry.conventions import FloatArray, from_unity
 from flexdt.twin.projection.analytic_solids import Box, Scene, Solid, Sphere, Vector
+from flexdt.twin.signatures import public
 
 CUBOIDS_MM: Final[Mapping[str, Vector]] = {
     "normal": (20.0, 40.0, 60.0),
@@ -111,19 +112,21 @@ def loop_positions(size_mm: Sequence[float], beads: int, inset_mm: float) -> Flo
     )
 
 
+@public
 def bead_phantom(
-    name_or_dims: str | Sequence[float] = "normal",
+    name_or_dims: str | npt.ArrayLike = "normal",
     beads: int = DEFAULT_BEADS,
     *,
     bead_radius_mm: float = 2.0,
     body_material: str = "abs",
     bead_material: str = "steel",
 ) -> Phantom:
-    """A cuboid with `beads` beads on the spiral.
+    """A cuboid with `beads` beads on the spiral, or beads in air at given positions.
 
     Args:
-        name_or_dims: a name of Table 6.2 or (width, breadth, height) [mm].
-        beads: K.
+        name_or_dims: a name of Table 6.2, (width, breadth, height) [mm], or the beads' centres
+            (k, 3) [mm], in the object's frame.
+        beads: K; not used with positions.
         bead_radius_mm: 2 mm in the thesis's simulations.
         body_material: of the cuboid (assumed: the thesis does not say).
         bead_material: of the beads (assumed: the thesis says "metallic").
@@ -134,6 +137,8 @@ def bead_phantom(
 
     >>> bead_phantom("tall", beads=3).name
     'tall-3'
+    >>> bead_phantom([[0, 0, 5], [8, 0, -5]], bead_radius_mm=0.5).beads.shape
+    (2, 3)
     """
     if isinstance(name_or_dims, str):
         if name_or_dims not in CUBOIDS_MM:
@@ -141,12 +146,20 @@ def bead_phantom(
             raise UnknownNameError.among(what, name_or_dims, CUBOIDS_MM)
         name, size = f"{name_or_dims}-{beads}", CUBOIDS_MM[name_or_dims]
     else:
-        if len(name_or_dims) != 3:
-            raise LimitError(
-                f"a cuboid has width, breadth and height; got {len(name_or_dims)} numbers",
-                {"asked": list(name_or_dims), "allowed": "three numbers [mm]"},
-            )
-        size = (float(name_or_dims[0]), float(name_or_dims[1]), float(name_or_dims[2]))
+        numbers = np.asarray(name_or_dims, dtype=np.float64)
+        if numbers.shape[-1:] != (3,) or numbers.ndim > 2 or not numbers.size:
+            what, more = "a cuboid or beads", ", or (k, 3) [mm]"
+            raise LimitError.of_shape(what, numbers.shape, (3,), more)
+        if numbers.ndim == 2:
+            many = len(numbers)
+            x, y, z = (2.0 * (np.abs(numbers).max(axis=0) + bead_radius_mm)).tolist()
+            return cuboid_with_beads(
+                f"beads-{many}", (x, y, z), numbers, np.full(many, bead_radius_mm),
+                body_material=None, bead_materials=(bead_material,) * many,
+                description=f"{many} {bead_material} bead(s) of radius {bead_radius_mm:g} mm",
+            )  # fmt: skip
+        x, y, z = numbers.tolist()
+        size = (x, y, z)
         name = f"cuboid-{size[0]:g}x{size[1]:g}x{size[2]:g}-{beads}"
     assumed: tuple[str, ...] = (
         "the spiral's formula (thesis: in words only)",

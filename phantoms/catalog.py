@@ -19,6 +19,7 @@ from flexdt.phantoms.phantom import Phantom
 from flexdt.twin.errors import UnknownNameError
 from flexdt.twin.geometry.conventions import rotation_z
 from flexdt.twin.projection.analytic_solids import Ellipsoid, Scene, Solid
+from flexdt.twin.signatures import public
 
 # Contrast, semi-axes (x, y, z), centre (x, y, z), turn about z [deg], in a unit of half the height.
 # Ellipsoids: Shepp and Logan 1974 in Kak and Slaney's 3D form (1988); contrasts: Toft 1996.
@@ -36,6 +37,7 @@ _ELLIPSOIDS: Final = (
 )
 
 
+@public
 def shepp_logan(size_mm: float = 50.0) -> Phantom:
     """The phantom scaled so that its unit cube [-1, 1] measures `size_mm` [mm] along each side.
 
@@ -92,6 +94,7 @@ def is_shipped(name: str) -> bool:
     return name in phantom_names() or (match is not None and match[1] in CUBOIDS_MM)
 
 
+@public
 def load_phantom(name: str) -> Phantom:
     """The phantom called `name`; a bare cuboid's name has five beads.
 

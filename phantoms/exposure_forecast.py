@@ -32,9 +32,11 @@ from flexdt.twin.physics.prediction import air_kerma_mGy, contrast_to_noise, pix
 from flexdt.twin.physics.radiograph import radiographs
 from flexdt.twin.physics.spectrum import Filter, tube_of, voltages
 from flexdt.twin.projection import project_body
+from flexdt.twin.projection.analytic_solids import Vector
 from flexdt.twin.scanner.settings import CameraChange, changed_camera
 from flexdt.twin.script.planning.plan import ScanPlan
 from flexdt.twin.script.problems import ScriptProblem
+from flexdt.twin.signatures import public
 
 VIEWS: Final = 8
 """Views of a turn that are looked at."""
@@ -135,6 +137,7 @@ class Forecast:
         )
 
 
+@public
 def expose(
     sample: object = "lego",
     *,
@@ -151,7 +154,7 @@ def expose(
     detail: str = f"{VOID}:0.5",
     machine: Machine | str = "flexray",
     material: str | None = None,
-    voxel_mm: float | None = None,
+    voxel_mm: float | Vector | None = None,
 ) -> Forecast:
     """Predict transmission, contrast to noise, dose, time and size of a circular scan.
 

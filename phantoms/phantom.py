@@ -20,7 +20,7 @@ from pydantic import PlainSerializer, PlainValidator, ValidationError
 
 from flexdt.phantoms import checked_reading as reading
 from flexdt.phantoms.checked_reading import PhantomError, scene_from_dict, scene_to_dict
-from flexdt.phantoms.pieces import Surface, Voxels, cut, freeze
+from flexdt.phantoms.pieces import Surface, Voxels, boxes, cut, freeze
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.values import ArrayValue, adapter_of, told
@@ -111,6 +111,11 @@ class Phantom(ArrayValue):
     def bounding_radius_mm(self) -> float:
         """Radius of the smallest sphere about the origin that is sure to hold it [mm]."""
         return float(np.linalg.norm(np.asarray(self.size_mm) / 2.0))
+
+    @property
+    def boxes(self) -> FloatArray:
+        """Low and high corner of the box around each part, (k, 2, 3) [mm]."""
+        return np.array(boxes(self.scene, self.surfaces, self.voxels)).reshape(-1, 2, 3)
 
     def parts(self) -> tuple[SurfacePart, ...]:
         """The scene side piece by piece: one closed mesh for each solid, with its material."""

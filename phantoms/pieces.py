@@ -98,17 +98,28 @@ def freeze(target: object, **arrays: npt.NDArray[np.generic]) -> None:
         object.__setattr__(target, name, array)
 
 
+def boxes(
+    scene: analytic.Scene, surfaces: Sequence[Surface] = (), voxels: Voxels | None = None
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Low and high corner of the box around each part, (3,) each [mm]."""
+    found = [bounds(solid.shape) for solid in scene.solids]
+    found += [(one.vertices.min(axis=0), one.vertices.max(axis=0)) for one in surfaces]
+    if voxels is not None:
+        half = np.array(voxels.voxel_mm) * voxels.data.shape[::-1] / 2.0
+        found.append((np.array(voxels.center_mm) - half, np.array(voxels.center_mm) + half))
+    return found
+
+
 def size_about_origin(scene: analytic.Scene, surfaces: Sequence[Surface] = ()) -> analytic.Vector:
     """Full extent along x, y, z [mm] of the box about the origin that holds everything.
 
     Raises:
         PhantomError: there is nothing.
     """
-    corners = [corner for solid in scene.solids for corner in bounds(solid.shape)]
-    corners += [end for one in surfaces for end in (one.vertices.min(0), one.vertices.max(0))]
-    if not corners:
+    found = boxes(scene, surfaces)
+    if not found:
         raise PhantomError("a phantom needs at least one solid or mesh")
-    x, y, z = (2.0 * np.abs(np.array(corners)).max(axis=0)).tolist()
+    x, y, z = (2.0 * np.abs(np.array(found)).max(axis=(0, 1))).tolist()
     return (x, y, z)
 
 

@@ -1,13 +1,57 @@
-"""Functions that pass their arguments on, with the signature of the function that takes them."""
+"""Public functions and classes: what their signatures say, said to the caller.
+
+`public` compares the arguments of a call with the annotations of the signature, so that a misspelt
+keyword, two arguments in the wrong order or a value of another type is one sentence that says what
+was given and what is allowed. Values are checked by what is called, as before.
+"""
 
 from __future__ import annotations
 
+import builtins
 import inspect
-from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+import re
+import types
+import typing
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from difflib import get_close_matches
+from functools import cached_property, wraps
+from numbers import Real
+from typing import Any, Final, Literal, NamedTuple, ParamSpec, TypeVar
+
+from flexdt.twin.errors import GeometryError, LimitError
 
 P = ParamSpec("P")
 Result = TypeVar("Result")
+Thing = TypeVar("Thing", bound=Callable[..., Any])
+
+NAMES: Final = (("voxel", "voxel_mm"), ("center", "center_mm"), ("geometry", "cone_vec"))
+"""Names of one thing (docs/conventions.md): where a signature has one, the other is deprecated."""
+SHOWN: Final = 60
+"""Characters of a value that a message repeats."""
+LOOKED_AT: Final = 100
+"""Members of a list that are compared with the annotation: mistakes stand at the beginning."""
+
+
+class ArgumentError(GeometryError, LimitError, TypeError):
+    """An argument that a function does not have, or of a type that it does not take.
+
+    Who handles the errors that these functions raise for wrong values handles this one, too.
+    """
+
+
+class Array:
+    """Stands for what numpy calls ArrayLike, a union of which texts are a part."""
+
+    def __class_getitem__(cls, member: object) -> type[Array]:
+        return cls
+
+
+class Kind(NamedTuple):
+    """What an annotation allows: in words, and as a test."""
+
+    words: tuple[str, ...]
+    holds: Callable[[Any], bool]
 
 
 def with_arguments_of(
@@ -22,3 +66,276 @@ def with_arguments_of(
         return function
 
     return typed
+
+
+def public(thing: Thing) -> Thing:
+    """A decorator: calls of a function, or of a class and its methods, are checked.
+
+    Raises:
+        ArgumentError: when called with arguments that the signature does not allow.
+
+    Example:
+        >>> @public
+        ... def scaled(value: float, by: int = 2) -> float:
+        ...     return value * by
+        >>> for wrong in ({"value": "1.5"}, {"value": 1.5, "bye": 3}):
+        ...     try:
+        ...         scaled(**wrong)
+        ...     except ArgumentError as error:
+        ...         print(error)
+        scaled: value is '1.5'; allowed: a number
+        scaled has no argument 'bye' (did you mean 'by'?); allowed: value, by
+    """
+    text = inspect.getdoc(thing) or ""
+    if not isinstance(thing, type):
+        return _checked(thing, text)
+    for name, member in list(vars(thing).items()):
+        if name == "__init__" or not name.startswith("_"):
+            if isinstance(member, classmethod | staticmethod):
+                inside = member.__func__
+                setattr(thing, name, type(member)(_checked(inside, inspect.getdoc(inside) or "")))
+            elif inspect.isfunction(member):
+                said = text if name == "__init__" else inspect.getdoc(member) or ""
+                setattr(thing, name, _checked(member, said))
+    return thing
+
+
+def _checked(function: Thing, text: str) -> Thing:
+    known = Known(function, text)
+
+    @wraps(function)
+    def call(*given: Any, **named: Any) -> Any:
+        # Types that have been allowed together once are not looked at again.
+        types_of = (*map(_type, given), *named, *map(_type, named.values()))
+        if types_of not in known.allowed:
+            named = known.checked(given, named, types_of)
+        return function(*given, **named)
+
+    return call  # type: ignore[return-value]
+
+
+def _told_by_type(value: Any) -> bool:
+    """Whether another value with the same `_type` is allowed where this one is."""
+    members = value if type(value) is tuple else (value,)
+    return not any(
+        isinstance(one, Mapping | list | tuple | str) or getattr(one, "ndim", 0) == 1
+        for one in members
+    )
+
+
+def _type(value: Any) -> Any:
+    if type(value) is tuple:
+        return tuple(map(type, value))
+    return (value.dtype, value.ndim) if hasattr(value, "ndim") else type(value)
+
+
+class Known:
+    """The signature of a function, read when it is first called.
+
+    Attributes:
+        allowed: types of arguments that were allowed, where types alone decide.
+    """
+
+    def __init__(self, function: Callable[..., Any], text: str) -> None:
+        self.function, self.text = function, text
+        self.allowed: set[tuple[Any, ...]] = set()
+        self.where = function.__qualname__.split("<locals>.")[-1].removesuffix(".__init__")
+
+    @cached_property
+    def signature(self) -> inspect.Signature:
+        """Names, defaults and annotations."""
+        return inspect.signature(self.function)
+
+    @cached_property
+    def kinds(self) -> dict[str, Kind]:
+        """What is allowed for each argument whose annotation says it."""
+        names = Names(
+            self.function.__globals__, npt=types.SimpleNamespace(ArrayLike=Array, NDArray=Array)
+        )
+        found = {}
+        for name, parameter in self.signature.parameters.items():
+            said = parameter.annotation
+            found[name] = kind_of(eval(said, {}, names) if isinstance(said, str) else said)
+        return {name: kind for name, kind in found.items() if kind is not None}
+
+    def checked(
+        self, given: tuple[Any, ...], named: dict[str, Any], types_of: tuple[Any, ...]
+    ) -> dict[str, Any]:
+        """The keywords, under the names that the signature has.
+
+        Raises:
+            ArgumentError: arguments that the signature does not allow.
+        """
+        named = self._renamed(named)
+        try:
+            bound = self.signature.bind(*given, **named).arguments
+        except TypeError as error:
+            raise ArgumentError.instead(
+                f"{self.where}: {error}", [*map(_shown, given), *named], self._names()
+            ) from None
+        by_types = True
+        for name, value in bound.items():
+            kind, form = self.kinds.get(name), self.signature.parameters[name].kind
+            members = value if form is inspect.Parameter.VAR_KEYWORD else {name: value}
+            if kind is None or form is inspect.Parameter.VAR_POSITIONAL:
+                continue
+            for label, one in members.items():
+                if not kind.holds(one):
+                    raise self._mistake(name, label, one, bound)
+                by_types &= _told_by_type(one)
+        if by_types:
+            self.allowed.add(types_of)
+        return named
+
+    def _names(self) -> list[str]:
+        return [name for name in self.signature.parameters if name not in ("self", "cls")]
+
+    def _renamed(self, named: dict[str, Any]) -> dict[str, Any]:
+        takes = self.signature.parameters
+        if any(one.kind is inspect.Parameter.VAR_KEYWORD for one in takes.values()):
+            return named
+        found = {}
+        for name, value in named.items():
+            other = next((b for pair in NAMES for a, b in (pair, pair[::-1]) if a == name), "")
+            if name in takes:
+                found[name] = value
+            elif other in takes and other not in named:
+                text = f"{self.where}: {name} is called {other} here"
+                warnings.warn(text, DeprecationWarning, stacklevel=4)
+                found[other] = value
+            else:
+                near = get_close_matches(name, self._names(), 1)
+                hint = f" (did you mean {near[0]!r}?)" if near else ""
+                said = f"{self.where} has no argument {name!r}{hint}"
+                raise ArgumentError.instead(said, name, self._names())
+        return found
+
+    def _mistake(
+        self, name: str, label: str, value: object, values: Mapping[str, Any]
+    ) -> ArgumentError:
+        *first, last = self.kinds[name].words
+        words = f"{', '.join(first)} or {last}" if first else last
+        places = [
+            other
+            for other in self._names()
+            if self.signature.parameters[other].kind is inspect.Parameter.POSITIONAL_OR_KEYWORD
+        ]
+        swapped = [
+            other
+            for other in places
+            if name in places and other in values
+            if self.kinds[name].holds(values[other])
+            and (other not in self.kinds or self.kinds[other].holds(value))
+        ]
+        hint = f"; are {label} and {swapped[-1]} in the wrong order?" if swapped else ""
+        told = re.search(rf"^ +(?:\w+, )*{name}(?:, \w+)*: (.*(?:\n {{8}}.*)*)", self.text, re.M)
+        more = f" ({' '.join(told[1].split()).split('. ')[0].rstrip('.')})" if told else ""
+        said = f"{self.where}: {label} is {_shown(value)}"
+        return ArgumentError.instead(said, repr(value)[:100], words + more + hint, argument=label)
+
+
+class Names(dict[str, Any]):
+    """What annotations name: the names of the function's module; those that only type checkers
+    import are anything.
+    """
+
+    def __missing__(self, name: str) -> Any:
+        return getattr(builtins, name, Any)
+
+
+def kind_of(annotation: Any) -> Kind | None:
+    """What an annotation allows; None where it is no more than anything.
+
+    Example:
+        >>> kind_of(float | None).words, kind_of(tuple[int, int]).holds((3, 4.5))
+        (('a number', 'None'), False)
+    """
+    origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
+    plain = origin not in (Literal, Callable)
+    inner = [kind_of(part) for part in parts if plain and part is not ...]
+    if origin in (typing.Union, types.UnionType):
+        kinds = [kind for kind in inner if kind is not None]
+        words = tuple(dict.fromkeys(word for kind in kinds for word in kind.words))
+        return Kind(words, lambda v: any(k.holds(v) for k in kinds)) if None not in inner else None
+    if origin is Literal:
+        return Kind(
+            tuple(map(repr, parts)), lambda v: v in [p for p in parts if type(p) is type(v)]
+        )
+    if annotation is Array or getattr(origin, "__name__", "") == "ndarray":
+        return Kind(("an array of numbers",), _is_numbers)
+    if origin is tuple and ... not in parts:
+        members = ["anything" if kind is None else " or ".join(kind.words) for kind in inner]
+        return Kind((f"({', '.join(members)})",), lambda v: _is_list(v, inner))
+    if origin in (tuple, list, Sequence):
+        member = "anything" if inner[0] is None else " or ".join(inner[0].words)
+        return Kind((f"a list ({member}, ...)",), lambda v: _is_list(v, inner, several=True))
+    if origin is Mapping:
+        return Kind(("a dictionary",), lambda v: isinstance(v, Mapping))
+    if origin is Callable:
+        return Kind(("a function",), callable)
+    wanted = origin or annotation
+    if wanted in (*PLAIN, Any, object, inspect.Parameter.empty) or not isinstance(wanted, type):
+        return PLAIN.get(wanted)
+    if getattr(wanted, "_is_protocol", False):
+        methods = [n for n, m in vars(wanted).items() if inspect.isfunction(m) and n != "__init__"]
+        return Kind((_named(wanted),), lambda v: all(hasattr(v, n) for n in methods))
+    return Kind((_named(wanted),), lambda v: isinstance(v, wanted))
+
+
+def _is_number(value: Any) -> bool:
+    alone = getattr(value, "ndim", 0) == 0 and hasattr(value, "__float__")
+    return alone and not isinstance(value, bool) and getattr(value, "dtype", "") != "bool"
+
+
+def _is_numbers(value: Any) -> bool:
+    """Whether an array can be made of it; what is not looked at, such as memory on a device, is
+    for the function to read.
+    """
+    import numpy as np
+
+    kind = "O" if isinstance(value, bool) else getattr(getattr(value, "dtype", None), "kind", None)
+    if kind is None and isinstance(value, Real | str | bytes | list | tuple | Mapping | None):
+        try:
+            kind = np.asarray(value).dtype.kind
+        except ValueError:  # lists of different lengths
+            kind = "O"
+    if kind is None:
+        forms = ("__array__", "__array_interface__", "__cuda_array_interface__", "__dlpack__")
+        return any(hasattr(value, form) for form in (*forms, "__getitem__"))
+    return kind in "biufc"
+
+
+def _is_list(value: Any, kinds: Sequence[Kind | None], *, several: bool = False) -> bool:
+    """Whether it is a list of so many members, or of several alike, each as its kind has it."""
+    if not (hasattr(value, "__len__") and hasattr(value, "__iter__")):
+        return False
+    alone = isinstance(value, str | bytes | Mapping) or getattr(value, "ndim", 1) == 0
+    kinds = kinds if alone or not several else [*kinds] * len(value)
+    return not alone and len(value) == len(kinds) and all(
+        kind is None or kind.holds(one)
+        for kind, one in zip(kinds[:LOOKED_AT], value, strict=False)
+    )  # fmt: skip
+
+
+def _named(kind: type) -> str:
+    name = "path" if kind.__name__ == "PathLike" else kind.__name__
+    return f"{'an' if name[0] in 'AEIOUaeiou' else 'a'} {name}"
+
+
+def _shown(value: object) -> str:
+    shape = getattr(value, "shape", None)
+    if shape is not None and hasattr(value, "dtype"):
+        return f"an array of shape {tuple(shape)}"
+    text = repr(value)
+    plain = isinstance(value, Real | str | bytes | list | tuple | Mapping | None)
+    return text if plain and len(text) <= SHOWN else _named(type(value))
+
+
+PLAIN: Final = {
+    None: Kind(("None",), lambda v: v is None),
+    types.NoneType: Kind(("None",), lambda v: v is None),
+    float: Kind(("a number",), _is_number),
+    int: Kind(("a whole number",), lambda v: _is_number(v) and hasattr(v, "__index__")),
+    bool: Kind(("True or False",), lambda v: _type(v) is bool or str(_type(v)) == "bool"),
+    str: Kind(("a text",), lambda v: isinstance(v, str)),
+}

@@ -15,6 +15,7 @@ from flexdt.clients.client.shared_methods import SharedMethods
 from flexdt.clients.client.transport import TcpTransport, Transport
 from flexdt.clients.client.twin_methods import Kind, Topic
 from flexdt.protocol.methods.session_messages import HelloResult
+from flexdt.twin.signatures import public
 
 _R = TypeVar("_R")
 
@@ -44,6 +45,7 @@ class AsyncTwinClient(SharedMethods):
         ...         await twin.move({"rot_obj": 90.0}, wait=True)
     """
 
+    @public
     def __init__(
         self,
         host: str = "127.0.0.1",

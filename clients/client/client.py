@@ -23,6 +23,7 @@ from flexdt.clients.client.shared_methods import SharedMethods
 from flexdt.clients.client.transport import Transport
 from flexdt.clients.client.twin_methods import Kind, Topic
 from flexdt.protocol.methods.session_messages import HelloResult
+from flexdt.twin.signatures import public
 
 _R = TypeVar("_R")
 
@@ -86,6 +87,7 @@ class TwinClient(SharedMethods):
         ...     image = twin.projection("counts").image
     """
 
+    @public
     def __init__(
         self,
         host: str = "127.0.0.1",

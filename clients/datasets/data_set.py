@@ -7,12 +7,12 @@ which are loaded when a method asks for them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import index as whole
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, Final, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -30,14 +30,17 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.lazy_backend import File, lazy_backend
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.scanner.state import NamedCorrection
+from flexdt.twin.signatures import public
 
 if TYPE_CHECKING:
     from flexdt.clients.calibration.align_dataset import Aligned
     from flexdt.clients.calibration.calibrate import Outcome
     from flexdt.phantoms import Phantom
+    from flexdt.twin.physics.tube import Tube
     from flexdt.twin.projection import Volume
 
 Counts = npt.NDArray[np.uint16]
+OPEN_COUNTS: Final = 60_000.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +57,7 @@ class Arrays:
     flats: npt.NDArray[Any] | None = None
 
 
+@public
 @dataclass(frozen=True, eq=False, repr=False)
 class DataSet:
     """The projections of a scan with dark and flat images and geometry.
@@ -126,10 +130,13 @@ class DataSet:
         """A data set in memory.
 
         Args:
-            counts: (n, rows, cols), whole numbers from 0 to 65535.
+            counts: (n, rows, cols), whole numbers from 0 to 65535; or line integrals, which are
+                floats without a flat image. They are kept as counts of an open beam of 60000, or
+                down to 20000 where pixels are brighter than it; a warning says how many are beyond
+                what that holds.
             geometry: one view for each image.
             dark, flat: (rows, cols), or several images (k, rows, cols), of which the mean is taken.
-                Without a flat image there are no line integrals.
+                Without a flat image, counts have no line integrals.
             name: of the data set.
             warnings: what is doubtful about it.
             truth: what lies behind a simulation.
@@ -145,6 +152,10 @@ class DataSet:
         values = np.asarray(counts)
         if values.ndim != 3 or 0 in values.shape:
             raise DatasetFormatError.of_shape("counts", values.shape, ("n", "rows", "cols"))
+        if values.dtype.kind == "f" and flat is None:
+            values, opened, lost = _counts_of(values)
+            dark, flat = np.zeros(values.shape[1:]), np.full(values.shape[1:], opened)
+            warnings = [*lost, *warnings]
         if values.dtype != np.uint16:
             whole_numbers = values.astype(np.uint16)
             if not np.array_equal(whole_numbers, values):
@@ -416,12 +427,27 @@ class DataSet:
             )
         return self
 
-    def calibrate(self, phantom: str | Phantom, **options: Any) -> Outcome:
+    def calibrate(
+        self,
+        phantom: str | Phantom,
+        *,
+        free: Sequence[str] | None = None,
+        priors: Mapping[str, float] | None = None,
+        start: Mapping[str, float] | None = None,
+        geometry: ConeVec | File | None = None,
+        markers: Any = None,
+        scale: str | None = None,
+        radius: float | None = None,
+        per_frame: Sequence[str] = (),
+    ) -> Outcome:
         """Estimate the geometry from the beads of a phantom; see `flexdt.calibrate`.
 
         `data.with_correction(data.calibrate("lego").correction)` is the corrected data set.
         """
-        found: Outcome = lazy_backend("analysis").calibrate(self, phantom, **options)
+        found: Outcome = lazy_backend("analysis").calibrate(
+            self, phantom, free=free, priors=priors, start=start, geometry=geometry,
+            markers=markers, scale=scale, radius=radius, per_frame=per_frame,
+        )  # fmt: skip
         return found
 
     def align(self, *, per_frame: bool = False) -> Aligned:
@@ -432,7 +458,25 @@ class DataSet:
         found: Aligned = lazy_backend("analysis").align(self, per_frame=per_frame)
         return found
 
-    def reconstruct(self, algorithm: str = "fdk", **options: Any) -> Volume:
+    def reconstruct(
+        self,
+        algorithm: str = "fdk",
+        *,
+        voxel: float | None = None,
+        shape: tuple[int, int, int] | None = None,
+        center: tuple[float, float, float] | None = None,
+        binning: int = 1,
+        every: int = 1,
+        iterations: int | None = None,
+        weight: float | None = None,
+        window: str = "ram-lak",
+        material: str | None = None,
+        scatter_correction: str | Sequence[str] | None = None,
+        tube: Tube | None = None,
+        parameters: Offsets | None = None,
+        progress: Callable[[float], None] | None = None,
+        errors: bool = True,
+    ) -> Volume:
         """Reconstruct into a volume in memory; see `flexdt.reconstruct` for the options.
 
         Example:
@@ -443,7 +487,12 @@ class DataSet:
             >>> data.reconstruct("fdk", voxel=1.0)
             <Volume: 2 x 3 x 3 voxels (z, y, x) of 1 mm about (0, 0, 0) mm>
         """
-        found: Volume = lazy_backend("analysis").reconstruct(self, algorithm, **options)
+        found: Volume = lazy_backend("analysis").reconstruct(
+            self, algorithm, voxel=voxel, shape=shape, center=center, binning=binning, every=every,
+            iterations=iterations, weight=weight, window=window, material=material,
+            scatter_correction=scatter_correction, tube=tube, parameters=parameters,
+            progress=progress, errors=errors,
+        )  # fmt: skip
         return found
 
     def save(self, folder: File) -> None:
@@ -529,6 +578,26 @@ class DataSet:
             'arrays: scan_000000.tif'
         """
         return lazy_backend("plots").plot_projection(self, index, axes)
+
+
+def _counts_of(integrals: npt.NDArray[Any]) -> tuple[Counts, float, list[str]]:
+    """Line integrals as counts, the open beam's count, and how many do not fit into them.
+
+    Raises:
+        DatasetFormatError: line integrals that are not finite.
+    """
+    if not np.isfinite(integrals).all():
+        said = "line integrals hold values that are not finite"
+        raise DatasetFormatError.instead(said, "NaN or infinity", "finite")
+    top = np.iinfo(np.uint16).max
+    images = np.exp(-np.maximum(integrals.astype(np.float32), -80.0))
+    # Brighter pixels than the open beam, as noise makes them, need room above it.
+    opened = float(np.clip(np.floor(top / max(images.max(), 1e-9)), OPEN_COUNTS / 3, OPEN_COUNTS))
+    images *= opened
+    lost = float(((images < 1.0) | (images > top)).mean())
+    held = f"{np.log(opened / top):.3g} to {np.log(opened):.3g}"
+    told = f"{100 * lost:.3g} % of the pixels have line integrals outside {held}: they are cut"
+    return np.rint(np.clip(images, 0, top)).astype(np.uint16), opened, [told] if lost else []
 
 
 def _several(

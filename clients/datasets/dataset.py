@@ -51,6 +51,7 @@ from flexdt.twin.machine.description import (
     builtin_profile,
     builtin_profiles,
 )
+from flexdt.twin.signatures import public
 
 AGREE_MM: Final = 1e-6
 """How far the cone_vec of a file may lie from what its motor positions give [mm]."""
@@ -59,6 +60,7 @@ MAX_SETTINGS_BYTES: Final = 16 << 20
 """Of a settings text; a larger file is none."""
 
 
+@public
 def load_dataset(
     folder: str | PathLike[str],
     *,
@@ -90,6 +92,7 @@ def load_dataset(
     return _from_texts(content, machine, profile)
 
 
+@public
 def read_tiffs(
     folder: str | PathLike[str],
     geometry: ConeVec | npt.ArrayLike | str | PathLike[str],
@@ -145,9 +148,6 @@ def read_tiffs(
     return listed(content, cone, chosen, darks, flats)
 
 
-OPEN_COUNTS: Final = 60_000.0
-
-
 def _of_floats(
     folder: Path,
     geometry: ConeVec,
@@ -173,22 +173,8 @@ def _of_floats(
         dark = np.mean([read_values(folder / n) for n in darks], axis=0) if darks else 0.0
         flat = np.mean([read_values(folder / n) for n in flats], axis=0)
         images = (images - dark) / np.maximum(flat - dark, 1e-6 * flat.max())
-    else:
-        images = np.exp(-np.maximum(images, -80.0))
-    top = np.iinfo(np.uint16).max
-    # Brighter pixels than the open beam, as noise makes them, need room above it.
-    opened = float(np.clip(np.floor(top / max(images.max(), 1e-9)), OPEN_COUNTS / 3, OPEN_COUNTS))
-    images *= opened
-    lost = float(((images < 1.0) | (images > top)).mean())
-    held = f"{np.log(opened / top):.3g} to {np.log(opened):.3g}"
-    told = f"{100 * lost:.3g} % of the pixels have line integrals outside {held}: they are cut"
-    counts = np.rint(np.clip(images, 0, top)).astype(np.uint16)
-    flat = np.full(counts.shape[1:], opened)
-    dark = np.zeros(counts.shape[1:])
-    return DataSet.from_arrays(
-        counts, geometry, dark=dark, flat=flat, name=folder.name,
-        warnings=[told] if lost else [],
-    )  # fmt: skip
+        images = -np.log(np.maximum(images, np.finfo(np.float32).tiny))
+    return DataSet.from_arrays(images, geometry, name=folder.name)
 
 
 def _by_numbers(name: str) -> list[tuple[int, str]]:

@@ -35,6 +35,7 @@ from flexdt.twin.exchange.geometry import ScanGeometry
 from flexdt.twin.exchange.number_tables import VECTOR_NAMES, geometry_text
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.lazy_backend import File
+from flexdt.twin.projection.volume import Volume
 
 
 def save_data_set(data: DataSet, folder: File) -> None:
@@ -147,6 +148,15 @@ def to_xarray(data: DataSet) -> Any:
     )
 
 
+def volume_to_xarray(volume: Volume) -> Any:
+    """See `Volume.to_xarray`."""
+    xarray = package("xarray", "to_xarray")
+    places = zip("xyz", volume.centers(), strict=True)
+    coords = {axis: (axis, values, {"units": "mm"}) for axis, values in places}
+    attrs = {"units": "1/mm"}
+    return xarray.DataArray(volume.data, coords, tuple("zyx"), "attenuation", attrs)
+
+
 PROJECTION, FLAT, DARK = 0, 1, 2
 KEYS: Final = {"di": DARK, "io": FLAT}
 """Image keys of what the scanner calls so."""
@@ -198,7 +208,7 @@ def _write(data: DataSet, out: Any) -> None:
     lengths = {
         "x_pixel_size": float(np.linalg.norm(geometry.u[0])),
         "y_pixel_size": float(np.linalg.norm(geometry.v[0])),
-        "distance": float(geometry.source_detector_distance[0]) - to_source,
+        "distance": abs(float(geometry.source_detector_distance[0])) - to_source,
     }
     for name, value in lengths.items():
         _measured(detector, name, value, "mm")

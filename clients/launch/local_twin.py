@@ -11,10 +11,12 @@ from typing import Literal
 
 from flexdt.clients.client.client import TwinClient
 from flexdt.clients.launch.processes import Servers
+from flexdt.twin.signatures import public
 
 LOG = "servers.log"
 
 
+@public
 class LocalTwin:
     """Projector and twin server as processes of this machine, as a context manager.
 

@@ -23,6 +23,7 @@ from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.pieces import Surface, Voxels
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection.analytic_solids import ConvexPolyhedron, Scene, Solid, Vector
+from flexdt.twin.signatures import public
 
 if TYPE_CHECKING:
     import trimesh
@@ -56,6 +57,7 @@ MAX_PLANES: Final = 128
 """A convex mesh with at most so many planes is projected as a solid, others as their triangles."""
 
 
+@public
 def mesh_phantom(
     source: bytes | str | os.PathLike[str],
     *,
@@ -195,6 +197,7 @@ def default_unit(file_type: str) -> str:
     return DEFAULT_UNIT.get(file_type, "mm")
 
 
+@public
 def voxel_phantom(
     data: npt.NDArray[np.float32],
     voxel_mm: float | Vector,

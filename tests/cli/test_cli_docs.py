@@ -15,7 +15,7 @@ from typer.main import get_command
 from flexdt.clients.cli.command_tree import SECTIONS, build
 from flexdt.clients.cli.settings_file import TABLES
 
-MOST_OPTIONS = 218
+MOST_OPTIONS = 216
 THEIRS = ("flexdt study", "flexdt batch", "flexdt bench", "flexdt phantom design")
 PROCESSES = ("up", "twin", "projector", "viewer", "gateway")
 ROOT = Path(__file__).parents[2]

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import json
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -38,17 +41,22 @@ def test_fdk_and_iterative_algorithms_take_a_grid() -> None:
 BALL = {"kind": "sphere", "center": [0, 0, 0], "radius": 5, "material": "pmma"}
 
 
+EDGES = r"voxel_mm is \(.*; allowed: a number, \(a number, a number, a number\)"
+
+
 @pytest.mark.parametrize(
     ("call", "told"),
     [
-        *((lambda size=size, f=f: f(np.ones((4, 4, 4)), voxel_mm=size), "one or three above 0")
+        *((lambda size=size, f=f: f(np.ones((4, 4, 4)), voxel_mm=size), EDGES)
           for size in ((), (1, 1), (1, 1, 1, 1))
           for f in (lambda *a, **b: fx.simulate(*a, SCAN, **b), fx.expose)),
         (lambda: fx.calibrate([], "lego"), "no data sets; allowed: one or more"),
         *((lambda f=f: f(np.zeros((0, 4, 4)), np.zeros((0, 12)), fx.Grid((4, 4, 4), 1)), "views")
           for f in (fx.fdk, fx.sirt, fx.cgls, fx.tv)),
         *((lambda n=n: fx.reconstruct(fx.simulate(BALL, SCAN), every=n), f"every {n} frames; all")
-          for n in (0, -2, 1.5)),
+          for n in (0, -2)),
+        (lambda: fx.reconstruct(fx.simulate(BALL, SCAN), every=1.5),
+         "every is 1.5; allowed: a whole number"),
     ],
 )  # fmt: skip
 def test_nothing_at_all_is_refused(call: Callable[[], object], told: str) -> None:
@@ -59,15 +67,19 @@ def test_nothing_at_all_is_refused(call: Callable[[], object], told: str) -> Non
 @pytest.mark.parametrize(
     ("call", "told"),
     [
-        (lambda: fx.simulate(SCAN, BALL), "cone_vec: a dict; allowed: an array of numbers"),
-        (lambda: fx.Tube(kV="90"), "kV is '90', no number; allowed: 20 to 240 kV"),
-        (lambda: fx.Detector(bits="14"), "bits is '14', no number"),
-        (lambda: fx.Tube(filters="Al 0.5mm"), "filter 'A'; allowed: .FORMULA@DENSITY, thickness"),
-        (lambda: fx.Tube(filters=[("Al@2.70", "0.5")]), "filter Al@2.70 is '0.5', no number"),
-        (lambda: fx.simulate(BALL, SCAN, exposure_ms="9"), "exposure_ms is '9', no number"),
-        (lambda: fx.Volume("part.stl", 1.0), "volume data: a str; allowed: an array of numbers"),
+        (lambda: fx.simulate(SCAN, BALL),
+         "geometry is a dict; allowed: a ConeVec, an array of numbers"),
+        (lambda: fx.Tube(kV="90"), "kV is '90'; allowed: a number .*, 20 to 240 kV"),
+        (lambda: fx.Detector(bits="14"), "bits is '14'; allowed: a whole number .depth, 1 to 16"),
+        (lambda: fx.Tube(filters="Al 0.5mm"),
+         "filters is 'Al 0.5mm'; allowed: .*FORMULA@DENSITY in g/cm3, thickness"),
+        (lambda: fx.Tube(filters=[("Al@2.70", "0.5")]),
+         "filters is .*'0.5'.*; allowed: .*a text, a number"),
+        (lambda: fx.simulate(BALL, SCAN, exposure_ms="9"),
+         "exposure_ms is '9'; allowed: a number or None"),
+        (lambda: fx.Volume("part.stl", 1.0), "data is 'part.stl'; allowed: an array of numbers"),
         (lambda: fx.sirt(np.zeros((16, 16, 16)), SCAN, fx.Grid((4, 4, 4), 1.0), iterations="9"),
-         "iterations is '9'; allowed: a whole number from 1"),
+         "iterations is '9'; allowed: a whole number"),
     ],
 )  # fmt: skip
 def test_values_of_another_kind_get_a_sentence(call: Callable[[], object], told: str) -> None:
@@ -184,5 +196,124 @@ def test_a_volume_is_given_to_other_libraries_by_dlpack() -> None:
 
 @pytest.mark.parametrize("seed", [-1, 1.5, "1"])
 def test_a_seed_is_a_whole_number(seed: object) -> None:
-    with pytest.raises(fx.TwinError, match="allowed: a seed >= 0, or None"):
+    with pytest.raises(fx.TwinError, match=r"noise is .*; allowed: .*seed,? >= 0[;,] .*None"):
         fx.simulate("lego", SCAN, noise=seed)  # type: ignore[arg-type]
+
+
+def test_line_integrals_in_memory_are_a_data_set() -> None:
+    integrals = np.random.default_rng(3).uniform(-0.05, 3.0, (16, 16, 16))
+    data = fx.DataSet.from_arrays(integrals, SCAN)
+    assert np.abs(data.line_integrals() - integrals).max() < 4e-4  # half a count of exp(-3) 60000
+    assert data.warnings == ()
+    beyond = fx.DataSet.from_arrays(integrals + 20.0 * (integrals > 2.5), SCAN)
+    assert any("they are cut" in doubt for doubt in beyond.warnings)
+    with pytest.raises(fx.TwinError, match="allowed: finite"):
+        fx.DataSet.from_arrays(np.where(integrals > 2.0, np.nan, integrals), SCAN)
+
+
+def test_scipy_takes_an_operator_as_it_is() -> None:
+    linalg = pytest.importorskip("scipy.sparse.linalg")
+    operator = fx.Operator(SCAN, fx.Grid((5, 6, 7), 0.5))
+    made = linalg.aslinearoperator(operator)
+    x = np.random.default_rng(1).random((5, 6, 7), np.float32)
+    y = np.random.default_rng(2).random((16, 16, 16), np.float32)
+    assert made.shape == (16**3, 5 * 6 * 7)
+    assert np.array_equal((made @ x.ravel()).reshape(y.shape), operator @ x)
+    assert np.array_equal((made.T @ y.ravel()).reshape(x.shape), operator.T @ y)
+
+
+def test_beads_stand_where_their_positions_say() -> None:
+    places = np.array([[0.0, 0.0, 5.0], [8.0, -3.0, -5.0]])
+    phantom = fx.phantoms.beads(places, bead_radius_mm=0.5)
+    assert np.array_equal(phantom.beads, places)
+    assert phantom.size_mm == (17.0, 7.0, 11.0)
+    assert len(phantom.scene.solids) == 2
+    for wrong in (np.zeros((3, 2)), np.zeros((0, 3)), np.zeros((1, 1, 3)), [1.0, 2.0]):
+        with pytest.raises(fx.TwinError, match=r"of shape .*; allowed: \(3,\), or \(k, 3\)"):
+            fx.phantoms.beads(wrong)
+
+
+def test_a_volume_is_shown_and_handed_to_xarray() -> None:
+    xarray = pytest.importorskip("xarray")
+    volume = fx.Volume(np.arange(60.0).reshape(3, 4, 5), 0.5, (1.0, 0.0, -2.0))
+    array = volume.to_xarray()
+    assert isinstance(array, xarray.DataArray)
+    assert float(array.sel(z=-2.0, y=-0.75, x=0.5)) == volume.data[1, 0, 1]
+    html = volume._repr_html_()
+    assert "2.5 x 2 x 1.5 mm" in html
+    assert "0 to 59 / mm" in html
+    pytest.importorskip("matplotlib").use("agg")
+    axes = volume.plot()
+    assert np.array_equal(axes.images[0].get_array(), volume.data[1])
+    assert axes.get_title() == "z = -2 mm"
+
+
+def test_what_a_completer_finds_is_public_and_methods_name_their_options() -> None:
+    tree = ast.parse(Path(fx.__file__).read_text(encoding="utf-8"))
+    static = {
+        (alias.asname or alias.name).split(".")[0]
+        for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)
+        for alias in node.names
+    }  # fmt: skip
+    assert static
+    assert all(name.startswith("_") for name in static)
+    for name in ("reconstruct", "calibrate", "align"):
+        _, *theirs = inspect.signature(getattr(fx.DataSet, name)).parameters
+        _, *ours = inspect.signature(getattr(fx, name)).parameters
+        assert theirs == ours
+
+
+def test_rows_that_point_nowhere_and_rows_that_count_upwards() -> None:
+    with pytest.raises(fx.TwinError, match=r"cone_vec row 0: .*; allowed: pixels that each have"):
+        fx.ConeVec.from_astra(np.zeros((3, 12)))
+    cone = {"type": "cone", "DetectorRowCount": 6, "DetectorColCount": 8, "DetectorSpacingX": 0.5,
+            "DetectorSpacingY": 0.5, "DistanceOriginSource": 400, "DistanceOriginDetector": 200,
+            "ProjectionAngles": [0.0, 1.0, 2.0]}  # fmt: skip
+    upwards = fx.ConeVec.from_astra(cone)
+    assert "source to detector 600 mm" in repr(upwards)
+    assert (upwards.v[:, 2] > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("sample", "scan", "told"),
+    [
+        ({**BALL, "center": [0, -60, 0]}, SCAN, "the source is inside the box around the sample"),
+        ({**BALL, "center": [0, 0, 90]}, SCAN, "the sample is outside every view"),
+        ({**BALL, "radius": 1e-3}, SCAN, "less than a pixel of 1 mm"),
+        ({**BALL, "radius": 0.01},
+         fx.ConeVec.circular(sod=0.05, sdd=100, angles=3, shape=(16, 16), pixel=1.0),
+         "the magnification is 2000, above 1000"),
+        (BALL, fx.ConeVec(SCAN.rows / 1000, (16, 16)), "are all lengths in mm"),
+    ],
+)  # fmt: skip
+def test_a_geometry_that_fits_no_scan_of_the_sample_is_doubted(
+    sample: object, scan: fx.ConeVec, told: str
+) -> None:
+    for call in (fx.project, fx.simulate):
+        with warnings.catch_warnings(record=True) as doubts:
+            warnings.simplefilter("always")
+            call(sample, scan)
+        assert any(told in str(doubt.message) for doubt in doubts)
+        assert {doubt.filename for doubt in doubts} == {__file__}
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3])
+def test_a_scan_of_few_rows_is_aligned_or_told_why_not(rows: int) -> None:
+    scan = fx.ConeVec.circular(sod=100, sdd=200, angles=90, shape=(rows, 64), pixel=0.25)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        found = fx.align(fx.simulate(BALL, scan, noise=1))
+    assert found.identifiable or found.document["refused"]["axis_column_px"]
+    if rows == 1:
+        told = found.document["refused"]["det_roll"]
+        assert "images of 1 rows and 64 columns" in told
+        assert "allowed: 2 rows or more" in told
+
+
+def test_another_name_of_the_same_thing_is_deprecated() -> None:
+    with pytest.warns(DeprecationWarning, match="Grid: voxel is called voxel_mm here") as told:
+        grid = fx.Grid((4, 4, 4), voxel=0.5)  # type: ignore[call-arg]
+    assert grid == fx.Grid((4, 4, 4), 0.5)
+    assert told[0].filename == __file__
+    with pytest.raises(TypeError, match="Grid has no argument 'voxel'"):
+        fx.Grid((4, 4, 4), voxel_mm=0.5, voxel=0.5)  # type: ignore[call-arg]

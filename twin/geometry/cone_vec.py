@@ -21,6 +21,7 @@ from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.conventions import FloatArray, as_numbers
 from flexdt.twin.geometry.trajectories import FULL_TURN, Bench, stage_angles
 from flexdt.twin.lazy_backend import File, lazy_backend
+from flexdt.twin.signatures import public
 
 ROW_LENGTH = 12
 DEGENERATE = 1e-12
@@ -30,6 +31,7 @@ SPELT_OUT = 2
 Shape2 = tuple[int, int]
 
 
+@public
 @dataclass(frozen=True, eq=False)
 class ConeVec:
     """A frozen stack of cone_vec rows, and the shape of the detector if it is known.
@@ -384,7 +386,7 @@ class ConeVec:
         return {
             "views": f"{len(self)} view{'' if len(self) == 1 else 's'}",
             "detector": f"{pixels} of {pitch} mm",
-            "source to detector": f"{_span(self.source_detector_distance)} mm",
+            "source to detector": f"{_span(np.abs(self.source_detector_distance))} mm",
             "source to origin": f"{_span(np.linalg.norm(self.source, axis=1))} mm",
         }
 
@@ -508,13 +510,14 @@ class ConeVec:
 
     @property
     def normal(self) -> FloatArray:
-        """Unit normal u x v of each view, (n, 3): away from the source."""
+        """Unit normal u x v of each view, (n, 3): away from the source where v points downwards."""
         n = np.cross(self.u, self.v)
         return np.asarray(n / np.linalg.norm(n, axis=1, keepdims=True), dtype=np.float64)
 
     @property
     def source_detector_distance(self) -> FloatArray:
-        """Distance of the focal spot from the detector plane, (n,) [mm]; positive if in front."""
+        """Distance of the focal spot from the detector plane along `normal`, (n,) [mm]: negative
+        where v points upwards, as in ASTRA's `cone`."""
         return np.asarray(np.sum((self.detector - self.source) * self.normal, axis=1))
 
     def rays(self, shape: Shape2 | None = None) -> FloatArray:
@@ -553,6 +556,8 @@ class ConeVec:
         """
         rows, cols = self.of_shape(shape)
         p = np.atleast_2d(np.asarray(points, dtype=np.float64))
+        if p.ndim != 2 or p.shape[1] != 3:
+            raise GeometryError.of_shape("points", p.shape, ("k", 3), " [mm]")
         ray = p[None, :, :] - self.source[:, None, :]
         normal = np.cross(self.u, self.v)
         offset = self.source - self.detector
@@ -651,12 +656,9 @@ class ConeVec:
         return ConeVec.from_vectors(self.source, centre, self.u * factor, self.v * factor, own)
 
 
-def check_shape(shape: object) -> Shape2:
+def check_shape(shape: Shape2) -> Shape2:
     """(rows, cols) as positive integers, or GeometryError."""
-    try:
-        rows, cols = (operator.index(n) for n in shape)  # type: ignore[attr-defined]
-    except (TypeError, ValueError):
-        rows, cols = 0, 0
+    rows, cols = map(operator.index, shape)
     if rows <= 0 or cols <= 0:
         raise GeometryError(
             f"detector shape {shape!r}; allowed: (rows, cols), both positive",

@@ -13,12 +13,14 @@ import numpy.typing as npt
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import BEAM, RIGHT, UP, FloatArray, rotation_about
+from flexdt.twin.signatures import public
 
 AXES: Final = {"x": RIGHT, "y": BEAM, "z": UP}
 ORTHOGONAL: Final = 1e-9
 """How far a rotation may be from orthogonal."""
 
 
+@public
 @dataclass(frozen=True, eq=False)
 class Rigid:
     """A rigid motion: points p become `turn` p + `shift`.

@@ -84,14 +84,9 @@ def stage_angles(angles: int | npt.ArrayLike, turns: float = 1.0) -> FloatArray:
     Raises:
         GeometryError: no views, or an angle that is not finite.
     """
-    found: FloatArray
-    try:
-        if isinstance(angles, int | np.integer) and not isinstance(angles, bool):
-            found = np.linspace(0.0, FULL_TURN * turns, max(int(angles), 0), endpoint=False)
-        else:
-            found = np.asarray(angles, dtype=np.float64)
-    except (TypeError, ValueError):
-        found = np.zeros(())
+    found: FloatArray = np.asarray(angles, dtype=np.float64)
+    if isinstance(angles, int | np.integer):
+        found = np.linspace(0.0, FULL_TURN * turns, max(int(angles), 0), endpoint=False)
     if found.ndim != 1 or len(found) == 0 or not np.isfinite(found).all():
         shown = angles if np.ndim(angles) == 0 else f"an array of shape {found.shape}"
         raise GeometryError(
@@ -104,10 +99,7 @@ def stage_angles(angles: int | npt.ArrayLike, turns: float = 1.0) -> FloatArray:
 def _numbers(
     name: str, value: object, count: int, unit: str, *, repeated: bool = False
 ) -> tuple[float, ...]:
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        array = np.full(count, np.nan)
+    array = np.asarray(value, dtype=np.float64)
     if array.ndim == 0 and (repeated or count == 1):
         array = np.full(count, array)
     if array.shape != (count,) or not np.isfinite(array).all():

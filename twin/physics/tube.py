@@ -9,11 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from flexdt.twin.attenuation.substances import Substance
-from flexdt.twin.errors import LimitError, require_within
+from flexdt.twin.errors import require_within
 from flexdt.twin.physics.exposure import ExposureSettings
 from flexdt.twin.physics.spectrum import Filter, TubeModel, monochromatic, voltages
+from flexdt.twin.signatures import public
 
 
+@public
 @dataclass(frozen=True, kw_only=True)
 class Tube:
     """An X-ray tube and its settings.
@@ -86,12 +88,6 @@ class Tube:
 def _filter(layer: tuple[str, float] | Filter) -> Filter:
     if isinstance(layer, Filter):
         return layer
-    if not (isinstance(layer, Sequence) and len(layer) == 2 and isinstance(layer[0], str)):
-        raise LimitError(
-            f"Tube: filter {layer!r}; allowed: (FORMULA@DENSITY, thickness in mm), such as "
-            "('Al@2.70', 0.5)",
-            {"asked": repr(layer)},
-        )
     material, thickness_mm = layer
     require_within(f"Tube: filter {material}", thickness_mm, 0.0, 1e3, "mm")
     return Filter(Substance.parse(material), float(thickness_mm))

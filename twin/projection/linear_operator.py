@@ -8,12 +8,13 @@ it, and by nothing else.
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, singledispatch
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +28,7 @@ from flexdt.twin.projection.device_arrays import DeviceArray
 from flexdt.twin.projection.geometry_gradient import geometry_change, geometry_gradient
 from flexdt.twin.projection.operators import Shape2, as_cone_vec, back, forward
 from flexdt.twin.projection.volume import DeviceVolume, Grid, Volume, as_volume, room_like
+from flexdt.twin.signatures import public
 
 if TYPE_CHECKING:
     from flexdt.twin.projection.frameworks.for_torch import TorchOperator
@@ -35,6 +37,7 @@ SMALLEST_TOLERANCE = 1e-5
 """Of a norm: images and voxels are single precision."""
 
 
+@public
 @dataclass(frozen=True, eq=False)
 class Operator:
     """The linear map from the voxels of a grid to the line integrals of a scan.
@@ -65,6 +68,7 @@ class Operator:
     geometry: ConeVec
     like: Volume
     detector_shape: Shape2
+    dtype: ClassVar = np.dtype(np.float32)
 
     def __init__(
         self,
@@ -123,6 +127,31 @@ class Operator:
         room = room_like(self.like)
         back(y, self.geometry, self.like, room)
         return room
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the matrix: what `scipy.sparse.linalg.aslinearoperator` asks for."""
+        return math.prod(self.image_shape), math.prod(self.voxel_shape)
+
+    def matvec(self, x: npt.NDArray[Any]) -> Float32Array:
+        """Line integrals of voxels, flat both (C order).
+
+        Example:
+            >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
+            >>> Operator(view, like=Grid((3, 4, 3), 0.5), shape=(1, 1)).matvec(np.ones(36))
+            array([2.], dtype=float32)
+        """
+        return self._forward(x.reshape(self.voxel_shape)).ravel()
+
+    def rmatvec(self, y: npt.NDArray[Any]) -> Float32Array:
+        """Voxels of projections by the transpose, flat both (C order).
+
+        Example:
+            >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
+            >>> Operator(view, like=Grid((3, 4, 3), 0.5), shape=(1, 1)).rmatvec(np.ones(1)).shape
+            (36,)
+        """
+        return self._back(y.reshape(self.image_shape)).ravel()
 
     def norm(self, tolerance: float = 1e-3) -> float:
         """The largest singular value [mm], by the power method.
@@ -188,14 +217,9 @@ class Operator:
             >>> A.linear_operator().shape
             (1, 36)
         """
-        from scipy.sparse.linalg import LinearOperator
+        from scipy.sparse.linalg import aslinearoperator
 
-        return LinearOperator(
-            shape=(int(np.prod(self.image_shape)), int(np.prod(self.voxel_shape))),
-            matvec=lambda x: self._forward(x.reshape(self.voxel_shape)).ravel(),
-            rmatvec=lambda y: self._back(y.reshape(self.image_shape)).ravel(),
-            dtype=np.float32,
-        )
+        return aslinearoperator(self)
 
     def torch(self) -> TorchOperator:
         """The same for PyTorch tensors, with gradients with respect to voxels and geometry.

@@ -31,10 +31,12 @@ from flexdt.twin.projection.volume import (
     bring_over,
     room_like,
 )
+from flexdt.twin.signatures import public
 
 Shape2 = tuple[int, int]
 
 
+@public
 def forward(
     volume: Volume | DeviceVolume,
     cone_vec: ConeVec | npt.ArrayLike,
@@ -44,7 +46,8 @@ def forward(
     """Line integrals of a volume: exact path length times value, summed over voxels (Siddon 1985).
 
     Args:
-        volume: attenuation [1/mm]. Of a `DeviceVolume`, the images stay on the device.
+        volume: attenuation [1/mm], as Volume(data, voxel_mm). Of a `DeviceVolume`, the images stay
+            on the device.
         cone_vec: ConeVec or (n, 12) [mm], object frame; any orientation of the detector.
         shape: detector (rows, cols); default: the geometry's own.
         out: float32 (n, rows, cols), C order, filled and returned if given.
@@ -103,6 +106,7 @@ def _on_device(volume: Volume, geometry: ConeVec, shape: Shape2, out: Float32Arr
     )
 
 
+@public
 def back(
     projections: npt.ArrayLike,
     cone_vec: ConeVec | npt.ArrayLike,

@@ -8,11 +8,11 @@ use, and kept.
 from __future__ import annotations
 
 import math
-import operator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from html import escape
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,9 +20,7 @@ import numpy.typing as npt
 from flexdt.twin.errors import GeometryError, NotBuiltError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray, as_numbers
 from flexdt.twin.lazy_backend import File, lazy_backend
-
-if TYPE_CHECKING:
-    from flexdt.twin.reconstruction.noise import Noise
+from flexdt.twin.signatures import public
 
 Vector3 = tuple[float, float, float]
 IntArray = npt.NDArray[np.int32]
@@ -138,6 +136,7 @@ def blank_layout(volume: Volume, room: Float32Array | None = None) -> Layout:
     )
 
 
+@public
 @dataclass(frozen=True, eq=False, repr=False)
 class Volume:
     """A frozen volume of voxels.
@@ -204,6 +203,15 @@ class Volume:
         nz, ny, nx = self.shape
         return f"<Volume: {nz} x {ny} x {nx} voxels (z, y, x) of {voxel} mm about ({centre}) mm>"
 
+    def _repr_html_(self) -> str:
+        size = " x ".join(f"{side:g}" for side in self.size_mm)
+        least, most = float(self.data.min()), float(self.data.max())
+        return (
+            f"<table><caption>{escape(repr(self)[1:-1])}</caption><tr><th>size (x, y, z)</th><td>"
+            f"{size} mm</td></tr><tr><th>values</th><td>{least:.4g} to {most:.4g} / mm</td></tr>"
+            "</table>"
+        )
+
     def to(self, device: str) -> Any:
         """The volume on a device: "cpu", where it is, or "cuda", a `DeviceVolume`.
 
@@ -231,6 +239,33 @@ class Volume:
         layout = self.layout
         there = replace(layout, flat=gpu.demand(layout.device_copy.uploaded))
         return DeviceVolume(there, self.shape, self.voxel_xyz, self.center_mm)
+
+    def plot(self, axes: Any = None) -> Any:
+        """Show the layer in the middle; needs matplotlib (the extra `plots`).
+
+        Args:
+            axes: matplotlib's axes to draw into; None makes a figure.
+
+        Returns:
+            The axes.
+
+        Example:
+            >>> Volume(np.zeros((6, 4, 4)), voxel_mm=0.5).plot().get_title()
+            'z = 0.25 mm'
+        """
+        return lazy_backend("plots").plot_volume(self, axes)
+
+    def to_xarray(self) -> Any:
+        """The values as an xarray DataArray (z, y, x) with positions [mm], which needs xarray.
+
+        Raises:
+            TwinError: xarray is not installed.
+
+        Example:
+            >>> Volume(np.zeros((6, 4, 4)), voxel_mm=0.5).to_xarray().dims
+            ('z', 'y', 'x')
+        """
+        return lazy_backend("clients.datasets.nxtomo").volume_to_xarray(self)
 
     def save(self, file: File) -> None:
         """Write the volume; the ending chooses the format: .tif, .nrrd, .mha, .nii.gz, .h5, .zarr.
@@ -273,13 +308,8 @@ class Volume:
         """Standard deviation of the noise in each voxel, (nz, ny, nx) [1/mm], as the images show it
         (`reconstruct("fdk")`); None where it was not found. It is computed at each call.
         """
-        noise = getattr(self, "_noise", None)
-        return None if noise is None else noise.sigma(self)
-
-    def with_noise(self, noise: Noise | None) -> Volume:
-        """The same volume, whose `sigma` is that of `noise`; other volumes made of it have none."""
-        found = replace(self)
-        object.__setattr__(found, "_noise", noise)
+        noise: Any = getattr(self, "_noise", None)  # of `noise.with_noise`
+        found: Float32Array | None = None if noise is None else noise.sigma(self)
         return found
 
     @property
@@ -301,6 +331,12 @@ class Volume:
         nz, ny, nx = self.shape
         x, y, z = self.voxel_xyz
         return nx * x, ny * y, nz * z
+
+    @property
+    def boxes(self) -> FloatArray:
+        """Low and high corner of its box, (1, 2, 3) [mm]."""
+        half = np.array(self.size_mm) / 2.0
+        return np.array([self.center_mm - half, self.center_mm + half])[None]
 
     def centers(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Object-frame positions of the voxel centres along x (nx,), y (ny,) and z (nz,) [mm].
@@ -440,6 +476,7 @@ class DeviceVolume:
         return Volume(data, self.voxel_xyz, self.center_mm)
 
 
+@public
 @dataclass(frozen=True)
 class Grid:
     """A grid of voxels without values: a description, no voxel is allocated.
@@ -459,11 +496,7 @@ class Grid:
     center_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        try:
-            counts, edge = [operator.index(n) for n in self.shape], float(self.voxel_mm)
-        except TypeError:
-            counts, edge = [0], 0.0
-        if len(counts) != 3 or min(counts) < 1 or not (math.isfinite(edge) and edge > 0):
+        if min(self.shape) < 1 or not (math.isfinite(self.voxel_mm) and self.voxel_mm > 0):
             raise GeometryError(
                 f"grid of {self.shape} voxels of {self.voxel_mm} mm; allowed: three whole numbers "
                 "above 0, and one edge above 0",
@@ -512,23 +545,11 @@ class Grid:
 def as_volume(volume: Volume | Grid) -> Volume:
     """A volume as it is, a grid as zeros.
 
-    Raises:
-        GeometryError: something else, such as an array, which does not say how large its voxels
-            are.
-
     Example:
         >>> as_volume(Grid((6, 4, 4), 0.5))
         <Volume: 6 x 4 x 4 voxels (z, y, x) of 0.5 mm about (0, 0, 0) mm>
     """
-    if isinstance(volume, Grid):
-        return volume.blank()
-    if isinstance(volume, Volume):
-        return volume
-    raise GeometryError(
-        f"the volume is a {type(volume).__name__}; allowed: Volume(data, voxel_mm) or Grid(shape, "
-        "voxel_mm), which say how large a voxel is",
-        {"asked": type(volume).__name__, "allowed": ["Volume", "Grid"]},
-    )
+    return volume.blank() if isinstance(volume, Grid) else volume
 
 
 def aligned_zeros(count: int) -> Float32Array:
@@ -610,10 +631,7 @@ def _cropped(
 
 
 def _vector(value: object, name: str) -> Vector3:
-    try:
-        numbers = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        numbers = np.empty(0)
+    numbers = np.asarray(value, dtype=np.float64)
     if numbers.shape != (3,) or not np.isfinite(numbers).all():
         raise GeometryError(
             f"{name} is {value!r}; allowed: three finite numbers (x, y, z) in mm",

@@ -38,7 +38,7 @@ from flexdt.twin.reconstruction.coverage import (
     normalise_coverage,
 )
 from flexdt.twin.reconstruction.helix import Sharing
-from flexdt.twin.reconstruction.noise import NoiseMeter
+from flexdt.twin.reconstruction.noise import NoiseMeter, with_noise
 from flexdt.twin.reconstruction.rectify import (
     FINER,
     is_upright,
@@ -59,6 +59,7 @@ from flexdt.twin.reconstruction.trajectory import (
     redundancy,
 )
 from flexdt.twin.reconstruction.truncation import Truncation, truncation_of
+from flexdt.twin.signatures import public
 
 MOST_COLUMNS = 65_535
 """Voxel columns along y that a device's grid can hold."""
@@ -336,6 +337,7 @@ Progress = Callable[[float], None]
 """Called with the fraction done, from 0 to 1."""
 
 
+@public
 def fdk(
     projections: npt.ArrayLike,
     cone_vec: ConeVec | npt.ArrayLike,
@@ -397,11 +399,11 @@ def fdk(
     if len(values) == len(geometry):
         truncation = truncation_of(lambda view: values[view], geometry, shape)
         if truncation is not None and truncation.doubt:
-            warnings.warn(truncation.doubt, stacklevel=2)
+            warnings.warn(truncation.doubt, stacklevel=3)
     volume = fdk_parts(parts, geometry, shape, like, window, progress, truncation)
     layers = layer_warnings(lost_layers(volume.data), len(volume.data))
     for doubt in (*missing_wedge(geometry), *layers):
-        warnings.warn(doubt, stacklevel=2)
+        warnings.warn(doubt, stacklevel=3)
     return volume
 
 
@@ -599,7 +601,7 @@ def _fdk(
                 meter.data, meter.grid, circle, table, rays, last - first, own, cut_off=cut_off
             )
     volume = replace(like, data=data.transpose(2, 0, 1))
-    return volume if meter is None else volume.with_noise(meter.found())
+    return volume if meter is None else with_noise(volume, meter.found())
 
 
 def _weighing(

@@ -28,6 +28,7 @@ from flexdt.twin.projection.device_arrays import DeviceArray
 from flexdt.twin.projection.linear_operator import dot as dot
 from flexdt.twin.projection.operators import as_cone_vec, check_projections, require_finite
 from flexdt.twin.projection.volume import DeviceVolume
+from flexdt.twin.signatures import public
 
 SMALLEST = 1e-6
 """Sums of weights below this part of the largest are not divided by."""
@@ -79,7 +80,7 @@ class LinearSystem:
             GeometryError: no views, or shapes that do not fit.
             LimitError: no iterations.
         """
-        if not isinstance(iterations, int | np.integer) or iterations < 1:
+        if iterations < 1:
             raise LimitError(
                 f"iterations is {iterations!r}; allowed: a whole number from 1",
                 {"asked": repr(iterations), "allowed": 1},
@@ -227,6 +228,7 @@ def far_apart(count: int) -> list[int]:
     return [int(i) for i in np.argsort((np.arange(count) * 0.6180339887498949) % 1.0)]
 
 
+@public
 def sirt(
     projections: npt.ArrayLike,
     cone_vec: ConeVec | npt.ArrayLike,
@@ -344,6 +346,7 @@ def _subset_steps(
     return problem.volume(x)
 
 
+@public
 def cgls(
     projections: npt.ArrayLike,
     cone_vec: ConeVec | npt.ArrayLike,

@@ -10,7 +10,7 @@ see it. On a grid of every few voxels, both cost little.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -72,6 +72,13 @@ class Noise:
             where = [np.full(flat.shape, k), *across]
             out[layer] = np.sqrt(map_coordinates(self.views.data, where, order=1) + shared)
         return np.where(np.isnan(grid.data), np.float32(np.nan), out)
+
+
+def with_noise(volume: Volume, noise: Noise | None) -> Volume:
+    """The same volume with a `sigma`. Volumes that are made of it have none: it is no field."""
+    found = replace(volume)
+    object.__setattr__(found, "_noise", noise)
+    return found
 
 
 class NoiseMeter:

@@ -35,7 +35,7 @@ from flexdt.twin.reconstruction.iterative import (
     ones,
     solved,
 )
-from flexdt.twin.signatures import with_arguments_of
+from flexdt.twin.signatures import public, with_arguments_of
 
 WEIGHT = 1e-2
 """Default strength as a part of max(A' b); see docs/operator.md for how it was chosen."""
@@ -146,6 +146,7 @@ def minimise_tv(
     return solved(problem, minimised)
 
 
+@public
 @with_arguments_of(minimise_tv)
 def tv(*args: Any, **options: Any) -> Volume:
     """Least squares with total variation, see `minimise_tv`, of which this is the volume.

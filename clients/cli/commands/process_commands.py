@@ -95,6 +95,10 @@ def _check(given: Mapping[str, Any]) -> None:
         raise typer.BadParameter("--tls-cert and --tls-key go together")
     if given.get("projector") is not None and given["projector_port"] is not None:
         raise typer.BadParameter("give --projector or --projector-port, not both")
+    if given.get("machine") is not None:  # found before any process starts
+        from flexdt.machines import machine
+
+        machine(given["machine"])
 
 
 def become(module: str, given: Mapping[str, object], more: Sequence[str] = ()) -> None:

@@ -31,21 +31,12 @@ EVERY_S = 2.0
 
 def batch(
     plan: Path = argument(..., "PLAN.toml"),
-    out: Path | None = option(None, "Of results; the plan's name if left out.", metavar="DIR"),
+    out: Path | None = option(None, "Write results here; default: the plan's name.", metavar="DIR"),
     jobs: Jobs = None,
     scheduler: Scheduler = None,
-    slurm: int | None = option(None, "So many SLURM jobs.", metavar="JOBS", min=1),
-    slurm_script: bool = option(False, "Print the SLURM job's script and leave.", "--slurm-script"),
-    cores: int = option(4, "Of a SLURM job.", "--slurm-cores", min=1),
-    memory: str = option("8GiB", "Of a SLURM job.", "--slurm-memory"),
-    walltime: str = option("01:00:00", "Of a SLURM job.", "--slurm-time", metavar="HH:MM:SS"),
-    queue: str | None = option(None, "Of a SLURM job.", "--slurm-queue", metavar="PARTITION"),
-    account: str | None = option(None, "Of a SLURM job.", "--slurm-account"),
-    extra: list[str] | None = option(
-        None, "Such as --gres=gpu:1; repeat.", "--slurm-extra", metavar="DIRECTIVE"
-    ),
-    setup: list[str] | None = option(
-        None, "Before workers start; repeat.", "--slurm-setup", metavar="COMMAND"
+    slurm: Path | None = option(None, "Submit workers to SLURM as this file says.", metavar="FILE"),
+    slurm_script: bool = option(
+        False, "Print the script of --slurm's jobs and leave.", "--slurm-script"
     ),
 ) -> Answer:
     """Make a batch of scans or calibrations; run again to take up an interrupted one.
@@ -57,25 +48,24 @@ def batch(
     from flexdt_extensions.batch.batch_run import run_batch
     from flexdt_extensions.batch.work import item_bytes
     from flexdt_extensions.executors import (
-        Slurm,
         dask_executor,
         job_script,
         processes,
-        slurm_executor,
+        read_slurm,
+        slurm_workers,
     )
 
     wanted = read_plan(plan)
-    queued = Slurm(
-        slurm or 1, cores, memory, walltime, queue, account, tuple(extra or ()), tuple(setup or ())
-    )
-    if slurm_script:
-        yield job_script(queued).rstrip()
-        return
     if scheduler is not None and slurm is not None:
         raise typer.BadParameter("give --scheduler or --slurm, not both")
     workers: AbstractContextManager[Executor]
     if slurm is not None:
-        workers = slurm_executor(queued)
+        if slurm_script:
+            yield job_script(read_slurm(slurm)).rstrip()
+            return
+        workers = slurm_workers(slurm)
+    elif slurm_script:
+        raise typer.BadParameter("--slurm-script needs --slurm FILE")
     else:
         workers = dask_executor(scheduler) if scheduler is not None else processes(jobs)
     folder = Path(wanted.batch.name) if out is None else out

@@ -8,12 +8,14 @@ from flexdt.extending import Json, become, names, option
 
 
 def bench(
-    out: Path | None = option(None, "bench.json.", metavar="DIR"),
-    only: str | None = option(None, "These cases only.", metavar="NAME,NAME,..."),
+    out: Path | None = option(None, "Write bench.json here.", metavar="DIR"),
+    only: str | None = option(None, "Run these cases only.", metavar="NAME,NAME,..."),
     no_peers: bool = option(False, "Do not run other projectors.", "--no-peers"),
-    quick: bool = option(False, "C1 and C1-tilt alone.", "--quick"),
+    quick: bool = option(False, "Run C1 and C1-tilt alone.", "--quick"),
     list_: bool = option(False, "Name the cases, measure nothing.", "--list"),
-    device: bool = option(False, "A CUDA device and its targets, beside ASTRA.", "--device"),
+    device: bool = option(
+        False, "Measure a CUDA device against its targets and ASTRA.", "--device"
+    ),
     json: Json = False,
 ) -> None:
     """Measure speed and accuracy, beside the peers that are installed."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from flexdt.extending import Answer, argument, option, warn
+from flexdt.twin.errors import TwinError
 
 
 def simulate(
@@ -24,6 +25,13 @@ def simulate(
     """
     from flexdt_extensions.ctsimu.scenario import ScenarioImages
 
+    if scenario.is_file() and scenario.suffix.lower() != ".json":
+        raise TwinError.instead(
+            f"{scenario}: `flexdt simulate` takes a CTSimU scenario",
+            str(scenario),
+            f"a .json file; to scan a mesh or a phantom: flexdt sample {scenario}, "
+            f"or in Python flexdt.simulate({str(scenario)!r}, geometry)",
+        )
     images = ScenarioImages(scenario, seed, rays)
     warn(images.scan.notes, scenario)
     metadata = images.write(scenario.stem if out is None else out)

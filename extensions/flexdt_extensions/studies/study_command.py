@@ -28,13 +28,13 @@ def study(
     ),
     variant: Literal["printed", "author"] = option(
         "printed",
-        "Phantoms and scenarios of beads, phantoms, damping: as the thesis prints them, "
+        "Take phantoms and scenarios of beads, phantoms, damping as the thesis prints them, "
         "or as its author's public code has them.",
     ),
-    out: Path | None = option(None, "summary.json, tables, charts.", metavar="DIR"),
+    out: Path | None = option(None, "Write summary.json, tables and charts here.", metavar="DIR"),
     jobs: Jobs = None,
     scheduler: Scheduler = None,
-    seed: int = option(1, "Of all noise.", min=0),
+    seed: int = option(1, "Draw all noise from this seed.", min=0),
 ) -> Answer:
     """Repeat an experiment of the thesis.
 

@@ -482,8 +482,12 @@ def test_the_slurm_jobs_script(
     worker = script.splitlines()[-1]
     assert "--nworkers 8" in worker
     assert "--nthreads 1" in worker
-    assert run(["batch", str(plan_file()), "--slurm-script", "--slurm-queue", "short"]) == 0
+    file = plan_file().with_name("slurm.toml")
+    file.write_text('queue = "short"')
+    assert run(["batch", str(plan_file()), "--slurm-script", "--slurm", str(file)]) == 0
     assert "#SBATCH -p short" in capsys.readouterr().out
+    assert run(["batch", str(plan_file()), "--slurm-script"]) == 2
+    assert "needs --slurm FILE" in capsys.readouterr().err
 
 
 def test_a_file_says_what_to_ask_slurm_for(
@@ -550,7 +554,10 @@ def test_reconstruct_by_jobs_of_a_stand_in_for_slurm(
 def test_slurm_where_there_is_none_is_said(
     plan_file: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(["batch", str(plan_file()), "--out", str(tmp_path / "o"), "--slurm", "2"]) == 1
+    file = tmp_path / "slurm.toml"
+    file.write_text("jobs = 2")
+    words = ["batch", str(plan_file()), "--out", str(tmp_path / "o"), "--slurm"]
+    assert run([*words, str(file)]) == 1
     assert "no sbatch here" in capsys.readouterr().err
 
 

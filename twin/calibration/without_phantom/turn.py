@@ -164,6 +164,11 @@ def _weights(angle: FloatArray, keep: npt.NDArray[np.bool_]) -> FloatArray:
 def _thumb(image: Float32Array) -> Float32Array:
     """Means over square blocks; what is left over at the ends is left out."""
     factor = max(1, round(image.shape[1] / THUMB_COLUMNS))
+    if min(image.shape) < 2 * factor:
+        raise NotIdentifiableError.instead(
+            f"images of {image.shape[0]} rows and {image.shape[1]} columns show no plane of the "
+            "source and no roll", list(image.shape), f"{2 * factor} rows or more",
+        )  # fmt: skip
     return np.asarray(binned_mean(image, factor), dtype=np.float32)
 
 

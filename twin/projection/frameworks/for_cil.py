@@ -44,7 +44,7 @@ def cil_operator(
         voxel_size_x=x, voxel_size_y=y, voxel_size_z=z,
     )  # fmt: skip
     n, rows, cols = image_shape
-    source, whole = np.linalg.norm(geometry.source[0]), geometry.source_detector_distance[0]
+    source, whole = np.linalg.norm(geometry.source[0]), abs(geometry.source_detector_distance[0])
     pitches = [float(np.linalg.norm(step[0])) for step in (geometry.u, geometry.v)]
     images = AcquisitionGeometry.create_Cone3D(
         [0, -float(source), 0], [0, float(whole - source), 0]
