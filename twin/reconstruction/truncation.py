@@ -239,7 +239,7 @@ def _fitted(
     usual = float(np.median(met)) if met.size else 0.0  # of the rays that meet the object
     for k in np.argsort(-seen.sum(axis=(0, 2))).tolist():
         band = seen[:, k]
-        cut_off[k] = (_cut_off(band, least) & edges_that_count).any()
+        cut_off[k] = (_cut_off(band, least, usual) & edges_that_count).any()
         if not cut_off[k]:
             continue
         even = max(float(np.ptp(band.mean(axis=axis))) for axis in (0, 1)) < ACCURACY * usual
@@ -269,7 +269,7 @@ def _noise(lines: npt.NDArray[np.floating]) -> float:
     return float(np.median(np.abs(bend))) / 1.65 if bend.size else 0.0
 
 
-def _cut_off(band: FloatArray, least: float) -> npt.NDArray[np.bool_]:
+def _cut_off(band: FloatArray, least: float, usual: float) -> npt.NDArray[np.bool_]:
     """Whether the object goes on beyond the edges (2,), in some neighbouring views or in all.
 
     The middle one of five views counts, and the mean of all, in which less noise hides it. Noise is
@@ -280,9 +280,10 @@ def _cut_off(band: FloatArray, least: float) -> npt.NDArray[np.bool_]:
     ends = band[:, [0, -1]]
     noise = SIGNIFICANT * np.array([_noise(band[:, :5:2]), _noise(band[:, :-6:-2])])
     some = median_filter(ends, (min(5, len(band)), 1)) > np.maximum(least, noise)
-    # A tenth of the accuracy is nothing in a view; in the mean, noise's logarithm is as much.
+    # In the mean a drift of the flat shows, too, and the logarithm of noise: what counts there is
+    # what would change densities by the accuracy (see `at_edges` above).
     apart = SIGNIFICANT * np.std(np.diff(ends, axis=0), axis=0) / np.sqrt(2.0 * len(ends))
-    every = ends.mean(axis=0) > np.maximum(10.0 * least, apart)
+    every = ends.mean(axis=0) > np.maximum(0.5 * np.pi * ACCURACY * usual, apart)
     return np.asarray(some.any(axis=0) | every)
 
 
