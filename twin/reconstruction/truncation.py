@@ -280,10 +280,12 @@ def _cut_off(band: FloatArray, least: float, usual: float) -> npt.NDArray[np.boo
     ends = band[:, [0, -1]]
     noise = SIGNIFICANT * np.array([_noise(band[:, :5:2]), _noise(band[:, :-6:-2])])
     some = median_filter(ends, (min(5, len(band)), 1)) > np.maximum(least, noise)
-    # In the mean a drift of the flat shows, too, and the logarithm of noise: what counts there is
+    # In the mean the flat's drift and noise show, too, and the logarithm of noise: what counts is
     # what would change densities by the accuracy (see `at_edges` above).
-    apart = SIGNIFICANT * np.std(np.diff(ends, axis=0), axis=0) / np.sqrt(2.0 * len(ends))
-    every = ends.mean(axis=0) > np.maximum(0.5 * np.pi * ACCURACY * usual, apart)
+    mean = band.mean(axis=0)
+    apart = np.std(np.diff(ends, axis=0), axis=0) / np.sqrt(2.0 * len(ends))
+    apart = SIGNIFICANT * np.hypot(apart, _noise(mean))
+    every = mean[[0, -1]] > np.maximum(0.5 * np.pi * ACCURACY * usual, apart)
     return np.asarray(some.any(axis=0) | every)
 
 
