@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from functools import cached_property, wraps
 from numbers import Real
-from typing import Any, Final, Literal, NamedTuple, ParamSpec, TypeVar
+from typing import Annotated, Any, Final, Literal, NamedTuple, ParamSpec, TypeVar
 
 from flexdt.twin.errors import GeometryError, LimitError
 
@@ -251,8 +251,10 @@ def kind_of(annotation: Any) -> Kind | None:
         (('a number', 'None'), False)
     """
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
-    plain = origin not in (Literal, Callable)
+    plain = origin not in (Annotated, Literal, Callable)
     inner = [kind_of(part) for part in parts if plain and part is not ...]
+    if origin is Annotated:  # a value, which its owner also makes of its JSON
+        return Kind((_named(parts[0]),), lambda v: isinstance(v, (parts[0], Mapping)))
     if origin in (typing.Union, types.UnionType):
         kinds = [kind for kind in inner if kind is not None]
         words = tuple(dict.fromkeys(word for kind in kinds for word in kind.words))

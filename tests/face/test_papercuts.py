@@ -8,6 +8,7 @@ import json
 import sys
 import warnings
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -317,3 +318,11 @@ def test_another_name_of_the_same_thing_is_deprecated() -> None:
     assert told[0].filename == __file__
     with pytest.raises(TypeError, match="Grid has no argument 'voxel'"):
         fx.Grid((4, 4, 4), voxel_mm=0.5, voxel=0.5)  # type: ignore[call-arg]
+
+
+def test_a_detector_comes_back_from_its_json() -> None:
+    detector = fx.Detector(exposure_ms=120.0, response=((20.0, 0.9), (60.0, 0.5)))
+    document = json.loads(json.dumps(asdict(detector)))
+    assert fx.Detector(**document) == detector
+    with pytest.raises(fx.TwinError, match="pixels is 3; allowed: a PixelGrid"):
+        fx.Detector(pixels=3)  # type: ignore[arg-type]
