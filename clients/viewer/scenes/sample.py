@@ -16,7 +16,6 @@ from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import product
 from typing import Any, Final, cast
 
 import numpy as np
@@ -107,19 +106,6 @@ def _standing(mesh: trimesh.Trimesh, center: Vector, paint: Paint, axis: str) ->
         mesh.apply_transform(turn_matrix((1, 0, 0), -np.pi / 2))
     mesh.apply_translation(center)
     return PaintedMesh(mesh, paint)
-
-
-def column(size: Vector, paint: Paint) -> list[PaintedMesh]:
-    """An upright aluminium profile [mm] with two T-slots in each of its four faces."""
-    x, y, z = size
-    width = 0.045 * (x + y)
-    pieces = [bevelled(size, (0, 0, 0), paint, 3.0)]
-    for at, side in product((-1 / 6, 1 / 6), (-0.5, 0.5)):
-        pieces += [
-            bevelled((width, 1.2, z * 0.985), (at * x, side * y, 0), RUBBER, 0.2),
-            bevelled((1.2, width, z * 0.985), (side * x, at * y, 0), RUBBER, 0.2),
-        ]
-    return pieces
 
 
 def glb(pieces: Iterable[PaintedMesh]) -> bytes:
