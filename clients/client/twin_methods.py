@@ -268,6 +268,11 @@ def sample_mesh() -> Flow[bytes]:
         >>> len(twin.sample_mesh()) > 84  # the header and a triangle of an STL file
         True
     """
+    return (yield from sample_shape()).data
+
+
+def sample_shape() -> Flow[stage.SampleMeshResult]:
+    """As `sample_mesh`, with the name and the revision of the sample that it is of."""
     while True:
         content, first = b"", None
         while first is None or len(content) < first.total:
@@ -277,7 +282,7 @@ def sample_mesh() -> Flow[bytes]:
                 break  # another sample is on the stage by now: start again
             content += part.data
         else:
-            return content
+            return first.model_copy(update={"data": content})
 
 
 def upload_mesh(

@@ -10,19 +10,20 @@ to a bounded size.
 
 from __future__ import annotations
 
-import base64
 import io
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Final, cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 import trimesh
 from trimesh.visual.material import PBRMaterial
 
+from flexdt.clients.client import twin_methods as m
+from flexdt.clients.client.flows import adrive
 from flexdt.phantoms import Phantom, load_phantom, mesh_phantom
 from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SampleState
@@ -301,9 +302,6 @@ def _box(sample: SampleState) -> SampleLook:
     return SampleLook((skin,), np.zeros((0, 3)), exact=False)
 
 
-CHUNK: Final = 4 << 20
-MOST: Final = 64 << 20
-
 Ask = Callable[[str, Mapping[str, Any]], Awaitable[object]]
 
 
@@ -313,23 +311,9 @@ async def fetch(ask: Ask, sample: SampleState) -> bytes | None:
     Raises:
         ConnectionLost: the twin has gone.
     """
-    content = bytearray()
-    while True:
-        try:
-            answer = await ask("sample.mesh", {"start": len(content), "count": CHUNK})
-        except RpcError:  # nothing on the stage any more, too large, or an older twin
-            return None
-        if (
-            not isinstance(answer, Mapping)
-            or (answer.get("name"), answer.get("revision")) != (sample.name, sample.revision)
-            or answer.get("start") != len(content)
-            or not 0 < int(answer["total"]) <= MOST
-        ):
-            return None
-        data = answer["data"]
-        chunk = base64.b64decode(data) if isinstance(data, str) else bytes(data)
-        content += chunk
-        if len(content) >= int(answer["total"]):
-            return bytes(content)
-        if not chunk:
-            return None
+    try:
+        told = await adrive(m.sample_shape(), lambda asked: ask(asked.method, asked.params))
+    except RpcError:  # nothing on the stage any more, too large, or an older twin
+        return None
+    same = (told.name, told.revision) == (sample.name, sample.revision)
+    return told.data or None if same else None
