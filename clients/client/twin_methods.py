@@ -268,21 +268,7 @@ def sample_mesh() -> Flow[bytes]:
         >>> len(twin.sample_mesh()) > 84  # the header and a triangle of an STL file
         True
     """
-    return (yield from sample_shape()).data
-
-
-def sample_shape() -> Flow[stage.SampleMeshResult]:
-    """As `sample_mesh`, with the name and the revision of the sample that it is of."""
-    while True:
-        content, first = b"", None
-        while first is None or len(content) < first.total:
-            part = yield from ask(stage.SAMPLE_MESH, start=len(content))
-            first = part if first is None else first
-            if (part.name, part.revision, part.total) != (first.name, first.revision, first.total):
-                break  # another sample is on the stage by now: start again
-            content += part.data
-        else:
-            return first.model_copy(update={"data": content})
+    return (yield from uploads.sample_shape()).data
 
 
 def upload_mesh(

@@ -22,8 +22,8 @@ import numpy.typing as npt
 import trimesh
 from trimesh.visual.material import PBRMaterial
 
-from flexdt.clients.client import twin_methods as m
 from flexdt.clients.client.flows import adrive
+from flexdt.clients.client.uploads import sample_shape
 from flexdt.phantoms import Phantom, load_phantom, mesh_phantom
 from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SampleState
@@ -312,7 +312,7 @@ async def fetch(ask: Ask, sample: SampleState) -> bytes | None:
         ConnectionLost: the twin has gone.
     """
     try:
-        told = await adrive(m.sample_shape(), lambda asked: ask(asked.method, asked.params))
+        told = await adrive(sample_shape(), lambda asked: ask(asked.method, asked.params))
     except RpcError:  # nothing on the stage any more, too large, or an older twin
         return None
     same = (told.name, told.revision) == (sample.name, sample.revision)
