@@ -230,12 +230,11 @@ class MeshCache:
     """Looks of samples, made once each."""
 
     def __init__(self) -> None:
-        self._uploads: OrderedDict[Key, Phantom] = OrderedDict()
-        self._known: OrderedDict[tuple[object, ...], SampleLook] = OrderedDict()
+        self._made: OrderedDict[Key, SampleLook] = OrderedDict()
 
     def lacks(self, sample: SampleState) -> bool:
         """Whether the sample is an upload whose mesh has not arrived yet."""
-        return sample.revision is not None and _key(sample) not in self._uploads
+        return sample.revision is not None and _key(sample) not in self._made
 
     def add(self, sample: SampleState, stl: bytes) -> None:
         """The shape of an upload.
@@ -243,35 +242,23 @@ class MeshCache:
         Raises:
             TwinError: it is no mesh.
         """
-        self._uploads[_key(sample)] = mesh_phantom(
-            stl,
-            material=sample.material or DEFAULT_MATERIAL,
-            file_type="stl",
-            name=sample.name,
-            place="keep",
-        )
-        while len(self._uploads) > KEPT:
-            self._uploads.popitem(last=False)
-        for key in [k for k in self._known if k[0] == sample.name]:
-            del self._known[key]
+        material = sample.material or DEFAULT_MATERIAL
+        made = mesh_phantom(stl, material=material, file_type="stl", place="keep")
+        self._keep(sample, made)
 
     def look(self, sample: SampleState) -> SampleLook:
-        """How `sample` looks; it may take a second."""
+        """How `sample` looks, an upload whose mesh is lacking as a box; it may take a second."""
         if sample.name is None:
             return NOTHING
-        key = (*_key(sample), sample.size_mm)
-        if key not in self._known:
-            self._known[key] = self._make(sample)
-            while len(self._known) > KEPT:
-                self._known.popitem(last=False)
-        return self._known[key]
-
-    def _make(self, sample: SampleState) -> SampleLook:
-        phantom = self._uploads.get(_key(sample))
-        if sample.name is not None and sample.revision is None:
+        if sample.revision is None and _key(sample) not in self._made:
             with suppress(TwinError):
-                phantom = load_phantom(sample.name)
-        return _box(sample) if phantom is None else _skins(phantom)
+                self._keep(sample, load_phantom(sample.name))
+        return self._made.get(_key(sample)) or _box(sample)
+
+    def _keep(self, sample: SampleState, phantom: Phantom) -> None:
+        self._made[_key(sample)] = _skins(phantom)
+        while len(self._made) > KEPT:
+            self._made.popitem(last=False)
 
 
 def _skins(phantom: Phantom) -> SampleLook:
