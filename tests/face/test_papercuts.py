@@ -316,6 +316,11 @@ def test_another_name_of_the_same_thing_is_deprecated() -> None:
         grid = fx.Grid((4, 4, 4), voxel=0.5)  # type: ignore[call-arg]
     assert grid == fx.Grid((4, 4, 4), 0.5)
     assert told[0].filename == __file__
+    with pytest.warns(DeprecationWarning, match="Grid: voxel is called"):  # not once alone
+        assert fx.Grid((4, 4, 4), voxel=0.5) == grid  # type: ignore[call-arg]
+    for _ in range(2):
+        with pytest.warns(DeprecationWarning, match="voxel_mm here"):
+            assert fx.Volume(np.zeros((2, 3, 4), np.float32), voxel=0.5).shape == (2, 3, 4)  # type: ignore[call-arg]
     with pytest.raises(TypeError, match="Grid has no argument 'voxel'"):
         fx.Grid((4, 4, 4), voxel_mm=0.5, voxel=0.5)  # type: ignore[call-arg]
 
