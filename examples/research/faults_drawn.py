@@ -457,6 +457,52 @@ def _flipped(axes: tuple[int, ...], *names: str) -> Fault:
     return fault
 
 
+def _distorted(terms: str) -> Fault:
+    """A panel whose picture is distorted smoothly, by up to a pixel at its upper edge."""
+
+    def fault(draft: Draft, rng: Rng) -> Draft:
+        half = np.array([(SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2])
+        size = float(_sign(rng) * rng.uniform(0.3, 1.0))
+        one, two = rng.normal(size=2) / math.sqrt(2)
+        bent = rng.normal(size=(2, 7))
+
+        def shift(x: Array, y: Array) -> Array:
+            square = x * x + y * y
+            if terms == "radial":
+                return np.stack([x * square, y * square], axis=1)
+            if terms == "decentred":
+                across = one * (square + 2 * x * x) + 2 * two * x * y
+                return np.stack([across, two * (square + 2 * y * y) + 2 * one * x * y], axis=1)
+            powers = [x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3]
+            return np.asarray((bent @ np.array(powers)).T / 2)
+
+        def after(spots: list[Array | None]) -> list[Array | None]:
+            for s in spots:
+                assert s is not None
+                x, y = ((s[:, :2] - half) / 305.0).T
+                s[:, :2] += size * shift(x, y)
+            return spots
+
+        return replace(draft, after=after, names=("panel_distorted",), beside=OTHERS)
+
+    return fault
+
+
+def _tiles_apart(draft: Draft, rng: Rng) -> Draft:
+    """Two tiles of the panel with a gap between them, which the image does not show."""
+    axis = int(rng.integers(2))
+    border = SHAPE[1 - axis] * rng.uniform(0.4, 0.6)
+    gap = rng.uniform(0.5, 2.0)
+
+    def after(spots: list[Array | None]) -> list[Array | None]:
+        for s in spots:
+            assert s is not None
+            s[:, axis] -= np.where(s[:, axis] > border, gap, 0.0)
+        return spots
+
+    return replace(draft, after=after, names=("panel_distorted",), beside=OTHERS)
+
+
 def _row_offset(draft: Draft, rng: Rng) -> Draft:
     """The read-out starts some rows late, as if the panel stood higher or lower."""
     rows = int(_sign(rng) * rng.integers(2, 8))
@@ -583,6 +629,10 @@ KINDS: Final[Mapping[str, Fault]] = {
     "images_upside_down": _flipped((1,), "image_upside_down"),
     "images_turned": _flipped((0, 1), "image_turned"),
     "row_offset": _row_offset,
+    "radial": _distorted("radial"),
+    "decentred": _distorted("decentred"),
+    "bent": _distorted("bent"),
+    "tiles_apart": _tiles_apart,
     "binned": _binned,
     "tau_held": _held("tau_x", 0.02, 1.0),
     "height_held": _held("dO_y", 0.2, 2.0),

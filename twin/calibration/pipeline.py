@@ -82,6 +82,7 @@ from flexdt.twin.calibration.identify import (
 from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.geometry.motion import Motion, require_movable
 from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets
+from flexdt.twin.geometry.panel import PanelModel
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection.analytic_solids import Scene
 
@@ -383,6 +384,7 @@ def _explain(
         fit,
         free_beads=want.bead_tolerance_mm is not None,
         refit=lambda **changes: _refit(state, want, fit, **changes),
+        loose=lambda: _loose(state, want, fit),
         misfit_px=want.misfit_px,
     )
 
@@ -514,6 +516,7 @@ def _fit(
     want: CalibrationRequest,
     start: Sequence[Offsets] | None = None,
     bead_tolerance_mm: float | None = None,
+    panel: PanelModel | None = None,
 ) -> FitResult:
     """The fit to the best positions there are: of the second measurement, else of the first."""
     tolerance = want.bead_tolerance_mm if bead_tolerance_mm is None else bead_tolerance_mm
@@ -541,6 +544,7 @@ def _fit(
         prior_centre=want.start,
         bound=want.bound,
         centre=np.concatenate([s.bias for s in seen]),
+        panel=panel,
     )
     return fit if state.motion is None else aware(fit, state.motion)
 
@@ -655,15 +659,17 @@ def _refit(
     motion: MotionFit | None = None,
     bead_tolerance_mm: float | None = None,
     start: Sequence[Offsets] | None = None,
+    panel: PanelModel | None = None,
 ) -> FitResult:
-    """The last fit with something else free: more parameters, the beads; or with a motion."""
+    """The last fit with something else free: more parameters, the beads, the panel's distortion; or
+    with a motion. A distortion that was found stays."""
     if motion is not None:
         scans = zip(state.scans, motion.motions, strict=True)
         moved = tuple(replace(s, poses=m.applied(s.poses)) for s, m in scans)
         state = replace(state, scans=moved)
     begin = fit.group_parameters if start is None else start
     freed = replace(want, free=tuple(dict.fromkeys((*want.free, *extra))))
-    return _fit(state, freed, begin, bead_tolerance_mm)
+    return _fit(state, freed, begin, bead_tolerance_mm, panel or fit.problem.panel)
 
 
 def _given(finding: Finding | None) -> list[Finding]:

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from flexdt.twin.calibration.detect.refine import Refined
+from flexdt.twin.calibration.diagnose.distortion import better_panel, distorted
 from flexdt.twin.calibration.diagnose.finding import Finding, Severity, error, warning
 from flexdt.twin.calibration.diagnose.moving import moving
 from flexdt.twin.calibration.fit.fit import FitResult
@@ -168,7 +169,12 @@ def judge_body(measured: Sequence[Refined]) -> Finding | None:
 
 
 def explain_residuals(
-    fit: FitResult, *, free_beads: bool, refit: Refit, misfit_px: float = MISFIT_PX
+    fit: FitResult,
+    *,
+    free_beads: bool,
+    refit: Refit,
+    loose: Callable[[], FitResult],
+    misfit_px: float = MISFIT_PX,
 ) -> tuple[FitResult, list[Finding]]:
     """Judge the residuals of the final fit; name what would explain them.
 
@@ -178,8 +184,9 @@ def explain_residuals(
     """
     if not fit.identifiable:
         return fit, []
+    fit = better_panel(fit, refit, loose, misfit_px)
     certificate = fit.certificate
-    out = _lost_beads(fit) + _drifts(fit)
+    out = [*_lost_beads(fit), *_drifts(fit), *filter(None, [distorted(fit)])]
     structured = (
         certificate.enlargement > 1.0
         or certificate.shared
