@@ -76,6 +76,7 @@ class Faulty:
         names: patterns of which each must be found in what is said.
         beside: patterns of what may be said, too.
         silent: to be offered and right without a word is right.
+        after: what was done to the spots of the frames, if anything.
     """
 
     spots: list[Array | None]
@@ -86,6 +87,7 @@ class Faulty:
     silent: bool
     noise_px: float
     shape: tuple[int, int] = SHAPE
+    after: Callable[[list[Array | None]], list[Array | None]] | None = None
 
 
 def shadows(world: World) -> tuple[Array, Array]:
@@ -192,11 +194,31 @@ def drawn(kind: str, seed: int) -> Faulty:
         for name, value in {**draft.world.offsets, **draft.truth}.items()
     }
     return Faulty(
-        spots, draft.believed, truth, draft.names, draft.beside, draft.silent, draft.noise_px
+        spots,
+        draft.believed,
+        truth,
+        draft.names,
+        draft.beside,
+        draft.silent,
+        draft.noise_px,
+        after=draft.after,
     )
 
 
 Fault = Callable[[Draft, Rng], Draft]
+UNSEEN: Final = {
+    "dD_x": 2.0, "dD_y": 2.0, "dD_z": 1.0, "det_roll": 0.3, "det_pitch": 0.3, "det_yaw": 0.3,
+    "axis_tilt_x": 0.1, "axis_tilt_z": 0.1,
+}  # fmt: skip
+"""How far panel and axis usually are from where they are said to be [mm, deg]."""
+
+
+def _bent(draft: Draft, rng: Rng, after: Callable[..., list[Array | None]]) -> Draft:
+    """A panel that is distorted, and is not exactly where it is said to be, as usual."""
+    offsets = {name: float(rng.normal(0.0, width)) for name, width in UNSEEN.items()}
+    world = replace(draft.world, offsets={**offsets, **draft.world.offsets})
+    return replace(draft, world=world, after=after, names=("panel_distorted",),
+                   beside=(*OTHERS, "priors_narrow"))  # fmt: skip
 
 
 def _sign(rng: Rng) -> float:
@@ -483,7 +505,7 @@ def _distorted(terms: str) -> Fault:
                 s[:, :2] += size * shift(x, y)
             return spots
 
-        return replace(draft, after=after, names=("panel_distorted",), beside=OTHERS)
+        return _bent(draft, rng, after)
 
     return fault
 
@@ -500,7 +522,7 @@ def _tiles_apart(draft: Draft, rng: Rng) -> Draft:
             s[:, axis] -= np.where(s[:, axis] > border, gap, 0.0)
         return spots
 
-    return replace(draft, after=after, names=("panel_distorted",), beside=OTHERS)
+    return _bent(draft, rng, after)
 
 
 def _row_offset(draft: Draft, rng: Rng) -> Draft:

@@ -126,7 +126,7 @@ class Panel:
                 "an image", image.shape, self.model.shape, ": the panel's distortion is of those"
             )
         columns, rows = self._map
-        out = cv2.remap(image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        out = cv2.remap(image, columns, rows, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(out, dtype=np.float32)
 
     def to_json(self) -> dict[str, Any]:
