@@ -24,6 +24,10 @@ FIRST_PX = 1.0
 """Standard deviation of the coefficients with which the search for their size begins."""
 OUTLIER = 5.0
 """Residuals beyond so many robust standard deviations count as so many."""
+SAID_PX = 0.015
+"""Root mean square of the residuals explained from which a distortion is said."""
+LOOSE_BEADS_MM = 0.3
+"""Prior of bead positions with which they are compared with a distortion."""
 CHANCE = 1e-4
 """Probability with which a model may be taken where there is only noise."""
 CUTS = 48
@@ -42,7 +46,10 @@ def evidence(fit: FitResult, noise: float) -> float:
     norms = fit.problem.residuals(fit.solution.x)[1][fit.problem.seen]
     bounded = np.minimum(norms, OUTLIER * noise)
     count = 2 * norms.size
-    return count * math.log(float(np.sum(bounded**2))) + _by_chance(fit.problem.panel)
+    layout = fit.problem.layout
+    beads = layout.panel_column - layout.parameter_count
+    chance = _by_chance(fit.problem.panel) + (float(chdtri(beads, CHANCE)) if beads else 0.0)
+    return count * math.log(float(np.sum(bounded**2))) + chance
 
 
 def spread(fit: FitResult) -> float:
@@ -71,7 +78,7 @@ def better_panel(
         wider = [bent] if has is None else []
         has = has or bent
         if len(has.borders) < 2:
-            wider.append(replace(has, borders=(*has.borders, _border(best, has))))
+            wider.append(replace(has, borders=(*has.borders, _border(best))))
         trials = [_sized(m, refit) for m in wider if _hinted(best, m)]
         better = min((t for t in trials if t.identifiable), key=partial(_among, [best, *trials]),
                      default=best)  # fmt: skip
@@ -82,14 +89,20 @@ def better_panel(
     # What moves during a scan looks like a distortion in part, and stays in the residuals.
     if best is fit or left.rms_px >= misfit_px or left.shared or left.drifts:
         return fit
-    other = loose()
-    return fit if _among([best, other], other) <= _among([best, other], best) else best
+    for rival in (loose, partial(refit, bead_tolerance_mm=LOOSE_BEADS_MM)):
+        other = rival()
+        if _among([best, other], other) <= _among([best, other], best):
+            return fit
+    return best
 
 
-def distorted(fit: FitResult) -> Finding | None:
-    """What is said of a distortion that was estimated."""
-    panel = fit.panel
-    if panel is None:
+def distorted(fit: FitResult, flat: FitResult) -> Finding | None:
+    """What is said of a distortion that was estimated, beside the fit of a flat panel.
+
+    What explains less than detection may err by is in the sigmas and no finding.
+    """
+    panel, left = fit.panel, fit.certificate.rms_px
+    if panel is None or math.sqrt(max(flat.certificate.rms_px**2 - left**2, 0.0)) < SAID_PX:
         return None
     rows, cols = panel.model.shape
     row, column = np.mgrid[0 : rows - 1 : 9j, 0 : cols - 1 : 9j]
@@ -145,7 +158,7 @@ def _hinted(fit: FitResult, model: PanelModel) -> bool:
     return -left.size * math.log(max(rest, 1e-300)) > more
 
 
-def _border(fit: FitResult, model: PanelModel) -> Border:
+def _border(fit: FitResult) -> Border:
     """Where the border of a tile explains most of the residuals, to first order."""
     left, places = _left(fit)
     basis = _basis(fit)
@@ -155,8 +168,8 @@ def _border(fit: FitResult, model: PanelModel) -> Border:
         middle = (along[1:] + along[:-1]) / 2
         for at in middle[np.linspace(0, len(middle) - 1, min(CUTS, len(middle))).astype(int)]:
             border = Border(axis, float(at))
-            alone = replace(model, borders=(border,)).terms(places)[..., -2:]
-            push, grown = _beyond(basis, left, _rows(fit, alone))
+            beyond = (places[:, axis] >= at).astype(np.float64)
+            push, grown = _beyond(basis, left, _rows(fit, beyond[:, None, None] * np.eye(2)))
             gram = grown.T @ grown
             gain = float((c := grown.T @ push) @ np.linalg.pinv(gram, rcond=1e-6) @ c)
             if gain > most:

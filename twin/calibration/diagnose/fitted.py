@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import chdtri
@@ -16,6 +17,7 @@ from flexdt.twin.calibration.detect.refine import Refined
 from flexdt.twin.calibration.diagnose.distortion import better_panel, distorted
 from flexdt.twin.calibration.diagnose.finding import Finding, Severity, error, warning
 from flexdt.twin.calibration.diagnose.moving import moving
+from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, nothing
 from flexdt.twin.calibration.identify import Identification
@@ -184,9 +186,13 @@ def explain_residuals(
     """
     if not fit.identifiable:
         return fit, []
-    fit = better_panel(fit, refit, loose, misfit_px)
+    flat, fit = fit, better_panel(fit, refit, loose, misfit_px)
+    told = distorted(fit, flat)
+    if fit is not flat and told is None:  # Either may be right: the interval has both.
+        off = {n: flat.values.get(n, v) - v for n, v in fit.values.items()}
+        fit = replace(fit, certificate=widened(fit.certificate, off))
     certificate = fit.certificate
-    out = [*_lost_beads(fit), *_drifts(fit), *filter(None, [distorted(fit)])]
+    out = [*_lost_beads(fit), *_drifts(fit), *([] if told is None else [told])]
     structured = (
         certificate.enlargement > 1.0
         or certificate.shared
