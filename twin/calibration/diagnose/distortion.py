@@ -24,8 +24,8 @@ FIRST_PX = 1.0
 """Standard deviation of the coefficients with which the search for their size begins."""
 OUTLIER = 5.0
 """Residuals beyond so many robust standard deviations count as so many."""
-SAID_PX = 0.015
-"""Root mean square of the residuals explained from which a distortion is said."""
+SAID_PX, GAP_SAID_PX = 0.015, 0.3
+"""Root mean square of the residuals explained, and gap, from which a distortion is said."""
 LOOSE_BEADS_MM = 0.3
 """Prior of bead positions with which they are compared with a distortion."""
 CHANCE = 1e-4
@@ -102,7 +102,11 @@ def distorted(fit: FitResult, flat: FitResult) -> Finding | None:
     What explains less than detection may err by is in the sigmas and no finding.
     """
     panel, left = fit.panel, fit.certificate.rms_px
-    if panel is None or math.sqrt(max(flat.certificate.rms_px**2 - left**2, 0.0)) < SAID_PX:
+    if panel is None:
+        return None
+    gaps = panel.coefficients[len(panel.coefficients) - 2 * len(panel.model.borders) :]
+    explained = math.sqrt(max(flat.certificate.rms_px**2 - left**2, 0.0))
+    if explained < SAID_PX and not max(map(abs, gaps), default=0.0) > GAP_SAID_PX:
         return None
     rows, cols = panel.model.shape
     row, column = np.mgrid[0 : rows - 1 : 9j, 0 : cols - 1 : 9j]
