@@ -69,7 +69,9 @@ class Aligned:
         now = datetime.now(UTC)
         name = f"alignment {now:%Y-%m-%d %H:%M:%S}"
         note = f"without a phantom, {self.alignment.frames} frames of {self.dataset.name}"
-        return NamedCorrection(name, now.isoformat(timespec="seconds"), offsets, note)
+        return NamedCorrection(
+            name, now.isoformat(timespec="seconds"), offsets, note, self.dataset.panel
+        )
 
 
 def align_dataset(data: DataSet, per_frame: bool = False) -> Aligned:

@@ -26,6 +26,7 @@ from flexdt.clients.calibration.markers import (
     read_markers,
     seen_alone,
 )
+from flexdt.clients.calibration.square_pixels import squared
 from flexdt.clients.calibration.verdict import next_commands, verdict_of
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.phantoms import Phantom, load_phantom
@@ -192,6 +193,7 @@ class Outcome:
             now.isoformat(timespec="seconds"),
             result.fit.parameters,
             f"{self.phantom.name}, {len(result.scans)} scan(s), rms {rms:.4f} px",
+            result.fit.panel,
         )
 
 
@@ -225,6 +227,8 @@ def calibrate_datasets(
         raise TwinError("no data sets; allowed: one or more", {"asked": 0, "allowed": 1})
     unknown = phantom == UNKNOWN
     want = request or CalibrationRequest(free=("dO_x",) if unknown else SIX)
+    if markers is None:
+        datasets = [squared(d) for d in datasets]
     frames = [DatasetFrames(d) for d in datasets]
     low, high = SpotFinder().radius_px
     sought = None
@@ -384,6 +388,8 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
     }
     if result.identifiable:
         document["correction"] = fit.parameters.to_edge()
+        if fit.panel is not None:
+            document["panel"] = fit.panel.to_json()
         document["limited"] = certificate.limited
         document["image_space"] = [
             {n: {"value": e.value, "sigma": e.sigma, "unit": e.unit} for n, e in some.items()}

@@ -45,8 +45,8 @@ def predictions(fit: FitResult, geometry: Sequence[Offsets]) -> FloatArray:
     base = [values_in(from_printed_reading(p, fit.reading)) for p in geometry]
     problem = problem.with_base(np.array(base))
     x = problem.start
-    if problem.layout.bead_column >= 0:
-        x[problem.layout.bead_column :] = fit.beads.ravel()
+    first = problem.layout.parameter_count  # then the beads, and the panel's distortion
+    x[first:] = fit.solution.x[first:]
     return problem.residuals(x, np.ones_like(problem.seen))[0]
 
 

@@ -26,6 +26,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.motion import Motion
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.geometry.panel import Panel
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.lazy_backend import File, lazy_backend
 from flexdt.twin.machine.description import Machine, Profile
@@ -286,8 +287,13 @@ class DataSet:
             'given'
         """
         if isinstance(correction, Offsets):
-            correction = NamedCorrection("given", "", correction)
+            correction = NamedCorrection("given", "", correction, panel=self.panel)
         return replace(self, correction=correction)
+
+    @property
+    def panel(self) -> Panel | None:
+        """The panel's distortion that the correction in force undoes in line integrals."""
+        return None if self.correction is None else self.correction.panel
 
     def with_motion(self, motion: Motion) -> DataSet:
         """The same data set with a motion of scanner or sample in its geometry.
@@ -371,7 +377,8 @@ class DataSet:
         return LineIntegrals.of(self.dark, self.flat)
 
     def line_integrals(self, index: int | None = None) -> Float32Array:
-        """Projections as -log((p - d) / (f - d)), always finite.
+        """Projections as -log((p - d) / (f - d)), always finite; the panel's distortion is undone
+        where the correction in force has one.
 
         Args:
             index: of one projection; None for all.
@@ -391,7 +398,8 @@ class DataSet:
         """
         if index is None:
             return self.stack(range(len(self)))
-        return self.normalisation(self.counts(index))
+        image = self.normalisation(self.counts(index))
+        return image if self.panel is None else self.panel.undistorted(image)
 
     def stack(self, indices: Sequence[int] | None = None) -> Float32Array:
         """Line integrals of several projections (default: all that are there), (n, rows, cols).

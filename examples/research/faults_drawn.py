@@ -76,6 +76,7 @@ class Faulty:
         names: patterns of which each must be found in what is said.
         beside: patterns of what may be said, too.
         silent: to be offered and right without a word is right.
+        after: what was done to the spots of the frames, if anything.
     """
 
     spots: list[Array | None]
@@ -86,6 +87,7 @@ class Faulty:
     silent: bool
     noise_px: float
     shape: tuple[int, int] = SHAPE
+    after: Callable[[list[Array | None]], list[Array | None]] | None = None
 
 
 def shadows(world: World) -> tuple[Array, Array]:
@@ -192,11 +194,31 @@ def drawn(kind: str, seed: int) -> Faulty:
         for name, value in {**draft.world.offsets, **draft.truth}.items()
     }
     return Faulty(
-        spots, draft.believed, truth, draft.names, draft.beside, draft.silent, draft.noise_px
+        spots,
+        draft.believed,
+        truth,
+        draft.names,
+        draft.beside,
+        draft.silent,
+        draft.noise_px,
+        after=draft.after,
     )
 
 
 Fault = Callable[[Draft, Rng], Draft]
+UNSEEN: Final = {
+    "dD_x": 2.0, "dD_y": 2.0, "dD_z": 1.0, "det_roll": 0.3, "det_pitch": 0.3, "det_yaw": 0.3,
+    "axis_tilt_x": 0.1, "axis_tilt_z": 0.1,
+}  # fmt: skip
+"""How far panel and axis usually are from where they are said to be [mm, deg]."""
+
+
+def _bent(draft: Draft, rng: Rng, after: Callable[..., list[Array | None]]) -> Draft:
+    """A panel that is distorted, and is not exactly where it is said to be, as usual."""
+    offsets = {name: float(rng.normal(0.0, width)) for name, width in UNSEEN.items()}
+    world = replace(draft.world, offsets={**offsets, **draft.world.offsets})
+    return replace(draft, world=world, after=after, names=("panel_distorted",),
+                   beside=(*OTHERS, "priors_narrow"))  # fmt: skip
 
 
 def _sign(rng: Rng) -> float:
@@ -457,6 +479,52 @@ def _flipped(axes: tuple[int, ...], *names: str) -> Fault:
     return fault
 
 
+def _distorted(terms: str) -> Fault:
+    """A panel whose picture is distorted smoothly, by up to a pixel at its upper edge."""
+
+    def fault(draft: Draft, rng: Rng) -> Draft:
+        half = np.array([(SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2])
+        size = float(_sign(rng) * rng.uniform(0.3, 1.0))
+        one, two = rng.normal(size=2) / math.sqrt(2)
+        bent = rng.normal(size=(2, 7))
+
+        def shift(x: Array, y: Array) -> Array:
+            square = x * x + y * y
+            if terms == "radial":
+                return np.stack([x * square, y * square], axis=1)
+            if terms == "decentred":
+                across = one * (square + 2 * x * x) + 2 * two * x * y
+                return np.stack([across, two * (square + 2 * y * y) + 2 * one * x * y], axis=1)
+            powers = [x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3]
+            return np.asarray((bent @ np.array(powers)).T / 2)
+
+        def after(spots: list[Array | None]) -> list[Array | None]:
+            for s in spots:
+                assert s is not None
+                x, y = ((s[:, :2] - half) / 305.0).T
+                s[:, :2] += size * shift(x, y)
+            return spots
+
+        return _bent(draft, rng, after)
+
+    return fault
+
+
+def _tiles_apart(draft: Draft, rng: Rng) -> Draft:
+    """Two tiles of the panel with a gap between them, which the image does not show."""
+    axis = int(rng.integers(2))
+    border = SHAPE[1 - axis] * rng.uniform(0.4, 0.6)
+    gap = rng.uniform(0.5, 2.0)
+
+    def after(spots: list[Array | None]) -> list[Array | None]:
+        for s in spots:
+            assert s is not None
+            s[:, axis] -= np.where(s[:, axis] > border, gap, 0.0)
+        return spots
+
+    return _bent(draft, rng, after)
+
+
 def _row_offset(draft: Draft, rng: Rng) -> Draft:
     """The read-out starts some rows late, as if the panel stood higher or lower."""
     rows = int(_sign(rng) * rng.integers(2, 8))
@@ -583,6 +651,10 @@ KINDS: Final[Mapping[str, Fault]] = {
     "images_upside_down": _flipped((1,), "image_upside_down"),
     "images_turned": _flipped((0, 1), "image_turned"),
     "row_offset": _row_offset,
+    "radial": _distorted("radial"),
+    "decentred": _distorted("decentred"),
+    "bent": _distorted("bent"),
+    "tiles_apart": _tiles_apart,
     "binned": _binned,
     "tau_held": _held("tau_x", 0.02, 1.0),
     "height_held": _held("dO_y", 0.2, 2.0),

@@ -82,6 +82,7 @@ from flexdt.twin.calibration.identify import (
 from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.geometry.motion import Motion, require_movable
 from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets
+from flexdt.twin.geometry.panel import PanelModel
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection.analytic_solids import Scene
 
@@ -96,6 +97,8 @@ ANYWHERE = 1e3
 """A prior [mm, deg] so wide that the images alone say where its parameter is."""
 OF_FRAME = ("dO_y", "alpha", "tau_x", "tau_z")
 """With beads that may be anywhere, these only say in which frame of the object they are."""
+OTHER_BEADS, BLURRED_FIRST = 1.0 / 6.0, 0.4
+"""Deviation of the first radii from which beads are others; and if blur is to be measured yet."""
 AS_GOOD = 1.2
 """A fit whose residuals are at most so many times as large explains the data as well."""
 
@@ -266,14 +269,16 @@ def calibrate(
     sized = zip(state.scans, identifications, looks, strict=True) if want.known_sizes else ()
     for g, (scan, found_, some) in enumerate(sized):
         radii = spot_radii(model, scan.poses.cone_vec(fit.group_parameters[g]))
-        findings += _given(judge_first_size(found_, some, radii))
+        # What is blurred is wider, and the second measurement knows by how much.
+        allowed = BLURRED_FIRST if want.second_look else OTHER_BEADS
+        findings += _given(judge_first_size(found_, some, radii, allowed))
     if any(f.forbids for f in findings):
         return replace(state, fit=fit, findings=_sorted(findings))
     if want.second_look:
         state, fit, repeats = _second_look(state, want, fit, solids)
         iterations += repeats
         if want.known_sizes:
-            findings += _given(judge_size(state.measured))
+            findings += _sizes(state, fit)
         findings += _given(judge_body(state.measured))
         if want.per_frame:
             state, fit = _with_motion(state, want, fit)
@@ -383,6 +388,8 @@ def _explain(
         fit,
         free_beads=want.bead_tolerance_mm is not None,
         refit=lambda **changes: _refit(state, want, fit, **changes),
+        loose=lambda: _loose(state, want, fit),
+        sigmas_known=bool(state.measured),
         misfit_px=want.misfit_px,
     )
 
@@ -514,6 +521,7 @@ def _fit(
     want: CalibrationRequest,
     start: Sequence[Offsets] | None = None,
     bead_tolerance_mm: float | None = None,
+    panel: PanelModel | None = None,
 ) -> FitResult:
     """The fit to the best positions there are: of the second measurement, else of the first."""
     tolerance = want.bead_tolerance_mm if bead_tolerance_mm is None else bead_tolerance_mm
@@ -541,6 +549,7 @@ def _fit(
         prior_centre=want.start,
         bound=want.bound,
         centre=np.concatenate([s.bias for s in seen]),
+        panel=panel,
     )
     return fit if state.motion is None else aware(fit, state.motion)
 
@@ -655,15 +664,30 @@ def _refit(
     motion: MotionFit | None = None,
     bead_tolerance_mm: float | None = None,
     start: Sequence[Offsets] | None = None,
+    panel: PanelModel | None = None,
 ) -> FitResult:
-    """The last fit with something else free: more parameters, the beads; or with a motion."""
+    """The last fit with something else free: more parameters, the beads, the panel's distortion; or
+    with a motion. A distortion that was found stays."""
     if motion is not None:
         scans = zip(state.scans, motion.motions, strict=True)
         moved = tuple(replace(s, poses=m.applied(s.poses)) for s, m in scans)
         state = replace(state, scans=moved)
     begin = fit.group_parameters if start is None else start
     freed = replace(want, free=tuple(dict.fromkeys((*want.free, *extra))))
-    return _fit(state, freed, begin, bead_tolerance_mm)
+    return _fit(state, freed, begin, bead_tolerance_mm, panel or fit.problem.panel)
+
+
+def _sizes(state: Calibration, fit: FitResult) -> list[Finding]:
+    """What the beads' size says; by the first measurement where the second could not tell."""
+    out = []
+    for g, scan in enumerate(state.scans):
+        radii = spot_radii(state.model, scan.poses.cone_vec(fit.group_parameters[g]))
+        if np.isfinite(state.measured[g].size):
+            out += _given(judge_size(state.measured[g], float(np.median(radii))))
+        else:
+            first = state.identifications[g], state.looks[g], radii
+            out += _given(judge_first_size(*first, OTHER_BEADS))
+    return out
 
 
 def _given(finding: Finding | None) -> list[Finding]:

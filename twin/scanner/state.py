@@ -15,6 +15,7 @@ from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray, rotation_x, rotation_y, rotation_z
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.geometry.panel import Panel
 from flexdt.twin.machine.camera import CameraSettings
 
 SafetyName = Literal["ready", "blocked", "estopped"]
@@ -117,12 +118,15 @@ class NamedCorrection:
         date: ISO 8601.
         parameters: the offsets [mm, rad].
         note: its origin (data set, phantom, residual).
+        panel: the distortion that was found along with it; None: none. It is undone in images, and
+            no state of the twin has it.
     """
 
     name: str
     date: str
     parameters: Offsets = NOMINAL
     note: str = ""
+    panel: Panel | None = None
 
     @classmethod
     def from_edge(

@@ -164,7 +164,7 @@ def _correction(named: str | None, twin: Twin) -> tuple[Offsets | None, Report |
 def scan_of(
     folder: Path, texts: bool, report: Report | None, geometry: Path | None = None
 ) -> DataSet:
-    """The data set, with the motion of a report or the geometry of a file."""
+    """The data set, with the motion and the panel of a report, or the geometry of a file."""
     from flexdt.clients.datasets.dataset import load_dataset
 
     data = load_dataset(folder, ignore_document=texts)
@@ -172,7 +172,15 @@ def scan_of(
         from flexdt.clients.datasets.exchange import load_geometry, with_geometry
 
         data = with_geometry(data, load_geometry(geometry))
-    return data if report is None else moved(data, report)
+    if report is None:
+        return data
+    if (panel := report.document.get("panel")) is not None:
+        from flexdt.twin.geometry.panel import Panel
+        from flexdt.twin.scanner.state import NamedCorrection
+
+        found = Panel.from_json(panel)
+        data = data.with_correction(NamedCorrection("report", "", report.parameters, panel=found))
+    return moved(data, report)
 
 
 def _workers(scheduler: str | None, slurm: Path | None) -> AbstractContextManager[Executor] | None:

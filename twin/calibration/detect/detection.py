@@ -237,7 +237,7 @@ def _measure(image: Float32Array, spot: _Candidate, how: SpotFinder) -> FloatArr
         result[kernels.OK] > 0
         and low <= result[kernels.RADIUS] <= high
         and result[kernels.SCORE] >= LIKENESS
-        and result[kernels.PEAK] > 5.0 * result[kernels.NOISE]
+        and result[kernels.PEAK] > 5.0 * result[kernels.NOISE] * min(1.0, 3.0 / radius)
     )
     return result if good else None
 

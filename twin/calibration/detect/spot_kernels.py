@@ -308,7 +308,7 @@ def measure(image, x0, y0, radius0, cap, least, result):  # type: ignore[no-unty
     _variance(
         image, x, y, 1.12 * radius + 1.5, limit, noise, power, plane, centre_x, centre_y, s, result
     )
-    result[SCORE] = _likeness(image, x, y, radius, peak, limit, plane, centre_x, centre_y)
+    result[SCORE] = _likeness(image, x, y, radius, peak, limit, noise, plane, centre_x, centre_y)
     result[X], result[Y], result[RADIUS] = x, y, radius
     result[PEAK], result[NOISE], result[BIAS] = peak, noise, factor
     result[OK] = 1.0
@@ -334,8 +334,9 @@ def _variance(image, x, y, reach, limit, noise, power, plane, cx, cy, mass, resu
 
 
 @linked
-def _likeness(image, x, y, radius, peak, cap, plane, cx, cy):  # type: ignore[no-untyped-def]
-    """Correlation of the spot with a ball's profile within 1.3 radii."""
+def _likeness(image, x, y, radius, peak, cap, noise, plane, cx, cy):  # type: ignore[no-untyped-def]
+    """Correlation of the spot with a ball's profile within 1.3 radii, that of a spot without noise:
+    a faint ball is no less like one. At most three quarters of what is seen are taken for noise."""
     limit = min(cap, peak)
     reach = 1.3 * radius + 1.0
     n, sa, sb, saa, sab, sbb = 0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -354,6 +355,7 @@ def _likeness(image, x, y, radius, peak, cap, plane, cx, cy):  # type: ignore[no
     va, vb = saa - sa * sa / n, sbb - sb * sb / n
     if va <= 0 or vb <= 0:
         return 0.0
+    va = max(va - n * noise * noise, 0.25 * va)
     return (sab - sa * sb / n) / math.sqrt(va * vb)
 
 
@@ -421,7 +423,7 @@ def fit_ball(  # type: ignore[no-untyped-def]
         image: (rows, cols) line integrals.
         mask: (rows, cols) uint8, 0 where a pixel must not be used; or (0, 0): all may.
         x0, y0: start [px]; the centre may lie outside the image.
-        radius: minor semi-axis of the spot [px]; peak: line integral through its middle.
+        radius: minor semi-axis of the spot [px]; peak: line integral that is seen in its middle.
         stretch: (3,) direction of the major semi-axis (unit, column and row) and its ratio to the
             minor one.
         blur: standard deviation of the image's blur [px].
@@ -437,7 +439,12 @@ def fit_ball(  # type: ignore[no-untyped-def]
     size = int(8.0 * (reach + 4.0)) + 8
     table = np.empty(size)
     slope = np.empty(size)
-    ball_table(radius, peak, blur, table, slope)
+    # Blur takes from the middle of a small ball, too: what is seen there is what it leaves.
+    middle, through = int(1.6 * radius), peak
+    for _ in range(3):
+        ball_table(radius, through, blur, table, slope)
+        seen = table[middle] / math.sqrt(1.0 - (middle / (8.0 * radius)) ** 2)
+        through = min(through * peak / max(seen, 1e-9), 3.0 * peak)
     masked = mask.shape[0] > 0
     base = _level(image, mask, masked, x0, y0, 1.12 * radius + 1.0, reach)
     plane = np.zeros(3)

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import chdtri
 
 from flexdt.twin.calibration.detect.refine import Refined
+from flexdt.twin.calibration.diagnose.distortion import better_panel, distorted
 from flexdt.twin.calibration.diagnose.finding import Finding, Severity, error, warning
 from flexdt.twin.calibration.diagnose.moving import moving
+from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, nothing
 from flexdt.twin.calibration.identify import Identification
@@ -28,8 +31,18 @@ MISFIT_PX = 0.10
 """Residual of the final fit above which its numbers are not to be used unless explained."""
 MOST_USED = 0.9
 """Share of the positions below which a fit is good only because it left the others out."""
+NOISY = 1.5
+"""Residuals below so many of their stated sigmas are noise, however large."""
 SIZE = 0.04
 """Deviation of the spots' radii from the expected ones that betrays a wrong scale."""
+BLURRED = 0.6
+"""By how much more they may deviate, by the square of the blur over the radius (measured)."""
+OPAQUE = 1.5
+"""Line integral through a ball from which what scatters into its shadow changes its size."""
+OR_OPAQUE = (
+    "; or the shadows of these nearly opaque balls are filled by scatter or by a wrong dark image: "
+    "take the dark image anew, or raise the voltage"
+)
 BODY = 0.5
 """Logarithm of the body's seen over its described attenuation from which that is said: beam
 hardening alone stays below."""
@@ -106,14 +119,15 @@ def judge_offsets(fit: FitResult) -> Finding | None:
 
 
 def judge_first_size(
-    found: Identification, looks: Sequence[FrameSpots], radii: FloatArray
+    found: Identification, looks: Sequence[FrameSpots], radii: FloatArray, allowed: float
 ) -> Finding | None:
-    """A coarse size check from the first measurement: beads more than a sixth off are other beads.
+    """A coarse size check from the first measurement.
 
     Args:
         found: which spot is which bead.
         looks: of every frame.
         radii: (n, k) expected radii [px].
+        allowed: deviation that may be blur.
     """
     ratios = [
         look.detections.radii_px[j] / radii[f, b]
@@ -121,27 +135,36 @@ def judge_first_size(
         for b, j in enumerate(found.index[f].tolist())
         if j >= 0 and look.detections.whole[j]
     ]
-    return _judge_ratios(ratios, 1.0 / 6.0)
+    ratio = float(np.median(ratios)) if ratios else 1.0
+    return None if abs(ratio - 1.0) < allowed else _other_size(ratio)
 
 
-def judge_size(measured: Sequence[Refined]) -> Finding | None:
+def judge_size(measured: Refined, radius_px: float) -> Finding | None:
     """Do the spots have the size the phantom's beads should cast at the fitted geometry?
 
     A phantom of another scale at another distance gives the same bead positions; only the beads'
     own size tells.
     """
-    return _judge_ratios([m.size for m in measured if np.isfinite(m.size)], SIZE)
-
-
-def _judge_ratios(ratios: Sequence[float], allowed: float) -> Finding | None:
-    """An error if the median of seen over expected radii is further than `allowed` from 1."""
-    ratio = float(np.median(ratios)) if ratios else 1.0
-    if abs(ratio - 1.0) < allowed:
+    off = abs(measured.size - 1.0)
+    blur = measured.blur_px / radius_px
+    if not off >= SIZE:
         return None
+    if off < SIZE + BLURRED * blur**2:
+        return warning(
+            "blurred",
+            f"the images are blurred by {measured.blur_px:.1f} px and the shadows are "
+            f"{radius_px:.1f} px wide: the beads' size is known to "
+            f"{100 * (SIZE + BLURRED * blur**2):.0f} % only, and with it the phantom's scale",
+        )
+    filled = measured.size > 1.0 and float(np.nanmedian(measured.contrast)) > OPAQUE
+    return _other_size(measured.size, OR_OPAQUE if filled else "")
+
+
+def _other_size(ratio: float, or_else: str = "") -> Finding:
     return error(
         "bead_size",
         f"the shadows are {100 * (ratio - 1):+.0f} % off the size the phantom's beads cast at the "
-        "fitted geometry: beads of another size, or a phantom of another scale",
+        f"fitted geometry: beads of another size, or a phantom of another scale{or_else}",
     )
 
 
@@ -168,9 +191,23 @@ def judge_body(measured: Sequence[Refined]) -> Finding | None:
 
 
 def explain_residuals(
-    fit: FitResult, *, free_beads: bool, refit: Refit, misfit_px: float = MISFIT_PX
+    fit: FitResult,
+    *,
+    free_beads: bool,
+    refit: Refit,
+    loose: Callable[[], FitResult],
+    sigmas_known: bool,
+    misfit_px: float = MISFIT_PX,
 ) -> tuple[FitResult, list[Finding]]:
     """Judge the residuals of the final fit; name what would explain them.
+
+    Args:
+        fit: to be judged.
+        free_beads: the beads' positions are unknowns of it.
+        refit: fits again with something else free.
+        loose: fits again with loosened priors.
+        sigmas_known: the positions' sigmas were measured, and are no more than compared.
+        misfit_px: residual above which the fit explains nothing, if noise does not.
 
     Returns:
         The fit to be reported (bead positions freed where they explain the residuals) and the
@@ -178,17 +215,23 @@ def explain_residuals(
     """
     if not fit.identifiable:
         return fit, []
+    flat, fit = fit, better_panel(fit, refit, loose, misfit_px)
+    told = distorted(fit, flat)
+    if fit is not flat and told is None:  # Either may be right: the interval has both.
+        off = {n: flat.values.get(n, v) - v for n, v in fit.values.items()}
+        fit = replace(fit, certificate=widened(fit.certificate, off))
     certificate = fit.certificate
-    out = _lost_beads(fit) + _drifts(fit)
+    out = [*_lost_beads(fit), *_drifts(fit), *([] if told is None else [told])]
+    noisy = sigmas_known and certificate.noise < NOISY
+    bad = certificate.rms_px >= misfit_px and not noisy
     structured = (
         certificate.enlargement > 1.0
         or certificate.shared
         or certificate.turning
         or bool(certificate.drifts)
     )
-    if certificate.rms_px < 0.03 or not (structured or certificate.rms_px >= misfit_px):
+    if certificate.rms_px < 0.03 or not (structured or bad):
         return fit, out
-    bad = certificate.rms_px >= misfit_px
     if bad or certificate.used.sum() < MOST_USED * fit.problem.seen.sum():
         explained = _angle_scale(fit, refit)
         if explained is not None:

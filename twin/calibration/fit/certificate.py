@@ -453,10 +453,11 @@ def spread_of_residuals(
 
 
 def _shares(names: Sequence[str], pull: FloatArray, sigma: float) -> dict[str, float]:
-    """What each prior adds to a sigma, largest first; the beads' together."""
+    """What each prior adds to a sigma, largest first; the beads' and the panel's together."""
     square: dict[str, float] = {}
     for name, value in zip(names, pull.tolist(), strict=True):
-        source = "beads" if name.startswith("bead ") else name
+        kind = name.split(" ")[0]
+        source = {"bead": "beads", "panel": "the panel's distortion"}.get(kind, name)
         square[source] = square.get(source, 0.0) + value**2
     ordered = sorted(square.items(), key=lambda item: -item[1])
     return {n: math.sqrt(s) for n, s in ordered if s > 0.01 * sigma**2}

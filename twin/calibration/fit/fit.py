@@ -33,6 +33,7 @@ from flexdt.twin.errors import NotIdentifiableError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.geometry.panel import Panel, PanelModel
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.signatures import with_arguments_of
 
@@ -72,6 +73,12 @@ class FitResult:
     problem: FitProblem
     solution: Solution
     bead_prior_mm: float = 0.0
+
+    @property
+    def panel(self) -> Panel | None:
+        """The panel's distortion; None if it was not estimated."""
+        model, first = self.problem.panel, self.problem.layout.panel_column
+        return None if model is None else Panel(model, tuple(self.solution.x[first:].tolist()))
 
     @property
     def values(self) -> dict[str, float]:
@@ -122,6 +129,7 @@ def estimate_geometry(
     priors: Mapping[str, float] | None = None,
     prior_centre: Offsets | None = None,
     bound: float = BOUND,
+    panel: PanelModel | None = None,
 ) -> FitResult:
     """Fit offsets (true minus nominal) to measured bead positions.
 
@@ -156,6 +164,7 @@ def estimate_geometry(
             for scanners).
         prior_centre: the offsets those priors are centred on; None is the start of the first group.
         bound: sigma [mm, deg] beyond which a direction counts as not determined.
+        panel: terms of a distortion of the panel, estimated too; None: it has none.
 
     Returns:
         The fit with its certificate, also where not everything is determined.
@@ -177,7 +186,7 @@ def estimate_geometry(
         tracks, model, geometry, free=free, shape=shape, covariances=covariances,
         noise_px=noise_px, groups=groups, per_group=per_group, free_beads=free_beads, start=start,
         reading=reading, centre=centre, bead_tolerance_mm=tolerance,
-        priors=require_widths(priors or {}), prior_centre=prior_centre,
+        priors=require_widths(priors or {}), prior_centre=prior_centre, panel=panel,
     )  # fmt: skip
     if not problem.seen.any():
         raise TwinError("no bead was seen in any frame: there is nothing to fit", {"seen": 0})

@@ -185,7 +185,8 @@ def derivative(
     params, beads = problem.spread(fit.solution.x)
     groups = len(params)
     alone = layout((name,), groups, (name,), len(beads), False)
-    moved = replace(problem, base=params, layout=alone, model=replace(problem.model, beads=beads))
+    still = replace(problem, base=params, layout=alone, panel=None)
+    moved = replace(still, model=replace(problem.model, beads=beads))
     return np.asarray(moved.jacobian(moved.start, use).sum(axis=1))
 
 

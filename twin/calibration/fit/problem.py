@@ -21,6 +21,7 @@ from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets, to_edge, to_internal
+from flexdt.twin.geometry.panel import PanelModel
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.description import builtin_machine
 
@@ -69,10 +70,12 @@ class ColumnLayout:
     """Which column of the normal equations means what.
 
     Attributes:
-        names: label of each column: a parameter, `parameter@group`, or `bead k x|y|z`.
+        names: label of each column: a parameter, `parameter@group`, `bead k x|y|z`, or
+            `panel term`.
         asked: so many columns were asked for; those after them are there for their prior.
         colmap: (groups, 17) column of each group's parameter, -1 if not free.
         bead_column: first column of the beads' coordinates, -1 if fixed.
+        panel_column: first column of the panel's distortion, the last; as many as columns if none.
         active: indices of parameters that have a column in at least one group.
         held: parameters asked for but held by the gauge, with the reason.
     """
@@ -81,13 +84,14 @@ class ColumnLayout:
     asked: int
     colmap: npt.NDArray[np.int64]
     bead_column: int
+    panel_column: int
     active: npt.NDArray[np.int64]
     held: tuple[tuple[str, str], ...]
 
     @property
     def parameter_count(self) -> int:
-        """Columns that are geometric parameters (the beads' come after)."""
-        return len(self.names) if self.bead_column < 0 else self.bead_column
+        """Columns that are geometric parameters (the beads' and the panel's come after)."""
+        return self.panel_column if self.bead_column < 0 else self.bead_column
 
 
 def require_names(names: Iterable[str]) -> None:
@@ -122,6 +126,7 @@ def layout(
     beads: int,
     free_beads: bool,
     priors: Sequence[str] = (),
+    panel: Sequence[str] = (),
 ) -> ColumnLayout:
     """Assign columns.
 
@@ -132,6 +137,7 @@ def layout(
         beads: number of beads.
         free_beads: whether the beads' coordinates are unknowns too.
         priors: names of parameters with a prior; each has a column, asked for or not.
+        panel: terms of the panel's distortion.
 
     Raises:
         UnknownNameError: a name that is no parameter.
@@ -174,8 +180,10 @@ def layout(
     if free_beads:
         bead_column = len(names)
         names += [f"bead {k} {axis}" for k in range(beads) for axis in "xyz"]
+    panel_column = len(names)
+    names += [f"panel {term}" for term in panel]
     active = np.array([NAMES.index(n) for n in (*wanted, *extra)], dtype=np.int64)
-    return ColumnLayout(tuple(names), asked, colmap, bead_column, active, tuple(held))
+    return ColumnLayout(tuple(names), asked, colmap, bead_column, panel_column, active, tuple(held))
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,6 +204,7 @@ class FitProblem:
         geometry: (n, 18) the poses as the kernels want them.
         origin: (n, 2) pixel coordinates (column, row) of the detector's centre.
         prior_mean, prior_sigma: of each column, internal units; sigma inf where there is none.
+        panel: terms of the panel's distortion; None: it has none.
     """
 
     poses: Poses
@@ -212,6 +221,7 @@ class FitProblem:
     origin: FloatArray
     prior_mean: FloatArray
     prior_sigma: FloatArray
+    panel: PanelModel | None = None
 
     @property
     def start(self) -> FloatArray:
@@ -220,7 +230,7 @@ class FitProblem:
         free = self.layout.colmap >= 0
         x[self.layout.colmap[free]] = self.base[free]  # of a shared column, the last group's
         if self.layout.bead_column >= 0:
-            x[self.layout.bead_column :] = self.model.beads.ravel()
+            x[self.layout.bead_column : self.layout.panel_column] = self.model.beads.ravel()
         return x
 
     @cached_property
@@ -236,7 +246,19 @@ class FitProblem:
         """Parameter sets (groups, 17) and beads (k, 3) for column values `x`."""
         columns, own = self.layout.colmap, self.layout.bead_column
         params = np.where(columns < 0, self.base, np.append(x, 0.0)[columns])
-        return params, np.array(self.model.beads if own < 0 else x[own:].reshape(-1, 3))
+        beads = self.model.beads if own < 0 else x[own : self.layout.panel_column].reshape(-1, 3)
+        return params, np.array(beads)
+
+    @cached_property
+    def panel_terms(self) -> FloatArray:
+        """(n, k, 2, m) shifts by a coefficient of 1 of each term of the panel's distortion."""
+        if self.panel is None:
+            return np.zeros((*self.measured.shape, 0))
+        return self.panel.terms(self.measured + self.origin[:, None, :])
+
+    def distortion(self, x: FloatArray) -> FloatArray:
+        """By how much the panel shifts each position (n, k, 2) [px]."""
+        return np.asarray(self.panel_terms @ np.asarray(x)[self.layout.panel_column :])
 
     def parameters(self, x: FloatArray) -> tuple[Offsets, ...]:
         """The geometry of each group for column values `x`, in the reading corrections use."""
@@ -246,9 +268,12 @@ class FitProblem:
     def residuals(
         self, x: FloatArray, use: npt.NDArray[np.bool_] | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Predicted pixels (n, k, 2) and whitened residual lengths (n, k), -1 where not used."""
+        """Predicted pixels (n, k, 2) on the panel as it is, and whitened residual lengths (n, k).
+
+        Lengths are -1 where a position is not used.
+        """
         predicted, norms, _ = self._evaluate(x, self.seen if use is None else use, 0)
-        return predicted + self.origin[:, None, :], norms
+        return predicted + self.distortion(x) + self.origin[:, None, :], norms
 
     def whitened(self, x: FloatArray) -> FloatArray:
         """Whitened residuals (n, k, 2), measured minus predicted, in the order of `jacobian`."""
@@ -285,8 +310,44 @@ class FitProblem:
             np.zeros((size, size)),
             np.zeros(size),
         )
-        cost = kernels.evaluate(self.data, params, beads, use, huber, want, *written)
-        return float(cost), *written
+        if self.panel is None:
+            cost = kernels.evaluate(self.data, params, beads, use, huber, want, *written)
+            return float(cost), *written
+        return self._evaluate_with_panel(x, params, beads, use, want, huber, written)
+
+    def _evaluate_with_panel(
+        self,
+        x: FloatArray,
+        params: FloatArray,
+        beads: FloatArray,
+        use: npt.NDArray[np.bool_],
+        want: int,
+        huber: float,
+        written: tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray],
+    ) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """`evaluate` of the positions that a panel without distortion would have."""
+        predicted, norms, jac, hess, grad = written
+        if want:
+            jac = np.zeros((2 * use.size, len(x)))
+        data = self.data._replace(measured=self.measured - self.distortion(x))
+        rows = kernels.evaluate(
+            data, params, beads, use, huber, 2 * min(want, 1), predicted, norms, jac, hess, grad
+        )
+        if want:
+            w, terms = self.whiten, np.where(use[..., None, None], self.panel_terms, 0.0)
+            across = w[..., :1] * terms[..., 0, :] + w[..., 1:2] * terms[..., 1, :]
+            jac[:, self.layout.panel_column :] = np.stack(
+                [across, w[..., 2:] * terms[..., 1, :]], axis=2
+            ).reshape(len(jac), -1)
+        if want == 1:
+            off = predicted + self.distortion(x) - self.measured
+            left = np.stack([w[..., 0] * off[..., 0] + w[..., 1] * off[..., 1],
+                             w[..., 2] * off[..., 1]], axis=-1)  # fmt: skip
+            weight = np.where(norms > huber, huber / np.maximum(norms, 1e-300), 1.0)
+            weighed = jac * np.repeat(weight.ravel(), 2)[:, None]
+            grad[:] = weighed.T @ np.where(use[..., None], left, 0.0).ravel()
+            hess[:] = np.triu(weighed.T @ jac)
+        return float(rows), predicted, norms, jac, hess, grad
 
     @property
     def pixels(self) -> FloatArray:
@@ -323,6 +384,7 @@ def build_problem(
     bead_tolerance_mm: float = math.inf,
     priors: Mapping[str, float] | None = None,
     prior_centre: Offsets | None = None,
+    panel: PanelModel | None = None,
 ) -> FitProblem:
     """Check the arguments of a fit and put them into arrays; see `fit_geometry` for each.
 
@@ -350,12 +412,13 @@ def build_problem(
         raise TwinError(f"{len(starts)} starts for {count} groups of frames")
     base = np.array([values_in(from_printed_reading(p, reading)) for p in starts])
     widths = {n: to_internal(n, w) for n, w in (priors or {}).items() if w > 0}
-    columns = layout(free, count, per_group, k, free_beads, tuple(widths))
+    terms = () if panel is None else panel.names
+    columns = layout(free, count, per_group, k, free_beads, tuple(widths), terms)
     centres = base[0]
     if prior_centre is not None:
         centres = values_in(from_printed_reading(prior_centre, reading))
     bases = [n.split("@")[0] for n in columns.names[: columns.parameter_count]]
-    beads = len(columns.names) - len(bases)
+    beads = columns.panel_column - len(bases)
     return FitProblem(
         poses=poses,
         model=model,
@@ -380,11 +443,20 @@ def build_problem(
         ),
         origin=origin,
         prior_mean=np.concatenate(
-            [[centres[NAMES.index(n)] for n in bases], model.beads.ravel()[:beads]]
+            [
+                [centres[NAMES.index(n)] for n in bases],
+                model.beads.ravel()[:beads],
+                np.zeros(len(terms)),
+            ]
         ),
         prior_sigma=np.concatenate(
-            [[widths.get(n, math.inf) for n in bases], np.full(beads, bead_tolerance_mm)]
+            [
+                [widths.get(n, math.inf) for n in bases],
+                np.full(beads, bead_tolerance_mm),
+                [] if panel is None else panel.sigmas,
+            ]
         ),
+        panel=panel,
     )
 
 

@@ -1,0 +1,73 @@
+"""Right scans are offered: faint, noisy, opaque and blurred balls of a renderer of its own."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import prior_coverage as own
+import pytest
+
+from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.frame_source import ArrayFrames
+from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
+from flexdt.twin.geometry.poses import Poses
+
+ANGLES = 15.0 * np.arange(24)
+SOD = 600.0
+
+
+def scanned(
+    monkeypatch: pytest.MonkeyPatch, seed: int, radius: float, attenuation: float,
+    blur: tuple[float, float], photons: float, cast: float = 1.0,
+) -> tuple[Calibration, dict[str, float]]:  # fmt: skip
+    """A calibration of images that are blurred (columns, rows) and counted here, and the truth;
+    the balls that cast shadows are `cast` times as large as those that are stated."""
+    monkeypatch.setattr(own, "BLUR_PX", 0.01)
+    monkeypatch.setattr(own, "PHOTONS", 1e12)
+    rng = np.random.default_rng(seed)
+    beads = own.spread(rng, 8.0)
+    truth = {n: float(rng.uniform(-r, r)) for n, r in own.REACH.items()}
+    images = []
+    for clean in own.radiographs(rng, beads, ANGLES, SOD, truth, radius * cast, attenuation):
+        light = cv2.GaussianBlur(np.exp(-clean.astype(float)), (0, 0), blur[0], sigmaY=blur[1])
+        counts = np.maximum(rng.poisson(photons * light), 0.5)
+        images.append(-np.log(counts / photons).astype(np.float32))
+    poses = Poses.upright([0, 0, 0], [0, SOD, 0], [0, own.SDD, 0], own.PIXEL, np.radians(ANGLES))
+    scan = Scan(ArrayFrames(images, own.SHAPE), poses)
+    model = BeadModel(beads, np.full(len(beads), radius))
+    return calibrate([scan], model, CalibrationRequest()), truth
+
+
+@pytest.mark.parametrize(
+    ("radius", "attenuation", "blur", "photons"),
+    [
+        (0.5, 0.4, (2.5, 2.5), 1e4),  # was refused as beads 9 % larger
+        (1.0, 0.02, (0.7, 0.7), 1e4),  # chords of 0.04: no bead was found
+        pytest.param(0.5, 0.4, (3.5, 3.5), 1e4, marks=pytest.mark.slow),
+        pytest.param(0.5, 0.4, (1.0, 3.0), 1e4, marks=pytest.mark.slow),
+        pytest.param(1.0, 0.4, (0.7, 0.7), 50.0, marks=pytest.mark.slow),
+        pytest.param(1.0, 4.0, (0.7, 0.7), 50.0, marks=pytest.mark.slow),
+    ],
+)
+def test_a_right_scan_is_offered(
+    monkeypatch: pytest.MonkeyPatch,
+    radius: float,
+    attenuation: float,
+    blur: tuple[float, float],
+    photons: float,
+) -> None:
+    result, truth = scanned(monkeypatch, 1, radius, attenuation, blur, photons)
+    assert result.identifiable, result.findings
+    assert {f.code for f in result.findings} <= {"blurred"}
+    assert result.fit is not None
+    for name, value in truth.items():
+        e = result.fit.certificate.estimates[name]
+        assert abs(e.value - value) < 4.0 * e.sigma, name
+
+
+@pytest.mark.parametrize("cast", [0.93, 1.07])
+def test_beads_of_another_size_are_still_refused(
+    monkeypatch: pytest.MonkeyPatch, cast: float
+) -> None:
+    result, _ = scanned(monkeypatch, 2, 1.0, 0.4, (0.7, 0.7), 1e4, cast)
+    assert [f.code for f in result.errors] == ["bead_size"]

@@ -1,0 +1,162 @@
+"""Distortion of the panel's picture: a low polynomial in the plane of the panel, and gaps between
+its tiles.
+
+A place measured at m [px] belongs to the undistorted place m - d(m), d(m) = sum of coefficient
+times term. The terms are the polynomials of degree two and three in both directions, unequal pixel
+pitches and a skew; with a gap, everything beyond the border is shifted. Shifts, a scale and a turn
+of the whole are not among them: those are offsets of the scanner.
+
+Terms of degree two look much like a tilted panel. What tells them apart is their prior: each
+coefficient is about as large as the data show the others to be. It enters every sigma.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+
+POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+"""Of column and row, of the terms in each direction."""
+AFFINE = ("aspect", "skew")
+GAP_PX = 5.0
+"""Standard deviation of a tile's shift, wide beside any: the data determine it."""
+
+
+@dataclass(frozen=True)
+class Border:
+    """Where a tile begins: from this column (axis 0) or row (axis 1) on [px]."""
+
+    axis: int
+    at: float
+
+
+@dataclass(frozen=True)
+class PanelModel:
+    """Which terms a distortion has.
+
+    Attributes:
+        width_px: standard deviation of every coefficient, the shift [px] at half the longer side.
+        shape: (rows, cols) of the image.
+        borders: of tiles.
+    """
+
+    width_px: float
+    shape: tuple[int, int]
+    borders: tuple[Border, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the coefficients."""
+        bent = [f"{way}_x{i}y{j}" for way in ("column", "row") for i, j in POWERS]
+        gaps = [
+            f"{way}_from_{('column', 'row')[b.axis]}_{b.at:.0f}"
+            for b in self.borders
+            for way in ("column", "row")
+        ]
+        return (*AFFINE, *bent, *gaps)
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(m,) of the priors [px]; their means are zero."""
+        m = len(self.names)
+        out = np.full(m, self.width_px)
+        out[m - 2 * len(self.borders) :] = GAP_PX
+        return out
+
+    def terms(self, places: FloatArray) -> FloatArray:
+        """Shifts (..., 2, m) for a coefficient of 1 at places (..., 2), pixels (column, row)."""
+        rows, cols = self.shape
+        middle, half = np.array([cols - 1, rows - 1]) / 2, max(rows, cols) / 2
+        x, y = np.moveaxis((places - middle) / half, -1, 0)
+        zero = np.zeros_like(x)
+        bent = [x**i * y**j for i, j in POWERS]
+        across = [x, y, *bent, *[zero] * len(bent)]
+        down = [-y, x, *[zero] * len(bent), *bent]
+        for border in self.borders:
+            beyond = (places[..., border.axis] >= border.at).astype(np.float64)
+            across += [beyond, zero]
+            down += [zero, beyond]
+        return np.stack([np.stack(across, axis=-1), np.stack(down, axis=-1)], axis=-2)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A distortion.
+
+    Attributes:
+        model: its terms.
+        coefficients: of them [px].
+    """
+
+    model: PanelModel
+    coefficients: tuple[float, ...]
+
+    def shift(self, places: FloatArray) -> FloatArray:
+        """Measured minus undistorted places [px], (..., 2), at measured places."""
+        return np.asarray(self.model.terms(places) @ np.array(self.coefficients))
+
+    @cached_property
+    def _map(self) -> tuple[Float32Array, Float32Array]:
+        """Columns and rows of the panel, (rows, cols) both, that undistorted pixels belong to."""
+        rows, cols = self.model.shape
+        row, column = np.mgrid[:rows, :cols].astype(np.float64)
+        places = np.stack([column, row], axis=-1)
+        out = places
+        for _ in range(4):  # A distortion is smooth: each time, little is left of the error.
+            out = places + self.shift(out)
+        return out[..., 0].astype(np.float32), out[..., 1].astype(np.float32)
+
+    def undistorted(self, image: Float32Array) -> Float32Array:
+        """The image (rows, cols) that a panel without distortion would have taken.
+
+        Raises:
+            TwinError: an image of another shape than those in which the distortion was found.
+        """
+        import cv2
+
+        if image.shape != self.model.shape:
+            raise TwinError.of_shape(
+                "an image", image.shape, self.model.shape, ": the panel's distortion is of those"
+            )
+        columns, rows = self._map
+        out = cv2.remap(image, columns, rows, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(out, dtype=np.float32)
+
+    def to_json(self) -> dict[str, Any]:
+        """A document of the distortion; `from_json` is its inverse."""
+        return {
+            "model": "cubic",
+            "shape": list(self.model.shape),
+            "borders": [{"axis": ("column", "row")[b.axis], "from": b.at}
+                        for b in self.model.borders],
+            "coefficients": dict(zip(self.model.names, self.coefficients, strict=True)),
+        }  # fmt: skip
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any]) -> Panel:
+        """The distortion of a document.
+
+        Raises:
+            TwinError: it is not one of `to_json`.
+        """
+        try:
+            rows, cols = (int(n) for n in document["shape"])
+            borders = tuple(
+                Border(("column", "row").index(b["axis"]), float(b["from"]))
+                for b in document["borders"]
+            )
+            model = PanelModel(0.0, (rows, cols), borders)
+            found = document["coefficients"]
+            return cls(model, tuple(float(found[name]) for name in model.names))
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise TwinError(
+                f"the panel's distortion cannot be read ({error}); allowed: the panel of a "
+                "calibration's report"
+            ) from None
