@@ -213,6 +213,7 @@ export type ExposurePredict = {
   mode?: string | null;
   roi?: [number, number, number, number] | null;
   frames?: number;
+  kind?: "fly" | "step" | "tiled" | "helical" | "calibration" | null;
   sod_mm?: number | null;
   sdd_mm?: number | null;
   detail?: string;
