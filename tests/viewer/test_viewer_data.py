@@ -73,11 +73,11 @@ def test_data_sets_are_found_by_words(page: Any, scans: Any) -> None:
     page.locator(".data-set[data-name='cut scan']").wait_for()
     page.locator("#data-count", has_text="2 of 2").wait_for()
     whole = page.locator(".data-set[data-name='whole scan']")
-    assert "9 images · 90 kV 20 W · 100 ms · lego" in whole.inner_text()
+    assert "9 projections · 90 kV 20 W · 100 ms · lego" in whole.inner_text()
     assert whole.locator(".state.complete").count() == 1
     assert whole.locator("canvas").evaluate("c => c.width") == 64
     cut = page.locator(".data-set[data-name='cut scan']").inner_text()
-    assert "8 of 9 images" in cut
+    assert "8 of 9 projections" in cut
     assert "incomplete: scan_000008.tif is missing" in cut
     find(page, "no such data set")
     page.locator("#data-count", has_text="none is found").wait_for()

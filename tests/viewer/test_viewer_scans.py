@@ -648,6 +648,7 @@ def test_the_designer_says_what_the_report_says_in_every_mode(
     page.click("#designer summary")
     page.locator("#design-quality .verdict").wait_for()
     pull(page, "exposure_ms", 0.6)
+    pull(page, "frames", 0.4)
     for mode in ("HW4SW1High", "HW2SW1High"):
         page.evaluate("mode => flexdt.call('camera.set', {mode})", mode)
         seen(page, twin)
