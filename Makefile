@@ -77,7 +77,7 @@ slow: studies page
 
 # Studies in their short form, the demonstration, the site.
 studies: $(TEST_STAMP)
-	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m 'slow and not browser' \
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'slow and not browser' \
 	  --junitxml=build/durations/studies.xml
 
 # The page in a browser, which draws on all cores: nothing else runs beside it.

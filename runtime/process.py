@@ -26,8 +26,6 @@ FAILED = 1
 USAGE = 2
 REFUSED = 4
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
-WAKE_S = 0.5
-"""How often a loop without signal handlers wakes up, so that Python can run its own [s]."""
 
 S = TypeVar("S", bound=ProcessSettings)
 T = TypeVar("T")
@@ -36,19 +34,9 @@ T = TypeVar("T")
 def stop_signal() -> asyncio.Event:
     """An event set by SIGTERM or SIGINT; a second signal does not interrupt the stopping."""
     stop, loop = asyncio.Event(), asyncio.get_running_loop()
-    try:
-        for number in SIGNALS:
-            loop.add_signal_handler(number, stop.set)
-    except NotImplementedError:  # Windows
-        for number in SIGNALS:
-            signal.signal(number, lambda *_: loop.call_soon_threadsafe(stop.set))
-        _keep_waking(loop)
+    for number in SIGNALS:
+        loop.add_signal_handler(number, stop.set)
     return stop
-
-
-def _keep_waking(loop: asyncio.AbstractEventLoop) -> None:
-    """Let the loop turn now and then: a signal does not end its wait for sockets on Windows."""
-    loop.call_later(WAKE_S, _keep_waking, loop)
 
 
 async def first_of(*events: asyncio.Event) -> None:

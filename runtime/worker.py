@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import resource
 import select
 import socket
 import struct
@@ -58,11 +59,7 @@ def _exactly(channel: socket.socket, size: int) -> bytearray:
 
 
 def limit(what: str, most: int) -> None:
-    """Bound one resource of this process, where the system can."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return
+    """Bound one resource of this process."""
     number = getattr(resource, what)
     hard = resource.getrlimit(number)[1]
     value = most if hard == resource.RLIM_INFINITY else min(most, hard)
@@ -78,12 +75,7 @@ def peak_bytes() -> int:
         with open("/proc/self/status", encoding="ascii") as status:
             return 1024 * int(next(x for x in status if x.startswith("VmHWM:")).split()[1])
     except (OSError, StopIteration):
-        pass
-    try:
-        import resource
-    except ImportError:
-        return 0
-    return 1024 * int(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+        return 1024 * int(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 
 
 def answer(request: Sequence[bytes]) -> list[bytes]:

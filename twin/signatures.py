@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from functools import cached_property, wraps
 from numbers import Real
-from typing import Any, Final, Literal, NamedTuple, ParamSpec, TypeVar
+from typing import Annotated, Any, Final, Literal, NamedTuple, ParamSpec, TypeVar
 
 from flexdt.twin.errors import GeometryError, LimitError
 
@@ -107,25 +107,23 @@ def _checked(function: Thing, text: str) -> Thing:
     def call(*given: Any, **named: Any) -> Any:
         # Types that have been allowed together once are not looked at again.
         types_of = (*map(_type, given), *named, *map(_type, named.values()))
-        if types_of not in known.allowed:
-            named = known.checked(given, named, types_of)
+        if None in types_of or types_of not in known.allowed:
+            checked = known.checked(given, named)
+            if checked.keys() == named.keys():
+                known.allowed.add(types_of)
+            named = checked
         return function(*given, **named)
 
     return call  # type: ignore[return-value]
 
 
-def _told_by_type(value: Any) -> bool:
-    """Whether another value with the same `_type` is allowed where this one is."""
-    members = value if type(value) is tuple else (value,)
-    return not any(
-        isinstance(one, Mapping | list | tuple | str) or getattr(one, "ndim", 0) == 1
-        for one in members
-    )
-
-
 def _type(value: Any) -> Any:
+    """What decides whether a value is allowed; None where its content does, too."""
     if type(value) is tuple:
-        return tuple(map(type, value))
+        inner = tuple(map(_type, value))
+        return None if None in inner else inner
+    if isinstance(value, Mapping | list | tuple | str) or getattr(value, "ndim", 0) == 1:
+        return None
     return (value.dtype, value.ndim) if hasattr(value, "ndim") else type(value)
 
 
@@ -158,9 +156,7 @@ class Known:
             found[name] = kind_of(eval(said, {}, names) if isinstance(said, str) else said)
         return {name: kind for name, kind in found.items() if kind is not None}
 
-    def checked(
-        self, given: tuple[Any, ...], named: dict[str, Any], types_of: tuple[Any, ...]
-    ) -> dict[str, Any]:
+    def checked(self, given: tuple[Any, ...], named: dict[str, Any]) -> dict[str, Any]:
         """The keywords, under the names that the signature has.
 
         Raises:
@@ -173,7 +169,6 @@ class Known:
             raise ArgumentError.instead(
                 f"{self.where}: {error}", [*map(_shown, given), *named], self._names()
             ) from None
-        by_types = True
         for name, value in bound.items():
             kind, form = self.kinds.get(name), self.signature.parameters[name].kind
             members = value if form is inspect.Parameter.VAR_KEYWORD else {name: value}
@@ -182,9 +177,6 @@ class Known:
             for label, one in members.items():
                 if not kind.holds(one):
                     raise self._mistake(name, label, one, bound)
-                by_types &= _told_by_type(one)
-        if by_types:
-            self.allowed.add(types_of)
         return named
 
     def _names(self) -> list[str]:
@@ -215,11 +207,8 @@ class Known:
     ) -> ArgumentError:
         *first, last = self.kinds[name].words
         words = f"{', '.join(first)} or {last}" if first else last
-        places = [
-            other
-            for other in self._names()
-            if self.signature.parameters[other].kind is inspect.Parameter.POSITIONAL_OR_KEYWORD
-        ]
+        takes = self.signature.parameters
+        places = [n for n in self._names() if takes[n].kind is takes[n].POSITIONAL_OR_KEYWORD]
         swapped = [
             other
             for other in places
@@ -251,8 +240,10 @@ def kind_of(annotation: Any) -> Kind | None:
         (('a number', 'None'), False)
     """
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
-    plain = origin not in (Literal, Callable)
+    plain = origin not in (Annotated, Literal, Callable)
     inner = [kind_of(part) for part in parts if plain and part is not ...]
+    if origin is Annotated:  # a value, which its owner also makes of its JSON
+        return Kind((_named(parts[0]),), lambda v: isinstance(v, (parts[0], Mapping)))
     if origin in (typing.Union, types.UnionType):
         kinds = [kind for kind in inner if kind is not None]
         words = tuple(dict.fromkeys(word for kind in kinds for word in kind.words))

@@ -26,6 +26,7 @@ from flexdt.clients.calibration.markers import (
     read_markers,
     seen_alone,
 )
+from flexdt.clients.calibration.verdict import next_commands, verdict_of
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.phantoms import Phantom, load_phantom
 from flexdt.phantoms.files.phantom_files import read_phantom_file
@@ -264,6 +265,7 @@ def calibrate_datasets(
     result = replace(result, findings=(*result.findings, *saturated))
     seconds = time.perf_counter() - start
     document = calibration_document(result, seconds) | told
+    document["next"] = next_commands(result, [d.where for d in datasets], target.name)
     if result.identifiable and result.motions:
         document["motion"] = [m.to_dict() for m in result.motions]
         datasets = [d.with_motion(m) for d, m in zip(datasets, result.motions, strict=True)]
@@ -318,7 +320,9 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
     """The JSON of `flexdt calibrate`; numbers are null where they must not be used."""
     fit = result.fit
     frames = sum(len(s.frames) for s in result.scans)
+    seen = image_quantities(fit) if fit is not None and result.identifiable else ()
     document: dict[str, object] = {
+        "verdict": verdict_of(result, seen),
         "identifiable": result.identifiable,
         "parameters": {},
         "rank": None,
@@ -329,7 +333,7 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
         "iterations": None,
         "frames": frames,
         "detections": result.detections,
-        "outliers": None,
+        "outliers": [],
         "seconds": round(seconds, 4),
         "problems": [
             {"code": f.code, "severity": f.severity.value, "text": f.text} for f in result.findings
@@ -338,6 +342,7 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
     if fit is None:
         return document
     certificate = fit.certificate
+    off = np.hypot(*np.moveaxis(certificate.residuals_px, 2, 0))
     offered = not result.errors
     parameters = {}
     for name, e in certificate.estimates.items():
@@ -359,7 +364,14 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
         "rms_px": _finite(certificate.rms_px),
         "cost_reduction_pct": _finite(fit.cost_reduction_pct),
         "iterations": fit.iterations,
-        "outliers": len(certificate.outliers),
+        "outliers": [
+            {
+                "frame": o.frame,
+                "marker": o.bead,
+                "px": _finite(off[o.frame, o.bead]),
+            }
+            for o in certificate.outliers
+        ],
         "noise": _finite(certificate.noise),
         "enlargement": certificate.enlargement,
         "reading": fit.reading.value,
@@ -375,7 +387,7 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
         document["limited"] = certificate.limited
         document["image_space"] = [
             {n: {"value": e.value, "sigma": e.sigma, "unit": e.unit} for n, e in some.items()}
-            for some in image_quantities(fit)
+            for some in seen
         ]
     return document
 

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from scipy.special import fdtri
 
 from flexdt.clients.calibration.calibrate import Outcome
+from flexdt.clients.calibration.verdict import digits
 from flexdt.clients.figures import (
     Series,
     arrows,
@@ -47,14 +48,15 @@ def write_report(outcome: Outcome, path: Path) -> None:
 
 def report(outcome: Outcome) -> str:
     """The whole page."""
-    document, result = outcome.document, outcome.calibration
-    names = ", ".join(d.name for d in outcome.datasets)
-    verdict = "identifiable" if result.identifiable else "NOT to be used"
+    document: Any = outcome.document
+    result, names = outcome.calibration, ", ".join(d.name for d in outcome.datasets)
     body = [
         f"<h1>Calibration of {html.escape(names)}</h1>",
         f"<p>Phantom {html.escape(outcome.phantom.name)}, {document['frames']} frames, "
-        f"{document['detections']} shadows, {document['seconds']} s. Result: "
-        f"<span class='{'good' if result.identifiable else 'bad'}'>{verdict}</span></p>",
+        f"{document['detections']} shadows, {document['seconds']} s.</p>",
+        f"<p class='{'good' if result.identifiable else 'bad'}'>"
+        f"{html.escape(document['verdict'])}</p>",
+        *(f"<pre>{html.escape(line)}</pre>" for line in document["next"]),
     ]
     problems: Any = document["problems"]
     if problems:
@@ -77,16 +79,16 @@ def _fit_parts(fit: FitResult, document: Mapping[str, Any]) -> list[str]:
     rows = [
         [
             n,
-            *(_digits(p[k], p["sigma"]) for k in ("value", "sigma")),
+            *(digits(p[k], p["sigma"]) for k in ("value", "sigma")),
             "-" if p["images"] is None else f"{p['images']:.2g}",
             "-" if p["prior"] is None else f"{p['prior']:g}",
-            *(_digits(p[k], p["sigma"]) for k in ("low", "high")),
+            *(digits(p[k], p["sigma"]) for k in ("low", "high")),
             p["unit"],
         ]
         for n, p in document["parameters"].items()
     ]
     seen = [
-        [n, *(_digits(q[k], q["sigma"]) for k in ("value", "sigma")), q["unit"]]
+        [n, *(digits(q[k], q["sigma"]) for k in ("value", "sigma")), q["unit"]]
         for some in document.get("image_space", ())
         for n, q in some.items()
     ]
@@ -125,13 +127,6 @@ def _fit_parts(fit: FitResult, document: Mapping[str, Any]) -> list[str]:
         rows = [[n, *map(float, row)] for n, row in zip(names, c.correlation, strict=True)]
         body += ["<h3>Correlations</h3>", table(["", *names], rows)]
     return body
-
-
-def _digits(value: float | None, sigma: float | None) -> str:
-    """A value to the digits its sigma leaves."""
-    if value is None or sigma is None or not sigma > 0:
-        return "-"
-    return f"{value:.{min(max(1 - math.floor(math.log10(sigma)), 0), 9)}f}"
 
 
 def _ellipses(c: Certificate) -> list[str]:

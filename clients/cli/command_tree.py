@@ -82,6 +82,7 @@ KNOWN: Final[Mapping[str, str]] = {
     "study": "Repeat an experiment of the thesis.",
     "batch": "Make a batch of scans or calibrations.",
     "bench": "Measure speed and accuracy, beside the peers that are installed.",
+    "evidence": "Compare real, public data with their published answers.",
     "phantom design": "Choose bead places that determine the geometry best.",
 }
 """Command of `flexdt-extensions` -> its line of the help page, which needs no look at what is
@@ -95,7 +96,7 @@ SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
                 "sample", "snap"),
     "Scans": ("script", "check", "expose", "run", "job", "follow"),
     "Data": ("calibrate", "align", "compare", "reconstruct", "export", "import", "simulate"),
-    "Analysis": ("phantom", "machine", "study", "batch", "bench"),
+    "Analysis": ("phantom", "machine", "study", "batch", "bench", "evidence"),
     "Processes": ("up", *ALONE, "demo", "doctor"),
 }  # fmt: skip
 """Sections of the help page; commands in none of them are listed under Extensions."""
@@ -227,7 +228,7 @@ def _add_others(
     if words is None:
         asked = [*KNOWN]
     else:
-        first, second = [*words, "", ""][:2]
+        first, second = [*own_first(words, OWN)[1], "", ""][:2]
         asked = [f"{first} {second}" if first in GROUPS else first]
     ours = {*COMMANDS, *(f"{group} {one}" for group, (_, more) in GROUPS.items() for one in more)}
     asked = [name for name in asked if name not in ours and name and name.split()[-1][0] != "-"]

@@ -21,8 +21,6 @@ from flexdt.clients.failure import CommandError
 from flexdt.process_settings import has_parameters
 
 if TYPE_CHECKING:
-    import ssl
-
     from flexdt.clients.client.client import TwinClient
 
 Answer = Iterator[object]
@@ -107,34 +105,22 @@ def connect(server: str | None = None, token_file: str | None = None) -> TwinCli
 
     Raises:
         typer.BadParameter: the address has another form.
-        CommandError: the certificate file holds no certificate, or the configuration is wrong.
-        OSError: the token or certificate file cannot be read, or nothing answers.
+        CommandError: the token or certificate file cannot be read or holds none, or the
+            configuration is wrong.
+        OSError: nothing answers.
     """
     own = configuration()
     host, port = option_values.server(server or own.server or option_values.DEFAULT_SERVER)
     shown = token_file or own.token_file
-    token = own.token if shown is None else _first_line(Path(shown))
-    context = None if own.tls_ca is None else _trusting(Path(own.tls_ca))
-
     from flexdt.clients.client.client import TwinClient
+    from flexdt.runtime.access import AccessError, client_tls, read_token
 
-    return TwinClient(host, port, token=token, name="flexdt", ssl=context)
-
-
-def _trusting(certificate: Path) -> ssl.SSLContext:
-    """A TLS context that trusts a file's certificates and checks the server's name."""
-    import ssl
-
-    text = certificate.read_text(encoding="ascii", errors="replace")
     try:
-        return ssl.create_default_context(cadata=text)
-    except (ssl.SSLError, ValueError):
-        raise CommandError(f"{certificate}: no certificate (PEM)") from None
-
-
-def _first_line(path: Path) -> str:
-    lines = path.read_text(encoding="utf-8").splitlines()
-    return lines[0].strip() if lines else ""
+        token = own.token if shown is None else read_token(Path(shown))
+        context = client_tls(None if own.tls_ca is None else Path(own.tls_ca))
+    except AccessError as error:
+        raise CommandError(str(error)) from None
+    return TwinClient(host, port, token=token, name="flexdt", ssl=context)
 
 
 MachineName = Annotated[

@@ -268,16 +268,7 @@ def sample_mesh() -> Flow[bytes]:
         >>> len(twin.sample_mesh()) > 84  # the header and a triangle of an STL file
         True
     """
-    while True:
-        content, first = b"", None
-        while first is None or len(content) < first.total:
-            part = yield from ask(stage.SAMPLE_MESH, start=len(content))
-            first = part if first is None else first
-            if (part.name, part.revision, part.total) != (first.name, first.revision, first.total):
-                break  # another sample is on the stage by now: start again
-            content += part.data
-        else:
-            return content
+    return (yield from uploads.sample_shape()).data
 
 
 def upload_mesh(

@@ -1,4 +1,5 @@
-"""Samples to be uploaded: mesh, voxels or scene as a header and bytes, divided into chunks.
+"""Samples to be uploaded: mesh, voxels or scene as a header and bytes, divided into chunks; and the
+shape of the one on the stage, which comes in chunks, too.
 
 The content of a mesh is read by the server only. A scene file is read here, because the meshes
 that it names lie beside it; what is sent stands for itself.
@@ -14,6 +15,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
+
+from flexdt.clients.client.flows import Flow, ask
+from flexdt.protocol.methods import sample_messages as stage
 
 if TYPE_CHECKING:
     from flexdt.phantoms import Phantom
@@ -108,3 +112,17 @@ def voxels(
         "shape": list(raw.shape), "voxel_mm": [float(v) for v in size],
     }  # fmt: skip
     return Upload(head, raw.tobytes())
+
+
+def sample_shape() -> Flow[stage.SampleMeshResult]:
+    """The mesh of the sample on the stage, with the name and the revision that it is of."""
+    while True:
+        content, first = b"", None
+        while first is None or len(content) < first.total:
+            part = yield from ask(stage.SAMPLE_MESH, start=len(content))
+            first = part if first is None else first
+            if (part.name, part.revision, part.total) != (first.name, first.revision, first.total):
+                break  # another sample is on the stage by now: start again
+            content += part.data
+        else:
+            return first.model_copy(update={"data": content})

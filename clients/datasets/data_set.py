@@ -48,11 +48,11 @@ class Arrays:
     """Images in memory.
 
     Attributes:
-        counts: uint16 (n, rows, cols).
+        counts: uint16 (n, rows, cols); None where they are files.
         darks, flats: (k, rows, cols), or None where there are none.
     """
 
-    counts: Counts
+    counts: Counts | None
     darks: npt.NDArray[Any] | None = None
     flats: npt.NDArray[Any] | None = None
 
@@ -210,7 +210,9 @@ class DataSet:
             cone_vec=self.cone_vec[chosen],
             nominal=None if self.nominal is None else self.nominal[chosen],
             positions={name: values[chosen] for name, values in self.positions.items()},
-            arrays=None if arrays is None else replace(arrays, counts=arrays.counts[chosen]),
+            arrays=arrays
+            if arrays is None or arrays.counts is None
+            else replace(arrays, counts=arrays.counts[chosen]),
             truth=self.truth.of_views(chosen) if hasattr(self.truth, "of_views") else None,
         )
 
@@ -327,7 +329,7 @@ class DataSet:
         if index is None:
             return np.stack([self.counts(i) for i in range(len(self))])
         frame = self.frames[index]
-        if self.arrays is not None:
+        if self.arrays is not None and self.arrays.counts is not None:
             counts: Counts = self.arrays.counts[index]
             return counts
         if not frame.present or frame.path is None:

@@ -8,7 +8,6 @@ Missing frames are listed, and reading one is an error.
 from __future__ import annotations
 
 import fnmatch
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from os import PathLike
@@ -19,6 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.clients.datasets.data_set import DataSet
+from flexdt.clients.datasets.foreign_files import open_file
+from flexdt.clients.datasets.listed_images import NO_DARK, by_numbers, doubts, listed
 from flexdt.runtime.files.dataset_folder import (
     Folder,
     list_folder,
@@ -55,7 +56,6 @@ from flexdt.twin.signatures import public
 
 AGREE_MM: Final = 1e-6
 """How far the cone_vec of a file may lie from what its motor positions give [mm]."""
-NO_DARK: Final = "no dark image"
 MAX_SETTINGS_BYTES: Final = 16 << 20
 """Of a settings text; a larger file is none."""
 
@@ -67,15 +67,18 @@ def load_dataset(
     machine: Machine | None = None,
     profile: Profile | None = None,
     ignore_document: bool = False,
+    geometry: ConeVec | None = None,
 ) -> DataSet:
     """Open a data set.
 
     Args:
-        folder: a folder of TIFFs with flexdt.json, or with a scanner's settings texts.
+        folder: a folder of TIFFs with flexdt.json, or with a scanner's settings texts; Nikon's
+            .xtekct file beside its TIFFs; or an NXtomo file.
         machine: the scanner, for texts that do not say one that ships with the package.
         profile: zero offsets to use; default: those of the file, or the profile that reproduces
             the printed figures.
         ignore_document: use the texts alone even if flexdt.json is there.
+        geometry: one view for each projection, for an NXtomo file that does not say it.
 
     Raises:
         DatasetError: what is wrong, with its path.
@@ -84,6 +87,8 @@ def load_dataset(
         >>> data = load_dataset("my-scans/lego")  # doctest: +SKIP
         >>> len(data), data.shape  # doctest: +SKIP
     """
+    if Path(folder).is_file():
+        return open_file(Path(folder), geometry)
     content = list_folder(Path(folder))
     if content.document is not None and not ignore_document:
         return _from_document(content, machine, profile)
@@ -129,7 +134,7 @@ def read_tiffs(
         ((3, 4, 5), 0.6931)
     """
     content = list_folder(Path(folder))
-    names = sorted(content.names, key=_by_numbers)
+    names = sorted(content.names, key=by_numbers)
     darks, flats = (fnmatch.filter(names, pattern) for pattern in (dark, flat))
     others = {*darks, *flats}
     chosen = [n for n in fnmatch.filter(names, frames) if n not in others]
@@ -177,12 +182,6 @@ def _of_floats(
     return DataSet.from_arrays(images, geometry, name=folder.name)
 
 
-def _by_numbers(name: str) -> list[tuple[int, str]]:
-    """Order of names in which 10 comes after 9."""
-    parts = re.split(r"(\d+)", name)
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
-
-
 def _from_document(content: Folder, machine: Machine | None, profile: Profile | None) -> DataSet:
     path = content.path / DOCUMENT
     doc = parse_document(read_text(path), str(path))
@@ -225,7 +224,7 @@ def _from_document(content: Folder, machine: Machine | None, profile: Profile | 
         full_scale=(1 << machine.detector.bits) - 1,
         complete=doc.complete and not lost,
         reason="; ".join(filter(None, (unfinished, lost))),
-        warnings=tuple(warnings + _doubts(doc.files("dark"))),
+        warnings=tuple(warnings + doubts(doc.files("dark"))),
     )
 
 
@@ -238,49 +237,6 @@ def _from_geometry(content: Folder) -> DataSet:
                    content.darks, content.flats, geometry.name)  # fmt: skip
     notes = [note for note in geometry.notes if not note.startswith(NO_DARK)]
     return replace(found, warnings=(*found.warnings, *notes), full_scale=geometry.full_scale)
-
-
-def listed(
-    content: Folder,
-    geometry: ConeVec,
-    names: Sequence[str],
-    darks: Sequence[str],
-    flats: Sequence[str],
-    name: str = "",
-) -> DataSet:
-    """The data set of images named one by one, (rows, cols) as the first that is there.
-
-    Raises:
-        DatasetError: none is there, or the geometry has another number of views or another shape.
-    """
-    there = [n for n in names if n in content.names]
-    if not there:
-        raise DatasetMissingError(
-            f"{content.path}: no projections ({', '.join(names[:1]) or 'none is listed'} ...)",
-            {"path": str(content.path), "missing": list(names[:100])},
-        )
-    if len(names) != len(geometry):
-        raise DatasetFormatError(
-            f"{content.path}: {len(names)} projections and {len(geometry)} views; allowed: as many "
-            "of both",
-            {"path": str(content.path), "asked": len(geometry), "allowed": len(names)},
-        )
-    rows, cols = read_image(content.path / there[0]).shape
-    geometry = geometry.with_shape(geometry.of_shape((rows, cols)))
-    lost = content.lost(names)
-    return DataSet(
-        name or content.path.name,
-        content.frames(names, [(rows, cols)] * len(names)),
-        (rows, cols),
-        geometry,
-        None,
-        content.path,
-        content.paths(darks),
-        content.paths(flats),
-        complete=not lost,
-        reason=lost,
-        warnings=tuple(_doubts(darks)),
-    )
 
 
 def _from_texts(content: Folder, machine: Machine | None, profile: Profile | None) -> DataSet:
@@ -331,7 +287,7 @@ def _from_texts(content: Folder, machine: Machine | None, profile: Profile | Non
         full_scale=None if rebuilt.machine is None else (1 << rebuilt.machine.detector.bits) - 1,
         complete=not reasons,
         reason="; ".join(reasons),
-        warnings=(*warnings, *rebuilt.notes, *_doubts(content.darks)),
+        warnings=(*warnings, *rebuilt.notes, *doubts(content.darks)),
     )
 
 
@@ -378,7 +334,3 @@ def _require_one_circle(content: Folder) -> None:
             f"state the pose of one only; {DOCUMENT} is needed",
             {"path": str(path), "missing": [DOCUMENT]},
         )
-
-
-def _doubts(darks: Sequence[str]) -> list[str]:
-    return [] if darks else [f"{NO_DARK} (di000000.tif): zero is taken"]

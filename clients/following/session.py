@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 
 from flexdt.clients.datasets.pictures import png
-from flexdt.clients.following import recording as r
+from flexdt.clients.following import traffic as r
 from flexdt.clients.gateway.vocabulary import MoveRelative, Question, Refusal, read_command
 from flexdt.clients.whole_files import write_whole
 from flexdt.phantoms import Phantom
@@ -282,7 +282,7 @@ class FollowSession:
         """Hear a recording as if it came now; the clock is the recording's.
 
         Args:
-            recording: see `flexdt.clients.following.recording`.
+            recording: see `flexdt.clients.following.traffic`.
             ahead: whether what is under way, and the rest of the script, are checked as well.
         """
         now = self._midnight = 0.0

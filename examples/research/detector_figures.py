@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import warnings
 from dataclasses import dataclass
 from math import erf, exp, pi, sqrt
 from pathlib import Path
@@ -128,8 +129,10 @@ def images(pixel_mm: float, ms: float, count: int, side: int, seed: int) -> np.n
     )  # fmt: skip
     aside = {"kind": "sphere", "center": [0, 0, 200], "radius": 1, "material": "pmma"}
     detector = fx.Detector(exposure_ms=ms, gain_sigma=0.0, dead_fraction=0.0)
-    scan = fx.simulate(aside, geometry, tube=fx.Tube(kV=KV, power_W=POWER_W), detector=detector,
-                       noise=seed, shape=(side + 2 * RIM, side + 2 * RIM))  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "the sample is outside every view")
+        scan = fx.simulate(aside, geometry, tube=fx.Tube(kV=KV, power_W=POWER_W), noise=seed,
+                           detector=detector, shape=(side + 2 * RIM,) * 2)  # fmt: skip
     inside = scan.counts()[:, RIM:-RIM, RIM:-RIM]
     return np.asarray(inside, float) - detector.offset_counts
 

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from flexdt.phantoms.checked_reading import scene_to_dict
 from flexdt.protocol import Code, RpcError, hello_params, image, parse_result
-from flexdt.protocol.projector import Health, VolumeList
+from flexdt.protocol.projector import Health
 from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.projector.wire import LinkLost, ProjectorLink
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -58,26 +58,10 @@ class ProjectorClient:
         self._connecting = asyncio.Lock()
         self._closed = False
 
-    async def __aenter__(self) -> ProjectorClient:
-        await self.connect()
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        await self.close()
-
     @property
     def connected(self) -> bool:
         """Whether there is a connection at this moment."""
         return self._channel is not None and not self._channel.lost
-
-    async def connect(self) -> None:
-        """Connect now instead of with the first call.
-
-        Raises:
-            ProjectorUnavailable: no server answers.
-            RpcError: the server refuses the client.
-        """
-        await self._connected()
 
     async def close(self) -> None:
         """End the connection; open requests fail."""
@@ -132,10 +116,6 @@ class ProjectorClient:
                 raise
         await self.put(name, self._volumes[name])  # another client removed it
         return await self._persist("project", lambda c: c.ask_array("project", params, whole))
-
-    async def volumes(self) -> VolumeList:
-        """The volumes that the server holds, and its memory."""
-        return parse_result(VolumeList, await self._ask("volume.list", {}))
 
     async def health(self) -> Health:
         """The server's version, load and memory."""

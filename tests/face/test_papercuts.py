@@ -8,6 +8,7 @@ import json
 import sys
 import warnings
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -127,8 +128,8 @@ def test_messages_are_ours_and_not_a_librarys() -> None:
 
 def test_a_calibration_without_a_fit_prints_no_figures() -> None:
     out = "\n".join(show(
-        {"parameters": {}, "frames": 12, "detections": 3, "rms_px": None, "outliers": None,
-         "seconds": 0.5, "weak": []}
+        {"verdict": "Not to be used: no beads.", "parameters": {}, "frames": 12, "detections": 3,
+         "rms_px": None, "outliers": [], "seconds": 0.5, "weak": []}
     ))  # fmt: skip
     assert "None" not in out
     assert "12 frames, 3 beads seen: no fit" in out
@@ -315,5 +316,18 @@ def test_another_name_of_the_same_thing_is_deprecated() -> None:
         grid = fx.Grid((4, 4, 4), voxel=0.5)  # type: ignore[call-arg]
     assert grid == fx.Grid((4, 4, 4), 0.5)
     assert told[0].filename == __file__
+    with pytest.warns(DeprecationWarning, match="Grid: voxel is called"):  # not once alone
+        assert fx.Grid((4, 4, 4), voxel=0.5) == grid  # type: ignore[call-arg]
+    for _ in range(2):
+        with pytest.warns(DeprecationWarning, match="voxel_mm here"):
+            assert fx.Volume(np.zeros((2, 3, 4), np.float32), voxel=0.5).shape == (2, 3, 4)  # type: ignore[call-arg]
     with pytest.raises(TypeError, match="Grid has no argument 'voxel'"):
         fx.Grid((4, 4, 4), voxel_mm=0.5, voxel=0.5)  # type: ignore[call-arg]
+
+
+def test_a_detector_comes_back_from_its_json() -> None:
+    detector = fx.Detector(exposure_ms=120.0, response=((20.0, 0.9), (60.0, 0.5)))
+    document = json.loads(json.dumps(asdict(detector)))
+    assert fx.Detector(**document) == detector
+    with pytest.raises(fx.TwinError, match="pixels is 3; allowed: a PixelGrid"):
+        fx.Detector(pixels=3)  # type: ignore[arg-type]

@@ -27,11 +27,11 @@ from flexdt.runtime.access import (
     token_matches,
 )
 from flexdt.runtime.wire_errors import ProjectorUnavailable
-from flexdt.server.imaging.projector_client import ProjectorClient
 from flexdt.server.network.shell_parts import Peer
 from flexdt.server.network.tcp import serve
 from flexdt.server.projector.service import serve_projector
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
+from tests.support.projector_user import ProjectorUser
 
 TLS = Path(__file__).parents[1] / "data" / "tls"
 CERTIFICATE, KEY = TLS / "test-only-cert.pem", TLS / "test-only-key.pem"
@@ -157,7 +157,7 @@ def test_the_projector_speaks_tls() -> None:
         server = await serve_projector(
             memory_limit=2**20, ssl=server_tls(CERTIFICATE, KEY), token="a token of sixteen letters"
         )
-        async with ProjectorClient(
+        async with ProjectorUser(
             port=server.port, ssl=trusting(), token="a token of sixteen letters"
         ) as client:
             await client.put("s", Scene((Solid(Sphere((0, 0, 0), 2.0), "steel", 0.5),)))
@@ -165,7 +165,7 @@ def test_the_projector_speaks_tls() -> None:
             seen = await client.project("s", np.array([row] * 20, float), (501, 501))
             assert seen.nbytes > 2**24
             assert seen[19, 250, 250] == pytest.approx(2.0)
-        plain = ProjectorClient(port=server.port, patience_s=0.0)
+        plain = ProjectorUser(port=server.port, patience_s=0.0)
         with pytest.raises(ProjectorUnavailable):
             await plain.health()
         await server.close()
@@ -214,7 +214,7 @@ def test_a_twin_and_a_projector_on_another_host_speak_tls(tmp_path: Path) -> Non
         assert not server.logged("error", "critical", "unstructured")
 
         async def refused(ssl: ssl.SSLContext | None) -> None:
-            client = ProjectorClient(port=rays.port, patience_s=0.0, ssl=ssl)
+            client = ProjectorUser(port=rays.port, patience_s=0.0, ssl=ssl)
             with pytest.raises(ProjectorUnavailable):
                 await client.health()
             await client.close()

@@ -38,7 +38,7 @@ from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.script.planning.dry_run import check_plan, check_script
 from flexdt.twin.script.planning.plan import StartState
-from flexdt.twin.script.poses import plan_poses
+from flexdt.twin.script.posed_scan import plan_poses
 
 M = builtin_machine("flexray")
 P = builtin_profile(M.default_profile)
@@ -64,6 +64,7 @@ def test_limits_that_are_none(word: str) -> None:
 
 
 @pytest.mark.timeout(120)
+@pytest.mark.slow
 def test_limits_hold_in_a_process(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rays = projector("--limit", "max_clients=9")
     options = [f"--limit={w}" for w in ("max_jobs=2", "max_upload=1000", "disk_quota=30e6",

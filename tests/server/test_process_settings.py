@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
-import signal
-from collections.abc import Iterator
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 
@@ -23,11 +20,9 @@ from flexdt.process_settings import (
     shared,
     words,
 )
-from flexdt.runtime import process
 from flexdt.runtime.files import directory
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.own_documents import lock_folder
-from flexdt.runtime.loop import ServerLoop
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 
 PROCESSES = (UpSettings, TwinSettings, ProjectorSettings, ViewerSettings, GatewaySettings)
@@ -101,72 +96,6 @@ def test_up_leaves_the_data_directory_of_the_viewer_open() -> None:
     assert shared(UpSettings(), ViewerSettings)["data"] is None
     assert "twin" not in shared(UpSettings(), ViewerSettings)
     assert set(asdict(UpSettings())) >= set(shared(UpSettings(), TwinSettings))
-
-
-@pytest.fixture
-def handlers() -> Iterator[None]:
-    before = [(number, signal.getsignal(number)) for number in process.SIGNALS]
-    yield
-    for number, handler in before:
-        signal.signal(number, handler)
-
-
-@pytest.mark.usefixtures("handlers")
-@pytest.mark.parametrize("number", process.SIGNALS)
-def test_a_loop_without_signal_handlers_is_stopped_all_the_same(
-    number: signal.Signals, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As on Windows."""
-
-    def missing(*_: object) -> None:
-        raise NotImplementedError
-
-    monkeypatch.setattr(asyncio.SelectorEventLoop, "add_signal_handler", missing)
-
-    async def scenario() -> bool:
-        stop = process.stop_signal()
-        os.kill(os.getpid(), number)
-        async with asyncio.timeout(30.0):
-            await stop.wait()
-        os.kill(os.getpid(), number)  # a second one does not interrupt the stopping
-        await asyncio.sleep(0.0)
-        return stop.is_set()
-
-    with asyncio.Runner(loop_factory=ServerLoop) as runner:
-        assert runner.run(scenario())
-
-
-@pytest.mark.usefixtures("handlers")
-def test_a_loop_without_signal_handlers_wakes_up_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On Windows a signal does not end the wait for sockets, so the loop has to turn now and then.
-
-    The handler runs here while nothing is due, as Python runs it there once the wait has ended.
-    """
-    monkeypatch.setattr(process, "WAKE_S", 0.01)
-
-    def missing(*_: object) -> None:
-        raise NotImplementedError
-
-    monkeypatch.setattr(asyncio.SelectorEventLoop, "add_signal_handler", missing)
-
-    async def scenario() -> int:
-        loop = asyncio.get_running_loop()
-        process.stop_signal()
-        turns = 0
-        real = process._keep_waking
-
-        def counted(loop: asyncio.AbstractEventLoop) -> None:
-            nonlocal turns
-            turns += 1
-            real(loop)
-
-        monkeypatch.setattr(process, "_keep_waking", counted)
-        until = loop.time() + 30.0
-        while turns < 3 and loop.time() < until:
-            await asyncio.sleep(0.05)
-        return turns
-
-    assert asyncio.run(scenario()) >= 3
 
 
 def test_a_data_directory_is_locked_without_a_file_in_it(tmp_path: Path) -> None:

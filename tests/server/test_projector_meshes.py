@@ -16,14 +16,14 @@ import trimesh
 from traced_mesh import traced
 
 from flexdt.protocol import Code, RpcError
-from flexdt.server.imaging.projector_client import ProjectorClient
 from flexdt.server.projector.service import ProjectorServer, serve_projector
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import TriangleMesh, project_scene
 from flexdt.twin.projection.analytic_solids import Box, Scene, Solid
+from tests.support.projector_user import ProjectorUser
 
 SHAPE = (24, 30)
-Body = Callable[[ProjectorServer, ProjectorClient], Awaitable[None]]
+Body = Callable[[ProjectorServer, ProjectorUser], Awaitable[None]]
 
 
 def views(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -41,7 +41,7 @@ def views(rng: np.random.Generator, n: int) -> np.ndarray:
 def run(body: Body, memory_limit: int = 64 * 2**20) -> None:
     async def main() -> None:
         server = await serve_projector(memory_limit=memory_limit)
-        client = ProjectorClient(port=server.port)
+        client = ProjectorUser(port=server.port)
         try:
             await asyncio.wait_for(body(server, client), 300)
         finally:
@@ -57,7 +57,7 @@ def box(x: float, y: float, z: float) -> TriangleMesh:
 
 
 def test_paths_through_a_box_are_those_of_the_solid() -> None:
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         rng = np.random.default_rng(4)
         cone = views(rng, 5)
         await client.put("m", box(5.0, 6.0, 7.0))
@@ -74,7 +74,7 @@ def test_paths_through_a_box_are_those_of_the_solid() -> None:
 def test_drawn_meshes_come_whole_in_many_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("flexdt.server.imaging.projector_client.CHUNK", 1000)
 
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         rng = np.random.default_rng(11)
         for i in range(4):
             ball = trimesh.creation.icosphere(2, 1.0)
@@ -94,7 +94,7 @@ def test_drawn_meshes_come_whole_in_many_pieces(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_what_is_no_closed_mesh_is_refused_and_the_server_lives_on() -> None:
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         good = box(2.0, 2.0, 2.0)
         corners, faces = good.vertices.astype("<f8"), good.faces.astype("<i4")
 
@@ -135,7 +135,7 @@ def test_what_is_no_closed_mesh_is_refused_and_the_server_lives_on() -> None:
 
 
 def test_memory_is_counted_and_a_restarted_server_gets_the_mesh_again() -> None:
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         ball = trimesh.creation.icosphere(5, 8.0)
         mesh = TriangleMesh(ball.vertices, ball.faces)
         with pytest.raises(RpcError) as caught:

@@ -19,11 +19,11 @@ import typer
 
 from flexdt.process_settings import memory_size
 from flexdt.runtime.wire_errors import ProjectorUnavailable
-from flexdt.server.imaging.projector_client import ProjectorClient
 from flexdt.server.projector import compute, wire
 from flexdt.server.projector.service import serve_projector
 from flexdt.twin.projection import Volume, forward
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
+from tests.support.projector_user import ProjectorUser
 
 COMMAND = (sys.executable, "-m", "flexdt.server.projector.main")
 
@@ -54,7 +54,7 @@ def test_ready_line_service_and_sigterm() -> None:
         assert (ready["threads"], ready["memory_limit"]) == (1, 64 * 2**20)
 
         async def talk() -> None:
-            async with ProjectorClient(port=ready["port"]) as client:
+            async with ProjectorUser(port=ready["port"]) as client:
                 await client.put("s", Scene((Solid(Sphere((0, 0, 0), 2.0), "steel", 0.5),)))
                 row = [0, -60, 0, 0, 40, 0, 0.4, 0, 0, 0, 0, -0.4]
                 seen = await client.project("s", row, (31, 41))
@@ -113,7 +113,7 @@ def test_a_projector_that_hangs_is_given_up_and_used_again(
         row = [0, -60, 0, 0, 40, 0, 0.4, 0, 0, 0, 0, -0.4]
 
         async def talk() -> None:
-            async with ProjectorClient(port=port, patience_s=2.0) as client:
+            async with ProjectorUser(port=port, patience_s=2.0) as client:
                 await client.put("s", Scene((Solid(Sphere((0, 0, 0), 2.0), "steel", 0.5),)))
                 first = await client.project("s", row, (31, 41))
                 process.send_signal(signal.SIGSTOP)
@@ -146,7 +146,7 @@ def test_a_projector_that_computes_for_long_is_waited_for(monkeypatch: pytest.Mo
 
     async def talk() -> None:
         server = await serve_projector(memory_limit=1 << 24)
-        async with ProjectorClient(port=server.port) as client:
+        async with ProjectorUser(port=server.port) as client:
             await client.put("v", volume)
             seen = await client.project("v", row, (31, 41))
             np.testing.assert_array_equal(seen, forward(volume, row, (31, 41)))

@@ -16,7 +16,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from flexdt.protocol import Code, Codec, Connection, Response, RpcError, image
 from flexdt.runtime.access import AccessError, ConnectionLimits
 from flexdt.runtime.wire_errors import ProjectorUnavailable
-from flexdt.server.imaging.projector_client import ProjectorClient
 from flexdt.server.projector import compute
 from flexdt.server.projector import compute as kernels
 from flexdt.server.projector import projector_methods as answers
@@ -33,6 +32,7 @@ from flexdt.twin.projection.analytic_solids import (
     Sphere,
 )
 from tests.support.device_simulator import run_simulated
+from tests.support.projector_user import ProjectorUser
 
 SHAPE = (30, 40)
 RNG = np.random.default_rng(5)
@@ -58,7 +58,7 @@ LIMIT = 64 * 2**20
 
 ConeRows = np.ndarray[Any, np.dtype[np.float64]]
 Images = np.ndarray[Any, np.dtype[np.float32]]
-Body = Callable[[ProjectorServer, ProjectorClient], Awaitable[None]]
+Body = Callable[[ProjectorServer, ProjectorUser], Awaitable[None]]
 
 
 def views(n: int, pixel: float = 0.4) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -74,7 +74,7 @@ def views(n: int, pixel: float = 0.4) -> np.ndarray[Any, np.dtype[np.float64]]:
 def run(body: Body, memory_limit: int = LIMIT, **options: Any) -> None:
     async def main() -> None:
         server = await serve_projector(memory_limit=memory_limit, **options)
-        client = ProjectorClient(port=server.port, token=options.get("token"))
+        client = ProjectorUser(port=server.port, token=options.get("token"))
         try:
             # A first call may have to compile.
             await asyncio.wait_for(body(server, client), 300)
@@ -102,7 +102,7 @@ async def raw(
 
 
 def test_projections_of_voxels_and_scenes_are_those_of_the_projector() -> None:
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         await client.put("v", VOLUME)
         await client.put("s", SCENE)
         cone = views(7)
@@ -124,7 +124,7 @@ def test_projections_of_voxels_and_scenes_are_those_of_the_projector() -> None:
 
 
 def test_a_view_without_rays_is_refused_by_its_row() -> None:
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         await client.put("v", VOLUME)
         await client.put("s", SCENE)
         many = 40  # more than are computed in one go
@@ -149,7 +149,7 @@ def test_a_view_without_rays_is_refused_by_its_row() -> None:
 
 
 def test_results_larger_than_a_frame_come_in_parts() -> None:
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         await client.put("s", SCENE)
         cone = views(9, 0.02)
         shape = (1000, 1100)  # 4.4 MB a view
@@ -168,7 +168,7 @@ def test_a_volume_of_many_chunks_arrives_whole() -> None:
     data = RNG.random((200, 120, 100), dtype=np.float32)  # 9.6 MB: two chunks
     big = Volume(data, 0.1)
 
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         await client.put("big", big)
         cone = views(1, 0.2)
         assert_array_equal(await client.project("big", cone, SHAPE), forward(big, cone, SHAPE))
@@ -204,7 +204,7 @@ def test_backprojection_in_one_and_in_several_requests() -> None:
     stack = RNG.random((6, *SHAPE), dtype=np.float32)
     expected = back(stack, cone, VOLUME)
 
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         assert_array_equal(await backprojected(server, stack, cone), expected.data)
         made = await backprojected(server, stack, cone, into="sum")
         assert_allclose(made, expected.data, rtol=1e-5)
@@ -215,7 +215,7 @@ def test_backprojection_in_one_and_in_several_requests() -> None:
 
 
 def test_several_requests_at_once_each_get_their_own_answer() -> None:
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         await client.put("v", VOLUME)
         cone = views(24)
         got = await asyncio.gather(*(client.project("v", row, SHAPE) for row in cone))
@@ -261,7 +261,7 @@ async def keyed(link: ProjectorLink, row: ConeRows) -> Images:
 def test_newest_wins_and_the_stale_are_answered(monkeypatch: pytest.MonkeyPatch) -> None:
     gate = Gate(monkeypatch)
 
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         await client.put("v", VOLUME)
         cone = views(6)
         tasks = []
@@ -284,7 +284,7 @@ def test_newest_wins_and_the_stale_are_answered(monkeypatch: pytest.MonkeyPatch)
 def test_keys_of_different_clients_do_not_touch(monkeypatch: pytest.MonkeyPatch) -> None:
     gate = Gate(monkeypatch)
 
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         await client.put("v", VOLUME)
         links = [await ProjectorLink.connect("127.0.0.1", server.port) for _ in range(2)]
         first = [asyncio.create_task(keyed(link, views(1)[0])) for link in links]
@@ -303,13 +303,13 @@ def test_a_long_scan_does_not_starve_another_clients_single_view(
 ) -> None:
     gate = Gate(monkeypatch)
 
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         await client.put("v", VOLUME)
         long = views(32 * 8)
         long[:, 0] += 1000.0  # recognisable
         scan = asyncio.create_task(client.project("v", long, SHAPE))
         await until(gate.entered.is_set)
-        async with ProjectorClient(port=server.port) as other:
+        async with ProjectorUser(port=server.port) as other:
             single = asyncio.create_task(other.project("v", views(1), SHAPE))
             await until(lambda: len(server.context.compute.queue) == 1)
             gate.open.set()
@@ -324,7 +324,7 @@ def test_a_long_scan_does_not_starve_another_clients_single_view(
 def test_a_cancelled_call_is_not_computed(monkeypatch: pytest.MonkeyPatch) -> None:
     gate = Gate(monkeypatch)
 
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         await client.put("v", VOLUME)
         cone = views(3)
         tasks = [asyncio.create_task(client.project("v", row, SHAPE)) for row in cone]
@@ -346,7 +346,7 @@ def test_an_id_in_use_is_refused_and_the_first_request_goes_on(
 ) -> None:
     gate = Gate(monkeypatch)
 
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         await client.put("v", VOLUME)
         threading.Timer(0.2, gate.open.set).start()
         ask = {"volume": "v", "cone_vec": views(1).tolist(), "detector": list(SHAPE)}
@@ -361,9 +361,9 @@ def test_an_id_in_use_is_refused_and_the_first_request_goes_on(
 def test_a_client_gone_in_mid_request_leaves_no_work(monkeypatch: pytest.MonkeyPatch) -> None:
     gate = Gate(monkeypatch)
 
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         await client.put("v", VOLUME)
-        other = ProjectorClient(port=server.port, patience_s=0.0)
+        other = ProjectorUser(port=server.port, patience_s=0.0)
         tasks = [asyncio.create_task(other.project("v", row, SHAPE)) for row in views(5)]
         await until(gate.entered.is_set)
         await until(lambda: len(server.context.compute.queue) == 4)
@@ -379,7 +379,7 @@ def test_a_client_gone_in_mid_request_leaves_no_work(monkeypatch: pytest.MonkeyP
 
 
 def test_the_memory_limit_is_an_error_that_says_what_is_left() -> None:
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         await client.put("small", VOLUME)
         used = (await client.volumes()).memory_used
         assert used == 2 * VOLUME.data.nbytes
@@ -408,7 +408,7 @@ def test_the_memory_limit_is_an_error_that_says_what_is_left() -> None:
 
 
 def test_an_upload_of_a_client_that_goes_away_is_forgotten() -> None:
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         put = {"name": "x", "grid": {"shape": [4, 4, 4], "voxel_mm": [1, 1, 1]}, "data": b"1234"}
         [reply] = await raw(server, {"id": 1, "method": "volume.put", "params": put})
         assert reply["result"]["received"] == 4
@@ -418,7 +418,7 @@ def test_an_upload_of_a_client_that_goes_away_is_forgotten() -> None:
 
 
 def test_the_wire_by_hand() -> None:
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         sphere = {"shape": {"kind": "sphere", "center": [0, 0, 0], "radius": 2.0},
                   "material": "steel", "mu_per_mm": 0.5}  # fmt: skip
         put = {"name": "ball", "scene": {"solids": [sphere]}}
@@ -477,7 +477,7 @@ BAD += [
 
 
 def test_bad_requests_get_their_codes_and_the_server_lives_on() -> None:
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         await client.put("v", VOLUME)
         for message, code in BAD:
             [reply] = await raw(server, message)
@@ -488,7 +488,7 @@ def test_bad_requests_get_their_codes_and_the_server_lives_on() -> None:
 
 
 def test_broken_bytes_half_a_frame_and_answers_end_in_an_error() -> None:
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         await client.put("v", VOLUME)
         an_answer = msgpack.packb({"jsonrpc": "2.0", "id": 1, "result": None})
         for sent, code in (
@@ -514,7 +514,7 @@ def test_broken_bytes_half_a_frame_and_answers_end_in_an_error() -> None:
 
 
 def test_a_client_that_never_reads_is_cut_off_and_others_are_served() -> None:
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         await client.put("s", SCENE)
         _, writer = await asyncio.open_connection("127.0.0.1", server.port)
         writer.transport.pause_reading()  # type: ignore[attr-defined]
@@ -537,7 +537,7 @@ def test_a_restarted_server_gets_the_volumes_again() -> None:
     async def main() -> None:
         server = await serve_projector(memory_limit=LIMIT)
         port = server.port
-        client = ProjectorClient(port=port, patience_s=60.0)
+        client = ProjectorUser(port=port, patience_s=60.0)
         await client.put("v", VOLUME)
         await client.put("s", SCENE)
         before = await client.project("v", views(2), SHAPE)
@@ -555,9 +555,9 @@ def test_a_restarted_server_gets_the_volumes_again() -> None:
 
 
 def test_a_volume_removed_by_somebody_else_is_sent_again() -> None:
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         await client.put("v", VOLUME)
-        async with ProjectorClient(port=server.port) as other:
+        async with ProjectorUser(port=server.port) as other:
             await other.remove("v")
         assert (await client.project("v", views(1), SHAPE)).shape == (1, *SHAPE)
         with pytest.raises(RpcError, match="no volume 'w'"):
@@ -568,7 +568,7 @@ def test_a_volume_removed_by_somebody_else_is_sent_again() -> None:
 
 def test_nobody_there_is_projector_unavailable() -> None:
     async def main() -> None:
-        client = ProjectorClient(port=1, patience_s=0.1)
+        client = ProjectorUser(port=1, patience_s=0.1)
         with pytest.raises(ProjectorUnavailable, match=r"no projector at 127\.0\.0\.1:1"):
             await client.project("v", views(1), SHAPE)
 
@@ -576,9 +576,9 @@ def test_nobody_there_is_projector_unavailable() -> None:
 
 
 def test_tokens_and_addresses() -> None:
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         assert (await client.health()).clients == 1
-        stranger = ProjectorClient(port=server.port)
+        stranger = ProjectorUser(port=server.port)
         with pytest.raises(RpcError) as caught:
             await stranger.health()
         assert caught.value.code == -32602 or caught.value.code == -32004
@@ -593,7 +593,7 @@ def test_tokens_and_addresses() -> None:
 def test_the_event_loop_stays_free_while_kernels_run() -> None:
     """Health is answered while a long job is computed: the kernels release the interpreter."""
 
-    async def body(server: ProjectorServer, client: ProjectorClient) -> None:
+    async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         await client.put("v", VOLUME)
         scan = asyncio.create_task(client.project("v", views(400), (300, 400)))
         answered = 0

@@ -13,7 +13,6 @@ import pytest
 from flexdt.phantoms import Phantom, load_phantom, voxel_phantom
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.imaging.projections import Imaging, digest_of
-from flexdt.server.imaging.projector_client import ProjectorClient
 from flexdt.server.imaging.projector_pool import ProjectorPool
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.projector.service import ProjectorServer, serve_projector
@@ -23,6 +22,7 @@ from flexdt.twin.machine.description import builtin_machine, profile_of
 from flexdt.twin.projection import Volume
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import Sample
+from tests.support.projector_user import ProjectorUser
 
 M = builtin_machine()
 SCANNER = ScannerTwin(M, profile_of(M))
@@ -58,8 +58,8 @@ async def brightest(imaging: Imaging, name: str = "thing") -> float:
 def run(work: Any, limit: int = LIMIT) -> None:
     async def main() -> None:
         server = await serve_projector(memory_limit=limit)
-        one, other = (ProjectorClient(port=server.port) for _ in range(2))
-        pool = ProjectorPool([ProjectorClient(port=server.port, patience_s=0.0)])
+        one, other = (ProjectorUser(port=server.port) for _ in range(2))
+        pool = ProjectorPool([ProjectorUser(port=server.port, patience_s=0.0)])
         try:
             await asyncio.wait_for(work(server, one, other, pool), 300)
         finally:

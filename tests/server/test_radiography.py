@@ -588,7 +588,8 @@ def test_a_voltage_without_a_spectrum_is_refused_before_there_is_a_job(
         report = _document(await twin.submissions.check(ScanSource(text), Codec.JSON))
         (problem,) = [p for p in report["problems"] if p["severity"] == "error"]
         assert problem["line"] == 1
-        assert "[20, 90] kV" in problem["message"]
+        assert "tube kV" in problem["message"]
+        assert "[20, 90]" in problem["message"]
         with pytest.raises(RpcError) as refused:
             await twin.submissions.submit(ScanSource(text), "low", None)
         assert refused.value.code == Code.SCRIPT_INVALID

@@ -151,6 +151,7 @@ def test_a_broken_memory_is_set_aside_and_the_twin_starts(
         assert process.end() == 0
 
 
+@pytest.mark.slow
 def test_two_twins_do_not_share_a_data_directory(rays: Process, tmp_path: Path) -> None:
     first = twin(rays.port, tmp_path)
     try:

@@ -20,7 +20,7 @@ from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.script import Exposure, ScanPlan
 from flexdt.twin.script.parse import parse_script
 from flexdt.twin.script.planning.planner import plan_script
-from flexdt.twin.script.poses import plan_poses
+from flexdt.twin.script.posed_scan import plan_poses
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)

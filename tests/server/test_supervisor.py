@@ -290,6 +290,7 @@ def test_a_service_that_says_nothing_is_ended_and_started_again(
     assert not any(alive(pid) for pid in started(tmp_path, "mute"))
 
 
+@pytest.mark.slow
 def test_a_start_may_take_as_long_as_it_works(
     tmp_path: Path, fake: Callable[..., Service], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -35,6 +35,7 @@ def check(total: dict) -> None:
     assert total["stops_short_of_touching"] > 0
 
 
+@pytest.mark.slow
 def test_short_study(study: ModuleType) -> None:
     check(study.summary(study.study_pairs(80, 7, lambda done: None)))
 

@@ -82,6 +82,7 @@ def test_coupled_motors_keep_in_step_when_a_move_takes_over_from_a_brake() -> No
     assert replay(Start("rig", axes), history).found == []
 
 
+@pytest.mark.slow
 def test_what_stands_in_a_part_after_a_restart_comes_out_and_never_goes_deeper() -> None:
     """Turned boxes and cylinders: their boxes along the axes part while they themselves do not."""
     rng = np.random.default_rng(7)

@@ -274,6 +274,7 @@ HUGE = "camera\tset number of frames\t1000000\t\tACK\t\t\r\n" + "".join(
 )
 
 
+@pytest.mark.slow
 def test_a_plan_that_takes_too_much_is_refused_and_the_pages_go_on(lab: Any) -> None:
     """Sixty million images: planned in a process of its own, with limits."""
 

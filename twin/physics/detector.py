@@ -6,8 +6,10 @@ the figures, and says of each default whether it is measured, from the literatur
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -120,7 +122,7 @@ class Detector:
     """Assumed."""
     serial: int = 1512
     """Assumed."""
-    pixels: PixelGrid = field(default_factory=PixelGrid)
+    pixels: Annotated[PixelGrid, "or its JSON"] = field(default_factory=PixelGrid)
     """Literature: see `PixelGrid`."""
     lag_fraction: float = 0.002
     """Assumed."""
@@ -138,6 +140,8 @@ class Detector:
             value = getattr(self, name)
             if value is not None or name not in _OPTIONAL:
                 require_within(f"Detector: {name}", value, low, high)
+        if isinstance(self.pixels, Mapping):
+            object.__setattr__(self, "pixels", PixelGrid(**self.pixels))
         response = tuple((float(energy), float(left)) for energy, left in self.response)
         object.__setattr__(self, "response", response)
         Substance.parse(self.scintillator)

@@ -64,9 +64,11 @@ from flexdt.twin.signatures import public
 MOST_COLUMNS = 65_535
 """Voxel columns along y that a device's grid can hold."""
 CHUNK = 32
-"""Views worked on at a time."""
+"""Views worked on at a time, at least."""
 GROUP: Final = 8
-"""Views that the processor weighs and filters at a time: they stay in its caches."""
+"""Views that the processor weighs and filters at a time, at least: they stay in its caches."""
+PIXELS: Final = 1 << 18
+"""Of a group; a chunk may hold four times as many. Calls of few rows cost more than their work."""
 STACKS: Final = 6
 """Stacks of so many images that a device holds: twice what came, and made wider, of three steps."""
 MOST_ASIDE: Final = 0.1
@@ -131,9 +133,9 @@ class OnProcessor:
         n, wide, cols, rows = views.sizes
         if views.sizes != self._sizes:  # new memory costs as much as filtering
             self._sizes, self._columns = views.sizes, fdk_kernels.room(n, cols, rows)
-        images = np.ascontiguousarray(views.images)
-        for first in range(0, n, GROUP):
-            some = slice(first, first + GROUP)
+        images, group = np.ascontiguousarray(views.images), max(GROUP, PIXELS // (wide * rows))
+        for first in range(0, n, group):
+            some = slice(first, first + group)
             ready = np.empty((len(images[some]), rows, wide), np.float32)
             fdk_kernels.weigh(
                 images[some], views.top, views.factors[some], views.across[some], views.up[some],
@@ -388,9 +390,11 @@ def fdk(
     if values.ndim != 3:
         values = check_projections(values, len(geometry))
 
+    chunk = max(CHUNK, 4 * PIXELS // max(values[0].size, 1)) if len(values) else CHUNK
+
     def parts() -> Iterable[Float32Array]:
-        for start in range(0, len(values), CHUNK):
-            part = np.asarray(values[start : start + CHUNK], dtype=np.float32)
+        for start in range(0, len(values), chunk):
+            part = np.asarray(values[start : start + chunk], dtype=np.float32)
             require_finite(part)
             yield part
 

@@ -155,14 +155,15 @@ class NoiseMeter:
         return np.where(inside, column, 0.0), np.where(inside, factors / depth**2, 0.0)
 
     def found(self) -> Noise | None:
-        """The noise, once all views have been added; None where there are too few rows."""
+        """The noise, once all views have been added; None where too few rows see the grid."""
         assert self._means is not None
-        if self._means.shape[1] <= APART:
+        if self._means.shape[1] <= APART + 1 or np.isnan(self.data).all():
             return None
         alternating = self.data
         if alternating.shape[2] > 2:  # without what few views cause, which layers have in common
-            alternating = np.diff(alternating, axis=2, append=alternating[:, :, -2:-1])
-            alternating = alternating / np.float32(np.sqrt(2.0))
+            pairs = np.diff(alternating, axis=2, append=alternating[:, :, -2:-1])
+            pairs /= np.float32(np.sqrt(2.0))
+            alternating = np.where(np.isnan(pairs), alternating, pairs)
         variance = _local_variance(alternating.transpose(2, 0, 1))
         radii = self._points()[0].reshape(-1, AROUND).mean(axis=1)
         shared = self._shared_variance().reshape(-1, AROUND).mean(axis=1)

@@ -239,7 +239,7 @@ def _fitted(
     usual = float(np.median(met)) if met.size else 0.0  # of the rays that meet the object
     for k in np.argsort(-seen.sum(axis=(0, 2))).tolist():
         band = seen[:, k]
-        cut_off[k] = (_cut_off(band, least) & edges_that_count).any()
+        cut_off[k] = (_cut_off(band, least, usual) & edges_that_count).any()
         if not cut_off[k]:
             continue
         even = max(float(np.ptp(band.mean(axis=axis))) for axis in (0, 1)) < ACCURACY * usual
@@ -269,17 +269,24 @@ def _noise(lines: npt.NDArray[np.floating]) -> float:
     return float(np.median(np.abs(bend))) / 1.65 if bend.size else 0.0
 
 
-def _cut_off(band: FloatArray, least: float) -> npt.NDArray[np.bool_]:
-    """Whether the object goes on beyond the edges (2,) in some neighbouring views.
+def _cut_off(band: FloatArray, least: float, usual: float) -> npt.NDArray[np.bool_]:
+    """Whether the object goes on beyond the edges (2,), in some neighbouring views or in all.
 
-    The middle one of five views counts. Noise is that of every other bin near the edge: detectors
-    blur it over some columns.
+    The middle one of five views counts, and the mean of all, in which less noise hides it. Noise is
+    that of every other bin near the edge: detectors blur it over some columns.
     """
     from scipy.ndimage import median_filter
 
-    values = median_filter(band[:, [0, -1]], (min(5, len(band)), 1))
-    noise = np.array([_noise(band[:, :5:2]), _noise(band[:, :-6:-2])])
-    return np.asarray((values > np.maximum(least, SIGNIFICANT * noise)).any(axis=0))
+    ends = band[:, [0, -1]]
+    noise = SIGNIFICANT * np.array([_noise(band[:, :5:2]), _noise(band[:, :-6:-2])])
+    some = median_filter(ends, (min(5, len(band)), 1)) > np.maximum(least, noise)
+    # In the mean the flat's drift and noise show, too, and the logarithm of noise: what counts is
+    # what would change densities by the accuracy (see `at_edges` above).
+    mean = band.mean(axis=0)
+    apart = np.std(np.diff(ends, axis=0), axis=0) / np.sqrt(2.0 * len(ends))
+    apart = SIGNIFICANT * np.hypot(apart, _noise(mean))
+    every = mean[[0, -1]] > np.maximum(0.5 * np.pi * ACCURACY * usual, apart)
+    return np.asarray(some.any(axis=0) | every)
 
 
 def _fit(

@@ -309,20 +309,31 @@ def push_correction(client: TwinClient, correction: NamedCorrection, source: str
 
 
 def show(document: Mapping[str, Any]) -> Iterator[str]:
-    """A calibration's document for people."""
-    yield table(parameter_rows(document), ("parameter", "value", "sigma", "of images", "unit"))
+    """A calibration's document for people: its use first, then what images and offsets say."""
+    yield document["verdict"]
+    for line in document.get("next", ()):
+        yield f"next: {line}"
+    rows = [
+        (f"{name}, scan {k}" if k else name, *_rounded(q, "value", "sigma"), _unit(q["unit"]))
+        for k, place in enumerate(document.get("image_space", ()))
+        for name, q in place.items()
+    ]
+    if rows:
+        yield table(rows, ("in the images", "value", "sigma", "unit"))
     seen = f"{document['frames']} frames, {document['detections']} beads seen"
     if document["rms_px"] is None:
         yield f"{seen}: no fit, {_number(document['seconds'], 2)} s"
         return
-    yield (
-        f"{seen}, {document['outliers']} outliers, rms {_number(document['rms_px'], 4)} px, "
-        f"cost down {_number(document['cost_reduction_pct'], 4)} %, "
-        f"{document['iterations']} iterations, rank {document['rank']}, "
-        f"condition {_number(document['condition'], 1)}, "
-        f"{_number(document['seconds'], 2)} s"
-    )
-    yield from limits(document)
+    yield table(parameter_rows(document), ("parameter", "value", "sigma", "of images", "unit"))
+    rms, seconds = _number(document["rms_px"], 4), _number(document["seconds"], 2)
+    yield f"{seen}, {len(document['outliers'])} left out, rms {rms} px, {seconds} s"
+    from flexdt.clients.calibration.verdict import ranges
+
+    frames: dict[int, list[int]] = {}
+    for one in document["outliers"]:
+        frames.setdefault(one["marker"], []).append(one["frame"])
+    for marker, left_out in sorted(frames.items()):
+        yield f"left out: bead {marker} of frames {ranges(left_out)}"
     yield from motions(document)
     if "scale" in document:
         rows = [
@@ -351,25 +362,14 @@ def motions(document: Mapping[str, Any]) -> Iterator[str]:
             )
 
 
-def limits(document: Mapping[str, Any]) -> Iterator[str]:
-    """What a reconstruction needs, and what limits the parameters that were asked for, in words."""
-    for places in document.get("image_space", ()):
-        listed = [
-            f"{n} {q['value']:.8g} +- {q['sigma']:.2g} {q['unit']}" for n, q in places.items()
-        ]
-        yield "in the images: " + ", ".join(listed)
-    for name, text in document.get("limited", {}).items():
-        yield f"{name} {text}"
-
-
 def parameter_rows(document: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """Parameters as rows of text: name, value, sigma, its part from the images, unit. Those that
     were not asked for and are estimated by their prior come last, in brackets."""
     return [
         (
             name if p["asked"] else f"({name})",
-            *(_number(p[key], 5) for key in ("value", "sigma", "images")),
-            p["unit"],
+            *_rounded(p, "value", "sigma", "images"),
+            _unit(p["unit"]),
         )
         for name, p in document["parameters"].items()
     ]
@@ -378,6 +378,17 @@ def parameter_rows(document: Mapping[str, Any]) -> list[tuple[str, ...]]:
 def write_json(path: Path, document: Mapping[str, object]) -> None:
     """Write a document under its final name only when it is whole."""
     write_whole(path, as_json(document) + "\n")
+
+
+def _rounded(estimate: Mapping[str, Any], *names: str) -> Iterator[str]:
+    """Numbers of an estimate, to the digits that its sigma leaves."""
+    from flexdt.clients.calibration.verdict import digits
+
+    return (digits(estimate[name], estimate["sigma"]) for name in names)
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else unit
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -61,10 +61,6 @@ def demo(
 
 SAMPLE: Final = "lego"
 SCRIPT: Final = "lego-fly-360.txt"
-VISIBLE: Final = 0.5
-"""Least line integral of a frame that shows the phantom; its beads alone make several."""
-BEAD_CONTRAST: Final = 3.0
-"""How much brighter a steel bead is than nearly all of the preview (plastic and air)."""
 Tell = Callable[[str], None]
 
 
@@ -146,7 +142,8 @@ def _stages(
             tell("the kernels of calibration and reconstruction are still being compiled (once)")
             compiling.wait()
         outcome, seconds = calibrate(dataset, tell)
-        push(client, outcome, tell)
+        push_correction(client, outcome.correction, outcome.sources)
+        tell(f"correction in force on the twin: {outcome.correction.name}")
         document |= {
             "calibration_s": round(seconds, 3),
             "calibration": outcome.document,
@@ -185,9 +182,6 @@ def inspect(folder: Path, tell: Tell) -> DataSet:
     dataset = load_dataset(folder).require_complete()
     files = [p for p in folder.iterdir() if p.is_file()]
     rows, cols = dataset.shape
-    deepest = float(dataset.line_integrals(0).max())
-    if deepest < VISIBLE:
-        raise CommandError(f"{folder}: no sample is to be seen in {dataset.frames[0].file}")
     tell(
         f"data set {folder}: {len(dataset.frames)} projections of {cols} x {rows}, "
         f"{len(files)} files, {size(sum(p.stat().st_size for p in files))}"
@@ -213,43 +207,14 @@ def calibrate(dataset: DataSet, tell: Tell) -> tuple[Outcome, float]:
     return outcome, seconds
 
 
-def push(client: TwinClient, outcome: Outcome, tell: Tell) -> None:
-    """Put the correction in force and see that the twin's geometry has it."""
-    before = client.geometry().cone_vec
-    correction = outcome.correction
-    push_correction(client, correction, outcome.sources)
-    name = correction.name
-    now = client.calibration()
-    if now is None or now.name != name:
-        raise CommandError(f"the correction {name!r} is not in force")
-    if client.geometry().cone_vec == before:
-        raise CommandError(f"the correction {name!r} did not change the twin's geometry")
-    tell(f"correction in force on the twin: {name}")
-
-
 def preview(dataset: DataSet, outcome: Outcome, out: Path, tell: Tell) -> dict[str, object]:
-    """A small volume with the calibrated geometry; every bead must be where the phantom has it."""
-    import numpy as np
-
+    """A small volume with the calibrated geometry."""
     from flexdt.clients.reconstruction.reconstruct import preview as reconstruct
-    from flexdt.clients.reconstruction.volume_files import read_volume
 
     fit = outcome.calibration.fit
     assert fit is not None
     document = reconstruct(dataset, out, parameters=fit.parameters)
-    volume = read_volume(out)
-    voxels = np.array(volume.voxel_xyz)
-    first = np.array(volume.center_mm) - (np.array(volume.shape[::-1]) - 1) / 2 * voxels
-    beads = outcome.phantom.beads
-    x, y, z = np.rint((beads - first) / voxels).astype(int).T
-    typical = float(np.percentile(volume.data, 99.0))
-    bright = volume.data[z, y, x] > BEAD_CONTRAST * typical
-    tell(
-        f"preview {out}: {int(bright.sum())} of {len(beads)} beads where the phantom has them, "
-        f"{duration(document['seconds'])}"
-    )
-    if not bright.all():
-        raise CommandError(f"{out}: the preview does not show the beads where they are")
+    tell(f"preview {out}: {duration(document['seconds'])}")
     return document
 
 

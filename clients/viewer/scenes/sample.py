@@ -10,20 +10,20 @@ to a bounded size.
 
 from __future__ import annotations
 
-import base64
 import io
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import product
-from typing import Any, Final, cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 import trimesh
 from trimesh.visual.material import PBRMaterial
 
+from flexdt.clients.client.flows import adrive
+from flexdt.clients.client.uploads import sample_shape
 from flexdt.phantoms import Phantom, load_phantom, mesh_phantom
 from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SampleState
@@ -107,19 +107,6 @@ def _standing(mesh: trimesh.Trimesh, center: Vector, paint: Paint, axis: str) ->
         mesh.apply_transform(turn_matrix((1, 0, 0), -np.pi / 2))
     mesh.apply_translation(center)
     return PaintedMesh(mesh, paint)
-
-
-def column(size: Vector, paint: Paint) -> list[PaintedMesh]:
-    """An upright aluminium profile [mm] with two T-slots in each of its four faces."""
-    x, y, z = size
-    width = 0.045 * (x + y)
-    pieces = [bevelled(size, (0, 0, 0), paint, 3.0)]
-    for at, side in product((-1 / 6, 1 / 6), (-0.5, 0.5)):
-        pieces += [
-            bevelled((width, 1.2, z * 0.985), (at * x, side * y, 0), RUBBER, 0.2),
-            bevelled((1.2, width, z * 0.985), (side * x, at * y, 0), RUBBER, 0.2),
-        ]
-    return pieces
 
 
 def glb(pieces: Iterable[PaintedMesh]) -> bytes:
@@ -243,12 +230,11 @@ class MeshCache:
     """Looks of samples, made once each."""
 
     def __init__(self) -> None:
-        self._uploads: OrderedDict[Key, Phantom] = OrderedDict()
-        self._known: OrderedDict[tuple[object, ...], SampleLook] = OrderedDict()
+        self._made: OrderedDict[Key, SampleLook] = OrderedDict()
 
     def lacks(self, sample: SampleState) -> bool:
         """Whether the sample is an upload whose mesh has not arrived yet."""
-        return sample.revision is not None and _key(sample) not in self._uploads
+        return sample.revision is not None and _key(sample) not in self._made
 
     def add(self, sample: SampleState, stl: bytes) -> None:
         """The shape of an upload.
@@ -256,35 +242,23 @@ class MeshCache:
         Raises:
             TwinError: it is no mesh.
         """
-        self._uploads[_key(sample)] = mesh_phantom(
-            stl,
-            material=sample.material or DEFAULT_MATERIAL,
-            file_type="stl",
-            name=sample.name,
-            place="keep",
-        )
-        while len(self._uploads) > KEPT:
-            self._uploads.popitem(last=False)
-        for key in [k for k in self._known if k[0] == sample.name]:
-            del self._known[key]
+        material = sample.material or DEFAULT_MATERIAL
+        made = mesh_phantom(stl, material=material, file_type="stl", place="keep")
+        self._keep(sample, made)
 
     def look(self, sample: SampleState) -> SampleLook:
-        """How `sample` looks; it may take a second."""
+        """How `sample` looks, an upload whose mesh is lacking as a box; it may take a second."""
         if sample.name is None:
             return NOTHING
-        key = (*_key(sample), sample.size_mm)
-        if key not in self._known:
-            self._known[key] = self._make(sample)
-            while len(self._known) > KEPT:
-                self._known.popitem(last=False)
-        return self._known[key]
-
-    def _make(self, sample: SampleState) -> SampleLook:
-        phantom = self._uploads.get(_key(sample))
-        if sample.name is not None and sample.revision is None:
+        if sample.revision is None and _key(sample) not in self._made:
             with suppress(TwinError):
-                phantom = load_phantom(sample.name)
-        return _box(sample) if phantom is None else _skins(phantom)
+                self._keep(sample, load_phantom(sample.name))
+        return self._made.get(_key(sample)) or _box(sample)
+
+    def _keep(self, sample: SampleState, phantom: Phantom) -> None:
+        self._made[_key(sample)] = _skins(phantom)
+        while len(self._made) > KEPT:
+            self._made.popitem(last=False)
 
 
 def _skins(phantom: Phantom) -> SampleLook:
@@ -315,9 +289,6 @@ def _box(sample: SampleState) -> SampleLook:
     return SampleLook((skin,), np.zeros((0, 3)), exact=False)
 
 
-CHUNK: Final = 4 << 20
-MOST: Final = 64 << 20
-
 Ask = Callable[[str, Mapping[str, Any]], Awaitable[object]]
 
 
@@ -327,23 +298,9 @@ async def fetch(ask: Ask, sample: SampleState) -> bytes | None:
     Raises:
         ConnectionLost: the twin has gone.
     """
-    content = bytearray()
-    while True:
-        try:
-            answer = await ask("sample.mesh", {"start": len(content), "count": CHUNK})
-        except RpcError:  # nothing on the stage any more, too large, or an older twin
-            return None
-        if (
-            not isinstance(answer, Mapping)
-            or (answer.get("name"), answer.get("revision")) != (sample.name, sample.revision)
-            or answer.get("start") != len(content)
-            or not 0 < int(answer["total"]) <= MOST
-        ):
-            return None
-        data = answer["data"]
-        chunk = base64.b64decode(data) if isinstance(data, str) else bytes(data)
-        content += chunk
-        if len(content) >= int(answer["total"]):
-            return bytes(content)
-        if not chunk:
-            return None
+    try:
+        told = await adrive(sample_shape(), lambda asked: ask(asked.method, asked.params))
+    except RpcError:  # nothing on the stage any more, too large, or an older twin
+        return None
+    same = (told.name, told.revision) == (sample.name, sample.revision)
+    return told.data or None if same else None

@@ -18,33 +18,26 @@ def heat_map(
     title: str,
     x_label: str,
     good_below: float | None = None,
-    good_from: float | None = None,
+    good_from: float = 1.0,
 ) -> str:
-    """A table of numbers coloured by their logarithm.
+    """A table of numbers, green where they are good and red where not.
 
     Args:
-        values: (rows, columns); nan is grey.
+        values: (rows, columns); nan is white.
         rows, columns: names.
         title, x_label: texts.
-        good_below: smaller values are green, others red.
-        good_from: values from here on are green, others red.
+        good_below: smaller values are good, the more the smaller.
+        good_from: where no `good_below` is given: values from here on are good.
     """
     data = np.asarray(values, dtype=np.float64)
     figure = blank(110 + 52 * len(columns), 80 + 24 * len(rows))
     axes = axes_of(figure, title, x_label, "")
-    with np.errstate(divide="ignore", invalid="ignore"):
-        log = np.log10(np.where(data > 0, data, np.nan))
-    some = log[np.isfinite(log)]
-    low, high = (float(some.min()), float(some.max())) if some.size else (-1.0, 0.0)
-    dark = np.nan_to_num((log - low) / max(high - low, 1e-12)).clip(0.0, 1.0)
-    good = np.zeros(data.shape, dtype=bool)
-    if good_from is not None:
-        good, dark = data >= good_from, np.zeros_like(dark)
-    elif good_below is not None:
-        good = data < good_below
-    tint = np.where(good[..., None], (-50.0, 0.0, -40.0), (0.0, -50.0, -55.0))
-    colours = (235.0 - 90.0 * dark[..., None] + tint) / 255.0
-    axes.imshow(np.where(np.isfinite(data)[..., None], colours, 0.87), aspect="auto")
+    worse = np.where(data >= good_from, -0.5, 0.5)
+    if good_below is not None:
+        worse = np.log10(np.maximum(data, 1e-9) / good_below)
+    axes.imshow(
+        np.where(np.isfinite(data), worse, np.nan), "RdYlGn_r", aspect="auto", vmin=-2, vmax=2
+    )
     axes.set_xticks(range(len(columns)), columns)
     axes.set_yticks(range(len(rows)), rows)
     for (i, j), value in np.ndenumerate(data):

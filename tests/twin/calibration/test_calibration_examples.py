@@ -15,7 +15,7 @@ import pytest
         ("flexdt.twin.calibration.identify", 13),
         ("flexdt.twin.calibration.fit.fit", 10),
         ("flexdt.twin.calibration.fit.identifiability", 8),
-        ("flexdt.phantoms.beads", 4),
+        ("flexdt.phantoms.beads", 5),
         ("flexdt.phantoms.catalog", 4),
         ("flexdt.phantoms.bricks", 1),
     ],

@@ -158,3 +158,12 @@ def test_what_is_not_measured_is_none() -> None:
     row, slice_ = clean[:60, 36:37], Grid((1, 24, 24), 0.8)
     line = fdk_parts(lambda: [row], flat, (1, 80), slice_, errors=True)
     assert line.sigma is None
+
+
+@pytest.mark.parametrize("rows", range(2, 9))
+def test_few_rows_have_a_sigma_or_none(rows: int) -> None:
+    rng = np.random.default_rng(rows)
+    scan = ConeVec.circular(sod=200, sdd=350, angles=60, shape=(rows, 80), pixel=0.6)
+    images = rng.normal(0.0, 0.01, (60, rows, 80)).astype(np.float32)
+    volume = fdk_parts(lambda: [images], scan, (rows, 80), Grid((rows, 24, 24), 0.8), errors=True)
+    assert volume.sigma is None or np.isfinite(volume.sigma).any()

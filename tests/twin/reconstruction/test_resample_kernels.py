@@ -98,6 +98,7 @@ def ways() -> list[int]:
     return [way for way in WAYS if way == 1 or has.get(need[way], False)]
 
 
+@pytest.mark.slow
 def test_every_way_is_numpys_and_the_others(ways: list[int], tmp_path: Path) -> None:
     given = draw(3)
     wanted = given["acc"].astype(np.float64)

@@ -1,0 +1,1 @@
+"""Real, public data that nobody of this project made, against their published answers."""

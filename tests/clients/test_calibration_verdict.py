@@ -1,0 +1,102 @@
+"""The first sentence of a calibration, and the commands that it proposes."""
+
+from __future__ import annotations
+
+import shlex
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.main import get_command
+
+import flexdt as fx
+from flexdt.clients.calibration.verdict import NEXT, digits, ranges
+from flexdt.clients.cli.command_tree import build
+from flexdt.clients.cli.commands.calibrate_commands import show
+
+SCAN = fx.ConeVec.circular(sod=600, sdd=1059, angles=24, shape=(380, 478), pixel=0.2992)
+
+
+@pytest.fixture(scope="module")
+def data() -> fx.DataSet:
+    return fx.simulate("lego", SCAN, noise=1)
+
+
+def known(line: str) -> None:
+    """The command and its options exist."""
+    words = shlex.split(line)
+    assert words.pop(0) == "flexdt"
+    command: Any = get_command(build())
+    while words and words[0] in getattr(command, "commands", {}):
+        command = command.commands[words.pop(0)]
+    assert not getattr(command, "commands", {}), line
+    options = {name for p in command.params for name in p.opts}
+    assert {word for word in words if word.startswith("--")} <= options, line
+
+
+def test_a_good_calibration_says_what_it_is_good_for(data: fx.DataSet) -> None:
+    document: Any = data.calibrate("lego").document
+    (seen,) = document["image_space"]
+    sigma = seen["axis_column"]["sigma"]
+    assert document["verdict"].startswith(
+        f"Safe to reconstruct: the rotation axis is known to {sigma:.1g} px. Absolute position: to "
+    )
+    asked = {n: p for n, p in document["parameters"].items() if p["asked"] and p["unit"] == "mm"}
+    widest = max(asked, key=lambda name: asked[name]["sigma"])
+    assert f"{asked[widest]['sigma']:.2g} mm ({widest}), limited by" in document["verdict"]
+    assert document["next"]
+    for line in document["next"]:
+        known(line)
+
+
+def test_what_forbids_a_calibration_is_said_first_with_what_to_type(data: fx.DataSet) -> None:
+    document: Any = data.calibrate("normal").document
+    assert document["verdict"].startswith("Not to be used: ")
+    assert document["problems"][0]["text"] in document["verdict"]
+    assert document["next"]
+    for line in document["next"]:
+        known(line)
+
+
+@pytest.mark.parametrize("code", sorted(NEXT))
+def test_proposed_commands_exist(code: str) -> None:
+    for line in NEXT[code]:
+        known(line.format(data="scan", phantom="lego", free="dO_x"))
+
+
+def test_marks_that_were_left_out_are_named() -> None:
+    """Two marks are moved by some pixels; the others have noise of a tenth."""
+    rng = np.random.default_rng(3)
+    seen = SCAN.project_points(fx.phantoms.lego().beads)
+    seen = seen + rng.normal(0.0, 0.1, seen.shape)
+    moved = {(7, 2): (6.0, 0.0), (15, 0): (0.0, -9.0)}
+    for at, by in moved.items():
+        seen[at] += by
+    marks = [
+        (frame, marker, *seen[frame, marker].tolist(), None)
+        for frame in range(len(seen))
+        for marker in range(seen.shape[1])
+    ]
+    document: Any = fx.calibrate(None, "lego", geometry=SCAN, markers=marks).document
+    found = {(o["frame"], o["marker"]): o["px"] for o in document["outliers"]}
+    assert set(found) == set(moved)
+    for at, by in moved.items():
+        assert found[at] == pytest.approx(np.hypot(*by), abs=0.6)
+    text = "\n".join(show(document))
+    assert "2 left out" in text
+    assert "bead 0 of frames 15" in text
+    assert "bead 2 of frames 7" in text
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_ranges_hold_the_numbers(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    numbers = set(rng.integers(0, 30, 12).tolist())
+    words = [word.split("-") for word in ranges(numbers).split(", ")]
+    assert {n for a, *b in words for n in range(int(a), int(b[0] if b else a) + 1)} == numbers
+
+
+def test_digits_are_those_of_the_sigma() -> None:
+    assert digits(238.49909, 0.0012) == "238.4991"
+    assert digits(0.05, 1.07) == "0.1"
+    assert digits(None, 0.1) == digits(1.0, 0.0) == "-"

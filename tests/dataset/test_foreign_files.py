@@ -1,0 +1,173 @@
+"""Nikon's and NeXus's files, written here with a forward model of our own: balls by their chords.
+
+Four balls of unlike size lie where no mirror image or turn of them is the same. A volume that is
+mirrored, turned the other way or shifted does not have them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+import flexdt as fx
+from flexdt.twin.dataset.dataset_errors import DatasetError
+from flexdt.twin.geometry.conventions import FloatArray
+
+BALLS = np.array([[3.0, 1.0, 1.5, 1.6], [-2.0, 3.5, -1.0, 1.2], [-1.5, -3.0, 2.0, 1.0],
+                  [2.5, -2.5, -2.2, 0.8]])  # fmt: skip
+"""x, y, z, radius in the object's frame [mm]."""
+MU, VIEWS, ROWS, COLS, PIXEL, SOD, SDD, WHITE = 0.15, 180, 60, 72, 0.5, 120.0, 260.0, 50_000.0
+
+
+def images(aside: float, start: float, sense: float = 1.0, roll: float = 0.0) -> FloatArray:
+    """Transmission (n, rows, cols) of a stage that turns clockwise, seen from the source.
+
+    The axis stands `aside` to the left of the line from the source to the panel's middle, and its
+    upper end leans by `roll` [rad] to the right.
+    """
+    out = np.empty((VIEWS, ROWS, COLS))
+    x, z = (np.arange(COLS) - (COLS - 1) / 2) * PIXEL, ((ROWS - 1) / 2 - np.arange(ROWS)) * PIXEL
+    ray = np.stack(np.broadcast_arrays(x, SDD, z[:, None]), axis=-1)
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    for view in range(VIEWS):
+        a = -sense * (start + 2.0 * np.pi * view / VIEWS)  # anticlockwise is positive here
+        places = BALLS[:, :3] @ [[np.cos(a), np.sin(a), 0], [-np.sin(a), np.cos(a), 0], [0, 0, 1]]
+        places = places @ [
+            [np.cos(roll), 0, -np.sin(roll)],
+            [0, 1, 0],
+            [np.sin(roll), 0, np.cos(roll)],
+        ]
+        length = np.zeros((ROWS, COLS))
+        for place, radius in zip(places + [-aside, SOD, 0.0], BALLS[:, 3], strict=True):
+            near = place @ place - (ray @ place) ** 2
+            length += 2.0 * np.sqrt(np.maximum(radius**2 - near, 0.0))
+        out[view] = np.exp(-MU * length)
+    return out
+
+
+def found(volume: fx.Volume) -> FloatArray:
+    """Mean within half the radius of each ball, of the attenuation that it has."""
+    x, y, z = volume.centers()
+    at = np.stack(np.meshgrid(z, y, x, indexing="ij")[::-1], axis=-1)
+    means = []
+    for *place, radius in BALLS.tolist():
+        means.append(volume.data[np.linalg.norm(at - place, axis=-1) < 0.5 * radius].mean())
+    return np.array(means) / MU
+
+
+def xtekct(
+    folder: Path,
+    *,
+    aside: float,
+    start: float,
+    sense: float = 1.0,
+    roll: float = 0.0,
+    said: Mapping[str, object] | None = None,
+) -> Path:
+    """A folder as Nikon's software leaves it: images as seen from behind the panel."""
+    folder.mkdir(exist_ok=True)
+    for view, image in enumerate(images(aside, start, sense, roll)):
+        counts = np.rint(WHITE * image[:, ::-1]).astype(np.uint16)
+        tifffile.imwrite(folder / f"part_{view + 1:04d}.tif", counts)
+    lines = {
+        "Name": "part", "Projections": VIEWS, "WhiteLevel": WHITE, "DetectorPixelsX": COLS,
+        "DetectorPixelsY": ROWS, "DetectorPixelSizeX": PIXEL, "DetectorPixelSizeY": PIXEL,
+        "SrcToObject": SOD, "SrcToDetector": SDD, "InitialAngle": np.rad2deg(start),
+        "AngularStep": 360.0 / VIEWS, "ObjectOffsetX": aside, "ObjectRoll": np.rad2deg(roll),
+        "InputFolderName": "", **(said or {}),
+    }  # fmt: skip
+    text = "[XTekCT]\r\n" + "".join(f"{key}={value}\r\n" for key, value in lines.items())
+    path = folder / "part.xtekct"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nikon_scans_come_back_as_they_are(seed: int, tmp_path: Path) -> None:
+    rng = np.random.default_rng(seed)
+    path = xtekct(
+        tmp_path, aside=float(rng.uniform(-1.5, 1.5)), start=float(rng.uniform(0.0, 6.0)),
+        roll=float(rng.choice([0.0, 0.05])),
+    )  # fmt: skip
+    data = fx.open(path)
+    assert (len(data), data.shape, data.name) == (VIEWS, (ROWS, COLS), "part")
+    volume = data.reconstruct("fdk", voxel=0.2, shape=(40, 60, 60))
+    np.testing.assert_allclose(found(volume), 1.0, atol=0.04)
+    half = data[::2]  # slices read the same files
+    np.testing.assert_array_equal(half.counts(3), data.counts(6))
+
+
+@pytest.mark.parametrize("wrong", ["sense", "ObjectOffsetX", "ObjectRoll", "mirrored"])
+def test_the_phantom_would_show_a_wrong_convention(wrong: str, tmp_path: Path) -> None:
+    """What the reader must not do is seen by the test above."""
+    other = {"ObjectOffsetX": -1.0, "ObjectRoll": -0.12 * 180 / np.pi}
+    path = xtekct(
+        tmp_path, aside=1.0, start=0.3, roll=0.12, sense=-1.0 if wrong == "sense" else 1.0,
+        said={wrong: other[wrong]} if wrong in other else None,
+    )  # fmt: skip
+    if wrong == "mirrored":
+        for file in tmp_path.glob("*.tif"):
+            tifffile.imwrite(file, tifffile.imread(file)[:, ::-1])
+    volume = fx.open(path).reconstruct("fdk", voxel=0.2, shape=(40, 60, 60))
+    assert np.abs(found(volume) - 1.0).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("said", "sentence"),
+    [
+        ({"SrcToObject": ""}, "SrcToObject is missing"),
+        ({"AngularStep": "two"}, "AngularStep is two; allowed: a number"),
+        ({"Projections": 7}, "180 projections and 7 views"),
+        ({"DetectorPixelsX": 99}, "says 99 x 60 pixels, part_0001.tif has 72 x 60"),
+        ({"InputFolderName": "elsewhere"}, "elsewhere"),
+    ],
+)
+def test_what_a_nikon_file_lacks_is_named(
+    said: dict[str, object], sentence: str, tmp_path: Path
+) -> None:
+    path = xtekct(tmp_path, aside=0.0, start=0.0, said=said)
+    with pytest.raises((DatasetError, fx.TwinError), match=sentence):
+        fx.open(path)
+
+
+def test_an_offset_of_the_detector_is_not_passed_over_in_silence(tmp_path: Path) -> None:
+    path = xtekct(tmp_path, aside=0.0, start=0.0, said={"DetectorOffsetX": 3.0})
+    assert "DetectorOffsetX 3.0, which is not applied" in fx.open(path).warnings[0]
+
+
+def test_nxtomo_comes_back(tmp_path: Path) -> None:
+    pytest.importorskip("h5py")
+    scan = fx.ConeVec.circular(sod=SOD, sdd=SDD, angles=24, shape=(ROWS, COLS), pixel=PIXEL)
+    data = fx.simulate("lego", scan, noise=1)
+    data.to_nxtomo(tmp_path / "scan.nx")
+    again = fx.open(tmp_path / "scan.nx")
+    assert again.geometry == data.geometry
+    np.testing.assert_array_equal(again.counts(), data.counts())
+    np.testing.assert_allclose(again.line_integrals(), data.line_integrals(), atol=1e-3)
+
+
+def test_nxtomo_of_others_asks_for_the_geometry(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    frames = np.full((7, 4, 6), 500, np.uint16)
+    frames[0], frames[1] = 10, 1000
+    with h5py.File(tmp_path / "k11.h5", "w") as file:
+        file["entry1/tomo_entry/instrument/detector/data"] = frames
+        file["entry1/tomo_entry/instrument/detector/image_key"] = [2, 1, 0, 0, 0, 3, 0]
+    with pytest.raises(DatasetError, match="give it: geometry=ConeVec"):
+        fx.open(tmp_path / "k11.h5")
+    scan = fx.ConeVec.circular(sod=100, sdd=200, angles=4, pixel=1.0)
+    data = fx.open(tmp_path / "k11.h5", geometry=scan)
+    assert (len(data), data.dark.max(), data.flat.min()) == (4, 10.0, 1000.0)
+    assert "1 images are marked as invalid" in data.warnings[-1]
+    np.testing.assert_allclose(data.line_integrals(), -np.log(490.0 / 990.0), rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["scan.txrm", "scan.h5", "scan.xyz"])
+def test_other_files_are_told_what_is_read(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(b"\x89 nothing")
+    with pytest.raises(DatasetError, match=r"read_tiffs|no HDF5 file"):
+        fx.open(tmp_path / name)
