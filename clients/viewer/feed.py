@@ -87,7 +87,7 @@ def base64_grey(pixels: npt.NDArray[np.generic], window: tuple[float, float]) ->
 def _byte(pixels: npt.NDArray[np.generic], window: tuple[float, float]) -> npt.NDArray[np.uint8]:
     low, high = window
     scaled = (np.asarray(pixels, dtype=np.float32) - low) * (255.0 / (high - low))
-    return np.asarray(np.clip(scaled, 0.0, 255.0), dtype=np.uint8)
+    return np.asarray(np.nan_to_num(np.clip(scaled, 0.0, 255.0)), dtype=np.uint8)
 
 
 def halved(pixels: npt.NDArray[np.generic]) -> Float32Array:

@@ -1,13 +1,13 @@
 """A volume that grows while its scan runs: FDK of the images so far, in a process of its own.
 
-`python -m flexdt.clients.viewer.live_volume FOLDER SIDE [past]` follows a data set's folder and prints a
+`python -m flexdt.clients.viewer.live_volume FOLDER SIDE [past]` follows a data set and prints a
 line of JSON whenever its slices have changed: views so far and of how many, the three middle slices
 as 8-bit grey, and points on the surface of what is dense, for the scenes. The geometry of all
 images is written when a scan begins, so each view has its final weight at once, and the values of a
 grown volume are those of the finished one.
 
-With `past` it is the volume of `flexdt reconstruct` from the images that are there, whose slices are
-then read by number.
+With `past` it is the volume of `flexdt reconstruct` from the images that are there, whose slices
+are then read by number.
 
 The process has a low priority and one thread, and ends with its viewer: neither twin nor viewer
 waits for it.
@@ -114,7 +114,7 @@ def grow(folder: Path, side: int, tell: Tell, alive: Callable[[], bool] = lambda
 
 
 def reconstruct(folder: Path, side: int, tell: Tell) -> Callable[[str, int], dict[str, Any]]:
-    """The volume of a past scan, as `flexdt reconstruct` makes it of images of about `side` columns.
+    """The volume of a past scan, as `flexdt reconstruct` makes it of binned images.
 
     Args:
         folder: of the data set.
@@ -167,7 +167,8 @@ def slices(grown: Float32Array) -> dict[str, Any]:
         name: _slice(grown, name, n // 2) for name, n in zip(SIDES, (nz, ny, nx), strict=True)
     }
     every = np.concatenate([part.reshape(-1) for part in middle.values()])
-    low, high = (float(v) for v in np.percentile(every, (1.0, 99.8)))
+    known = every[np.isfinite(every)]  # what no view has seen is no number
+    low, high = (float(v) for v in np.percentile(known, (1.0, 99.8))) if known.size else (0.0, 0.0)
     high = max(high, low + 1e-9)
     return {
         "low": low,
@@ -228,7 +229,8 @@ class LiveReconstruction:
     """
 
     def __init__(self, tell: Callable[[str], None]) -> None:
-        self._tell, self._asked, self.newest = tell, ("",), ""
+        self._tell, self.newest = tell, ""
+        self._asked: tuple[str, ...] = ()
         self._task: asyncio.Task[None] | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._wanted: deque[asyncio.Future[dict[str, Any]]] = deque()
@@ -248,7 +250,12 @@ class LiveReconstruction:
         """End what is under way."""
         if self._task is not None:
             self._task.cancel()
-        self._task, self._asked, self.newest, self._writer = None, ("",), "", None
+        self._task, self._asked, self.newest = None, (), ""
+        self._hang_up()
+
+    def _hang_up(self) -> None:
+        """Nobody answers any more who has been asked for a slice."""
+        self._writer = None
         while self._wanted:
             self._wanted.popleft().cancel()
 
@@ -281,6 +288,7 @@ class LiveReconstruction:
                 else:
                     self.newest = line.decode()
                     self._tell(self.newest)
+            self._hang_up()
             await process.wait()  # to kill what has just ended would take its code from the loop
         finally:
             if process.returncode is None:
@@ -309,7 +317,8 @@ def main(folder: str, side: str, past: str = "") -> None:
         known = isinstance(error, (TwinError, OSError, ValueError))
         problem = str(error) if known else f"{type(error).__name__}: {error}"
         with suppress(OSError):
-            say({"type": "volume", "name": Path(folder).name, "problem": problem})
+            name = Path(folder).name
+            say({"type": "volume", "name": name, "past": bool(past), "problem": problem})
 
 
 if __name__ == "__main__":

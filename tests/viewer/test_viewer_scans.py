@@ -408,9 +408,9 @@ def test_corrections_are_shown_with_units_and_digits_that_say_something(
     page.locator("#in-force", has_text="angle_scale").wait_for()
     rows = [r.split("\t") for r in page.locator("#in-force tr").all_inner_texts()]
     assert {name: (value, unit) for name, value, _, unit in rows} == {
-        "dO_x": ("0.412", "mm"),
-        "alpha": ("0.0000321", "°"),
-        "angle_scale": ("1.000125", ""),
+        "axis sideways dO_x": ("0.412", "mm"),
+        "start angle alpha": ("0.0000321", "°"),
+        "scale of angles angle_scale": ("1.000125", ""),
     }
     page.click("#revert")
     page.locator(".note.good", has_text="nominal geometry").wait_for()

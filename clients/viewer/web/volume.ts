@@ -53,7 +53,8 @@ on("volume", (m) => {
   setText(note, `${other}${m.views} of ${m.of} views · voxels of ${fixed(1000 * m.voxel_mm, 0)} µm · ${fixed(m.low, 4)} to ${fixed(m.high, 4)} per mm${m.binning ? ` · flexdt reconstruct --binning ${m.binning}` : ""}`);
   for (const side of SIDES) {
     const slider = $input(`#at-${side}`), count = m.size?.[side] ?? 0;
-    putImage($canvas(`#slice-${side}`), m.slices[side]);
+    const grey = m.slices[side];
+    if (grey) putImage($canvas(`#slice-${side}`), grey);
     slider.hidden = !count; slider.max = String(count - 1); slider.value = String(Math.floor(count / 2));
     where(side);
   }
@@ -80,6 +81,6 @@ for (const side of SIDES) {
   slider.addEventListener("input", () => void turn(side));
   $(`#slice-${side}`).addEventListener("wheel", (e) => {
     if (slider.hidden) return;
-    e.preventDefault(); slider.value = String(Number(slider.value) + Math.sign((e as WheelEvent).deltaY)); void turn(side);
+    e.preventDefault(); slider.value = String(Number(slider.value) + Math.sign(e.deltaY)); void turn(side);
   }, { passive: false });
 }
