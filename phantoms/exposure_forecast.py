@@ -23,7 +23,7 @@ from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.camera import CameraSettings, Roi
-from flexdt.twin.machine.description import Machine, builtin_machine
+from flexdt.twin.machine.description import Machine, Profile, builtin_machine, profile_of
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.physics.chain import Chain, flux_of
 from flexdt.twin.physics.detector import detector_of
@@ -34,7 +34,9 @@ from flexdt.twin.physics.spectrum import Filter, tube_of, voltages
 from flexdt.twin.projection import project_body
 from flexdt.twin.projection.analytic_solids import Vector
 from flexdt.twin.scanner.settings import CameraChange, changed_camera
-from flexdt.twin.script.planning.plan import ScanPlan
+from flexdt.twin.script.compose import Kind, ScanRequest, compose_script
+from flexdt.twin.script.planning.plan import ScanPlan, StartState
+from flexdt.twin.script.planning.planner import plan_script
 from flexdt.twin.script.problems import ScriptProblem
 from flexdt.twin.signatures import public
 
@@ -112,8 +114,8 @@ class Forecast:
         asked: the setting asked for.
         best: settings of the same power and time, the greatest `cnr` first.
         images: of the scan.
-        seconds: that the images take at least.
-        bytes: that they take on disk.
+        seconds: that the images take at least; of a kind of scan, all of its script.
+        bytes: that they take on disk; of a kind of scan, with its dark and flat images.
         assumed: what is not known and was assumed.
     """
 
@@ -149,12 +151,15 @@ def expose(
     mode: str | None = None,
     roi: Roi | None = None,
     images: int = 361,
+    kind: Kind | None = None,
     sod: float = 600.0,
     sdd: float = 1059.0,
     detail: str = f"{VOID}:0.5",
     machine: Machine | str = "flexray",
     material: str | None = None,
     voxel_mm: float | Vector | None = None,
+    profile: Profile | None = None,
+    start: StartState | None = None,
 ) -> Forecast:
     """Predict transmission, contrast to noise, dose, time and size of a circular scan.
 
@@ -168,11 +173,15 @@ def expose(
         averages: read-outs averaged into an image.
         mode, roi: camera mode and region of interest; default: the machine's.
         images: of the scan.
+        kind: of a scan to compose for the machine, whose time, bytes and dose are then the whole
+            script's, as `flexdt.check` has them; None counts `images` exposures and nothing else.
         sod, sdd: distances [mm].
         detail: MATERIAL:MM, a detail of so much of that material on the darkest ray, or void:MM,
             so much less of what this ray meets most of.
         machine: a machine (see `flexdt.machine`) or the name of one that ships.
         material, voxel_mm: of a mesh or an array, as for `flexdt.simulate`.
+        profile, start: zero offsets and the scanner before a scan of `kind`; default: the
+            machine's.
 
     Returns:
         The forecast. It is as good as the panel's figures, most of which are assumed, and knows no
@@ -227,6 +236,17 @@ def expose(
         sod=sod, sdd=sdd, angles=VIEWS, shape=camera.shape, pixel=camera.pixel_mm(spec.pixels)
     )
     lit = ExposureSettings(tried[0], power, camera.exposure_ms, averages)
+    rows, cols = camera.shape
+    total, seconds = images * 2 * rows * cols, images * averages * camera.exposure_ms / 1e3
+    if kind is not None:
+        request = ScanRequest(
+            kind, sod, sdd, images, camera.exposure_ms, averages, mode=camera.mode, roi=camera.roi,
+            kV=lit.kV, power_W=power,
+        )  # fmt: skip
+        offsets = profile or profile_of(scanner)
+        text = compose_script(request, scanner, offsets)
+        plan = plan_script(text, scanner, offsets, start=start)
+        images, seconds, total = plan.frames, plan.duration_s, plan.bytes
     panel, tube = detector_of(spec), tube_of(scanner.tube)
 
     def chain(layer: str) -> Chain:
@@ -262,7 +282,6 @@ def expose(
     kVs = tried if len(tried) > 1 else np.arange(10.0 * math.ceil(low / 10), high + 1, 10.0)
     found = [setting(layer, split(layer, float(one))) for layer in FILTERS for one in kVs]
     best = [s for s in found if spec.min_exposure_ms <= s.exposure_ms <= spec.max_exposure_ms]
-    rows, cols = camera.shape
     return Forecast(
         Transmission.of(through),
         saturated,
@@ -271,8 +290,8 @@ def expose(
         setting(filter, lit),
         tuple(sorted(best, key=lambda one: -one.cnr)),
         images,
-        images * averages * lit.exposure_ms / 1e3,
-        images * 2 * rows * cols,
+        seconds,
+        total,
         tuple(dict.fromkeys(part.assumed for part in parts if part.assumed)),
     )
 

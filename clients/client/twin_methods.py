@@ -447,6 +447,7 @@ def predict_exposure(
     mode: str | None = None,
     roi: tuple[int, int, int, int] | None = None,
     frames: int = 361,
+    kind: str | None = None,
     sod_mm: float | None = None,
     sdd_mm: float | None = None,
     detail: str = "void:0.5",
@@ -458,6 +459,7 @@ def predict_exposure(
         kV, power_W, exposure_ms, averages, mode, roi: default: as they are set.
         filter: MATERIAL:MM beside the machine's own.
         frames: of the scan.
+        kind: of a scan to compose, whose time and bytes are told; default: those of the images.
         sod_mm, sdd_mm: distances; default: the present ones.
         detail: MATERIAL:MM or void:MM on the darkest ray, whose contrast is told.
 
@@ -470,8 +472,8 @@ def predict_exposure(
         (True, 60.0)
     """
     return ask(
-        images.EXPOSURE_PREDICT, sample=sample, kV=kV, power_W=power_W,
-        filter=filter, exposure_ms=exposure_ms, averages=averages, frames=frames, detail=detail,
+        images.EXPOSURE_PREDICT, sample=sample, kV=kV, power_W=power_W, filter=filter,
+        exposure_ms=exposure_ms, averages=averages, frames=frames, kind=kind, detail=detail,
         mode=mode, roi=None if roi is None else list(roi), sod_mm=sod_mm, sdd_mm=sdd_mm,
     )  # fmt: skip
 

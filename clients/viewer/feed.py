@@ -30,6 +30,8 @@ from flexdt.runtime.log import log
 from flexdt.twin.geometry.conventions import Float32Array
 
 MAGIC = b"FXI2"
+AIR: Final = 0.05
+"""Line integral below which a pixel counts as air."""
 TOP = 65535
 JPEG_QUALITY = 85
 """Of images in motion; 20 to 50 kB each."""
@@ -60,13 +62,15 @@ class ShownImage:
 
 
 def window_of(image: ShownImage) -> tuple[float, float]:
-    """A window [low, high] in which everything of the image can be seen."""
+    """A window [low, high] of all but the densest 2 % of what is not air: beads do not set it."""
     pixels = np.asarray(image.pixels[::4, ::4], dtype=np.float32)
     if pixels.size == 0:
         return 0.0, 1.0
     low, high = (float(v) for v in np.percentile(pixels, (0.2, 99.8)))
     if image.kind == "line_integral":
         low = min(low, 0.0)
+        if (matter := pixels[pixels > AIR]).size:
+            high = float(np.percentile(matter, 98.0))
     return (low, high) if high - low > 1e-6 else (low, low + 1.0)
 
 
@@ -83,7 +87,7 @@ def base64_grey(pixels: npt.NDArray[np.generic], window: tuple[float, float]) ->
 def _byte(pixels: npt.NDArray[np.generic], window: tuple[float, float]) -> npt.NDArray[np.uint8]:
     low, high = window
     scaled = (np.asarray(pixels, dtype=np.float32) - low) * (255.0 / (high - low))
-    return np.asarray(np.clip(scaled, 0.0, 255.0), dtype=np.uint8)
+    return np.asarray(np.nan_to_num(np.clip(scaled, 0.0, 255.0)), dtype=np.uint8)
 
 
 def halved(pixels: npt.NDArray[np.generic]) -> Float32Array:

@@ -1,10 +1,13 @@
 """A volume that grows while its scan runs: FDK of the images so far, in a process of its own.
 
-`python -m flexdt.clients.viewer.live_volume FOLDER SIDE` follows a data set's folder and prints a
+`python -m flexdt.clients.viewer.live_volume FOLDER SIDE [past]` follows a data set and prints a
 line of JSON whenever its slices have changed: views so far and of how many, the three middle slices
 as 8-bit grey, and points on the surface of what is dense, for the scenes. The geometry of all
 images is written when a scan begins, so each view has its final weight at once, and the values of a
 grown volume are those of the finished one.
+
+With `past` it is the volume of `flexdt reconstruct` from the images that are there, whose slices
+are then read by number.
 
 The process has a low priority and one thread, and ends with its viewer: neither twin nor viewer
 waits for it.
@@ -18,6 +21,7 @@ import json
 import os
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -46,6 +50,7 @@ COARSE: Final = 64
 """Cells along the longest side of the grid on which the surface is looked for."""
 MOST_POINTS: Final = 12_000
 LINE_BYTES: Final = 4 << 20
+SIDES: Final = ("top", "front", "side")
 NICENESS: Final = 10
 
 Tell = Callable[[dict[str, Any]], None]
@@ -100,7 +105,7 @@ def grow(folder: Path, side: int, tell: Tell, alive: Callable[[], bool] = lambda
                 "name": folder.name,
                 "side": side,
                 "voxel_mm": voxel_mm,
-                **slices(target),
+                **slices(target.volume()),
                 "surface": surface(target.volume(), like.voxel_mm, like.center_mm),
             }
         )
@@ -108,21 +113,62 @@ def grow(folder: Path, side: int, tell: Tell, alive: Callable[[], bool] = lambda
     fdk_parts(parts, cone_vec, shape, like, progress=progress, target=target)
 
 
-def slices(target: OnProcessor) -> dict[str, Any]:
-    """The three middle slices of what has been added up, and the values that are black and white.
+def reconstruct(folder: Path, side: int, tell: Tell) -> Callable[[str, int], dict[str, Any]]:
+    """The volume of a past scan, as `flexdt reconstruct` makes it of binned images.
 
-    As they are seen from above (+x to the right, +y up), from the source (+x to the right, +z up)
-    and from +x, as the view from the side (+y to the right, +z up).
+    Args:
+        folder: of the data set.
+        side: columns to which images are binned.
+        tell: called with the progress, and with the middle slices in the end.
+
+    Returns:
+        A slice by the name of its side and its number from below, the source or the left.
+
+    Raises:
+        TwinError: as `reconstruct_volume`.
     """
-    grown = target.volume()  # (y, x, z)
+    from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_volume
+
+    data = load_dataset(folder)
+    binning, about = max(1, data.shape[1] // side), {"name": folder.name, "side": side}
+    steps: dict[str, Any] = {"type": "volume", **about, "past": True}
+    request = VolumeRequest(binning=binning)
+    volume = reconstruct_volume(data, request, progress=lambda a, b: tell(steps | {"done": a / b}))
+    grown = volume.data.transpose(1, 2, 0)
+    found = slices(grown)
+    size, voxel_mm = (
+        dict(zip(SIDES, np.roll(grown.shape, 1).tolist(), strict=True)),
+        volume.voxel_xyz,
+    )
+    shown = {"size": size, "voxel_mm": voxel_mm[0], "binning": binning, **found}
+    tell(steps | {"done": 1.0, "views": len(data.present), "of": len(data)} | shown)
+
+    def cut(name: str, index: int) -> dict[str, Any]:
+        part = _slice(grown, name, min(index, size[name] - 1))
+        data = base64_grey(part, (found["low"], found["high"]))
+        return {"shape": list(part.shape), "data": data}
+
+    return cut
+
+
+def _slice(grown: Float32Array, name: str, k: int) -> Float32Array:
+    """Slice `k` of a volume (y, x, z) as it is seen from above (+x to the right, +y up), from the
+    source (+x to the right, +z up) or from +x, as the view from the side (+y to the right, +z up).
+    """
+    if name == "top":
+        return grown[::-1, :, k]
+    return (grown[k] if name == "front" else grown[:, k]).T[::-1]
+
+
+def slices(grown: Float32Array) -> dict[str, Any]:
+    """The three middle slices of a volume (y, x, z), and the values that are black and white."""
     ny, nx, nz = grown.shape
     middle = {
-        "top": grown[::-1, :, nz // 2],
-        "front": grown[ny // 2].T[::-1],
-        "side": grown[:, nx // 2].T[::-1],
+        name: _slice(grown, name, n // 2) for name, n in zip(SIDES, (nz, ny, nx), strict=True)
     }
     every = np.concatenate([part.reshape(-1) for part in middle.values()])
-    low, high = (float(v) for v in np.percentile(every, (1.0, 99.8)))
+    known = every[np.isfinite(every)]  # what no view has seen is no number
+    low, high = (float(v) for v in np.percentile(known, (1.0, 99.8))) if known.size else (0.0, 0.0)
     high = max(high, low + 1e-9)
     return {
         "low": low,
@@ -183,12 +229,15 @@ class LiveReconstruction:
     """
 
     def __init__(self, tell: Callable[[str], None]) -> None:
-        self._tell, self._asked, self.newest = tell, ("", 0), ""
+        self._tell, self.newest = tell, ""
+        self._asked: tuple[str, ...] = ()
         self._task: asyncio.Task[None] | None = None
+        self._writer: asyncio.StreamWriter | None = None
+        self._wanted: deque[asyncio.Future[dict[str, Any]]] = deque()
 
-    def grow(self, folder: Path, side: int) -> None:
+    def grow(self, folder: Path, side: int, past: bool = False) -> None:
         """Grow the volume of a data set, unless that is being done; the last line comes again."""
-        asked = str(folder.absolute()), side
+        asked = str(folder.absolute()), str(side), *(["past"] if past else [])
         if asked == self._asked:
             if self.newest:
                 self._tell(self.newest)
@@ -201,20 +250,45 @@ class LiveReconstruction:
         """End what is under way."""
         if self._task is not None:
             self._task.cancel()
-        self._task, self._asked, self.newest = None, ("", 0), ""
+        self._task, self._asked, self.newest = None, (), ""
+        self._hang_up()
 
-    async def _follow(self, folder: str, side: int) -> None:
+    def _hang_up(self) -> None:
+        """Nobody answers any more who has been asked for a slice."""
+        self._writer = None
+        while self._wanted:
+            self._wanted.popleft().cancel()
+
+    async def slice(self, name: str, index: int) -> dict[str, Any] | None:
+        """A slice of the volume of a past scan; None while there is none."""
+        if self._writer is None or "size" not in self.newest:
+            return None
+        wanted: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
+        self._wanted.append(wanted)
+        self._writer.write(f"{name} {index}\n".encode())
+        with suppress(asyncio.CancelledError):  # somebody has asked for another volume
+            return await wanted
+        return None
+
+    async def _follow(self, *asked: str) -> None:
         process = await asyncio.create_subprocess_exec(
-            sys.executable, "-P", "-m", __name__, folder, str(side),
-            stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE,
+            sys.executable, "-P", "-m", __name__, *asked,
+            stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.DEVNULL,
             env={**os.environ, **ENVIRONMENT}, limit=LINE_BYTES,
         )  # fmt: skip
         assert process.stdout is not None
+        self._writer = process.stdin
         try:
             async for line in process.stdout:
-                self.newest = line.decode()
-                self._tell(self.newest)
+                kind, _, content = line.decode().partition("\t")
+                if kind == "slice":
+                    if not (wanted := self._wanted.popleft()).done():
+                        wanted.set_result(json.loads(content))
+                else:
+                    self.newest = line.decode()
+                    self._tell(self.newest)
+            self._hang_up()
             await process.wait()  # to kill what has just ended would take its code from the loop
         finally:
             if process.returncode is None:
@@ -222,7 +296,7 @@ class LiveReconstruction:
             await process.wait()
 
 
-def main(folder: str, side: str) -> None:
+def main(folder: str, side: str, past: str = "") -> None:
     """The process."""
     parent = os.getppid()
     os.nice(NICENESS)
@@ -232,12 +306,19 @@ def main(folder: str, side: str) -> None:
         print(json.dumps(document.pop("surface", None)), json.dumps(document), sep="\t", flush=True)
 
     try:
-        grow(Path(folder), int(side), say, lambda: os.getppid() == parent)
+        if not past:
+            grow(Path(folder), int(side), say, lambda: os.getppid() == parent)
+            return
+        cut = reconstruct(Path(folder), int(side), say)
+        for line in sys.stdin:
+            name, index = line.split()
+            print("slice", json.dumps(cut(name, int(index))), sep="\t", flush=True)
     except Exception as error:  # whatever it is, the page says it instead of waiting for ever
         known = isinstance(error, (TwinError, OSError, ValueError))
         problem = str(error) if known else f"{type(error).__name__}: {error}"
         with suppress(OSError):
-            say({"type": "volume", "name": Path(folder).name, "problem": problem})
+            name = Path(folder).name
+            say({"type": "volume", "name": name, "past": bool(past), "problem": problem})
 
 
 if __name__ == "__main__":

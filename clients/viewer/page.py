@@ -89,6 +89,7 @@ class Page:
         connection: to the browser.
         address: of the twin.
         local: the viewer's own methods.
+        person: who is there, for the others.
     """
 
     def __init__(
@@ -97,6 +98,7 @@ class Page:
         connection: ServerConnection,
         address: TwinAddress,
         local: Mapping[str, Local],
+        person: str = "a visitor",
     ) -> None:
         self.id = id
         self.kind = "line_integral"
@@ -107,7 +109,7 @@ class Page:
         self.recorded: str | None = None
         """The data set whose images this page shows instead of live ones."""
         self._connection, self._local = connection, local
-        self.link = KeptConnection(address, "flexdt viewer", on_change=self._link_changed)
+        self.link = KeptConnection(address, person, on_change=self._link_changed)
         self._notes: deque[str] = deque()
         self._newest: dict[str, str | bytes] = {}
         self._sent_at: dict[str, deque[float]] = {slot: deque() for slot in ON_THE_WAY}

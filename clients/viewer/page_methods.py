@@ -305,8 +305,13 @@ async def live(viewer: Viewer, page: Page, params: p.Live) -> object:
     folder = _data(viewer) / plain_name(params.name, "data set")
     if folder.is_symlink() or not folder.is_dir():
         raise RpcError(Code.INVALID_PARAMS, f"no data set {params.name!r}")
-    viewer.grower.grow(folder, params.side)
+    viewer.grower.grow(folder, params.side, params.past)
     return {}
+
+
+async def volume_slice(viewer: Viewer, page: Page, params: p.Slice) -> object:
+    """A slice of the volume that is reconstructed; empty while there is none."""
+    return await viewer.grower.slice(params.name, params.index) or {}
 
 
 async def compose(viewer: Viewer, page: Page, params: p.Compose) -> object:
@@ -475,6 +480,7 @@ METHODS: Mapping[str, tuple[type[Params], Answer]] = {
     "viewer.recorded": (p.Recorded, recorded),
     "viewer.recorded_image": (p.RecordedImage, recorded_image),
     "viewer.live": (p.Live, live),
+    "viewer.slice": (p.Slice, volume_slice),
     "viewer.compose": (p.Compose, compose),
     "viewer.datasets": (p.Datasets, datasets),
     "viewer.scrub": (p.Scrub, scrub),

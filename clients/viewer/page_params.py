@@ -122,7 +122,16 @@ class Live(Params):
     """A data set to reconstruct while it is scanned, and voxels a side; none: no longer."""
 
     name: FileName | None = None
-    side: Literal[128, 192, 256] = 128
+    side: Literal[128, 192, 256, 512] = 128
+    past: bool = False
+    """The whole volume of a scan that was made, not one that grows."""
+
+
+class Slice(Params):
+    """A slice of the volume of a past scan, by its number."""
+
+    name: Literal["top", "front", "side"]
+    index: Index
 
 
 class Compose(Params):

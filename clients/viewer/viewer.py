@@ -16,6 +16,7 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import parse_qs, urlsplit
 
 import viser
 from websockets.asyncio.server import ServerConnection
@@ -378,7 +379,9 @@ class Viewer:
             log("a page was refused", logging.WARNING, page=id, reason=reason)
             await connection.close(TRY_AGAIN, reason)
             return
-        page = Page(id, connection, self.twin_address, self._local)
+        asked = parse_qs(urlsplit(connection.request.path).query) if connection.request else {}
+        person = "".join(c for c in asked.get("person", [""])[0] if c.isprintable()).strip()[:40]
+        page = Page(id, connection, self.twin_address, self._local, person or "a visitor")
         self.opened += 1
         self.open_pages.add(page)
         self.pages[id] = page

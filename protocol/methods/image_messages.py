@@ -57,7 +57,10 @@ class ExposurePredict(f.Params):
     averages: Averages | None = None
     mode: f.ShortText | None = None
     roi: f.RoiAsked | None = None
-    frames: Frames = Field(default=361, description="of the scan")
+    frames: Frames = Field(default=361, description="of the scan, or of each of its turns")
+    kind: Literal["fly", "step", "tiled", "helical", "calibration"] | None = Field(
+        default=None, description="of a script, of which time and bytes are then; default: images"
+    )
     sod_mm: f.Distance | None = Field(default=None, description="default: as it stands")
     sdd_mm: f.Distance | None = Field(default=None, description="default: as it stands")
     detail: LayerText = Field(
@@ -118,8 +121,8 @@ class ExposurePrediction(f.Result):
     asked: PredictedSetting
     best: list[PredictedSetting] = Field(description="of the same power and time, the best first")
     frames: int
-    seconds: float = Field(description="that the frames take at least")
-    bytes: int
+    seconds: float = Field(description="that the frames take at least; of a kind, all of the scan")
+    bytes: int = Field(description="of the frames; of a kind, with dark and flat images")
     assumed: list[str] = Field(description="what is not known of the sample")
 
 

@@ -111,7 +111,7 @@ class CheckResult(f.Result):
     frames: int
     bytes: int
     collisions: list[CheckCollision] = Field(default_factory=list)
-    min_clearance_mm: float | None = None
+    min_clearance_mm: float | None = Field(None, description="of parts in relative motion")
 
 
 class SubmitResult(f.Result):

@@ -85,7 +85,7 @@ class Submissions:
         Raises:
             RpcError: -32008, it takes too long, too much memory, or is too large for an answer.
         """
-        matter = await self._matter(wish, self._start(), self.scanner.sample)
+        matter = await self._matter(wish, self.start(), self.scanner.sample)
         return Encoded(tuple(await self._checks.report(matter, codec)))
 
     def close(self) -> None:
@@ -113,7 +113,7 @@ class Submissions:
         else:
             seed = self.seed() if wish.seed is None else wish.seed
             begin = StartConditions(
-                self._start(),
+                self.start(),
                 self.scanner.sample,
                 seed,
                 wish.moments,
@@ -211,7 +211,7 @@ class Submissions:
         async def prepare() -> JobInputs:
             begun = asked
             if not resume:  # others may have moved since, and put something else on the stage
-                begin = replace(asked.begin, start=self._start(), sample=self.scanner.sample)
+                begin = replace(asked.begin, start=self.start(), sample=self.scanner.sample)
                 begun = replace(asked, begin=begin)
             # The sample's file and the correction may be others by now; then it is checked anew.
             final = await self._checks.sound(
@@ -237,7 +237,7 @@ class Submissions:
 
         return await asyncio.to_thread(work)
 
-    def _start(self) -> StartState:
+    def start(self) -> StartState:
         """The scanner at rest where its motors are bound."""
         s = self.scanner
         return StartState(

@@ -56,4 +56,7 @@ def test_a_free_script_tells_its_least_clearance(
     path.write_bytes(moves.encode())
     assert run(["check", str(path), "--sample", "lego"]) == 0
     out = capsys.readouterr().out
-    assert "none; smallest clearance 25.08 mm (sample_base and detector_platform)" in out
+    assert (
+        "none; parts in relative motion stay 25.08 mm apart (sample_base and detector_platform)"
+        in out
+    )

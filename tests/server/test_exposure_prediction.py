@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
+from in_process import Lab, M, P, run
 
 import flexdt as fx
 from flexdt.phantoms.samples import as_phantom
@@ -14,6 +17,9 @@ from flexdt.protocol import METHODS, Codec, RpcError
 from flexdt.protocol.methods.image_messages import ExposurePrediction
 from flexdt.server.imaging.exposure_quality import BEST, predict
 from flexdt.twin.errors import LimitError
+from flexdt.twin.machine.camera import Roi
+from flexdt.twin.scanner.settings import changed_camera
+from flexdt.twin.script.compose import ScanRequest, compose_script
 
 ROD = {"kind": "cylinder", "center": [0, 0, 0], "radius": 12.0, "height": 60, "material": "pmma"}
 
@@ -79,3 +85,51 @@ def test_a_twin_predicts_its_own_images() -> None:
         with pytest.raises(RpcError, match="nothing stands on the stage"):
             twin.predict_exposure()
     assert METHODS["exposure.predict"].safe
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_prediction_report_and_finished_data_set_are_one(tmp_path: Path, seed: int) -> None:
+    """In drawn camera modes, regions and kinds of scan: bytes to the byte, and time."""
+    rng = np.random.default_rng(4300 + seed)
+    kind = ("fly", "step", "tiled", "helical", "calibration")[seed]
+    mode = str(rng.choice(M.detector.mode_names))
+    left, top = (int(x) for x in rng.integers(700, 850, 2))  # near enough for the motors
+    roi = Roi(left, top, left + int(rng.integers(60, 400)), top + int(rng.integers(60, 300)))
+    frames, exposure = int(rng.integers(40, 60)), float(rng.uniform(300, 500))
+    sod, sdd = round(float(rng.uniform(500, 700)), 4), 1059.0
+    request = ScanRequest(
+        kind, sod, sdd, frames, exposure, mode=mode, roi=roi, kV=70.0, power_W=30.0
+    )
+    text = compose_script(request, M, P)
+    asked: dict[str, Any] = {
+        "mode": mode, "frames": frames, "exposure_ms": exposure, "averages": 1, "sod_mm": sod,
+        "sdd_mm": sdd, "kV": 70.0, "power_W": 30.0, "kind": kind,
+    }  # fmt: skip
+
+    found: list[int] = []
+
+    async def body(lab: Lab) -> None:
+        a = lab.client()
+        told = await a.call("exposure.predict", roi=list(roi.edges), **asked)
+        here = fx.expose(
+            ROD, kV=70.0, power_W=30.0, exposure_ms=exposure, mode=mode, roi=roi, images=frames,
+            kind=kind, sod=sod, sdd=sdd, profile=P, start=lab.twin.submissions.start(),
+        )  # fmt: skip
+        report = await a.call("script.check", text=text)
+        assert report["ok"], report["problems"]
+        assert (here.bytes, here.images) == (told["bytes"], told["frames"])
+        assert (report["bytes"], report["frames"]) == (told["bytes"], told["frames"])
+        assert here.seconds == told["seconds"] == report["duration_s"]
+        answer = await a.call("script.submit", text=text, name="drawn")
+        status = await lab.ended(a, answer["job"])
+        assert status["state"] == "done"
+        assert status["elapsed_s"] == pytest.approx(told["seconds"], rel=1e-6)
+        found.extend((told["bytes"], told["frames"]))
+
+    run(tmp_path, body)
+    images = [tifffile.imread(f) for f in (tmp_path / "drawn").glob("*.tif")]
+    assert sum(i.nbytes for i in images) == found[0]
+    rows, cols = (n // changed_camera(M.detector, M.detector.camera, {"mode": mode}).binning
+                  for n in (roi.bottom - roi.top + 1, roi.right - roi.left + 1))  # fmt: skip
+    assert {i.shape for i in images} == {(rows, cols)}
+    assert len(images) - 2 == found[1]

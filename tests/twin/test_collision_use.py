@@ -285,7 +285,7 @@ def test_the_line_of_a_collision_is_the_one_that_moves_its_parts(other: str) -> 
     assert found
     assert {c.line for c in found} == {6}, found
     report = check_script(text, M, P, collision=collision_check())
-    assert "smallest clearance" not in report.text
+    assert "relative motion" not in report.text
 
 
 def test_moves_without_wait_are_swept_together() -> None:

@@ -382,6 +382,36 @@ def test_a_broken_upload_is_told(page: Any, tmp_path: Path) -> None:
     page.locator(".note.error").filter(has_text="broken.stl").first.wait_for()
 
 
+def test_people_have_names(
+    page: Any, twin: TwinClient, open_page: Callable[..., Any], wait: Wait
+) -> None:
+    """In control, log and take-over; kept in the browser, and changeable."""
+    connected = "window.flexdt.store.session"
+    page.fill("#person", "Ada <b>")
+    page.press("#person", "Enter")
+    wait(lambda: "Ada" in (page.evaluate(connected) or ""), "the name")
+    page.click("#take")
+    page.locator("#holder", has_text="you control").wait_for()
+    assert (twin.state().controller or "").startswith("Ada <b> #")
+    other = open_page()
+    other.locator("#holder", has_text="held by Ada <b>").wait_for()
+    other.fill("#person", "Emmy")
+    other.press("#person", "Enter")
+    wait(lambda: "Emmy" in (other.evaluate(connected) or ""), "the other name")
+    other.click("#take")
+    told = "Emmy #"
+    page.locator(".note").filter(has_text=told).filter(has_text="took control from Ada").wait_for()
+    page.locator("#holder", has_text="held by Emmy").wait_for()
+    page.reload()
+    page.wait_for_function("window.flexdt?.store.session")
+    assert page.input_value("#person") == "Ada <b>"
+    other.click("#take")
+    other.close()
+    page.fill("#person", "")
+    page.press("#person", "Enter")
+    wait(lambda: "a visitor" in (page.evaluate(connected) or ""), "no name")
+
+
 def test_control_is_taken_released_and_taken_over(
     page: Any, twin: TwinClient, open_page: Callable[..., Any], wait: Wait
 ) -> None:

@@ -73,11 +73,11 @@ def test_data_sets_are_found_by_words(page: Any, scans: Any) -> None:
     page.locator(".data-set[data-name='cut scan']").wait_for()
     page.locator("#data-count", has_text="2 of 2").wait_for()
     whole = page.locator(".data-set[data-name='whole scan']")
-    assert "9 images · 90 kV 20 W · 100 ms · lego" in whole.inner_text()
+    assert "9 projections · 90 kV 20 W · 100 ms · lego" in whole.inner_text()
     assert whole.locator(".state.complete").count() == 1
     assert whole.locator("canvas").evaluate("c => c.width") == 64
     cut = page.locator(".data-set[data-name='cut scan']").inner_text()
-    assert "8 of 9 images" in cut
+    assert "8 of 9 projections" in cut
     assert "incomplete: scan_000008.tif is missing" in cut
     find(page, "no such data set")
     page.locator("#data-count", has_text="none is found").wait_for()
@@ -114,6 +114,41 @@ def test_frames_are_gone_through_with_the_machine(page: Any, scans: Any) -> None
     page.click("#record-close")
     page.wait_for_function("flexdt.store.image && !flexdt.store.image.recorded")
     assert not page.locator("#film-recorded").is_visible()
+
+
+def test_a_past_scan_is_reconstructed_and_gone_through(
+    page: Any, scans: Any, twin: TwinClient, wait: Wait
+) -> None:
+    """In two clicks, or with the reason why not; slices come by slider and wheel."""
+    find(page, "whole")
+    page.locator(".data-set[data-name='whole scan']").click()
+    shows(page, 2)
+    page.click("#record-volume")
+    page.locator("#volume-note", has_text="FDK needs").wait_for()
+    twin.submit_script(fly_script(frames=61, exposure_ms=500.0), "turned once", "max")
+    assert twin.wait_job().state == "done"
+    twin.control("release")
+    find(page, "turned once")
+    page.locator(".data-set[data-name='turned once']").click()
+    shows(page, 2)
+    page.click("#record-volume")
+    page.locator("#volume-title", has_text="Volume of turned once").wait_for()
+    page.locator("#volume-note", has_text="flexdt reconstruct --binning").wait_for(timeout=120_000)
+    at = page.locator("#at-top")
+    last = int(at.get_attribute("max"))
+    assert int(at.input_value()) == (last + 1) // 2
+    before = page.evaluate("document.querySelector('#slice-top').toDataURL()")
+    at.evaluate("e => { e.value = e.max; e.dispatchEvent(new Event('input')); }")
+    wait(lambda: page.locator("#slice-top").get_attribute("data-index") == str(last), "its slice")
+    assert page.evaluate("document.querySelector('#slice-top').toDataURL()") != before
+    page.locator("#slice-top").hover()
+    page.mouse.wheel(0, -100)
+    wait(lambda: page.locator("#slice-top").get_attribute("data-index") == str(last - 1), "wheel")
+    page.click("#volume-cancel")
+    page.locator("#volume-title", has_text="Slices so far").wait_for()
+    assert not page.locator("#slice-top").is_visible()
+    page.click("#record-close")
+    shutil.rmtree(scans / "turned once")
 
 
 def test_an_image_that_cannot_be_read_leaves_none_in_its_place(page: Any, scans: Any) -> None:

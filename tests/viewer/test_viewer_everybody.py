@@ -59,6 +59,37 @@ def test_axe_finds_nothing_and_targets_are_large(open_page: Callable[..., Any], 
     page.close()
 
 
+def test_axe_finds_nothing_after_a_run_and_with_a_data_set_open(
+    open_page: Callable[..., Any], twin: TwinClient, wait: Wait
+) -> None:
+    page = open_page(size=(1366, 768))
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.id") == "skip"
+    page.keyboard.press("Enter")
+    assert page.evaluate("document.activeElement.id") == "film-canvas"
+    page.click("#tabs [data-tab=scan]")
+    assert all(page.locator(f"#{name}").is_disabled() for name in ("check", "run"))
+    page.fill("#wish-frames", "60")
+    page.click("#compose")
+    page.locator("#report .verdict.ok").wait_for()
+    name = twin.job_status(begun(page, twin)).dataset
+    page.locator("#job-state", has_text="done").wait_for()
+    page.locator("#thumbs figure").first.wait_for()
+    assert findings(page) == []
+    assert page.inner_text("#volume-note") == ""
+    page.click("#job-data")
+    page.locator("#record-at", has_text="image ").wait_for()
+    wait(lambda: "measuring" not in page.inner_text("#record-note"), "all lanes")
+    assert str(name).endswith(page.inner_text("#record-name"))
+    assert findings(page) == []
+    assert page.inner_text("#saturated") == "saturated: not judged in a recorded image"
+    lanes = page.locator("#record .lanes")
+    assert lanes.evaluate("e => e.scrollHeight <= e.clientHeight + 1"), "no lane is cut off"
+    page.click("#record-close")
+    page.evaluate("flexdt.call('session.control', {action: 'release'})")
+    page.close()
+
+
 @pytest.mark.parametrize("size", SIZES)
 def test_every_size_has_all_parts_and_the_stop(
     open_page: Callable[..., Any], size: tuple[int, int]

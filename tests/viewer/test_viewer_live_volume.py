@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import json
 import threading
 import time
 from collections.abc import AsyncIterator
@@ -16,11 +17,13 @@ import numpy.typing as npt
 import pytest
 import tifffile
 
+from flexdt.clients.cli import main
 from flexdt.clients.viewer.live_volume import (
     MOST_POINTS,
     LiveReconstruction,
     grow,
     points_of,
+    reconstruct,
     surface,
 )
 from flexdt.runtime.files.directory import open_data
@@ -181,11 +184,67 @@ def test_nobody_waits_for_a_scan_that_nobody_looks_at(scan: tuple[Path, list[Pat
         grow(scan[0], SIDE, lambda document: None, alive=lambda: False)
 
 
+def test_the_volume_of_a_past_scan_is_that_of_the_command(
+    scan: tuple[Path, list[Path]], tmp_path: Path
+) -> None:
+    """Every slice, within half a grey step, of what `flexdt reconstruct --binning` writes."""
+    home, files = scan
+    for file in files:
+        file.rename(home / file.name)
+    told: list[dict[str, Any]] = []
+    cut = reconstruct(home, 120, told.append)
+    last = told[-1]
+    assert [d["done"] for d in told] == sorted(d["done"] for d in told)
+    assert (last["done"], last["views"], last["of"]) == (1.0, VIEWS, VIEWS)
+    out = tmp_path / "volume.tif"
+    words = ["reconstruct", str(home), "--out", str(out), "--binning", str(last["binning"])]
+    with pytest.raises(SystemExit, match="0"):
+        main(words)
+    whole = tifffile.imread(out)  # (z, y, x)
+    assert last["size"] == dict(zip(("top", "front", "side"), whole.shape, strict=True))
+    step = (last["high"] - last["low"]) / 255.0
+    for name, seen in (
+        ("top", lambda k: whole[k, ::-1]),
+        ("front", lambda k: whole[::-1, k]),
+        ("side", lambda k: whole[::-1, :, k]),
+    ):
+        for k in (0, last["size"][name] // 3, last["size"][name] - 1, 10**6):
+            part = cut(name, k)
+            grey = np.frombuffer(base64.b64decode(part["data"]), np.uint8).reshape(part["shape"])
+            true = np.clip(seen(min(k, last["size"][name] - 1)), last["low"], last["high"])
+            assert np.abs(last["low"] + step * grey - true).max() < 1.01 * step
+
+
+def test_slices_come_from_the_process_until_it_is_stopped(scan: tuple[Path, list[Path]]) -> None:
+    home, files = scan
+    for file in files:
+        file.rename(home / file.name)
+
+    async def body() -> None:
+        told: list[str] = []
+        one = LiveReconstruction(told.append)
+        assert await one.slice("top", 0) is None
+        one.grow(home, 120, past=True)
+        while '"slices"' not in one.newest:
+            assert "problem" not in one.newest
+            await asyncio.sleep(0.02)
+        middle = json.loads(one.newest.partition("\t")[2])["size"]["top"] // 2
+        low, high = await asyncio.gather(one.slice("top", 0), one.slice("top", middle))
+        assert low is not None
+        assert high is not None
+        assert low["shape"] == high["shape"]
+        assert low["data"] != high["data"]
+        one.stop()
+        assert await one.slice("top", 0) is None
+
+    asyncio.run(body())
+
+
 class Ended:
     """A process that has said a line and ended; the loop has not heard of its end yet."""
 
     returncode: int | None = None
-    killed = False
+    killed, stdin = False, None
 
     async def _lines(self) -> AsyncIterator[bytes]:
         yield b"{}\n"

@@ -76,7 +76,8 @@ def test_an_open_data_set_is_complete_when_its_scan_is(
     page.evaluate("name => flexdt.data.open(name)", name)
     assert "running" in page.inner_text("#record-state")
     wait(lambda: twin.job_status(job).state == "done", "the scan")
-    wait(lambda: page.inner_text("#record-state").startswith("complete · 60 images"), "all of it")
+    whole = "complete · 60 projections"
+    wait(lambda: page.inner_text("#record-state").startswith(whole), "all of it")
     assert page.evaluate("Number(document.querySelector('#record-frame').max)") >= 59
     page.fill("#script", "")
 

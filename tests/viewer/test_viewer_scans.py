@@ -408,9 +408,9 @@ def test_corrections_are_shown_with_units_and_digits_that_say_something(
     page.locator("#in-force", has_text="angle_scale").wait_for()
     rows = [r.split("\t") for r in page.locator("#in-force tr").all_inner_texts()]
     assert {name: (value, unit) for name, value, _, unit in rows} == {
-        "dO_x": ("0.412", "mm"),
-        "alpha": ("0.0000321", "°"),
-        "angle_scale": ("1.000125", ""),
+        "axis sideways dO_x": ("0.412", "mm"),
+        "start angle alpha": ("0.0000321", "°"),
+        "scale of angles angle_scale": ("1.000125", ""),
     }
     page.click("#revert")
     page.locator(".note.good", has_text="nominal geometry").wait_for()
@@ -596,7 +596,7 @@ def test_a_bar_of_the_designer_rewrites_the_script(page: Any, twin: TwinClient, 
     for share in (0.55, 0.7):
         frames = pull(page, "frames", share)
         wait(lambda n=frames: f"\t{n:.0f}\t" in page.input_value("#script"), "the script")
-        size = f"{frames * 956 * 760 * 2 / 1e6:.1f} MB"
+        size = f"{(frames + 2) * 956 * 760 * 2 / 1e6:.1f} MB"  # a dark and a flat beside them
         page.locator("#design-time", has_text=size).wait_for()
         told.append(
             float(re.findall(r"([0-9.]+) mGy", page.inner_text("#design-time"))[0]) / frames
@@ -631,3 +631,39 @@ def test_a_bar_of_the_designer_rewrites_the_script(page: Any, twin: TwinClient, 
     page.click("#designer summary")
     page.fill("#script", "")
     page.evaluate("roi => flexdt.call('camera.set', {roi, exposure_ms: 100})", ROI)
+    seen(page, twin)
+
+
+@pytest.mark.parametrize("kind", ["fly", "tiled"])
+def test_the_designer_says_what_the_report_says_in_every_mode(
+    page: Any, twin: TwinClient, wait: Wait, kind: str
+) -> None:
+    """Its scales follow the mode that is set: a script was impossible after a change of mode."""
+    page.evaluate("flexdt.call('sample.set', {name: 'lego'})")
+    page.evaluate("flexdt.call('camera.set', {roi: [32, 8, 1943, 1527], mode: 'HW2SW1High'})")
+    seen(page, twin)
+    page.click("#tabs [data-tab=scan]")
+    page.select_option("#wish-kind", kind)
+    page.fill("#script", "")
+    page.click("#designer summary")
+    page.locator("#design-quality .verdict").wait_for()
+    pull(page, "exposure_ms", 0.6)
+    pull(page, "frames", 0.4)
+    for mode in ("HW4SW1High", "HW2SW1High"):
+        page.evaluate("mode => flexdt.call('camera.set', {mode})", mode)
+        seen(page, twin)
+        wait(lambda mode=mode: f"set mode\t{mode}" in page.input_value("#script"), "the script")
+        state = twin.state()
+        g, voxel = state.geometry, float(page.inner_text("#design-voxel_um-is").split()[0])
+        assert voxel == pytest.approx(1000 * state.camera.pixel_mm * g.SOD_mm / g.SDD_mm, abs=0.06)
+        report = twin.check_script(page.input_value("#script"))
+        size = f"{report.bytes / 1e6:.1f} MB"
+        page.locator("#design-time", has_text=size).wait_for()
+        page.locator("#report", has_text=size).wait_for()
+        time_s = page.inner_text("#design-time").split(" · ")[0]
+        page.locator("#report", has_text=f"{time_s} · ").wait_for()
+    page.click("#designer summary")
+    page.fill("#script", "")
+    page.select_option("#wish-kind", "fly")
+    page.evaluate("roi => flexdt.call('camera.set', {roi, exposure_ms: 100})", ROI)
+    seen(page, twin)

@@ -102,6 +102,23 @@ def test_a_killed_server_is_seen(page: Any, lab: Any, wait: Wait, name: str) -> 
     assert min(shown) < SHOWN_S
 
 
+def test_a_page_that_stood_still_itself_blames_nobody(page: Any, wait: Wait) -> None:
+    """Its own main thread was blocked for seconds: viewer and twin have answered all along."""
+    said = page.evaluate(
+        """new Promise((done) => {
+          const veil = document.querySelector('#veil'), said = [];
+          new MutationObserver(() => { if (!veil.hidden) said.push(veil.textContent); })
+            .observe(veil, { attributes: true, childList: true, subtree: true });
+          setTimeout(() => {
+            const end = performance.now() + 6000;
+            while (performance.now() < end);
+            setTimeout(() => done(said), 3000);
+          }, 100);
+        })"""
+    )
+    assert said == []
+
+
 def test_an_emergency_stop_that_nobody_confirms_is_said(page: Any, lab: Any, wait: Wait) -> None:
     shown = []
     while not shown or (min(shown) >= TOLD_S and len(shown) < TRIES):

@@ -257,6 +257,23 @@ def test_counts_are_exact_and_windows_hold() -> None:
     assert (rgb[0, 0, 0], rgb[2, 3, 0]) == (0, 255)
 
 
+def test_beads_do_not_set_the_window() -> None:
+    """Plastic walls were nearly black beside steel beads a hundred times as dense."""
+    rng = np.random.default_rng(7)
+    pixels = rng.normal(0.0, 0.01, (400, 400)).astype(np.float32)
+    pixels[100:300, 100:300] += 0.4  # a quarter of the image
+    for row, column in rng.integers(105, 290, (12, 2)):
+        pixels[row : row + 8, column : column + 8] += 12.0
+    image = ShownImage(pixels, "line_integral", (0.0,) * 12, 0.0, 1)
+    low, high = window_of(image)
+    assert low <= 0.0
+    assert (0.4 - low) / (high - low) > 0.5, "walls are brighter than the middle grey"
+    only = np.zeros((400, 400), np.float32)
+    only[200:216, 200:216] = 3.0  # a small sample is seen, too
+    low, high = window_of(ShownImage(only, "line_integral", (0.0,) * 12, 0.0, 1))
+    assert high == 3.0
+
+
 def _unpack(content: bytes) -> tuple[dict[str, Any], np.ndarray]:
     assert content[:4] == b"FXI2"
     (size,) = struct.unpack_from("<I", content, 4)

@@ -16,8 +16,9 @@ const canvas = el("canvas", { id: "record-line", role: "img", "aria-label": "Mot
 const button = (id, text, title, f) => el("button", { id, class: "small", title, onclick: f }, text);
 const panel = el("div", { id: "record", hidden: true }, el("div", { class: "row head" }, el("b", { id: "record-name", class: "cut" }), el("span", { id: "record-state", class: "muted cut" }), el("span", { class: "spacer" }), button("record-fit", "Calibrate", "Calibrate from this data set: its sample is the phantom", () => { if (told)
     emit("calibrate", told.info.name, told.info.sample); }), button("record-align", "Align", "Find the axis of this scan without a phantom", () => { if (told)
-    emit("align", told.info.name); }), button("record-script", "Script", "Bring its script into the Scan tab", script), button("record-replay", "Replay file", "This scan as one HTML file that plays it", () => offer("viewer.export", { format: "html", replay: true }, "No replay")), button("record-close", "Close", "Back to what is live (Escape)", () => open(null, null, true))), el("div", { class: "row head" }, button("record-play", "▶", "Play", () => play(!playing)), button("record-back", "‹", "The image before", () => show(index - 1)), slider, button("record-next", "›", "The next image", () => show(index + 1)), el("span", { id: "record-at", class: "mono small-text cut" })), compare.row, marks.row((all) => { if (told)
-    emit("calibrate", told.info.name, told.info.sample, all); }), el("div", { class: "lanes" }, canvas), el("div", { id: "record-note", class: "muted small-text cut" }));
+    emit("align", told.info.name); }), button("record-volume", "Reconstruct", "Its volume, as flexdt reconstruct makes it", () => { if (told)
+    emit("reconstruct", told.info.name); }), button("record-script", "Script", "Bring its script into the Scan tab", script), button("record-replay", "Replay file", "This scan as one HTML file that plays it", () => offer("viewer.export", { format: "html", replay: true }, "No replay")), button("record-close", "Close", "Back to what is live (Escape)", () => open(null, null, true))), el("div", { class: "row head" }, button("record-play", "▶", "Play", () => play(!playing)), button("record-back", "‹", "The image before", () => show(index - 1)), slider, button("record-next", "›", "The next image", () => show(index + 1)), el("span", { id: "record-at", class: "mono small-text cut" })), compare.row, marks.row((all) => { if (told)
+    emit("calibrate", told.info.name, told.info.sample, all); }), el("div", { class: "lanes", tabIndex: 0, role: "group", "aria-label": "Motors, clearance and counts" }, canvas), el("div", { id: "record-note", class: "muted small-text cut" }));
 $("#stage").append(panel);
 // Thumbnails come as 8-bit grey.
 function thumbnail(small) {
@@ -26,7 +27,7 @@ function thumbnail(small) {
 }
 const dated = (info) => (info.started ? info.started.slice(0, 16).replace("T", " ") : new Date(1000 * info.modified).toISOString().slice(0, 16).replace("T", " "));
 function settings(info) {
-    const frames = info.present < info.projections ? `${info.present} of ${info.projections} images` : `${info.projections} images`;
+    const frames = info.present < info.projections ? `${info.present} of ${info.projections} projections` : `${info.projections} projections`;
     const beam = info.kV === null ? null : `${fixed(info.kV, 0)} kV ${fixed(info.power_W, 0)} W`;
     return [frames, beam, info.exposure_ms === null ? null : `${fixed(info.exposure_ms, 0)} ms`, info.sample || null].filter(Boolean).join(" · ");
 }
@@ -158,9 +159,9 @@ let moment = null, kept;
 function redraw() {
     if (!plan || panel.hidden)
         return;
-    drawTimeline(canvas, plan, moment, null);
-    const rest = panel.offsetHeight - $(".lanes", panel).offsetHeight + 2;
-    $("#stage").style.setProperty("--record", `${Math.min(rest + canvas.offsetHeight, Math.max(rest + LEAST_PX, 0.45 * $("#stage").clientHeight))}px`);
+    const rest = panel.offsetHeight - $(".lanes", panel).offsetHeight + 2, room = Math.max(LEAST_PX, 0.45 * $("#stage").clientHeight - rest);
+    drawTimeline(canvas, plan, moment, null, room);
+    $("#stage").style.setProperty("--record", `${rest + Math.min(canvas.offsetHeight, room)}px`);
 }
 // The newest image asked for wins; one that cannot be shown leaves no other in its place.
 const still = (name) => told?.info.name === name;
@@ -201,7 +202,7 @@ async function show(wanted) {
         panel.dataset.shown = String(Boolean(about));
         const facts = about && [about.file, about.time_s === null ? "" : `${fixed(about.time_s, 2)} s`, about.image === "projection" ? "" : about.image,
             why && `counts: ${why}`, about.problem && `no virtual image: ${about.problem}`];
-        setText($("#record-at"), [`${at + 1} of ${told.images}`, ...(facts ?? [why])].filter(Boolean).join(" · "));
+        setText($("#record-at"), [`image ${at + 1} of ${told.images}`, ...(facts ?? [why])].filter(Boolean).join(" · "));
         $("#record-at").title = $("#record-at").textContent;
         redraw();
     }

@@ -1,6 +1,6 @@
 // The scan designer: bars for voxel, tube, exposure and images; what a scan with them will look like. A change of a bar
 // rewrites the script, unless somebody else's stands there.
-import { $input, bars, bytes, cleared, el, fixed, seconds, setText, words } from "./dom.js";
+import { $input, $select, bars, bytes, cleared, el, fixed, seconds, setText, words } from "./dom.js";
 import { call, emit, on, store } from "./link.js";
 const SETTLE_MS = 400, LATEST = 1.02;
 const BARS = [["voxel_um", "voxel", "µm", 1], ["kV", "voltage", "kV", 0], ["power_W", "power", "W", 0], ["exposure_ms", "exposure", "ms", 0], ["frames", "images", "", 0]];
@@ -33,16 +33,26 @@ export const wish = () => (card.open && scales.kV ? wished() : {});
 async function begin() {
     if (scales.kV || !store.state)
         return;
-    const { tube, camera, geometry: g } = store.state, pixel = 1000 * camera.pixel_mm;
+    const { tube, camera } = store.state;
     const limits = await call("viewer.spectrum", { kV: tube.kV }).then((s) => s.limits, () => null);
     if (!limits)
         return;
-    Object.assign(scales, { voxel_um: [pixel / 20, pixel, true], kV: [...limits.kV, false], power_W: [1, limits.power_W[1], false],
-        exposure_ms: [...limits.exposure_ms, true], frames: [2, 3600, true] });
-    const start = { voxel_um: (pixel * g.SOD_mm) / g.SDD_mm, kV: tube.kV, power_W: tube.power_W, exposure_ms: camera.exposure_ms, frames: $input("#wish-frames").valueAsNumber || 361 };
-    for (const [name] of BARS)
-        put(name, start[name]);
+    Object.assign(scales, { kV: [...limits.kV, false], power_W: [1, limits.power_W[1], false], exposure_ms: [...limits.exposure_ms, true], frames: [2, 3600, true] });
+    const start = { kV: tube.kV, power_W: tube.power_W, exposure_ms: camera.exposure_ms, frames: $input("#wish-frames").valueAsNumber || 361 };
+    for (const [name, v] of Object.entries(start))
+        put(name, v);
+    scaleVoxels();
     void predict();
+}
+// Voxels are pixels of the mode that is set, at the distances that stand.
+let pixel = 0;
+function scaleVoxels() {
+    if (!store.state)
+        return;
+    const { camera, geometry: g } = store.state;
+    pixel = 1000 * camera.pixel_mm;
+    scales.voxel_um = [pixel / 20, pixel, true];
+    put("voxel_um", (pixel * g.SOD_mm) / g.SDD_mm);
 }
 let due, number = 0;
 function changed() {
@@ -56,8 +66,8 @@ async function predict() {
         return;
     const mine = ++number, { geometry: g, camera, sample } = store.state, w = wished();
     setText(facts, `predicting a scan of ${sample.name || "nothing"} …`);
-    const asked = { kV: w.kV, power_W: w.power_W, exposure_ms: w.exposure_ms, frames: w.frames, filter: $input("#design-filter").value.trim(), detail: $input("#design-detail").value.trim(),
-        sdd_mm: g.SDD_mm, sod_mm: (w.voxel_um / 1000 / camera.pixel_mm) * g.SDD_mm };
+    const asked = { kV: w.kV, power_W: w.power_W, exposure_ms: w.exposure_ms, frames: w.frames, kind: $select("#wish-kind").value, averages: 1, filter: $input("#design-filter").value.trim(), detail: $input("#design-detail").value.trim(),
+        sdd_mm: Number(g.SDD_mm.toFixed(4)), sod_mm: Number(((w.voxel_um / 1000 / camera.pixel_mm) * g.SDD_mm).toFixed(4)) };
     let p;
     try {
         p = await call("exposure.predict", asked);
@@ -76,7 +86,7 @@ async function predict() {
     // Noise of photons goes with the root of the time, what the panel adds falls faster.
     const other = best && (best.kV !== w.kV || best.filter !== p.asked.filter);
     const reach = { class: "small", id: "design-reach", onclick: () => { put("exposure_ms", ms); changed(); } };
-    facts.replaceChildren(line("time", `${seconds(p.seconds)} at least · ${bytes(p.bytes)} · ${fixed(p.asked.kerma_mGy, 2)} mGy on the axis`), line("least", `least transmission ${part(p.transmission.least)} · saturated ${part(p.saturated)} · starved ${part(p.starved)}`), line("quality", `contrast to noise of ${p.detail}: `, el("b", { class: `verdict ${enough ? "ok" : "bad"}` }, fixed(cnr, 2)), " ", enough || !(goal > 0) ? null : ms <= (scales.exposure_ms?.[1] ?? 0) ? el("button", reach, `${fixed(goal, 1)} takes ${fixed(Math.ceil(ms), 0)} ms at most`) : `no exposure reaches ${fixed(goal, 1)}`), line("best", other ? `best at ${fixed(best.kV, 0)} kV${best.filter ? `, ${best.filter}` : ""}: ${fixed(best.cnr, 2)}` : "", ...p.assumed.map((a) => ` · ${a}`)));
+    facts.replaceChildren(line("time", `${seconds(p.seconds)} · ${bytes(p.bytes)} · ${fixed(p.asked.kerma_mGy, 2)} mGy on the axis`), line("least", `least transmission ${part(p.transmission.least)} · saturated ${part(p.saturated)} · starved ${part(p.starved)}`), line("quality", `contrast to noise of ${p.detail}: `, el("b", { class: `verdict ${enough ? "ok" : "bad"}` }, fixed(cnr, 2)), " ", enough || !(goal > 0) ? null : ms <= (scales.exposure_ms?.[1] ?? 0) ? el("button", reach, `${fixed(goal, 1)} takes ${fixed(Math.ceil(ms), 0)} ms at most`) : `no exposure reaches ${fixed(goal, 1)}`), line("best", other ? `best at ${fixed(best.kV, 0)} kV${best.filter ? `, ${best.filter}` : ""}: ${fixed(best.cnr, 2)}` : "", ...p.assumed.map((a) => ` · ${a}`)));
     draw(p.transmission);
 }
 function draw({ edges, shares }) {
@@ -85,9 +95,18 @@ function draw({ edges, shares }) {
     bars(room, shares.map((share) => 1000 * share), (k) => { room[0].fillStyle = style.getPropertyValue(edges[k] < 0.02 ? "--warn" : "--accent"); });
 }
 on("state", (s) => {
-    const now = JSON.stringify([s.sample.name, s.sample.revision, s.camera.mode, s.geometry.SDD_mm.toFixed(1)]);
-    if (card.open && scales.kV && now !== stood)
+    if (!scales.kV)
+        return;
+    const now = JSON.stringify([s.sample.name, s.sample.revision, s.geometry.SDD_mm.toFixed(1)]), seen = JSON.stringify([s.camera.mode, s.camera.roi]);
+    if (pixel !== 1000 * s.camera.pixel_mm)
+        scaleVoxels();
+    if (card.open && panel && seen !== panel)
+        changed();
+    else if (card.open && now !== stood)
         void predict();
     stood = now;
+    panel = seen;
 });
-let stood = "";
+let stood = "", panel = "";
+$input("#wish-kind").addEventListener("change", () => { if (card.open && scales.kV)
+    changed(); });

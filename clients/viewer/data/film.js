@@ -208,7 +208,7 @@ for (const end of ["pointerup", "pointercancel"])
     chart.addEventListener(end, () => { pulled?.dispatchEvent(new Event("change")); pulled = null; });
 on("state", (s) => {
     for (const what of ["saturated", "starved"])
-        setText($(`#${what}`), `${what} ${s.image && !store.recorded ? (100 * s.image[what]).toFixed(s.image[what] && s.image[what] < 0.1 ? 1 : 0) : "–"} %`);
+        setText($(`#${what}`), store.recorded ? `${what}: not judged in a recorded image` : `${what} ${s.image ? `${(100 * s.image[what]).toFixed(s.image[what] && s.image[what] < 0.1 ? 1 : 0)} %` : "–"}`);
     if ($("#film-beam").hidden === unlit(store.image))
         ask(); // a dark image has no flags
     beam(store.image);

@@ -1,6 +1,6 @@
 // The page's connection to its viewer: requests with answers, newest states and images, how old they are,
 // reconnection.
-import { words } from "./dom.js";
+import { keep, words } from "./dom.js";
 export const pageId = [...crypto.getRandomValues(new Uint8Array(12))].map((b) => b.toString(16).padStart(2, "0")).join("");
 export const store = {
     state: null, framing: null, near: null, hello: null, session: null,
@@ -10,7 +10,7 @@ export const store = {
 };
 // Older than OLD_S, what is shown is said to be old; after SILENT_S nobody waits for answers any more.
 export const OLD_S = 1;
-const SILENT_S = Number(new URLSearchParams(location.search).get("patience") ?? 5), LOOK_MS = 200, TRY_AGAIN = 1013;
+const SILENT_S = Number(new URLSearchParams(location.search).get("patience") ?? 5), LOOK_MS = 200, STOOD_MS = 1000, REST_MS = 500, TRY_AGAIN = 1013;
 const listeners = {};
 const waiting = new Map();
 // Why a request was refused; code 0: nobody answered it.
@@ -48,8 +48,12 @@ export async function command(method, params = {}, title = "Refused") {
         return null;
     }
 }
+// Who is there: kept in this browser, and told to the twin with each connection.
+const PERSON = "flexdt-person";
+export const person = () => localStorage.getItem(PERSON) ?? "";
+export function rename(name) { keep(PERSON, name.trim()); socket?.close(); }
 export function connect() {
-    socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws/${pageId}`);
+    socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws/${pageId}?person=${encodeURIComponent(person())}`);
     socket.binaryType = "arraybuffer";
     socket.onopen = () => { store.viewer = true; parts = []; heard = least = null; emit("connection"); emit("open"); };
     socket.onmessage = (event) => {
@@ -105,7 +109,8 @@ const handlers = {
     job(m) { emit("job", m.data); },
     note(m) { emit("note", m.level, m.title, m.body); },
     log(m) { emit("log", m.data); },
-    beat(m) { heard = { at: performance.now(), late: late(m.at), silent: m.silent_s }; look(); },
+    beat(m) { heard = { at: performance.now(), late: late(m.at), silent: m.silent_s }; if (rested())
+        look(); },
 };
 function text(content) {
     const m = JSON.parse(content);
@@ -136,11 +141,15 @@ function look() {
 }
 // A page that itself stood still (much to draw, a laptop asleep) first reads what has come meanwhile, before it
 // says that the viewer is silent.
-let looked = performance.now();
+let looked = performance.now(), woken = -Infinity;
+const rested = () => performance.now() - looked < STOOD_MS && performance.now() - woken > REST_MS;
 setInterval(() => {
-    const now = performance.now(), awake = now - looked < 1000;
+    const now = performance.now(), awake = now - looked < STOOD_MS;
+    if (!awake)
+        woken = now;
     looked = now;
-    look();
+    if (rested())
+        look();
     if (!awake || store.age <= SILENT_S)
         return;
     for (const [id, w] of waiting)

@@ -1,6 +1,6 @@
 // Bar, readouts, warnings and notes: who holds control, how near things are, what went wrong.
-import { $, $$, $button, $dialog, el, fixed, isNumber, setText } from "./dom.js";
-import { command, OLD_S, on, store } from "./link.js";
+import { $, $$, $button, $dialog, $input, el, fixed, isNumber, setText } from "./dom.js";
+import { command, OLD_S, on, person, rename, store } from "./link.js";
 const ROWS = [
     ["SOD", (s) => `${fixed(s.geometry.SOD_mm, 2)} mm`], ["SDD", (s) => `${fixed(s.geometry.SDD_mm, 2)} mm`],
     ["magnification", (s) => `${fixed(s.geometry.magnification, 4)}×`], ["voxel", (s) => `${fixed(s.geometry.voxel_size_mm * 1000, 2)} µm`],
@@ -124,6 +124,10 @@ $button("#take").addEventListener("click", () => {
     const who = store.state?.controller ?? null, action = who === null ? "acquire" : who === store.session ? "release" : "force";
     void command("session.control", { action }, "Control");
 });
+const me = $input("#person");
+me.value = person();
+me.addEventListener("change", () => rename(me.value));
+$button("#skip").addEventListener("click", () => $("#film-canvas").focus());
 const UNCONFIRMED = "E-stop not confirmed";
 // Pressed when [ms], after which stop, and not confirmed by a newer one yet.
 let pressed = null;

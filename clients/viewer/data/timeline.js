@@ -2,7 +2,7 @@
 import { context2d, fixed } from "./dom.js";
 const COLORS = { light: ["#1668c4", "#a85f00", "#6a46e8", "#127a52", "#b52d62", "#00788a"], dark: ["#5aa9ff", "#ffb454", "#b09aff", "#4cc38a", "#ff7fa6", "#45d0e0"] };
 const TICKS = { dark: "#8892a0", flat: "#e0a800", projection: "#2f9e63", preview: "#b0b8c4" };
-const LANE = 34, LABEL = 13, AXIS = 30, GAP = 70;
+const LANE = 34, LEAST = 24, LABEL = 13, AXIS = 30, GAP = 70;
 // The value at a time: the last one told at or before it.
 function valueAt(times, values, t) {
     let low = 0, high = times.length - 1;
@@ -19,8 +19,9 @@ function steps(total, width) {
     const rough = total / Math.max(1, Math.floor(width / GAP)), ten = 10 ** Math.floor(Math.log10(rough));
     return [1, 2, 5, 10].map((k) => k * ten).find((s) => s >= rough) ?? 10 * ten;
 }
-export function draw(canvas, plan, at, running) {
-    const lanes = Object.entries(plan.curves), tall = lanes.length * LANE + AXIS;
+export function draw(canvas, plan, at, running, room = Infinity) {
+    // Lanes give way down to LEAST where the room is short.
+    const lanes = Object.entries(plan.curves), lane = Math.min(LANE, Math.max(LEAST, Math.floor((room - AXIS) / lanes.length))), tall = lanes.length * lane + AXIS;
     canvas.style.height = `${tall}px`;
     const dpr = Math.min(devicePixelRatio, 2), w = canvas.clientWidth, total = Math.max(plan.duration_s, 1e-9);
     if (!w)
@@ -47,7 +48,7 @@ export function draw(canvas, plan, at, running) {
     }
     x.textAlign = "left";
     lanes.forEach(([name, values], i) => {
-        const known = values.filter((v) => v !== null), unit = plan.units[name] ?? "", top = i * LANE + LABEL + 3, bottom = (i + 1) * LANE - 3;
+        const known = values.filter((v) => v !== null), unit = plan.units[name] ?? "", top = i * lane + LABEL + 3, bottom = (i + 1) * lane - 3;
         const low = known.reduce((a, v) => Math.min(a, v), Infinity), high = known.reduce((a, v) => Math.max(a, v), -Infinity);
         const now = at === null ? null : valueAt(plan.times, values, at), digits = Math.max(Math.abs(low), Math.abs(high)) >= 1000 ? 0 : 2;
         x.strokeStyle = x.fillStyle = colors[i % colors.length];
@@ -68,7 +69,7 @@ export function draw(canvas, plan, at, running) {
         });
         x.stroke();
         const range = known.length ? `${fixed(low, digits)} – ${fixed(high, digits)} ${unit}` : "not known";
-        x.fillText(`${name}  ${now === null || now === undefined ? range : `${fixed(now, digits)} ${unit}`}`, 4, i * LANE + LABEL - 2);
+        x.fillText(`${name}  ${now === null || now === undefined ? range : `${fixed(now, digits)} ${unit}`}`, 4, i * lane + LABEL - 2);
     });
     for (const [t, color] of [[running, colour("--ok")], [at, colour("--bad")]]) {
         if (t === null)

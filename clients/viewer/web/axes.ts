@@ -1,12 +1,12 @@
 // The Move tab: a slider, a number and two hold-to-jog buttons for every axis, and the keys.
-import { $, $input, $select, el, field, fixed, parsed } from "./dom.js";
+import { $, $input, $select, el, field, fixed, parsed, setText } from "./dom.js";
 import type { AxisState, State } from "./viewer.js";
 import { call, command, emit, Failure, on, store } from "./link.js";
 
 const LEASE_S = 0.5, MOST_S = 10, RENEW_MS = 180, SETTLE_MS = 400;
 const GROUPS: Array<[title: string, tint: string, axes: Record<string, string>]> = [
   ["Source", "#ffb020", { ver_tube: "height", tra_tube: "sideways" }],
-  ["Sample", "#3aa0ff", { mag_obj: "to the detector", tra_obj: "sideways", rot_obj: "turn", ver_obj: "source and detector, up and down" }],
+  ["Sample", "#3aa0ff", { mag_obj: "to the detector", tra_obj: "sideways", rot_obj: "turn", ver_obj: "beam height" }],
   ["Detector", "#7a5cff", { mag_det: "distance", ver_det: "height", tra_det: "to the left" }],
 ];
 const JOG_FALLBACK = { mm: 50, deg: 45 };
@@ -115,7 +115,17 @@ function axisRow(name: string, axis: AxisState, what: string) {
   return box;
 }
 
+// What the chosen speed is of those axes.
+function pace(state: State) {
+  const of = (unit: AxisState["unit"]) => {
+    const all = Object.values(state.axes).filter((a) => a.unit === unit && !a.virtual).map((a) => (a.speed ?? JOG_FALLBACK[unit]) * Number($select("#jog-speed").value));
+    const low = Math.min(...all), high = Math.max(...all);
+    return all.length ? [`${low === high ? fixed(low, 1) : `${fixed(low, 1)} to ${fixed(high, 1)}`} ${unit === "deg" ? "°/s" : "mm/s"}`] : [];
+  };
+  setText($("#jog-is"), [...of("mm"), ...of("deg")].join(", "));
+}
 function refresh(state: State) {
+  pace(state);
   if (!rows.size || Object.keys(state.axes).some((n) => !rows.has(n))) build(state);
   for (const row of rows.values()) draw(row);
 }

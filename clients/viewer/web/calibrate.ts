@@ -21,13 +21,19 @@ export function parametersOf(report: unknown): Record<string, number> {
   return found as Record<string, number>;
 }
 const unit = (name: string) => (name === "angle_scale" ? "" : /^(alpha|det_|axis_tilt_)/.test(name) ? "°" : "mm");
+// What the thesis's names mean, in the words of the page.
+const MEANS: Record<string, string | undefined> = {
+  dO_x: "axis sideways", dO_y: "axis height", dO_z: "source to axis", alpha: "start angle", tau_x: "sample off the axis, sideways", tau_z: "sample off the axis, along the beam",
+  dD_x: "detector sideways", dD_y: "detector height", dD_z: "source to detector", dS_x: "focal spot sideways", dS_y: "focal spot height",
+  det_roll: "detector roll", det_pitch: "detector pitch", det_yaw: "detector yaw", axis_tilt_x: "axis towards the detector", axis_tilt_z: "axis sideways tilt", angle_scale: "scale of angles",
+};
 // Decimals that leave `digits` significant ones.
 const decimals = (v: number, digits: number) => Math.min(9, Math.max(0, digits - 1 - Math.floor(Math.log10(Math.abs(v) || 1))));
 function table(parameters: Parameters, sigmas: Record<string, number | null> = {}, units: Record<string, string> = {}) {
   const shown = Object.entries(parameters).filter(([k, v]) => (k === "angle_scale" ? v !== 1 : v !== 0));
   return el("table", { class: "plain mono" }, ...shown.map(([k, v]) => {
     const sigma = sigmas[k] ?? 0, d = sigma > 0 ? decimals(sigma, 2) : decimals((v ?? 0) - (k === "angle_scale" ? 1 : 0), 3);
-    return el("tr", {}, el("td", {}, k), el("td", { class: "n" }, fixed(v, d)),
+    return el("tr", {}, el("td", {}, MEANS[k] ?? k, MEANS[k] ? el("span", { class: "muted small-text" }, ` ${k}`) : null), el("td", { class: "n" }, fixed(v, d)),
       el("td", { class: "n muted" }, sigma > 0 ? `± ${fixed(sigma, d)}` : ""), el("td", { class: "muted" }, units[k] ?? unit(k)));
   }));
 }
@@ -90,7 +96,7 @@ async function estimate<M extends "calibration.fit" | "calibration.align">(metho
   if (!r) return;
   const scan = know(r.tracks?.datasets ?? []), { correction, parameters = {} } = r;
   const of = <W extends keyof Estimated>(what: W) => Object.fromEntries(Object.entries(parameters).map(([k, v]) => [k, v[what]]));
-  const figures = r.tracks ? `  rms ${fixed(r.rms_px, 3)} px · ${r.frames} frames · cost −${fixed(r.cost_reduction_pct, 1)} %` : `  ${names[0]}, without a phantom`;
+  const figures = r.tracks ? `  rms ${fixed(r.rms_px, 3)} px · ${r.frames} frames · sum of squares ${fixed(Math.abs(r.cost_reduction_pct ?? 0), 1)} % ${(r.cost_reduction_pct ?? 0) < 0 ? "above" : "below"} that before` : `  ${names[0]}, without a phantom`;
   const applied = { id: "fit-apply", class: "small primary", disabled: !r.identifiable || !correction, onclick: () => { if (correction) void apply(correction, names.join(", ")); } };
   const compared = { id: "fit-compare", class: "small", disabled: !scan, title: "Where the beads were predicted before and after, over the radiographs",
     onclick: () => open(scan, null, true) };

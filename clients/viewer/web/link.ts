@@ -1,6 +1,6 @@
 // The page's connection to its viewer: requests with answers, newest states and images, how old they are,
 // reconnection.
-import { words } from "./dom.js";
+import { keep, words } from "./dom.js";
 import type { Answers, Camera, Events, Framing, HelloResult, ImageHead, JobStatus, Messages, Near, Pair, Requests, Shown, State } from "./viewer.js";
 
 export const pageId = [...crypto.getRandomValues(new Uint8Array(12))].map((b) => b.toString(16).padStart(2, "0")).join("");
@@ -12,7 +12,7 @@ export const store = {
 };
 // Older than OLD_S, what is shown is said to be old; after SILENT_S nobody waits for answers any more.
 export const OLD_S = 1;
-const SILENT_S = Number(new URLSearchParams(location.search).get("patience") ?? 5), LOOK_MS = 200, TRY_AGAIN = 1013;
+const SILENT_S = Number(new URLSearchParams(location.search).get("patience") ?? 5), LOOK_MS = 200, STOOD_MS = 1000, REST_MS = 500, TRY_AGAIN = 1013;
 type Listeners = { [E in keyof Events]?: Array<(...args: Events[E]) => unknown> };
 const listeners: Listeners = {};
 interface Waiting { resolve: (result: never) => void; reject: (why: Failure) => void; since: number }
@@ -42,8 +42,12 @@ export async function command<M extends Method>(method: M, params: Partial<Reque
   catch (error) { emit("note", "error", typeof title === "function" ? title(error) : title, words(error)); return null; }
 }
 
+// Who is there: kept in this browser, and told to the twin with each connection.
+const PERSON = "flexdt-person";
+export const person = (): string => localStorage.getItem(PERSON) ?? "";
+export function rename(name: string): void { keep(PERSON, name.trim()); socket?.close(); }
 export function connect() {
-  socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws/${pageId}`);
+  socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws/${pageId}?person=${encodeURIComponent(person())}`);
   socket.binaryType = "arraybuffer";
   socket.onopen = () => { store.viewer = true; parts = []; heard = least = null; emit("connection"); emit("open"); };
   socket.onmessage = (event: MessageEvent<string | ArrayBuffer>) => {
@@ -86,7 +90,7 @@ const handlers: { [T in keyof Messages]: (m: Messages[T]) => void } = {
   job(m) { emit("job", m.data); },
   note(m) { emit("note", m.level, m.title, m.body); },
   log(m) { emit("log", m.data); },
-  beat(m) { heard = { at: performance.now(), late: late(m.at), silent: m.silent_s }; look(); },
+  beat(m) { heard = { at: performance.now(), late: late(m.at), silent: m.silent_s }; if (rested()) look(); },
 };
 function text(content: string) {
   const m = JSON.parse(content) as { type: keyof Messages };
@@ -117,10 +121,13 @@ function look() {
 }
 // A page that itself stood still (much to draw, a laptop asleep) first reads what has come meanwhile, before it
 // says that the viewer is silent.
-let looked = performance.now();
+let looked = performance.now(), woken = -Infinity;
+const rested = () => performance.now() - looked < STOOD_MS && performance.now() - woken > REST_MS;
 setInterval(() => {
-  const now = performance.now(), awake = now - looked < 1000;
-  looked = now; look();
+  const now = performance.now(), awake = now - looked < STOOD_MS;
+  if (!awake) woken = now;
+  looked = now;
+  if (rested()) look();
   if (!awake || store.age <= SILENT_S) return;
   for (const [id, w] of waiting) if (now - w.since > 1000 * SILENT_S) { waiting.delete(id); w.reject(new Failure(0, `no answer for ${SILENT_S} s; it may still take effect`)); }
 }, LOOK_MS);

@@ -22,6 +22,7 @@ for (const action of ["pause", "resume", "step", "abort"] as const) clicks({ [`j
 
 function marks() {
   written = text.value.split("\n"); worst = new Map();
+  for (const id of ["#check", "#run", "#plan"]) $button(id).disabled = !text.value.trim();
   for (const p of problems) {
     if (p.line) worst.set(p.line, worst.get(p.line) === "hit" || p.severity === "error" ? "hit" : "soft");
   }
@@ -135,10 +136,10 @@ export function show(r: Report): void {
   marks();
   const box = $("#report");
   box.textContent = "";
-  const clearance = isNumber(r.min_clearance_mm) ? ` · nearest ${fixed(r.min_clearance_mm, 1)} mm` : "";
+  const clearance = isNumber(r.min_clearance_mm) ? ` · moving parts stay ${fixed(r.min_clearance_mm, 1)} mm apart` : "";
   box.append(el("div", {},
     el("span", { class: `verdict ${r.ok ? "ok" : "bad"}` }, r.ok ? "Ready to run" : "Not ready"),
-    el("span", { class: "muted" }, `  ${seconds(r.duration_s)} · ${r.frames} frames · ${bytes(r.bytes)}${clearance}`)));
+    el("span", { class: "muted", title: "Of parts that move against each other; those that stand or move together are not counted" }, `  ${seconds(r.duration_s)} · ${r.frames} frames · ${bytes(r.bytes)}${clearance}`)));
   const link = (line: number | null) => (line ? el("a", pressed(() => goTo(line)), `line ${line}`) : el("span", { class: "muted" }, "whole"));
   for (const p of problems.slice(0, 100)) {
     box.append(el("div", { class: "problem" }, link(p.line), el("span", { class: p.severity === "error" ? "error" : "" }, p.message)));

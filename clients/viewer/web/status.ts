@@ -1,7 +1,7 @@
 // Bar, readouts, warnings and notes: who holds control, how near things are, what went wrong.
-import { $, $$, $button, $dialog, el, fixed, isNumber, setText } from "./dom.js";
+import { $, $$, $button, $dialog, $input, el, fixed, isNumber, setText } from "./dom.js";
 import type { State } from "./viewer.js";
-import { command, OLD_S, on, store } from "./link.js";
+import { command, OLD_S, on, person, rename, store } from "./link.js";
 
 const ROWS: Array<[name: string, text: (s: State) => string]> = [
   ["SOD", (s) => `${fixed(s.geometry.SOD_mm, 2)} mm`], ["SDD", (s) => `${fixed(s.geometry.SDD_mm, 2)} mm`],
@@ -102,6 +102,10 @@ $button("#take").addEventListener("click", () => {
   const who = store.state?.controller ?? null, action = who === null ? "acquire" : who === store.session ? "release" : "force";
   void command("session.control", { action }, "Control");
 });
+const me = $input("#person");
+me.value = person();
+me.addEventListener("change", () => rename(me.value));
+$button("#skip").addEventListener("click", () => $("#film-canvas").focus());
 const UNCONFIRMED = "E-stop not confirmed";
 // Pressed when [ms], after which stop, and not confirmed by a newer one yet.
 let pressed: { at: number; after: number | undefined } | null = null;

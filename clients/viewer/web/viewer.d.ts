@@ -27,7 +27,9 @@ export interface Shown extends ImageHead {
 
 export interface Grey { shape: Pair; data: string }
 export interface VolumeMessage {
-  name: string; problem?: string; side: number; voxel_mm: number; views: number; of: number; low: number; high: number; slices: Record<string, Grey>;
+  name: string; problem?: string; side: number; voxel_mm: number; views: number; of: number; low: number; high: number; slices?: Record<string, Grey>;
+  // Of a past scan: how much of the work is done, and then how many slices there are.
+  past?: boolean; done?: number; size?: Record<string, number>; binning?: number;
 }
 interface Failure { code: number; message: string; data?: unknown }
 // Messages by their type.
@@ -63,6 +65,7 @@ export interface Answers extends WireAnswers {
   "viewer.plan": PlanDocument;
   "viewer.recorded": DatasetResult;
   "viewer.recorded_image": AboutImage;
+  "viewer.slice": Partial<Grey>;
   "viewer.compose": { text: string; moved: Record<string, Pair> };
   "viewer.datasets": DatasetListResult;
   "viewer.scrub": { positions: Record<string, number> | null };
@@ -77,5 +80,5 @@ export interface Events {
   state: [state: State]; job: [job: JobStatus]; volume: [volume: VolumeMessage]; image: [image?: Shown | null];
   log: [entry: { level: string; message: string }];
   tab: [name: string]; "show-tab": [name: string]; recorded: [name: string | null]; frame: [target: Window];
-  calibrate: [dataset: string, sample: string, markers?: Mark[]]; align: [dataset: string]; script: [text: string];
+  calibrate: [dataset: string, sample: string, markers?: Mark[]]; align: [dataset: string]; reconstruct: [dataset: string]; script: [text: string];
 }

@@ -213,6 +213,7 @@ export type ExposurePredict = {
   mode?: string | null;
   roi?: [number, number, number, number] | null;
   frames?: number;
+  kind?: "fly" | "step" | "tiled" | "helical" | "calibration" | null;
   sod_mm?: number | null;
   sdd_mm?: number | null;
   detail?: string;
@@ -303,7 +304,8 @@ export type Layers = {
 };
 export type Live = {
   name?: string | null;
-  side?: 128 | 192 | 256;
+  side?: 128 | 192 | 256 | 512;
+  past?: boolean;
 };
 export type Mark = {
   frame: number;
@@ -463,6 +465,10 @@ export type ScriptInput = {
 export type Scrub = {
   time_s?: number | null;
 };
+export type Slice = {
+  name: "top" | "front" | "side";
+  index: number;
+};
 export type Spectrum = {
   kV: number;
 };
@@ -578,6 +584,7 @@ export interface Methods {
   "viewer.recorded": [Recorded, object];
   "viewer.recorded_image": [RecordedImage, object];
   "viewer.live": [Live, object];
+  "viewer.slice": [Slice, object];
   "viewer.compose": [Compose, object];
   "viewer.datasets": [Datasets, object];
   "viewer.scrub": [Scrub, object];

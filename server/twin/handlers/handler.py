@@ -49,8 +49,9 @@ class Client:
 
     @property
     def name(self) -> str:
-        """The connection's name, as in `controller`."""
-        return self.peer.name
+        """As in `controller`: what the client called itself, with the connection's number."""
+        number = self.peer.name.rpartition("#")[2]
+        return f"{self.program[:40]} #{number}" if self.program else self.peer.name
 
 
 Handler = Callable[[TwinServer, Client, Any], object | Awaitable[object]]

@@ -134,6 +134,7 @@ async def predict(twin: TwinServer, client: Client, params: p.ExposurePredict) -
         "averages": params.averages or camera.averages,
         "mode": params.mode or camera.mode, "roi": Roi(*(params.roi or camera.roi.edges)),
         "filter": params.filter, "images": params.frames, "detail": params.detail,
+        "kind": params.kind, "profile": scanner.profile, "start": twin.submissions.start(),
         "sod": params.sod_mm or at.SOD_mm, "sdd": params.sdd_mm or at.SDD_mm,
     }  # fmt: skip
     async with twin.samples.turn:

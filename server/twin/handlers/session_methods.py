@@ -16,7 +16,7 @@ from flexdt.server.twin.hub import ImageWish
 def hello(twin: TwinServer, client: Client, params: p.Hello) -> p.HelloResult:
     """Greet a client whose token `network.shell_parts.TokenCheck` has found right."""
     require_compatible(params.protocol)
-    client.program = params.client
+    client.program = client.program or params.client  # control goes by the name
     return p.HelloResult(
         protocol=PROTOCOL,
         server=f"flexdt {twin.version}",

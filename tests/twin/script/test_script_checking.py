@@ -312,8 +312,8 @@ def test_figures_of_the_report_in_words(flexray: Machine, profile: Profile) -> N
     assert dict(summary(wide))["duration"].startswith("0 min ")
     free = Clearance((), 12.5, ("sample", "source"), ((0.0, 12.5),))
     hit = Clearance((Collision(10, 4.5, ("sample", "source"), {}),), 0.5, ("sample", "source"))
-    for found, text, ok in ((free, "none; smallest clearance 12.50 mm (sample and source)", True),
-                            (hit, "1", False)):  # fmt: skip
+    stay = "none; parts in relative motion stay 12.50 mm apart (sample and source)"
+    for found, text, ok in ((free, stay, True), (hit, "1", False)):
         checked = report(flexray, profile, collision=lambda *_, found=found: found)
         assert dict(summary(checked))["collisions"] == text
         assert (checked.ok, repr(checked).split(",")[1]) == (ok, f" {1 - ok} collisions")

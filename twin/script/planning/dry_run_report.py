@@ -150,7 +150,7 @@ def _collisions(report: CheckReport) -> str:
     nearest = ""
     if c.min_clearance_mm is not None and not c.collisions:
         pair = f" ({' and '.join(c.min_clearance_pair)})" if c.min_clearance_pair else ""
-        nearest = f"; smallest clearance {c.min_clearance_mm:.2f} mm{pair}"
+        nearest = f"; parts in relative motion stay {c.min_clearance_mm:.2f} mm apart{pair}"
     return f"{len(c.collisions) or 'none'}{nearest}"
 
 
