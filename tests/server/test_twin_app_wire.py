@@ -45,7 +45,7 @@ def test_a_handler_of_an_unknown_method_is_an_error() -> None:
 def test_state_motion_and_geometry_agree(tmp_path: Path) -> None:
     async def body(lab: Lab) -> None:
         c = lab.client()
-        await c.call("session.hello", protocol="1.0", client="test")
+        hello = await c.call("session.hello", protocol="1.0", client="test")
         answer = await c.call("axes.move", targets={"mag_obj": 650.0, "rot_obj": 90.0}, wait=True)
         assert answer["duration_s"] == pytest.approx(4.0)  # 90 deg: 45 deg/s after 2 s at 22.5
         state = await c.call("state.get")
@@ -53,7 +53,7 @@ def test_state_motion_and_geometry_agree(tmp_path: Path) -> None:
         assert state["axes"]["rot_obj"]["moving"] is False
         assert state["axes"]["ver_obj"]["virtual"] is True
         assert state["geometry"]["SOD_mm"] == pytest.approx(650.0 + 14.9192)
-        assert state["controller"] == c.name
+        assert state["controller"] == hello["session"] == f"test #{c.name}"
         g = await c.call("geometry.get")
         # At 90 degrees the object's frame has turned clockwise: the source stands on +x.
         assert g["cone_vec"][0] == pytest.approx(650.0 + 14.9192)
