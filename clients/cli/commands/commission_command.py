@@ -1,0 +1,29 @@
+"""`flexdt commission`: a machine from a laboratory's past scans."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from flexdt.clients.cli.commands.scan_commands import read_log_file
+from flexdt.clients.cli.console import table
+from flexdt.clients.cli.options import Answer, argument, option
+
+
+def commission(
+    folders: list[Path] = argument(..., "FOLDER...", "Past scans."),
+    traffic: Path | None = option(
+        None, "Read this recording of `flexdt follow --record` too.", metavar="FILE"
+    ),
+    out: Path = option(..., "Write machine, profile and report to this folder.", metavar="DIR"),
+) -> Answer:
+    """Fit a machine, its zero offsets and their drift to past scans, and say what disagrees."""
+    from flexdt.clients.commission import commission as commissioned
+    from flexdt.clients.commission import require_free, write_commission
+
+    require_free(out)
+    found = commissioned(folders, traffic, read_log_file)
+    write_commission(found, out)
+    yield found.document(out)
+    for title, head, rows in found.sections(out):
+        yield f"{title}\n{table(rows, head) if rows else 'nothing'}\n"
+    yield f"{out}: machine.toml, profile.toml, commission.json and report.html written"
