@@ -23,7 +23,12 @@ SHAPE = (100, 120)
 FRAMES = 49
 MODES = {"HW2SW1High": 2, "HW4SW1High": 4, "HW2SW2Low": 4, "HW4SW1Low": 4}
 LINEAR = ("ver_tube", "ver_det", "tra_obj", "tra_det", "mag_det", "mag_obj")
-PLANTS = ("speed", "limits", "target", "sod", "pixel", "roi", "mode", "count", "axis")
+NAMED = {
+    "speed": "rates of ver_tube", "limits": "limits of tra_obj", "target": "mag_obj in",
+    "sod": "c_obj of the texts", "pixel": "binned_pixel_mm in", "roi": "shape in",
+    "mode": "camera in", "count": "projections in", "axis": "axs_tan",
+}  # fmt: skip
+"""What is planted -> how the contradiction's name begins."""
 
 
 @dataclass
@@ -73,10 +78,11 @@ class Laboratory:
         self.scans = [self._scan(i, ends, age) for i, age in enumerate([*ages, 0.0])]
         self.planted: list[tuple[str, str]] = []
         if self.sign != -1:
-            self.planted.append(("tra_det", "machine flexray"))
+            self.planted.append(("sign of tra_det", "machine flexray"))
         early = self.scans[:-1]
-        for plant, scan in zip(rng.sample(PLANTS, plants), rng.sample(early, plants), strict=True):
-            scan.plants.append(plant)
+        drawn = rng.sample(list(NAMED), plants)
+        for plant, scan in zip(drawn, rng.sample(early, plants), strict=True):
+            self._plant(scan, plant)
         self.bodies = self._bodies()
 
     def _scan(self, i: int, ends: datetime, age: float) -> Past:
@@ -177,8 +183,6 @@ class Laboratory:
         rng = np.random.default_rng(self.rng.randrange(1 << 30))
         folders = []
         for p in self.scans:
-            for plant in p.plants:
-                getattr(self, f"_plant_{plant}")(p)
             p.column = self.true_column(p)
             folder = root / p.name
             folder.mkdir(parents=True)
@@ -255,38 +259,15 @@ class Laboratory:
                 "Last angle : 360.000000"]  # fmt: skip
         return "\r\n".join(out) + "\r\n"
 
-    # What is planted; each names what a report must name.
-
-    def _plant_speed(self, p: Past) -> None:
-        self.planted.append(("ver_tube", p.name))
-
-    def _plant_limits(self, p: Past) -> None:
-        self.planted.append(("tra_obj", p.name))
-
-    def _plant_target(self, p: Past) -> None:
-        self.planted.append(("mag_obj", p.name))
-
-    def _plant_sod(self, p: Past) -> None:
-        self.planted.append(("c_obj", p.name))
-
-    def _plant_pixel(self, p: Past) -> None:
-        self.planted.append(("binned pixel", p.name))
-
-    def _plant_roi(self, p: Past) -> None:
-        self.planted.append(("ROI", p.name))
-
-    def _plant_count(self, p: Past) -> None:
-        self.planted.append(("projections", p.name))
-
-    def _plant_axis(self, p: Past) -> None:
-        p.aside = 1.0
-        self.planted.append(("axis", p.name))
-
-    def _plant_mode(self, p: Past) -> None:
-        """A mode that the machine that ships does not have; its region grows with its binning."""
-        old, p.binning, p.mode = p.binning, 3, "HW3SW1High"
-        left, top, right, bottom = p.roi
-        x, y = (left + right + 1) // 2, (top + bottom + 1) // 2
-        wide, high = ((right - left + 1) * 3 // old, (bottom - top + 1) * 3 // old)
-        p.roi = (x - wide // 2, y - high // 2, x + wide // 2 - 1, y + high // 2 - 1)
-        self.planted.append(("camera", p.name))
+    def _plant(self, p: Past, plant: str) -> None:
+        """Put a contradiction into a scan; the texts and the log look at `plants` themselves."""
+        p.plants.append(plant)
+        self.planted.append((NAMED[plant], p.name))
+        if plant == "axis":
+            p.aside = 1.0
+        if plant == "mode":  # one that does not ship; the region grows with its binning
+            old, p.binning, p.mode = p.binning, 3, "HW3SW1High"
+            left, top, right, bottom = p.roi
+            x, y = (left + right + 1) // 2, (top + bottom + 1) // 2
+            wide, high = ((right - left + 1) * 3 // old, (bottom - top + 1) * 3 // old)
+            p.roi = (x - wide // 2, y - high // 2, x + wide // 2 - 1, y + high // 2 - 1)
