@@ -3,8 +3,8 @@
 `align` tells the column in which the rotation axis is seen, and texts where the motors stood. A
 sideways shift of the axis moves the column in proportion to the magnification, one of the panel
 does not: axs_tan, det_tan and axs_tan's drift follow from one weighted least squares, into which
-det_tan enters as the texts have it, with its prior. Roll gets a weighted line. Where residuals are
-larger than their sigmas say, all sigmas grow in proportion (Birge 1932,
+det_tan enters as the texts have it, with its prior. Roll gets a weighted line, and either drift a
+prior. Where residuals are larger than their sigmas say, all sigmas grow in proportion (Birge 1932,
 doi:10.1103/PhysRev.40.207).
 """
 
@@ -34,13 +34,15 @@ from flexdt.twin.script.grammar import own_name
 
 YEAR_S: Final = 365.25 * 86400.0
 FOR_A_LINE: Final = 3
-"""Dates that a drift needs: with two there is nothing to check it by."""
+"""Dates that a drift needs, and rows beyond the unknowns that outvote a scan: with two there is
+nothing to check one by."""
 FAR_OFF: Final = 4.0
 """Sigmas from which on a scan contradicts the others, and is left out where enough remain."""
 TOLD: Final = 0.5
 """Share of its prior's width below which scans tell det_tan themselves."""
-STEP_MM: Final = 0.01
-"""Of the slopes; the column is all but linear in both offsets."""
+DRIFT: Final = 0.25
+"""Prior of a drift [mm or deg a year]: from one published profile of the FleX-ray to the next
+det_tan changes by 0.23 mm rms and the roll by 0.15 deg."""
 AGREE: Final = 1e-4
 """By what part statements of one quantity may differ: texts carry six decimals, cameras round
 their exposures. Motors and offsets may differ by `rebuild.MATCH_MM`."""
@@ -296,46 +298,44 @@ def zero_offsets(scans: Sequence[PastScan], machine: Machine, usual: Profile) ->
     told = [s for s in told if s.date is not None or not drifts]
     width = prior_widths(machine, usual)["dD_x"]
 
-    def fitted(of: Sequence[PastScan], sides: FloatArray, rest: Any, sigmas: Any,
-               *names: str) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-        """Put the first name's line, with its drift, and the other's value into `lines`; rows
-        beyond those of the scans are priors."""
-        at, covariance, pulls = _fit(sides, np.array(rest), np.array(sigmas), len(of))
+    def fitted(
+        sides: FloatArray, rest: list[float], sigmas: list[float], *names: str
+    ) -> tuple[FloatArray, FloatArray]:
+        """Put the first name's line and the other's value into `lines`; the rows beyond those of
+        the scans are priors, of the drift first."""
+        at, covariance, pulls = _fit(sides, np.array(rest), np.array(sigmas), len(told))
         widths = np.sqrt(np.diag(covariance)).tolist()
         for name, i in zip(names, (0, 2), strict=False):
-            value, slope = lines[name].value + float(at[i]), i == 0 and widths[1] > 0.0
-            rates = {"per_year": float(at[1]), "drift_sigma": widths[1]} if slope else {}
-            lines[name] = Line(value, widths[i], scans=len(of), **rates)
-        for scan, pull in zip(of, pulls.tolist(), strict=True):
+            slope = {"per_year": float(at[1]), "drift_sigma": widths[1]}
+            value = lines[name].value + float(at[i])
+            more = slope if drifts and i == 0 else {}
+            lines[name] = Line(value, widths[i], scans=len(told), **more)
+        for scan, pull in zip(told, pulls.tolist(), strict=True):
             if abs(pull) > FAR_OFF:
                 text = f"{scan.name} is {abs(pull):.1f} sigma from the line of all scans"
                 findings.append(Finding(names[0], text))
         return at, covariance
 
-    def years(of: Sequence[PastScan]) -> FloatArray:
-        """Since the last scan; all 0, which makes a line a mean, where there are too few dates."""
-        return np.array([(s.date - last).total_seconds() / YEAR_S if drifts and s.date and last
-                         else 0.0 for s in of])  # fmt: skip
-
     if told:
+        years = np.array([(s.date - last).total_seconds() / YEAR_S if s.date and last else 0.0
+                          for s in told])  # fmt: skip
         found = [s.aligned.parameters for s in told if s.aligned]
-        sides = np.column_stack([np.ones(len(told)), years(told)])
         rolls = [p["det_roll"] for p in found]
-        fitted(told, sides, [r.value - base.det_roll_deg for r in rolls], [r.sigma for r in rolls],
-               "det_roll_deg")  # fmt: skip
+        sides = np.vstack([np.column_stack([np.ones(len(told)), years]), [0.0, 1.0]])
+        rest = [*(r.value - base.det_roll_deg for r in rolls), 0.0]
+        fitted(sides, rest, [*(r.sigma for r in rolls), DRIFT], "det_roll_deg")
         seen = np.array(
             [_axis(machine, s, base, r.value) for s, r in zip(told, rolls, strict=True)]
         )
-        sides = np.column_stack([seen[:, 1], seen[:, 1] * years(told), seen[:, 2]])
+        sides = np.column_stack([seen[:, 1], seen[:, 1] * years, seen[:, 2]])
         measured = [p["axis_column_px"] for p in found]
-        rest = [*(m.value - at for m, at in zip(measured, seen[:, 0], strict=True)), 0.0]
-        sigmas = [*(m.sigma for m in measured), width]
-        at, covariance = fitted(
-            told, np.vstack([sides, [0.0, 0.0, 1.0]]), rest, sigmas, "axs_tan", "det_tan"
-        )
+        rest = [*(m.value - at for m, at in zip(measured, seen[:, 0], strict=True)), 0.0, 0.0]
+        sigmas = [*(m.sigma for m in measured), DRIFT, width]
+        known = np.vstack([sides, [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        at, covariance = fitted(known, rest, sigmas, "axs_tan", "det_tan")
         spread = np.sqrt(np.einsum("ij,jk,ik->i", sides, covariance, sides))
-        for s, m, *rest in zip(told, measured, seen[:, 0] + sides @ at, spread, strict=True):
-            columns[s.name] = (m.value, float(rest[0]), float(rest[1]))
+        for s, m, *more in zip(told, measured, seen[:, 0] + sides @ at, spread, strict=True):
+            columns[s.name] = (m.value, float(more[0]), float(more[1]))
     day = "undated" if last is None else f"{last:%Y-%m-%d}"
     source = "; ".join(f"{n}: {x.scans or 'texts of the'} scans" for n, x in lines.items())
     head = {"name": f"commissioned-{day}", "machine": machine.name, "date": day, "source": source}
@@ -352,15 +352,16 @@ def zero_offsets(scans: Sequence[PastScan], machine: Machine, usual: Profile) ->
 
 
 def _axis(machine: Machine, scan: PastScan, base: Profile, roll: float) -> tuple[float, ...]:
-    """The axis's column [px] with the offsets of `base`, and its slopes with axs_tan, det_tan."""
+    """The axis's column [px] with the offsets of `base`, and its slopes [px/mm] with axs_tan and
+    det_tan, in which it is linear."""
     own, camera = scan.profile or base, scan.camera or machine.detector.camera
     middle = (np.array(camera.shape[::-1]) - 1) / 2
     column = []
-    for axs, det in ((0.0, 0.0), (STEP_MM, 0.0), (0.0, STEP_MM)):
+    for axs, det in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)):
         moved = {"axs_tan": base.axs_tan + axs, "det_tan": base.det_tan + det, "det_roll_deg": roll}
         poses = motor_poses(machine, own.model_copy(update=moved), camera, scan.positions)
         column.append(float(axis_in_image(poses, NOMINAL, middle)[0]))
-    return column[0], (column[1] - column[0]) / STEP_MM, (column[2] - column[0]) / STEP_MM
+    return column[0], column[1] - column[0], column[2] - column[0]
 
 
 def _fit(
@@ -369,14 +370,13 @@ def _fit(
     """Weighted least squares of rows, of which the first `scans` belong to a scan each.
 
     The scan that contradicts the others most is left out while it does so by `FAR_OFF` sigmas and
-    enough remain; directions of which no row says anything stay at 0.
+    enough remain.
 
     Returns:
         Values, covariance, and the residuals of all scans in sigmas.
     """
     a, b = sides / sigmas[:, None], values / sigmas
-    free = np.abs(a).max(axis=0) > 0.0
-    a, kept = a[:, free], np.ones(len(b), dtype=bool)
+    kept = np.ones(len(b), dtype=bool)
     while True:
         inverse = np.linalg.inv(a[kept].T @ a[kept])
         at = inverse @ (a[kept].T @ b[kept])
@@ -384,10 +384,6 @@ def _fit(
         spread = np.sqrt(np.maximum(np.where(kept, 1.0 - leverage, 1.0 + leverage), 1e-9))
         pulls, freedom = (rest / spread)[:scans], int(kept.sum()) - a.shape[1]
         far = np.where(kept[:scans], np.abs(pulls), 0.0)
-        if freedom < 2 or far.max() <= FAR_OFF:
-            break
+        if freedom < FOR_A_LINE or far.max() <= FAR_OFF:
+            return at, max(1.0, float(rest[kept] @ rest[kept]) / max(freedom, 1)) * inverse, pulls
         kept[int(far.argmax())] = False
-    birge = max(1.0, float(rest[kept] @ rest[kept]) / freedom) if freedom else 1.0
-    out, covariance = np.zeros(len(free)), np.zeros((len(free),) * 2)
-    out[free], covariance[np.ix_(free, free)] = at, birge * inverse
-    return out, covariance, pulls
