@@ -9,6 +9,7 @@ from pathlib import Path
 
 import laboratories
 import pytest
+import scanner_traffic
 from bead_scan import bead_scan
 from past_laboratory import Laboratory
 
@@ -16,7 +17,9 @@ from flexdt import machines
 from flexdt.clients.cli.commands.scan_commands import read_log_file
 from flexdt.clients.cli.entry import run
 from flexdt.clients.commission import commission
+from flexdt.clients.following.traffic import Recorded, format_recorded
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.script.executed_log import read_log
 
 LOG = Path(__file__).parents[1] / "data" / "logs" / "unitom_xl_201106_001.txt"
 
@@ -137,6 +140,24 @@ def test_the_public_log_alone_and_the_same_as_traffic(tmp_path: Path) -> None:
     axis = alone.machine.axes["tra_obj"]
     assert (axis.lower, axis.upper, axis.max_speed) == (12.0, 319.0, 50.0)
     assert any(q.what == "which scanner it is" for q in alone.questions)
+
+
+def test_limits_from_a_recording_of_raw_messages(
+    tmp_path: Path, lab: tuple[Laboratory, list[Path]]
+) -> None:
+    made, folders = lab
+    log = (folders[1] / "script_executed.txt").read_bytes()
+    raw = scanner_traffic.replay(log, read_log(log)[0])
+    traffic = tmp_path / "traffic.txt"
+    traffic.write_bytes(b"".join(format_recorded(Recorded(at, 0.0, m)) for at, m in raw))
+    folder = tmp_path / "past"
+    shutil.copytree(folders[1], folder)
+    (folder / "script_executed.txt").unlink()
+    found = commission([folder], traffic, read_log_file)
+    for name, limits in made.rig.limits.items():
+        axis = found.machine.axes[name]
+        assert (axis.lower, axis.upper, axis.max_speed, axis.max_acceleration) == limits
+    assert not any(q.what == "limits of mag_obj" for q in found.questions)
 
 
 def test_errors_are_sentences_and_nothing_is_left(

@@ -264,7 +264,7 @@ class Laboratory:
         p.plants.append(plant)
         self.planted.append((NAMED[plant], p.name))
         if plant == "axis":
-            p.aside = 1.0
+            p.aside = 0.4
         if plant == "mode":  # one that does not ship; the region grows with its binning
             old, p.binning, p.mode = p.binning, 3, "HW3SW1High"
             left, top, right, bottom = p.roi
