@@ -18,6 +18,7 @@ from flexdt.clients.cli.commands import data_commands as data
 from flexdt.clients.cli.commands import process_commands as processes
 from flexdt.clients.cli.commands import scan_commands as scans
 from flexdt.clients.cli.commands import scanner_commands as scanner
+from flexdt.clients.cli.commands.commission_command import commission
 from flexdt.clients.cli.commands.demo_command import demo
 from flexdt.clients.cli.commands.follow_command import follow
 from flexdt.clients.cli.options import Json, Server, TokenFile, argument, completed, option
@@ -50,6 +51,7 @@ COMMANDS: Final[Mapping[str, Callable[..., object]]] = {
     "export": data.export,
     "import": data.import_,
     "follow": follow,
+    "commission": commission,
     "doctor": processes.doctor,
 }
 """Name -> what it runs."""
@@ -96,7 +98,7 @@ SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
                 "sample", "snap"),
     "Scans": ("script", "check", "expose", "run", "job", "follow"),
     "Data": ("calibrate", "align", "compare", "reconstruct", "export", "import", "simulate"),
-    "Analysis": ("phantom", "machine", "study", "batch", "bench", "evidence"),
+    "Analysis": ("phantom", "machine", "commission", "study", "batch", "bench", "evidence"),
     "Processes": ("up", *ALONE, "demo", "doctor"),
 }  # fmt: skip
 """Sections of the help page; commands in none of them are listed under Extensions."""

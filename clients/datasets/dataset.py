@@ -201,7 +201,7 @@ def _from_document(content: Folder, machine: Machine | None, profile: Profile | 
     cone_vec = doc.cone_vec() if own else found.cone_vec()
     frames = content.frames(files, shapes)
     warnings: list[str] = []
-    settings = _settings(content, warnings)
+    settings = read_settings(content, warnings)
     if np.abs(found.cone_vec().rows - cone_vec.rows).max() > AGREE_MM:
         warnings.append(f"{path}: cone_vec does not follow from its motor positions")
     lost = content.lost((*doc.files("dark"), *doc.files("flat"), *files))
@@ -246,7 +246,7 @@ def _from_texts(content: Folder, machine: Machine | None, profile: Profile | Non
             {"path": str(content.path), "missing": ["scan_000000.tif"]},
         )
     warnings: list[str] = []
-    settings = _settings(content, warnings)
+    settings = read_settings(content, warnings)
     if settings is None:
         raise DatasetMissingError(
             f"{content.path}: none of {DOCUMENT}, {SCAN_SETTINGS!r} and {XRE_SETTINGS!r} is there, "
@@ -291,7 +291,7 @@ def _from_texts(content: Folder, machine: Machine | None, profile: Profile | Non
     )
 
 
-def _settings(content: Folder, warnings: list[str]) -> ScanSettings | None:
+def read_settings(content: Folder, warnings: list[str]) -> ScanSettings | None:
     """The settings of the scanner's text, or of its second text where the first is of no use."""
     readers: Sequence[tuple[str | None, Callable[[str, str], ScanSettings]]] = (
         (content.scan_settings, parse_scan_settings),

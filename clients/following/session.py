@@ -26,7 +26,7 @@ import numpy as np
 
 from flexdt.clients.datasets.pictures import png
 from flexdt.clients.following import traffic as r
-from flexdt.clients.gateway.vocabulary import MoveRelative, Question, Refusal, read_command
+from flexdt.clients.gateway.vocabulary import Question, Refusal, read_command
 from flexdt.clients.whole_files import write_whole
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import line_integrals as projected
@@ -139,16 +139,13 @@ def shift(virtual: Float32Array, real: Float32Array) -> tuple[float, float]:
 # Bytes of the scanner's interface to what a follower hears: no socket, no clock.
 
 
-def heard(
-    data: bytes, axes: Collection[str], mirror: Mirror, stamp: str, late_s: float = 0.0
-) -> Heard:
+def heard(data: bytes, axes: Collection[str], stamp: str, late_s: float = 0.0) -> Heard:
     """One message.
 
     Args:
         data: as it came; UTF-8, or one byte for each character where a cluster makes it none. What
             stands before the object, such as a topic, is left out.
         axes: motors and virtual axes of the machine.
-        mirror: says where a relative move begins.
         stamp: time of day, hh:mm:ss.mmm.
         late_s: by how much earlier it may have come than it was read [s].
 
@@ -161,27 +158,21 @@ def heard(
     except AcquilaError:
         event = parse_event(data.decode("latin-1"))
     event = replace(event, component=own_name(event.component, axes))
-    command, asks = _read(event, axes, mirror)
+    command, asks = _read(event, axes)
     words = (event.component, event.command, event.arg1, event.arg2)
     what: What = event.reply_type.value or "SEND"  # type: ignore[assignment]
     tick, reply = event.tick_count, event.reply
     return Heard(event.key, what, words, command, reply, asks, stamp, tick, late_s)
 
 
-def _read(
-    event: AcquilaEvent, axes: Collection[str], mirror: Mirror
-) -> tuple[c.Command | None, str]:
+def _read(event: AcquilaEvent, axes: Collection[str]) -> tuple[c.Command | None, str]:
     """The typed command, and what a question asks for; neither of what the scripts do not know."""
     try:
         command = read_command(event, axes)
     except Refusal:
         return None, ""
-    match command:
-        case Question():
-            return None, command.path[-1]
-        case MoveRelative() if command.component in mirror.axes:
-            at = mirror.axes[command.component].position
-            return c.MoveAbsolute(component=command.component, target=at + command.step), ""
+    if isinstance(command, Question):
+        return None, command.path[-1]
     return (command if type(command).__module__ == c.__name__ else None), ""
 
 
@@ -231,7 +222,7 @@ class FollowSession:
         at = self.clock() if at is None else at
         self._keep(data, at, late_s)
         try:
-            said = heard(data, self._axes, self.mirror, self.time_of_day(at), late_s)
+            said = heard(data, self._axes, self.time_of_day(at), late_s)
         except AcquilaError as error:
             self.unread += 1
             self.unread_example = self.unread_example or f"{error}: {data[:200].decode('latin-1')}"

@@ -18,10 +18,8 @@ from flexdt.clients.gateway.connected_twin import POLL_S, Armed, CommandProgress
 from flexdt.clients.gateway.recording import Image
 from flexdt.clients.gateway.vocabulary import (
     AbortScript,
-    MoveRelative,
     Question,
     Refusal,
-    RunScript,
     StopAll,
     shown,
 )
@@ -36,9 +34,6 @@ ARMED_S: Final = 10.0
 JOB_POLL_S: Final = 0.1
 READY_S: Final = 900.0
 """Twin seconds that X-rays may take to be ready."""
-
-TEN_DECIMALS: Final = ("position", "speed")
-"""The scanner's replies have ten decimals there and six elsewhere."""
 
 Action = Callable[[ConnectedTwin, Any, CommandProgress], Awaitable[str]]
 
@@ -156,15 +151,6 @@ async def move(twin: ConnectedTwin, command: c.MoveAbsolute, progress: CommandPr
     return await asyncio.shield(armed.ended)
 
 
-async def move_relative(
-    twin: ConnectedTwin, command: MoveRelative, progress: CommandProgress
-) -> str:
-    """Move by a distance from the present position."""
-    state = await twin.state()
-    at = state.axes[command.component].position
-    return await _go(twin, command.component, at + command.step, progress)
-
-
 async def _go(twin: ConnectedTwin, axis: str, target: float, progress: CommandProgress) -> str:
     await twin.ask("axes.move", {"targets": {axis: target}})
     state = await twin.state()
@@ -192,16 +178,9 @@ async def question(twin: ConnectedTwin, command: Question, progress: CommandProg
     value: object = (await twin.state()).model_dump(mode="json")
     for key in command.path:
         value = value.get(key) if isinstance(value, Mapping) else None
-    match value:
-        case bool():
-            return "TRUE" if value else "FALSE"
-        case float():
-            return f"{value:.{10 if command.path[-1] in TEN_DECIMALS else 6}f}"
-        case list():
-            return " ".join(str(v) for v in value)
-        case Mapping():  # a job
-            return f"{value.get('state')} {value.get('frames_done')}/{value.get('frames_total')}"
-    return "" if value is None else str(value)
+    if isinstance(value, bool):
+        return "TRUE" if value else "FALSE"
+    return f"{value:.{10 if command.path[-1] == 'position' else 6}f}"
 
 
 async def sequence(twin: ConnectedTwin, command: c.TakeSequence, progress: CommandProgress) -> str:
@@ -262,11 +241,6 @@ def _sequence_script(state: State, command: c.TakeSequence, armed: Armed | None)
     if armed is not None:  # the same move once more, to wait for its end
         lines.append((armed.axis, "move absolute", repr(armed.target), "", "ACK"))
     return "".join("\t".join((*line, "", "")) + "\r\n" for line in lines)
-
-
-async def run_script(twin: ConnectedTwin, command: RunScript, progress: CommandProgress) -> str:
-    """Run a whole script as a job; FDB counts frames, ACK names the data set's folder."""
-    return await _run(twin, command.text.encode(), command.name or "script", progress)
 
 
 async def abort_script(twin: ConnectedTwin, command: AbortScript, progress: CommandProgress) -> str:
@@ -361,11 +335,9 @@ ACTIONS: Final[Mapping[type[c.Command], Action]] = {
         lambda k: {"axis": k.component, "acceleration": k.acceleration},
         lambda k: f"{k.acceleration:.6f}",
     ),
-    MoveRelative: move_relative,
     # Works for anyone, with or without control.
     StopAll: setting("axes.stop", lambda k: {}, lambda k: ""),
     Question: question,
-    RunScript: run_script,
     AbortScript: abort_script,
 }
 """The action of each command of the grammar and of `vocabulary`; tested to be complete."""

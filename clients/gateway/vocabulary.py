@@ -21,25 +21,12 @@ class Refusal(ValueError):
     """A command that cannot be executed; the message becomes the reply of ERR."""
 
 
-class MoveRelative(c.MotorCommand):
-    """`AXIS move relative STEP`."""
-
-    step: float
-
-
 class StopAll(c.Command):
     """`AXIS stop` and `scanner stop`: all axes brake, as everywhere in the twin."""
 
 
-class RunScript(c.Command):
-    """`scanner run script TEXT [NAME]`."""
-
-    text: str
-    name: str
-
-
 class AbortScript(c.Command):
-    """`scanner abort script`."""
+    """`scanner abort script`: the sequence that runs."""
 
 
 class Question(c.Command):
@@ -55,49 +42,17 @@ def _question(*path: str) -> Extra:
     return lambda event: Question(path=path)
 
 
-def _about(key: str) -> Extra:
-    return lambda event: Question(path=("axes", event.component, key))
-
-
-def _relative(event: AcquilaEvent) -> c.Command:
-    step = grammar.number(event.arg1.strip(), "displacement")
-    return MoveRelative(component=event.component, step=step)
-
-
-def _script(event: AcquilaEvent) -> c.Command:
-    if not event.arg1.strip():
-        raise ArgumentError("the script's text (argument 1) is missing")
-    return RunScript(text=event.arg1, name=event.arg2.strip())
-
-
 _EXTRA: Final[Mapping[str, Mapping[str, Extra]]] = {
-    "tube": {
-        "status_XReady_get": _question("tube", "ready"),
-        "status_xrayon_get": _question("tube", "on"),
-        "status_kV_get": _question("tube", "kV"),
-        "status_power_get": _question("tube", "power_W"),
-    },
-    "camera": {
-        "status_mode_get": _question("camera", "mode"),
-        "status_exposure_get": _question("camera", "exposure_ms"),
-        "status_ROI_get": _question("camera", "roi"),
-        "status_averages_get": _question("camera", "averages"),
-        "status_frames_get": _question("camera", "frames"),
-    },
+    "tube": {"status_XReady_get": _question("tube", "ready")},
+    "camera": {},
     "scanner": {
         "stop": lambda event: StopAll(),
-        "run script": _script,
         "abort script": lambda event: AbortScript(),
         "status_time_get": _question("time"),
-        "status_job_get": _question("job"),
     },
     "": {
-        "move relative": _relative,
         "stop": lambda event: StopAll(),
-        "status_position_get": _about("position"),
-        "status_speed_get": _about("speed"),
-        "status_acceleration_get": _about("acceleration"),
-        "status_moving_get": _about("moving"),
+        "status_position_get": lambda event: Question(path=("axes", event.component, "position")),
     },
 }
 """Commands beside the script's vocabulary; only status_XReady_get is in any public text."""

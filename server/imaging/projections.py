@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import Channel, attenuating, channels, scatter_object
@@ -82,13 +81,12 @@ class Imaging:
         poses: Poses,
         camera: CameraSettings,
         *,
-        times: npt.ArrayLike | None = None,
         truth: TrueGeometry | None = None,
     ) -> Float32Array:
-        """Images of `sample` at n nominal poses, `times` (n,) [s] after the scan's start.
+        """Images of `sample` at n nominal poses.
 
         Args:
-            sample, poses, camera, times: as `Radiography.take` has them.
+            sample, poses, camera: as `Radiography.take` has them.
             truth: instead of the hidden one.
 
         Returns:
@@ -102,7 +100,7 @@ class Imaging:
             return np.zeros((len(poses), *camera.shape), dtype=np.float32)
         _, bodies, names = await self._sent(sample, "part")
         factors = [factor for _, factor in bodies]
-        cone = (truth or self.truth).cone_vec(poses, sample.offset, times)
+        cone = (truth or self.truth).cone_vec(poses, sample.offset)
         check_cone_vec(cone, camera.pixels_mm(self.sensor))
         if factors == [1.0]:
             return await self.projector.project(names[0], cone, camera.shape)
@@ -117,7 +115,6 @@ class Imaging:
         poses: Poses,
         camera: CameraSettings,
         *,
-        times: npt.ArrayLike | None = None,
         truth: TrueGeometry | None = None,
         spot: tuple[float, int] = (0.0, 1),
     ) -> tuple[tuple[Channel, ...], Float32Array, FloatArray]:
@@ -133,7 +130,7 @@ class Imaging:
         Raises:
             As `line_integrals`.
         """
-        cone = (truth or self.truth).cone_vec(poses, sample.offset, times)
+        cone = (truth or self.truth).cone_vec(poses, sample.offset)
         check_cone_vec(cone, camera.pixels_mm(self.sensor))
         if spot[1] > 1:
             cone = ConeVec(spot_views(cone.rows, *spot))

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from flexdt.phantoms.channels import chain_through
 from flexdt.phantoms.materials import stated_keV
@@ -144,7 +143,6 @@ class Radiography:
         camera: CameraSettings,
         exposures: Sequence[ExposureSettings],
         *,
-        times: npt.ArrayLike | None = None,
         truth: TrueGeometry | None = None,
     ) -> list[Radiograph]:
         """Images of `sample`, one for each of `exposures`.
@@ -154,7 +152,6 @@ class Radiography:
             poses: n nominal poses: as many for each image, spread over its exposure.
             camera: of all of them.
             exposures: tube and time of each image; taken as if X-rays were on.
-            times: of the poses since the scan's start, (n,) [s]; None is the start.
             truth: instead of the hidden one.
 
         Raises:
@@ -164,23 +161,20 @@ class Radiography:
         """
         count = len(exposures)
         if self.physics == "ideal":
-            lines = await self.imaging.line_integrals(
-                sample, poses, camera, times=times, truth=truth
-            )
+            lines = await self.imaging.line_integrals(sample, poses, camera, truth=truth)
             if len(lines) == count:
                 return [Radiograph(one) for one in lines]
             return [Radiograph(part) for part in lines.reshape(count, -1, *lines.shape[1:])]
         points, moments = self.tube.spot_points, len(poses) // count
         if points > 1 and count > 1:  # one by one: each holds the paths of all its points
-            at = np.broadcast_to(0.0 if times is None else times, len(poses))
             parts = [slice(i * moments, (i + 1) * moments) for i in range(count)]
             return [
-                (await self.take(sample, poses[p], camera, [e], times=at[p], truth=truth))[0]
+                (await self.take(sample, poses[p], camera, [e], truth=truth))[0]
                 for p, e in zip(parts, exposures, strict=True)
             ]
         spot = self.tube.focal_spot_mm(exposures[0].power_W), points
         channels, paths, views = await self.imaging.path_lengths(
-            sample, poses, camera, times=times, truth=truth, spot=spot
+            sample, poses, camera, truth=truth, spot=spot
         )
         mono_keV = stated_keV() if self.physics == "mono" else None
         chain = chain_through(channels, self.panel, self.tube, mono_keV)

@@ -155,10 +155,7 @@ class Acquisition:
             positions = {n: np.array([e.positions[n] for e in batch]) for n in axes}
         nominal = motor_poses(self.plan.machine, self.plan.profile, frame.camera, positions)
         exposures = [settings_of(e) for e in batch]
-        times = np.repeat([e.start_s for e in batch], len(nominal) // len(batch))
-        images = await self.radiography.take(
-            self.sample, nominal, frame.camera, exposures, times=times
-        )
+        images = await self.radiography.take(self.sample, nominal, frame.camera, exposures)
         self.ensure_same()  # of what was projected, not of what stands there before
         return images
 

@@ -52,7 +52,7 @@ ABSURD = st.one_of(
 SENSIBLE: dict[str, st.SearchStrategy[Any]] = {
     "component": st.sampled_from(["tube", "camera", "scanner", "mag_obj", "rot_obj", "heater"]),
     "command": st.sampled_from(
-        ["xrayon", "set kV", "move absolute", "move relative", "stop", "status_job_get", "pause",
+        ["xrayon", "set kV", "move absolute", "move relative", "stop", "status_time_get", "pause",
          "status_position_get", "take image", "save image", "run script", "set ROI", "explode",
          "set output path", "take and save image sequence", "set sample info", "abort script"]
     ),

@@ -7,7 +7,6 @@ import pytest
 from flexdt.clients.gateway.actions import ACTIONS
 from flexdt.clients.gateway.event_server import bind_endpoint, check_loopback, transcript_line
 from flexdt.clients.gateway.vocabulary import (
-    MoveRelative,
     Question,
     Refusal,
     component_type,
@@ -34,7 +33,6 @@ def test_commands_are_the_scripts_own() -> None:
     )
     move = read("ROT_OBJ", "move absolute", "360.5", "0.0")
     assert move == c.MoveAbsolute(component="rot_obj", target=360.5, trigger=0.0)
-    assert read("ver_obj", "move relative", "-2") == MoveRelative(component="ver_obj", step=-2.0)
     assert read("mag_obj", "status_position_get") == Question(path=("axes", "mag_obj", "position"))
 
 
@@ -58,7 +56,7 @@ def test_names_of_axes_are_the_machines_own_in_any_case() -> None:
         (("tube", "set kV", "ninety"), "kV must be a number"),
         (("tube", "xrayon", "1"), "takes no argument"),
         (("camera", "set number of frames", "0"), "from 1 to"),
-        (("scanner", "run script", " "), "text"),
+        (("scanner", "run script", " "), "it knows: "),
         (("mag_obj", "move absolute", "1e400"), "number"),
     ],
 )
@@ -77,7 +75,7 @@ def test_every_command_of_the_grammar_has_an_action() -> None:
 
 def test_every_command_that_is_told_of_can_be_read() -> None:
     arguments = {"set kV": "80", "set power": "40", "set mode": "HW1SW1High", "set ROI": "0 0 9 9",
-                 "keep xrayon": "TRUE", "run script": "tube\txrayon\t\t\tACK"}  # fmt: skip
+                 "keep xrayon": "TRUE"}  # fmt: skip
     for component in (*grammar.FIXED, "rot_obj"):
         for command in known_commands(component):
             argument = arguments.get(command, "5")

@@ -137,7 +137,7 @@ def test_the_twins_images_have_the_samples_scatter(tmp_path: Path) -> None:
     beam = Beam.of(chain, 90.0)
     # Half the panel's pixels are open beam: what was added there is scatter alone.
     thing = scatter_object(parts, phantom.size_mm, 40_000)
-    row = TrueGeometry().cone_vec(pose, Sample("lego").offset, None).rows[0]
+    row = TrueGeometry().cone_vec(pose, Sample("lego").offset).rows[0]
     settings = ScatterSettings(seed=77, error=0.01)
     image_77 = scatter_image(thing, row, MIDDLE.shape, beam, settings, 5)
     empty = ExposureSettings(90.0, 50.0, 100.0)
@@ -278,7 +278,7 @@ def test_rays_from_points_of_the_focal_spot_blur_each_depth_as_it_is(tmp_path: P
         asyncio.run(one.take(Sample("lego"), pose, seen, [LISTING_1]))[0].integrals
         for one in (made, replace(made, tube=replace(made.tube, spot_points=1)))
     )
-    row = TrueGeometry().cone_vec(pose, Sample("lego").offset, None).rows[0]
+    row = TrueGeometry().cone_vec(pose, Sample("lego").offset).rows[0]
     at = np.linspace(-3.3, 3.3, 23)
     places = np.array([(x, y) for x in at for y in at])
     weight = np.exp(-(places**2).sum(axis=1) / 2)

@@ -495,7 +495,7 @@ class Events:
         """Whether it answers a question."""
         self.asked += 1
         number = 10**9 + self.asked
-        self._out.send(json.dumps(event("tube", "status_kV_get", UUID=number)).encode())
+        self._out.send(json.dumps(event("tube", "status_XReady_get", UUID=number)).encode())
         until = time.monotonic() + patience_s
         while (left := until - time.monotonic()) > 0 and self._in.poll(1000 * left):
             told = json.loads(self._in.recv())

@@ -91,8 +91,8 @@ def rebuild(
         DatasetFormatError: neither machine and motors nor the figures suffice.
     """
     angles = np.radians(angles_deg(settings, count, file))
-    settings, moved = _physical(settings, file)
-    machine = machines[0] if len(machines) == 1 else _machine(settings, machines)
+    settings, moved = physical(settings, file)
+    machine = machines[0] if len(machines) == 1 else named_machine(settings, machines)
     figures = settings.figures
     if machine is None:
         who = settings.scanner_name or "(unnamed)"
@@ -126,7 +126,7 @@ def rebuild(
     )
 
 
-def _physical(settings: ScanSettings, file: str) -> tuple[ScanSettings, list[str]]:
+def physical(settings: ScanSettings, file: str) -> tuple[ScanSettings, list[str]]:
     """Settings with the detector where it physically is, and what that changes.
 
     Some FleX-ray files have `mag_det_phys` beside `mag_det`. Where the two differ, the printed SDD
@@ -181,7 +181,7 @@ def _profile(
     return None
 
 
-def _machine(settings: ScanSettings, machines: Sequence[Machine]) -> Machine | None:
+def named_machine(settings: ScanSettings, machines: Sequence[Machine]) -> Machine | None:
     """The candidate whose scanner name or type the texts name and whose motors they have."""
     said = {_word(settings.scanner_name), _word(settings.scanner_type)} - {""}
     for machine in machines:

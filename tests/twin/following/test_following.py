@@ -50,7 +50,7 @@ class Listener:
         for at, data in messages:
             self.now = self.now or at - 0.1
             self.wait(at)
-            said = heard(data, axes, self.mirror, _stamp(at))
+            said = heard(data, axes, _stamp(at))
             self._take(self.follower.hear(self.mirror, said, at))
             self.record += b"".join(self.mirror.lines)
         return self
@@ -336,9 +336,7 @@ def test_a_day_leaves_nothing_behind() -> None:
             for when, data in batch:
                 axes = (*FLEXRAY.axes, *FLEXRAY.virtual_axes)
                 listener._take(
-                    follow.hear(
-                        listener.mirror, heard(data, axes, listener.mirror, "00:00:00.000"), when
-                    )
+                    follow.hear(listener.mirror, heard(data, axes, "00:00:00.000"), when)
                 )
             listener._take(follow.tick(listener.mirror, at))
         # Each second scan ends with a move that is not the script's, so the script's is late.
@@ -359,5 +357,5 @@ def test_a_cluster_that_is_no_utf8_is_read_byte_for_byte() -> None:
     raw = text.encode("latin-1").replace(
         b'"@"', b'"' + reply.replace(b'"', b'\\"').replace(b"\\", b"\\\\") + b'"'
     )
-    said = heard(raw, ["tra_obj"], Mirror.of(UNITOM), "00:00:00.000")
+    said = heard(raw, ["tra_obj"], "00:00:00.000")
     assert said.reply.encode("latin-1") == reply

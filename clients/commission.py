@@ -1,0 +1,282 @@
+"""`flexdt commission` without its command line: folders of past scans in; a machine, a profile and
+what contradicts what out.
+
+The machine is the one that ships and that the texts name, with the signs and rates of the texts,
+fitted to the executed scripts; `flexdt.twin.commissioning` says the rest. A scan that cannot be
+read is no error: it is named among what could not be judged.
+"""
+
+from __future__ import annotations
+
+import html
+import json
+import os
+import shutil
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from flexdt import machines
+from flexdt.clients import figures
+from flexdt.clients.calibration.align_dataset import align_dataset
+from flexdt.clients.datasets.dataset import load_dataset, read_settings
+from flexdt.clients.failure import CommandError
+from flexdt.runtime.files.dataset_folder import list_folder, read_image, read_text
+from flexdt.twin import commissioning as tells
+from flexdt.twin.commissioning import PastScan, Question
+from flexdt.twin.dataset import rebuild
+from flexdt.twin.dataset.xre import parse_xre
+from flexdt.twin.errors import TwinError
+from flexdt.twin.machine import description as d
+from flexdt.twin.machine.fitted_file import fitted_text
+from flexdt.twin.script.executed_log import Executed
+from flexdt.twin.script.grammar import own_name
+from flexdt.twin.script.parse import read_script
+from flexdt.twin.script.planning.log_fit import Fit, fit_machine
+
+MOST_NEXT: Final = 3
+"""Scans that are proposed; a list of all nobody follows."""
+ENOUGH: Final = 3
+"""Times of a kind of command from which on its range is its own (`docs/machine-fit.md`)."""
+NEXT: Final = {
+    "ordinary": ("a full turn of any object with structure", "fly --frames 721"),
+    "magnified": ("the same at another magnification", "fly --frames 721 --sod {sod:.0f}"),
+    "later": ("the same on another day", "fly --frames 721"),
+    "beads": ("a bead phantom at two distances, then `flexdt calibrate`", "calibration"),
+    "recorded": ("a scan with `flexdt follow ADDRESS --record FILE` beside it", "calibration"),
+}
+"""Kind of scan -> what it is, and the words that `flexdt script new --kind` needs."""
+NEARER: Final = 0.6
+"""Of its source-object distance, the scan at another magnification: clearly other, and the sample
+still clears the source in most scanners."""
+ReadLog = Callable[[Path, d.Machine], tuple[Executed, ...]]
+Table = tuple[Sequence[str], list[Sequence[Any]]]
+
+
+class Commissioned(NamedTuple):
+    """What past scans tell: the fitted machine and its file, `fit` of the executed scripts (None
+    without any), the scans with the oldest first, zero offsets, contradictions and questions."""
+
+    machine: d.Machine
+    text: str
+    fit: Fit | None
+    scans: Sequence[PastScan]
+    offsets: tells.ZeroOffsets
+    findings: Sequence[tells.Finding]
+    questions: Sequence[Question]
+
+    def tables(self, out: Path) -> dict[str, Table]:
+        """The report: title -> head and rows; `out` is the folder that its commands name."""
+        votes = Counter(q.settled_by for q in self.questions if q.settled_by)
+        sod = next((s.settings.sod_mm for s in self.scans[::-1] if s.settings), None) or 1000.0
+        files = f"--machine {out / 'machine.toml'} --profile {out / 'profile.toml'}"
+        make = f"flexdt script new {files} --out next.txt --kind "
+        columns = self.offsets.columns
+        return {
+            "scans": (
+                ("scan", "date", "executed_lines", "images", "axis_column_px", "fitted", "sigma"),
+                [(s.name, s.date and s.date.isoformat(), len(s.log), s.images,
+                  *columns.get(s.name, (None,) * 3)) for s in self.scans],
+            ),
+            "axes": (
+                ("axis", "lower", "upper", "max_speed", "max_acceleration", "source"),
+                [(n, a.lower, a.upper, a.max_speed, a.max_acceleration, a.source or "as shipped")
+                 for n, a in self.machine.axes.items()],
+            ),
+            "zero_offsets": (
+                ("offset", *tells.Line._fields),
+                [(name, *line) for name, line in self.offsets.lines.items()],
+            ),
+            "disagreements": (tells.Finding._fields, [*self.findings]),
+            "not_judged": (Question._fields, [*self.questions]),
+            "next": (
+                ("scan", "settles", "command"),
+                [(NEXT[kind][0], n, make + NEXT[kind][1].format(sod=NEARER * sod))
+                 for kind, n in votes.most_common(MOST_NEXT)],
+            ),
+        }  # fmt: skip
+
+    def document(self, out: Path) -> dict[str, object]:
+        """`commission.json`: the tables, each row an object, and the fit."""
+        rows = {
+            title: [dict(zip(head, row, strict=True)) for row in rows]
+            for title, (head, rows) in self.tables(out).items()
+        }
+        return {
+            "machine": self.machine.name,
+            **rows,
+            "profile": self.offsets.profile.model_dump(),
+            "fit": None if self.fit is None else self.fit.to_dict(),
+        }
+
+
+def commission(folders: Sequence[Path], traffic: Path | None, read_log: ReadLog) -> Commissioned:
+    """What past scans tell of a machine.
+
+    Args:
+        folders: of scans, as the scanner or a twin writes them.
+        traffic: a recording of `flexdt follow`, or a log; what is in a folder too counts once.
+        read_log: reads an executed script or a recording.
+
+    Raises:
+        CommandError: no folder holds anything of a scan.
+        TwinError: there is no such folder.
+    """
+    open_questions = list[Question]()
+    ask = open_questions.append
+    read = [_texts(folder, ask) for folder in dict.fromkeys(folders)]
+    known = [d.builtin_machine(name) for name in d.builtin_machines()]
+    named = [m.name for s in read
+             if s.settings and (m := rebuild.named_machine(s.settings, known))]  # fmt: skip
+    if not named:
+        ask(Question("which scanner it is", "no text names one that ships; the FleX-ray is taken"))
+    shipped = machines.machine(Counter(named).most_common(1)[0][0] if named else None)
+    scans = sorted((_script(s, shipped, read_log, ask) for s in read),
+                   key=lambda s: s.date or datetime.max)  # fmt: skip
+    if traffic is not None:
+        log = read_log(traffic, shipped)
+        told = [x.command for x in log]
+        if all([x.command for x in s.log] != told for s in scans):
+            scans.append(PastScan(str(traffic), log=log))
+    if not any(s.settings or s.log or s.images for s in scans):
+        where = ", ".join(map(str, folders))
+        raise CommandError(f"{where}: no settings text, executed script or radiograph of a scan")
+    machine, text, fit = _fitted(scans, shipped)
+    scans = [_measured(s, machine, ask) for s in scans]
+    offsets = tells.zero_offsets(scans, machine, d.profile_of(shipped))
+    unseen = [f"limits of {n}" for n in machine.axes if fit is None or n not in fit.axes]
+    times = {k: x.n for k, x in machine.timing.spread.items()} if fit else {}
+    unseen += [f"time of {k}" for k in machine.timing.kinds if times.get(k, 0) < ENOUGH]
+    why = f"no executed script tells it, or fewer than {ENOUGH} commands of one"
+    rest = [*offsets.questions, *(Question(what, why, "recorded") for what in unseen)]
+    findings = [*tells.contradictions(scans, shipped, machine), *offsets.findings]
+    questions = [*open_questions, *rest]
+    return Commissioned(machine, text, fit, scans, offsets, findings, questions)
+
+
+def _texts(folder: Path, ask: Callable[[Question], None]) -> PastScan:
+    """The scan as its settings texts and the names of its images tell it."""
+    content, warnings = list_folder(folder), list[str]()
+    scan = PastScan(str(folder), images=len(content.projections))
+    try:
+        if content.xre_settings is not None:
+            xre = parse_xre(read_text(folder / content.xre_settings))
+            start = xre.text("Scan info", "Start") or ""
+            date = datetime.fromisoformat(start[:19]) if start else None
+            scan = replace(scan, second=xre.settings, date=date)
+        settings = read_settings(content, warnings)
+        if settings is not None:
+            scan = replace(scan, settings=settings, date=settings.started or scan.date)
+        if content.projections:
+            first = read_image(folder / next(iter(content.projections.values())))
+            scan = replace(scan, shape=first.shape)
+    except ValueError as error:  # of ours, or a date's
+        warnings.append(str(error))
+    for text in warnings:
+        ask(Question(scan.name, text))
+    return scan
+
+
+def _script(
+    scan: PastScan, machine: d.Machine, read_log: ReadLog, ask: Callable[[Question], None]
+) -> PastScan:
+    """The scan with its executed script, or else with the script that was submitted."""
+    content = list_folder(Path(scan.name))
+    for name in sorted(content.names - {content.scan_settings, content.xre_settings}):
+        path = content.path / name
+        if path.suffix.lower() in (".txt", ".tsv", ".log"):
+            try:
+                log = read_log(path, machine)
+                return replace(scan, log=log, commands=tuple(x.command for x in log))
+            except CommandError as error:
+                script, problems = read_script(path.read_bytes())
+                if not script.commands or any(p.severity == "error" for p in problems):
+                    ask(Question(scan.name, "; ".join(error.lines)))
+                else:
+                    scan = replace(scan, commands=script.commands)
+    return scan
+
+
+def _fitted(scans: Sequence[PastScan], shipped: d.Machine) -> tuple[d.Machine, str, Fit | None]:
+    """The machine of the texts' signs and rates and of the executed scripts, and its file."""
+    turning = shipped.geometry.get("angle", {})
+    axes = {n: a if n in turning else _stated(a, n, scans, shipped)
+            for n, a in shipped.axes.items()}  # fmt: skip
+    machine, fit = shipped.model_copy(update={"axes": axes}), None
+    logs = [
+        [x if own_name(getattr(x.command, "component", ""), axes) in axes
+         else replace(x, motor=None) for x in s.log]
+        for s in scans if s.log
+    ]  # fmt: skip
+    if logs:
+        names = ", ".join(Path(s.name).name for s in scans if s.log)
+        fit = fit_machine(logs, machine, f"measured: {names} ({sum(map(len, logs))} lines)")
+        machine = fit.machine
+    changed = [n for n, axis in machine.axes.items() if axis != shipped.axes[n]]
+    text = fitted_text(d.builtin_machine_text(shipped.name), machine, changed, machines.parsed)
+    return machine, text, fit
+
+
+def _stated(axis: d.Axis, name: str, scans: Sequence[PastScan], machine: d.Machine) -> d.Axis:
+    """An axis with the rates of the last settings text, and the sign of most of them."""
+    told = [(s, m) for s in scans if s.settings and (m := s.settings.motors.get(name))]
+    signs = Counter[int]()
+    for scan, motor in told:
+        asked = tells.scripted(scan, machine).get(name, 0.0)
+        if abs(asked) > 1.0 and abs(abs(asked) - abs(motor.value)) <= rebuild.MATCH_MM:
+            signs[1 if asked * motor.value > 0 else -1] += 1
+    changes: dict[str, Any] = {"settings_sign": signs.most_common(1)[0][0]} if signs else {}
+    for rate in ("speed", "acceleration"):
+        values = [v for _, m in told if (v := getattr(m, rate))]
+        if values:
+            most = max(values[-1], getattr(axis, f"max_{rate}"))
+            changes |= {rate: values[-1], f"max_{rate}": most}
+    stated = axis.model_copy(update=changes)
+    source = f"rates: settings texts, n = {len(told)}; limits as shipped"
+    return axis if stated == axis else stated.model_copy(update={"source": source})
+
+
+def _measured(scan: PastScan, machine: d.Machine, ask: Callable[[Question], None]) -> PastScan:
+    """The scan with how the machine stood, and with what its images tell of the axis."""
+    try:
+        scan = tells.standing(scan, machine)
+        if not scan.images:
+            raise TwinError("it has no radiographs")
+        data = load_dataset(scan.name, machine=machine, profile=scan.profile, ignore_document=True)
+        found = align_dataset(data).alignment
+        if found.offsets is None:
+            raise TwinError(f"align: {found.refused['axis_column_px']}")
+        return replace(scan, aligned=found)
+    except TwinError as error:
+        ask(Question(scan.name, error.message, "ordinary" if scan.profile else ""))
+        return scan
+
+
+def write_commission(found: Commissioned, out: Path) -> None:
+    """Write `machine.toml`, `profile.toml`, `commission.json` and `report.html` into a new folder,
+    which appears when all of it is there.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    part = out.absolute().with_name(f".{out.absolute().name}.part.{os.getpid()}")
+    profile = found.offsets.profile.model_dump(exclude={"priors"})
+    lines = [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in profile.items()]
+    body = ["<h1>What past scans tell of the machine</h1>"]
+    for title, (head, rows) in found.tables(out).items():
+        body += [f"<h2>{html.escape(title)}</h2>", figures.table(head, rows)]
+    try:
+        part.mkdir(parents=True)
+        for name, text in (
+            ("machine.toml", found.text),
+            ("profile.toml", "\n".join(lines) + "\n"),
+            ("commission.json", json.dumps(found.document(out), indent=1) + "\n"),
+            ("report.html", figures.page("Commissioning", body)),
+        ):
+            (part / name).write_text(text, encoding="utf-8")
+        part.rename(out)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)

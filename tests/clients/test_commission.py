@@ -1,0 +1,200 @@
+"""`flexdt commission` against laboratories whose hidden machine, texts, images and logs are made by
+`past_laboratory.py`, which uses nothing of flexdt, and against the one public log."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import laboratories
+import pytest
+import scanner_traffic
+from bead_scan import bead_scan
+from past_laboratory import Laboratory
+
+from flexdt import machines
+from flexdt.clients.cli.commands.scan_commands import read_log_file
+from flexdt.clients.cli.entry import run
+from flexdt.clients.commission import commission
+from flexdt.clients.following.traffic import Recorded, format_recorded
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.script.executed_log import read_log
+
+LOG = Path(__file__).parents[1] / "data" / "logs" / "unitom_xl_201106_001.txt"
+
+
+def require_right(out: laboratories.Outcome) -> None:
+    assert out.wrong == []
+    assert len(out.columns) >= 3
+    assert max(map(abs, out.columns.values())) < 0.05
+    assert set(out.pulls) == {"axs_tan", "det_tan", "det_roll_deg", "drift"}
+    assert all(abs(pull) < 3.0 for pull in out.pulls.values())
+    assert out.missed == []
+    assert out.false == []
+
+
+@pytest.mark.parametrize("seed", [3, 8])
+def test_a_laboratory_is_found_and_every_planted_contradiction_named(
+    seed: int, tmp_path: Path
+) -> None:
+    lab = Laboratory(seed)
+    found = commission(lab.write(tmp_path), None, read_log_file)
+    assert len(lab.planted) >= 3
+    require_right(laboratories.judged(lab, found))
+
+
+@pytest.mark.slow
+def test_fifteen_laboratories() -> None:
+    outcomes = list(laboratories.laboratories(15, seed=7))
+    assert len(outcomes) == 15
+    for out in outcomes:
+        assert out.wrong == [] == out.missed
+        assert max(map(abs, out.columns.values())) < 0.05
+        assert abs(out.pulls["drift"]) < 3.0
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> tuple[Laboratory, list[Path]]:
+    """One without a contradiction, of two scans: too few for a drift."""
+    made = Laboratory(31, scans=2, plants=0)
+    return made, made.write(tmp_path_factory.mktemp("past"))
+
+
+def test_the_command_writes_a_machine_a_profile_and_a_report(
+    lab: tuple[Laboratory, list[Path]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made, folders = lab
+    out = tmp_path / "lab"
+    words = [*map(str, folders), "--out", str(out)]
+    assert run(["commission", *words, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document == json.loads((out / "commission.json").read_text())
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["lab"]
+    machine = machines.machine(out / "machine.toml")
+    profile = machines.profile(out / "profile.toml", machine)
+    for name, limits in made.rig.limits.items():
+        axis = machine.axes[name]
+        assert (axis.lower, axis.upper, axis.max_speed, axis.max_acceleration) == limits
+    assert profile.c_obj == pytest.approx(made.c_obj, abs=1e-5)
+    assert profile.c_det == pytest.approx(made.c_det, abs=1e-5)
+    assert profile.src_ort == pytest.approx(made.src_ort, abs=1e-5)
+    sigma = {row["offset"]: row["sigma"] for row in document["zero_offsets"]}
+    assert abs(profile.axs_tan - made.axs_tan - made.hidden_axs) < 3 * sigma["axs_tan"]
+    assert abs(profile.det_tan - made.det_tan - made.hidden_det) < 3 * sigma["det_tan"]
+    assert sigma["c_obj"] is None
+    page = (out / "report.html").read_text()
+    assert all(f"<h2>{title}</h2>" in page for title in ("scans", "not_judged", "next"))
+    named = {row["about"] for row in document["disagreements"]}
+    assert {"limits of tra_obj", "rates of mag_obj"} <= named
+    asked = {row["what"]: row["settled_by"] for row in document["not_judged"]}
+    assert asked["drift"] == "later"
+    assert asked["limits of tra_tube"] == "recorded"
+    assert asked["c_obj"] == "beads"
+
+
+def test_the_scans_that_it_proposes_can_be_made(
+    lab: tuple[Laboratory, list[Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """On a machine that keeps its shipped limits: the laboratory's are drawn without its bodies."""
+    folder = tmp_path / "past"
+    shutil.copytree(lab[1][1], folder)
+    (folder / "script_executed.txt").unlink()
+    monkeypatch.chdir(tmp_path)
+    assert run(["commission", "past", "--out", "lab", "--json"]) == 0
+    proposed = json.loads(capsys.readouterr().out)["next"]
+    assert 1 <= len(proposed) <= 3
+    assert [p["settles"] for p in proposed] == sorted(p["settles"] for p in proposed)[::-1]
+    for scan in proposed:
+        name, *words = scan["command"].split()
+        assert name == "flexdt"
+        assert run(words) == 0, capsys.readouterr().err
+        assert run(["check", "next.txt", "--machine", "lab/machine.toml",
+                    "--profile", "lab/profile.toml"]) == 0  # fmt: skip
+
+
+def test_scans_of_the_twin_agree_with_themselves_and_tell_its_hidden_axis(tmp_path: Path) -> None:
+    folder = bead_scan(tmp_path, {"dO_x": 0.31}, 61)
+    found = commission([folder], None, read_log_file)
+    assert list(found.findings) == []
+    usual = builtin_profile("cwi-2023-08-21")
+    line = found.offsets.lines["axs_tan"]
+    assert line.scans == 1
+    assert line.sigma is not None
+    assert abs(line.value - usual.axs_tan - 0.31) < max(4 * line.sigma, 0.02)
+    for name in ("src_ort", "c_obj", "c_det"):
+        assert found.offsets.lines[name].value == pytest.approx(getattr(usual, name), abs=1e-5)
+    assert found.machine == builtin_machine()
+
+
+def test_the_public_log_alone_and_the_same_as_traffic(tmp_path: Path) -> None:
+    folder = tmp_path / "unitom"
+    folder.mkdir()
+    shutil.copy(LOG, folder)
+    alone = commission([folder], None, read_log_file)
+    twice = commission([folder], LOG, read_log_file)
+    assert alone.fit is not None
+    assert twice.fit is not None
+    assert len(alone.fit.lines.rows) == len(twice.fit.lines.rows) == 57
+    axis = alone.machine.axes["tra_obj"]
+    assert (axis.lower, axis.upper, axis.max_speed) == (12.0, 319.0, 50.0)
+    assert any(q.what == "which scanner it is" for q in alone.questions)
+
+
+def test_limits_from_a_recording_of_raw_messages(
+    tmp_path: Path, lab: tuple[Laboratory, list[Path]]
+) -> None:
+    made, folders = lab
+    log = (folders[1] / "script_executed.txt").read_bytes()
+    raw = scanner_traffic.replay(log, read_log(log)[0])
+    traffic = tmp_path / "traffic.txt"
+    traffic.write_bytes(b"".join(format_recorded(Recorded(at, 0.0, m)) for at, m in raw))
+    folder = tmp_path / "past"
+    shutil.copytree(folders[1], folder)
+    (folder / "script_executed.txt").unlink()
+    found = commission([folder], traffic, read_log_file)
+    for name, limits in made.rig.limits.items():
+        axis = found.machine.axes[name]
+        assert (axis.lower, axis.upper, axis.max_speed, axis.max_acceleration) == limits
+    assert not any(q.what == "limits of mag_obj" for q in found.questions)
+
+
+def test_errors_are_sentences_and_nothing_is_left(
+    tmp_path: Path, lab: tuple[Laboratory, list[Path]], capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    empty, taken, out = tmp_path / "empty", tmp_path / "taken", tmp_path / "out"
+    empty.mkdir()
+    taken.mkdir()
+    (taken / "notes").write_text("mine")
+    for words, said in (
+        ([str(empty)], "no settings text, executed script or radiograph"),
+        ([str(tmp_path / "nowhere")], "cannot read folder"),
+    ):
+        assert run(["commission", *words, "--out", str(out)]) == 1
+        assert said in capsys.readouterr().err
+    assert run(["commission", str(lab[1][0]), "--out", str(taken)]) == 1
+    assert "allowed: a new or an empty folder" in capsys.readouterr().err
+
+    def full(*_: object) -> str:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("flexdt.clients.figures.page", full)
+    assert run(["commission", str(lab[1][0]), "--out", str(out)]) == 1
+    assert "No space left" in capsys.readouterr().err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["empty", "taken"]
+
+
+def test_a_scan_that_cannot_be_read_is_named_and_the_others_count(
+    tmp_path: Path, lab: tuple[Laboratory, list[Path]]
+) -> None:
+    bad = tmp_path / "bad"
+    shutil.copytree(lab[1][0], bad)
+    (bad / "scan settings.txt").write_text("SOD : far\n")
+    (bad / "script_executed.txt").write_text("tube\tnothing\n")
+    found = commission([bad, *lab[1]], None, read_log_file)
+    whys = [q.why for q in found.questions if q.what == str(bad)]
+    assert any("cannot read 'SOD : far'" in why for why in whys)
+    assert any("no line of an executed script" in why for why in whys)
+    assert len(found.offsets.columns) == 2

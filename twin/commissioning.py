@@ -1,0 +1,389 @@
+"""What past scans tell of a machine: its zero offsets, their drift, and what contradicts what.
+
+`align` tells the column in which the rotation axis is seen, and texts where the motors stood. A
+sideways shift of the axis moves the column in proportion to the magnification, one of the panel
+does not: axs_tan, det_tan and axs_tan's drift follow from one weighted least squares, into which
+det_tan enters as the texts have it, with its prior. Roll gets a weighted line, and either drift a
+prior. Where residuals are larger than their sigmas say, all sigmas grow in proportion (Birge 1932,
+doi:10.1103/PhysRev.40.207).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from flexdt.twin.calibration.fit.image_quantities import axis_in_image
+from flexdt.twin.calibration.fit.priors import prior_widths
+from flexdt.twin.calibration.without_phantom.align import Alignment
+from flexdt.twin.dataset import rebuild, scan_settings
+from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.offsets import NOMINAL
+from flexdt.twin.machine.camera import CameraSettings, check_roi
+from flexdt.twin.machine.description import ZERO, Axis, Machine, Profile
+from flexdt.twin.machine.kinematics import motor_poses
+from flexdt.twin.script import commands as c
+from flexdt.twin.script.executed_log import Executed, MotorReply
+from flexdt.twin.script.grammar import own_name
+
+YEAR_S: Final = 365.25 * 86400.0
+FOR_A_LINE: Final = 3
+"""Dates that a drift needs, and rows beyond the unknowns that outvote a scan: with two there is
+nothing to check one by."""
+FAR_OFF: Final = 4.0
+"""Sigmas from which on a scan contradicts the others, and is left out where enough remain."""
+TOLD: Final = 0.5
+"""Share of its prior's width below which scans tell det_tan themselves."""
+DRIFT: Final = 0.25
+"""Prior of a drift [mm or deg a year]: from one published profile of the FleX-ray to the next
+det_tan changes by 0.23 mm rms and the roll by 0.15 deg."""
+AGREE: Final = 1e-4
+"""By what part statements of one quantity may differ: texts carry six decimals, cameras round
+their exposures. Motors and offsets may differ by `rebuild.MATCH_MM`."""
+OFFSETS: Final = ("det_tan", "src_ort", "axs_tan", "c_obj", "c_det", "det_roll_deg")
+TELLS: Final = {"axs_tan": "ordinary", "det_roll_deg": "ordinary", "src_ort": "beads",
+                "c_obj": "beads", "c_det": "beads"}  # fmt: skip
+"""Offset -> the kind of scan that tells it."""
+
+
+class Finding(NamedTuple):
+    """A contradiction: about what, and who says what."""
+
+    about: str
+    text: str
+
+
+class Question(NamedTuple):
+    """What could not be judged, why, and the kind of scan that would settle it ("": none)."""
+
+    what: str
+    why: str
+    settled_by: str = ""
+
+
+class Line(NamedTuple):
+    """An offset at the last date and its drift, with sigmas [mm or deg; a year].
+
+    Without scans it is the texts'; without three dates there is no drift.
+    """
+
+    value: float
+    sigma: float | None = None
+    per_year: float | None = None
+    drift_sigma: float | None = None
+    scans: int = 0
+
+
+@dataclass(frozen=True)
+class PastScan:
+    """A scan as its folder tells it, each part where it is there.
+
+    Attributes:
+        name: of its folder.
+        date: when it started.
+        settings, second: what `scan settings.txt` and `data settings XRE.txt` say.
+        commands, log: its script, and the lines of the executed one.
+        images: number of projections; `shape` is the (rows, cols) of the first.
+        positions: motor -> (1,) in the script's sign [mm, deg].
+        camera: mode and region.
+        profile: the zero offsets behind the printed figures.
+        aligned: what its projections tell of the geometry.
+    """
+
+    name: str
+    date: datetime | None = None
+    settings: scan_settings.ScanSettings | None = None
+    second: scan_settings.ScanSettings | None = None
+    commands: tuple[c.Command, ...] = ()
+    log: tuple[Executed, ...] = ()
+    images: int = 0
+    shape: tuple[int, int] | None = None
+    positions: Mapping[str, FloatArray] = field(default_factory=dict)
+    camera: CameraSettings | None = None
+    profile: Profile | None = None
+    aligned: Alignment | None = None
+
+
+def standing(scan: PastScan, machine: Machine) -> PastScan:
+    """The scan with its motors, camera and the zero offsets behind its printed figures.
+
+    Raises:
+        TwinError: its texts do not say them, or contradict themselves.
+    """
+    s = None if scan.settings is None else rebuild.physical(scan.settings, scan.name)[0]
+    f = None if s is None else s.figures
+    if s is None or s.roi is None or s.mode is None or not set(s.motors) & set(machine.axes):
+        raise TwinError("no settings text states its motors, camera mode and ROI")
+    if f is None or not 0.0 < f.sod_mm < f.sdd_mm:
+        raise TwinError("its text does not state SOD, SDD, HC, VC, COR and pixel")
+    camera = CameraSettings(s.mode, s.roi, modes=machine.detector.camera.modes)
+    zero = Profile(name=ZERO, machine=machine.name, source="figures of the settings text")
+    built = rebuild.rebuild(s, 1, camera.shape, [machine], [zero], file=scan.name)
+    sod, sdd = float(built.poses.sod[0]), float(built.poses.sdd[0])
+    far = zero.model_copy(update={"c_obj": f.sod_mm - sod, "c_det": f.sdd_mm - sdd})
+    at = motor_poses(machine, far, camera, built.positions)
+    own = scan_settings.figures_of(at, camera.shape)
+    across = [(g.cor_px - g.hc_px) * own.pixel_mm * g.sod_mm / g.sdd_mm for g in (f, own)]
+    found = {
+        "det_tan": (own.hc_px - f.hc_px) * own.pixel_mm,
+        "src_ort": (own.vc_px - f.vc_px) * own.pixel_mm,
+        "axs_tan": across[0] - across[1],
+    }
+    profile = far.model_copy(update=found)
+    return replace(scan, positions=built.positions, camera=camera, profile=profile)
+
+
+def scripted(scan: PastScan, machine: Machine) -> dict[str, Any]:
+    """What its script asks for: axis -> target when the settings file is written, and settings of
+    camera and tube, by the names of `ScanSettings`, when the sequence begins."""
+    now: dict[str, Any] = {}
+    moved: dict[str, Any] = {}
+    for k in scan.commands:
+        if isinstance(k, c.MoveAbsolute):
+            now[own_name(k.component, machine.axes)] = k.target
+        elif isinstance(k, c.CameraSetting | c.TubeSetting):
+            now |= k.arguments
+        elif isinstance(k, c.WriteSettingsFile):
+            moved = {name: value for name, value in now.items() if name in machine.axes}
+        elif isinstance(k, c.TakeSequence):
+            now["projections"] = now.pop("frames", None)
+            return {name: v for name, v in now.items() if name not in machine.axes} | moved
+    return moved
+
+
+def contradictions(
+    scans: Sequence[PastScan], shipped: Machine, fitted: Machine
+) -> Iterator[Finding]:
+    """What texts, scripts, images and replies of the scans, and the machine that ships, say
+    differently; `fitted` has the signs and limits that the scans show."""
+    said: dict[str, list[tuple[Any, list[str]]]] = {}
+    lengths = {*fitted.axes, *(f"{name} of the texts" for name in OFFSETS)}
+    every = [(f"{name} in {scan.name}", value, who, name) for scan in scans
+             for name, value, who in _within(scan, fitted)]  # fmt: skip
+    every += [(name, value, scan.name, name) for scan in scans
+              for name, value in _alike(scan, fitted)]  # fmt: skip
+    known = {about for about, *_ in every}
+    every += [(name, value, f"machine {shipped.name}", name)
+              for name, value in _of_machine(shipped) if name in known]  # fmt: skip
+    every += [(f"sign of {name}", axis.settings_sign, who, name) for m, who in
+              ((fitted, "the scans' texts"), (shipped, f"machine {shipped.name}"))
+              for name, axis in m.axes.items()]  # fmt: skip
+    for about, value, who, name in every:
+        slack = (0.0, rebuild.MATCH_MM) if name in lengths else (AGREE, 0.0)
+        told = said.setdefault(about, [])
+        names = next((n for other, n in told if _agree(value, other, slack)), None)
+        if names is None:
+            told.append((value, [who]))
+        elif who not in names:
+            names.append(who)
+    for about, told in said.items():
+        if len(told) > 1:
+            yield Finding(about, "; ".join(f"{_plain(v)} in {_some(n)}" for v, n in told))
+    for scan in scans:
+        try:
+            if scan.settings is not None and scan.settings.mode is not None:
+                shipped.detector.check_mode(scan.settings.mode)
+            if scan.camera is not None:
+                check_roi(scan.camera.roi, shipped.detector.pixels, scan.camera.binning)
+        except TwinError as error:
+            yield Finding(f"camera in {scan.name}", f"machine {shipped.name}: {error.message}")
+
+
+def _within(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any, str]]:
+    """(name, value, who) of what a scan's own parts say of the same thing."""
+    s, camera = scan.settings, scan.camera
+    if s is None:
+        return
+    signs = {name: axis.settings_sign for name, axis in machine.axes.items()}
+    read = {n: signs[n] * m.value for n, m in s.motors.items() if n in signs}
+    asked = scripted(scan, machine)
+    for name in asked.keys() & signs.keys():
+        asked[name] = min(max(asked[name], machine.axes[name].lower), machine.axes[name].upper)
+    sources: dict[str, Mapping[str, Any]] = {"the text": {**vars(s), **read}, "the script": asked}
+    sources["the images"] = {"projections": scan.images or None, "shape": scan.shape}
+    if scan.second is not None:
+        sources["the XRE text"] = vars(scan.second)
+    if s.figures is not None:
+        f = s.figures
+        sources["its figures"] = {"magnification": f.magnification, "voxel_um": f.voxel_um}
+    if camera is not None:
+        pixel = camera.pixel_mm(machine.detector.pixels)
+        sources["mode and ROI"] = {
+            "shape": camera.shape, "binning": camera.binning, "binned_pixel_mm": pixel,
+        }  # fmt: skip
+    for who, told in sources.items():
+        for name in (*scan_settings.ENTRIES, "shape", *read):
+            if told.get(name) not in (None, ""):
+                yield name, told[name], who
+
+
+def _alike(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any]]:
+    """(name, value) of what should be alike in all scans."""
+    s = scan.settings
+    for name in ("scanner_name", "scanner_type", "serial", "original_pixel_mm"):
+        if getattr(s, name, None) not in (None, ""):
+            yield name, getattr(s, name)
+    turning = machine.geometry.get("angle", {})
+    for name, motor in {} if s is None else s.motors.items():
+        if name not in turning and motor.speed is not None:
+            yield f"rates of {name}", (motor.speed, motor.acceleration)
+    for x in scan.log:
+        if x.motor is not None and isinstance(x.command, c.MotorCommand):
+            yield f"limits of {own_name(x.command.component, machine.axes)}", _limits(x.motor)
+    for name in OFFSETS[:-1] if scan.profile is not None else ():
+        yield f"{name} of the texts", getattr(scan.profile, name)
+
+
+def _of_machine(machine: Machine) -> Iterator[tuple[str, Any]]:
+    """The same of a machine file."""
+    yield "original_pixel_mm", machine.detector.pitch_mm
+    for name, axis in machine.axes.items():
+        yield f"rates of {name}", (axis.speed, axis.acceleration)
+        yield f"limits of {name}", _limits(axis)
+
+
+def _limits(axis: Axis | MotorReply) -> tuple[float, ...]:
+    return axis.lower, axis.upper, axis.max_speed, axis.max_acceleration
+
+
+def _agree(a: Any, b: Any, slack: tuple[float, float]) -> bool:
+    if isinstance(a, int | float | tuple) and isinstance(b, int | float | tuple):
+        return bool(np.allclose(a, b, *slack))
+    return str(a).lower() == str(b).lower()
+
+
+def _plain(value: Any) -> str:
+    return str(np.round(value, 4).tolist() if isinstance(value, float | tuple) else value)
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+class ZeroOffsets(NamedTuple):
+    """The profile that past scans give, at the last date.
+
+    `lines` are each offset's value and drift, `columns` of each scan the axis's (measured, fitted,
+    sigma of the fitted) column [px], `findings` the scans that contradict the others, and
+    `questions` what the scans leave open.
+    """
+
+    profile: Profile
+    lines: Mapping[str, Line]
+    columns: Mapping[str, tuple[float, float, float]]
+    findings: Sequence[Finding]
+    questions: Sequence[Question]
+
+
+def zero_offsets(scans: Sequence[PastScan], machine: Machine, usual: Profile) -> ZeroOffsets:
+    """Zero offsets and drift.
+
+    Args:
+        scans: the oldest first, those without a date last.
+        machine: whose.
+        usual: offsets where no text states any.
+    """
+    base = next((scan.profile for scan in reversed(scans) if scan.profile is not None), usual)
+    lines = {name: Line(getattr(base, name)) for name in OFFSETS}
+    findings, columns = list[Finding](), dict[str, tuple[float, float, float]]()
+    last = max((scan.date for scan in scans if scan.date is not None), default=None)
+    told = [s for s in scans if s.aligned is not None and s.aligned.offsets is not None]
+    drifts = len({s.date for s in told if s.date is not None}) >= FOR_A_LINE
+    told = [s for s in told if s.date is not None or not drifts]
+    width = prior_widths(machine, usual)["dD_x"]
+
+    def fitted(
+        sides: FloatArray, rest: list[float], sigmas: list[float], *names: str
+    ) -> tuple[FloatArray, FloatArray]:
+        """Put the first name's line and the other's value into `lines`; the rows beyond those of
+        the scans are priors, of the drift first."""
+        at, covariance, pulls = _fit(sides, np.array(rest), np.array(sigmas), len(told))
+        widths = np.sqrt(np.diag(covariance)).tolist()
+        for name, i in zip(names, (0, 2), strict=False):
+            slope = {"per_year": float(at[1]), "drift_sigma": widths[1]}
+            value = lines[name].value + float(at[i])
+            more = slope if drifts and i == 0 else {}
+            lines[name] = Line(value, widths[i], scans=len(told), **more)
+        for scan, pull in zip(told, pulls.tolist(), strict=True):
+            if abs(pull) > FAR_OFF:
+                text = f"{scan.name} is {abs(pull):.1f} sigma from the line of all scans"
+                findings.append(Finding(names[0], text))
+        return at, covariance
+
+    if told:
+        years = np.array([(s.date - last).total_seconds() / YEAR_S if s.date and last else 0.0
+                          for s in told])  # fmt: skip
+        found = [s.aligned.parameters for s in told if s.aligned]
+        rolls = [p["det_roll"] for p in found]
+        sides = np.vstack([np.column_stack([np.ones(len(told)), years]), [0.0, 1.0]])
+        rest = [*(r.value - base.det_roll_deg for r in rolls), 0.0]
+        fitted(sides, rest, [*(r.sigma for r in rolls), DRIFT], "det_roll_deg")
+        seen = np.array(
+            [_axis(machine, s, base, r.value) for s, r in zip(told, rolls, strict=True)]
+        )
+        sides = np.column_stack([seen[:, 1], seen[:, 1] * years, seen[:, 2]])
+        measured = [p["axis_column_px"] for p in found]
+        rest = [*(m.value - at for m, at in zip(measured, seen[:, 0], strict=True)), 0.0, 0.0]
+        sigmas = [*(m.sigma for m in measured), DRIFT, width]
+        known = np.vstack([sides, [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        at, covariance = fitted(known, rest, sigmas, "axs_tan", "det_tan")
+        spread = np.sqrt(np.einsum("ij,jk,ik->i", sides, covariance, sides))
+        for s, m, *more in zip(told, measured, seen[:, 0] + sides @ at, spread, strict=True):
+            columns[s.name] = (m.value, float(more[0]), float(more[1]))
+    day = "undated" if last is None else f"{last:%Y-%m-%d}"
+    source = "; ".join(f"{n}: {x.scans or 'texts of the'} scans" for n, x in lines.items())
+    head = {"name": f"commissioned-{day}", "machine": machine.name, "date": day, "source": source}
+    profile = Profile.model_validate(head | {n: round(x.value, 6) for n, x in lines.items()})
+    questions = [Question(n, "no scan's images tell it; it is the texts'", by)
+                 for n, by in TELLS.items() if not lines[n].scans]  # fmt: skip
+    if (lines["det_tan"].sigma or math.inf) > TOLD * width:
+        why = "no scans of different magnification tell the axis"
+        questions.append(Question("det_tan apart from axs_tan", why, "magnified"))
+    if not drifts:
+        why = f"it takes scans of {FOR_A_LINE} dates whose images tell the axis"
+        questions.append(Question("drift", why, "later"))
+    return ZeroOffsets(profile, lines, columns, findings, questions)
+
+
+def _axis(machine: Machine, scan: PastScan, base: Profile, roll: float) -> tuple[float, ...]:
+    """The axis's column [px] with the offsets of `base`, and its slopes [px/mm] with axs_tan and
+    det_tan, in which it is linear."""
+    own, camera = scan.profile or base, scan.camera or machine.detector.camera
+    middle = (np.array(camera.shape[::-1]) - 1) / 2
+    column = []
+    for axs, det in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)):
+        moved = {"axs_tan": base.axs_tan + axs, "det_tan": base.det_tan + det, "det_roll_deg": roll}
+        poses = motor_poses(machine, own.model_copy(update=moved), camera, scan.positions)
+        column.append(float(axis_in_image(poses, NOMINAL, middle)[0]))
+    return column[0], column[1] - column[0], column[2] - column[0]
+
+
+def _fit(
+    sides: FloatArray, values: FloatArray, sigmas: FloatArray, scans: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Weighted least squares of rows, of which the first `scans` belong to a scan each.
+
+    The scan that contradicts the others most is left out while it does so by `FAR_OFF` sigmas and
+    enough remain.
+
+    Returns:
+        Values, covariance, and the residuals of all scans in sigmas.
+    """
+    a, b = sides / sigmas[:, None], values / sigmas
+    kept = np.ones(len(b), dtype=bool)
+    while True:
+        inverse = np.linalg.inv(a[kept].T @ a[kept])
+        at = inverse @ (a[kept].T @ b[kept])
+        rest, leverage = b - a @ at, np.einsum("ij,jk,ik->i", a, inverse, a)
+        spread = np.sqrt(np.maximum(np.where(kept, 1.0 - leverage, 1.0 + leverage), 1e-9))
+        pulls, freedom = (rest / spread)[:scans], int(kept.sum()) - a.shape[1]
+        far = np.where(kept[:scans], np.abs(pulls), 0.0)
+        if freedom < FOR_A_LINE or far.max() <= FAR_OFF:
+            return at, max(1.0, float(rest[kept] @ rest[kept]) / max(freedom, 1)) * inverse, pulls
+        kept[int(far.argmax())] = False
