@@ -83,9 +83,7 @@ def test_from_scan_to_correction_and_back(page: Any, twin: TwinClient, wait: Wai
     page.click("#fit")
     page.locator("#fit-report .verdict.ok").wait_for(timeout=600_000)
     assert "13 frames" in page.inner_text("#fit-report")
-    rows = page.locator("#fit-report tr").all_inner_texts()
-    cells = [row.split("\t") for row in rows]
-    sigmas = {each: float(sigma.removeprefix("± ")) for each, _, sigma, _ in cells if sigma.strip()}
+    sigmas = {name: sigma for name, (_, sigma) in estimates(page).items()}
 
     page.click("#fit-compare")
     page.locator("#film-recorded", has_text="scan_000000.tif").wait_for()
@@ -161,11 +159,11 @@ def told_place(page: Any) -> tuple[float, float]:
 
 
 def estimates(page: Any) -> dict[str, tuple[float, float]]:
-    """Values and sigmas of the report that is shown."""
+    """Values and sigmas of the report that is shown, by the name behind each meaning."""
     cells = [row.split("\t") for row in page.locator("#fit-report tr").all_inner_texts()]
     return {
-        name: (float(value), float(sigma.removeprefix("± ")))
-        for name, value, sigma, _ in cells
+        named.split()[-1]: (float(value), float(sigma.removeprefix("± ")))
+        for named, value, sigma, _ in cells
         if sigma.strip()
     }
 
