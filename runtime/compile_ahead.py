@@ -11,8 +11,9 @@ import math
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any, Final
 
 import numpy as np
@@ -20,6 +21,7 @@ import numpy as np
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Grid
 from flexdt.twin.projection.analytic import warm_up_back, warm_up_forward
+from flexdt.twin.projection.kernels.compiling import SILENT_S
 
 MODULE: Final = "flexdt.runtime.compile_ahead"
 
@@ -66,7 +68,6 @@ GROUPS: Final[dict[str, tuple[Callable[[], None], str]]] = {
     "FDK": (_reconstruction, "reconstruction.fdk_kernels:warp"),
 }
 """What compiles it, and the entry point that it compiles last; those that take longest first."""
-PROJECTOR: Final = ("back projection", "projection")
 ANALYSIS: Final = ("calibration", "bead detection", "FDK")
 
 
@@ -85,22 +86,26 @@ def compile_ahead(groups: Sequence[str], note: Callable[[str], None]) -> None:
 
     Args:
         groups: names, of `GROUPS`.
-        note: told what is compiled, if anything is, and when a group is done.
+        note: told what is compiled, if anything is, when a group is done, and every `SILENT_S`.
     """
     missing = [group for group in groups if not is_compiled(group)]
     if not missing:
         return
     note(f"compiling kernels (once): {', '.join(missing)}")
+    begun = time.monotonic()
     with ThreadPoolExecutor(min(os.cpu_count() or 1, len(missing))) as pool:
-        for at, group in enumerate(pool.map(_elsewhere, missing), 1):
-            note(f"compiled {at} of {len(missing)}: {group}")
+        left = {pool.submit(elsewhere, group): group for group in missing}
+        while left:
+            done = wait(left, SILENT_S, return_when="FIRST_COMPLETED").done
+            now = [left.pop(each) for each in done] or ["still"]
+            compiled, seconds = len(missing) - len(left), time.monotonic() - begun
+            note(f"compiled {compiled} of {len(missing)} ({', '.join(now)}, {seconds:.0f} s)")
 
 
-def _elsewhere(group: str) -> str:
+def elsewhere(group: str) -> None:
     """Compile a group in a process that ends with this one; what fails is told at its first use."""
     with start(["--here", group]) as process:
         process.wait()
-    return group
 
 
 def start(words: Sequence[str], **streams: Any) -> subprocess.Popen[bytes]:

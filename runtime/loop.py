@@ -117,6 +117,8 @@ class ListeningServer:
         host: str,
         port: int,
         ssl: tls.SSLContext | None = None,
+        *,
+        serving: bool = True,
     ) -> None:
         """Accept connections.
 
@@ -124,14 +126,21 @@ class ListeningServer:
             made: makes the protocol of a connection.
             host, port: where; port 0 is any free one.
             ssl: for TLS.
+            serving: False lets connections wait until `serve`.
 
         Raises:
             OSError: the address is taken or not ours.
         """
         self.server = await asyncio.get_running_loop().create_server(
             made, host, port, ssl=ssl, backlog=1,
-            ssl_handshake_timeout=None if ssl is None else TLS_HANDSHAKE_S,
+            ssl_handshake_timeout=None if ssl is None else TLS_HANDSHAKE_S, start_serving=serving,
         )  # fmt: skip
+        one_at_a_time(self.server)
+
+    async def serve(self) -> None:
+        """Take the connections that `listen` let wait."""
+        assert self.server is not None
+        await self.server.start_serving()
         one_at_a_time(self.server)
 
 

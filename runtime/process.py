@@ -25,6 +25,8 @@ INVALID = 1
 FAILED = 1
 USAGE = 2
 REFUSED = 4
+SUPERVISED = "FLEXDT_SUPERVISED"
+"""In the environment of a supervisor's processes."""
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 S = TypeVar("S", bound=ProcessSettings)
@@ -58,6 +60,12 @@ def announce(server: str, facts: Mapping[str, object], out: TextIO | None = None
         gc.freeze()
         loop.holds.begin()  # until here nobody has waited for it
     print(json.dumps({"ready": server, **facts, "pid": os.getpid()}), file=out, flush=True)
+
+
+def announce_bound(server: str, host: str, port: int) -> None:
+    """For a supervisor, which starts others meanwhile: a line with the address before `ready`."""
+    if SUPERVISED in os.environ:
+        print(json.dumps({"bound": server, "host": host, "port": port}), flush=True)
 
 
 def run_process(settings: S, run: Callable[[S], Coroutine[None, None, int]]) -> int:

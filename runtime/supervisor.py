@@ -1,7 +1,8 @@
 """Start several server processes in order, keep them alive, stop them all: no orphans.
 
 Each service prints one JSON `ready` line with its address on standard output; later services get
-the addresses of earlier ones. A service that ends, or is killed at any moment, is started again for
+the addresses of earlier ones. One whose start takes long prints the same as `bound` before, so that
+later ones start meanwhile. A service that ends, or is killed at any moment, is started again for
 ever on the address it had, with pauses that grow up to half a minute; it never ends the others.
 Only one that leaves by itself at its very first start ends them all: somebody has to look at its
 options. A start may take as long as it works (compiling takes minutes on a busy machine): only one
@@ -24,15 +25,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from flexdt.process_settings import Address
-from flexdt.runtime.process import session_seconds, stop_signal
+from flexdt.runtime.process import SUPERVISED, session_seconds, stop_signal
 
 STALLED_S = 300.0
 """A service that is not ready and has used no processor time for so long waits for something that
 will not come."""
 SILENT_S = 2.0
-"""After so long without a `ready` line, somebody who waits is told for what."""
-STILL_S = 60.0
-"""How often somebody who waits is told how much work a start has done so far."""
+"""As often, somebody who waits is told for what, and how much work the start has done so far."""
 STOP_GRACE_S = 10.0
 FIRST_PAUSE_S = 0.5
 """Between the second end in a row and the next start; it doubles from there."""
@@ -135,15 +134,12 @@ class Supervisor:
     async def _look_after(self) -> None:
         keepers: list[asyncio.Task[None]] = []
         try:
-            for service in self.services:
-                ready = asyncio.Event()
-                keepers.append(asyncio.create_task(self._keep(service, ready)))
-                first = asyncio.create_task(ready.wait())
-                await asyncio.wait({first, *keepers}, return_when=FIRST_COMPLETED)
-                first.cancel()
-                for keeper in keepers:
-                    if keeper.done():
-                        keeper.result()
+            starts = [_Start(service) for service in self.services]
+            for start in starts:
+                keepers.append(asyncio.create_task(self._keep(start)))
+                await _unless_one_ends(start.bound, keepers)
+            for start in starts:
+                await _unless_one_ends(start.ready, keepers)
             self.announce(dict(self.addresses))
             await asyncio.gather(*keepers)
         finally:
@@ -151,20 +147,21 @@ class Supervisor:
                 keeper.cancel()
             await asyncio.gather(*keepers, return_exceptions=True)
 
-    async def _keep(self, service: Service, ready: asyncio.Event) -> None:
-        """Start a service, wait for its end, and again; `ready` is set once it has been ready.
+    async def _keep(self, start: _Start) -> None:
+        """Start a service, wait for its end, and again.
 
         Raises:
             ServiceError: it left by itself at its first start.
         """
         clock, ends, first = asyncio.get_running_loop().time, Ends(), True
+        service = start.service
         while True:
             begun = None
             try:
                 process = await self._spawn(service)
-                self.addresses[service.name] = await self._ready(process, service)
+                await self._ready(process, start)
                 begun = clock()
-                ready.set()
+                start.ready.set()
                 how = _how(await _drained(process))
             except _Ended as end:
                 if first and end.returncode is not None and end.returncode >= 0:
@@ -193,25 +190,26 @@ class Supervisor:
                 stdin=PIPE,
                 stdout=PIPE,
                 start_new_session=True,
+                env=os.environ | {SUPERVISED: "1"},
             )
         except OSError as error:
             raise _Ended(f"no process: {error.strerror}") from None
         self._running[service.name] = process
         return process
 
-    async def _ready(self, process: Process, service: Service) -> Address:
-        """Where it listens; says what is waited for, and later how far it has come.
+    async def _ready(self, process: Process, start: _Start) -> None:
+        """Until it answers; says what is waited for, and later how far it has come.
 
         Raises:
             _Ended: before it said so, or it no longer does anything.
         """
-        clock = asyncio.get_running_loop().time
-        address = asyncio.create_task(_address(process, service.name))
+        clock, service = asyncio.get_running_loop().time, start.service
+        ready = asyncio.create_task(self._lines(process, start))
         end = asyncio.create_task(_ended(process))
         used_s, since, note_at = session_seconds(process.pid), clock(), clock() + SILENT_S
         note = f"waiting for the {service.name}" + (service.slow and f": {service.slow}")
         try:
-            while not (address.done() or end.done()):
+            while not (ready.done() or end.done()):
                 now_s = session_seconds(process.pid)
                 if now_s is None or now_s != used_s:
                     used_s, since = now_s, clock()
@@ -222,15 +220,33 @@ class Supervisor:
                         f"the {service.name} is still starting: {used_s or 0:.0f} s of work so far"
                     )
                     self.note(note or work)
-                    note, note_at = "", clock() + STILL_S
-                await asyncio.wait({address, end}, timeout=LOOK_S, return_when=FIRST_COMPLETED)
-            if address.done():
-                return address.result()
+                    note, note_at = "", clock() + SILENT_S
+                await asyncio.wait({ready, end}, timeout=LOOK_S, return_when=FIRST_COMPLETED)
+            if ready.done():
+                return ready.result()
             raise _Ended(_how(end.result()), end.result())
         finally:
-            for task in (address, end):
+            for task in (ready, end):
                 task.cancel()
-            await asyncio.gather(address, end, return_exceptions=True)
+            await asyncio.gather(ready, end, return_exceptions=True)
+
+    async def _lines(self, process: Process, start: _Start) -> None:
+        """Take the address from the `bound` and `ready` lines, up to `ready`; pass over others."""
+        assert process.stdout is not None
+        name = start.service.name
+        while True:
+            # A ValueError, too, is a line longer than the reader keeps.
+            with contextlib.suppress(
+                ValueError, KeyError, TypeError, AttributeError, RecursionError
+            ):
+                if not (line := await process.stdout.readline()):
+                    await asyncio.Event().wait()  # it prints no more, and may live: others look
+                message = json.loads(line)
+                if name in (message.get("bound"), message.get("ready")):
+                    self.addresses[name] = Address(str(message["host"]), int(message["port"]))
+                    start.bound.set()
+                    if "ready" in message:
+                        return
 
     def _bury(self, service: Service) -> None:
         """End what is left of a service: processes it started may hold its port or its files."""
@@ -264,17 +280,23 @@ class _Ended(Exception):
         self.returncode = returncode
 
 
-async def _address(process: Process, name: str) -> Address:
-    """The address in the `ready` line; other lines before it are passed over."""
-    assert process.stdout is not None
-    while True:
-        # A ValueError, too, is a line longer than the reader keeps.
-        with contextlib.suppress(ValueError, KeyError, TypeError, RecursionError):
-            if not (line := await process.stdout.readline()):
-                await asyncio.Event().wait()  # it prints no more, and may live: others look
-            message = json.loads(line)
-            if message["ready"] == name:
-                return Address(str(message["host"]), int(message["port"]))
+@dataclass(frozen=True)
+class _Start:
+    """A service, and how far its first start has come."""
+
+    service: Service
+    bound: asyncio.Event = field(default_factory=asyncio.Event)
+    ready: asyncio.Event = field(default_factory=asyncio.Event)
+
+
+async def _unless_one_ends(event: asyncio.Event, keepers: Sequence[asyncio.Task[None]]) -> None:
+    """Wait for an event; a keeper's error ends the waiting."""
+    waiting = asyncio.create_task(event.wait())
+    await asyncio.wait({waiting, *keepers}, return_when=FIRST_COMPLETED)
+    waiting.cancel()
+    for keeper in keepers:
+        if keeper.done():
+            keeper.result()
 
 
 async def _drained(process: Process) -> int:

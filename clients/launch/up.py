@@ -36,7 +36,7 @@ from flexdt.runtime.supervisor import (
     until_signalled,
 )
 
-COMPILING = "its first start on a machine compiles the kernels, half a minute of processor time"
+COMPILING = "its first start on a machine compiles the kernels, some ten seconds of processor time"
 
 
 def services(options: UpSettings) -> tuple[Service, ...]:

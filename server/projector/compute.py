@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable, Iterator
@@ -25,10 +26,12 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.protocol.rpc_errors import RpcError, internal, invalid_params, too_large
-from flexdt.runtime.compile_ahead import PROJECTOR, compile_ahead
+from flexdt.runtime import compile_ahead
 from flexdt.runtime.log import log
 from flexdt.twin.errors import TwinError
-from flexdt.twin.projection import Body, gpu, project_body, warm_up
+from flexdt.twin.projection import Body, gpu, project_body
+from flexdt.twin.projection.analytic import warm_up_forward
+from flexdt.twin.projection.kernels.compiling import LOG
 
 T = TypeVar("T")
 
@@ -281,15 +284,22 @@ def views_a_block(shape: tuple[int, int]) -> int:
 
 
 def begin(threads: int) -> None:
-    """Set the thread count of this thread's kernels and load all that a server runs; what has not
-    been compiled on this machine is, on all cores.
+    """Set the thread count of this thread's kernels, and load or compile those that project; those
+    that project back, which few ask for, are compiled meanwhile and behind all other work.
 
     Raises:
         ValueError: more threads than numba was started with.
     """
     numba.set_num_threads(threads)
-    compile_ahead(PROJECTOR, log)
-    warm_up()
+    LOG.setLevel(logging.ERROR)  # the supervisor says what is waited for
+    warm_up_forward()
+    threading.Thread(target=_compile_back, name="projector-compiling", daemon=True).start()
+
+
+def _compile_back() -> None:
+    os.nice(10)  # Linux: of this thread, and of the process that it starts
+    if not compile_ahead.is_compiled("back projection"):
+        compile_ahead.elsewhere("back projection")
 
 
 def backend() -> str:

@@ -14,7 +14,7 @@ from flexdt.runtime.access import ConnectionLimits, read_token, server_tls, with
 from flexdt.runtime.files.directory import memory_bytes
 from flexdt.runtime.log import LEVELS, set_up
 from flexdt.runtime.metrics import Requests
-from flexdt.runtime.process import OK, announce, run_process, stop_signal
+from flexdt.runtime.process import OK, announce, announce_bound, run_process, stop_signal
 
 
 async def run(options: ProjectorSettings) -> int:
@@ -32,6 +32,7 @@ async def run(options: ProjectorSettings) -> int:
         options.port,
         memory_limit=limit,
         begin=lambda: begin(threads),
+        bound=lambda port: announce_bound("projector", options.host, port),
         facts={"backend": backend(), "threads": threads},
         limits=with_limits(options.limit, ConnectionLimits()),
         observe=requests.observe,

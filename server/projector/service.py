@@ -186,18 +186,20 @@ async def serve_projector(
     *,
     memory_limit: int,
     begin: Callable[[], None] = lambda: None,
+    bound: Callable[[int], None] = lambda port: None,
     facts: Mapping[str, object] | None = None,
     limits: ConnectionLimits | None = None,
     token: str | None = None,
     ssl: tls.SSLContext | None = None,
     observe: Observe = unobserved,
 ) -> ProjectorServer:
-    """Compile, then listen on `host`:`port` (0: any free port).
+    """Compile, then serve on `host`:`port` (0: any free port); connections wait until then.
 
     Args:
         host, port: where; others than loopback need a token.
         memory_limit: bytes that all volumes together may take.
         begin: run first in the compute thread: threads, warm-up.
+        bound: told the port as soon as it is taken.
         facts: backend and threads, for `health`.
         limits: of connections.
         token: clients must bring it.
@@ -216,7 +218,6 @@ async def serve_projector(
         Context(compute, VolumeStore(memory_limit), token, facts), limits, observe
     )
     try:
-        await compute.ready
         await server.listen(
             lambda: FrameLink(
                 server.frame,
@@ -230,9 +231,13 @@ async def serve_projector(
             host,
             port,
             ssl,
+            serving=False,
         )
+        bound(server.port)
+        await compute.ready
+        await server.serve()
     except BaseException:
-        compute.close()
+        await server.close()
         raise
     return server
 

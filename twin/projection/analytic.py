@@ -3,9 +3,9 @@
 A solid costs only the pixels its shadow can reach. Results are line integrals, or path lengths for
 each material.
 
-`warm_up` compiles (or loads from the disk cache) the kernels that servers usually run. A server
-calls it before it prints `ready`. The kernels of meshes, of FDK and of `back` into given memory
-compile at their first use.
+`warm_up` compiles (or loads from the disk cache) the kernels that programs usually run. A server
+calls `warm_up_forward` before it prints `ready`. The kernels of meshes, of FDK and of `back` into
+given memory compile at their first use.
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from flexdt.runtime import compile_ahead
+from flexdt.twin.projection.kernels import compiling
 from flexdt.twin.projection.kernels.siddon_kernels import clip
 
 USERS = """
@@ -42,9 +43,11 @@ assert not seen, seen
 def test_nothing_compiles_after_it_was_compiled_ahead(tmp_path: Path) -> None:
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     ahead = [sys.executable, "-P", "-m", "flexdt.runtime.compile_ahead"]
-    for told in (len(compile_ahead.GROUPS) + 1, 0):
+    groups = len(compile_ahead.GROUPS)
+    for last in (f"flexdt: compiled {groups} of {groups} ", ""):
         done = subprocess.run(ahead, env=environment, capture_output=True, text=True, check=True)
-        assert len(done.stdout.splitlines()) == told
+        assert ["", *done.stdout.splitlines()][-1].startswith(last)
+    assert done.stdout == ""
     users = [sys.executable, "-P", "-c", USERS]
     done = subprocess.run(users, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -54,7 +57,7 @@ def test_nothing_compiles_after_it_was_compiled_ahead(tmp_path: Path) -> None:
 def test_what_is_missing_is_named_and_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     compiled: list[str] = []
     monkeypatch.setattr(compile_ahead, "is_compiled", lambda group: group == "FDK")
-    monkeypatch.setattr(compile_ahead, "_elsewhere", lambda group: compiled.append(group) or group)
+    monkeypatch.setattr(compile_ahead, "elsewhere", lambda group: compiled.append(group))
     told: list[str] = []
     compile_ahead.compile_ahead(["FDK"], told.append)
     assert (compiled, told) == ([], [])
@@ -62,6 +65,18 @@ def test_what_is_missing_is_named_and_compiled(monkeypatch: pytest.MonkeyPatch) 
     assert compiled == ["calibration"]
     assert "calibration" in told[0]
     assert "FDK" not in told[0]
+
+
+def test_who_waits_for_one_kernel_is_told_which(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def sum_of_squares(n: int) -> int:
+        return sum([i * i for i in range(n)])
+
+    monkeypatch.setattr(compiling, "SILENT_S", 0.01)
+    assert compiling.serial(sum_of_squares, cache=False)(4) == 14
+    told = [record.getMessage() for record in caplog.records]
+    assert any(line.startswith("flexdt: still compiling sum_of_squares (") for line in told), told
 
 
 def test_a_kernel_that_has_code_in_its_callers_only_is_refused_to_python() -> None:

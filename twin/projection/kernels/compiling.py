@@ -17,6 +17,8 @@ from __future__ import annotations
 import ctypes
 import inspect
 import logging
+import threading
+import time
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -31,8 +33,13 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.extending import intrinsic
 
+LOG = logging.getLogger("flexdt.kernels")
+"""To standard error, unless the program has set up logging."""
 SLOW = "flexdt: compiling %s (once on this machine; some seconds, and perhaps other kernels)"
 """What a process says when it first compiles, instead of loading from the disk cache."""
+STILL = "flexdt: still compiling %s (%.0f s)"
+SILENT_S = 2.0
+"""As often, somebody who waits is told for what."""
 
 
 class _LinkedLibrary(JITCodeLibrary):  # type: ignore[misc]
@@ -75,19 +82,34 @@ class _Linked(Compiler):  # type: ignore[misc]
             return super()._compile_core()
 
 
+@contextmanager
+def _telling(name: str) -> Iterator[None]:
+    done, begun = threading.Event(), time.monotonic()
+
+    def tell() -> None:
+        while not done.wait(SILENT_S):
+            LOG.warning(STILL, name, time.monotonic() - begun)
+
+    threading.Thread(target=tell, name="flexdt-compiling", daemon=True).start()
+    try:
+        yield
+    finally:
+        done.set()
+
+
 class _EntryPoint(_Linked):
     silent = False
 
     def _compile_core(self) -> Any:
         name = self.state.func_id.func_name
         if not _EntryPoint.silent:
-            # To standard error, unless the program has set up logging.
-            logging.getLogger("flexdt").warning(SLOW, name)
+            LOG.warning(SLOW, name)
             _EntryPoint.silent = True
         library = JITCodeLibrary(self.state.targetctx.codegen(), name)
         library.enable_object_caching()
         self.state.library = library
-        return super()._compile_core()
+        with _telling(name):
+            return super()._compile_core()
 
 
 # Only entry points go to the disk cache: a cached inner function would not notice that a function
