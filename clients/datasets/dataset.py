@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.datasets.foreign_files import open_file
-from flexdt.clients.datasets.listed_images import NO_DARK, by_numbers, doubts, listed
+from flexdt.clients.datasets.listed_images import NO_DARK, by_numbers, doubts, listed, log_of
 from flexdt.runtime.files.dataset_folder import (
     Folder,
     list_folder,
@@ -73,12 +73,12 @@ def load_dataset(
 
     Args:
         folder: a folder of TIFFs with flexdt.json, or with a scanner's settings texts; Nikon's
-            .xtekct file beside its TIFFs; or an NXtomo file.
+            .xtekct file beside its TIFFs; Zeiss's .txrm; or an NXtomo file.
         machine: the scanner, for texts that do not say one that ships with the package.
         profile: zero offsets to use; default: those of the file, or the profile that reproduces
             the printed figures.
         ignore_document: use the texts alone even if flexdt.json is there.
-        geometry: one view for each projection, for an NXtomo file that does not say it.
+        geometry: one view for each projection, for an NXtomo or .txrm file that does not say it.
 
     Raises:
         DatasetError: what is wrong, with its path.
@@ -177,8 +177,7 @@ def _of_floats(
     if flats:
         dark = np.mean([read_values(folder / n) for n in darks], axis=0) if darks else 0.0
         flat = np.mean([read_values(folder / n) for n in flats], axis=0)
-        images = (images - dark) / np.maximum(flat - dark, 1e-6 * flat.max())
-        images = -np.log(np.maximum(images, np.finfo(np.float32).tiny))
+        images = log_of(images, dark, flat)
     return DataSet.from_arrays(images, geometry, name=folder.name)
 
 

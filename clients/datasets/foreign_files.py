@@ -1,4 +1,4 @@
-"""Scans in files of other programs: Nikon's .xtekct and NXtomo.
+"""Scans in files of other programs: Nikon's .xtekct and NXtomo here, Zeiss's in `zeiss`.
 
 Nikon (as CIL's NikonDataReader 25.0 reads it, Apache-2.0; https://github.com/TomographicImaging/CIL):
 images are seen from behind the panel, column 0 at the right as seen from the source; the stage
@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from flexdt.clients.datasets.data_set import Arrays, DataSet
 from flexdt.clients.datasets.listed_images import by_numbers, listed
+from flexdt.clients.datasets.zeiss import open_txrm
 from flexdt.clients.extras import package
 from flexdt.runtime.files.dataset_folder import list_folder
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
@@ -34,15 +35,17 @@ def open_file(path: Path, geometry: ConeVec | None) -> DataSet:
     Raises:
         DatasetError: another kind of file, or one that lacks what is needed; says what.
     """
-    if path.suffix.lower() == ".xtekct":
+    suffix = path.suffix.lower()
+    if suffix == ".xtekct":
         return _nikon(path)
-    if path.suffix.lower() in NXTOMO:
+    if suffix == ".txrm":
+        return open_txrm(path, geometry)
+    if suffix in NXTOMO:
         return _nxtomo(path, geometry)
     raise DatasetFormatError(
-        f"{path} is a file; allowed: a folder, Nikon's .xtekct, NXtomo ({', '.join(NXTOMO)}). Of "
-        "other scanners, Zeiss's .txrm among them: TIFFs and a geometry, fx.read_tiffs(folder, "
-        "geometry)",
-        {"asked": str(path), "allowed": [".xtekct", *NXTOMO]},
+        f"{path} is a file; allowed: a folder, Nikon's .xtekct, Zeiss's .txrm, NXtomo "
+        f"({', '.join(NXTOMO)}); else TIFFs with a geometry, fx.read_tiffs(folder, geometry)",
+        {"asked": str(path), "allowed": [".xtekct", ".txrm", *NXTOMO]},
     )
 
 
