@@ -236,7 +236,7 @@ def _geometry(file: _Streams, views: int, rows: int) -> tuple[ConeVec, list[str]
     stated = {name: file.values(name, "<f4", default=0.0)[0] for name in NOT_APPLIED}
     doubts = [f"{name} of {value:g} is not applied" for name, value in stated.items() if value]
     if center[0]:
-        doubts.append(f"CenterShift of {center[0]:g} pixels is applied; data.align() checks it")
+        doubts.append(f"CenterShift of {center[0]:g} pixels is applied")
     o, p = np.zeros(views), np.full(views, pixel)
     place = np.stack([o, -near, o, right, far, up, p, o, o, o, o, p], axis=-1).reshape(-1, 4, 3)
     return ConeVec((place @ _about_z(-angles)).reshape(-1, 12)), doubts
