@@ -87,6 +87,7 @@ def test_every_block_has_ten_lines_and_two_imports() -> None:
         assert imports <= 2, name
 
 
+@pytest.mark.filterwarnings("ignore:. of .. layers of the grid")  # the panel moved up and down
 @pytest.mark.parametrize(
     "name",
     ["Zeiss", "NXtomo", *(pytest.param(n, marks=pytest.mark.slow) for n in ("Nikon", "RTK"))],
@@ -111,7 +112,8 @@ def test_a_ctsimu_set_becomes_a_volume(tmp_path: Path, monkeypatch: pytest.Monke
     here = ROOT / "extensions" / "examples" / "ctsimu"
     for file in here.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
-    command = [sys.executable, "-m", "flexdt", "simulate", "shell.json", "--out", "shell"]
+    flexdt = Path(sys.executable).with_name("flexdt")
+    command = [flexdt, "simulate", "shell.json", "--out", "shell"]
     subprocess.run(command, check=True, capture_output=True, timeout=250)
     space = ran(BLOCKS["CTSimU"])
     assert np.abs(space["data"].geometry.source).max() > 0.0
@@ -164,15 +166,13 @@ def test_astra_sees_the_balls_where_they_are(
     scan: str, scans: dict[str, fx.DataSet], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     astra = ModuleType("astra")
-    astra.create_proj_geom = lambda *given: given  # type: ignore[attr-defined]
     astra.data3d = SimpleNamespace(create=lambda *given: given)  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "astra", astra)
-    kind, (form, rows, cols, vectors), sino = ran(BLOCKS["To ASTRA"], {"data": scans[scan]})[
-        "number"
-    ]
-    assert (kind, form, sino.shape) == ("-sino", "cone_vec", (rows, VIEWS, cols))
+    kind, geometry, sino = ran(BLOCKS["To ASTRA"], {"data": scans[scan]})["number"]
+    rows, cols = geometry["DetectorRowCount"], geometry["DetectorColCount"]
+    assert (kind, geometry["type"], sino.shape) == ("-sino", "cone_vec", (rows, VIEWS, cols))
     pictures = sino.transpose(1, 0, 2)
-    places = of_vectors(vectors, (rows, cols))
+    places = of_vectors(geometry["Vectors"], (rows, cols))
     assert through_the_balls(pictures, places)
     assert not through_the_balls(pictures[:, ::-1], places)
     assert not through_the_balls(pictures[:, :, ::-1], places)
@@ -234,8 +234,8 @@ def test_tigre_sees_the_balls_where_they_are(
         [geo.DSO * one, zero, zero], corner, [zero, geo.dDetector[1] * one, zero],
         [zero, zero, geo.dDetector[0] * one],
     ])  # fmt: skip
-    turn = np.array([[np.cos(angles), -np.sin(angles), zero], [np.sin(angles), np.cos(angles), zero],
-                     [zero, zero, one]])  # fmt: skip
+    c, s = np.cos(angles), np.sin(angles)
+    turn = np.array([[c, -s, zero], [s, c, zero], [zero, zero, one]])
     places = crossed(*np.einsum("ijn,kjn->kni", turn, standing))
     np.testing.assert_allclose(geo.sDetector, geo.nDetector * geo.dDetector)
     assert through_the_balls(space["images"], places)
@@ -244,7 +244,7 @@ def test_tigre_sees_the_balls_where_they_are(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scan", ["nikon", "zeiss", "own"])
+@pytest.mark.parametrize("scan", ["nikon", "zeiss"])
 def test_rtk_sees_the_balls_where_they_are(
     scan: str, scans: dict[str, fx.DataSet], tmp_path: Path
 ) -> None:
@@ -257,9 +257,9 @@ def test_rtk_sees_the_balls_where_they_are(
         "reader.GenerateOutputInformation()\n"
         "seen = reader.GetOutputObject()\n"
         "back = itk.imread('scan.mha')\n"
+        "matrices = [itk.array_from_matrix(seen.GetMatrix(i)) for i in range(len(data))]\n"
         "np.savez('seen.npz', images=itk.array_from_image(back), first=list(back.GetOrigin()),\n"
-        "         step=list(back.GetSpacing()), matrices=[itk.array_from_matrix(m)\n"
-        "         for m in seen.GetMatrices()])\n"
+        "         step=list(back.GetSpacing()), matrices=matrices)\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path, timeout=250)
     seen = np.load(tmp_path / "seen.npz")
