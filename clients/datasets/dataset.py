@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.datasets.foreign_files import open_file
-from flexdt.clients.datasets.listed_images import NO_DARK, by_numbers, doubts, listed, log_of
+from flexdt.clients.datasets.listed_images import NO_DARK, by_numbers, doubts, listed
 from flexdt.runtime.files.dataset_folder import (
     Folder,
     list_folder,
@@ -78,7 +78,8 @@ def load_dataset(
         profile: zero offsets to use; default: those of the file, or the profile that reproduces
             the printed figures.
         ignore_document: use the texts alone even if flexdt.json is there.
-        geometry: one view for each projection, for an NXtomo or .txrm file that does not say it.
+        geometry: one view for each projection, in place of a file's, or where an NXtomo or .txrm
+            file does not say it.
 
     Raises:
         DatasetError: what is wrong, with its path.
@@ -161,13 +162,8 @@ def _of_floats(
     flats: Sequence[str],
 ) -> DataSet:
     """The data set of float images, in memory."""
-    values = [read_values(folder / n) for n in names]
-    for name, some in zip(names, values, strict=True):
-        if some.shape != values[0].shape:
-            raise DatasetFormatError(
-                f"{folder / name} has shape {some.shape}; allowed: that of {names[0]}, "
-                f"{values[0].shape}", {"path": name},
-            )  # fmt: skip
+    shape = read_values(folder / names[0]).shape
+    values = [read_values(folder / n, shape) for n in names]
     images = np.stack(values).astype(np.float32)
     if not np.isfinite(images).all():
         bad = names[int(np.flatnonzero(~np.isfinite(images).all(axis=(1, 2)))[0])]
@@ -177,7 +173,8 @@ def _of_floats(
     if flats:
         dark = np.mean([read_values(folder / n) for n in darks], axis=0) if darks else 0.0
         flat = np.mean([read_values(folder / n) for n in flats], axis=0)
-        images = log_of(images, dark, flat)
+        images = (images - dark) / np.maximum(flat - dark, 1e-6 * flat.max())
+        images = -np.log(np.maximum(images, np.finfo(np.float32).tiny))
     return DataSet.from_arrays(images, geometry, name=folder.name)
 
 

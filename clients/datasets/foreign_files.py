@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.clients.datasets.data_set import Arrays, DataSet
-from flexdt.clients.datasets.listed_images import by_numbers, listed, log_of
+from flexdt.clients.datasets.listed_images import by_numbers, listed
 from flexdt.clients.extras import package
 from flexdt.runtime.files.dataset_folder import list_folder, opened
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
@@ -43,26 +43,22 @@ GIVE: Final = ", or give it: geometry=ConeVec"
 
 
 def open_file(path: Path, geometry: ConeVec | None) -> DataSet:
-    """The data set in a file.
+    """The data set in a file; a geometry that is given replaces the file's.
 
     Raises:
         DatasetError: another kind of file, or one that lacks what is needed; says what.
     """
-    suffix = path.suffix.lower()
-    if suffix == ".xtekct":
-        return _nikon(path)
-    if suffix == ".txrm":
-        return _zeiss(path, geometry)
-    if suffix in NXTOMO:
-        return _nxtomo(path, geometry)
+    readers = {".xtekct": _nikon, ".txrm": _zeiss, **dict.fromkeys(NXTOMO, _nxtomo)}
+    if path.suffix.lower() in readers:
+        return readers[path.suffix.lower()](path, geometry)
     raise DatasetFormatError(
         f"{path} is a file; allowed: a folder, Nikon's .xtekct, Zeiss's .txrm, NXtomo "
         f"({', '.join(NXTOMO)}); else TIFFs with a geometry, fx.read_tiffs(folder, geometry)",
-        {"asked": str(path), "allowed": [".xtekct", ".txrm", *NXTOMO]},
+        {"asked": str(path), "allowed": list(readers)},
     )
 
 
-def _nikon(path: Path) -> DataSet:
+def _nikon(path: Path, geometry: ConeVec | None) -> DataSet:
     said = dict(re.findall(r"^(\w+)=(.*?)\s*$", path.read_text("utf-8", "replace"), re.MULTILINE))
     views = int(_number(path, said, "Projections"))
     sod, sdd = (_number(path, said, key) for key in ("SrcToObject", "SrcToDetector"))
@@ -81,7 +77,8 @@ def _nikon(path: Path) -> DataSet:
     folder = list_folder(path.parent / said.get("InputFolderName", "").replace("\\", "/"))
     names = sorted((n for n in folder.names if n.lower().endswith((".tif", ".tiff"))),
                    key=by_numbers)  # fmt: skip
-    data = listed(folder, ConeVec(rows.reshape(views, 12)), names, (), (), said.get("Name", ""))
+    cone = ConeVec(rows.reshape(views, 12)) if geometry is None else geometry
+    data = listed(folder, cone, names, (), (), said.get("Name", ""))
     if list(data.shape) != size:
         raise DatasetFormatError(
             f"{path} says {size[1]} x {size[0]} pixels, {names[0]} has "
@@ -124,11 +121,6 @@ def _axis(roll: float, tilt: float) -> FloatArray:
 
 
 def _zeiss(path: Path, geometry: ConeVec | None) -> DataSet:
-    """The data set in a .txrm file; a geometry replaces the one that it says.
-
-    Raises:
-        DatasetError: it is damaged or lacks what is needed; says what.
-    """
     olefile = package("olefile", "Zeiss's .txrm")
     try:
         with opened(path) as raw:
@@ -197,7 +189,9 @@ def _read(file: _Streams, geometry: ConeVec | None, name: str) -> DataSet:
     if images.dtype.kind == "f":
         if flats is None:
             raise DatasetFormatError(f"images of floats; allowed: with {REFERENCES[0]}/Image")
-        images, flats = log_of(images, 0.0, flats.mean(axis=0)), None
+        with np.errstate(all="ignore"):  # what is not finite is refused by its name
+            images = images / np.maximum(flats.mean(axis=0), 1e-6 * flats.max())
+            images, flats = -np.log(np.maximum(images, np.finfo(np.float32).tiny)), None
     elif flats is None:
         doubts.append("no reference: DataSet.from_arrays(data.counts(), data.geometry, flat=FLAT)")
     dark = np.zeros((rows, cols))
@@ -209,8 +203,7 @@ def _read(file: _Streams, geometry: ConeVec | None, name: str) -> DataSet:
 def _reference(file: _Streams, code: int, shape: tuple[int, int]) -> npt.NDArray[Any] | None:
     """The images of the open beam, one or several."""
     for folder in REFERENCES:
-        several = (f"{folder}/Image{k or ''}" for k in range(1000))
-        names = [name for name in several if file.ole.exists(name)]
+        names = [n for k in range(1000) if file.ole.exists(n := f"{folder}/Image{k or ''}")]
         if names:
             images = file.images(names, file.whole(f"{folder}/DataType", code), shape)
             if not np.isfinite(images).all():

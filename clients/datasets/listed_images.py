@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import Any, Final
-
-import numpy as np
-import numpy.typing as npt
+from typing import Final
 
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.runtime.files.dataset_folder import Folder, read_image
@@ -69,12 +66,3 @@ def listed(
 def doubts(darks: Sequence[str]) -> list[str]:
     """What to say of a data set with these dark images."""
     return [] if darks else [f"{NO_DARK} (di000000.tif): zero is taken"]
-
-
-def log_of(
-    images: npt.NDArray[Any], dark: npt.NDArray[Any] | float, flat: npt.NDArray[Any]
-) -> npt.NDArray[Any]:
-    """Line integrals of float images (n, rows, cols); where they are not finite, these are not."""
-    with np.errstate(all="ignore"):
-        images = (images - dark) / np.maximum(flat - dark, 1e-6 * flat.max())
-        return np.asarray(-np.log(np.maximum(images, np.finfo(np.float32).tiny)))

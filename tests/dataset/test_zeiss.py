@@ -133,6 +133,14 @@ def test_the_phantom_would_show_a_wrong_sign(wrong: str, tmp_path: Path) -> None
     assert np.abs(found(volume) - 1.0).max() > 0.1
 
 
+def test_align_finds_the_axis_of_a_panel_that_steps_about(tmp_path: Path) -> None:
+    """With each view's shift, and a CenterShift that points the other way."""
+    data = fx.open(balls(tmp_path / "scan.txrm", 0, wrong="CenterShift")[0])
+    right = data.with_correction(data.align().correction)
+    volume = right.reconstruct("fdk", voxel=0.2, shape=(40, 60, 60))
+    np.testing.assert_allclose(found(volume), 1.0, atol=0.04)
+
+
 @pytest.mark.parametrize(
     ("said", "sentence"),
     [
