@@ -94,6 +94,12 @@ def test_an_offset_of_the_detector_is_not_passed_over_in_silence(tmp_path: Path)
     assert "DetectorOffsetX 3.0, which is not applied" in fx.open(path).warnings[0]
 
 
+def test_another_geometry_takes_the_place_of_nikons(tmp_path: Path) -> None:
+    path = xtekct(tmp_path, aside=0.0, start=0.0)
+    scan = fx.ConeVec.circular(sod=100, sdd=200, angles=VIEWS, pixel=1.0)
+    np.testing.assert_array_equal(fx.open(path, geometry=scan).geometry.rows, scan.rows)
+
+
 def test_nxtomo_comes_back(tmp_path: Path) -> None:
     pytest.importorskip("h5py")
     scan = fx.ConeVec.circular(sod=SOD, sdd=SDD, angles=24, shape=(ROWS, COLS), pixel=PIXEL)
