@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from typing import Final
 
 import numpy as np
+from scipy.ndimage import shift
 
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.twin.calibration.fit.priors import prior_widths
-from flexdt.twin.calibration.without_phantom.align import Alignment, align_turn
+from flexdt.twin.calibration.without_phantom.align import STANDS, Alignment, align_turn
 from flexdt.twin.errors import NotIdentifiableError
+from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import NOMINAL
+from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.scanner.state import NamedCorrection
+
+MOST: Final = 0.1
+"""Of the panel's shorter side: larger steps of a panel are those of a tiled scan."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -86,8 +93,9 @@ def align_dataset(data: DataSet, per_frame: bool = False) -> Aligned:
     """
     begun = time.perf_counter()
     base = NOMINAL if data.correction is None else data.correction.parameters
+    frames, poses = _at_rest(data)
     found = align_turn(
-        data.line_integrals, data.poses, data.present, data.shape, base,
+        frames, poses, data.present, data.shape, base,
         prior_widths(data.machine, data.profile), np.random.default_rng(0), per_frame,
     )  # fmt: skip
     document: dict[str, object] = {
@@ -106,3 +114,15 @@ def align_dataset(data: DataSet, per_frame: bool = False) -> Aligned:
         document["datasets"] = [data.where]
         data = data.with_motion(found.motion)
     return Aligned(found, document, data)
+
+
+def _at_rest(data: DataSet) -> tuple[Callable[[int], Float32Array], Poses]:
+    """Line integrals and poses, the images moved instead of a panel that steps about a little."""
+    poses = data.poses
+    aside = poses.detector - poses.detector.mean(axis=0)
+    steps = np.stack([(aside * side).sum(1) / (side**2).sum(1) for side in (poses.v, poses.u)], 1)
+    if not STANDS < np.abs(steps).max() < MOST * min(data.shape):
+        return data.line_integrals, poses
+    still = poses.detector - steps[:, :1] * poses.v - steps[:, 1:] * poses.u
+    moved = replace(poses, detector=still)
+    return lambda i: shift(data.line_integrals(i), steps[i], order=1, mode="nearest"), moved

@@ -73,12 +73,13 @@ def load_dataset(
 
     Args:
         folder: a folder of TIFFs with flexdt.json, or with a scanner's settings texts; Nikon's
-            .xtekct file beside its TIFFs; or an NXtomo file.
+            .xtekct file beside its TIFFs; Zeiss's .txrm; or an NXtomo file.
         machine: the scanner, for texts that do not say one that ships with the package.
         profile: zero offsets to use; default: those of the file, or the profile that reproduces
             the printed figures.
         ignore_document: use the texts alone even if flexdt.json is there.
-        geometry: one view for each projection, for an NXtomo file that does not say it.
+        geometry: one view for each projection, in place of a file's, or where an NXtomo or .txrm
+            file does not say it.
 
     Raises:
         DatasetError: what is wrong, with its path.
@@ -161,13 +162,8 @@ def _of_floats(
     flats: Sequence[str],
 ) -> DataSet:
     """The data set of float images, in memory."""
-    values = [read_values(folder / n) for n in names]
-    for name, some in zip(names, values, strict=True):
-        if some.shape != values[0].shape:
-            raise DatasetFormatError(
-                f"{folder / name} has shape {some.shape}; allowed: that of {names[0]}, "
-                f"{values[0].shape}", {"path": name},
-            )  # fmt: skip
+    shape = read_values(folder / names[0]).shape
+    values = [read_values(folder / n, shape) for n in names]
     images = np.stack(values).astype(np.float32)
     if not np.isfinite(images).all():
         bad = names[int(np.flatnonzero(~np.isfinite(images).all(axis=(1, 2)))[0])]

@@ -17,7 +17,7 @@ import flexdt as fx
 
 SOURCE = Path(fx.__file__)
 HEAVY = ("numpy", "scipy", "numba", "trimesh", "fcl", "cv2", "viser", "matplotlib", "tifffile",
-         "pydantic", "h5py", "torch", "zarr")  # fmt: skip
+         "pydantic", "h5py", "olefile", "torch", "zarr")  # fmt: skip
 NAMES = [name for name in fx.__all__ if name != "__version__"]
 
 

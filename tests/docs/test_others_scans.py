@@ -1,0 +1,271 @@
+"""Scans of other scanners, and scans to other programs: the blocks of the page run, and the balls
+are where each program's own geometry puts them.
+
+The balls' radiographs are closed forms. A pixel that looks through the middle of a ball has at
+least its diameter on the way; with an axis, a sign or an order turned, it does not.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from four_balls import BALLS, COLS, MU, PIXEL, ROWS, SDD, SOD, VIEWS, found, images
+from loaded_script import load
+from required import required
+
+import flexdt as fx
+from flexdt.twin.geometry.conventions import FloatArray
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = (ROOT / "docs" / "data-sets.md").read_text(encoding="utf-8")
+BLOCKS = dict(re.findall(r"^### ([^\n]+)\n(?:(?!^### ).)*?```python\n(.*?)```", PAGE, re.M | re.S))
+START = 0.4
+"""Stage angle of the first view [rad]."""
+RTK = '<?xml version="1.0"?>\n<!DOCTYPE RTKGEOMETRY>\n<RTKThreeDCircularGeometry version="3">\n{}'
+VIEW = (
+    "<Projection><GantryAngle>{}</GantryAngle><SourceToIsocenterDistance>{}"
+    "</SourceToIsocenterDistance><SourceToDetectorDistance>{}</SourceToDetectorDistance>"
+    "</Projection>\n"
+)
+
+
+def nikon(folder: Path) -> None:
+    made = load(ROOT / "tests" / "dataset" / "test_foreign_files.py")
+    made.xtekct(folder / "part", aside=0.7, start=START)
+
+
+def zeiss(folder: Path) -> None:
+    required("olefile")
+    load(ROOT / "tests" / "dataset" / "test_zeiss.py").balls(folder / "tooth.txrm", 3)
+
+
+def nxtomo(folder: Path) -> None:
+    frames = np.r_[np.full((1, ROWS, COLS), 5e4), 5e4 * images(0.0, 0.0)]
+    with required("h5py").File(folder / "scan.nxs", "w") as file:
+        file["entry/detector/data"] = frames.round().astype(np.uint16)
+        file["entry/detector/image_key"] = [1] + [0] * VIEWS
+
+
+def rtk(folder: Path) -> None:
+    """As RTK's own programs leave a circle: positive distances, rows from the lowest."""
+    required("itk")
+    angles = np.rad2deg(START) + 360.0 / VIEWS * np.arange(VIEWS)
+    views = "".join(VIEW.format(angle % 360.0, SOD, SDD) for angle in angles)
+    (folder / "geometry.xml").write_text(RTK.format(views) + "</RTKThreeDCircularGeometry>\n")
+    lines = -np.log(images(0.0, START))[:, ::-1].astype("<f4")
+    origin = -(COLS - 1) / 2 * PIXEL, -(ROWS - 1) / 2 * PIXEL, 0.0
+    head = (
+        "ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = False\n"
+        f"Offset = {' '.join(map(str, origin))}\nElementSpacing = {PIXEL} {PIXEL} 1\n"
+        f"DimSize = {COLS} {ROWS} {VIEWS}\nElementType = MET_FLOAT\nElementDataFile = LOCAL\n"
+    )
+    (folder / "projections.mha").write_bytes(head.encode() + lines.tobytes())
+
+
+MAKERS = {"Nikon": nikon, "Zeiss": zeiss, "NXtomo": nxtomo, "RTK": rtk}
+
+
+def ran(block: str, names: dict[str, Any] | None = None) -> dict[str, Any]:
+    space = {} if names is None else names
+    exec(compile(block, "<page>", "exec"), space)
+    return space
+
+
+def test_every_block_has_ten_lines_and_two_imports() -> None:
+    assert list(BLOCKS) == [*MAKERS, "CTSimU", "To ASTRA", "To CIL", "To TIGRE", "To RTK"]
+    for name, block in BLOCKS.items():
+        lines = [line for line in block.splitlines() if line.strip()]
+        imports = sum(line.startswith(("import ", "from ")) for line in lines)
+        assert len(lines) - imports <= 10, name
+        assert imports <= 2, name
+
+
+@pytest.mark.filterwarnings("ignore:. of .. layers of the grid")  # the panel moved up and down
+@pytest.mark.parametrize(
+    "name", ["NXtomo", *(pytest.param(n, marks=pytest.mark.slow) for n in MAKERS if n != "NXtomo")]
+)
+def test_a_scan_becomes_a_volume(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    MAKERS[name](tmp_path)
+    if name == "RTK":  # ITK in a process of its own
+        subprocess.run([sys.executable, "-c", BLOCKS[name]], check=True, timeout=250)
+        volume = fx.Volume.load("rtk.mha")
+    else:
+        volume = ran(BLOCKS[name])["volume"]
+    np.testing.assert_allclose(found(volume), 1.0, atol=0.05)
+
+
+@pytest.mark.slow
+def test_a_ctsimu_set_becomes_a_volume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("flexdt_extensions")
+    monkeypatch.chdir(tmp_path)
+    here = ROOT / "extensions" / "examples" / "ctsimu"
+    for file in here.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    flexdt = Path(sys.executable).with_name("flexdt")
+    command = [flexdt, "simulate", "shell.json", "--out", "shell"]
+    subprocess.run(command, check=True, capture_output=True, timeout=250)
+    space = ran(BLOCKS["CTSimU"])
+    lines = space["data"].line_integrals()
+    assert (len(space["data"]), len(space["data"].flats), len(space["data"].darks)) == (24, 2, 1)
+    assert abs(float(np.median(lines[:, :, [0, -1]]))) < 0.02 < 0.2 < float(lines.max())
+    assert 0.0 < float(space["found"].parameters["axis_column_px"]["value"]) < lines.shape[2]
+    assert float(np.nanmax(space["volume"].data)) > 0.0
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory: pytest.TempPathFactory) -> dict[str, fx.DataSet]:
+    """Panels with columns and rows in all the orders that occur: Nikon's, Zeiss's, our own."""
+    folder = tmp_path_factory.mktemp("scans")
+    nikon(folder)
+    zeiss(folder)
+    own = fx.ConeVec.circular(
+        sod=SOD, sdd=SDD, shape=(ROWS, COLS), pixel=PIXEL,
+        angles=np.rad2deg(START) + 360.0 / VIEWS * np.arange(VIEWS),
+    )  # fmt: skip
+    return {
+        "nikon": fx.open(folder / "part" / "part.xtekct"),
+        "zeiss": fx.open(folder / "tooth.txrm"),
+        "own": fx.DataSet.from_arrays(-np.log(images(0.0, START)), own),
+    }
+
+
+def crossed(source: FloatArray, corner: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
+    """Columns and rows (n, balls, 2) where rays through the balls meet panels (n, 3)."""
+    out = np.empty((len(source), len(BALLS), 2))
+    for n in range(len(source)):
+        for k, ball in enumerate(BALLS[:, :3]):
+            sides = np.stack([u[n], v[n], source[n] - ball], axis=-1)
+            out[n, k] = np.linalg.solve(sides, source[n] - corner[n])[:2]
+    return out
+
+
+def through_the_balls(pictures: FloatArray, places: FloatArray) -> bool:
+    """Whether the pixels at these places have the balls' diameters on their way."""
+    cols, rows = np.rint(places).astype(int).transpose(2, 0, 1)
+    seen = pictures[np.arange(len(pictures))[:, None], rows, cols]
+    return bool((seen > 0.93 * 2.0 * MU * BALLS[:, 3]).all())
+
+
+def of_vectors(vectors: FloatArray, shape: tuple[int, int]) -> FloatArray:
+    """ASTRA's: the middle of the panel, steps to the next column and the next row."""
+    source, middle, u, v = np.split(np.asarray(vectors), 4, axis=1)
+    corner = middle - (shape[1] - 1) / 2 * u - (shape[0] - 1) / 2 * v
+    return crossed(source, corner, u, v)
+
+
+@pytest.mark.parametrize("scan", ["nikon", "zeiss", "own"])
+def test_astra_sees_the_balls_where_they_are(
+    scan: str, scans: dict[str, fx.DataSet], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    astra = ModuleType("astra")
+    astra.data3d = SimpleNamespace(create=lambda *given: given)  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "astra", astra)
+    kind, geometry, sino = ran(BLOCKS["To ASTRA"], {"data": scans[scan]})["number"]
+    rows, cols = geometry["DetectorRowCount"], geometry["DetectorColCount"]
+    assert (kind, geometry["type"], sino.shape) == ("-sino", "cone_vec", (rows, VIEWS, cols))
+    pictures = sino.transpose(1, 0, 2)
+    places = of_vectors(geometry["Vectors"], (rows, cols))
+    assert through_the_balls(pictures, places)
+    assert not through_the_balls(pictures[:, ::-1], places)
+    assert not through_the_balls(pictures[:, :, ::-1], places)
+
+
+class Flexible:
+    """CIL's geometry of one pose a view, panels' origins at the bottom left."""
+
+    def __init__(self, *sides: FloatArray) -> None:
+        self.sides = [np.asarray(side) for side in sides]
+
+    @classmethod
+    def create_Cone3D_Flex(cls, *sides: FloatArray) -> Flexible:
+        return cls(*sides)
+
+    def set_panel(self, num_pixels: Any, pixel_size: Any) -> None:
+        self.pixels, self.size = num_pixels, pixel_size
+
+    def allocate(self, value: float) -> SimpleNamespace:
+        kept: list[FloatArray] = []
+        return SimpleNamespace(fill=kept.append, kept=kept)
+
+
+@pytest.mark.parametrize("scan", ["nikon", "zeiss", "own"])
+def test_cil_sees_the_balls_where_they_are(
+    scan: str, scans: dict[str, fx.DataSet], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    framework = ModuleType("cil.framework")
+    framework.AcquisitionGeometry = Flexible  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "cil", ModuleType("cil"))
+    monkeypatch.setitem(sys.modules, "cil.framework", framework)
+    space = ran(BLOCKS["To CIL"], {"data": scans[scan]})
+    source, middle, *directions = space["scan"].sides
+    u, v = (
+        side / np.linalg.norm(side, axis=1, keepdims=True) * size
+        for side, size in zip(directions, space["scan"].size, strict=True)
+    )
+    cols, rows = space["scan"].pixels
+    places = of_vectors(np.concatenate([source, middle, u, v], axis=1), (rows, cols))
+    assert through_the_balls(space["images"].kept[0], places)
+
+
+@pytest.mark.parametrize("scan", ["nikon", "zeiss", "own"])
+def test_tigre_sees_the_balls_where_they_are(
+    scan: str, scans: dict[str, fx.DataSet], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The source stands on +x and turns anticlockwise by the angle, together with the panel: its
+    columns go to +y, its rows, from the lowest, to +z.
+    """
+    tigre = ModuleType("tigre")
+    tigre.geometry = lambda mode: SimpleNamespace(mode=mode)  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "tigre", tigre)
+    space = ran(BLOCKS["To TIGRE"], {"data": scans[scan]})
+    geo, angles = space["geo"], space["angles"]
+    zero, one = np.zeros(VIEWS), np.ones(VIEWS)
+    low, left = -(geo.nDetector - 1) / 2 * geo.dDetector
+    corner = [geo.DSO - geo.DSD, left + geo.offDetector[:, 1], low + geo.offDetector[:, 0]]
+    standing = np.array([
+        [geo.DSO * one, zero, zero], corner, [zero, geo.dDetector[1] * one, zero],
+        [zero, zero, geo.dDetector[0] * one],
+    ])  # fmt: skip
+    c, s = np.cos(angles), np.sin(angles)
+    turn = np.array([[c, -s, zero], [s, c, zero], [zero, zero, one]])
+    places = crossed(*np.einsum("ijn,kjn->kni", turn, standing))
+    np.testing.assert_allclose(geo.sDetector, geo.nDetector * geo.dDetector)
+    assert through_the_balls(space["images"], places)
+    assert not through_the_balls(space["images"][:, ::-1], places)
+    assert not through_the_balls(space["images"][:, :, ::-1], places)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scan", ["nikon", "zeiss"])
+def test_rtk_sees_the_balls_where_they_are(
+    scan: str, scans: dict[str, fx.DataSet], tmp_path: Path
+) -> None:
+    """What RTK's reader makes of the file, with the images that ITK wrote."""
+    required("itk")
+    scans[scan].save(tmp_path / "scan")
+    code = f"import flexdt as fx\ndata = fx.open('scan')\n{BLOCKS['To RTK']}" + (
+        "reader = itk.RTK.ThreeDCircularProjectionGeometryXMLFileReader.New()\n"
+        "reader.SetFilename('scan.xml')\n"
+        "reader.GenerateOutputInformation()\n"
+        "seen = reader.GetOutputObject()\n"
+        "back = itk.imread('scan.mha')\n"
+        "matrices = [itk.array_from_matrix(seen.GetMatrix(i)) for i in range(len(data))]\n"
+        "np.savez('seen.npz', images=itk.array_from_image(back), first=list(back.GetOrigin()),\n"
+        "         step=list(back.GetSpacing()), matrices=matrices)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path, timeout=250)
+    seen = np.load(tmp_path / "seen.npz")
+    balls = BALLS[:, [0, 2, 1]] * [1.0, 1.0, -1.0]  # RTK's x, y, z
+    shown = seen["matrices"] @ np.c_[balls, np.ones(len(balls))].T
+    places = (shown[:, :2] / shown[:, 2:]).transpose(0, 2, 1)
+    assert through_the_balls(seen["images"], (places - seen["first"][:2]) / seen["step"][:2])
