@@ -22,6 +22,7 @@ from ophyd_async.core import NotConnectedError, SignalBackend, SignalRW
 
 from flexdt.clients import ConnectionLost, RpcError, State
 from flexdt.clients.client.async_client import AsyncTwinClient
+from flexdt.clients.client.transport import Transport
 
 Watcher = Callable[[State], None]
 
@@ -37,6 +38,8 @@ class LabConnection:
 
     Args:
         host, port, token, ssl: of the twin server.
+        transport: replaces TCP, such as that of a twin in process; host, port and ssl are not used
+            then.
 
     Attributes:
         client: for all methods of the twin.
@@ -50,9 +53,12 @@ class LabConnection:
         token: str | None = None,
         *,
         ssl: tls.SSLContext | None = None,
+        transport: Transport | None = None,
     ) -> None:
-        self.address = f"{host}:{port}"
-        self.client = AsyncTwinClient(host, port, token, name="flexdt_extensions.bluesky", ssl=ssl)
+        self.address = f"{host}:{port}" if transport is None else "in-process"
+        self.client = AsyncTwinClient(
+            host, port, token, transport, name="flexdt_extensions.bluesky", ssl=ssl
+        )
         self.state: State | None = None
         self._watchers: list[Watcher] = []
         self._news = asyncio.Event()
