@@ -23,6 +23,7 @@ from flexdt.runtime.access import ConnectionLimits
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.network.tcp import TcpServer
+from flexdt.server.scans.checking import Checks
 from flexdt.server.twin.application import TwinSession
 from flexdt.server.twin.core import TwinServer
 from flexdt.testing.virtual_time import Deadlock, SimulatedLoop
@@ -263,6 +264,7 @@ def twin(
                 chosen, zero, DirectProjector(), open_data(Path(fspath(folder))), truth=hidden,
                 speed_up=speed_up, seed=lambda: seed, physics=physics, wall=loop.time,
             )  # fmt: skip
+            server.submissions.checks = Checks(apart=False)
             found = InProcessTwin(loop, server)
             found.run(server.start(Sample(sample)))
             try:
