@@ -1,4 +1,4 @@
-"""What tests of your own programme need of a scanner: a twin in process, and things drawn at random.
+"""What tests of your own programme need of a scanner: a twin in process, and drawn input.
 
     from flexdt.testing import twin
 
@@ -6,8 +6,8 @@
         scanner.client.move({"rot_obj": 90.0}, wait=True)
 
 `flexdt.testing.fixtures` has the same as a fixture of pytest, `flexdt.testing.strategies` draws
-machines, geometries and scripts with Hypothesis. Names are looked up on first use, so that importing
-this package loads nothing.
+machines and geometries with Hypothesis. Names are looked up on first use, so that
+importing this package loads nothing.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """An event loop whose time is virtual: it never sleeps, and the same seed gives the same run.
 
-When nothing is ready the clock jumps to the next timer. Work for threads runs in the loop itself, at
-once, or a moment drawn from a seed later, so that what runs beside each other comes in many orders.
-A wait that nothing can end is an error (`Deadlock`) instead of a test that hangs; a loop that
-another thread runs for ever (Bluesky's engine does) waits for that thread's next request instead.
+When nothing is ready the clock jumps to the next timer. Work for threads runs in the loop itself,
+at once, or a moment drawn from a seed later, so that what runs beside each other comes in many
+orders. A wait that nothing can end is an error (`Deadlock`) instead of a test that hangs; a loop
+that runs for ever in a thread (Bluesky's engine does that) waits for the next request instead.
 """
 
 from __future__ import annotations
@@ -35,7 +35,6 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
     def __init__(self, rng: random.Random | None = None, start: float = 0.0) -> None:
         self._now = start
         self._rng = rng
-        self._still = threading.Event()
         self.alone = False
         """Whether it runs until one result is there, so that nobody else can end a wait."""
         super().__init__(_Jumps(self))
@@ -47,14 +46,6 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
     def jump(self, seconds: float) -> None:
         """Let time pass."""
         self._now += seconds
-
-    def run_forever(self) -> None:
-        """As any loop does."""
-        self._still.clear()
-        try:
-            super().run_forever()
-        finally:
-            self._still.set()
 
     def run_until_complete(self, future: Generator[Any, None, T] | Awaitable[T]) -> T:
         """As any loop does.
@@ -68,22 +59,20 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
         finally:
             self.alone = False
 
-    def end(self) -> None:
-        """Close it, wherever it runs."""
-        if self.is_running():
-            self.call_soon_threadsafe(self.stop)
-            self._still.wait()
-        self.close()
+    def come_to_rest(self) -> None:
+        """End a thread that runs it."""
+        for thread in threading.enumerate():
+            if thread.ident == self._thread_id:  # type: ignore[attr-defined]
+                self.call_soon_threadsafe(self.stop)
+                thread.join()
 
     def run_in_executor(  # type: ignore[override]
         self, executor: Any, func: Callable[..., Any], *args: Any
     ) -> asyncio.Future[Any]:
         """Run `func` here, soon."""
         done: asyncio.Future[Any] = self.create_future()
-        if self._rng is None:
-            self.call_soon(_work, done, func, args)
-        else:
-            self.call_later(self._rng.choice(LATER_S), _work, done, func, args)
+        later = 0.0 if self._rng is None else self._rng.choice(LATER_S)
+        self.call_later(later, _work, done, func, args)
         return done
 
 

@@ -194,9 +194,7 @@ class Submissions:
     ) -> tuple[ScanPlan, Prepare, list[str]]:
         """Check all of a scan, and say how it is begun."""
         begin = asked.begin
-        checked = await self.checks.sound(
-            await self._matter(asked.wish, begin.start, begin.sample)
-        )
+        checked = await self.checks.sound(await self._matter(asked.wish, begin.start, begin.sample))
         self._ensure_same(begin)
         await asyncio.to_thread(self._require_room, checked.plan.bytes, name)
         warnings = list(checked.warnings)
