@@ -120,7 +120,7 @@ class InProcessTransport(asyncio.Transport):
         return 0
 
     abort = close
-    pause_reading = resume_reading = set_write_buffer_limits = get_write_buffer_size
+    pause_reading = resume_reading = set_write_buffer_limits = get_write_buffer_size  # type: ignore[assignment]
 
 
 class _Client(TwinClient):
