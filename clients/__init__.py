@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from flexdt.clients.client.async_client import AsyncTwinClient
     from flexdt.clients.client.client import TwinClient
     from flexdt.clients.client.events import Projection
-    from flexdt.clients.client.transport import ConnectionLost
+    from flexdt.clients.client.transport import ConnectionLost, Transport
     from flexdt.clients.client.twin_methods import FINAL_STATES
     from flexdt.protocol.methods.job_messages import CheckResult
     from flexdt.protocol.rpc_errors import RpcError
@@ -23,6 +23,7 @@ _HOMES = {
     "Projection": "flexdt.clients.client.events",
     "TwinClient": "flexdt.clients.client.client",
     "ConnectionLost": "flexdt.clients.client.transport",
+    "Transport": "flexdt.clients.client.transport",
     "FINAL_STATES": "flexdt.clients.client.twin_methods",
     "CheckResult": "flexdt.protocol.methods.job_messages",
     "RpcError": "flexdt.protocol.rpc_errors",
@@ -41,6 +42,7 @@ __all__ = [
     "Projection",
     "RpcError",
     "State",
+    "Transport",
     "TwinClient",
 ]
 

@@ -16,12 +16,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from flexdt.testing.in_process import InProcessTransport as InProcessTransport
     from flexdt.testing.in_process import InProcessTwin as InProcessTwin
     from flexdt.testing.in_process import twin as twin
     from flexdt.testing.virtual_time import Deadlock as Deadlock
 
-__all__ = ["Deadlock", "InProcessTransport", "InProcessTwin", "twin"]
+__all__ = ["Deadlock", "InProcessTwin", "twin"]
 
 
 def __getattr__(name: str) -> Any:

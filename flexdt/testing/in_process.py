@@ -17,7 +17,7 @@ from typing import Any, Literal, TypeVar
 
 from flexdt import machines
 from flexdt.clients.client.client import TwinClient
-from flexdt.clients.client.transport import ConnectionLost
+from flexdt.clients.client.transport import ConnectionLost, Transport
 from flexdt.protocol import METHODS, Codec, Connection, Message
 from flexdt.runtime.access import ConnectionLimits
 from flexdt.runtime.files.directory import open_data
@@ -32,7 +32,7 @@ from flexdt.twin.machine.description import Machine
 from flexdt.twin.projection import Body, project_body
 from flexdt.twin.scanner.state import Sample
 
-__all__ = ["Deadlock", "InProcessTransport", "InProcessTwin", "twin"]
+__all__ = ["Deadlock", "InProcessTwin", "twin"]
 
 T = TypeVar("T")
 
@@ -158,7 +158,7 @@ class InProcessTwin:
         """Another client: a second controller, or somebody who watches."""
         return _Client(self, name)
 
-    def transport(self) -> InProcessTransport:
+    def transport(self) -> Transport:
         """A connection of its own, for `AsyncTwinClient` and for Bluesky's `TwinLab`."""
         return InProcessTransport(self.loop, self._shell.connection)
 

@@ -18,7 +18,7 @@ from ophyd_async.core import (
     StandardReadableFormat,
 )
 
-from flexdt.clients.client.transport import Transport
+from flexdt.clients import Transport
 from flexdt.twin.machine.description import Machine, builtin_machine
 from flexdt_extensions.bluesky.axes import TwinAxis
 from flexdt_extensions.bluesky.camera_device import TwinCamera

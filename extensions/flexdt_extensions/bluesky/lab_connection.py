@@ -20,9 +20,8 @@ from bluesky.protocols import Reading
 from event_model import DataKey, Dtype, Limits
 from ophyd_async.core import NotConnectedError, SignalBackend, SignalRW
 
-from flexdt.clients import ConnectionLost, RpcError, State
+from flexdt.clients import ConnectionLost, RpcError, State, Transport
 from flexdt.clients.client.async_client import AsyncTwinClient
-from flexdt.clients.client.transport import Transport
 
 Watcher = Callable[[State], None]
 
@@ -227,17 +226,13 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
         """The value now."""
         return self._get(await self._link.fresh())
 
-    async def get_setpoint(self) -> _T:
-        """The value that was last requested."""
-        return self._get(await self._link.fresh())
+    get_setpoint = get_value
 
     def set_callback(self, callback: Callable[[Reading[_T]], None] | None) -> None:
         """Subscribe a callback to changes."""
         if self._end is not None:
             self._end()
-            self._end = None
-        if callback is not None:
-            self._end = self._link.watch(_changes(self._get, callback))
+        self._end = None if callback is None else self._link.watch(_changes(self._get, callback))
 
 
 def _changes(get: Get[_T], callback: Callable[[Reading[_T]], None]) -> Callable[[State], None]:
