@@ -167,14 +167,15 @@ class InProcessTwin:
 
         Raises:
             Deadlock: nothing is left that could end the wait.
-            RuntimeError: called in that loop, where it would wait for itself.
+            RuntimeError: called in an event loop, where it would wait for itself.
         """
-        if not self.loop.is_running():
-            return self.loop.run_until_complete(work)
-        if asyncio._get_running_loop() is self.loop:
+        here = asyncio._get_running_loop()
+        if self.loop.is_running() and here is not self.loop:
+            return asyncio.run_coroutine_threadsafe(work, self.loop).result()
+        if here is not None:
             work.close()
-            raise RuntimeError("a blocking call in the twin's own event loop: await it instead")
-        return asyncio.run_coroutine_threadsafe(work, self.loop).result()
+            raise RuntimeError("a blocking call in an event loop: await it, or use LocalTwin")
+        return self.loop.run_until_complete(work)
 
     async def close(self) -> None:
         """End the server and its connections."""
