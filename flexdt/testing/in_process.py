@@ -197,8 +197,9 @@ def twin(
 
     Motion takes the machine's true time, by its speeds and accelerations, on a virtual clock that
     passes while a call waits (`move(..., wait=True)`, `wait_job`) or in `advance`, and at no other
-    time. Nothing sleeps. Files that are sent, `fit_calibration`, `align_dataset`, `dataset` and
-    `predict_exposure` are worked on in a process with limits, as always.
+    time. Nothing sleeps. Meshes and scenes that are sent, the calls about data sets,
+    `fit_calibration`, `align_dataset` and `predict_exposure` are worked on in a process with
+    limits, as always.
 
     Args:
         machine: the scanner, its shipped name or file; None for the FleX-ray. Its zero offsets are

@@ -270,6 +270,8 @@ def test_the_fixture_takes_the_arguments_of_a_twin(
 def test_what_does_not_exist_is_said() -> None:
     with pytest.raises(fx.TwinError, match="no machine called 'flexrey'"), twin(machine="flexrey"):
         pass
+    with pytest.raises(fx.TwinError, match="no sample called 'legi'"), twin(sample="legi"):
+        pass
 
 
 # What loads what --------------------------------------------------------------------------------
