@@ -9,20 +9,24 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from flexdt.clients.client.async_client import AsyncTwinClient
-    from flexdt.clients.client.client import TwinClient
-    from flexdt.clients.client.events import Projection
-    from flexdt.clients.client.transport import ConnectionLost
-    from flexdt.clients.client.twin_methods import FINAL_STATES
-    from flexdt.protocol.methods.job_messages import CheckResult
-    from flexdt.protocol.rpc_errors import RpcError
-    from flexdt.protocol.state_model import AxisState, JobStatus, State
+    from flexdt.clients.client.async_client import AsyncTwinClient as AsyncTwinClient
+    from flexdt.clients.client.client import TwinClient as TwinClient
+    from flexdt.clients.client.events import Projection as Projection
+    from flexdt.clients.client.transport import ConnectionLost as ConnectionLost
+    from flexdt.clients.client.transport import Transport as Transport
+    from flexdt.clients.client.twin_methods import FINAL_STATES as FINAL_STATES
+    from flexdt.protocol.methods.job_messages import CheckResult as CheckResult
+    from flexdt.protocol.rpc_errors import RpcError as RpcError
+    from flexdt.protocol.state_model import AxisState as AxisState
+    from flexdt.protocol.state_model import JobStatus as JobStatus
+    from flexdt.protocol.state_model import State as State
 
 _HOMES = {
     "AsyncTwinClient": "flexdt.clients.client.async_client",
     "Projection": "flexdt.clients.client.events",
     "TwinClient": "flexdt.clients.client.client",
     "ConnectionLost": "flexdt.clients.client.transport",
+    "Transport": "flexdt.clients.client.transport",
     "FINAL_STATES": "flexdt.clients.client.twin_methods",
     "CheckResult": "flexdt.protocol.methods.job_messages",
     "RpcError": "flexdt.protocol.rpc_errors",
@@ -31,18 +35,7 @@ _HOMES = {
     "State": "flexdt.protocol.state_model",
 }
 
-__all__ = [
-    "FINAL_STATES",
-    "AsyncTwinClient",
-    "AxisState",
-    "CheckResult",
-    "ConnectionLost",
-    "JobStatus",
-    "Projection",
-    "RpcError",
-    "State",
-    "TwinClient",
-]
+__all__ = list(_HOMES)
 
 
 def __getattr__(name: str) -> Any:

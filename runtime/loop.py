@@ -162,14 +162,14 @@ INTERVAL_S: Final = 10
 PROBES: Final = 3
 
 
-def tune(sock: socket.socket) -> None:
+def tune(sock: socket.socket | None) -> None:
     """No Nagle delay; keep-alive probes after 30 s of silence, given up after three of them.
 
     A peer whose machine or network has died is thus gone after a minute instead of two hours, and
     with it whatever it held (control of the twin, memory of an upload). Harmless on sockets that
     are not TCP, and where the platform lacks an option.
     """
-    if sock.family not in (socket.AF_INET, socket.AF_INET6):
+    if sock is None or sock.family not in (socket.AF_INET, socket.AF_INET6):
         return
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)

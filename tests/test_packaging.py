@@ -33,8 +33,9 @@ def listed() -> dict[str, list[str]]:
 
 
 def present() -> set[str]:
-    inits = (init.parent for folder in CODE for init in (ROOT / folder).rglob("__init__.py"))
-    return {"flexdt", *(".".join(("flexdt", *i.relative_to(ROOT).parts)) for i in inits)}
+    inits = (init.parent for folder in FOLDERS for init in (ROOT / folder).rglob("__init__.py"))
+    inside = (init.relative_to(ROOT).parts for init in inits)
+    return {".".join(p if p[0] == "flexdt" else ("flexdt", *p)) for p in inside}
 
 
 def test_every_package_is_listed_and_every_listed_package_is_there() -> None:

@@ -105,7 +105,7 @@ class TwinClient(SharedMethods):
             host, port, token, transport,
             name=name, timeout_s=timeout_s, reconnect_s=reconnect_s, wait_s=wait_s, ssl=ssl,
         )  # fmt: skip
-        _result(self._client.connect())
+        self._wait(self._client.connect())
 
     def __repr__(self) -> str:
         return f"<TwinClient: {self._client.core.transport!r}>"
@@ -118,7 +118,7 @@ class TwinClient(SharedMethods):
 
     def close(self) -> None:
         """End the connection; this releases control."""
-        _result(self._client.close())
+        self._wait(self._client.close())
 
     @property
     def server(self) -> HelloResult:
@@ -152,10 +152,13 @@ class TwinClient(SharedMethods):
             *topics, max_rate_hz=max_rate_hz, projection_kind=projection_kind,
             projection_binning=projection_binning, max_queue=max_queue,
         )  # fmt: skip
-        _result(events.__aenter__())
-        return Subscription(events, _result)
+        self._wait(events.__aenter__())
+        return Subscription(events, self._wait)
 
     def _perform(self, effect: Effect) -> object:
         if isinstance(effect, Tell):  # in the thread that calls, where it may call the client
             return effect.function(*effect.args)
-        return _result(perform(effect, self._client.core.call))
+        return self._wait(perform(effect, self._client.core.call))
+
+    def _wait(self, work: Coroutine[Any, Any, _R]) -> _R:
+        return _result(work)

@@ -123,6 +123,10 @@ class TcpServer(ListeningServer):
         self._look_due = False
         self.opened = 0
 
+    def connection(self) -> asyncio.Protocol:
+        """What serves one connection, whatever carries its bytes."""
+        return _Link(self)
+
     def look_soon(self, link: _Link) -> None:
         """Have the urgent requests of a connection found, in turns that no flood can fill."""
         self._to_look_at[link] = None
@@ -185,7 +189,7 @@ async def serve(
     check_bind(host, token)
     limits = limits or ConnectionLimits()
     server = TcpServer(open, limits, token, methods, observe, read)
-    await server.listen(lambda: _Link(server), host, port, ssl)
+    await server.listen(server.connection, host, port, ssl)
     return server
 
 

@@ -64,6 +64,7 @@ class Submissions:
         seed: makes the noise's seed of a new scan; None for scans without noise.
         version: of the software, for data sets.
         quota: bytes that the data directory may hold; None for what the disk holds.
+        checks: of what is submitted.
     """
 
     scanner: ScannerTwin
@@ -77,7 +78,7 @@ class Submissions:
     seed: Callable[[], int | None]
     version: str
     quota: int | None
-    _checks: Checks = field(default_factory=Checks)
+    checks: Checks = field(default_factory=Checks)
 
     async def check(self, wish: ScanSource, codec: Codec) -> Encoded:
         """The dry-run report from where the scanner stands; nothing moves.
@@ -86,11 +87,11 @@ class Submissions:
             RpcError: -32008, it takes too long, too much memory, or is too large for an answer.
         """
         matter = await self._matter(wish, self.start(), self.scanner.sample)
-        return Encoded(tuple(await self._checks.report(matter, codec)))
+        return Encoded(tuple(await self.checks.report(matter, codec)))
 
     def close(self) -> None:
         """End what checks."""
-        self._checks.close()
+        self.checks.close()
 
     async def submit(
         self,
@@ -193,9 +194,7 @@ class Submissions:
     ) -> tuple[ScanPlan, Prepare, list[str]]:
         """Check all of a scan, and say how it is begun."""
         begin = asked.begin
-        checked = await self._checks.sound(
-            await self._matter(asked.wish, begin.start, begin.sample)
-        )
+        checked = await self.checks.sound(await self._matter(asked.wish, begin.start, begin.sample))
         self._ensure_same(begin)
         await asyncio.to_thread(self._require_room, checked.plan.bytes, name)
         warnings = list(checked.warnings)
@@ -214,7 +213,7 @@ class Submissions:
                 begin = replace(asked.begin, start=self.start(), sample=self.scanner.sample)
                 begun = replace(asked, begin=begin)
             # The sample's file and the correction may be others by now; then it is checked anew.
-            final = await self._checks.sound(
+            final = await self.checks.sound(
                 await self._matter(begun.wish, begun.begin.start, begun.begin.sample)
             )
             self._ensure_same(begun.begin)

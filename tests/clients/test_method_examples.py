@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import doctest
 import inspect
+from contextlib import ExitStack
 
 import pytest
 
 import flexdt as fx
+from flexdt import testing
 from flexdt.clients import TwinClient
 from flexdt.clients.client import twin_methods
-from flexdt.clients.launch.processes import Servers
 
 METHODS = {
     name: found
@@ -25,9 +26,16 @@ def test_each_method_has_an_example() -> None:
 
 
 @pytest.mark.slow
-def test_the_examples_hold(servers: Servers) -> None:
+@pytest.mark.parametrize("place", ["server", "process"])
+def test_the_examples_hold(place: str, request: pytest.FixtureRequest) -> None:
+    """Of a server, and of a twin in this process."""
     finder, runner = doctest.DocTestFinder(recurse=False), doctest.DocTestRunner(verbose=False)
-    with TwinClient(*servers.address) as twin:
+    with ExitStack() as stack:
+        if place == "server":
+            address = request.getfixturevalue("servers").address
+            twin = stack.enter_context(TwinClient(*address))
+        else:
+            twin = stack.enter_context(testing.twin(sample="lego", speed_up="max")).client
         # In the order of the page: an example finds the twin as those before it left it.
         for name, found in sorted(METHODS.items(), key=lambda m: m[1].__code__.co_firstlineno):
             given = {**vars(twin_methods), "fx": fx, "twin": twin}

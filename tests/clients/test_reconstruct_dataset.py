@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from direct_projector import DirectProjector
 
 from flexdt.clients.cli import main
 from flexdt.clients.datasets.data_set import DataSet
@@ -31,6 +30,7 @@ from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.scans.acquisition import Acquisition
 from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.server.storage.stored_samples import SampleStore
+from flexdt.testing.in_process import DirectProjector
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.errors import GeometryError, LimitError, TwinError, UnknownNameError

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from direct_projector import DirectProjector
 
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.simulate import simulate
@@ -27,6 +26,7 @@ from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.storage.stored_samples import SampleStore
+from flexdt.testing.in_process import DirectProjector
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import GeometryError, LimitError, TwinError

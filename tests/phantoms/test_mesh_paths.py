@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from direct_projector import DirectProjector
 from traced_mesh import traced
 
 from flexdt.phantoms import material, mesh_phantom
@@ -19,6 +18,7 @@ from flexdt.phantoms.pieces import PhantomError
 from flexdt.phantoms.samples import as_phantom
 from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.truth import TrueGeometry
+from flexdt.testing.in_process import DirectProjector
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import builtin_machine, builtin_profile

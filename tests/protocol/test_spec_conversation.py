@@ -17,8 +17,6 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
-from direct_projector import DirectProjector
-
 import flexdt
 from flexdt.clients.cli.entry import run
 from flexdt.clients.reconstruction.volume_files import read_volume
@@ -28,6 +26,7 @@ from flexdt.runtime.files.directory import open_data
 from flexdt.server.network.tcp import serve
 from flexdt.server.twin.application import TwinSession
 from flexdt.server.twin.core import TwinServer
+from flexdt.testing.in_process import DirectProjector
 from flexdt.twin.dataset.flexdt_json import parse_document
 from flexdt.twin.machine.description import builtin_machine, profile_of
 from flexdt.twin.scanner.state import Sample

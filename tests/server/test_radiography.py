@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import trimesh
-from direct_projector import DirectProjector
 
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.phantoms import bead_phantom, load_phantom, material, mesh_phantom, voxel_phantom
@@ -34,6 +33,7 @@ from flexdt.server.scans.scan_record import BEGINNING, ScanSource, StartConditio
 from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.setting_methods import set_tube
+from flexdt.testing.in_process import DirectProjector
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import LimitError, MachineFileError
 from flexdt.twin.geometry.cone_vec import ConeVec

@@ -9,10 +9,10 @@ from functools import partial
 
 import numpy as np
 import pytest
-from simulated_loop import SimulatedLoop
 
 from flexdt.server.scans.runner import JobAborted, ScanRunner, rejoin
 from flexdt.server.scans.twin_clock import TwinClock
+from flexdt.testing.virtual_time import SimulatedLoop
 from flexdt.twin.errors import CollisionError, LimitError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.physics.exposure import ExposureSettings, IdealResponse, expose, frame_rng

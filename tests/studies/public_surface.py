@@ -17,13 +17,20 @@ import typer.core
 import typer.main
 
 import flexdt as fx
+from flexdt import testing
 from flexdt.clients.cli.command_tree import build
+from flexdt.testing import fixtures, strategies
 
 
 def library() -> Iterator[str]:
-    """`fx.__all__`: functions and public methods with their parameters, fields of values."""
+    """`fx.__all__`: functions and public methods with their parameters, fields of values.
+
+    And `flexdt.testing`, which nothing else loads.
+    """
     for name in sorted(fx.__all__):
         yield from _lines(f"fx.{name}", getattr(fx, name))
+    for module in (testing, fixtures, strategies):
+        yield from _lines(module.__name__, module)
 
 
 def _lines(name: str, what: Any) -> Iterator[str]:
@@ -47,6 +54,8 @@ def _lines(name: str, what: Any) -> Iterator[str]:
 def _parameters(what: Any) -> str:
     """Names, order, kinds and which have defaults; types and defaults may widen."""
     shown = []
+    if getattr(what, "__init__", None) is Exception.__init__:
+        return ""
     for parameter in inspect.signature(what).parameters.values():
         default = parameter.empty if parameter.default is parameter.empty else ...
         if parameter.name not in ("self", "cls"):

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 
-from direct_projector import DirectProjector
-
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.radiography import Radiography
@@ -16,6 +14,7 @@ from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.scans.acquisition import Acquisition
 from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.server.storage.stored_samples import SampleStore
+from flexdt.testing.in_process import DirectProjector
 from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import Machine, builtin_machine, profile_of

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from simulated_loop import SimulatedLoop
 
 from flexdt.protocol import METHODS, Codec, Connection, Message, Prepared, RpcError, parse_params
 from flexdt.protocol.messages import Encoded
@@ -21,6 +20,7 @@ from flexdt.runtime.files.directory import open_data
 from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.twin.application import TwinSession
 from flexdt.server.twin.core import TwinServer
+from flexdt.testing.virtual_time import SimulatedLoop
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.description import builtin_machine, builtin_profile

@@ -35,11 +35,11 @@ from typing import Any, TypeVar
 
 from in_process import Client, M, P, PointProjector
 from simulated_disk import Disk, Fault
-from simulated_loop import SimulatedLoop
 
 from flexdt.runtime.files.directory import open_data
 from flexdt.runtime.files.own_documents import lock_folder
 from flexdt.server.twin.core import TwinServer
+from flexdt.testing.virtual_time import SimulatedLoop
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.scanner.state import Sample
 

@@ -18,6 +18,7 @@ from ophyd_async.core import (
     StandardReadableFormat,
 )
 
+from flexdt.clients import Transport
 from flexdt.twin.machine.description import Machine, builtin_machine
 from flexdt_extensions.bluesky.axes import TwinAxis
 from flexdt_extensions.bluesky.camera_device import TwinCamera
@@ -63,6 +64,7 @@ class TwinLab(Device, AsyncStageable):
     Args:
         where: names folder and file of the camera's images.
         host, port, token, ssl: of the twin server.
+        transport: replaces TCP, such as that of a twin in process (`flexdt.testing.twin`).
         machine: whose axes there are; a shipped name or a value.
         name: of the device.
         collisions: whether `check_value` asks the twin about collisions too.
@@ -76,12 +78,13 @@ class TwinLab(Device, AsyncStageable):
         token: str | None = None,
         *,
         ssl: tls.SSLContext | None = None,
+        transport: Transport | None = None,
         machine: Machine | str = "flexray",
         name: str = "",
         collisions: bool = True,
     ) -> None:
         scanner = builtin_machine(machine) if isinstance(machine, str) else machine
-        self.link = LabConnection(host, port, token, ssl=ssl)
+        self.link = LabConnection(host, port, token, ssl=ssl, transport=transport)
         self.axis_names = (*scanner.axes, *scanner.virtual_axes)
         for axis in self.axis_names:
             unit = scanner.axes[axis].unit if axis in scanner.axes else "mm"

@@ -345,9 +345,8 @@ class TwinFlyer(
     def _scanner(self) -> tuple[Machine, Profile]:
         server = self._link.client.server
         machine = builtin_machine(server.machine) if self._machine is None else self._machine
-        if self._profile is not None:
-            return machine, self._profile
-        return machine, profile_of(machine, server.profile)
+        profile = profile_of(machine, server.profile) if self._profile is None else self._profile
+        return machine, profile
 
 
 def _planned(

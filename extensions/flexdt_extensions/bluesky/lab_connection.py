@@ -20,7 +20,7 @@ from bluesky.protocols import Reading
 from event_model import DataKey, Dtype, Limits
 from ophyd_async.core import NotConnectedError, SignalBackend, SignalRW
 
-from flexdt.clients import ConnectionLost, RpcError, State
+from flexdt.clients import ConnectionLost, RpcError, State, Transport
 from flexdt.clients.client.async_client import AsyncTwinClient
 
 Watcher = Callable[[State], None]
@@ -37,6 +37,8 @@ class LabConnection:
 
     Args:
         host, port, token, ssl: of the twin server.
+        transport: replaces TCP, such as that of a twin in process; host, port and ssl are not used
+            then.
 
     Attributes:
         client: for all methods of the twin.
@@ -50,9 +52,12 @@ class LabConnection:
         token: str | None = None,
         *,
         ssl: tls.SSLContext | None = None,
+        transport: Transport | None = None,
     ) -> None:
-        self.address = f"{host}:{port}"
-        self.client = AsyncTwinClient(host, port, token, name="flexdt_extensions.bluesky", ssl=ssl)
+        self.address = f"{host}:{port}" if transport is None else "in-process"
+        self.client = AsyncTwinClient(
+            host, port, token, transport, name="flexdt_extensions.bluesky", ssl=ssl
+        )
         self.state: State | None = None
         self._watchers: list[Watcher] = []
         self._news = asyncio.Event()
@@ -221,17 +226,13 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
         """The value now."""
         return self._get(await self._link.fresh())
 
-    async def get_setpoint(self) -> _T:
-        """The value that was last requested."""
-        return self._get(await self._link.fresh())
+    get_setpoint = get_value
 
     def set_callback(self, callback: Callable[[Reading[_T]], None] | None) -> None:
         """Subscribe a callback to changes."""
         if self._end is not None:
             self._end()
-            self._end = None
-        if callback is not None:
-            self._end = self._link.watch(_changes(self._get, callback))
+        self._end = None if callback is None else self._link.watch(_changes(self._get, callback))
 
 
 def _changes(get: Get[_T], callback: Callable[[Reading[_T]], None]) -> Callable[[State], None]:

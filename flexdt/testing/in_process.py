@@ -1,0 +1,240 @@
+"""A whole twin in the process and thread of its test: no socket, no server process, no sleep.
+
+The server, its connections and its clients are the real ones. They share one event loop, whose time
+is virtual and passes only while a call waits, so the same calls give the same answers, at once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import tempfile
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager, nullcontext
+from functools import partial
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from flexdt import machines
+from flexdt.clients.client.client import TwinClient
+from flexdt.clients.client.transport import ConnectionLost, Transport
+from flexdt.protocol import METHODS, Codec, Connection, Message
+from flexdt.runtime.access import ConnectionLimits
+from flexdt.runtime.files.directory import open_data
+from flexdt.server.network.tcp import TcpServer
+from flexdt.server.scans.checking import Checks
+from flexdt.server.twin.application import TwinSession
+from flexdt.server.twin.core import TwinServer
+from flexdt.testing.virtual_time import Deadlock, SimulatedLoop
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.machine.description import Machine
+from flexdt.twin.projection import Body, project_body
+from flexdt.twin.scanner.state import Sample
+
+__all__ = ["Deadlock", "InProcessTwin", "twin"]
+
+T = TypeVar("T")
+
+
+class DirectProjector:
+    """The projector's work without its server."""
+
+    def __init__(self) -> None:
+        self.known: dict[str, Body] = {}
+
+    async def put(self, name: str, body: Body) -> None:
+        """Name a body."""
+        self.known[name] = body
+
+    async def remove(self, name: str) -> None:
+        """Forget a body."""
+        del self.known[name]
+
+    async def project(self, name: str, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
+        """Line integrals, float32 (n, rows, cols)."""
+        return project_body(self.known[name], cone_vec, shape)
+
+
+class InProcessTransport(asyncio.Transport):
+    """A client's transport to a server of the same event loop; to the server it is asyncio's.
+
+    Args:
+        loop: of both.
+        serve: makes the server's end of a connection.
+    """
+
+    def __init__(
+        self, loop: asyncio.AbstractEventLoop, serve: Callable[[], asyncio.Protocol]
+    ) -> None:
+        super().__init__({"peername": ("in-process", 0)})
+        self._loop, self._serve = loop, serve
+        self._server: asyncio.Protocol | None = None
+
+    async def open(self) -> None:
+        """Connect anew.
+
+        Raises:
+            RuntimeError: in another event loop.
+        """
+        if asyncio.get_running_loop() is not self._loop:
+            say = "a twin in process answers on its own event loop: RunEngine({}, loop=twin.loop)"
+            raise RuntimeError(f"{say}, or twin.run(...)")
+        self.close()
+        await asyncio.sleep(0.0)  # the end of an earlier connection comes first
+        self._wire, self._inbox = Connection(Codec.MSGPACK), asyncio.Queue[bytes]()
+        self._server = self._serve()
+        self._server.connection_made(self)
+
+    async def send(self, message: Message) -> None:
+        """Hand one message to the server."""
+        if self._server is None:
+            raise ConnectionLost("the twin has ended the connection")
+        self._server.data_received(self._wire.send(message))
+
+    async def receive(self) -> list[Message]:
+        """Messages, or an empty list at the end."""
+        messages: list[Message] = []
+        while not messages and (data := await self._inbox.get()):
+            messages = self._wire.receive_data(data)
+        return messages
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """Hand bytes to the client."""
+        if self._server is not None:
+            self._inbox.put_nowait(bytes(data))
+
+    def close(self) -> None:
+        """End the connection, from either side."""
+        server, self._server = self._server, None
+        if server is not None:
+            self._inbox.put_nowait(b"")
+            self._loop.call_soon(server.connection_lost, None)
+
+    def is_closing(self) -> bool:
+        """Whether it has ended."""
+        return self._server is None
+
+    def get_write_buffer_size(self, *_: Any, **__: Any) -> int:
+        """Nothing waits here: what is written lies in the client's memory."""
+        return 0
+
+    abort = close
+    pause_reading = resume_reading = set_write_buffer_limits = get_write_buffer_size  # type: ignore[assignment]
+
+
+class _Client(TwinClient):
+    """A blocking client that lets virtual time pass while it waits."""
+
+    def __init__(self, twin: InProcessTwin, name: str) -> None:
+        self._twin = twin
+        super().__init__(transport=twin.transport(), name=name)
+
+    def _wait(self, work: Coroutine[Any, Any, T]) -> T:
+        return self._twin.run(work)
+
+
+class InProcessTwin:
+    """A twin server and its event loop; made by `twin`.
+
+    Attributes:
+        client: a connected `TwinClient`.
+        loop: of virtual time, for what is asynchronous: `RunEngine({}, loop=twin.loop)`.
+        server: the twin server's parts, to look inside.
+        data: the folder in which data sets appear.
+    """
+
+    client: TwinClient
+
+    def __init__(self, loop: SimulatedLoop, server: TwinServer) -> None:
+        self.loop, self.server, self.data = loop, server, server.root
+        self._shell = TcpServer(partial(TwinSession, server), ConnectionLimits(), None, METHODS)
+
+    def advance(self, seconds: float) -> None:
+        """Let virtual seconds of the laboratory pass, and whatever happens in them happen."""
+        self.run(asyncio.sleep(seconds))
+
+    def connect(self, name: str = "flexdt.testing") -> TwinClient:
+        """Another client: a second controller, or somebody who watches."""
+        return _Client(self, name)
+
+    def transport(self) -> Transport:
+        """A connection of its own, for `AsyncTwinClient` and for Bluesky's `TwinLab`."""
+        return InProcessTransport(self.loop, self._shell.connection)
+
+    def run(self, work: Coroutine[Any, Any, T]) -> T:
+        """The result of a coroutine on the twin's loop; time passes until it is there.
+
+        Raises:
+            Deadlock: nothing is left that could end the wait.
+            RuntimeError: called in an event loop, where it would wait for itself.
+        """
+        here = asyncio._get_running_loop()
+        if self.loop.is_running() and here is not self.loop:
+            return asyncio.run_coroutine_threadsafe(work, self.loop).result()
+        if here is not None:
+            work.close()
+            raise RuntimeError("a blocking call in an event loop: await it, or use LocalTwin")
+        return self.loop.run_until_complete(work)
+
+    async def close(self) -> None:
+        """End the server and its connections."""
+        await self._shell.close()
+        await self.server.stop()
+
+
+@contextmanager
+def twin(
+    *,
+    machine: Machine | str | PathLike[str] | None = None,
+    sample: str = "",
+    physics: Literal["ideal", "mono", "poly"] = "ideal",
+    speed_up: float | Literal["max"] = 1.0,
+    seed: int | None = 0,
+    data: str | PathLike[str] | None = None,
+) -> Iterator[InProcessTwin]:
+    """A twin in this process, for tests; it ends with the `with` block.
+
+    Motion takes the machine's true time, by its speeds and accelerations, on a virtual clock that
+    passes while a call waits (`move(..., wait=True)`, `wait_job`) or in `advance`, and at no other
+    time. Nothing sleeps. Meshes and scenes that are sent, the calls about data sets,
+    `fit_calibration`, `align_dataset` and `predict_exposure` are worked on in a process with
+    limits, as always.
+
+    Args:
+        machine: the scanner, its shipped name or file; None for the FleX-ray. Its zero offsets are
+            those of its default profile.
+        sample: on the stage at start, a phantom's name; none unless given.
+        physics: how images are made: ideal, mono or poly.
+        speed_up: the twin's seconds for each of the loop; "max" ends each motion at once.
+        seed: of a scan's noise; None for images without noise.
+        data: folder for all that the twin writes; None for a temporary one.
+
+    Raises:
+        MachineFileError, UnknownNameError: there is no such machine or sample.
+
+    Example:
+        >>> with twin() as scanner:
+        ...     move = scanner.client.move({"rot_obj": 90.0})
+        ...     scanner.advance(move.duration_s / 2)
+        ...     half = scanner.client.state().axes["rot_obj"]
+        >>> round(half.position, 6), half.moving
+        (45.0, True)
+    """
+    chosen = machine if isinstance(machine, Machine) else machines.machine(machine)
+    folder = tempfile.TemporaryDirectory() if data is None else nullcontext(data)
+    loop = SimulatedLoop()
+    with folder as root, asyncio.Runner(loop_factory=lambda: loop):
+        server = TwinServer(
+            chosen, machines.profile(None, chosen), DirectProjector(), open_data(Path(root)),
+            speed_up=speed_up, seed=lambda: seed, physics=physics, wall=loop.time,
+        )  # fmt: skip
+        server.submissions.checks = Checks(apart=False)
+        found = InProcessTwin(loop, server)
+        found.run(server.start(Sample(sample)))
+        try:
+            found.client = found.connect()
+            yield found
+        finally:
+            found.run(found.close())
+            loop.come_to_rest()
