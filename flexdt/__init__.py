@@ -54,6 +54,10 @@ if not _os.path.isdir(_os.path.join(__path__[0], "twin")):
     __path__.append(_os.path.dirname(__path__[0]))
 _moved.watch()
 
+from flexdt import long_work as _long_work  # noqa: E402  (found through the path)
+
+_long_work.watch()
+
 _HOMES: _typing.Final = {
     "AsyncTwinClient": "flexdt.clients",
     "ConeVec": "flexdt.twin.geometry.cone_vec",

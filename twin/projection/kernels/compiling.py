@@ -17,8 +17,6 @@ from __future__ import annotations
 import ctypes
 import inspect
 import logging
-import threading
-import time
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -33,13 +31,12 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.extending import intrinsic
 
+from flexdt.twin import long_work
+
 LOG = logging.getLogger("flexdt.kernels")
 """To standard error, unless the program has set up logging."""
 SLOW = "flexdt: compiling %s (once on this machine; some seconds, and perhaps other kernels)"
 """What a process says when it first compiles, instead of loading from the disk cache."""
-STILL = "flexdt: still compiling %s (%.0f s)"
-SILENT_S = 2.0
-"""As often, somebody who waits is told for what."""
 
 
 class _LinkedLibrary(JITCodeLibrary):  # type: ignore[misc]
@@ -82,21 +79,6 @@ class _Linked(Compiler):  # type: ignore[misc]
             return super()._compile_core()
 
 
-@contextmanager
-def _telling(name: str) -> Iterator[None]:
-    done, begun = threading.Event(), time.monotonic()
-
-    def tell() -> None:
-        while not done.wait(SILENT_S):
-            LOG.warning(STILL, name, time.monotonic() - begun)
-
-    threading.Thread(target=tell, name="flexdt-compiling", daemon=True).start()
-    try:
-        yield
-    finally:
-        done.set()
-
-
 class _EntryPoint(_Linked):
     silent = False
 
@@ -108,7 +90,7 @@ class _EntryPoint(_Linked):
         library = JITCodeLibrary(self.state.targetctx.codegen(), name)
         library.enable_object_caching()
         self.state.library = library
-        with _telling(name):
+        with long_work.during(f"compiling {name}"):
             return super()._compile_core()
 
 
