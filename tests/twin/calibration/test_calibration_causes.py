@@ -87,7 +87,7 @@ SOME = (
 )  # fmt: skip
 
 
-@pytest.mark.daily(8)
+@pytest.mark.daily(4)
 @pytest.mark.parametrize("kind", SOME)
 def test_a_drawn_fault_has_its_name(kind: str) -> None:
     found = scored(kind, 40)
@@ -127,14 +127,14 @@ def test_what_is_held_exactly_and_wrongly_is_never_offered_in_silence(kind: str)
         assert found.verdict == "right"
 
 
-@pytest.mark.daily(2)
+@pytest.mark.daily(1)
 @pytest.mark.parametrize(
     ("kind", "seed"),
     [
+        ("angle_factor", 301),  # a fifth of the frames was left out
+        ("angle_factor", 300),  # its last frames are where no others put them
         ("screw", 303),  # panel and axis had taken up a part of it
         ("gap", 303),  # both the last half and the last third fit by themselves
-        ("angle_factor", 300),  # its last frames are where no others put them
-        ("angle_factor", 301),  # a fifth of the frames was left out
         ("spot_drift", 1002),  # its last frames were
         ("bead_displaced", 1001),  # its spots are not another ball's
         ("scanner_held", 303),

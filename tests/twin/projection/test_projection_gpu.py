@@ -433,6 +433,7 @@ assert "lacks memory" in said[0] and gpu.availability().present
 """
 
 
+@pytest.mark.slow
 def test_a_device_that_fails_at_any_time_leaves_it_to_the_processor() -> None:
     run_simulated(FAILING)
 
