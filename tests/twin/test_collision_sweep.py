@@ -524,6 +524,7 @@ def signed_distance(a: FloatArray, b: FloatArray) -> float:
     return inside if inside < 0.0 else true_distance(a, b)
 
 
+@pytest.mark.daily(10)
 @pytest.mark.parametrize("seed", range(40))
 def test_depth_of_an_overlap_and_what_is_left_of_it_on_the_way_out(seed: int) -> None:
     rng = np.random.default_rng(seed)

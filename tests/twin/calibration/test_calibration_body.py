@@ -74,7 +74,7 @@ def calibrated(
     return result, max(abs(fit.values[n] - true[n]) / sigma for n, sigma in fit.sigmas.items())
 
 
-@pytest.mark.daily(2)
+@pytest.mark.daily(1)
 @pytest.mark.parametrize(
     ("plastic", "turn_deg", "aside_mm", "code", "factor"),
     [
