@@ -98,10 +98,13 @@ def test_a_drawn_fault_has_its_name(kind: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in SOME])
 def test_no_other_drawn_fault_is_offered_wrong(kind: str) -> None:
-    """More draws of every kind: `causes_named.py`, see docs/calibration.md."""
-    found = [scored(kind, seed) for seed in (50, 51)]
-    assert not any(f.wrong for f in found), found
-    assert any(f.verdict == "right" for f in found), found
+    """A second draw where the first is too mild to be named; more: docs/calibration.md."""
+    found = scored(kind, 50)
+    if found.verdict != "right":
+        assert not found.wrong, found
+        found = scored(kind, 51)
+    assert not found.wrong, found
+    assert found.verdict == "right", found
 
 
 @pytest.mark.daily(1)
