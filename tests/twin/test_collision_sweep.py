@@ -455,7 +455,7 @@ def drawn_motion(rng: np.random.Generator, reach: float) -> Trajectory:
     return motion.joined(legs)
 
 
-@pytest.mark.daily(4)
+@pytest.mark.daily(2)
 @pytest.mark.parametrize("seed", range(24))
 def test_drawn_motions_against_distances_at_many_times(seed: int) -> None:
     """Where they touch first, and how near they come: least squares at 1200 times say the same.
