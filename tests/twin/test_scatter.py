@@ -14,7 +14,6 @@ from importlib import import_module, resources
 import numba
 import numpy as np
 import pytest
-import xraydb
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import RectBivariateSpline
@@ -99,6 +98,8 @@ def attenuation(substance: Substance, energy):  # type: ignore[no-untyped-def]
 
 def test_the_tables_agree_with_independent_ones() -> None:
     """Integrals with Elam's cross-sections; F with Waasmaier and Kirfel's (1995)."""
+    import xraydb
+
     for formula, worst in (("C5H8O2", 0.005), ("H2O", 0.005), ("Al", 0.005), ("Fe", 0.012)):
         one = Substance.of(formula, formula, 1.0)
         found = cross_sections([one])

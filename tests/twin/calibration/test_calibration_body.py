@@ -96,6 +96,7 @@ def test_the_body_is_subtracted_as_the_images_have_it(
     assert worst < 4.0
 
 
+@pytest.mark.slow
 def test_a_body_that_is_not_there_costs_nothing() -> None:
     """Subtracted all the same, its edges would pull the shadows."""
     beads = Scene(tuple(s for s in DESCRIBED.solids if isinstance(s.shape, Sphere)))

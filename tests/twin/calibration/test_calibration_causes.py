@@ -64,6 +64,7 @@ def test_a_stage_that_turns_the_other_way_is_not_called_turned_images(first: flo
     assert codes(detections) == [("angle_reversed", "error")]
 
 
+@pytest.mark.slow
 def test_steps_of_a_turn_over_one_frame_less_are_named() -> None:
     assert codes(spots(ANGLES * 36 / 35, [0, 1, 2, 3, 4])) == [("angle_endpoint", "error")]
 

@@ -310,6 +310,7 @@ for found in paths:
 """
 
 
+@pytest.mark.slow
 def test_each_material_of_voxels_goes_to_the_device_once() -> None:
     run_simulated(MATERIALS)
 
