@@ -422,7 +422,7 @@ def cupping(line_integrals: np.ndarray, size: float) -> tuple[float, float]:
     )
 
 
-@pytest.mark.daily(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("atoms", "density", "radius"), [(PMMA, 1.19, 35.0), ({"Al": 1}, 2.7, 15.0)]
 )

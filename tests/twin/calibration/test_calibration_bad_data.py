@@ -49,7 +49,7 @@ SURVIVED = (
 )
 
 
-@pytest.mark.daily(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "code"), SURVIVED)
 def test_survived_within_its_own_sigmas(kind: str, code: str | None) -> None:
     found = outcome(kind, 5)

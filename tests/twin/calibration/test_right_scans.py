@@ -66,7 +66,7 @@ def test_a_right_scan_is_offered(
         assert abs(e.value - value) < 4.0 * e.sigma, name
 
 
-@pytest.mark.daily(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("cast", [0.93, 1.07])
 def test_beads_of_another_size_are_still_refused(
     monkeypatch: pytest.MonkeyPatch, cast: float
