@@ -318,10 +318,11 @@ def box_lines(scanner: Scanner, low: np.ndarray, high: np.ndarray, rays: int) ->
 
 @pytest.mark.slow
 def test_what_spoils_scans_misleads_nobody(capsys: pytest.CaptureFixture[str]) -> None:
-    assert align_faults.main(["--count", "14", "--seed", "4"]) == 0, capsys.readouterr().out
-    assert re.search(r"^all +14 +1[0-4] ", capsys.readouterr().out, re.MULTILINE)
+    assert align_faults.main(["--count", "8", "--seed", "4"]) == 0, capsys.readouterr().out
+    assert re.search(r"^all +8 +[5-8] ", capsys.readouterr().out, re.MULTILINE)
 
 
+@pytest.mark.slow
 def test_a_round_body_that_turns_back_is_no_repeated_frame() -> None:
     scanner, degrees = scan(0)[0], np.arange(120) * 3.0
     rod = np.array([[9.0, 4.0, 0, 11, 11, 21, 0.02]])

@@ -34,6 +34,7 @@ def require_right(out: laboratories.Outcome) -> None:
     assert out.false == []
 
 
+@pytest.mark.daily(1)
 @pytest.mark.parametrize("seed", [3, 8])
 def test_a_laboratory_is_found_and_every_planted_contradiction_named(
     seed: int, tmp_path: Path
@@ -115,7 +116,7 @@ def test_the_scans_that_it_proposes_can_be_made(
 
 
 def test_scans_of_the_twin_agree_with_themselves_and_tell_its_hidden_axis(tmp_path: Path) -> None:
-    folder = bead_scan(tmp_path, {"dO_x": 0.31}, 61)
+    folder = bead_scan(tmp_path, {"dO_x": 0.31}, 31)
     found = commission([folder], None, read_log_file)
     assert list(found.findings) == []
     usual = builtin_profile("cwi-2023-08-21")

@@ -40,7 +40,8 @@ def test_square_pixels_stay_what_they_are() -> None:
     assert squared(data) is data
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.daily(1)
+@pytest.mark.parametrize("seed", [2, 1, 0])
 def test_a_right_scan_with_oblong_pixels_is_offered(seed: int) -> None:
     """It was refused as beads of another size, or none was found."""
     rng = np.random.default_rng(seed)

@@ -55,22 +55,20 @@ def dataset(misaligned: tuple[Servers, Path], flexdt: Run) -> Path:
 def test_calibrate_finds_the_truth_and_pushes_it(
     flexdt: Run, dataset: Path, tmp_path: Path
 ) -> None:
-    page, report = tmp_path / "r.html", tmp_path / "r.json"
+    page = tmp_path / "r.html"
     code, out, err = flexdt(
-        "calibrate", dataset, "--phantom", "normal-5", "--report", report, "--push", "--json",
+        "calibrate", dataset, "--phantom", "normal-5", "--report", page, "--push", "--json",
         talk=True,
     )  # fmt: skip
     assert code == 0, err
     document: dict[str, Any] = json.loads(out)
-    assert json.loads(report.read_text())["parameters"].keys() == document["parameters"].keys()
+    assert page.read_text().lstrip().lower().startswith("<!doctype html>")
     for name, true in TRUTH.items():
         found = document["parameters"][name]
         assert abs(found["value"] - true) < 4 * found["sigma"], name
         assert found["images"] < 0.2, name
     state = json.loads(flexdt("state", "--json", talk=True)[1])
     assert state["correction"]["parameters"]["dO_x"] == pytest.approx(TRUTH["dO_x"], abs=0.02)
-    assert flexdt("calibrate", dataset, "--phantom", "normal-5", "--report", page)[0] == 0
-    assert page.read_text().lstrip().lower().startswith("<!doctype html>")
 
 
 def test_a_push_to_nobody_is_refused_before_the_work(
@@ -102,7 +100,6 @@ def test_compare_is_within_after_and_not_before(flexdt: Run, dataset: Path, tmp_
 @pytest.mark.parametrize(
     ("words", "code", "says"),
     [
-        (["calibrate", "{data}", "--phantom", "normal-1"], 5, "not identifiable"),
         (["calibrate", "{data}", "--phantom", "shepp-logan"], 1, "no beads"),
         (["calibrate", "{data}", "--phantom", "nobody"], 1, "nobody"),
         (["calibrate", "{data}", "--phantom", "normal-5", "--free", "warp"], 1, "warp"),
@@ -116,4 +113,4 @@ def test_refusals(flexdt: Run, dataset: Path, words: list[str], code: int, says:
     found, out, err = flexdt(*(word.format(data=dataset) for word in words))
     assert found == code, err
     assert says in err
-    assert out == "" or code == 5
+    assert out == ""

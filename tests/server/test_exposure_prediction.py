@@ -87,6 +87,7 @@ def test_a_twin_predicts_its_own_images() -> None:
     assert METHODS["exposure.predict"].safe
 
 
+@pytest.mark.daily(1)
 @pytest.mark.parametrize("seed", range(5))
 def test_prediction_report_and_finished_data_set_are_one(tmp_path: Path, seed: int) -> None:
     """In drawn camera modes, regions and kinds of scan: bytes to the byte, and time."""

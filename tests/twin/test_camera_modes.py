@@ -16,6 +16,9 @@ from flexdt.twin.machine.description import Machine, builtin_machine, parse_mach
 from flexdt.twin.scanner.settings import changed_camera
 from flexdt.twin.script import ScanRequest, compose_script, plan_script
 
+SMALL = Roi(900, 700, 963, 763)
+"""Read out for a prediction: the sentence does not depend on it, and the whole panel costs much."""
+
 
 def sentences(machine: Machine, mode: str) -> set[str]:
     """What script, scanner, composed script and prediction say of a mode; "" for nothing."""
@@ -26,7 +29,7 @@ def sentences(machine: Machine, mode: str) -> set[str]:
     for ask in (
         lambda: changed_camera(spec, spec.camera, {"mode": mode}),
         lambda: compose_script(ScanRequest(mode=mode), machine, profile_of(machine)),
-        lambda: expose("normal-5", machine=machine, mode=mode, images=1, kV=[80.0]),
+        lambda: expose("normal-5", machine=machine, mode=mode, roi=SMALL, images=1, kV=[80.0]),
     ):
         try:
             ask()

@@ -455,7 +455,7 @@ def drawn_motion(rng: np.random.Generator, reach: float) -> Trajectory:
     return motion.joined(legs)
 
 
-@pytest.mark.daily(4)
+@pytest.mark.daily(2)
 @pytest.mark.parametrize("seed", range(24))
 def test_drawn_motions_against_distances_at_many_times(seed: int) -> None:
     """Where they touch first, and how near they come: least squares at 1200 times say the same.
@@ -524,6 +524,7 @@ def signed_distance(a: FloatArray, b: FloatArray) -> float:
     return inside if inside < 0.0 else true_distance(a, b)
 
 
+@pytest.mark.daily(10)
 @pytest.mark.parametrize("seed", range(40))
 def test_depth_of_an_overlap_and_what_is_left_of_it_on_the_way_out(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -14,7 +14,6 @@ from importlib import import_module, resources
 import numba
 import numpy as np
 import pytest
-import xraydb
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import RectBivariateSpline
@@ -99,6 +98,8 @@ def attenuation(substance: Substance, energy):  # type: ignore[no-untyped-def]
 
 def test_the_tables_agree_with_independent_ones() -> None:
     """Integrals with Elam's cross-sections; F with Waasmaier and Kirfel's (1995)."""
+    import xraydb
+
     for formula, worst in (("C5H8O2", 0.005), ("H2O", 0.005), ("Al", 0.005), ("Fe", 0.012)):
         one = Substance.of(formula, formula, 1.0)
         found = cross_sections([one])
@@ -284,7 +285,7 @@ def test_the_image_does_not_depend_on_the_number_of_threads() -> None:
 
 def test_standard_errors_hold_and_photons_and_energy_are_kept() -> None:
     images = [scene(seed) for seed in range(20)]
-    truth = scene(1000, 0.004).mean
+    truth = scene(1000, 0.008).mean
     pulls = np.array([(one.mean - truth) / one.error for one in images])
     # Neighbouring nodes go together: 20 seeds and a few independent regions.
     assert 0.75 < np.sqrt(np.mean(pulls**2)) < 1.3
@@ -310,7 +311,7 @@ def test_views_between_simulated_ones_are_interpolated(monkeypatch: pytest.Monke
     across = np.stack([-np.sin(angle), np.cos(angle), 0 * angle], axis=1)
     down = np.broadcast_to([0.0, 0.0, -1.0], turned.shape)
     views = np.concatenate([-300 * turned, 200 * turned, 2 * across, 2 * down], axis=1)
-    settings = ScatterSettings(error=0.001, step_deg=5.0, nodes=80)
+    settings = ScatterSettings(error=0.002, step_deg=5.0, nodes=80)
     scan = scan_scatter(thing, views, (40, 50), beam, settings)
     gaps = np.diff(scan.simulated)
     assert scan.simulated[0] == 0
@@ -421,7 +422,7 @@ def cupping(line_integrals: np.ndarray, size: float) -> tuple[float, float]:
     )
 
 
-@pytest.mark.daily(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("atoms", "density", "radius"), [(PMMA, 1.19, 35.0), ({"Al": 1}, 2.7, 15.0)]
 )

@@ -503,6 +503,7 @@ def drawn_machine(rng: np.random.Generator) -> Machine:
     return parse_machine(f"{text}exposure_ms = {min(most, 500.0)}\n")
 
 
+@pytest.mark.daily(1)
 @pytest.mark.parametrize("block", range(3))
 def test_no_machine_is_proposed_what_its_own_check_refuses(block: int) -> None:
     """With collisions; what a machine cannot do is refused before there is a script."""

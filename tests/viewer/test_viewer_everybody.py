@@ -128,7 +128,8 @@ def test_without_webgl_radiograph_axes_and_scans_work(
     field.press("Enter")
     wait(lambda: abs(twin.state().axes["tra_obj"].position - 3.0) < 1e-6)
     page.click("#tabs [data-tab=scan]")
-    page.fill("#wish-frames", "60")
+    page.select_option("#wish-kind", "step")
+    page.fill("#wish-frames", "12")
     page.click("#compose")
     page.locator("#report .verdict.ok").wait_for()
     page.evaluate("flexdt.call('session.control', {action: 'release'})")
@@ -176,7 +177,7 @@ def test_four_views_fetch_the_program_once(open_page: Callable[..., Any], wait: 
 
 def test_slices_grow_while_a_scan_runs(page: Any, twin: TwinClient, wait: Wait) -> None:
     page.click("#tabs [data-tab=scan]")
-    page.fill("#wish-frames", "60")
+    page.fill("#wish-frames", "45")
     page.click("#compose")
     page.locator("#report .verdict").wait_for()
     page.evaluate("flexdt.call('session.control', {action: 'release'})")
@@ -184,12 +185,12 @@ def test_slices_grow_while_a_scan_runs(page: Any, twin: TwinClient, wait: Wait) 
     page.locator("#volume-card").wait_for()
     page.select_option("#volume-side", "128")
     views = lambda: int((page.inner_text("#volume-note").split() or ["0"])[0])  # noqa: E731
-    told = lambda: "of 60 views" in page.inner_text("#volume-note")  # noqa: E731
+    told = lambda: "of 45 views" in page.inner_text("#volume-note")  # noqa: E731
     wait(told, "the first slices")
     first = views()
     wait(lambda: twin.job_status(job).state == "done", "the scan")
-    wait(lambda: views() == 60, "all views")
-    assert first <= 60
+    wait(lambda: views() == 45, "all views")
+    assert first <= 45
     for name in ("top", "front", "side"):
         spread = page.evaluate(
             "name => { const c = document.querySelector(`#slice-${name}`);"

@@ -100,14 +100,15 @@ class Panel:
 
     def shift(self, places: FloatArray) -> FloatArray:
         """Measured minus undistorted places [px], (..., 2), at measured places."""
+        if places.ndim > 2:  # row by row: the terms of a whole image take 200 MB
+            return np.stack([self.shift(row) for row in places])
         return np.asarray(self.model.terms(places) @ np.array(self.coefficients))
 
     @cached_property
     def _map(self) -> tuple[Float32Array, Float32Array]:
         """Columns and rows of the panel, (rows, cols) both, that undistorted pixels belong to."""
         rows, cols = self.model.shape
-        row, column = np.mgrid[:rows, :cols].astype(np.float64)
-        places = np.stack([column, row], axis=-1)
+        places = np.moveaxis(np.mgrid[:rows, :cols][::-1], 0, -1).astype(np.float64)
         out = places
         for _ in range(4):  # A distortion is smooth: each time, little is left of the error.
             out = places + self.shift(out)
@@ -125,8 +126,7 @@ class Panel:
             raise TwinError.of_shape(
                 "an image", image.shape, self.model.shape, ": the panel's distortion is of those"
             )
-        columns, rows = self._map
-        out = cv2.remap(image, columns, rows, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
+        out = cv2.remap(image, *self._map, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(out, dtype=np.float32)
 
     def to_json(self) -> dict[str, Any]:

@@ -20,13 +20,11 @@ def outcome(kind: str, seed: int = 0) -> Outcome:
 @pytest.mark.parametrize(
     ("kind", "code"),
     [
-        # Named from spots alone in test_calibration_causes.py: endpoint, renumbered.
-        pytest.param("angle_endpoint", "angle_endpoint", marks=pytest.mark.slow),
-        ("mirrored_phantom", "mirrored_phantom"),
+        # Named in drawn scans in test_calibration_causes.py, and by its volume in test_chiral.py.
+        pytest.param("mirrored_phantom", "mirrored_phantom", marks=pytest.mark.slow),
         pytest.param("wrong_phantom", "wrong_phantom", marks=pytest.mark.slow),
-        ("no_beads", "no_beads"),
+        pytest.param("no_beads", "no_beads", marks=pytest.mark.slow),
         pytest.param("one_bead", "one_bead", marks=pytest.mark.slow),
-        pytest.param("frames_renumbered", "frame_numbers", marks=pytest.mark.slow),
         ("scaled_phantom", "bead_size"),
         pytest.param("image_mirrored", "image_mirrored", marks=pytest.mark.slow),
         # Named from annotated markers in test_calibrate_anybody.py.
@@ -51,7 +49,7 @@ SURVIVED = (
 )
 
 
-@pytest.mark.daily(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "code"), SURVIVED)
 def test_survived_within_its_own_sigmas(kind: str, code: str | None) -> None:
     found = outcome(kind, 5)
@@ -78,7 +76,11 @@ def test_dead_columns_and_pixels_are_no_shadows() -> None:
     assert found.worst < 4.0
 
 
+DRAWN = ("frames_repeated", "vibration", "angle_slip", "angle_jitter", "angle_scale")
+"""Of times and angles, not of images: drawn from spots in test_calibration_causes.py."""
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [kind for kind in SURVIVABLE if kind not in dict(SURVIVED)])
+@pytest.mark.parametrize("kind", [k for k in SURVIVABLE if k not in (*dict(SURVIVED), *DRAWN)])
 def test_never_confidently_wrong(kind: str) -> None:
     assert not outcome(kind, 1001).wrong

@@ -74,7 +74,7 @@ def calibrated(
     return result, max(abs(fit.values[n] - true[n]) / sigma for n, sigma in fit.sigmas.items())
 
 
-@pytest.mark.daily(2)
+@pytest.mark.daily(1)
 @pytest.mark.parametrize(
     ("plastic", "turn_deg", "aside_mm", "code", "factor"),
     [
@@ -96,6 +96,7 @@ def test_the_body_is_subtracted_as_the_images_have_it(
     assert worst < 4.0
 
 
+@pytest.mark.slow
 def test_a_body_that_is_not_there_costs_nothing() -> None:
     """Subtracted all the same, its edges would pull the shadows."""
     beads = Scene(tuple(s for s in DESCRIBED.solids if isinstance(s.shape, Sphere)))

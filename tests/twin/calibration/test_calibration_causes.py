@@ -64,6 +64,7 @@ def test_a_stage_that_turns_the_other_way_is_not_called_turned_images(first: flo
     assert codes(detections) == [("angle_reversed", "error")]
 
 
+@pytest.mark.slow
 def test_steps_of_a_turn_over_one_frame_less_are_named() -> None:
     assert codes(spots(ANGLES * 36 / 35, [0, 1, 2, 3, 4])) == [("angle_endpoint", "error")]
 
@@ -87,7 +88,7 @@ SOME = (
 )  # fmt: skip
 
 
-@pytest.mark.daily(8)
+@pytest.mark.daily(4)
 @pytest.mark.parametrize("kind", SOME)
 def test_a_drawn_fault_has_its_name(kind: str) -> None:
     found = scored(kind, 40)
@@ -98,10 +99,13 @@ def test_a_drawn_fault_has_its_name(kind: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in SOME])
 def test_no_other_drawn_fault_is_offered_wrong(kind: str) -> None:
-    """More draws of every kind: `causes_named.py`, see docs/calibration.md."""
-    found = [scored(kind, seed) for seed in (50, 51)]
-    assert not any(f.wrong for f in found), found
-    assert any(f.verdict == "right" for f in found), found
+    """A second draw where the first is too mild to be named; more: docs/calibration.md."""
+    found = scored(kind, 50)
+    if found.verdict != "right":
+        assert not found.wrong, found
+        found = scored(kind, 51)
+    assert not found.wrong, found
+    assert found.verdict == "right", found
 
 
 @pytest.mark.daily(1)
@@ -127,14 +131,14 @@ def test_what_is_held_exactly_and_wrongly_is_never_offered_in_silence(kind: str)
         assert found.verdict == "right"
 
 
-@pytest.mark.daily(2)
+@pytest.mark.daily(1)
 @pytest.mark.parametrize(
     ("kind", "seed"),
     [
+        ("angle_factor", 301),  # a fifth of the frames was left out
+        ("angle_factor", 300),  # its last frames are where no others put them
         ("screw", 303),  # panel and axis had taken up a part of it
         ("gap", 303),  # both the last half and the last third fit by themselves
-        ("angle_factor", 300),  # its last frames are where no others put them
-        ("angle_factor", 301),  # a fifth of the frames was left out
         ("spot_drift", 1002),  # its last frames were
         ("bead_displaced", 1001),  # its spots are not another ball's
         ("scanner_held", 303),

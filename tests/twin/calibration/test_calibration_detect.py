@@ -186,7 +186,7 @@ def test_second_look_removes_the_pull_of_the_body() -> None:
 
 
 def test_second_look_separates_touching_beads_and_fits_cut_ones() -> None:
-    poses, truth = scenario("G0", 36)
+    poses, truth = scenario("G0", 18)
     error, _, whole = second_look_errors(bead_phantom("coplanar", 3), poses.cone_vec(truth), 2e4)
     assert (~whole).sum() >= 5
     assert np.isfinite(error[~whole]).all()

@@ -73,7 +73,7 @@ def calibrated(scan: tuple[Poses, Float32Array], request: CalibrationRequest) ->
     return calibrate([Scan(ArrayFrames(list(images), SHAPE), poses)], LEGO, request)
 
 
-@pytest.mark.daily(4)
+@pytest.mark.daily(3)
 @pytest.mark.parametrize("tolerance", [None, 0.0, 0.005])
 @pytest.mark.parametrize(
     ("free", "says"),
@@ -178,6 +178,7 @@ def test_a_detector_that_is_elsewhere_is_named() -> None:
     assert abs(freed.fit.values["dO_z"] - 0.8) < 5 * freed.fit.sigmas["dO_z"]
 
 
+@pytest.mark.slow
 def test_one_bead_can_still_show_where_it_is() -> None:
     """Not all six can be told from one bead; each of the held ones is freed by itself."""
     bead = load_phantom("normal-1")
@@ -195,6 +196,7 @@ def test_one_bead_can_still_show_where_it_is() -> None:
         assert ("held_parameter" in [f.code for f in result.errors]) != good
 
 
+@pytest.mark.slow
 def test_what_is_exactly_known_stays_so_where_other_priors_are_widened() -> None:
     """A panel rolled by five of its prior's sigmas; SDD is stated as exact."""
     poses, _ = careful_scan(np.random.default_rng(7), FRAMES)

@@ -15,7 +15,7 @@ from flexdt.twin.calibration.identify import assign, identify, identify_beads
 from flexdt.twin.errors import TwinError
 
 
-@pytest.mark.daily(3)
+@pytest.mark.daily(2)
 @pytest.mark.parametrize(
     ("beads", "frames", "missing", "false"),
     [(5, 36, 0.0, 0), (3, 3, 0.0, 0), (2, 12, 0.0, 0), (5, 36, 0.4, 3), (3, 5, 0.0, 1)],

@@ -100,7 +100,7 @@ def test_what_a_reconstruction_needs_is_known_far_better(
 
 
 def test_intervals_and_regions_hold_for_detectors_drawn_from_the_priors() -> None:
-    found = study(60, seed=3)
+    found = study(40, seed=3)
     assert found["refused"] == 0
     for name, share in found["inside_pct"].items():
         assert share >= 95 - 4 * found["binomial_error_pct"], name

@@ -310,6 +310,7 @@ for found in paths:
 """
 
 
+@pytest.mark.slow
 def test_each_material_of_voxels_goes_to_the_device_once() -> None:
     run_simulated(MATERIALS)
 
@@ -433,6 +434,7 @@ assert "lacks memory" in said[0] and gpu.availability().present
 """
 
 
+@pytest.mark.slow
 def test_a_device_that_fails_at_any_time_leaves_it_to_the_processor() -> None:
     run_simulated(FAILING)
 

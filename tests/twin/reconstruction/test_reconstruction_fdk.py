@@ -558,7 +558,7 @@ def test_opposite_rays_share_one_line(seed: int) -> None:
     assert shared > 20
 
 
-@pytest.mark.daily(2)
+@pytest.mark.daily(1)
 @pytest.mark.parametrize("seed", range(4))
 def test_what_the_views_cover_decides_and_not_their_order(seed: int) -> None:
     """Gaps were looked for at the ends of the list: one in its middle was +6.5 %, and a part of a

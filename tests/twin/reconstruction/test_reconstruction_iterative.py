@@ -15,7 +15,11 @@ from tests.twin.reconstruction.scans import MU, ball, circle, measure
 SCAN = circle(45, pixel=1.4)
 SHAPE = (52, 56)
 LIKE = Grid((40, 40, 40), 0.8).blank()
-DATA = ball(SCAN, SHAPE)
+
+
+@pytest.fixture(scope="module")
+def images():
+    return ball(SCAN, SHAPE)
 
 
 @pytest.mark.parametrize(
@@ -23,9 +27,9 @@ DATA = ball(SCAN, SHAPE)
     [(sirt, {"iterations": 40}), (sart, {"iterations": 5}), (cgls, {"iterations": 10}),
      (em, {"iterations": 25})],
 )  # fmt: skip
-def test_a_ball_comes_back_and_residuals_fall(method, options):
+def test_a_ball_comes_back_and_residuals_fall(images, method, options):
     steps = []
-    volume = method(DATA, SCAN, LIKE, watch=steps.append, **options)
+    volume = method(images, SCAN, LIKE, watch=steps.append, **options)
     found, centre = measure(volume)
     assert found == pytest.approx(1.0, abs=0.03)
     assert np.abs(centre).max() < 0.1
@@ -77,11 +81,11 @@ def ball_at(rows):
     return ball(ConeVec(rows), SHAPE)
 
 
-def test_start_and_positivity():
-    few = sirt(DATA, SCAN, LIKE, iterations=3)
-    more = sirt(DATA, SCAN, LIKE, iterations=2, start=few)
-    np.testing.assert_allclose(more.data, sirt(DATA, SCAN, LIKE, iterations=5).data, atol=1e-6)
-    noisy = DATA + np.random.default_rng(0).normal(0, 0.05, DATA.shape).astype(np.float32)
+def test_start_and_positivity(images):
+    few = sirt(images, SCAN, LIKE, iterations=3)
+    more = sirt(images, SCAN, LIKE, iterations=2, start=few)
+    np.testing.assert_allclose(more.data, sirt(images, SCAN, LIKE, iterations=5).data, atol=1e-6)
+    noisy = images + np.random.default_rng(0).normal(0, 0.05, images.shape).astype(np.float32)
     assert sirt(noisy, SCAN, LIKE, iterations=3).data.min() < -1e-4
     assert sirt(noisy, SCAN, LIKE, iterations=3, nonnegative=True).data.min() == 0.0
     positive = em(noisy, SCAN, LIKE, iterations=3).data
@@ -89,26 +93,26 @@ def test_start_and_positivity():
     assert positive.max() < 3 * MU
 
 
-def test_what_they_refuse():
+def test_what_they_refuse(images):
     with pytest.raises(LimitError, match="iterations"):
-        sirt(DATA, SCAN, LIKE, iterations=0)
+        sirt(images, SCAN, LIKE, iterations=0)
     with pytest.raises(LimitError, match="subsets"):
-        sart(DATA, SCAN, LIKE, subsets=0)
+        sart(images, SCAN, LIKE, subsets=0)
     with pytest.raises(GeometryError):
-        cgls(DATA[:3], SCAN, LIKE)
+        cgls(images[:3], SCAN, LIKE)
     with pytest.raises(GeometryError, match="first guess"):
-        sirt(DATA, SCAN, LIKE, start=Grid((2, 2, 2), 1.0).blank())
+        sirt(images, SCAN, LIKE, start=Grid((2, 2, 2), 1.0).blank())
     for other in (
         replace(LIKE, voxel_mm=2.0 * LIKE.voxel_xyz[0]), replace(LIKE, center_mm=(0.0, 0.0, 3.0)),
     ):  # fmt: skip
         with pytest.raises(GeometryError, match="first guess"):
-            cgls(DATA, SCAN, LIKE, start=other)
+            cgls(images, SCAN, LIKE, start=other)
 
 
 @pytest.mark.parametrize("method", [sirt, sart, cgls, em, tv, fdk])
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_images_that_are_not_finite_are_refused(method, bad):
-    images = np.array(DATA)
+def test_images_that_are_not_finite_are_refused(images, method, bad):
+    images = np.array(images)
     images[1, 2, 3] = bad
     with pytest.raises(GeometryError, match="not finite"):
         method(images, SCAN, LIKE)

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from scipy import stats
+from scipy.special import stdtrit
 
 from flexdt.clients.cli.entry import run
 from flexdt.twin.machine.description import (
@@ -355,7 +355,7 @@ def test_times_and_their_ranges_follow_the_description(seed: int, blank: Machine
         middle, own = median(found), going_on[kind]
         freedom = 4 + len(own)
         square = (4 * common + sum(x**2 for x in own)) / freedom
-        reach = stats.t.ppf(0.95, freedom) * math.sqrt(square * (1 + 1 / len(found)))
+        reach = stdtrit(freedom, 0.95) * math.sqrt(square * (1 + 1 / len(found)))
         low, high = np.quantile(found, (0.05, 0.95), method="weibull")
         low = min(low, (middle + 0.003) * math.exp(-reach) - 0.003)
         high = max(high, (middle + 0.003) * math.exp(reach) - 0.003)
