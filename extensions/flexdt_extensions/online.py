@@ -86,12 +86,13 @@ class Online:
             UnknownNameError: a name that is not estimated.
             TwinError: no tolerance is given: there is nothing to wait for.
         """
-        _require_estimated(self.free, tolerance)
+        require_estimated(self.free, tolerance)
         now = self.sigmas()
         return all(now[name] <= limit for name, limit in tolerance.items())
 
 
-def _require_estimated(free: Sequence[str], tolerance: Mapping[str, float]) -> None:
+def require_estimated(free: Sequence[str], tolerance: Mapping[str, float]) -> None:
+    """Refuse tolerances for what is not estimated, and none at all; raises as `Online.done`."""
     if not tolerance:
         raise TwinError("no tolerance given; allowed: parameter -> sigma", {"allowed": list(free)})
     for name in tolerance:
@@ -242,7 +243,7 @@ def next_angle(
         TwinError: there is no estimate yet, no candidate, or no tolerance.
         UnknownNameError: a tolerance for what is not estimated.
     """
-    _require_estimated(state.free, tolerance)
+    require_estimated(state.free, tolerance)
     fit = state.fit
     if fit is None or not fit.identifiable:
         raise TwinError("no estimate yet: feed more frames at angles spread over the turn")
