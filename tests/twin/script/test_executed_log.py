@@ -355,7 +355,7 @@ def test_times_and_their_ranges_follow_the_description(seed: int, blank: Machine
     for kind, found in times.items():
         middle, n = median(found), len(found)
         tail = stats.expon(scale=np.average([common, scales[kind]], weights=[4, n - 1]))
-        beyond = tail.isf(min(1.0, 0.05 * (n + 1)))
+        beyond = tail.isf(min(1.0, 0.05 * (n + 1))) * math.hypot(1.0, 1.0 / n)
         low, high = np.quantile(logs_of[kind], (0.05, 0.95), method="weibull")
         low = math.exp(low - beyond + min(agreed, 0.0)) - 0.003
         high = math.exp(high + beyond + max(agreed, 0.0)) - 0.003

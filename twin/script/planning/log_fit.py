@@ -7,7 +7,9 @@ each of the n + 1 gaps between and beyond those that were measured. Of fewer tim
 more than 5 % at each end, and the range reaches beyond the least and the greatest. How far, an
 exponential tail in the logarithm says, whose scale is the kind's mean absolute deviation, into
 which that of all kinds enters as `BORROWED_TIMES` times (a variance moderated by those of all
-groups, Smyth 2004, doi:10.2202/1544-6115.1027); so a kind that was seen once has a range, too.
+groups, Smyth 2004, doi:10.2202/1544-6115.1027); so a kind that was seen once has a range, too. The
+extremes of one or two times need not lie in the tails: the root of 1 + 1/n^2 makes up for that, to
+2 % of what a Laplace distribution needs.
 
 What the kinds have in common is drift: the logarithms of the later half of a kind's times over the
 median of the earlier half (a split in time, Tashman 2000, doi:10.1016/S0169-2070(00)00065-0), over
@@ -410,14 +412,15 @@ def _later(times: Times) -> list[float]:
 
 def _spread(times: Times, scale: float, shift: float) -> Spread:
     """5 % and 95 % of the next time of a kind, with a tail of this scale and a drift."""
-    beyond = scale * max(0.0, -math.log(_TAIL * (len(times) + 1)))
+    n = len(times)
+    beyond = scale * max(0.0, -math.log(_TAIL * (n + 1))) * math.sqrt(1.0 + 1.0 / n**2)
     low, high = np.quantile([_log(x) for x in times], (_TAIL, 1.0 - _TAIL), method="weibull")
     low, high = low - beyond + min(0.0, shift), high + beyond + max(0.0, shift)
     place = 10.0**_DECIMALS
     return Spread(
         p5_s=math.floor(max(0.0, math.exp(low) - _FLOOR_S) * place) / place,
         p95_s=min(math.ceil((math.exp(high) - _FLOOR_S) * place) / place, MAX_TIME_S),
-        n=len(times),
+        n=n,
     )
 
 
