@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 
 from flexdt.clients import FINAL_STATES, JobStatus, TwinClient
-from flexdt.extending import Answer, Twin, argument, assignments, names, note, option
+from flexdt.extending import Answer, Twin, argument, assignments, note, option
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration import SIX, bead_model, detect_beads
 from flexdt.twin.calibration.fit.priors import exact, prior_widths
@@ -32,8 +32,6 @@ from flexdt.twin.machine.description import builtin_machine, profile_of
 from flexdt_extensions.online import Online, begin, feed, require_estimated
 
 POLL_S: Final = 0.2
-MOST: Final = 2000
-"""Images of a data set that are looked at; of more, as many spread evenly."""
 
 
 @dataclass(frozen=True)
@@ -103,13 +101,16 @@ def watch(
 
 
 def _frames(client: TwinClient, job: str) -> Iterator[tuple[str, Any, Any]]:
-    """Data set, line integrals and nominal cone_vec of each projection, until the job ends."""
+    """Data set, line integrals and nominal cone_vec of each projection, until the job ends.
+
+    Of a scan of more than 2000 images, the wire tells as many that are spread evenly.
+    """
     seen = set[int]()
     while True:
         status = client.job_status(job)
         if status.state != "queued" and status.dataset:
             name = PurePath(status.dataset).name
-            plan = client.dataset(name, MOST)
+            plan = client.dataset(name, 2000)
             for i, kind, there in zip(plan.indices, plan.kinds, plan.present, strict=True):
                 if kind == "projection" and there and i not in seen:
                     seen.add(i)
@@ -123,45 +124,32 @@ def _frames(client: TwinClient, job: str) -> Iterator[tuple[str, Any, Any]]:
 def _machine_priors(client: TwinClient) -> dict[str, float]:
     try:
         machine = builtin_machine(client.server.machine)
-        return prior_widths(machine, profile_of(machine, client.server.profile))
     except UnknownNameError:
         return prior_widths()
+    return prior_widths(machine, profile_of(machine))
 
 
 def watch_job(
     twin: Twin,
     job: str | None = argument(None, "[JOB]"),
     phantom: str = option(..., "Calibrate with this phantom, which is scanned.", metavar="NAME"),
-    stop_when: str = option(
-        ..., "End the job at these sigmas (mm, deg), e.g. tau_x=0.001,alpha=0.02.",
-        metavar="P=SIGMA,...",
-    ),
-    free: str | None = option(
-        None, "Estimate these parameters; default: six.", metavar="P,P,..."
-    ),
-    prior: str = option(
-        "", "As of `flexdt calibrate`: none, or standard deviations.", metavar="P=SIGMA,..."
-    ),
-) -> Answer:  # fmt: skip
+    stop_when: str = option(..., "End the job at these sigmas (mm, deg).", metavar="P=SIGMA,..."),
+    prior: str = option("", "As of `flexdt calibrate`, or none.", metavar="P=SIGMA,..."),
+) -> Answer:
     """End a scan of beads once its calibration is sure enough.
 
     The data set stays, says why it ended, and calibrates as far as it goes. JOB: the current one if
     left out. A job whose sigmas are not reached runs to its end.
     """
     wanted = assignments(stop_when.split(","))
-    asked = SIX if free is None else names(free)
-    known = assignments(prior.split(",")) if prior not in ("", "none") else None
+    known = exact() if prior == "none" else assignments(prior.split(",")) if prior else None
 
     def tell(state: Online) -> None:
         now = ", ".join(f"{n} {state.sigmas().get(n, 0):.3g}" for n in wanted)
         note(f"frame {len(state.detections)}: {now}")
 
     with twin() as client:
-        found = watch(
-            client, phantom, wanted, job, free=asked, tell=tell,
-            priors=exact(asked) if prior == "none" else known,
-        )  # fmt: skip
+        found = watch(client, phantom, wanted, job, priors=known, tell=tell)
     yield {**asdict(found), "job": found.job.model_dump()}
-    yield f"{found.job.job}: {found.job.state} after {found.frames} frames; " + (
-        "the sigmas asked for are reached" if found.reached else "they are not reached"
-    )
+    met = "reached" if found.reached else "not reached"
+    yield f"{found.job.job}: {found.job.state}, {found.frames} frames seen; the sigmas are {met}"

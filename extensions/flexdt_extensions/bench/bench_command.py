@@ -19,7 +19,6 @@ def bench(
     json: Json = False,
 ) -> None:
     """Measure speed and accuracy, beside the peers that are installed."""
-    given = {"out": out, "no-peers": no_peers, "quick": quick, "list": list_, "json": json}
-    given["device"] = device
+    given = {"out": out, "no-peers": no_peers, "quick": quick, "list": list_, "device": device}
     more = [] if only is None else ["--only", *names(only)]
-    become("flexdt_extensions.bench", given, more)
+    become("flexdt_extensions.bench", {**given, "json": json}, more)

@@ -374,7 +374,7 @@ def _timing(samples: Mapping[str, Times], before: Timing, source: str, logs: int
     shifts = [fmean(found) for times in samples.values() if (found := _later(times))]
     shift = fmean(shifts) if shifts else 0.0
     unsure = variance(shifts) / len(shifts) if len(shifts) > 1 else 0.0
-    sure = max(0.0, 1.0 - unsure / shift**2) if shift else 0.0
+    sure = max(0.0, 1.0 - unsure / shift / shift) if shift else 0.0
     # From the middle of the earlier half to that of the later it is half of the logs, from the
     # middle of all logs to that of the next scan half of them and half a scan.
     shift *= 1.0 + 1.0 / logs
@@ -386,17 +386,11 @@ def _timing(samples: Mapping[str, Times], before: Timing, source: str, logs: int
     }
     common = fmean([off[kind] for kind, times in samples.items() if len(times) > 1] or [1.0])
     spread = {
-        kind: _spread(times, _moderated(off[kind], len(times), common), sure * shift)
-        for kind, times in samples.items()
+        kind: _spread(times, off[kind], common, sure * shift) for kind, times in samples.items()
     }
     update = {f"{kind}_s": round(x, _DECIMALS) for kind, x in medians.items()}
-    drift = round(math.expm1(abs(shift)), _DECIMALS)
-    told = {"source": source, "drift": drift, "spread": spread}
+    told = {"source": source, "drift": round(math.expm1(abs(shift)), _DECIMALS), "spread": spread}
     return before.model_copy(update={**update, **told})
-
-
-def _moderated(own: float, n: int, common: float) -> float:
-    return (BORROWED_TIMES * common + (n - 1) * own) / (BORROWED_TIMES + n - 1)
 
 
 def _log(time: float) -> float:
@@ -410,9 +404,10 @@ def _later(times: Times) -> list[float]:
     return [(_log(x) - middle) / scale for x in times[half:]]
 
 
-def _spread(times: Times, scale: float, shift: float) -> Spread:
-    """5 % and 95 % of the next time of a kind, with a tail of this scale and a drift."""
+def _spread(times: Times, own: float, common: float, shift: float) -> Spread:
+    """5 % and 95 % of the next time of a kind, with its own and the common scale, and a drift."""
     n = len(times)
+    scale = (BORROWED_TIMES * common + (n - 1) * own) / (BORROWED_TIMES + n - 1)
     beyond = scale * max(0.0, -math.log(_TAIL * (n + 1))) * math.sqrt(1.0 + 1.0 / n**2)
     low, high = np.quantile([_log(x) for x in times], (_TAIL, 1.0 - _TAIL), method="weibull")
     low, high = low - beyond + min(0.0, shift), high + beyond + max(0.0, shift)
