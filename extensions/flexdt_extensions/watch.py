@@ -23,7 +23,7 @@ from flexdt.clients import FINAL_STATES, JobStatus, TwinClient
 from flexdt.extending import Answer, Twin, argument, assignments, note, option
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration import SIX, bead_model, detect_beads
-from flexdt.twin.calibration.fit.priors import exact, prior_widths
+from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.pipeline import detector_for
 from flexdt.twin.errors import UnknownNameError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -131,25 +131,23 @@ def _machine_priors(client: TwinClient) -> dict[str, float]:
 
 def watch_job(
     twin: Twin,
+    phantom: str = argument(..., "PHANTOM"),
     job: str | None = argument(None, "[JOB]"),
-    phantom: str = option(..., "Calibrate with this phantom, which is scanned.", metavar="NAME"),
     stop_when: str = option(..., "End the job at these sigmas (mm, deg).", metavar="P=SIGMA,..."),
-    prior: str = option("", "As of `flexdt calibrate`, or none.", metavar="P=SIGMA,..."),
 ) -> Answer:
     """End a scan of beads once its calibration is sure enough.
 
-    The data set stays, says why it ended, and calibrates as far as it goes. JOB: the current one if
-    left out. A job whose sigmas are not reached runs to its end.
+    PHANTOM is what is scanned. JOB: the current one if left out. The data set stays, says why it
+    ended, and calibrates as far as it goes. A job whose sigmas are not reached runs to its end.
     """
     wanted = assignments(stop_when.split(","))
-    known = exact() if prior == "none" else assignments(prior.split(",")) if prior else None
 
     def tell(state: Online) -> None:
         now = ", ".join(f"{n} {state.sigmas().get(n, 0):.3g}" for n in wanted)
         note(f"frame {len(state.detections)}: {now}")
 
     with twin() as client:
-        found = watch(client, phantom, wanted, job, priors=known, tell=tell)
+        found = watch(client, phantom, wanted, job, tell=tell)
     yield {**asdict(found), "job": found.job.model_dump()}
     met = "reached" if found.reached else "not reached"
     yield f"{found.job.job}: {found.job.state}, {found.frames} frames seen; the sigmas are {met}"

@@ -47,7 +47,7 @@ def test_the_job_ends_early_and_its_data_set_is_worth_what_was_asked(
         job, _ = submit(mine, rng, FRAMES, 8.0)
         words = ",".join(f"{name}={most}" for name, most in wanted.items())
         capsys.readouterr()
-        code = run(["job", "watch", job, "--phantom", "lego", "--stop-when", words,
+        code = run(["job", "watch", "lego", job, "--stop-when", words,
                     "--json", "--server", f"127.0.0.1:{port}"])  # fmt: skip
         told = json.loads(capsys.readouterr().out)
         status = mine.job_status(job)
