@@ -11,7 +11,7 @@ A dot in the name stands for a group: `phantom.design` is `flexdt phantom design
 
 from flexdt.clients.cli.commands.process_commands import become
 from flexdt.clients.cli.console import note, size, table, warn
-from flexdt.clients.cli.option_values import names, numbers, position, triple
+from flexdt.clients.cli.option_values import assignments, names, numbers, position, triple
 from flexdt.clients.cli.options import (
     Answer,
     Free,
@@ -20,6 +20,7 @@ from flexdt.clients.cli.options import (
     MachineName,
     ProfileName,
     Scheduler,
+    Twin,
     argument,
     option,
 )
@@ -41,7 +42,9 @@ __all__ = [
     "OneLine",
     "ProfileName",
     "Scheduler",
+    "Twin",
     "argument",
+    "assignments",
     "become",
     "free_bytes",
     "message_of",

@@ -85,6 +85,7 @@ KNOWN: Final[Mapping[str, str]] = {
     "batch": "Make a batch of scans or calibrations.",
     "bench": "Measure speed and accuracy, beside the peers that are installed.",
     "evidence": "Compare real, public data with their published answers.",
+    "job watch": "End a scan of beads once its calibration is sure enough.",
     "phantom design": "Choose bead places that determine the geometry best.",
 }
 """Command of `flexdt-extensions` -> its line of the help page, which needs no look at what is

@@ -646,15 +646,15 @@ def step_job(job: str | None = None) -> Flow[s.JobStatus]:
     return ask(scans.JOB_STEP, job=job)
 
 
-def abort_job(job: str | None = None) -> Flow[s.JobStatus]:
-    """End a job; its data set stays, marked incomplete.
+def abort_job(job: str | None = None, reason: str | None = None) -> Flow[s.JobStatus]:
+    """End a job; its data set stays, marked incomplete, and says the reason.
 
     Example:
         >>> job = twin.submit_trajectory([{"rot_obj": 0.0}] * 20, 9000.0, speed_up=1.0).job
         >>> twin.wait_job(twin.abort_job(job).job).state
         'aborted'
     """
-    return ask(scans.JOB_ABORT, job=job)
+    return ask(scans.JOB_ABORT, job=job, reason=reason)
 
 
 def wait_job(

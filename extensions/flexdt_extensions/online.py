@@ -19,7 +19,6 @@ from flexdt.twin.calibration import (
     SIX,
     BeadModel,
     BeadPhantom,
-    Certificate,
     FitResult,
     bead_model,
     build_problem,
@@ -68,11 +67,6 @@ class Online:
     updates: int
     priors: Mapping[str, float]
 
-    @property
-    def certificate(self) -> Certificate | None:
-        """Of the present estimate."""
-        return None if self.fit is None else self.fit.certificate
-
     def sigmas(self) -> dict[str, float]:
         """Present standard deviation of every parameter, edge units; inf where not determined."""
         if self.fit is None or not self.fit.identifiable:
@@ -86,12 +80,13 @@ class Online:
             UnknownNameError: a name that is not estimated.
             TwinError: no tolerance is given: there is nothing to wait for.
         """
-        _require_estimated(self.free, tolerance)
+        require_estimated(self.free, tolerance)
         now = self.sigmas()
         return all(now[name] <= limit for name, limit in tolerance.items())
 
 
-def _require_estimated(free: Sequence[str], tolerance: Mapping[str, float]) -> None:
+def require_estimated(free: Sequence[str], tolerance: Mapping[str, float]) -> None:
+    """Refuse tolerances for what is not estimated, and none at all; raises as `Online.done`."""
     if not tolerance:
         raise TwinError("no tolerance given; allowed: parameter -> sigma", {"allowed": list(free)})
     for name in tolerance:
@@ -153,15 +148,11 @@ def feed(state: Online, pose: Poses, detections: Detections) -> Online:
     points = detections.centers[None]
     index = assign(predicted, points, np.array([len(detections)]), gate)
     found = identified(index, [detections], fit.parameters)
-    return _renew(
-        replace(
-            grown,
-            tracks=np.concatenate([state.tracks, found.tracks]),
-            covariances=np.concatenate([state.covariances, found.covariances]),
-            bias=np.concatenate([state.bias, found.bias]),
-        ),
-        fit.parameters,
+    tracks, covariances, bias = (
+        np.concatenate([getattr(state, name), getattr(found, name)])
+        for name in ("tracks", "covariances", "bias")
     )
+    return _renew(replace(grown, tracks=tracks, covariances=covariances, bias=bias), fit.parameters)
 
 
 def _first(state: Online) -> Online:
@@ -225,10 +216,7 @@ class NextAngle:
 
 
 def next_angle(
-    state: Online,
-    pose: Poses,
-    candidates: npt.ArrayLike,
-    tolerance: Mapping[str, float],
+    state: Online, pose: Poses, candidates: npt.ArrayLike, tolerance: Mapping[str, float]
 ) -> NextAngle:
     """The candidate angle after which the worst sigma, in units of its tolerance, is smallest.
 
@@ -242,7 +230,7 @@ def next_angle(
         TwinError: there is no estimate yet, no candidate, or no tolerance.
         UnknownNameError: a tolerance for what is not estimated.
     """
-    _require_estimated(state.free, tolerance)
+    require_estimated(state.free, tolerance)
     fit = state.fit
     if fit is None or not fit.identifiable:
         raise TwinError("no estimate yet: feed more frames at angles spread over the turn")
@@ -259,17 +247,11 @@ def next_angle(
     rows = rows * np.repeat(visible, 2, axis=1)[..., None]
     # A new position is worth as much as those already in the fit turned out to be.
     noise = _noise_px(fit)
-    best: NextAngle | None = None
-    score = math.inf
-    for i, angle in enumerate(angles):
-        covariance = np.linalg.inv(information + rows[i].T @ rows[i] / noise**2)
-        sigma = np.sqrt(np.diag(covariance))
-        worst = max(sigma[names.index(n)] / limit for n, limit in tolerance.items())
-        if worst < score:
-            score = float(worst)
-            best = NextAngle(float(angle), dict(zip(names, sigma.tolist(), strict=True)))
-    assert best is not None
-    return best
+    covariances = np.linalg.inv(information + np.swapaxes(rows, 1, 2) @ rows / noise**2)
+    sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    worst = [sigmas[:, names.index(n)] / limit for n, limit in tolerance.items()]
+    best = int(np.argmin(np.max(worst, axis=0)))
+    return NextAngle(float(angles[best]), dict(zip(names, sigmas[best].tolist(), strict=True)))
 
 
 def _noise_px(fit: FitResult) -> float:

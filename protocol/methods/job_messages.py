@@ -73,6 +73,14 @@ class JobRef(f.Params):
     job: Annotated[f.ShortText, Len(1, 120)] | None = None
 
 
+class JobAbort(JobRef):
+    """Which job, and why it ends."""
+
+    reason: Annotated[
+        f.ShortText | None, Field(description="is written into the data set; none says aborted")
+    ] = None
+
+
 class Problem(f.Result):
     """Something about a script, with its place."""
 
@@ -149,6 +157,6 @@ JOB_PAUSE = command("job.pause", JobRef, JobStatus,
                     "pause a job; a frame under exposure is taken again")  # fmt: skip
 JOB_RESUME = command("job.resume", JobRef, JobStatus, "return to the pose of the pause and go on")
 JOB_STEP = command("job.step", JobRef, JobStatus, "run a paused job for one step")
-JOB_ABORT = Method("job.abort", JobRef, JobStatus,
+JOB_ABORT = Method("job.abort", JobAbort, JobStatus,
                    "end a job, its data set incomplete", urgent=True)  # fmt: skip
 JOB_LIST = read("job.list", f.Empty, JobListResult, "all jobs, oldest first")

@@ -239,10 +239,10 @@ class Jobs:
         self._take_over()
         runner.step()
 
-    def abort(self, job: Job) -> None:
-        """End a job in any phase; its data set stays, incomplete."""
+    def abort(self, job: Job, reason: str | None = None) -> None:
+        """End a job in any phase; its data set stays, incomplete, with the reason."""
         if job.runner is not None and job.phase not in ENDED:
-            job.runner.abort()
+            job.runner.abort(reason)
         elif job.phase == "queued":
             job.phase = "aborted"
             self._notify(job)
@@ -328,8 +328,8 @@ class Jobs:
             self._notify(job)
             await job.runner.run()
             await asyncio.to_thread(scan.store.finish, duration_s=scan.plan.duration_s)
-        except JobAborted:
-            await asyncio.to_thread(self._mark, job, scan, "aborted")
+        except JobAborted as ended:
+            await asyncio.to_thread(self._mark, job, scan, str(ended))
             return "aborted"
         except asyncio.CancelledError:
             # The loop is being closed: nothing can be awaited any more.

@@ -144,7 +144,10 @@ def hopeless(error: Exception) -> bool:
 
 
 class JobAborted(Exception):
-    """Somebody ended the job."""
+    """Somebody ended the job, for the reason given."""
+
+    def __init__(self, reason: str | None = None) -> None:
+        super().__init__(f"aborted: {reason}" if reason else "aborted")
 
 
 @dataclass(frozen=True)
@@ -237,8 +240,10 @@ class ScanRunner:
         self._set(error=None)
         self._wake()
 
-    def abort(self) -> None:
+    def abort(self, reason: str | None = None) -> None:
         """End the run."""
+        if reason is not None:
+            self._end = JobAborted(reason)
         self._abort = True
         self._wake()
 

@@ -89,11 +89,11 @@ def test_stop_during_a_scan_pauses_it_and_abort_leaves_it_incomplete(tmp_path: P
         await lab.until(
             lambda: lab.twin.jobs.status(lab.twin.jobs.get(job)).state == "paused", "it pauses"
         )
-        status = await watcher.call("job.abort", job=job)
+        status = await watcher.call("job.abort", job=job, reason="sure enough")
         assert status["state"] == "aborted"
         document = json.loads((lab.root / "cut" / "flexdt.json").read_text())
         assert document["complete"] is False
-        assert "aborted" in document["reason"]
+        assert document["reason"] == "aborted: sure enough"
         assert not list((lab.root / "cut").glob(".*"))
         assert lab.twin.jobs.current is None
 

@@ -6,8 +6,8 @@ Each simulated machine has limits, rates and times of its own and runs one to fo
 are fitted, and then another one, whose lines and total are compared with their ranges. Where its
 axes stand before that scan is known. Its times follow a family that the fit does not know:
 lognormal, bimodal (some commands of a kind take much longer) or drifting (everything becomes slower
-from line to line). Not among the 50 unless asked for is `daily`: all times of a scan share a
-factor.
+from line to line). Not among the 50 unless asked for are `daily`: all times of a scan share a
+factor; and those of `COMPARED` and `UNSEEN`.
 
 The logs are written here, byte by byte, with kinematics and times of this file; of flexdt only the
 reader, the fit and the comparison are used.
@@ -35,6 +35,10 @@ from flexdt.twin.script.planning.log_fit import LogComparison, fit_machine
 
 FAMILIES = ("lognormal", "bimodal", "drifting")
 DAILY = "daily"
+COMPARED = ("gamma", "waiting", "tails", "weibull")
+"""Families that variants of the method were compared by, beside `FAMILIES`."""
+UNSEEN = ("uniform", "loglogistic", "triangular", "pareto")
+"""Families by which nothing was chosen: they were drawn after the last change."""
 TIMES = {  # kind: least and greatest median of a machine [s]
     "xrayon": (0.5, 3.0),
     "ready": (4.0, 30.0),
@@ -49,6 +53,8 @@ TIMES = {  # kind: least and greatest median of a machine [s]
     "standing": (0.05, 0.3),
     "other": (0.0004, 0.002),
 }
+FEW = 3
+"""Times of a kind from which on its range is to hold 88 to 92 %."""
 AXES = ("ver_tube", "ver_det", "tra_obj", "tra_det", "mag_det", "mag_obj", "rot_obj")
 
 
@@ -89,6 +95,24 @@ class Rig:
             return middle * noise * (1.0 + 5.0 * width if slow else 1.0)
         if self.family == DAILY:
             return middle * noise * self.day
+        if self.family == "gamma":
+            return middle * self.rng.gammavariate(width**-2, width**2)
+        if self.family == "waiting":  # a fixed part, and an exponential one
+            return middle * (1.0 - width + self.rng.expovariate(1.0 / width))
+        if self.family == "tails":  # Student's t of three degrees, in the logarithm
+            normal, square = self.rng.gauss(0.0, 1.0), self.rng.gammavariate(1.5, 2.0 / 3.0)
+            return middle * math.exp(min(5.0, 0.6 * width * normal / math.sqrt(square)))
+        if self.family == "weibull":
+            return middle * self.rng.weibullvariate(1.0, 1.2 / width)
+        if self.family == "uniform":
+            return middle * self.rng.uniform(1.0 - width, 1.0 + width)
+        if self.family == "loglogistic":
+            chance = self.rng.uniform(1e-6, 1.0 - 1e-6)
+            return middle * (chance / (1.0 - chance)) ** (0.6 * width)
+        if self.family == "triangular":
+            return middle * self.rng.triangular(1.0 - width, 1.0 + 2.0 * width, 1.0)
+        if self.family == "pareto":
+            return middle * (1.0 - 0.5 * width) * self.rng.paretovariate(1.0 + 1.0 / width)
         return middle * noise * (1.0 + 2.0 * width * self.lines / 300.0)
 
     def reply(self, axis: str, target: float) -> bytes:
@@ -236,6 +260,7 @@ def share(parts: list[list[bool]]) -> dict[str, float]:
 def study(machines: int, seed: int, families: Sequence[str] = FAMILIES) -> dict[str, Any]:
     """Lines and totals inside their range: of all machines, by family, number of logs and kind."""
     held: dict[str, list[list[bool]]] = defaultdict(list)
+    relative: dict[str, list[float]] = defaultdict(list)
     widths, wrong = [], 0
     for index in range(machines):
         rng = random.Random(f"{seed}/{index}")
@@ -253,12 +278,18 @@ def study(machines: int, seed: int, families: Sequence[str] = FAMILIES) -> dict[
         kinds: dict[str, list[bool]] = defaultdict(list)
         for row in found.rows:
             kinds[row.kind].append(bool(row.inside))
+        timing = found.machine.timing
         for kind, parts in kinds.items():
             held[f"lines, kind {kind}"].append(parts)
+            known = timing.spread.get(kind)
+            if known is not None and known.n >= FEW:
+                held[f"lines, kind {kind}, n >= {FEW}"].append(parts)
+                relative[kind].append((known.p95_s - known.p5_s) / max(timing.seconds(kind), 1e-3))
     return {
         "machines": machines,
         "seed": seed,
         "inside": {group: share(parts) for group, parts in sorted(held.items())},
+        "width_percent": {k: 100.0 * statistics.median(w) for k, w in sorted(relative.items())},
         "total_width_percent": 100.0 * statistics.median(widths),
         "limits_wrong": wrong,
     }
@@ -268,7 +299,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--machines", type=int, default=50)
     parser.add_argument("--seed", type=int, default=17)
-    parser.add_argument("--families", nargs="+", choices=(*FAMILIES, DAILY), default=FAMILIES)
+    parser.add_argument(
+        "--families", nargs="+", choices=(*FAMILIES, DAILY, *COMPARED, *UNSEEN), default=FAMILIES
+    )
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     found = study(options.machines, options.seed, options.families)
@@ -279,6 +312,8 @@ def main() -> None:
         f"{found['machines']} machines, seed {found['seed']}; {found['limits_wrong']} limits wrong"
     )
     print(f"median width of a total's range: {found['total_width_percent']:.0f} % of the total")
+    for kind, width in found["width_percent"].items():
+        print(f"median width of {kind}, n >= {FEW}: {width:.0f} % of its median")
     print(f"{'inside the 90 % range':36} {'%':>6} {'binomial':>9} {'machines':>9} {'n':>6}")
     for group, x in found["inside"].items():
         print(

@@ -263,6 +263,10 @@ export type ImageValue = {
   shape: Array<number>;
   data: string;
 };
+export type JobAbort = {
+  job?: string | null;
+  reason?: string | null;
+};
 export type JobListResult = Record<string, unknown>;
 export type JobRef = {
   job?: string | null;
@@ -563,7 +567,7 @@ export interface Methods {
   "job.pause": [JobRef, JobStatus];
   "job.resume": [JobRef, JobStatus];
   "job.step": [JobRef, JobStatus];
-  "job.abort": [JobRef, JobStatus];
+  "job.abort": [JobAbort, JobStatus];
   "job.list": [Empty, JobListResult];
   "dataset.get": [DatasetGet, DatasetResult];
   "calibration.apply": [Correct, CorrectionResult];

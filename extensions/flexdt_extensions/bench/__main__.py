@@ -19,7 +19,6 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="write bench.json here")
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="these cases only")
     parser.add_argument("--no-peers", action="store_true", help="do not run other projectors")
-    parser.add_argument("--quick", action="store_true", help="C1 and C1-tilt without the rest")
     parser.add_argument("--list", action="store_true", help="name the cases, measure nothing")
     parser.add_argument("--device", action="store_true", help="a CUDA device: its targets, a page")
     options = parser.parse_args()
@@ -29,7 +28,6 @@ def main() -> None:
     unknown = [name for name in options.only if name not in case_names()]
     if unknown:
         parser.error(f"no case {', '.join(unknown)}; there are: {', '.join(case_names())}")
-    only = ["C1", "C1-tilt"] if options.quick else options.only
     text = ""
     if options.device:
         found = gpu.availability()
@@ -41,7 +39,7 @@ def main() -> None:
         # Here and in the processes that this one starts.
         os.environ["NUMBA_DISABLE_CUDA"] = "1"
         with gpu.switched_off():
-            document = run_bench(only=only, with_peers=not options.no_peers, tell=to_stderr)
+            document = run_bench(only=options.only, with_peers=not options.no_peers, tell=to_stderr)
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
         name = "device" if options.device else "bench"

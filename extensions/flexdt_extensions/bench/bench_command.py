@@ -11,7 +11,6 @@ def bench(
     out: Path | None = option(None, "Write bench.json here.", metavar="DIR"),
     only: str | None = option(None, "Run these cases only.", metavar="NAME,NAME,..."),
     no_peers: bool = option(False, "Do not run other projectors.", "--no-peers"),
-    quick: bool = option(False, "Run C1 and C1-tilt alone.", "--quick"),
     list_: bool = option(False, "Name the cases, measure nothing.", "--list"),
     device: bool = option(
         False, "Measure a CUDA device against its targets and ASTRA.", "--device"
@@ -19,7 +18,6 @@ def bench(
     json: Json = False,
 ) -> None:
     """Measure speed and accuracy, beside the peers that are installed."""
-    given = {"out": out, "no-peers": no_peers, "quick": quick, "list": list_, "json": json}
-    given["device"] = device
+    given = {"out": out, "no-peers": no_peers, "list": list_, "device": device}
     more = [] if only is None else ["--only", *names(only)]
-    become("flexdt_extensions.bench", given, more)
+    become("flexdt_extensions.bench", {**given, "json": json}, more)

@@ -38,13 +38,7 @@ def geometries(
             for name, end in (("Min", low), ("Max", high))
         },
     }
-    panel = {
-        "type": "cone_vec",
-        "DetectorRowCount": shape[0],
-        "DetectorColCount": shape[1],
-        "Vectors": np.array(cone_vec.rows),
-    }
-    return space, panel
+    return space, cone_vec.with_shape(shape).to_astra()
 
 
 class Resident:

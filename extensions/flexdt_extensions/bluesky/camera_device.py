@@ -48,11 +48,7 @@ def folder_uri(folder: PurePath) -> str:
 
 
 def tiff_stream(
-    data_key: str,
-    folder: PurePath,
-    template: str,
-    shape: tuple[int, int],
-    written: SignalR[int],
+    data_key: str, folder: PurePath, template: str, shape: tuple[int, int], written: SignalR[int]
 ) -> StreamResourceDataProvider:
     """What announces files as they appear.
 

@@ -19,9 +19,7 @@ from flexdt.extending import (
     table,
     triple,
 )
-from flexdt.extending import (
-    position as place,
-)
+from flexdt.extending import position as place
 
 
 def design(
@@ -72,22 +70,14 @@ def design(
         beads, radius, bead, per_brick, criterion, seed=seed, trials=trials
     )
     if grid == "lego":
-        stack = stack_of(_studs(studs), bricks)
+        n, m = map(int, numbers(studs, "studs", "NxM, e.g. 3x2", 2, by="x", whole=True))
+        stack = stack_of((n, m), bricks)
         holder = work.BeadHolder(stack, stack.size_mm)
     else:
-        holder = work.BeadHolder(None, _size(size), body)
+        holder = work.BeadHolder(None, triple(size, "size", "W,B,H, e.g. 20,40,60"), body)
     document = work.run_design(holder, scans, request, out=out, tell=note)
     yield document
     yield table(work.table_rows(document), work.HEADER)
     yield f"\n{work.verdict(document)}"
     if out is not None:
         yield (f"building instruction: {out / 'build.html'}; phantom: {out / 'phantom.json'}")
-
-
-def _studs(text: str) -> tuple[int, int]:
-    n, m = map(int, numbers(text, "studs", "NxM, e.g. 3x2", 2, by="x", whole=True))
-    return n, m
-
-
-def _size(text: str) -> tuple[float, float, float]:
-    return triple(text, "size", "W,B,H, e.g. 20,40,60")

@@ -94,10 +94,10 @@ async def step(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatu
 
 
 @answers(p.JOB_ABORT)
-async def abort(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
-    """The data set stays, marked incomplete."""
+async def abort(twin: TwinServer, client: Client, params: p.JobAbort) -> w.JobStatus:
+    """The data set stays, marked incomplete, and says why."""
     job = twin.jobs.get(params.job)
-    twin.jobs.abort(job)
+    twin.jobs.abort(job, params.reason)
     with contextlib.suppress(DatasetError):  # an abort does not fail because of the disk
         await twin.keeper.flush()
     return await _when(twin, job, lambda: job.phase in ENDED)

@@ -13,13 +13,13 @@ import struct
 from collections.abc import Callable
 from datetime import datetime, timedelta
 from pathlib import Path
-from statistics import fmean, median
+from statistics import median
 
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from scipy.special import stdtrit
+from scipy import stats
 
 from flexdt.clients.cli.entry import run
 from flexdt.twin.machine.description import (
@@ -325,7 +325,7 @@ def drawn_log(rng: np.random.Generator, slower: float) -> tuple[Executed, ...]:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_times_and_their_ranges_follow_the_description(seed: int, blank: Machine) -> None:
-    """The sums of the module's description, with another library's t distribution."""
+    """The sums of the module's description, with another library's distributions."""
     rng = np.random.default_rng(seed)
     logs = [drawn_log(rng, slower) for slower in (1.0, 1.1, 1.3)]
     fit = fit_machine(logs, blank, "drawn")
@@ -339,26 +339,26 @@ def test_times_and_their_ranges_follow_the_description(seed: int, blank: Machine
     assert {k: list(v) for k, v in fit.samples.items()} == {
         k: pytest.approx(v) for k, v in times.items()
     }
-    errors = {}
+    logs_of = {kind: np.log(np.array(found) + 0.003) for kind, found in times.items()}
+    middles = {kind: math.log(median(found) + 0.003) for kind, found in times.items()}
+    shifts = []
     for kind, found in times.items():
         half = math.ceil(len(found) / 2)
-        middle = median(found[:half]) + 0.003
-        errors[kind] = [
-            math.log((x + 0.003) / middle) / math.sqrt(1 + 1 / half) for x in found[half:]
-        ]
-    shift = fmean(fmean(e) for e in errors.values())
-    going_on = {kind: [x + shift / 3 for x in e] for kind, e in errors.items()}
-    common = median(fmean(x**2 for x in e) for e in going_on.values())
+        later = np.mean(logs_of[kind][half:]) - math.log(median(found[:half]) + 0.003)
+        shifts.append(later / math.sqrt(1 + 1 / half))
+    shift = float(np.mean(shifts))
+    agreed = max(0.0, 1.0 - (stats.sem(shifts) / shift) ** 2) * shift * 4 / 3
+    scales = {kind: np.abs(y - middles[kind]).sum() / (len(y) - 0.5) for kind, y in logs_of.items()}
+    common = np.mean(list(scales.values()))
     timing = fit.machine.timing
     assert timing.drift == pytest.approx(math.exp(abs(shift) * 4 / 3) - 1, abs=1e-4)
     for kind, found in times.items():
-        middle, own = median(found), going_on[kind]
-        freedom = 4 + len(own)
-        square = (4 * common + sum(x**2 for x in own)) / freedom
-        reach = stdtrit(freedom, 0.95) * math.sqrt(square * (1 + 1 / len(found)))
-        low, high = np.quantile(found, (0.05, 0.95), method="weibull")
-        low = min(low, (middle + 0.003) * math.exp(-reach) - 0.003)
-        high = max(high, (middle + 0.003) * math.exp(reach) - 0.003)
+        middle, n = median(found), len(found)
+        tail = stats.expon(scale=np.average([common, scales[kind]], weights=[4, n - 1]))
+        beyond = tail.isf(min(1.0, 0.05 * (n + 1))) * math.hypot(1.0, 1.0 / n)
+        low, high = np.quantile(logs_of[kind], (0.05, 0.95), method="weibull")
+        low = math.exp(low - beyond + min(agreed, 0.0)) - 0.003
+        high = math.exp(high + beyond + max(agreed, 0.0)) - 0.003
         spread = timing.spread[kind]
         assert timing.seconds(kind) == pytest.approx(middle, abs=1e-4)
         assert (spread.p5_s, spread.p95_s) == pytest.approx((max(low, 0.0), high), abs=2e-4)

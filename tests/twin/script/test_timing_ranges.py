@@ -53,3 +53,13 @@ def test_what_a_total_is_uncertain_by(n: int, count: int, squares: float) -> Non
     assert high - 2.0 * count - 50.0 == pytest.approx(4.0 * math.sqrt(squares) + 0.2 * count)
     low, _ = total_range(rows, 0.1, timing) or (1.0, 1.0)
     assert low == 0.0  # no scan takes less than no time
+
+
+def test_rare_kinds_of_families_that_nothing_was_chosen_by() -> None:
+    """A kind with one or two lines a scan, known from three to eight times."""
+    found = timing_ranges.study(48, seed=17, families=timing_ranges.UNSEEN)
+    rare = ("xrayon", "xray_ready", "xrayoff", "xrayoff_again", "write_settings")
+    shares = [found["inside"][f"lines, kind {kind}, n >= 3"] for kind in rare]
+    count = sum(share["n"] for share in shares)
+    assert count > 150
+    assert 85.0 <= sum(s["percent"] * s["n"] for s in shares) / count <= 95.0

@@ -1,14 +1,21 @@
 """A machine fitted to executed scripts: limits and rates from motors' replies, times of commands.
 
 The time of a command beyond its motion, pause or exposures is the median over its kind. Its 90 %
-range is about the next scan, so what counts is how later times differ from earlier ones: the
-logarithms of the later half of a kind's times over the median of the earlier half (a split in time,
-Tashman 2000, doi:10.1016/S0169-2070(00)00065-0), over the root of 1 + 1/n, as for a mean of n. The
-range is the prediction interval of Student's t with their mean square, into which that of the other
-kinds enters as `BORROWED_TIMES` errors (a variance moderated by those of all groups, Smyth 2004,
-doi:10.2202/1544-6115.1027), and it is no narrower than the kind's own times (order statistics,
-Wilks 1941, doi:10.1214/aoms/1177731788). What the errors of all kinds have in common is drift: it
-goes on until the next scan, and it is common to all lines of a scan.
+range is about the next time. From 19 times on it is that of order statistics (Wilks 1941,
+doi:10.1214/aoms/1177731788), whatever the times are distributed like: the next one is as likely in
+each of the n + 1 gaps between and beyond those that were measured. Of fewer times, 1 / (n + 1) is
+more than 5 % at each end, and the range reaches beyond the least and the greatest. How far, an
+exponential tail in the logarithm says, whose scale is the kind's mean absolute deviation, into
+which that of all kinds enters as `BORROWED_TIMES` times (a variance moderated by those of all
+groups, Smyth 2004, doi:10.2202/1544-6115.1027); so a kind that was seen once has a range, too. The
+extremes of one or two times need not lie in the tails: the root of 1 + 1/n^2 makes up for that, to
+2 % of what a Laplace distribution needs.
+
+What the kinds have in common is drift: the logarithms of the later half of a kind's times over the
+median of the earlier half (a split in time, Tashman 2000, doi:10.1016/S0169-2070(00)00065-0), over
+the root of 1 + 1/n, as for a mean of n. It goes on until the next scan. Ranges reach so much
+further, as far as the kinds agree on it (James and Stein 1961); in a total it is common to all
+lines.
 """
 
 from __future__ import annotations
@@ -16,7 +23,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from statistics import fmean, median, mode
+from statistics import fmean, median, mode, variance
 from typing import ClassVar, Final
 
 import numpy as np
@@ -32,7 +39,7 @@ from flexdt.twin.script.planning.simulated_script import Simulation
 from flexdt.twin.script.problems import ScriptProblem
 
 BORROWED_TIMES: Final = 4.0
-"""How many errors of its own the errors of the other kinds count for."""
+"""How many times of its own the deviations of all kinds count for."""
 _TAIL: Final = 0.05
 _FLOOR_S: Final = 0.003
 """Added to a time before its logarithm: a few times the resolution, since times may be 0."""
@@ -364,47 +371,51 @@ def _samples(logs: Sequence[Log], machine: Machine) -> dict[str, tuple[float, ..
 
 
 def _timing(samples: Mapping[str, Times], before: Timing, source: str, logs: int) -> Timing:
-    later = {kind: found for kind, times in samples.items() if (found := _later(times))}
-    shift = fmean(map(fmean, later.values())) if later else 0.0
+    shifts = [fmean(found) for times in samples.values() if (found := _later(times))]
+    shift = fmean(shifts) if shifts else 0.0
+    unsure = variance(shifts) / len(shifts) if len(shifts) > 1 else 0.0
+    sure = max(0.0, 1.0 - unsure / shift / shift) if shift else 0.0
     # From the middle of the earlier half to that of the later it is half of the logs, from the
     # middle of all logs to that of the next scan half of them and half a scan.
-    errors = {kind: [e + shift / logs for e in found] for kind, found in later.items()}
-    common = median(fmean(x * x for x in e) for e in errors.values()) if errors else 1.0
+    shift *= 1.0 + 1.0 / logs
     medians = {kind: median(times) for kind, times in samples.items()}
-    spread = {
-        kind: _spread(times, medians[kind], errors.get(kind, []), common)
+    # About their median, n times of a Laplace distribution are apart by n - 1/2 of its scale.
+    off = {
+        kind: sum(abs(_log(x) - _log(medians[kind])) for x in times) / (len(times) - 0.5)
         for kind, times in samples.items()
     }
-    drift = math.expm1(abs(shift) * (1.0 + 1.0 / logs))
+    common = fmean([off[kind] for kind, times in samples.items() if len(times) > 1] or [1.0])
+    spread = {
+        kind: _spread(times, off[kind], common, sure * shift) for kind, times in samples.items()
+    }
     update = {f"{kind}_s": round(x, _DECIMALS) for kind, x in medians.items()}
-    told = {"source": source, "drift": round(drift, _DECIMALS), "spread": spread}
+    told = {"source": source, "drift": round(math.expm1(abs(shift)), _DECIMALS), "spread": spread}
     return before.model_copy(update={**update, **told})
+
+
+def _log(time: float) -> float:
+    return math.log(time + _FLOOR_S)
 
 
 def _later(times: Times) -> list[float]:
     """Logarithms of the later half of the times over the median of the earlier half, scaled."""
     half = (len(times) + 1) // 2
-    middle = median(times[:half])
-    scale = math.sqrt(1.0 + 1.0 / half)
-    return [math.log((x + _FLOOR_S) / (middle + _FLOOR_S)) / scale for x in times[half:]]
+    middle, scale = _log(median(times[:half])), math.sqrt(1.0 + 1.0 / half)
+    return [(_log(x) - middle) / scale for x in times[half:]]
 
 
-def _spread(times: Times, middle: float, errors: Times, common: float) -> Spread:
-    """5 % and 95 % of the next time of a kind."""
-    from scipy.special import stdtrit
-
-    freedom = BORROWED_TIMES + len(errors)
-    square = (BORROWED_TIMES * common + sum(e * e for e in errors)) / freedom
-    reach = float(stdtrit(freedom, 1.0 - _TAIL)) * math.sqrt(square * (1.0 + 1.0 / len(times)))
-    factor = math.exp(reach)
-    low, high = np.quantile(times, (_TAIL, 1.0 - _TAIL), method="weibull")
-    low = min(float(low), (middle + _FLOOR_S) / factor - _FLOOR_S)
-    high = max(float(high), (middle + _FLOOR_S) * factor - _FLOOR_S)
+def _spread(times: Times, own: float, common: float, shift: float) -> Spread:
+    """5 % and 95 % of the next time of a kind, with its own and the common scale, and a drift."""
+    n = len(times)
+    scale = (BORROWED_TIMES * common + (n - 1) * own) / (BORROWED_TIMES + n - 1)
+    beyond = scale * max(0.0, -math.log(_TAIL * (n + 1))) * math.sqrt(1.0 + 1.0 / n**2)
+    low, high = np.quantile([_log(x) for x in times], (_TAIL, 1.0 - _TAIL), method="weibull")
+    low, high = low - beyond + min(0.0, shift), high + beyond + max(0.0, shift)
     place = 10.0**_DECIMALS
     return Spread(
-        p5_s=math.floor(max(0.0, low) * place) / place,
-        p95_s=min(math.ceil(high * place) / place, MAX_TIME_S),
-        n=len(times),
+        p5_s=math.floor(max(0.0, math.exp(low) - _FLOOR_S) * place) / place,
+        p95_s=min(math.ceil((math.exp(high) - _FLOOR_S) * place) / place, MAX_TIME_S),
+        n=n,
     )
 
 

@@ -1,0 +1,153 @@
+"""`flexdt job watch`: a client that calibrates while a job scans beads, and ends it in time.
+
+Each frame is fetched over the wire as soon as it is there and fed to the online calibration. Once
+that has an estimate, the server fits the data set as it is by then, as `flexdt calibrate` does, and
+only that fit ends the job. It looks twice, with the phantom's body subtracted, so its sigmas are
+smaller than the online ones, by a factor that is much the same a few frames later. It is asked
+again when the online sigmas times that factor meet what was asked, and not before an eighth more
+frames are there.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import PurePath
+from typing import Any, Final
+
+import numpy as np
+
+from flexdt.clients import FINAL_STATES, JobStatus, TwinClient
+from flexdt.extending import Answer, Twin, argument, assignments, note, option
+from flexdt.phantoms import load_phantom
+from flexdt.twin.calibration import SIX, bead_model, detect_beads
+from flexdt.twin.calibration.fit.priors import prior_widths
+from flexdt.twin.calibration.pipeline import detector_for
+from flexdt.twin.errors import UnknownNameError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.machine.description import builtin_machine, profile_of
+from flexdt_extensions.online import Online, begin, feed, require_estimated
+
+POLL_S: Final = 0.2
+
+
+@dataclass(frozen=True)
+class Watched:
+    """How a watched job ended.
+
+    Attributes:
+        job: its last status.
+        frames: that were looked at.
+        sigmas: of the last fit that was asked for, edge units; None where it offers none.
+        reached: whether that fit met what was asked, and the job was ended for it.
+    """
+
+    job: JobStatus
+    frames: int
+    sigmas: Mapping[str, float | None]
+    reached: bool
+
+
+def watch(
+    client: TwinClient,
+    phantom: str,
+    tolerance: Mapping[str, float],
+    job: str | None = None,
+    *,
+    free: Sequence[str] = SIX,
+    priors: Mapping[str, float] | None = None,
+    tell: Callable[[Online], object] = lambda state: None,
+) -> Watched:
+    """End a job once a calibration from its frames is sure enough.
+
+    Args:
+        client: of the twin that runs it; it need not be in control.
+        phantom: that is scanned; one that ships.
+        tolerance: parameter -> sigma that is enough, edge units.
+        job: which; the current one if left out.
+        free: parameters to estimate.
+        priors: as of `flexdt calibrate`; None: the machine's, or the assumed ones of a machine that
+            does not ship.
+        tell: called with the estimate after each frame.
+
+    Raises:
+        TwinError: there is no such phantom, a tolerance is for what is not estimated, or for none.
+    """
+    require_estimated(free, tolerance)
+    model = bead_model(load_phantom(phantom))
+    state = begin(model, free, priors=_machine_priors(client) if priors is None else priors)
+    sigmas: dict[str, float | None] = {}
+    due, goal = 0, dict.fromkeys(tolerance, math.inf)
+    status = client.job_status(job)
+    for name, image, row in _frames(client, status.job):
+        pose = Poses.from_cone_vec(ConeVec(np.array([row])))
+        state = feed(state, pose, detect_beads(image, detector_for(model, pose)))
+        tell(state)
+        seen = len(state.detections)
+        if state.fit is None or seen < due or not state.done(goal):
+            continue
+        fit = client.fit_calibration([name], phantom, free, priors=priors)
+        sigmas = {n: p.sigma for n, p in fit.parameters.items() if n in tolerance}
+        if all((s := sigmas.get(n)) is not None and s <= most for n, most in tolerance.items()):
+            words = ", ".join(f"{n} {s:.3g} of {tolerance[n]:g}" for n, s in sigmas.items())
+            reason = f"sigmas reached after {seen} frames: {words}"
+            return Watched(client.abort_job(status.job, reason), seen, sigmas, True)
+        due, now = seen + 1 + seen // 8, state.sigmas()
+        goal = {n: most * now[n] / (sigmas.get(n) or now[n]) for n, most in tolerance.items()}
+    return Watched(client.job_status(status.job), len(state.detections), sigmas, False)
+
+
+def _frames(client: TwinClient, job: str) -> Iterator[tuple[str, Any, Any]]:
+    """Data set, line integrals and nominal cone_vec of each projection, until the job ends.
+
+    Of a scan of more than 2000 images, the wire tells as many that are spread evenly.
+    """
+    seen = set[int]()
+    while True:
+        status = client.job_status(job)
+        if status.state != "queued" and status.dataset:
+            name = PurePath(status.dataset).name
+            plan = client.dataset(name, 2000)
+            for i, kind, there in zip(plan.indices, plan.kinds, plan.present, strict=True):
+                if kind == "projection" and there and i not in seen:
+                    seen.add(i)
+                    image, what = client.dataset_frame(name, i, "line_integral")
+                    yield name, image, what.cone_vec
+        if status.state in FINAL_STATES:
+            return
+        time.sleep(POLL_S)
+
+
+def _machine_priors(client: TwinClient) -> dict[str, float]:
+    try:
+        machine = builtin_machine(client.server.machine)
+    except UnknownNameError:
+        return prior_widths()
+    return prior_widths(machine, profile_of(machine))
+
+
+def watch_job(
+    twin: Twin,
+    phantom: str = argument(..., "PHANTOM"),
+    job: str | None = argument(None, "[JOB]"),
+    stop_when: str = option(..., "End the job at these sigmas (mm, deg).", metavar="P=SIGMA,..."),
+) -> Answer:
+    """End a scan of beads once its calibration is sure enough.
+
+    PHANTOM is what is scanned. JOB: the current one if left out. The data set stays, says why it
+    ended, and calibrates as far as it goes. A job whose sigmas are not reached runs to its end.
+    """
+    wanted = assignments(stop_when.split(","))
+
+    def tell(state: Online) -> None:
+        now = ", ".join(f"{n} {state.sigmas().get(n, 0):.3g}" for n in wanted)
+        note(f"frame {len(state.detections)}: {now}")
+
+    with twin() as client:
+        found = watch(client, phantom, wanted, job, tell=tell)
+    yield {**asdict(found), "job": found.job.model_dump()}
+    met = "reached" if found.reached else "not reached"
+    yield f"{found.job.job}: {found.job.state}, {found.frames} frames seen; the sigmas are {met}"
