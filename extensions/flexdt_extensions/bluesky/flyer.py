@@ -34,7 +34,6 @@ from ophyd_async.core import (
     AsyncStageable,
     AsyncStatus,
     Device,
-    StreamResourceDataProvider,
     WatchableAsyncStatus,
     WatcherUpdate,
     soft_signal_r_and_setter,
@@ -45,7 +44,7 @@ from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import Machine, Profile, builtin_machine, profile_of
 from flexdt.twin.script import ScanRequest, compose_script, parse_script, plan_script
 from flexdt_extensions.bluesky.axes import LimitsExceeded
-from flexdt_extensions.bluesky.camera_device import tiff_stream
+from flexdt_extensions.bluesky.camera_device import Announcements, tiff_stream
 from flexdt_extensions.bluesky.lab_connection import LabConnection
 
 
@@ -145,10 +144,11 @@ class TwinFlyer(
     ) -> None:
         self._link, self._machine, self._profile = link, machine, profile
         self._prepared: _Prepared | None = None
-        self._images: StreamResourceDataProvider | None = None
+        self._images: Announcements | None = None
         self._written, self._set_written = soft_signal_r_and_setter(int, 0)
         self.job: JobStatus | None = None
-        # A pause or stop in the middle of a submission waits for the job that it is for.
+        # A pause or stop in the middle of a submission waits for the job that it is for, and a
+        # preparation that is replayed after a pause comes after the first.
         self._submitting = asyncio.Lock()
         self.frames = FrameEvents(self)
         super().__init__(name=name)
@@ -174,18 +174,19 @@ class TwinFlyer(
             LimitsExceeded: the twin would not run it; says the lines.
             TwinError: the request cannot be composed, or the images are not one series.
         """
-        await self._link.connect()
-        machine, profile = self._scanner()
-        script = value.script
-        if isinstance(script, ScanRequest):
-            script = compose_script(script, machine, profile)
-        text = script.encode("utf-8") if isinstance(script, str) else script
-        report = await self._link.client.check_script(text)
-        if not report.ok:
-            raise _refused(report)
-        self._prepared = _planned(value, text, report, machine, profile)
-        self._images, self.job = None, None
-        self._set_written(0)
+        async with self._submitting:
+            await self._link.connect()
+            machine, profile = self._scanner()
+            script = value.script
+            if isinstance(script, ScanRequest):
+                script = compose_script(script, machine, profile)
+            text = script.encode("utf-8") if isinstance(script, str) else script
+            report = await self._link.client.check_script(text)
+            if not report.ok:
+                raise _refused(report)
+            self._prepared = _planned(value, text, report, machine, profile)
+            self._images, self.job = None, None
+            self._set_written(0)
 
     @AsyncStatus.wrap
     async def kickoff(self) -> None:
