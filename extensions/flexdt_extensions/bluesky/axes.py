@@ -10,11 +10,10 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 from bluesky.protocols import Location
 from ophyd_async.core import (
-    CALCULATE_TIMEOUT,
-    CalculatableTimeout,
     MovableLogic,
     SignalR,
     SignalRW,
@@ -168,12 +167,10 @@ class TwinAxis(ReadBeforeDescribed, StandardReadable, StandardMovable[float]):
         self.setpoint = member("target", lambda v: client.move({axis: v}), unit)
         super().__init__(name=name)
 
-    def set(
-        self, new_position: float, timeout: CalculatableTimeout = CALCULATE_TIMEOUT
-    ) -> WatchableAsyncStatus[float]:
+    def set(self, new_position: float, *more: Any, **options: Any) -> WatchableAsyncStatus[float]:
         """Move there, unless `stop` comes first."""
         self.movable_logic.stopped = False
-        return super().set(new_position, timeout)
+        return super().set(new_position, *more, **options)
 
     async def locate(self) -> Location[float]:
         """Target and position, from the newest state that is known.

@@ -51,7 +51,8 @@ def fly_scan(
             declared = None
             while declared is None:
                 declared = yield from bps.declare_stream(device, name=name, collect=True)
-                declared = declared or not live  # a simulator answers nothing
+                if not live:
+                    break  # nothing answers a simulator
         started = yield from bps.kickoff(flyer)
         while not (yield from _done(started)):
             pass

@@ -141,7 +141,7 @@ class ReadBeforeDescribed(AsyncConfigurable):
 
     async def describe_configuration(self) -> dict[str, DataKey]:
         """What `read_configuration` reads."""
-        described = await super().describe_configuration()
+        described = await super().describe_configuration()  # type: ignore[safe-super]
         await self.read_configuration()  # answered after what was asked at the same time
         return described
 

@@ -211,7 +211,7 @@ class Interrupter:
                 return
             except RunEngineInterrupted:
                 if self.engine.state != "paused":
-                    raise
+                    return  # the pause came when the plan had just ended
                 time.sleep(self.current.hold_s if self.current else 0.0)
                 self.current = None
                 call = self.engine.resume
@@ -385,13 +385,14 @@ class Study:
     """Where everything stands before each run."""
     messages: dict[str, int] = field(default_factory=dict)
     reference: dict[str, Images] = field(default_factory=dict)
+    documents: dict[str, Documents] = field(default_factory=dict)
 
     def learn(self, plan: str) -> list[str]:
         """Run a plan undisturbed, once; what is wrong even then."""
         if plan in self.messages:
             return []
         interrupter, documents = self._run(Drawn(plan, "max", []))
-        self.messages[plan] = interrupter.total
+        self.messages[plan], self.documents[plan] = interrupter.total, documents
         self.reference[plan] = images_of(documents)
         return problems_of(documents, PLANS[plan])
 
@@ -449,8 +450,7 @@ def begin(address: tuple[str, int], images: Path) -> Study:
     return Study(engine, lab, beam, scene)
 
 
-def main(runs: int, seed: int, only: str | None) -> None:
-    plans = [only] if only else list(PLANS)
+def main(runs: int, seed: int, plans: Sequence[str]) -> None:
     met: Counter[tuple[str, str]] = Counter()
     valid: Counter[str] = Counter()
     began = time.monotonic()
@@ -482,6 +482,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--plan", choices=list(PLANS))
+    parser.add_argument("--plans", nargs="+", choices=list(PLANS), default=list(PLANS))
     given = parser.parse_args()
-    main(given.runs, given.seed, given.plan)
+    main(given.runs, given.seed, given.plans)
