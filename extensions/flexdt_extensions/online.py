@@ -225,10 +225,7 @@ class NextAngle:
 
 
 def next_angle(
-    state: Online,
-    pose: Poses,
-    candidates: npt.ArrayLike,
-    tolerance: Mapping[str, float],
+    state: Online, pose: Poses, candidates: npt.ArrayLike, tolerance: Mapping[str, float]
 ) -> NextAngle:
     """The candidate angle after which the worst sigma, in units of its tolerance, is smallest.
 

@@ -267,11 +267,7 @@ Tell = Callable[[int, int, float], None]
 
 
 def run_batch(
-    plan: Plan,
-    out: Path,
-    workers: AbstractContextManager[Executor],
-    *,
-    tell: Tell | None = None,
+    plan: Plan, out: Path, workers: AbstractContextManager[Executor], *, tell: Tell | None = None
 ) -> dict[str, Any]:
     """Compute the missing items of a batch.
 

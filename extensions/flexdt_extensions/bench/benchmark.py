@@ -35,10 +35,7 @@ def listing() -> list[str]:
 
 
 def run_bench(
-    *,
-    only: Sequence[str] = (),
-    with_peers: bool = True,
-    tell: Tell = lambda line: None,
+    *, only: Sequence[str] = (), with_peers: bool = True, tell: Tell = lambda line: None
 ) -> Document:
     """Measure and return the benchmark document.
 

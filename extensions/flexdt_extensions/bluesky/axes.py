@@ -92,15 +92,6 @@ class AxisLogic(MovableLogic[float]):
                  "last_free": dict(first.last_free)},
             )  # fmt: skip
 
-    async def calculate_timeout(self, old_position: float, new_position: float) -> float | None:
-        """None: the twin's clock may run slowly, and it always ends a motion."""
-        return None
-
-    async def get_units_precision(self) -> tuple[str | None, int | None]:
-        """Unit, and digits for people."""
-        state = self.link.state or await self.link.fresh()
-        return state.axes[self.axis].unit, 4
-
     async def move(self, new_position: float, timeout: TimeoutCalculator) -> None:
         """Move there.
 

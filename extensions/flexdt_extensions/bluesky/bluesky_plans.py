@@ -18,11 +18,7 @@ FRAMES = "frames"
 
 
 def fly_scan(
-    flyer: TwinFlyer,
-    scan: FlyScan,
-    *,
-    md: Mapping[str, Any] | None = None,
-    flush_s: float = 0.5,
+    flyer: TwinFlyer, scan: FlyScan, *, md: Mapping[str, Any] | None = None, flush_s: float = 0.5
 ) -> MsgGenerator[str]:
     """One smooth scan as a run; its images are announced while it goes on.
 

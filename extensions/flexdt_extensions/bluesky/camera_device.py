@@ -31,7 +31,6 @@ from ophyd_async.core import (
     PathProvider,
     ReadableDataProvider,
     SignalDataProvider,
-    SignalDict,
     SignalR,
     SignalRW,
     StandardDetector,
@@ -80,11 +79,7 @@ class Announcements(StreamResourceDataProvider):
 
 
 def tiff_stream(
-    data_key: str,
-    folder: PurePath,
-    template: str,
-    shape: tuple[int, int],
-    written: SignalR[int],
+    data_key: str, folder: PurePath, template: str, shape: tuple[int, int], written: SignalR[int]
 ) -> Announcements:
     """What announces files as they appear.
 
@@ -150,9 +145,6 @@ class _Triggering(DetectorTriggerLogic):
 
     def config_sigs(self) -> set[SignalR[float]]:
         return self.config
-
-    def get_deadtime(self, config_values: SignalDict) -> float:
-        return 0.0
 
     async def prepare_internal(self, num: int, livetime: float, deadtime: float) -> None:
         if livetime > 0:

@@ -235,15 +235,13 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
 
     async def get_reading(self) -> Reading[_T]:
         """The value now."""
-        return _reading(self._get(await self._link.fresh()))
+        return _reading(await self.get_value())
 
     async def get_value(self) -> _T:
         """The value now."""
         return self._get(await self._link.fresh())
 
-    async def get_setpoint(self) -> _T:
-        """The value that was last requested."""
-        return self._get(await self._link.fresh())
+    get_setpoint = get_value
 
     def set_callback(self, callback: Callable[[Reading[_T]], None] | None) -> None:
         """Subscribe a callback to changes."""

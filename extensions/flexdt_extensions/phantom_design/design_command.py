@@ -19,9 +19,7 @@ from flexdt.extending import (
     table,
     triple,
 )
-from flexdt.extending import (
-    position as place,
-)
+from flexdt.extending import position as place
 
 
 def design(

@@ -19,12 +19,7 @@ from flexdt.twin.errors import UnknownNameError
 from flexdt.twin.geometry.conventions import FloatArray, from_unity
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
-from flexdt_extensions.studies.thesis_tables import (
-    author,
-    placements,
-    projection_counts,
-    thesis,
-)
+from flexdt_extensions.studies.thesis_tables import author, placements, projection_counts, thesis
 
 SHAPE: Final = (760, 956)
 """Detector (rows, cols) of the thesis's experiments."""

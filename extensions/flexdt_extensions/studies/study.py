@@ -24,13 +24,7 @@ from flexdt_extensions.studies.basin import (
     cells,
     success_grid,
 )
-from flexdt_extensions.studies.experiments import (
-    EXPERIMENTS,
-    NOISE_PX,
-    VARIANTS,
-    WorkUnit,
-    tasks,
-)
+from flexdt_extensions.studies.experiments import EXPERIMENTS, NOISE_PX, VARIANTS, WorkUnit, tasks
 from flexdt_extensions.studies.experiments import FIDELITIES as ALL_FIDELITIES
 from flexdt_extensions.studies.runs import Run, point_runs, summary
 from flexdt_extensions.studies.thesis_tables import author
