@@ -211,9 +211,9 @@ _SOURCE: Final = "-y dS_x, z dS_y"
 _DETECTOR: Final = "-y dD_x, z dD_y, x dD_z, v det_yaw, u det_pitch, w det_roll"
 _STAGE: Final = ("-y dO_x, z dO_y, x dO_z, -y tau_x, x tau_z", "-w alpha")
 _OBJECT: Final = "-y axis_tilt_x, x axis_tilt_z, -u tau_x, -v tau_z"
-"""Along or about which axis of the scenario each parameter acts, in their order. A tilt is about our
-+x, which is the scenario's -y, then about our +y, its +x; the object's own frame lies tau beside
-the axis it turns about."""
+"""Along or about which axis of the scenario each parameter acts, in their order. A tilt is about
+our +x, which is the scenario's -y, then about our +y, its +x; the object's own frame lies tau
+beside the axis it turns about."""
 
 
 class _Deviations:
