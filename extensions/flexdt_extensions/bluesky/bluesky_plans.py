@@ -8,7 +8,7 @@ from typing import Any
 
 import bluesky.plan_stubs as bps
 import bluesky.preprocessors as bpp
-from bluesky.utils import MsgGenerator
+from bluesky.utils import Msg, MsgGenerator
 
 from flexdt_extensions.bluesky.flyer import FlyScan, TwinFlyer
 
@@ -66,6 +66,22 @@ def fly_scan(
     run = bpp.run_wrapper(inner(), md=start)  # type: ignore[no-untyped-call]
     uid: str = yield from bpp.stage_wrapper(run, [flyer])  # type: ignore[no-untyped-call]
     return uid
+
+
+def checkpoint_before_close(plan: MsgGenerator[Any]) -> MsgGenerator[Any]:
+    """For `RunEngine.preprocessors`: after a run's end an interruption repeats nothing of it.
+
+    The RunEngine sets no checkpoint when a run ends, and would measure the last point once more.
+    """
+
+    def close(message: Msg) -> tuple[MsgGenerator[Any] | None, None]:
+        return (both(message) if message.command == "close_run" else None), None
+
+    def both(message: Msg) -> MsgGenerator[Any]:
+        yield from bps.checkpoint()
+        return (yield message)
+
+    return bpp.plan_mutator(plan, close)  # type: ignore[no-any-return, no-untyped-call]
 
 
 def _done(status: Any, seconds: float | None = None) -> MsgGenerator[bool]:

@@ -140,11 +140,11 @@ class Roll:
 class _Triggering(DetectorTriggerLogic):
     """Exposure and number of images."""
 
-    def __init__(self, exposure_ms: SignalRW[float], config: set[SignalR[float]]) -> None:
-        self.exposure_ms, self.config, self.images = exposure_ms, config, 1
+    def __init__(self, exposure_ms: SignalRW[float]) -> None:
+        self.exposure_ms, self.images = exposure_ms, 1
 
     def config_sigs(self) -> set[SignalR[float]]:
-        return self.config
+        return {self.exposure_ms}
 
     async def prepare_internal(self, num: int, livetime: float, deadtime: float) -> None:
         if livetime > 0:
@@ -236,7 +236,7 @@ class TwinCamera(ReadBeforeDescribed, StandardDetector):
         )  # fmt: skip
         super().__init__(name=name)
         self._roll = roll = Roll()
-        self._triggering = _Triggering(self.exposure_ms, {self.exposure_ms})
+        self._triggering = _Triggering(self.exposure_ms)
         self._files = _Files(link, where, roll)
         self._staging: AsyncStatus[None] | None = None
         self.add_detector_logics(

@@ -335,9 +335,7 @@ class TwinFlyer(
     def _scanner(self) -> tuple[Machine, Profile]:
         server = self._link.client.server
         machine = builtin_machine(server.machine) if self._machine is None else self._machine
-        if self._profile is not None:
-            return machine, self._profile
-        return machine, profile_of(machine, server.profile)
+        return machine, self._profile or profile_of(machine, server.profile)
 
 
 def _planned(

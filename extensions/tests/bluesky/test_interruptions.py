@@ -16,6 +16,7 @@ import bluesky.plans as bp
 import pytest
 from bluesky.run_engine import call_in_bluesky_event_loop as drive
 from bluesky.simulators import summarize_plan
+from bluesky.utils import IllegalMessageSequence, RunEngineInterrupted
 from bluesky_interruptions import (
     PLANS,
     Documents,
@@ -59,6 +60,28 @@ def test_a_suspension_before_each_message_in_turn(study: Study) -> None:
         drawn = Drawn("count", "max", [Interruption("suspender", message, 0.0, 0.0)])
         found, met = study.try_(drawn)
         assert (found, len(met)) == ([], 1), met
+
+
+def test_a_pause_after_a_runs_end(study: Study) -> None:
+    """Between `close_run` and `unstage`; without the preprocessor the RunEngine measures again."""
+    engine = study.engine
+
+    def pause(name: str, document: dict[str, Any]) -> None:
+        if name == "stop":  # this is the engine's loop, which waits for no other thread
+            engine.loop.create_task(engine._request_pause_coro())
+
+    def run() -> None:
+        with pytest.raises(RunEngineInterrupted):
+            engine(PLANS["count"].make(study.lab), pause)
+        engine.resume()
+
+    run()
+    left = engine.preprocessors.pop()
+    try:
+        with pytest.raises(IllegalMessageSequence, match="without an open run"):
+            run()
+    finally:
+        engine.preprocessors.append(left)
 
 
 def test_the_validator_sees_what_is_wrong(study: Study) -> None:

@@ -42,7 +42,7 @@ from flexdt.clients.launch.processes import Servers
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.script.compose import ScanRequest
 from flexdt_extensions.bluesky import FlyScan, TwinLab
-from flexdt_extensions.bluesky.bluesky_plans import fly_scan
+from flexdt_extensions.bluesky.bluesky_plans import checkpoint_before_close, fly_scan
 
 START = {"tra_obj": 0.0, "mag_obj": 600.0, "rot_obj": 5.0, "mag_det": 1000.0}
 TURN = ScanRequest(
@@ -447,6 +447,7 @@ def begin(address: tuple[str, int], images: Path) -> Study:
     with init_devices():
         lab = TwinLab(StaticPathProvider(UUIDFilenameProvider(), images), *address, name="lab")
     engine.install_suspender(SuspendBoolHigh(beam))
+    engine.preprocessors.append(checkpoint_before_close)
     return Study(engine, lab, beam, scene)
 
 
