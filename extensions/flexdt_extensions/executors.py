@@ -30,16 +30,8 @@ from flexdt.extending import CommandError, package
 from flexdt.twin.errors import TwinError
 from flexdt_extensions.toml_files import problems_of, read_toml
 
-SINGLE: Final[Mapping[str, str]] = dict.fromkeys(
-    (
-        "NUMBA_NUM_THREADS",
-        "OMP_NUM_THREADS",
-        "OPENBLAS_NUM_THREADS",
-        "MKL_NUM_THREADS",
-        "VECLIB_MAXIMUM_THREADS",
-    ),
-    "1",
-)
+_NUMBERED: Final = ("NUMBA_NUM", "OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "VECLIB_MAXIMUM")
+SINGLE: Final[Mapping[str, str]] = {f"{name}_THREADS": "1" for name in _NUMBERED}
 """Environment of workers that share a machine: one thread each, so sums have one order."""
 
 SCHEDULER_S = 10.0

@@ -1,10 +1,15 @@
-"""`flexdt bench`: runs the project's own benchmarks, which are a separate program."""
+"""`flexdt bench`: runs the project's own benchmarks."""
 
 from __future__ import annotations
 
+import json
+import os
 from pathlib import Path
 
-from flexdt.extending import Json, become, names, option
+from flexdt.extending import Answer, CommandError, names, option
+
+WRONG = 2
+"""Exit code of wrong options."""
 
 
 def bench(
@@ -15,9 +20,38 @@ def bench(
     device: bool = option(
         False, "Measure a CUDA device against its targets and ASTRA.", "--device"
     ),
-    json: Json = False,
-) -> None:
+) -> Answer:
     """Measure speed and accuracy, beside the peers that are installed."""
-    given = {"out": out, "no-peers": no_peers, "list": list_, "device": device}
-    more = [] if only is None else ["--only", *names(only)]
-    become("flexdt_extensions.bench", {**given, "json": json}, more)
+    from flexdt.measuring import gpu
+    from flexdt_extensions.bench.benchmark import case_names, listing, run_bench, to_stderr
+    from flexdt_extensions.bench.device_page import page, run_device_bench
+
+    if list_:
+        yield case_names()
+        yield from listing()
+        return
+    wanted = [] if only is None else names(only)
+    if unknown := [name for name in wanted if name not in case_names()]:
+        known = ", ".join(case_names())
+        raise CommandError(f"no case {', '.join(unknown)}; there are: {known}", WRONG)
+    text, name = "", "bench"
+    if device:
+        found = gpu.availability()
+        if not found.present:
+            raise CommandError(f"--device needs a CUDA device: {found.reason}", WRONG)
+        document = run_device_bench(to_stderr)
+        text, name = page(document), "device"
+    else:
+        # Here and in the processes that this one starts.
+        os.environ["NUMBA_DISABLE_CUDA"] = "1"
+        with gpu.switched_off():
+            document = run_bench(only=wanted, with_peers=not no_peers, tell=to_stderr)
+    yield document
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / f"{name}.json").write_text(json.dumps(document, indent=1) + "\n", "utf-8")
+        if text:
+            (out / "device.md").write_text(text + "\n", "utf-8")
+        to_stderr(f"wrote {name}.json into {out}")
+    elif text:
+        yield text

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -133,55 +134,35 @@ def peer_cases() -> list[Case]:
 
 def untuned_cases() -> list[Case]:
     """Cases nobody tuned for: exact, and without a cliff in speed."""
-    s = BINNED
-    sod, sdd = 40.0, 80.0
-
-    def case(
-        name: str,
-        shape: tuple[int, int, int],
-        geometry: ConeVec,
-        what: str,
-        voxel: float | tuple[float, float, float] = 0.1,
-    ) -> Case:
-        return Case(name, lambda: noise(shape, voxel), geometry, s, False, what)
-
+    s, cube, strong = BINNED, (256, 256, 256), (45.0, 45.0, 45.0)
     # 60 degrees across the detector's diagonal.
-    wide = 2 * math.tan(math.radians(30)) * sdd / math.hypot(*s)
-    cube = (256, 256, 256)
-    strong = (45.0, 45.0, 45.0)
-    return [
-        Case("ball", lambda: ball(512), circle(1, s), s, False, "a ball in empty 512^3"),
-        case("cone-60", cube, circle(1, s, sod=sod, sdd=sdd, pitch=wide), "60 degree cone"),
-        case(
-            "cone-60-tilt",
-            cube,
-            circle(1, s, sod=sod, sdd=sdd, pitch=wide, tilt_deg=TILT_DEG),
-            "and tilt",
-        ),
-        case("tilt-45", C1_SHAPE, circle(1, s, tilt_deg=strong), "three tilts of 45 degrees"),
-        case("roll-90", C1_SHAPE, circle(1, s, tilt_deg=LYING), "C1, detector on its side"),
-        case(
-            "roll-90-tilt",
-            C1_SHAPE,
-            circle(1, s, tilt_deg=(LYING[0] + TILT_DEG[0], *TILT_DEG[1:])),
-            "and tilted",
-        ),
-        case("near", cube, circle(1, s, sod=19.2, sdd=60.0, pitch=0.08), "source 1 mm off the box"),
-        case("flat", (4, 1024, 1024), circle(1, s, height=100.0), "4 slices of 1024^2, from above"),
-        case("long", (2000, 32, 32), circle(1, s), "a rod 2000 voxels long"),
-        case("anisotropic", C1_SHAPE, circle(1, s), "voxels 0.1 x 0.2 x 0.05 mm", (0.1, 0.2, 0.05)),
-        # Nearly parallel rays pass no z level: what is left is walking through the voxel columns.
-        case("far", C1_SHAPE, circle(1, s, sod=FAR * SOD, sdd=FAR * SDD), "C1, 100 times as far"),
-        case("on-axis", C1_SHAPE, on_axis(s), "rays along a voxel axis, tilted"),
-        Case(
-            "C1x1000",
-            lambda: noise(C1_SHAPE),
-            circle(1000, (95, 120), pitch=1.2),
-            (95, 120),
-            False,
-            "1000 views of 120 x 95 pixels in one call",
-        ),
+    wide = 2 * math.tan(math.radians(30)) * 80.0 / math.hypot(*s)
+    cone: dict[str, Any] = {"sod": 40.0, "sdd": 80.0, "pitch": wide}
+    aslant = (LYING[0] + TILT_DEG[0], *TILT_DEG[1:])
+    near, small = {"sod": 19.2, "sdd": 60.0, "pitch": 0.08}, (95, 120)
+    # Nearly parallel rays pass no z level: what is left is walking through the voxel columns.
+    far = {"sod": FAR * SOD, "sdd": FAR * SDD}
+    rows: list[tuple[str, tuple[int, int, int], dict[str, Any], str]] = [
+        ("cone-60", cube, cone, "60 degree cone"),
+        ("cone-60-tilt", cube, cone | {"tilt_deg": TILT_DEG}, "and tilt"),
+        ("tilt-45", C1_SHAPE, {"tilt_deg": strong}, "three tilts of 45 degrees"),
+        ("roll-90", C1_SHAPE, {"tilt_deg": LYING}, "C1, detector on its side"),
+        ("roll-90-tilt", C1_SHAPE, {"tilt_deg": aslant}, "and tilted"),
+        ("near", cube, near, "source 1 mm off the box"),
+        ("flat", (4, 1024, 1024), {"height": 100.0}, "4 slices of 1024^2, from above"),
+        ("long", (2000, 32, 32), {}, "a rod 2000 voxels long"),
+        ("far", C1_SHAPE, far, "C1, 100 times as far"),
     ]
+    c1, aniso = partial(noise, C1_SHAPE), partial(noise, C1_SHAPE, (0.1, 0.2, 0.05))
+    many = circle(1000, small, pitch=1.2)
+    return [
+        Case("ball", partial(ball, 512), circle(1, s), s, False, "a ball in empty 512^3"),
+        *(Case(name, partial(noise, shape), circle(1, s, **how), s, False, what)
+          for name, shape, how, what in rows),
+        Case("anisotropic", aniso, circle(1, s), s, False, "voxels 0.1 x 0.2 x 0.05 mm"),
+        Case("on-axis", c1, on_axis(s), s, False, "rays along a voxel axis, tilted"),
+        Case("C1x1000", c1, many, small, False, "1000 views of 120 x 95 pixels in one call"),
+    ]  # fmt: skip
 
 
 def all_cases() -> list[Case]:

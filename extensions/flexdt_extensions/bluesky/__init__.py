@@ -9,8 +9,6 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from flexdt.twin.errors import TwinError
-
 if TYPE_CHECKING:
     from flexdt_extensions.bluesky.axes import LimitsExceeded as LimitsExceeded
     from flexdt_extensions.bluesky.axes import TwinAxis as TwinAxis
@@ -38,13 +36,8 @@ __all__ = list(_HOMES)
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    try:
-        return getattr(import_module(_HOMES[name]), name)
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.startswith("flexdt"):
-            raise
-        raise TwinError(
-            f"flexdt_extensions.bluesky needs {error.name}, which is not installed: "
-            "pip install 'flexdt-extensions[lab]'",
-            {"asked": name, "missing": error.name},
-        ) from None
+    from flexdt.extending import package
+
+    for needed in ("ophyd_async.core", "bluesky"):
+        package(needed, __name__, "lab", "flexdt-extensions")
+    return getattr(import_module(_HOMES[name]), name)

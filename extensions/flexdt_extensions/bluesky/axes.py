@@ -10,7 +10,9 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
+from bluesky.protocols import Location
 from ophyd_async.core import (
     MovableLogic,
     SignalR,
@@ -19,10 +21,17 @@ from ophyd_async.core import (
     StandardReadable,
     StandardReadableFormat,
     TimeoutCalculator,
+    WatchableAsyncStatus,
 )
 
 from flexdt.clients import AxisState, State
-from flexdt_extensions.bluesky.lab_connection import LabConnection, Put, TwinBackend, settable
+from flexdt_extensions.bluesky.lab_connection import (
+    LabConnection,
+    Put,
+    ReadBeforeDescribed,
+    TwinBackend,
+    settable,
+)
 
 ARRIVED = 1e-6
 """Distance from the target at which an axis has arrived [mm, deg]."""
@@ -47,9 +56,12 @@ class AxisLogic(MovableLogic[float]):
     link: LabConnection
     axis: str
     collisions: bool
+    stopped: bool = False
+    """Whether it was stopped since the last target was set."""
 
     async def stop(self) -> None:
-        """Brake this axis."""
+        """Brake this axis; a motion that is still being checked does not begin."""
+        self.stopped = True
         await self.link.client.jog(self.axis, 0.0)
 
     async def check_move(self, new_position: float) -> None:
@@ -80,15 +92,6 @@ class AxisLogic(MovableLogic[float]):
                  "last_free": dict(first.last_free)},
             )  # fmt: skip
 
-    async def calculate_timeout(self, old_position: float, new_position: float) -> float | None:
-        """None: the twin's clock may run slowly, and it always ends a motion."""
-        return None
-
-    async def get_units_precision(self) -> tuple[str | None, int | None]:
-        """Unit, and digits for people."""
-        state = self.link.state or await self.link.fresh()
-        return state.axes[self.axis].unit, 4
-
     async def move(self, new_position: float, timeout: TimeoutCalculator) -> None:
         """Move there.
 
@@ -96,6 +99,8 @@ class AxisLogic(MovableLogic[float]):
             RpcError: a limit, a collision, a running job, or another controller.
             RuntimeError: another client stopped the axis on its way.
         """
+        if self.stopped:
+            return
         async with asyncio.timeout(timeout()):
             await self.link.client.move({self.axis: new_position})
             async for state in self.link.states():
@@ -113,7 +118,7 @@ class AxisLogic(MovableLogic[float]):
             )
 
 
-class TwinAxis(StandardReadable, StandardMovable[float]):
+class TwinAxis(ReadBeforeDescribed, StandardReadable, StandardMovable[float]):
     """One motor or virtual axis.
 
     Args:
@@ -152,6 +157,21 @@ class TwinAxis(StandardReadable, StandardMovable[float]):
             )
         self.setpoint = member("target", lambda v: client.move({axis: v}), unit)
         super().__init__(name=name)
+
+    def set(self, new_position: float, *more: Any, **options: Any) -> WatchableAsyncStatus[float]:
+        """Move there, unless `stop` comes first."""
+        self.movable_logic.stopped = False
+        return super().set(new_position, *more, **options)
+
+    async def locate(self) -> Location[float]:
+        """Target and position, from the newest state that is known.
+
+        Nothing is awaited while the twin's states arrive: Bluesky loses the answer to a message
+        that is interrupted, and its relative plans then take the axis to be at 0.
+        """
+        axis = (await self._link.known()).axes[self._axis]
+        at = axis.position
+        return Location(setpoint=at if axis.target is None else axis.target, readback=at)
 
     @cached_property
     def movable_logic(self) -> AxisLogic:

@@ -6,26 +6,31 @@ them as stream resources. For data sets that the twin itself writes, see `flyer`
 One image is in each file, and files are numbered. The documents follow bluesky's own convention for
 image sequences (mimetype `multipart/related;type=image/tiff`, a `template`, one frame in each
 chunk), so its consolidators and Tiled find the files.
+
+After a pause or a suspension the RunEngine triggers again what it had triggered since the last
+checkpoint, without a word to the detector. An image that no document names is then replaced.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import AsyncIterator, Sequence
 from pathlib import Path, PurePath
 from typing import Final
 from urllib.parse import quote
 
 import numpy as np
 import numpy.typing as npt
+from bluesky.protocols import StreamAsset
+from event_model import StreamDatum
 from ophyd_async.core import (
+    AsyncStatus,
     DetectorAcquireLogic,
     DetectorDataLogic,
     DetectorTriggerLogic,
     PathProvider,
     ReadableDataProvider,
     SignalDataProvider,
-    SignalDict,
     SignalR,
     SignalRW,
     StandardDetector,
@@ -37,7 +42,7 @@ from ophyd_async.core import (
 )
 
 from flexdt.extending import tiff_bytes, write_whole
-from flexdt_extensions.bluesky.lab_connection import LabConnection, settable
+from flexdt_extensions.bluesky.lab_connection import LabConnection, ReadBeforeDescribed, settable
 
 MIMETYPE: Final = "multipart/related;type=image/tiff"
 
@@ -47,9 +52,35 @@ def folder_uri(folder: PurePath) -> str:
     return f"file://localhost{quote(folder.as_posix())}/"
 
 
+class Announcements(StreamResourceDataProvider):
+    """What announces files as they appear, and knows which of its documents were emitted.
+
+    The RunEngine collects documents when it reads a detector and emits them with the event. If it
+    is interrupted in between, it drops them. It completes those that it emits, which shows here.
+    """
+
+    _last: StreamDatum | None = None
+
+    def count(self) -> int:
+        """How many events' images the emitted documents name; what was dropped is due again."""
+        if self._last is not None and not self._last["descriptor"]:
+            self.last_emitted, self._last = self._last["indices"]["start"], None
+        return self.last_emitted
+
+    async def make_stream_docs(
+        self, collections_written: int, collections_per_event: int
+    ) -> AsyncIterator[StreamAsset]:
+        """Announce what has been written since."""
+        self.count()
+        async for asset in super().make_stream_docs(collections_written, collections_per_event):
+            if asset[0] == "stream_datum":
+                self._last = asset[1]
+            yield asset
+
+
 def tiff_stream(
     data_key: str, folder: PurePath, template: str, shape: tuple[int, int], written: SignalR[int]
-) -> StreamResourceDataProvider:
+) -> Announcements:
     """What announces files as they appear.
 
     Args:
@@ -68,7 +99,7 @@ def tiff_stream(
         parameters={"template": template, "join_method": "concat"},
         source=uri,
     )
-    return StreamResourceDataProvider(uri, [resource], MIMETYPE, written)
+    return Announcements(uri, [resource], MIMETYPE, written)
 
 
 class Roll:
@@ -80,14 +111,20 @@ class Roll:
         self.written, self._set_written = soft_signal_r_and_setter(int, 0)
         self.mean, self._set_mean = soft_signal_r_and_setter(float, 0.0)
         self.count = 0
+        self.turn = asyncio.Lock()
+        """Held while a trigger takes its images: one that was interrupted goes on to its end."""
 
     def load(self, folder: PurePath, filename: str) -> None:
         """Begin a new series."""
         self.folder = Path(folder)
         self.folder.mkdir(parents=True, exist_ok=True)
         self.template = f"{filename}_{{:06d}}.tif"
-        self.count = 0
-        self._set_written(0)
+        self.rewind(0)
+
+    def rewind(self, count: int) -> None:
+        """Keep that many images; the next replaces what came after."""
+        self.count = count
+        self._set_written(count)
 
     async def keep(self, image: npt.NDArray[np.generic]) -> None:
         """Write an image of counts."""
@@ -103,14 +140,11 @@ class Roll:
 class _Triggering(DetectorTriggerLogic):
     """Exposure and number of images."""
 
-    def __init__(self, exposure_ms: SignalRW[float], config: set[SignalR[float]]) -> None:
-        self.exposure_ms, self.config, self.images = exposure_ms, config, 1
+    def __init__(self, exposure_ms: SignalRW[float]) -> None:
+        self.exposure_ms, self.images = exposure_ms, 1
 
     def config_sigs(self) -> set[SignalR[float]]:
-        return self.config
-
-    def get_deadtime(self, config_values: SignalDict) -> float:
-        return 0.0
+        return {self.exposure_ms}
 
     async def prepare_internal(self, num: int, livetime: float, deadtime: float) -> None:
         if livetime > 0:
@@ -136,7 +170,8 @@ class _Acquiring(DetectorAcquireLogic):
         pass  # `start_acquiring` returns with the last image
 
     async def ensure_stopped(self) -> None:
-        pass
+        async with self.roll.turn:
+            pass
 
 
 class _Files(DetectorDataLogic):
@@ -144,14 +179,19 @@ class _Files(DetectorDataLogic):
 
     def __init__(self, link: LabConnection, where: PathProvider, roll: Roll) -> None:
         self.link, self.where, self.roll = link, where, roll
+        self.announcements: Announcements | None = None
 
     async def prepare_unbounded(self, datakey_name: str) -> StreamableDataProvider:
         info = self.where(datakey_name)
         self.roll.load(info.directory_path, info.filename)
         shape = (await self.link.fresh()).camera.shape
-        return tiff_stream(
+        self.announcements = tiff_stream(
             datakey_name, info.directory_path, self.roll.template, shape, self.roll.written
         )
+        return self.announcements
+
+    async def stop(self) -> None:
+        self.announcements = None
 
 
 class _Mean(DetectorDataLogic):
@@ -170,7 +210,7 @@ class _Mean(DetectorDataLogic):
         return [datakey_name]
 
 
-class TwinCamera(StandardDetector):
+class TwinCamera(ReadBeforeDescribed, StandardDetector):
     """The camera.
 
     Counts come as the panel gives them: X-rays off make a dark image.
@@ -195,12 +235,29 @@ class TwinCamera(StandardDetector):
             get=lambda state: " ".join(map(str, state.camera.roi)),
         )  # fmt: skip
         super().__init__(name=name)
-        roll = Roll()
-        triggering = _Triggering(self.exposure_ms, {self.exposure_ms})
+        self._roll = roll = Roll()
+        self._triggering = _Triggering(self.exposure_ms)
+        self._files = _Files(link, where, roll)
+        self._staging: AsyncStatus[None] | None = None
         self.add_detector_logics(
-            triggering, _Acquiring(link, triggering, roll), _Files(link, where, roll), _Mean(roll)
+            self._triggering, _Acquiring(link, self._triggering, roll), self._files, _Mean(roll)
         )
         self.add_config_signals(self.averages, self.mode, self.roi)
+
+    def stage(self) -> AsyncStatus[None]:
+        """Be ready for a new run."""
+        self._staging = super().stage()
+        return self._staging
+
+    @AsyncStatus.wrap
+    async def trigger(self) -> None:  # type: ignore[override]
+        """Take an image, in place of one that no document names."""
+        if self._staging is not None:
+            await self._staging  # the RunEngine does not wait for it again after an interruption
+        async with self._roll.turn:
+            if self._files.announcements is not None:
+                self._roll.rewind(self._files.announcements.count() * self._triggering.images)
+            await super().trigger()
 
 
 def _edges(text: str) -> tuple[int, int, int, int]:

@@ -23,10 +23,10 @@ from flexdt.twin.machine.description import Machine, builtin_machine
 from flexdt_extensions.bluesky.axes import TwinAxis
 from flexdt_extensions.bluesky.camera_device import TwinCamera
 from flexdt_extensions.bluesky.flyer import TwinFlyer
-from flexdt_extensions.bluesky.lab_connection import LabConnection, settable
+from flexdt_extensions.bluesky.lab_connection import LabConnection, ReadBeforeDescribed, settable
 
 
-class TwinTube(StandardReadable):
+class TwinTube(ReadBeforeDescribed, StandardReadable):
     """The X-ray tube.
 
     Args:

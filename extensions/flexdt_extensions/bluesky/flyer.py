@@ -11,8 +11,7 @@ import asyncio
 import hashlib
 import re
 import time
-import weakref
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Any
@@ -28,13 +27,12 @@ from bluesky.protocols import (
     StreamAsset,
     WritesStreamAssets,
 )
-from event_model import DataKey, PartialEvent
+from event_model import DataKey, Dtype, PartialEvent
 from ophyd_async.core import (
     AsyncConfigurable,
     AsyncStageable,
     AsyncStatus,
     Device,
-    StreamResourceDataProvider,
     WatchableAsyncStatus,
     WatcherUpdate,
     soft_signal_r_and_setter,
@@ -45,7 +43,7 @@ from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import Machine, Profile, builtin_machine, profile_of
 from flexdt.twin.script import ScanRequest, compose_script, parse_script, plan_script
 from flexdt_extensions.bluesky.axes import LimitsExceeded
-from flexdt_extensions.bluesky.camera_device import tiff_stream
+from flexdt_extensions.bluesky.camera_device import Announcements, tiff_stream
 from flexdt_extensions.bluesky.lab_connection import LabConnection
 
 
@@ -87,12 +85,13 @@ class FrameEvents(Device, EventCollectable):
     """
 
     def __init__(self, flyer: TwinFlyer) -> None:
-        self._flyer = weakref.ref(flyer)  # a device kept as a member would become a child
+        # A device that is kept as a member would become a child.
+        self._flyer: Callable[[], TwinFlyer] = lambda: flyer
         super().__init__()
 
     async def describe_collect(self) -> dict[str, DataKey]:
         """Angle of the stage in the middle of the image, and the planned start of its exposure."""
-        flyer = self._of()
+        flyer = self._flyer()
         source = flyer.source("script.check")
         return {
             f"{flyer.name}-{key}": DataKey(
@@ -103,17 +102,12 @@ class FrameEvents(Device, EventCollectable):
 
     def collect(self) -> Iterator[PartialEvent]:
         """One event for each image that is complete."""
-        flyer = self._of()
+        flyer = self._flyer()
         name = flyer.name
         for angle, start in flyer.taken():
             now = time.time()
             data = {f"{name}-angle_deg": angle, f"{name}-time_s": start}
             yield PartialEvent(data=data, timestamps=dict.fromkeys(data, now), time=now)
-
-    def _of(self) -> TwinFlyer:
-        flyer = self._flyer()
-        assert flyer is not None, "a flyer outlives its events"
-        return flyer
 
 
 class TwinFlyer(
@@ -145,10 +139,11 @@ class TwinFlyer(
     ) -> None:
         self._link, self._machine, self._profile = link, machine, profile
         self._prepared: _Prepared | None = None
-        self._images: StreamResourceDataProvider | None = None
+        self._images: Announcements | None = None
         self._written, self._set_written = soft_signal_r_and_setter(int, 0)
         self.job: JobStatus | None = None
-        # A pause or stop in the middle of a submission waits for the job that it is for.
+        # A pause or stop in the middle of a submission waits for the job that it is for, and a
+        # preparation that is replayed after a pause comes after the first.
         self._submitting = asyncio.Lock()
         self.frames = FrameEvents(self)
         super().__init__(name=name)
@@ -174,18 +169,19 @@ class TwinFlyer(
             LimitsExceeded: the twin would not run it; says the lines.
             TwinError: the request cannot be composed, or the images are not one series.
         """
-        await self._link.connect()
-        machine, profile = self._scanner()
-        script = value.script
-        if isinstance(script, ScanRequest):
-            script = compose_script(script, machine, profile)
-        text = script.encode("utf-8") if isinstance(script, str) else script
-        report = await self._link.client.check_script(text)
-        if not report.ok:
-            raise _refused(report)
-        self._prepared = _planned(value, text, report, machine, profile)
-        self._images, self.job = None, None
-        self._set_written(0)
+        async with self._submitting:
+            await self._link.connect()
+            machine, profile = self._scanner()
+            script = value.script
+            if isinstance(script, ScanRequest):
+                script = compose_script(script, machine, profile)
+            text = script.encode("utf-8") if isinstance(script, str) else script
+            report = await self._link.client.check_script(text)
+            if not report.ok:
+                raise _refused(report)
+            self._prepared = _planned(value, text, report, machine, profile)
+            self._images, self.job = None, None
+            self._set_written(0)
 
     @AsyncStatus.wrap
     async def kickoff(self) -> None:
@@ -296,36 +292,30 @@ class TwinFlyer(
 
     async def describe_configuration(self) -> dict[str, DataKey]:
         """What `read_configuration` reads."""
-        ready = self._ready()
-        source = self.source("script.check")
-
-        def key(dtype: Any, shape: list[int | None], kind: str, units: str | None) -> DataKey:
-            made = DataKey(dtype=dtype, shape=shape, source=source, dtype_numpy=kind)
-            if units is not None:
-                made["units"] = units
-            return made
-
-        return {
-            f"{self.name}-frames": key("integer", [], "<i8", None),
-            f"{self.name}-exposure_ms": key("number", [], "<f8", "ms"),
-            f"{self.name}-duration_s": key("number", [], "<f8", "s"),
-            f"{self.name}-angles_deg": key("array", [len(ready.angles_deg)], "<f8", "deg"),
-            f"{self.name}-script_sha256": key("string", [], "|S64", None),
-        }
+        source, keys = self.source("script.check"), dict[str, DataKey]()
+        for name, (value, dtype, numpy, units) in self._settings().items():
+            shape: list[int | None] = [len(value)] if isinstance(value, list) else []
+            key = DataKey(dtype=dtype, shape=shape, source=source, dtype_numpy=numpy)
+            keys[f"{self.name}-{name}"] = key if units is None else {**key, "units": units}
+        return keys
 
     async def read_configuration(self) -> dict[str, Reading[Any]]:
         """The scan: frames, exposure, expected duration, angle of each image, script."""
-        ready, now = self._ready(), time.time()
-        values: dict[str, object] = {
-            "frames": ready.report.frames,
-            "exposure_ms": ready.exposure_ms,
-            "duration_s": ready.report.duration_s,
-            "angles_deg": list(ready.angles_deg),
-            "script_sha256": hashlib.sha256(ready.text).hexdigest(),
-        }
+        now = time.time()
         return {
-            f"{self.name}-{key}": Reading(value=value, timestamp=now)
-            for key, value in values.items()
+            f"{self.name}-{name}": Reading(value=setting[0], timestamp=now)
+            for name, setting in self._settings().items()
+        }
+
+    def _settings(self) -> dict[str, tuple[Any, Dtype, str, str | None]]:
+        """Value, type and unit by name."""
+        ready = self._ready()
+        return {
+            "frames": (ready.report.frames, "integer", "<i8", None),
+            "exposure_ms": (ready.exposure_ms, "number", "<f8", "ms"),
+            "duration_s": (ready.report.duration_s, "number", "<f8", "s"),
+            "angles_deg": (list(ready.angles_deg), "array", "<f8", "deg"),
+            "script_sha256": (hashlib.sha256(ready.text).hexdigest(), "string", "|S64", None),
         }
 
     # -- helpers -------------------------------------------------------------------------------
@@ -345,8 +335,7 @@ class TwinFlyer(
     def _scanner(self) -> tuple[Machine, Profile]:
         server = self._link.client.server
         machine = builtin_machine(server.machine) if self._machine is None else self._machine
-        profile = profile_of(machine, server.profile) if self._profile is None else self._profile
-        return machine, profile
+        return machine, self._profile or profile_of(machine, server.profile)
 
 
 def _planned(

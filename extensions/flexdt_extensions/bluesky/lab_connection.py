@@ -18,7 +18,7 @@ from typing import Any, Generic, TypeVar, cast
 import numpy as np
 from bluesky.protocols import Reading
 from event_model import DataKey, Dtype, Limits
-from ophyd_async.core import NotConnectedError, SignalBackend, SignalRW
+from ophyd_async.core import AsyncConfigurable, NotConnectedError, SignalBackend, SignalRW
 
 from flexdt.clients import ConnectionLost, RpcError, State, Transport
 from flexdt.clients.client.async_client import AsyncTwinClient
@@ -94,6 +94,12 @@ class LabConnection:
             self._pump = asyncio.create_task(self._listen(), name="flexdt-lab")
         return state
 
+    async def known(self) -> State:
+        """The newest state that has arrived; requested where states do not arrive any more."""
+        if self.state is None or self._pump is None or self._pump.done():
+            return await self.fresh()
+        return self.state
+
     def watch(self, watcher: Watcher) -> Callable[[], None]:
         """Call `watcher` with every new state; the returned function ends that."""
         self._watchers.append(watcher)
@@ -129,6 +135,20 @@ class LabConnection:
         self.state = state
         for watcher in list(self._watchers):
             watcher(state)
+
+
+class ReadBeforeDescribed(AsyncConfigurable):
+    """A device whose configuration is read whole before it is described.
+
+    Bluesky asks for both at once and takes what has been described for read, also where it was
+    interrupted in between.
+    """
+
+    async def describe_configuration(self) -> dict[str, DataKey]:
+        """What `read_configuration` reads."""
+        described = await super().describe_configuration()  # type: ignore[safe-super]
+        await self.read_configuration()  # answered after what was asked at the same time
+        return described
 
 
 Value = bool | int | float | str
@@ -220,7 +240,7 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
 
     async def get_reading(self) -> Reading[_T]:
         """The value now."""
-        return _reading(self._get(await self._link.fresh()))
+        return _reading(await self.get_value())
 
     async def get_value(self) -> _T:
         """The value now."""

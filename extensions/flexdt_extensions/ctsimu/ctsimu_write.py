@@ -9,7 +9,6 @@ the panel must be the same in all frames.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -19,7 +18,7 @@ from flexdt import DataSet
 from flexdt.clients.datasets.exchange import geometry_of
 from flexdt.twin.exchange import SAME_MM, ExchangeError, require_panel
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.geometry.offsets import NOMINAL, UNITS, Offsets
 from flexdt.twin.geometry.poses import Poses
 
 TO_CTSIMU: Final = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -139,12 +138,12 @@ def scenario_document(scan: Scenario) -> dict[str, Any]:
         "environment": {"material_id": None, "temperature": None},
         "geometry": {
             "detector": _part(
-                poses.detector - origin, u / pitch_u, np.cross(u, v), pairs.detector()
+                poses.detector - origin, u / pitch_u, np.cross(u, v), pairs.of(_DETECTOR)
             ),
             "source": {
                 "type": "cone",
                 "beam_divergence": None,
-                **_part(poses.source - origin, right, ahead, pairs.source()),
+                **_part(poses.source - origin, right, ahead, pairs.of(_SOURCE)),
             },
             "stage": _part(
                 poses.axis - origin,
@@ -208,59 +207,41 @@ def _stage_motion(angles_deg: FloatArray) -> tuple[float, float, str, list[dict[
     return start, stop, direction, [_drifting_turn(rest, True, "motors")] if uneven else []
 
 
+_SOURCE: Final = "-y dS_x, z dS_y"
+_DETECTOR: Final = "-y dD_x, z dD_y, x dD_z, v det_yaw, u det_pitch, w det_roll"
+_STAGE: Final = ("-y dO_x, z dO_y, x dO_z, -y tau_x, x tau_z", "-w alpha")
+_OBJECT: Final = "-y axis_tilt_x, x axis_tilt_z, -u tau_x, -v tau_z"
+"""Along or about which axis of the scenario each parameter acts, in their order. A tilt is about
+our +x, which is the scenario's -y, then about our +y, its +x; the object's own frame lies tau
+beside the axis it turns about."""
+
+
 class _Deviations:
     """Deviations of all parameters: the known amount, then what is added to it unknown."""
 
     def __init__(self, known: Offsets, real: Offsets) -> None:
         self._known, self._real = known.to_edge(), real.to_edge()
 
-    def source(self) -> list[dict[str, Any]]:
-        return [*self._shift("y", "dS_x", sign=-1.0), *self._shift("z", "dS_y")]
-
-    def detector(self) -> list[dict[str, Any]]:
-        return [
-            *self._shift("y", "dD_x", sign=-1.0),
-            *self._shift("z", "dD_y"),
-            *self._shift("x", "dD_z"),
-            *self._turn("v", "det_yaw"),
-            *self._turn("u", "det_pitch"),
-            *self._turn("w", "det_roll"),
-        ]
-
-    def stage(
-        self, motion: Sequence[dict[str, Any]], angles_deg: FloatArray
-    ) -> list[dict[str, Any]]:
-        out = [
-            *self._shift("y", "dO_x", sign=-1.0),
-            *self._shift("z", "dO_y"),
-            *self._shift("x", "dO_z"),
-            *self._shift("y", "tau_x", sign=-1.0),
-            *self._shift("x", "tau_z"),
-            *motion,
-            *self._turn("w", "alpha", sign=-1.0),
-        ]
-        for known, amount in self._amounts("angle_scale", 1.0):
-            out.append(_drifting_turn(-amount * angles_deg, known, "angle_scale"))
-        # About our +x, which is the scenario's -y, then about our +y, its +x.
-        out += self._turn("y", "axis_tilt_x", sign=-1.0)
-        out += self._turn("x", "axis_tilt_z")
-        # The object's own frame lies tau beside the axis it turns about.
-        out += self._shift("u", "tau_x", sign=-1.0)
-        out += self._shift("v", "tau_z", sign=-1.0)
-        return out
+    def stage(self, motion: list[dict[str, Any]], angles_deg: FloatArray) -> list[dict[str, Any]]:
+        scale = [_drifting_turn(-amount * angles_deg, known, "angle_scale")
+                 for known, amount in self._amounts("angle_scale", 1.0)]  # fmt: skip
+        moved, turned = (self.of(part) for part in _STAGE)
+        return [*moved, *motion, *turned, *scale, *self.of(_OBJECT)]
 
     def _amounts(self, name: str, nominal: float = 0.0) -> list[tuple[bool, float]]:
         known = self._known[name] - nominal
         return [(k, a) for k, a in ((True, known), (False, self._real[name] - self._known[name]))
                 if a != 0.0]  # fmt: skip
 
-    def _shift(self, axis: str, name: str, sign: float = 1.0) -> list[Any]:
-        return [_deviation("translation", axis, _mm(sign * a), k, name)
-                for k, a in self._amounts(name)]  # fmt: skip
-
-    def _turn(self, axis: str, name: str, sign: float = 1.0) -> list[Any]:
-        return [_deviation("rotation", axis, _deg(sign * a), k, name)
-                for k, a in self._amounts(name)]  # fmt: skip
+    def of(self, parameters: str) -> list[dict[str, Any]]:
+        """The deviations of a table of axes and parameters."""
+        out = []
+        for axis, name in (pair.split() for pair in parameters.split(", ")):
+            turn, sign = UNITS[name] == "deg", -1.0 if axis.startswith("-") else 1.0
+            kind, amount = ("rotation", _deg) if turn else ("translation", _mm)
+            for known, value in self._amounts(name):
+                out.append(_deviation(kind, axis[-1], amount(sign * value), known, name))
+        return out
 
 
 def _deviation(

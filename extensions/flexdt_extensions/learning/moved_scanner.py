@@ -19,7 +19,7 @@ from flexdt.twin.errors import CollisionError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
-from flexdt.twin.machine.description import Machine, builtin_machine, profile_of
+from flexdt.twin.machine.description import builtin_machine, profile_of
 from flexdt.twin.motion.profiles import move
 from flexdt.twin.scanner.scanner import ScannerTwin
 
@@ -87,16 +87,10 @@ class Lab:
     Args:
         size_mm: of the box around the sample, for collisions.
         exposure_s: of each frame.
-        machine: None is the FleX-ray.
     """
 
-    def __init__(
-        self,
-        size_mm: tuple[float, float, float],
-        exposure_s: float = 0.5,
-        machine: Machine | None = None,
-    ) -> None:
-        self.machine = builtin_machine() if machine is None else machine
+    def __init__(self, size_mm: tuple[float, float, float], exposure_s: float = 0.5) -> None:
+        self.machine = builtin_machine()
         profile = profile_of(self.machine)
         guard = SceneGuard(build_scene(self.machine, profile, (box(size_mm),)))
         self.scanner = ScannerTwin(self.machine, profile, guard=guard)

@@ -70,12 +70,11 @@ def play(env: ScanEnv, policy: Policy, seed: int) -> Episode:
     rewards: list[float] = []
     infos: list[dict[str, Any]] = []
     targets: list[dict[str, float]] = []
-    collided = done = False
-    while not done:
+    collided = cut = False
+    while not (collided or cut):
         action = policy(env, len(rewards))
         targets.append(env.targets(action))
         _, reward, collided, cut, info = env.step(action)
         rewards.append(float(reward))
         infos.append(info)
-        done = collided or cut
     return Episode(tuple(rewards), tuple(infos), tuple(targets), collided)

@@ -23,8 +23,6 @@ from flexdt.twin.geometry.conventions import FloatArray
 
 MOST_BRICKS: Final = 20
 MOST_STUDS: Final = 8
-HEIGHTS: Final = ("rim", "middle", "roof")
-"""Where in a brick a seat is: just above the studs below, half way up, against the roof."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,12 +32,10 @@ class Seats:
     Attributes:
         places: (m, 3) bead centres [mm, object frame].
         brick: (m,) number of the brick, 0 the lowest.
-        height: (m,) index into HEIGHTS.
     """
 
     places: FloatArray
     brick: npt.NDArray[np.int64]
-    height: npt.NDArray[np.int64]
 
     def __len__(self) -> int:
         return len(self.places)
@@ -83,31 +79,22 @@ def seats_of(work: Brickwork, radius_mm: float) -> Seats:
     for n, h in zip(work.studs, half, strict=True):
         pitched = np.arange(1 - n, n) * step  # those inside the walls, and the walls
         along.append(np.append(pitched[np.abs(pitched) <= h + 1e-9], [-h, h]))
-    rows: list[tuple[float, float, float, int]] = []
+    rows: list[tuple[float, float, float]] = []
     for x in along[0]:
         for y in along[1]:
             at_wall = math.isclose(abs(x), half[0]) or math.isclose(abs(y), half[1])
             near = np.linalg.norm(tubes_at(work) - [x, y], axis=1)
             if (near < v["tube_outer_diameter_mm"] / 2.0 + radius_mm - 1e-9).any():
                 continue
-            rows += [
-                (float(x), float(y), z, level)
-                for level, z in enumerate(levels)
-                if at_wall or level == len(levels) - 1
-            ]
+            rows += [(float(x), float(y), z) for z in (levels if at_wall else levels[-1:])]
     if not rows or roof < levels[0]:
         raise LimitError(
             f"a bead of radius {radius_mm:g} mm does not fit into the cavity of a brick",
             {"asked": radius_mm, "allowed": (roof + radius_mm - v["stud_height_mm"]) / 2.0},
         )
-    local = np.array(rows)
-    count = len(local)
-    places = np.concatenate([local[:, :3] + [0.0, 0.0, work.floor(b)] for b in range(work.bricks)])
-    return Seats(
-        places,
-        np.repeat(np.arange(work.bricks), count),
-        np.tile(local[:, 3].astype(np.int64), work.bricks),
-    )
+    local, count = np.array(rows), len(rows)
+    places = np.concatenate([local + [0.0, 0.0, work.floor(b)] for b in range(work.bricks)])
+    return Seats(places, np.repeat(np.arange(work.bricks), count))
 
 
 def stack_phantom(

@@ -14,8 +14,8 @@ import pytest
 from device_simulator import run_simulated
 from loaded_script import load
 
+from flexdt.clients.cli.entry import run as run_command
 from flexdt.twin.projection import forward, gpu
-from flexdt_extensions.bench import __main__ as command
 from flexdt_extensions.bench import benchmark as run
 from flexdt_extensions.bench.cases import (
     Case,
@@ -84,8 +84,7 @@ def test_document_has_the_published_shape(small) -> None:
 
 
 def test_json_goes_to_standard_output_alone(small, monkeypatch, capsys, tmp_path) -> None:
-    monkeypatch.setattr(sys, "argv", ["bench", "--json", "--only", "C1", "--out", str(tmp_path)])
-    command.main()
+    assert run_command(["bench", "--json", "--only", "C1", "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr()
     assert json.loads(printed.out)["cases"][0]["name"] == "C1"
     assert "C1" in printed.err
@@ -132,11 +131,11 @@ def test_a_page_keeps_what_was_not_run_again(small, monkeypatch, tmp_path) -> No
         further_bench, "growth_with_threads", lambda: [{"series": "level", "x": 1, "ms": 7.5}]
     )
     further = ["--no-peers", "--only", "growth-threads"]
+    words = ["bench", "--out", str(tmp_path / "out")]
     for main, arguments in (
-        (command.main, ["--only", "C1"]),
-        (further_bench.main, further),
-    ):
-        monkeypatch.setattr(sys, "argv", ["bench", "--out", str(tmp_path / "out"), *arguments])
+        (lambda: run_command(sys.argv), ["--only", "C1"]), (further_bench.main, further)
+    ):  # fmt: skip
+        monkeypatch.setattr(sys, "argv", [*words, *arguments])
         main()
         document = str(tmp_path / "out" / "bench.json")
         monkeypatch.setattr(sys, "argv", ["bench_page.py", document, "--page", str(page)])
@@ -265,25 +264,23 @@ def test_no_peers_means_none(small) -> None:
     assert not document["cases"][0]["peers"]
 
 
-def test_the_list_names_every_case(monkeypatch, capsys) -> None:
-    monkeypatch.setattr(sys, "argv", ["bench", "--list"])
-    command.main()
+def test_the_list_names_every_case(capsys) -> None:
+    assert run_command(["bench", "--list"]) == 0
     listed = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in listed] == run.case_names()
 
 
 @pytest.mark.skipif(gpu.availability().present, reason="this machine has a device")
-def test_the_page_of_a_device_needs_one(monkeypatch, capsys) -> None:
-    monkeypatch.setattr(sys, "argv", ["bench", "--device"])
-    with pytest.raises(SystemExit):
-        command.main()
+def test_the_page_of_a_device_needs_one(capsys) -> None:
+    assert run_command(["bench", "--device"]) == 2
     assert "--device needs a CUDA device: no CUDA driver" in capsys.readouterr().err
 
 
 DEVICE = """
 import sys, json
 from pathlib import Path
-from flexdt_extensions.bench import __main__ as command, device_page
+from flexdt.clients.cli import main
+from flexdt_extensions.bench import device_page
 from flexdt.twin.projection import gpu
 from flexdt.twin.projection.kernels import gpu_array_kernels, gpu_kernels
 from flexdt.twin.reconstruction import gpu_fdk_kernels
@@ -301,8 +298,7 @@ real = device_page.on_the_clock
 device_page.on_the_clock = lambda work, rounds=1: real(work, 1)
 device_page.by_events = real  # the simulator has no clock of its own
 device_page.astra_ms = lambda volume, scan, algorithm: 1.0 if algorithm == "FP3D_CUDA" else None
-sys.argv = ["bench", "--device", "--out", sys.argv[1]]
-command.main()
+main(["bench", "--device", "--out", sys.argv[1]])
 """
 
 

@@ -9,7 +9,6 @@ from flexdt.phantoms import PhantomError
 from flexdt.phantoms.bricks import Brickwork, lego_phantom
 from flexdt.twin.errors import LimitError
 from flexdt_extensions.phantom_design.seats import (
-    HEIGHTS,
     grid_seats,
     seats_of,
     stack_of,
@@ -54,7 +53,9 @@ def test_no_seat_lies_in_plastic_and_each_touches_some() -> None:
         assert not plastic(work, place + 0.999 * directions).any(), place
         assert plastic(work, place + 1.02 * axes).any(), place
     assert set(seats.brick.tolist()) == set(range(5))
-    assert set(seats.height.tolist()) == set(range(len(HEIGHTS)))
+    floors = np.array([work.floor(brick) for brick in range(5)])
+    levels = np.round(seats.places[:, 2] - floors[seats.brick], 6)
+    assert len(set(levels.tolist())) == 3  # just above the studs, half way up, against the roof
 
 
 def test_stack_is_the_thesis_phantom_but_for_its_beads() -> None:
