@@ -25,6 +25,7 @@ from flexdt.twin.calibration.without_phantom.mirror_symmetry import (
     first_column,
     sharpness,
 )
+from flexdt.twin.calibration.without_phantom.opposite_rays import OppositeRays
 from flexdt.twin.calibration.without_phantom.plane_pairs import PlanePairs, without
 from flexdt.twin.calibration.without_phantom.source_row import find_height
 from flexdt.twin.calibration.without_phantom.turn import Image, Turn, read_turn
@@ -167,7 +168,8 @@ class _System:
         return float((self.weight[:, None] * np.square(rest)).sum())
 
 
-FREE: Final = ("dO_x", "det_roll", "det_yaw")
+FREE: Final = ("dO_x", "det_roll", "det_yaw", "dD_z")
+"""Of these the last is not told, but adds to what opposite rays leave open."""
 UNTOLD: Final[Mapping[str, str]] = {
     "SOD": "an object twice as large at twice the distance gives the same images; a phantom of "
     "known size tells it",
@@ -179,6 +181,30 @@ UNTOLD: Final[Mapping[str, str]] = {
 }
 """What a circular scan, or this method, cannot tell, and why."""
 
+NOWHERE: Final = (
+    "the images are symmetric about no column within {:.0f} px of the nominal one ({:.1f}): the axis "
+    "is elsewhere, or too much of the object is out of view"
+)
+ELSEWHERE: Final = (
+    "the images are about as symmetric about another column as about {:.1f} (ratio {:.2f}; at least "
+    "1.5)"
+)
+DISAGREE: Final = (
+    "{:.1f} % of what should be symmetric is not (at most 5 %): something does not turn with the "
+    "stage, or the angles or the object change during the scan"
+)
+UNCERTAIN: Final = (
+    "the column would be known to {:.2g} px and the roll to {:.2g} deg; allowed: 2 px and 0.5 deg "
+    "(more views or light help)"
+)
+FEW_ROWS: Final = (
+    "{} tells no roll: the correction keeps what was in force, +- {:.2g} deg; a full turn with more "
+    "rows tells it"
+)
+BAND: Final = 12
+"""Rows above and below the source's plane that are read for opposite rays."""
+MOST_VIEWS: Final = 1440
+"""Of more views every second, third and so on is used for opposite rays."""
 STANDS: Final = 0.05
 """Source and panel may move so far between frames, seen from the axis [px]."""
 LEAST_RATIO: Final = 1.5
@@ -286,12 +312,11 @@ def _align(
 ) -> Alignment:  # fmt: skip
     _refuse_if(len(present) == 0, "no frame is there")
     pose = _standing(poses, present)
-    turn = read_turn(image, base.angle_scale * poses.angle, present)
     rows, cols = shape
     middle = np.array([(cols - 1) / 2, (rows - 1) / 2])
 
     def offsets(values: FloatArray) -> Offsets:
-        return replace(base, **dict(zip(FREE, values.tolist(), strict=True)))
+        return replace(base, **dict(zip(FREE, values.tolist(), strict=False)))
 
     def view(values: FloatArray) -> FloatArray:
         return np.asarray(_about_axis(pose, offsets(values)).rows[0])
@@ -301,21 +326,25 @@ def _align(
 
     start = np.array([getattr(base, name) for name in FREE])
     pitch, sdd = float(np.linalg.norm(pose.u[0])), float(pose.sdd[0])
-    scales = np.array([pitch * float(pose.sod[0]) / sdd, 2 / rows, 2 * sdd / (pitch * cols**2)])
+    ends = 2 * sdd / cols
+    scales = np.array([pitch * float(pose.sod[0]) / sdd, 2 / rows, ends / (pitch * cols), ends])
     sideways = math.atan(priors["dD_x"] / sdd)
     yaw = max(math.hypot(math.radians(priors["det_yaw"]), sideways), 1e-9)
+    known = np.array([math.inf, math.radians(priors["det_roll"]), yaw, priors["dD_z"]])
+    try:
+        turn = read_turn(image, base.angle_scale * poses.angle, present)
+    except NotIdentifiableError as whole:
+        try:
+            return _by_rays(
+                image, poses, present, shape, offsets, seen, start, scales, known, random
+            )
+        except NotIdentifiableError as error:
+            raise NotIdentifiableError(f"{whole.message}; {error.message}") from whole
+    start, scales = start[:3], scales[:3]
     nominal = seen(start)
     column, ratio = first_column(turn.mean, nominal)
-    _refuse_if(
-        ratio == 0.0,
-        f"the mean is symmetric about no column within {REACH * cols:.0f} px of the nominal one "
-        f"({nominal:.1f}): the axis is elsewhere, or too much of the object is out of view",
-    )
-    _refuse_if(
-        ratio < LEAST_RATIO,
-        f"the mean is about as symmetric about another column as about {column:.1f} (ratio "
-        f"{ratio:.2f}; at least {LEAST_RATIO:g})",
-    )
+    _refuse_if(ratio == 0.0, NOWHERE.format(REACH * cols, nominal))
+    _refuse_if(ratio < LEAST_RATIO, ELSEWHERE.format(column, ratio))
     start[0] += (column - nominal) / _slopes(seen, start, scales)[0]
     found = find_symmetry(turn, view, start, scales, np.array([math.inf, math.inf, yaw]))
     _refuse_if(
@@ -323,12 +352,7 @@ def _align(
         "no plane of symmetry is found: too little structure for the noise, or too few columns on "
         "both sides of the axis",
     )
-    _refuse_if(
-        found.asymmetry > MOST_ASYMMETRY,
-        f"{100 * found.asymmetry:.1f} % of the mean is not symmetric (at most "
-        f"{100 * MOST_ASYMMETRY:g} %): something does not turn with the stage, or the angles or "
-        "the object change during the scan",
-    )
+    _refuse_if(found.asymmetry > MOST_ASYMMETRY, DISAGREE.format(100 * found.asymmetry))
     step = (0.0, 0.0) if turn.step_px is None else turn.step_px[0]
     covariance = found.covariance.copy()
     covariance[0, 0] += (math.hypot(FLOOR_PX, step[0] / 2) * scales[0]) ** 2
@@ -336,11 +360,7 @@ def _align(
     slopes = _slopes(seen, found.values, scales)
     sigma = math.sqrt(slopes @ covariance @ slopes)
     roll, turned = np.degrees(np.sqrt(np.diag(covariance)[1:])).tolist()
-    _refuse_if(
-        sigma > MOST_COLUMN or roll > MOST_ROLL,
-        f"the column would be known to {sigma:.2g} px and the roll to {roll:.2g} deg; allowed: "
-        f"{MOST_COLUMN:g} px and {MOST_ROLL:g} deg (more views or light help)",
-    )
+    _refuse_if(sigma > MOST_COLUMN or roll > MOST_ROLL, UNCERTAIN.format(sigma, roll))
     parameters = {
         "axis_column_px": AlignEstimate(seen(found.values), sigma, "px"),
         "det_roll": AlignEstimate(math.degrees(found.values[1]), roll, "deg"),
@@ -367,6 +387,64 @@ def _align(
             refused["motion"] = error.message
     warnings = _warnings(turn, found, len(poses) - len(present))
     return Alignment(corrected, parameters, refused, warnings, len(turn.used), motion)
+
+
+def _by_rays(
+    image: Image, poses: Poses, present: tuple[int, ...], shape: tuple[int, int],
+    offsets: Callable[[FloatArray], Offsets], seen: Callable[[FloatArray], float],
+    start: FloatArray, scales: FloatArray, known: FloatArray, random: np.random.Generator,
+) -> Alignment:  # fmt: skip
+    """What rays tell that two views see from opposite ends, near the plane of the source.
+
+    Raises:
+        NotIdentifiableError: not the column.
+    """
+    rows, cols = shape
+    scales = scales * np.array([1.0, rows / cols, 1.0, 1.0])
+    angle = offsets(start).angle_scale * poses.angle[list(present)] % (2 * np.pi)
+    order = np.array(present)[np.argsort(angle, kind="stable")][:: -(-len(present) // MOST_VIEWS)]
+    of_views = poses[order]
+
+    def views(values: FloatArray) -> FloatArray:
+        return np.asarray(_about_axis(of_views, offsets(values)).rows)
+
+    first = _about_axis(of_views[:1], offsets(start))
+    level = first.project_points([[0.0, 0.0, float(first.source[0, 2])]], shape)[0, 0]
+    lean = 2 * float(of_views.sdd[0]) / (cols * float(np.linalg.norm(of_views.u[0])))
+    _refuse_if(
+        not -lean < level[1] < rows - 1 + lean,
+        f"the source turns in the plane of row {level[1]:.0f}: rays to rows 0 to {rows - 1} lean too "
+        f"much to be those of opposite views (a region of the panel within {lean:.0f} rows of it does)",
+    )
+    top, end = np.clip(np.round(level[1]) + (-BAND, BAND + 1), (0, 1), (rows - 1, rows)).astype(int)
+    stack = np.stack([image(i)[top:end] for i in order.tolist()])
+    found, ratio = OppositeRays(stack, int(top), shape, views, start, scales, known, random).find()
+    column = seen(found.values)
+    _refuse_if(ratio == 0.0, NOWHERE.format(REACH * cols, seen(start)))
+    _refuse_if(ratio < LEAST_RATIO, ELSEWHERE.format(column, ratio))
+    _refuse_if(
+        not found.converged, "opposite rays tell no column: too little structure for the noise"
+    )
+    _refuse_if(found.asymmetry > MOST_ASYMMETRY, DISAGREE.format(100 * found.asymmetry))
+    covariance = found.covariance.copy()
+    covariance[0, 0] += (FLOOR_PX * scales[0]) ** 2
+    slopes = _slopes(seen, found.values, scales)
+    sigma = math.sqrt(slopes @ covariance @ slopes)
+    wide = np.sqrt(np.diag(covariance))
+    roll, turned = np.degrees(wide[1:3]).tolist()
+    _refuse_if(sigma > MOST_COLUMN, UNCERTAIN.format(sigma, roll))
+    parameters = {"axis_column_px": AlignEstimate(column, sigma, "px")}
+    untold = "only a full turn of more rows tells it"
+    refused = {**UNTOLD, "source_row_px": untold, "motion": untold}
+    if wide[1] < known[1] / 2:
+        parameters["det_roll"] = AlignEstimate(math.degrees(found.values[1]), roll, "deg")
+    else:
+        refused["det_roll"] = FEW_ROWS.format("one row" if rows == 1 else "few rows", roll)
+    if wide[2] < known[2] / 2:
+        parameters["det_yaw"] = AlignEstimate(math.degrees(found.values[2]), turned, "deg")
+    else:
+        refused["det_yaw"] = f"the images tell it no better than to +- {turned:.2g} deg"
+    return Alignment(offsets(found.values[:3]), parameters, refused, (), len(order))
 
 
 class _Planes:
