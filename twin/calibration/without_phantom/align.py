@@ -198,8 +198,8 @@ UNCERTAIN: Final = (
     "(more views or light help)"
 )
 FEW_ROWS: Final = (
-    "{} tells no roll: the correction keeps what was in force, +- {:.2g} deg; a full turn with more "
-    "rows tells it"
+    "{} does not tell it: the correction keeps what was in force, +- {:.2g} deg; a full turn of "
+    "more rows tells it"
 )
 BAND: Final = 12
 """Rows above and below the source's plane that are read for opposite rays."""
@@ -417,7 +417,13 @@ def _by_rays(
         f"much to be those of opposite views (a region of the panel within {lean:.0f} rows of it does)",
     )
     top, end = np.clip(np.round(level[1]) + (-BAND, BAND + 1), (0, 1), (rows - 1, rows)).astype(int)
-    stack = np.stack([image(i)[top:end] for i in order.tolist()])
+    few = end - top <= 2 * BAND
+    stack = np.stack(
+        [
+            image(i)[top:end].mean(axis=0, keepdims=True) if few else image(i)[top:end]
+            for i in order.tolist()
+        ]
+    )
     found, ratio = OppositeRays(stack, int(top), shape, views, start, scales, known, random).find()
     column = seen(found.values)
     _refuse_if(ratio == 0.0, NOWHERE.format(REACH * cols, seen(start)))
@@ -439,7 +445,7 @@ def _by_rays(
     if wide[1] < known[1] / 2:
         parameters["det_roll"] = AlignEstimate(math.degrees(found.values[1]), roll, "deg")
     else:
-        refused["det_roll"] = FEW_ROWS.format("one row" if rows == 1 else "few rows", roll)
+        refused["det_roll"] = FEW_ROWS.format(f"a panel of {rows} rows" if few else "the images", roll)
     if wide[2] < known[2] / 2:
         parameters["det_yaw"] = AlignEstimate(math.degrees(found.values[2]), turned, "deg")
     else:

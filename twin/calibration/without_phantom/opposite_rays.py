@@ -36,7 +36,7 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 MOST_PAIRS: Final = 30_000
 """Pairs of views that are used, evenly chosen of more; for the first search a tenth of them."""
-FEWEST_PAIRS: Final = 100
+FEWEST_PAIRS: Final = 50
 ROUNDS: Final = 15
 LIFT: Final = 0.25
 """Rows beside the source's plane count where a ray that leans and its opposite are so little apart
@@ -195,8 +195,10 @@ class _Level:
             longest = float(np.abs(step / rays.scales).max())
             values = values + step * min(1.0, 4.0 * self.sigma / max(longest, 1e-30))
             sigmas = np.sqrt(np.abs(np.diag(covariance)))
-            power = float((w * np.square(rest)).sum() - (w * np.square(noise)).sum())
-            done = bool((np.abs(step) <= 0.02 * sigmas + 1e-5 * rays.scales).all())
+            # Noise comes to more by chance, of few views the most.
+            chance = 1.0 + 3.0 * math.sqrt(2.0 / len(rays.frames))
+            power = float((w * (np.square(rest) - chance * np.square(noise))).sum())
+            done = bool((np.abs(step) <= 0.05 * sigmas + 1e-5 * rays.scales).all())
             asymmetry = math.sqrt(max(power, 0.0) / self.structure)
             found = Symmetry(values, covariance, sigmas, asymmetry, done)
             if done or not np.isfinite(values).all():
