@@ -203,7 +203,9 @@ def main(words: list[str] | None = None) -> int:
           f"sigma {np.median(sigma):.3f} px; in sigmas {rms:.2f} rms, {far} beyond 3")  # fmt: skip
     rolls = [run["roll"] for run in good if "roll" in run]
     if rolls:
-        print(f"roll told in {len(rolls)}: {math.sqrt(float(np.square(rolls).mean())):.2f} sigmas rms")
+        print(
+            f"roll told in {len(rolls)}: {math.sqrt(float(np.square(rolls).mean())):.2f} sigmas rms"
+        )
     if o.kind == "untold":
         return 1
     return int(far > max(1, 0.01 * len(good)) or not 0.7 < rms < 1.2)

@@ -445,7 +445,9 @@ def _by_rays(
     if wide[1] < known[1] / 2:
         parameters["det_roll"] = AlignEstimate(math.degrees(found.values[1]), roll, "deg")
     else:
-        refused["det_roll"] = FEW_ROWS.format(f"a panel of {rows} rows" if few else "the images", roll)
+        refused["det_roll"] = FEW_ROWS.format(
+            f"a panel of {rows} rows" if few else "the images", roll
+        )
     if wide[2] < known[2] / 2:
         parameters["det_yaw"] = AlignEstimate(math.degrees(found.values[2]), turned, "deg")
     else:

@@ -30,7 +30,7 @@ from flexdt.twin.calibration.without_phantom.mirror_symmetry import (
     read_spline,
 )
 from flexdt.twin.calibration.without_phantom.plane_pairs import noise_like, spread
-from flexdt.twin.calibration.without_phantom.turn import DARKEST
+from flexdt.twin.calibration.without_phantom.turn import DARKEST, MEDIAN_OF_CHI_SQUARE
 from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
@@ -180,14 +180,18 @@ class _Level:
             inside = rays._places(values, rays.pairs)[1]
             if inside.sum() < FEWEST_PAIRS:
                 break
-            rest, slopes, noise, noisy, w, sums = self._equations(values, rays.pairs[inside])
+            pairs = rays.pairs[inside]
+            rest, slopes, noise, noisy, w = self._equations(values, pairs)
             gain = (slopes * w) @ slopes.T
             alone = (noisy * w) @ noisy.T
             if not gain[0, 0] - alone[0, 0] > CLEAN * alone[0, 0]:
                 break
             information = gain - alone
-            score, parts = (slopes * w) @ rest, sums(slopes * w * rest)
-            scatter = self._scatter(parts, values, rays.pairs[inside])
+            score = (slopes * w) @ rest
+            of_pairs = (k, len(pairs), len(rays.lifts))
+            scatter = self._scatter((slopes * w * rest).reshape(of_pairs), values, pairs)
+            rings = self._rings((slopes * w).reshape(of_pairs), values, pairs)
+            scatter = scatter + rings
             kappa = scatter[0, 0] / information[0, 0]
             inverse = np.linalg.inv(information + kappa * rays.known)
             step = -inverse @ (score + kappa * rays.known @ (values - rays.start))
@@ -206,8 +210,7 @@ class _Level:
         return found
 
     def _equations(self, values: FloatArray, pairs: npt.NDArray[np.intp]):  # type: ignore[no-untyped-def]
-        """Differences (m,) and their slopes (k, m), both of noise alone, weights, and what adds up
-        the rays of each pair."""
+        """Differences (m,) and their slopes (k, m), both of noise alone, and weights."""
         places = self.rays._places(values, pairs)[0]
         both = self.read(self.images, places, pairs).reshape(2, -1)
         w = 1.0 / np.exp(np.minimum(both, DARKEST)).sum(axis=0)
@@ -230,23 +233,38 @@ class _Level:
                 slopes[which, i] = (low - high) / (2.0 * e[i])
         self.structure = max(float((w * np.square(both - np.average(both))).sum()) / 2, 1e-30)
         rest, noise = freed(both[0] - both[1]), freed(difference(self.alone, places))
-
-        def sums(parts: FloatArray) -> FloatArray:
-            return np.asarray(parts.reshape(len(parts), len(pairs), -1).sum(axis=2))
-
-        return rest, freed(slopes[0]), noise, freed(slopes[1]), w, sums
+        return rest, freed(slopes[0]), noise, freed(slopes[1]), w
 
     def _scatter(
         self, parts: FloatArray, values: FloatArray, pairs: npt.NDArray[np.intp]
     ) -> FloatArray:
-        """Covariance of sums over all pairs of parts (k, q)."""
-        own = parts - parts.mean(axis=1, keepdims=True)
+        """Covariance of sums over all rays of parts (k, q, lifts): slopes, weights, differences."""
+        sums = parts.sum(axis=2)
+        own = sums - sums.mean(axis=1, keepdims=True)
         covariance = own @ own.T
-        usual = np.maximum(np.diag(covariance), 1e-300)
         columns = self.rays._places(values, pairs)[0][:, 0]
         near = (np.abs(columns[0] - columns[1]) / (6.0 * self.sigma)).astype(np.intp)
         of_columns = np.stack([np.bincount(near, part) for part in own])
         wide = np.square(of_columns).sum(axis=1)
-        wide = np.maximum(wide, np.square(spread(parts, pairs, len(self.rays.frames))))
-        wider = np.sqrt(np.maximum(wide / usual, 1.0))
+        wide = np.maximum(wide, np.square(spread(sums, pairs, len(self.rays.frames))))
+        wider = np.sqrt(np.maximum(wide / np.maximum(np.diag(covariance), 1e-300), 1.0))
         return np.asarray(covariance * np.outer(wider, wider))
+
+    def _rings(
+        self, slopes: FloatArray, values: FloatArray, pairs: npt.NDArray[np.intp]
+    ) -> FloatArray:
+        """Covariance of what the noise of the flat field, which all frames share, adds up to, for
+        weighted slopes (k, q, lifts)."""
+        change = np.square(np.diff(self.rays.frames.mean(axis=0), 2, axis=1)) / 6
+        power = float(np.median(change)) / MEDIAN_OF_CHI_SQUARE
+        power /= max(1.0, 2.0 * math.sqrt(math.pi) * self.sigma * (len(change) > 1))
+        columns = self.rays._places(values, pairs)[0][:, 0].round().astype(np.intp)
+        size = self.rays.shape[1]
+        of_columns = np.stack(
+            [
+                np.bincount(columns[0], part, size) - np.bincount(columns[1], part, size)
+                for part in slopes.sum(axis=2)
+            ]
+        )
+        soft = gaussian_filter(of_columns, (0, self.sigma))
+        return np.asarray(power * (soft @ soft.T))
