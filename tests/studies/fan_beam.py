@@ -1,11 +1,11 @@
-"""A slice from a fan beam beside a plain compiled loop, in turns: processor seconds, and how far apart.
+"""A slice from a fan beam beside a plain compiled loop, in turns: processor seconds, and results.
 
     python tests/studies/fan_beam.py [--views 720] [--columns 512] [--rounds 5]
     NUMBA_NUM_THREADS=1 python tests/studies/fan_beam.py
 
 The loop has the weights, filter and backprojection that a textbook gives for a whole turn of a
-panel in the middle (Kak and Slaney 1988, 3.4.2), shares nothing with `twin/reconstruction`, and runs
-on one thread. Times are the least of the rounds, everything compiled, from line integrals to volume.
+panel in the middle (Kak and Slaney 1988, 3.4.2), shares nothing with `twin/reconstruction`, and
+runs on one thread. Times are the least of the rounds, all compiled, from line integrals to volume.
 """
 
 from __future__ import annotations
@@ -100,8 +100,10 @@ def main(words: list[str] | None = None) -> int:
     middle = (np.arange(o.columns) - (o.columns - 1) / 2) * voxel
     inside = np.hypot(middle[:, None], middle) < 0.45 * WIDTH * SOD / SDD
     apart = np.abs(found[0] - found[1])[inside].max() / np.abs(found[1]).max()
-    print(f"{o.columns}^2 from {o.views} views: flexdt {best[0]:.2f} CPU s with "
-          f"{numba.get_num_threads()} threads, the plain loop {best[1]:.2f}; apart by {apart:.1e}")  # fmt: skip
+    print(
+        f"{o.columns}^2 from {o.views} views: flexdt {best[0]:.2f} CPU s with "
+        f"{numba.get_num_threads()} threads, the plain loop {best[1]:.2f}; apart by {apart:.1e}"
+    )
     return int(apart > 1e-4)
 
 

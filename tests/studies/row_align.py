@@ -2,8 +2,9 @@
 
     python tests/studies/row_align.py [--count 200] [--seed 1] [--kind one_row] [--json]
 
-Every scan has a random object of ellipses, a scanner that is not where it is said to be (axis beside
-the beam by up to 2 % of the columns, panel off, turned and nearer or farther), noise of counted photons and of the flat field's, and a whole turn or half a turn and the fan. Kinds:
+Every scan has a random object of ellipses, a scanner that is not where it is said to be (axis
+beside the beam by up to 2 % of the columns; panel off, turned and nearer or farther), noise of
+counted photons and of the flat field's, and a whole turn or half a turn and the fan. Kinds:
 
 one_row: a panel of one row, at random one to three.
 symmetric: one row of objects whose density is the same after half a turn.
@@ -198,9 +199,11 @@ def main(words: list[str] | None = None) -> int:
     error, sigma = np.array([[run["error"], run["sigma"]] for run in good]).T
     pull = error / sigma
     rms, far = math.sqrt(float(np.square(pull).mean())), int((np.abs(pull) > 3).sum())
-    print(f"{o.kind}: {len(good)} of {o.count} told; error {np.sqrt(np.square(error).mean()):.3f} px "
-          f"rms (median of |error| {np.median(np.abs(error)):.3f}, largest {np.abs(error).max():.3f}), "
-          f"sigma {np.median(sigma):.3f} px; in sigmas {rms:.2f} rms, {far} beyond 3")  # fmt: skip
+    print(
+        f"{o.kind}: {len(good)} of {o.count} told; error {np.sqrt(np.square(error).mean()):.3f} px "
+        f"rms (median {np.median(np.abs(error)):.3f}, largest {np.abs(error).max():.3f}), sigma "
+        f"{np.median(sigma):.3f} px; in sigmas {rms:.2f} rms, {far} beyond 3"
+    )
     rolls = [run["roll"] for run in good if "roll" in run]
     if rolls:
         print(

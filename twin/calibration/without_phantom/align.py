@@ -182,12 +182,12 @@ UNTOLD: Final[Mapping[str, str]] = {
 """What a circular scan, or this method, cannot tell, and why."""
 
 NOWHERE: Final = (
-    "the images are symmetric about no column within {:.0f} px of the nominal one ({:.1f}): the axis "
-    "is elsewhere, or too much of the object is out of view"
+    "the images are symmetric about no column within {:.0f} px of the nominal one ({:.1f}): the "
+    "axis is elsewhere, or too much of the object is out of view"
 )
 ELSEWHERE: Final = (
-    "the images are about as symmetric about another column as about {:.1f} (ratio {:.2f}; at least "
-    "1.5)"
+    "the images are about as symmetric about another column as about {:.1f} (ratio {:.2f}; at "
+    "least 1.5)"
 )
 DISAGREE: Final = (
     "{:.1f} % of what should be symmetric is not (at most 5 %): something does not turn with the "
@@ -198,8 +198,8 @@ UNCERTAIN: Final = (
     "(more views or light help)"
 )
 FEW_ROWS: Final = (
-    "{} does not tell it: the correction keeps what was in force, +- {:.2g} deg; a full turn of "
-    "more rows tells it"
+    "{} do not tell it: the correction keeps what was in force, +- {:.2g} deg; a full turn of more "
+    "rows tells it"
 )
 BAND: Final = 12
 """Rows above and below the source's plane that are read for opposite rays."""
@@ -249,7 +249,7 @@ class Alignment:
 
     Attributes:
         offsets: the correction, all of it: what was in force with what was found; None: refused.
-        parameters: axis_column_px, det_roll and, if the images tell them, det_yaw and
+        parameters: axis_column_px and, if the images tell them, det_roll, det_yaw and
             source_row_px [px, deg].
         refused: name -> why it is not given.
         warnings: what is doubtful about the scan.
@@ -266,7 +266,7 @@ class Alignment:
 
     @property
     def identifiable(self) -> bool:
-        """Whether axis column and roll are given."""
+        """Whether the axis column is given."""
         return self.offsets is not None
 
 
@@ -413,17 +413,13 @@ def _by_rays(
     lean = 2 * float(of_views.sdd[0]) / (cols * float(np.linalg.norm(of_views.u[0])))
     _refuse_if(
         not -lean < level[1] < rows - 1 + lean,
-        f"the source turns in the plane of row {level[1]:.0f}: rays to rows 0 to {rows - 1} lean too "
-        f"much to be those of opposite views (a region of the panel within {lean:.0f} rows of it does)",
+        f"the source turns in the plane of row {level[1]:.0f}: rays to rows 0 to {rows - 1} lean "
+        f"too much to be those of opposite views; allowed are regions within {lean:.0f} rows of it",
     )
     top, end = np.clip(np.round(level[1]) + (-BAND, BAND + 1), (0, 1), (rows - 1, rows)).astype(int)
-    few = end - top <= 2 * BAND
-    stack = np.stack(
-        [
-            image(i)[top:end].mean(axis=0, keepdims=True) if few else image(i)[top:end]
-            for i in order.tolist()
-        ]
-    )
+    stack = np.stack([image(i)[top:end] for i in order.tolist()])
+    if few := end - top <= 2 * BAND:
+        stack = stack.mean(axis=1, keepdims=True)
     found, ratio = OppositeRays(stack, int(top), shape, views, start, scales, known, random).find()
     column = seen(found.values)
     _refuse_if(ratio == 0.0, NOWHERE.format(REACH * cols, seen(start)))
@@ -446,7 +442,7 @@ def _by_rays(
         parameters["det_roll"] = AlignEstimate(math.degrees(found.values[1]), roll, "deg")
     else:
         refused["det_roll"] = FEW_ROWS.format(
-            f"a panel of {rows} rows" if few else "the images", roll
+            f"images of {rows} rows" if few else "the images", roll
         )
     if wide[2] < known[2] / 2:
         parameters["det_yaw"] = AlignEstimate(math.degrees(found.values[2]), turned, "deg")

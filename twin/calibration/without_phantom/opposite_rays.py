@@ -128,7 +128,7 @@ class OppositeRays:
                 out[side, i] = ((ray - panel) * axis).sum(axis=1) / np.square(axis).sum(axis=1)
             out[side] += middle[:, None]
         inside = (out[:, 0] >= 0) & (out[:, 0] <= self.shape[1] - 1)
-        return out, inside.all(axis=0)
+        return out, np.asarray(inside.all(axis=0))
 
 
 def _nothing(k: int) -> tuple[FloatArray, FloatArray, float, bool]:
@@ -209,7 +209,9 @@ class _Level:
                 break
         return found
 
-    def _equations(self, values: FloatArray, pairs: npt.NDArray[np.intp]):  # type: ignore[no-untyped-def]
+    def _equations(
+        self, values: FloatArray, pairs: npt.NDArray[np.intp]
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """Differences (m,) and their slopes (k, m), both of noise alone, and weights."""
         places = self.rays._places(values, pairs)[0]
         both = self.read(self.images, places, pairs).reshape(2, -1)
