@@ -49,7 +49,7 @@ def test_one_row_says_what_it_cannot_tell_and_its_correction_keeps_that() -> Non
     found = one.data(rng).align(per_frame=True)
     assert set(found.parameters) == {"axis_column_px"}
     refused = found.alignment.refused
-    assert "images of 1 rows do not tell it" in refused["det_roll"]
+    assert "1 rows tell it to +- " in refused["det_roll"]
     assert {"source_row_px", "det_yaw", "motion"} <= set(refused)
     assert found.correction.parameters.det_roll == pytest.approx(0.0, abs=1e-6)
     corrected = found.dataset.with_correction(found.correction).geometry

@@ -181,26 +181,6 @@ UNTOLD: Final[Mapping[str, str]] = {
 }
 """What a circular scan, or this method, cannot tell, and why."""
 
-NOWHERE: Final = (
-    "the images are symmetric about no column within {:.0f} px of the nominal one ({:.1f}): the "
-    "axis is elsewhere, or too much of the object is out of view"
-)
-ELSEWHERE: Final = (
-    "the images are about as symmetric about another column as about {:.1f} (ratio {:.2f}; at "
-    "least 1.5)"
-)
-DISAGREE: Final = (
-    "{:.1f} % of what should be symmetric is not (at most 5 %): something does not turn with the "
-    "stage, or the angles or the object change during the scan"
-)
-UNCERTAIN: Final = (
-    "the column would be known to {:.2g} px and the roll to {:.2g} deg; allowed: 2 px and 0.5 deg "
-    "(more views or light help)"
-)
-FEW_ROWS: Final = (
-    "{} do not tell it: the correction keeps what was in force, +- {:.2g} deg; a full turn of more "
-    "rows tells it"
-)
 BAND: Final = 12
 """Rows above and below the source's plane that are read for opposite rays."""
 MOST_VIEWS: Final = 1440
@@ -326,56 +306,81 @@ def _align(
 
     start = np.array([getattr(base, name) for name in FREE])
     pitch, sdd = float(np.linalg.norm(pose.u[0])), float(pose.sdd[0])
-    ends = 2 * sdd / cols
+    ends, nominal = 2 * sdd / cols, seen(start)
     scales = np.array([pitch * float(pose.sod[0]) / sdd, 2 / rows, ends / (pitch * cols), ends])
     sideways = math.atan(priors["dD_x"] / sdd)
     yaw = max(math.hypot(math.radians(priors["det_yaw"]), sideways), 1e-9)
-    known = np.array([math.inf, math.radians(priors["det_roll"]), yaw, priors["dD_z"]])
+    turn, rays, instead = None, None, ""
     try:
         turn = read_turn(image, base.angle_scale * poses.angle, present)
-    except NotIdentifiableError as whole:
+    except NotIdentifiableError as error:
+        instead = f"{error.message}; "
+    if turn is not None:
+        known, start, scales = np.array([math.inf, math.inf, yaw]), start[:3], scales[:3]
+        column, ratio = first_column(turn.mean, nominal)
+        start[0] += (column - nominal) / _slopes(seen, start, scales)[0]
+    else:
+        scales[1] = 2 / cols
+        known = np.array([math.inf, math.radians(priors["det_roll"]), yaw, priors["dD_z"]])
         try:
-            return _by_rays(
-                image, poses, present, shape, offsets, seen, start, scales, known, random
-            )
+            rays = _rays(image, poses, present, shape, offsets, start, scales, known, random)
         except NotIdentifiableError as error:
-            raise NotIdentifiableError(f"{whole.message}; {error.message}") from whole
-    start, scales = start[:3], scales[:3]
-    nominal = seen(start)
-    column, ratio = first_column(turn.mean, nominal)
-    _refuse_if(ratio == 0.0, NOWHERE.format(REACH * cols, nominal))
-    _refuse_if(ratio < LEAST_RATIO, ELSEWHERE.format(column, ratio))
-    start[0] += (column - nominal) / _slopes(seen, start, scales)[0]
-    found = find_symmetry(turn, view, start, scales, np.array([math.inf, math.inf, yaw]))
+            raise NotIdentifiableError(instead + error.message) from error
+        start, ratio = rays.first()
+        column = seen(start)
+    _refuse_if(
+        ratio == 0.0,
+        f"{instead}the images are symmetric about no column within {REACH * cols:.0f} px of the "
+        f"nominal one ({nominal:.1f}): the axis is elsewhere, or too much of the object is out of "
+        "view",
+    )
+    _refuse_if(
+        ratio < LEAST_RATIO,
+        f"{instead}the images are about as symmetric about another column as about {column:.1f} "
+        f"(ratio {ratio:.2f}; at least {LEAST_RATIO:g})",
+    )
+    found = find_symmetry(turn, view, start, scales, known) if turn else rays.find(start)  # type: ignore[union-attr]
     _refuse_if(
         not found.converged,
-        "no plane of symmetry is found: too little structure for the noise, or too few columns on "
-        "both sides of the axis",
+        f"{instead}no plane of symmetry is found: too little structure for the noise, or too few "
+        "columns on both sides of the axis",
     )
-    _refuse_if(found.asymmetry > MOST_ASYMMETRY, DISAGREE.format(100 * found.asymmetry))
-    step = (0.0, 0.0) if turn.step_px is None else turn.step_px[0]
+    _refuse_if(
+        found.asymmetry > MOST_ASYMMETRY,
+        f"{instead}{100 * found.asymmetry:.1f} % of the mean, or of opposite rays, is not "
+        f"symmetric (at most {100 * MOST_ASYMMETRY:g} %): something does not turn with the stage, or the "
+        "angles or the object change during the scan",
+    )
+    step = (0.0, 0.0) if turn is None or turn.step_px is None else turn.step_px[0]
     covariance = found.covariance.copy()
     covariance[0, 0] += (math.hypot(FLOOR_PX, step[0] / 2) * scales[0]) ** 2
     covariance[1, 1] += math.radians(FLOOR_DEG) ** 2 + (step[0] / rows) ** 2
     slopes = _slopes(seen, found.values, scales)
     sigma = math.sqrt(slopes @ covariance @ slopes)
-    roll, turned = np.degrees(np.sqrt(np.diag(covariance)[1:])).tolist()
-    _refuse_if(sigma > MOST_COLUMN or roll > MOST_ROLL, UNCERTAIN.format(sigma, roll))
-    parameters = {
-        "axis_column_px": AlignEstimate(seen(found.values), sigma, "px"),
-        "det_roll": AlignEstimate(math.degrees(found.values[1]), roll, "deg"),
-    }
-    refused = dict(UNTOLD)
-    if found.images[2] < yaw / 2:
-        aside = math.hypot(turned, math.degrees(sideways))
-        parameters["det_yaw"] = AlignEstimate(math.degrees(found.values[2]), aside, "deg")
-    else:
-        refused["det_yaw"] = (
-            f"the images tell it to +- {math.degrees(found.images[2]):.2g} deg, its prior to +- "
-            f"{math.degrees(yaw):.2g} deg: that is what the correction contains"
-        )
+    roll, turned = np.degrees(np.sqrt(np.diag(covariance)[1:3])).tolist()
+    told = found.images[1:3] < known[1:3] / 2
+    _refuse_if(
+        sigma > MOST_COLUMN or (bool(told[0]) and roll > MOST_ROLL),
+        f"{instead}the column would be known to {sigma:.2g} px and the roll to {roll:.2g} deg; "
+        f"allowed: {MOST_COLUMN:g} px and {MOST_ROLL:g} deg (more views or light help)",
+    )
+    parameters = {"axis_column_px": AlignEstimate(seen(found.values), sigma, "px")}
+    aside = math.hypot(turned, math.degrees(sideways))
+    refused, widths = dict(UNTOLD), (roll, aside)
+    for i, name in enumerate(FREE[1:3]):
+        if told[i]:
+            value = math.degrees(found.values[1 + i])
+            parameters[name] = AlignEstimate(value, widths[i], "deg")
+        else:
+            refused[name] = (
+                f"{rows} rows tell it to +- {math.degrees(found.images[1 + i]):.2g} deg, its prior "
+                f"to +- {math.degrees(known[1 + i]):.2g} deg: that is what the correction contains"
+            )
+    corrected, motion = offsets(found.values[:3]), None
+    if turn is None:
+        refused |= dict.fromkeys(("source_row_px", "motion"), "a full turn of more rows tells it")
+        return Alignment(corrected, parameters, refused, (), len(present))
     planes = _Planes(image, poses, turn, offsets, found.values, covariance, priors)
-    corrected, motion = offsets(found.values), None
     try:
         corrected, parameters["source_row_px"] = planes.row(random)
     except NotIdentifiableError as error:
@@ -389,66 +394,37 @@ def _align(
     return Alignment(corrected, parameters, refused, warnings, len(turn.used), motion)
 
 
-def _by_rays(
+def _rays(
     image: Image, poses: Poses, present: tuple[int, ...], shape: tuple[int, int],
-    offsets: Callable[[FloatArray], Offsets], seen: Callable[[FloatArray], float],
-    start: FloatArray, scales: FloatArray, known: FloatArray, random: np.random.Generator,
-) -> Alignment:  # fmt: skip
-    """What rays tell that two views see from opposite ends, near the plane of the source.
+    offsets: Callable[[FloatArray], Offsets], start: FloatArray, scales: FloatArray,
+    known: FloatArray, random: np.random.Generator,
+) -> OppositeRays:  # fmt: skip
+    """Rays near the plane of the source that two views see from opposite ends.
 
     Raises:
-        NotIdentifiableError: not the column.
+        NotIdentifiableError: there are hardly any.
     """
     rows, cols = shape
-    scales = scales * np.array([1.0, rows / cols, 1.0, 1.0])
     angle = offsets(start).angle_scale * poses.angle[list(present)] % (2 * np.pi)
     order = np.array(present)[np.argsort(angle, kind="stable")][:: -(-len(present) // MOST_VIEWS)]
-    of_views = poses[order]
+    some = poses[order]
+    first = _about_axis(some[:1], offsets(start))
+    row = first.project_points([[0.0, 0.0, float(first.source[0, 2])]], shape)[0, 0, 1]
+    lean = 2 * float(some.sdd[0]) / (cols * float(np.linalg.norm(some.u[0])))
+    _refuse_if(
+        not -lean < row < rows - 1 + lean,
+        f"the source turns in the plane of row {row:.0f}: rays to rows 0 to {rows - 1} lean too "
+        f"much to be those of opposite views; allowed are regions within {lean:.0f} rows of it",
+    )
+    top, end = np.clip(np.round(row) + (-BAND, BAND + 1), (0, 1), (rows - 1, rows)).astype(int)
+    stack = np.stack([image(i)[top:end] for i in order.tolist()])
+    if end - top <= 2 * BAND:
+        stack = stack.mean(axis=1, keepdims=True)
 
     def views(values: FloatArray) -> FloatArray:
-        return np.asarray(_about_axis(of_views, offsets(values)).rows)
+        return np.asarray(_about_axis(some, offsets(values)).rows)
 
-    first = _about_axis(of_views[:1], offsets(start))
-    level = first.project_points([[0.0, 0.0, float(first.source[0, 2])]], shape)[0, 0]
-    lean = 2 * float(of_views.sdd[0]) / (cols * float(np.linalg.norm(of_views.u[0])))
-    _refuse_if(
-        not -lean < level[1] < rows - 1 + lean,
-        f"the source turns in the plane of row {level[1]:.0f}: rays to rows 0 to {rows - 1} lean "
-        f"too much to be those of opposite views; allowed are regions within {lean:.0f} rows of it",
-    )
-    top, end = np.clip(np.round(level[1]) + (-BAND, BAND + 1), (0, 1), (rows - 1, rows)).astype(int)
-    stack = np.stack([image(i)[top:end] for i in order.tolist()])
-    if few := end - top <= 2 * BAND:
-        stack = stack.mean(axis=1, keepdims=True)
-    found, ratio = OppositeRays(stack, int(top), shape, views, start, scales, known, random).find()
-    column = seen(found.values)
-    _refuse_if(ratio == 0.0, NOWHERE.format(REACH * cols, seen(start)))
-    _refuse_if(ratio < LEAST_RATIO, ELSEWHERE.format(column, ratio))
-    _refuse_if(
-        not found.converged, "opposite rays tell no column: too little structure for the noise"
-    )
-    _refuse_if(found.asymmetry > MOST_ASYMMETRY, DISAGREE.format(100 * found.asymmetry))
-    covariance = found.covariance.copy()
-    covariance[0, 0] += (FLOOR_PX * scales[0]) ** 2
-    slopes = _slopes(seen, found.values, scales)
-    sigma = math.sqrt(slopes @ covariance @ slopes)
-    wide = np.sqrt(np.diag(covariance))
-    roll, turned = np.degrees(wide[1:3]).tolist()
-    _refuse_if(sigma > MOST_COLUMN, UNCERTAIN.format(sigma, roll))
-    parameters = {"axis_column_px": AlignEstimate(column, sigma, "px")}
-    untold = "only a full turn of more rows tells it"
-    refused = {**UNTOLD, "source_row_px": untold, "motion": untold}
-    if wide[1] < known[1] / 2:
-        parameters["det_roll"] = AlignEstimate(math.degrees(found.values[1]), roll, "deg")
-    else:
-        refused["det_roll"] = FEW_ROWS.format(
-            f"images of {rows} rows" if few else "the images", roll
-        )
-    if wide[2] < known[2] / 2:
-        parameters["det_yaw"] = AlignEstimate(math.degrees(found.values[2]), turned, "deg")
-    else:
-        refused["det_yaw"] = f"the images tell it no better than to +- {turned:.2g} deg"
-    return Alignment(offsets(found.values[:3]), parameters, refused, (), len(order))
+    return OppositeRays(stack, int(top), shape, views, start, scales, known, random)
 
 
 class _Planes:

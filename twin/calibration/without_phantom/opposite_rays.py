@@ -90,27 +90,26 @@ class OppositeRays:
                 f"{180 + math.degrees(2 * fan / (1 + 2 * REACH)):.4g} deg, or a full turn tell it"
             )
 
-    def find(self) -> tuple[Symmetry, float]:
-        """The parameters, coarse to fine, and how much better they are than the next best column
-        (as of `first_column`).
-        """
+    def first(self) -> tuple[FloatArray, float]:
+        """The parameters about which rays agree best, and how much better than about the next best
+        column, as `first_column` has it."""
         cols = self.shape[1]
         level = _Level(self, cols / LEVELS[0])
         some = self.pairs[:: -(-len(self.pairs) // (MOST_PAIRS // 10))]
+        half = int(2 * REACH * cols / level.sigma)
         step = level.sigma / 2 * np.eye(len(self.start))[0] * self.scales[0]
-        columns = np.arange(-REACH * cols, REACH * cols + 1, level.sigma / 2)
-        tried = [self.start + k * step for k in range(-(len(columns) // 2), len(columns) // 2 + 1)]
-        cost = np.array([level.disagreement(values, some) for values in tried])
-        best, ratio = best_dip(cost, 2)
-        if ratio == 0.0:
-            return Symmetry(tried[best], *_nothing(len(step))), 0.0
-        found, values = [], tried[best]
+        tried = [self.start + k * step for k in range(-half, half + 1)]
+        best, ratio = best_dip(np.array([level.disagreement(t, some) for t in tried]), 2)
+        return tried[best], ratio
+
+    def find(self, values: FloatArray) -> Symmetry:
+        """The parameters, coarse to fine: the estimate of the level that tells the first best."""
+        found = []
         for part in LEVELS:
-            found.append(_Level(self, max(cols / part, 1.0)).solve(values))
+            found.append(_Level(self, max(self.shape[1] / part, 1.0)).solve(values))
             if found[-1].converged:
                 values = found[-1].values
-        good = [one for one in found if one.converged] or found[:1]
-        return min(good, key=lambda one: one.images[0]), ratio
+        return min(found, key=lambda one: one.images[0] if one.converged else math.inf)
 
     def _places(
         self, values: FloatArray, pairs: npt.NDArray[np.intp]
@@ -129,10 +128,6 @@ class OppositeRays:
             out[side] += middle[:, None]
         inside = (out[:, 0] >= 0) & (out[:, 0] <= self.shape[1] - 1)
         return out, np.asarray(inside.all(axis=0))
-
-
-def _nothing(k: int) -> tuple[FloatArray, FloatArray, float, bool]:
-    return np.full((k, k), np.inf), np.full(k, np.inf), math.inf, False
 
 
 class _Level:
@@ -175,7 +170,7 @@ class _Level:
     def solve(self, start: FloatArray) -> Symmetry:
         """The root of the estimating equation from a start."""
         rays, values, k = self.rays, start.copy(), len(start)
-        found = Symmetry(values, *_nothing(k))
+        found = Symmetry(values, np.full((k, k), np.inf), np.full(k, np.inf), math.inf, False)
         for _ in range(ROUNDS):
             inside = rays._places(values, rays.pairs)[1]
             if inside.sum() < FEWEST_PAIRS:
@@ -188,10 +183,7 @@ class _Level:
                 break
             information = gain - alone
             score = (slopes * w) @ rest
-            of_pairs = (k, len(pairs), len(rays.lifts))
-            scatter = self._scatter((slopes * w * rest).reshape(of_pairs), values, pairs)
-            rings = self._rings((slopes * w).reshape(of_pairs), values, pairs)
-            scatter = scatter + rings
+            scatter = self._scatter(slopes * w, rest, pairs, values)
             kappa = scatter[0, 0] / information[0, 0]
             inverse = np.linalg.inv(information + kappa * rays.known)
             step = -inverse @ (score + kappa * rays.known @ (values - rays.start))
@@ -238,35 +230,24 @@ class _Level:
         return rest, freed(slopes[0]), noise, freed(slopes[1]), w
 
     def _scatter(
-        self, parts: FloatArray, values: FloatArray, pairs: npt.NDArray[np.intp]
+        self, slopes: FloatArray, rest: FloatArray, pairs: npt.NDArray[np.intp], values: FloatArray
     ) -> FloatArray:
-        """Covariance of sums over all rays of parts (k, q, lifts): slopes, weights, differences."""
-        sums = parts.sum(axis=2)
+        """Covariance of sums over all rays of weighted slopes (k, m) times differences (m,), and of
+        what the noise of the flat field, which all frames share, adds to them."""
+        rays, of_pairs = self.rays, (len(slopes), len(pairs), -1)
+        columns = rays._places(values, pairs)[0][:, 0]
+        sums = (slopes * rest).reshape(of_pairs).sum(axis=2)
         own = sums - sums.mean(axis=1, keepdims=True)
-        covariance = own @ own.T
-        columns = self.rays._places(values, pairs)[0][:, 0]
         near = (np.abs(columns[0] - columns[1]) / (6.0 * self.sigma)).astype(np.intp)
-        of_columns = np.stack([np.bincount(near, part) for part in own])
-        wide = np.square(of_columns).sum(axis=1)
-        wide = np.maximum(wide, np.square(spread(sums, pairs, len(self.rays.frames))))
+        wide = np.square([np.bincount(near, part) for part in own]).sum(axis=1)
+        wide = np.maximum(wide, np.square(spread(sums, pairs, len(rays.frames))))
+        covariance = own @ own.T
         wider = np.sqrt(np.maximum(wide / np.maximum(np.diag(covariance), 1e-300), 1.0))
-        return np.asarray(covariance * np.outer(wider, wider))
-
-    def _rings(
-        self, slopes: FloatArray, values: FloatArray, pairs: npt.NDArray[np.intp]
-    ) -> FloatArray:
-        """Covariance of what the noise of the flat field, which all frames share, adds up to, for
-        weighted slopes (k, q, lifts)."""
-        change = np.square(np.diff(self.rays.frames.mean(axis=0), 2, axis=1)) / 6
+        change = np.square(np.diff(rays.frames.mean(axis=0), 2, axis=1)) / 6
         power = float(np.median(change)) / MEDIAN_OF_CHI_SQUARE
         power /= max(1.0, 2.0 * math.sqrt(math.pi) * self.sigma * (len(change) > 1))
-        columns = self.rays._places(values, pairs)[0][:, 0].round().astype(np.intp)
-        size = self.rays.shape[1]
-        of_columns = np.stack(
-            [
-                np.bincount(columns[0], part, size) - np.bincount(columns[1], part, size)
-                for part in slopes.sum(axis=2)
-            ]
-        )
-        soft = gaussian_filter(of_columns, (0, self.sigma))
-        return np.asarray(power * (soft @ soft.T))
+        ends, size = columns.round().astype(np.intp), rays.shape[1]
+        of_columns = [np.bincount(ends[0], part, size) - np.bincount(ends[1], part, size)
+                      for part in slopes.reshape(of_pairs).sum(axis=2)]  # fmt: skip
+        rings = gaussian_filter(np.stack(of_columns), (0, self.sigma))
+        return np.asarray(covariance * np.outer(wider, wider) + power * (rings @ rings.T))
