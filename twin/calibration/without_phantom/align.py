@@ -348,8 +348,8 @@ def _align(
     _refuse_if(
         found.asymmetry > MOST_ASYMMETRY,
         f"{instead}{100 * found.asymmetry:.1f} % of the mean, or of opposite rays, is not "
-        f"symmetric (at most {100 * MOST_ASYMMETRY:g} %): something does not turn with the stage, or the "
-        "angles or the object change during the scan",
+        f"symmetric (at most {100 * MOST_ASYMMETRY:g} %): something does not turn with the stage, "
+        "or the angles or the object change during the scan",
     )
     step = (0.0, 0.0) if turn is None or turn.step_px is None else turn.step_px[0]
     covariance = found.covariance.copy()

@@ -139,13 +139,10 @@ class _Level:
 
     def _soft(self, images: Float32Array) -> FloatArray:
         """Coefficients of a spline through all smoothed images, one below the other."""
-        rows = images.shape[1]
-        # Across rows no more than what a panel of many rows has of each.
-        soft = gaussian_filter(images, (0, self.sigma if rows > 1 else 0, self.sigma))
-        soft = spline_filter1d(soft, axis=2, output=np.float32)
-        if rows > 1:
-            soft = spline_filter1d(soft, axis=1, output=np.float32)
-        soft = np.pad(soft, ((0, 0), (EDGE, EDGE), (0, 0)), "reflect" if rows > 1 else "edge")
+        soft = gaussian_filter(images, (0, self.sigma, self.sigma))
+        for axis in (1, 2):
+            soft = spline_filter1d(soft, axis=axis, output=np.float32)
+        soft = np.pad(soft, ((0, 0), (EDGE, EDGE), (0, 0)), "reflect")
         return soft.reshape(-1, soft.shape[2])
 
     def read(
@@ -156,8 +153,7 @@ class _Level:
         row = places[:, 1, :, None] + self.rays.lifts - self.rays.top
         row = np.clip(row, 0, rows - 1) + EDGE + pairs.T[:, :, None] * (rows + 2 * EDGE)
         column = np.broadcast_to(places[:, 0, :, None], row.shape)
-        at = np.stack([column.ravel(), row.ravel()])
-        return read_spline(image, at).reshape(row.shape)
+        return read_spline(image, np.stack([column, row]))
 
     def disagreement(self, values: FloatArray, pairs: npt.NDArray[np.intp]) -> float:
         """Mean square of the differences over that of what is seen; infinite for few rays."""
@@ -177,11 +173,10 @@ class _Level:
                 break
             pairs = rays.pairs[inside]
             rest, slopes, noise, noisy, w = self._equations(values, pairs)
-            gain = (slopes * w) @ slopes.T
             alone = (noisy * w) @ noisy.T
-            if not gain[0, 0] - alone[0, 0] > CLEAN * alone[0, 0]:
+            information = (slopes * w) @ slopes.T - alone
+            if not information[0, 0] > CLEAN * alone[0, 0]:
                 break
-            information = gain - alone
             score = (slopes * w) @ rest
             scatter = self._scatter(slopes * w, rest, pairs, values)
             kappa = scatter[0, 0] / information[0, 0]
@@ -216,8 +211,7 @@ class _Level:
             return np.asarray(lines - (lines @ to_odd.T) @ odd)
 
         def difference(image: FloatArray, where: FloatArray) -> FloatArray:
-            first, second = self.read(image, where, pairs).reshape(2, -1)
-            return np.asarray(first - second)
+            return np.asarray(-np.diff(self.read(image, where, pairs), axis=0).ravel())
 
         slopes = np.empty((2, len(values), both.shape[1]))
         for i, e in enumerate(np.diag(0.25 * self.rays.scales * (1.0 + self.sigma))):
