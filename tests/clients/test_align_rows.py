@@ -60,7 +60,7 @@ def test_one_row_says_what_it_cannot_tell_and_its_correction_keeps_that() -> Non
 def test_too_short_a_scan_says_how_long_it_must_be() -> None:
     short, rng = scan(180.0)
     why = short.data(rng).align().alignment.refused["axis_column_px"]
-    assert "the views span 179 deg; half a turn and the fan, 187.7 deg, or a full turn" in why
+    assert "the views span 179 deg; half a turn and the fan, 187.7 deg in small steps" in why
 
 
 def test_rows_far_from_the_plane_of_the_source_are_refused() -> None:

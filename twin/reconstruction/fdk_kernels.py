@@ -25,9 +25,6 @@ from flexdt.twin.reconstruction import resample_kernels
 from flexdt.twin.reconstruction.resample_kernels import LANES, MARGIN, add_column, mix_columns
 
 TILE = 8
-FEW_ROWS = 4
-"""Of a fan beam's one or two rows, and one beyond them on either side. Slabs of taller panels,
-which are the whole volume's to the bit, have more."""
 WIDE = 64
 """Voxels beside one another that are done at a time for few rows."""
 
@@ -170,7 +167,7 @@ def _add_tile(
 ):
     """Add all views to one tile of voxel columns."""
     ny, nx = volume.shape[:2]
-    few = rows <= FEW_ROWS
+    few = images.shape[2] == rows
     last_x = min(nx, first_x + (WIDE if few else TILE))
     for view in range(len(images)):
         g, share = views[view], shares[view]
@@ -202,7 +199,7 @@ def _entry_point(key: int, lanes: int):  # type: ignore[no-untyped-def]
         """
         _ = key, lanes  # part of the disk cache's key
         ny, nx = volume.shape[:2]
-        wide = WIDE if rows <= FEW_ROWS else TILE
+        wide = WIDE if images.shape[2] == rows else TILE
         tiles_x = (nx + wide - 1) // wide
         tiles = tiles_x * ((ny + TILE - 1) // TILE)
         counter = np.zeros(1, np.int64)
@@ -290,10 +287,10 @@ def normalise_coverage(
                     volume[iy, ix, iz] *= total / part
 
 
-def room(n: int, cols: int, rows: int) -> Float32Array:
+def room(n: int, cols: int, rows: int, few: bool) -> Float32Array:
     """Memory for images, (n, cols, rows and more): columns of whole registers, aligned to them; of
-    few rows no more."""
-    shape = (n, cols, rows if rows <= FEW_ROWS else -(-rows // LANES) * LANES)
+    panels of few rows no more, by which the kernel knows them."""
+    shape = (n, cols, rows if few else (rows // LANES + 1) * LANES)
     return aligned_zeros(math.prod(shape)).reshape(shape)
 
 

@@ -87,7 +87,8 @@ class OppositeRays:
             raise NotIdentifiableError(
                 f"{count} pairs of views see a line from both ends (at least {FEWEST_PAIRS}): the "
                 f"views span {360 - math.degrees(gap):.4g} deg; half a turn and the fan, "
-                f"{180 + math.degrees(2 * fan / (1 + 2 * REACH)):.4g} deg, or a full turn tell it"
+                f"{180 + math.degrees(2 * fan / (1 + 2 * REACH)):.4g} deg in small steps, or a "
+                "full turn tell it"
             )
 
     def first(self) -> tuple[FloatArray, float]:
