@@ -22,8 +22,6 @@ def test_the_column_of_one_row_and_of_half_a_turn_is_within_its_sigma(
     for seed in seeds:
         told = row_align.tried(kind, seed)
         assert abs(told["error"]) < min(0.15, 3.5 * told["sigma"]), told
-        assert abs(told.get("roll", 0.0)) < 3.5
-        assert ("roll" in told) == (kind == "half_turn")
 
 
 @pytest.mark.slow
@@ -49,7 +47,7 @@ def test_one_row_says_what_it_cannot_tell_and_its_correction_keeps_that() -> Non
     found = one.data(rng).align(per_frame=True)
     assert set(found.parameters) == {"axis_column_px"}
     refused = found.alignment.refused
-    assert "1 rows tell it to +- " in refused["det_roll"]
+    assert "full turn of more rows" in refused["det_roll"]
     assert {"source_row_px", "det_yaw", "motion"} <= set(refused)
     assert found.correction.parameters.det_roll == pytest.approx(0.0, abs=1e-6)
     corrected = found.dataset.with_correction(found.correction).geometry

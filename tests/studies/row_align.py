@@ -174,9 +174,6 @@ def tried(kind: str, seed: int) -> dict[str, Any]:
         return {**told, "refused": found.alignment.refused["axis_column_px"]}
     p: Any = found.parameters["axis_column_px"]
     told |= {"error": p["value"] - scan.column(), "sigma": p["sigma"]}
-    if "det_roll" in found.parameters:
-        p = found.parameters["det_roll"]
-        told["roll"] = (p["value"] - math.degrees(scan.roll)) / p["sigma"]
     return told
 
 
@@ -204,11 +201,6 @@ def main(words: list[str] | None = None) -> int:
         f"rms (median {np.median(np.abs(error)):.3f}, largest {np.abs(error).max():.3f}), sigma "
         f"{np.median(sigma):.3f} px; in sigmas {rms:.2f} rms, {far} beyond 3"
     )
-    rolls = [run["roll"] for run in good if "roll" in run]
-    if rolls:
-        print(
-            f"roll told in {len(rolls)}: {math.sqrt(float(np.square(rolls).mean())):.2f} sigmas rms"
-        )
     if o.kind == "untold":
         return 1
     return int(far > max(1, 0.01 * len(good)) or not 0.7 < rms < 1.2)

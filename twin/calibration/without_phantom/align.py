@@ -168,8 +168,8 @@ class _System:
         return float((self.weight[:, None] * np.square(rest)).sum())
 
 
-FREE: Final = ("dO_x", "det_roll", "det_yaw", "dD_z")
-"""Of these the last is not told, but adds to what opposite rays leave open."""
+FREE: Final = ("dO_x", "det_roll", "det_yaw", "dD_z", "dD_y")
+"""Of these the last two are not told, but add to what opposite rays leave open."""
 UNTOLD: Final[Mapping[str, str]] = {
     "SOD": "an object twice as large at twice the distance gives the same images; a phantom of "
     "known size tells it",
@@ -307,7 +307,9 @@ def _align(
     start = np.array([getattr(base, name) for name in FREE])
     pitch, sdd = float(np.linalg.norm(pose.u[0])), float(pose.sdd[0])
     ends, nominal = 2 * sdd / cols, seen(start)
-    scales = np.array([pitch * float(pose.sod[0]) / sdd, 2 / rows, ends / (pitch * cols), ends])
+    scales = np.array(
+        [pitch * float(pose.sod[0]) / sdd, 2 / rows, ends / (pitch * cols), ends, pitch]
+    )
     sideways = math.atan(priors["dD_x"] / sdd)
     yaw = max(math.hypot(math.radians(priors["det_yaw"]), sideways), 1e-9)
     turn, rays, instead = None, None, ""
@@ -321,7 +323,9 @@ def _align(
         start[0] += (column - nominal) / _slopes(seen, start, scales)[0]
     else:
         scales[1] = 2 / cols
-        known = np.array([math.inf, math.radians(priors["det_roll"]), yaw, priors["dD_z"]])
+        known = np.array(
+            [math.inf, math.radians(priors["det_roll"]), yaw, priors["dD_z"], priors["dD_y"]]
+        )
         try:
             rays = _rays(image, poses, present, shape, offsets, start, scales, known, random)
         except NotIdentifiableError as error:
@@ -351,36 +355,43 @@ def _align(
         f"symmetric (at most {100 * MOST_ASYMMETRY:g} %): something does not turn with the stage, "
         "or the angles or the object change during the scan",
     )
+    values, covariance = found.values.copy(), found.covariance.copy()
+    told, beside = found.images[1:3] < known[1:3] / 2, 0.0
+    if rays is not None:  # what few rows say of the roll was up to six sigma off
+        # It moves the axis in the panel's middle row, if rows beside that were read.
+        read = rays.frames.shape[1]
+        beside = known[1] * (rays.top - (rows - read) / 2) * (read > 1)
+        values[1], covariance[1], covariance[:, 1], told[0] = base.det_roll, 0.0, 0.0, False
+        covariance[1, 1] = known[1] ** 2
     step = (0.0, 0.0) if turn is None or turn.step_px is None else turn.step_px[0]
-    covariance = found.covariance.copy()
-    covariance[0, 0] += (math.hypot(FLOOR_PX, step[0] / 2) * scales[0]) ** 2
+    covariance[0, 0] += (math.hypot(FLOOR_PX, step[0] / 2, beside) * scales[0]) ** 2
     covariance[1, 1] += math.radians(FLOOR_DEG) ** 2 + (step[0] / rows) ** 2
-    slopes = _slopes(seen, found.values, scales)
+    slopes = _slopes(seen, values, scales)
     sigma = math.sqrt(slopes @ covariance @ slopes)
     roll, turned = np.degrees(np.sqrt(np.diag(covariance)[1:3])).tolist()
-    told = found.images[1:3] < known[1:3] / 2
     _refuse_if(
         sigma > MOST_COLUMN or (bool(told[0]) and roll > MOST_ROLL),
         f"{instead}the column would be known to {sigma:.2g} px and the roll to {roll:.2g} deg; "
         f"allowed: {MOST_COLUMN:g} px and {MOST_ROLL:g} deg (more views or light help)",
     )
-    parameters = {"axis_column_px": AlignEstimate(seen(found.values), sigma, "px")}
+    parameters = {"axis_column_px": AlignEstimate(seen(values), sigma, "px")}
     aside = math.hypot(turned, math.degrees(sideways))
     refused, widths = dict(UNTOLD), (roll, aside)
     for i, name in enumerate(FREE[1:3]):
         if told[i]:
-            value = math.degrees(found.values[1 + i])
+            value = math.degrees(values[1 + i])
             parameters[name] = AlignEstimate(value, widths[i], "deg")
         else:
             refused[name] = (
-                f"{rows} rows tell it to +- {math.degrees(found.images[1 + i]):.2g} deg, its prior "
+                f"the images tell it to +- {math.degrees(found.images[1 + i]):.2g} deg, its prior "
                 f"to +- {math.degrees(known[1 + i]):.2g} deg: that is what the correction contains"
             )
-    corrected, motion = offsets(found.values[:3]), None
+    corrected, motion = offsets(values[:3]), None
     if turn is None:
-        refused |= dict.fromkeys(("source_row_px", "motion"), "a full turn of more rows tells it")
+        told_by = "a full turn of more rows tells it; the correction keeps what was in force"
+        refused |= dict.fromkeys(("det_roll", "source_row_px", "motion"), told_by)
         return Alignment(corrected, parameters, refused, (), len(present))
-    planes = _Planes(image, poses, turn, offsets, found.values, covariance, priors)
+    planes = _Planes(image, poses, turn, offsets, values, covariance, priors)
     try:
         corrected, parameters["source_row_px"] = planes.row(random)
     except NotIdentifiableError as error:

@@ -3,8 +3,7 @@
 The line through the sources of two views is a ray of both, whatever the object: where it falls on
 both panels, both must say the same. Of a whole turn every ray of the fan is one of these, of half a
 turn and the fan those of its first and last views. Beside the plane in which the source turns rays
-differ from their opposites by the little that they lean, so rows near it count as well; where a
-panel is rolled, they say by how much.
+differ from their opposites by the little that they lean, so rows near it count as well.
 
 The estimate is the root of Z' W r: r is the difference of the two, Z its slopes, freed of what a
 flat field that is wrong by a polynomial would add. Noise is in Z too; what an image of noise alone
