@@ -189,7 +189,7 @@ class _Level:
             # Noise comes to more by chance, of few views the most.
             chance = 1.0 + 3.0 * math.sqrt(2.0 / len(rays.frames))
             power = float((w * (np.square(rest) - chance * np.square(noise))).sum())
-            done = bool((np.abs(step) <= 0.05 * sigmas + 1e-5 * rays.scales).all())
+            done = bool((np.abs(step) <= 0.05 * sigmas + 1e-5 * rays.scales)[0])
             asymmetry = math.sqrt(max(power, 0.0) / self.structure)
             found = Symmetry(values, covariance, sigmas, asymmetry, done)
             if done or not np.isfinite(values).all():
