@@ -361,7 +361,7 @@ def _align(
         # It moves the axis in the panel's middle row, if rows beside that were read.
         read = rays.frames.shape[1]
         beside = known[1] * (rays.top - (rows - read) / 2) * (read > 1)
-        values[1], covariance[1], covariance[:, 1], told[0] = base.det_roll, 0.0, 0.0, False
+        told[:], values[1], covariance[1], covariance[:, 1] = False, base.det_roll, 0.0, 0.0
         covariance[1, 1] = known[1] ** 2
     step = (0.0, 0.0) if turn is None or turn.step_px is None else turn.step_px[0]
     covariance[0, 0] += (math.hypot(FLOOR_PX, step[0] / 2, beside) * scales[0]) ** 2
