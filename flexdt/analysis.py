@@ -172,17 +172,17 @@ def reconstruct(
 
 @public
 def align(data: Data, *, per_frame: bool = False) -> Aligned:
-    """Find axis and source plane of an ordinary full-turn scan without a phantom.
+    """Find axis and source plane of an ordinary scan without a phantom.
 
     Args:
         data: a data set or its folder.
         per_frame: look for shifts of single frames (jitter) too; `.dataset` then has them.
 
     Returns:
-        Axis column, roll and, if the object tells them, yaw of the panel and row of the plane in
+        Axis column and, if the object tells them, roll and yaw of the panel and row of the plane in
         which the source turns, each with its sigma, what is refused and why, and the correction;
-        `document` is the JSON of `flexdt align`. Where the scan cannot tell column and roll,
-        `identifiable` is False.
+        `document` is the JSON of `flexdt align`. Half a turn and the fan, and single rows, tell the
+        column. Where the scan cannot, `identifiable` is False.
 
     Raises:
         TwinError: the folder is no data set, or a frame cannot be read.

@@ -293,7 +293,7 @@ def zero_offsets(scans: Sequence[PastScan], machine: Machine, usual: Profile) ->
     lines = {name: Line(getattr(base, name)) for name in OFFSETS}
     findings, columns = list[Finding](), dict[str, tuple[float, float, float]]()
     last = max((scan.date for scan in scans if scan.date is not None), default=None)
-    told = [s for s in scans if s.aligned is not None and s.aligned.offsets is not None]
+    told = [s for s in scans if s.aligned is not None and "det_roll" in s.aligned.parameters]
     drifts = len({s.date for s in told if s.date is not None}) >= FOR_A_LINE
     told = [s for s in told if s.date is not None or not drifts]
     width = prior_widths(machine, usual)["dD_x"]

@@ -57,8 +57,8 @@ class Aligned:
 
     @property
     def parameters(self) -> Mapping[str, Mapping[str, object]]:
-        """Name -> {value, sigma, unit}: axis_column_px [px], det_roll [deg] and, if the images tell
-        them, det_yaw [deg] and source_row_px [px]."""
+        """Name -> {value, sigma, unit}: axis_column_px [px] and, if the images tell them, det_roll
+        and det_yaw [deg] and source_row_px [px]."""
         found: Mapping[str, Mapping[str, object]] = self.document["parameters"]  # type: ignore[assignment]
         return found
 

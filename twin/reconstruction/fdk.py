@@ -69,6 +69,9 @@ GROUP: Final = 8
 """Views that the processor weighs and filters at a time, at least: they stay in its caches."""
 PIXELS: Final = 1 << 18
 """Of a group; a chunk may hold four times as many. Calls of few rows cost more than their work."""
+FEW_ROWS: Final = 5
+"""Of a panel that is done voxels beside one another at a time. The panel decides, not the rows that
+a grid needs: slabs are the whole volume's to the bit."""
 STACKS: Final = 6
 """Stacks of so many images that a device holds: twice what came, and made wider, of three steps."""
 MOST_ASIDE: Final = 0.1
@@ -90,6 +93,7 @@ class Views:
         response: of the filter.
         kept: columns whose filtered values are needed.
         shares, table: of `fdk_kernels.backproject`.
+        few: whether the panel has few rows.
     """
 
     images: Float32Array
@@ -101,6 +105,7 @@ class Views:
     kept: slice
     shares: Float32Array
     table: FloatArray
+    few: bool
 
     @property
     def sizes(self) -> tuple[int, int, int, int]:
@@ -132,7 +137,7 @@ class OnProcessor:
 
         n, wide, cols, rows = views.sizes
         if views.sizes != self._sizes:  # new memory costs as much as filtering
-            self._sizes, self._columns = views.sizes, fdk_kernels.room(n, cols, rows)
+            self._sizes, self._columns = views.sizes, fdk_kernels.room(n, cols, rows, views.few)
         images, group = np.ascontiguousarray(views.images), max(GROUP, PIXELS // (wide * rows))
         for first in range(0, n, group):
             some = slice(first, first + group)
@@ -552,6 +557,7 @@ def _fdk(
     backed = window_of(level, shape, (first, last), (-near[0], shape[1] + near[1]))
     level = window_of(level, shape, (first, last), (-before, shape[1] + after))
     table = view_table(backed, (last - first, kept.stop - kept.start))
+    few = shape[0] <= FEW_ROWS and not circle.rise
     sharing = Sharing.of(circle, panels, shape, like) if circle.rise else None
     if sharing is not None:
         table = np.hstack([table, sharing.columns()])
@@ -586,7 +592,7 @@ def _fdk(
         shares = np.zeros((len(part), 0, 0), np.float32)
         if sharing is not None:
             shares = sharing.table(views, (first, last))
-        target.add(Views(images, top, *weighing, response, kept, shares, table[views]))
+        target.add(Views(images, top, *weighing, response, kept, shares, table[views], few))
         done = views.stop
         if progress is not None:
             progress(done / len(cone_vec))

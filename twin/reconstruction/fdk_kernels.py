@@ -25,9 +25,8 @@ from flexdt.twin.reconstruction import resample_kernels
 from flexdt.twin.reconstruction.resample_kernels import LANES, MARGIN, add_column, mix_columns
 
 TILE = 8
-FEW_ROWS = 4
-"""Of a fan beam's one or two rows, and one beyond them on either side. Slabs of taller panels,
-which are the whole volume's to the bit, have more."""
+WIDE = 64
+"""Voxels beside one another that are done at a time for few rows."""
 
 
 @fused
@@ -93,42 +92,94 @@ def _add_view(acc, image, rows, shares, g, x, y, z0, dz, line):
     add_column(acc, line, lowest, highest - lowest + 1, first, step)
 
 
+@fused
+def _places(at, across, down, weight, size, base, zero, depth, slope, c, turn, row, rise):
+    """Where a view sees voxels beside one another: the sample before, how far on across and down it
+    is, and the weight, 0 for voxels that it does not see. Numbers that differ little are float32.
+
+    size, base: columns and rows of the image; the column to which `c` is relative.
+    zero: the voxel of which `depth`, `c` and `row` are.
+    slope, turn, rise: change a voxel of the depth, and of column and row times the depth.
+    """
+    none = np.float32(0.0)
+    first, last, lowest = np.float32(-base), np.float32(size[0] - 1 - base), np.float32(size[1] - 1)
+    for k in range(at.size):
+        step = np.float32(k - zero)
+        far = depth + step * slope
+        inverse = np.float32(1.0) / far
+        column, line = c + step * turn * inverse, row + step * rise * inverse
+        # One condition a line: the compiler does sixteen voxels at a time then.
+        part = inverse * inverse if far > none else none
+        part = part if column >= first else none
+        part = part if column <= last else none
+        part = part if line >= none else none
+        weight[k] = part if line <= lowest else none
+        column, line = min(max(column, first), last), min(max(line, none), lowest)
+        i = np.int32(column)
+        i = min(i - np.int32(column < np.float32(i)), np.int32(size[0] - 2 - base))
+        j = min(np.int32(line), np.int32(size[1] - 2))
+        across[k], down[k] = column - np.float32(i), line - np.float32(j)
+        at[k] = (i + np.int32(base)) * np.int32(size[1]) + j
+
+
+@fused
+def _add_places(acc, image, rows, at, across, down, weight):
+    """acc += weight * what a view shows at places; image: (cols * rows,)."""
+    rows = np.uint64(rows)
+    for k in range(at.size):
+        i = np.uint64(at[k])
+        left, below = image[i], image[i + np.uint64(1)]
+        upper = left + across[k] * (image[i + rows] - left)
+        lower = below + across[k] * (image[i + rows + np.uint64(1)] - below)
+        acc[k] += weight[k] * (upper + down[k] * (lower - upper))
+
+
 @kernel
-def _add_few(acc, image, rows, g, x, y, z0, dz):
-    """As `_add_view` for few rows, where whole registers cost more than they bring."""
-    depth, c = _column(g, len(image), x, y)
-    if depth == 0.0:
+def _add_few(acc, image, rows, g, x, y, z0, dx, dz, at, parts):
+    """Add one view to voxels beside one another, acc (nx, nz) from (x, y) on: for few rows, of
+    which whole registers would cost more than they bring."""
+    n, cols = len(acc), len(image)
+    y -= g[1]
+    slope = dx * g[3]
+    zero = n - 1 if slope > 0.0 else 0  # the farthest one
+    x += zero * dx - g[0]
+    depth = x * g[3] + y * g[4]
+    if depth <= 0.0:
         return
-    inverse = 1.0 / depth
-    i = min(int(c), len(image) - 2)
-    across = np.float32(c - i)
-    left, right, weight = image[i], image[i + 1], np.float32(inverse * inverse)
-    step = dz * g[9] * inverse
-    row = g[10] - (z0 - g[2]) * g[9] * inverse
-    for k in range(acc.size):
-        if 0.0 <= row <= rows - 1:
-            j = min(int(row), rows - 2)
-            down = np.float32(row - j)
-            upper = left[j] + across * (right[j] - left[j])
-            lower = left[j + 1] + across * (right[j + 1] - left[j + 1])
-            acc[k] += weight * (upper + down * (lower - upper))
-        row -= step
+    aside = (x * g[5] + y * g[6]) / depth
+    c = g[8] + aside * g[7]
+    base = math.floor(min(max(c, 0.0), cols - 1.0))
+    turn = (dx * g[5] - aside * slope) * g[7]
+    at, across, down, weight = at[:n], parts[0, :n], parts[1, :n], parts[2, :n]
+    for k in range(acc.shape[1]):
+        up = (z0 + k * dz - g[2]) * g[9] / depth
+        _places(
+            at, across, down, weight, (cols, rows), base, zero, np.float32(depth),
+            np.float32(slope), np.float32(c - base), np.float32(turn), np.float32(g[10] - up),
+            np.float32(up * slope),
+        )  # fmt: skip
+        _add_places(acc[:, k], image.reshape(cols * rows), rows, at, across, down, weight)
 
 
 @kernel
-def _add_tile(images, rows, shares, views, first_x, first_y, x0, y0, z0, dx, dy, dz, line, volume):
+def _add_tile(
+    images, rows, shares, views, first_x, first_y, x0, y0, z0, dx, dy, dz, line, at, parts, volume
+):
     """Add all views to one tile of voxel columns."""
     ny, nx = volume.shape[:2]
+    few = images.shape[2] == rows
+    last_x = min(nx, first_x + (WIDE if few else TILE))
     for view in range(len(images)):
         g, share = views[view], shares[view]
         for iy in range(first_y, min(ny, first_y + TILE)):
             y = y0 + iy * dy
-            for ix in range(first_x, min(nx, first_x + TILE)):
+            if few:
+                some = volume[iy, first_x:last_x]
+                _add_few(some, images[view], rows, g, x0 + first_x * dx, y, z0, dx, dz, at, parts)
+                continue
+            for ix in range(first_x, last_x):
                 x = x0 + ix * dx
-                if rows <= FEW_ROWS:
-                    _add_few(volume[iy, ix], images[view], rows, g, x, y, z0, dz)
-                else:
-                    _add_view(volume[iy, ix], images[view], rows, share, g, x, y, z0, dz, line)
+                _add_view(volume[iy, ix], images[view], rows, share, g, x, y, z0, dz, line)
 
 
 def _entry_point(key: int, lanes: int):  # type: ignore[no-untyped-def]
@@ -136,7 +187,7 @@ def _entry_point(key: int, lanes: int):  # type: ignore[no-untyped-def]
     def backproject(images, rows, shares, views, x0, y0, z0, dx, dy, dz, volume, workers):
         """Add views to a volume.
 
-        images: float32 (n, cols, rows and as many more as `room` says), rows contiguous.
+        images: float32 (n, cols, rows and as many more as `room` says), contiguous.
         rows: of the images.
         shares: float32 (n, depths, rows), what rows count in a helix; else (n, 0, 0).
         views: float64 (n, 11): source x, y, z; unit normal x, y; unit u x, y; distance in pitches
@@ -148,17 +199,20 @@ def _entry_point(key: int, lanes: int):  # type: ignore[no-untyped-def]
         """
         _ = key, lanes  # part of the disk cache's key
         ny, nx = volume.shape[:2]
-        tiles_x = (nx + TILE - 1) // TILE
+        wide = WIDE if images.shape[2] == rows else TILE
+        tiles_x = (nx + wide - 1) // wide
         tiles = tiles_x * ((ny + TILE - 1) // TILE)
         counter = np.zeros(1, np.int64)
         for _ in prange(workers):
             line = np.zeros(rows + 2 + MARGIN, np.float32)
+            at, parts = np.empty(WIDE, np.int32), np.empty((3, WIDE), np.float32)
             tile = fetch_next(counter)
             while tile < tiles:
-                across, along = tile % tiles_x * TILE, tile // tiles_x * TILE
+                across, along = tile % tiles_x * wide, tile // tiles_x * TILE
                 _add_tile(
-                    images, rows, shares, views, across, along, x0, y0, z0, dx, dy, dz, line, volume
-                )
+                    images, rows, shares, views, across, along, x0, y0, z0, dx, dy, dz, line, at,
+                    parts, volume,
+                )  # fmt: skip
                 tile = fetch_next(counter)
 
     return backproject
@@ -233,9 +287,10 @@ def normalise_coverage(
                     volume[iy, ix, iz] *= total / part
 
 
-def room(n: int, cols: int, rows: int) -> Float32Array:
-    """Memory for images, (n, cols, rows and more): columns of whole registers, aligned to them."""
-    shape = (n, cols, -(-rows // LANES) * LANES)
+def room(n: int, cols: int, rows: int, few: bool) -> Float32Array:
+    """Memory for images, (n, cols, rows and more): columns of whole registers, aligned to them; of
+    panels of few rows no more, by which the kernel knows them."""
+    shape = (n, cols, rows if few else (rows // LANES + 1) * LANES)
     return aligned_zeros(math.prod(shape)).reshape(shape)
 
 

@@ -210,10 +210,10 @@ def align(
     push: options.Push = False,
     geometry: options.Geometry = None,
 ) -> Answer:
-    """Find axis and source plane of an ordinary full-turn scan, without a phantom.
+    """Find axis and source plane of an ordinary scan, without a phantom.
 
-    Axis column, roll and, if the object tells them, yaw of the panel and row of the plane in which
-    the source turns. Exit code 5 when the scan cannot tell column and roll; then there is no
+    Axis column and, if the object tells them, roll and yaw of the panel and row of the plane in
+    which the source turns. Exit code 5 when the scan cannot tell the column; then there is no
     correction.
     """
     if out is not None:

@@ -10,6 +10,7 @@ import warnings
 from itertools import pairwise
 from pathlib import Path
 
+import fan_beam
 import numpy as np
 import pytest
 from llvmlite import binding
@@ -468,6 +469,12 @@ def test_a_row_of_detectors_is_a_panel():
     assert float(found[inside].mean()) == pytest.approx(0.02, rel=0.01)
     with pytest.raises(GeometryError, match="2 or more"):
         fdk(data[:, :, :1], scan, Grid((1, 8, 8), 4.0).blank())
+
+
+@pytest.mark.parametrize("columns", [40, 150])
+def test_a_fan_beam_slice_is_a_plain_loops(columns):
+    """One with weights, filter and backprojection of its own; 150 are several registers."""
+    assert fan_beam.main(["--views", "90", "--columns", str(columns), "--rounds", "1"]) == 0
 
 
 @pytest.mark.parametrize(("cycles", "kept"), [(0.1, 0.995), (0.25, 0.97), (0.33, 0.9)])

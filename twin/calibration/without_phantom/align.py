@@ -25,6 +25,7 @@ from flexdt.twin.calibration.without_phantom.mirror_symmetry import (
     first_column,
     sharpness,
 )
+from flexdt.twin.calibration.without_phantom.opposite_rays import OppositeRays
 from flexdt.twin.calibration.without_phantom.plane_pairs import PlanePairs, without
 from flexdt.twin.calibration.without_phantom.source_row import find_height
 from flexdt.twin.calibration.without_phantom.turn import Image, Turn, read_turn
@@ -167,7 +168,8 @@ class _System:
         return float((self.weight[:, None] * np.square(rest)).sum())
 
 
-FREE: Final = ("dO_x", "det_roll", "det_yaw")
+FREE: Final = ("dO_x", "det_roll", "det_yaw", "dD_z", "dD_y")
+"""Of these the last two are not told, but add to what opposite rays leave open."""
 UNTOLD: Final[Mapping[str, str]] = {
     "SOD": "an object twice as large at twice the distance gives the same images; a phantom of "
     "known size tells it",
@@ -179,6 +181,10 @@ UNTOLD: Final[Mapping[str, str]] = {
 }
 """What a circular scan, or this method, cannot tell, and why."""
 
+BAND: Final = 12
+"""Rows above and below the source's plane that are read for opposite rays."""
+MOST_VIEWS: Final = 1440
+"""Of more views every second, third and so on is used for opposite rays."""
 STANDS: Final = 0.05
 """Source and panel may move so far between frames, seen from the axis [px]."""
 LEAST_RATIO: Final = 1.5
@@ -223,7 +229,7 @@ class Alignment:
 
     Attributes:
         offsets: the correction, all of it: what was in force with what was found; None: refused.
-        parameters: axis_column_px, det_roll and, if the images tell them, det_yaw and
+        parameters: axis_column_px and, if the images tell them, det_roll, det_yaw and
             source_row_px [px, deg].
         refused: name -> why it is not given.
         warnings: what is doubtful about the scan.
@@ -240,7 +246,7 @@ class Alignment:
 
     @property
     def identifiable(self) -> bool:
-        """Whether axis column and roll are given."""
+        """Whether the axis column is given."""
         return self.offsets is not None
 
 
@@ -286,12 +292,11 @@ def _align(
 ) -> Alignment:  # fmt: skip
     _refuse_if(len(present) == 0, "no frame is there")
     pose = _standing(poses, present)
-    turn = read_turn(image, base.angle_scale * poses.angle, present)
     rows, cols = shape
     middle = np.array([(cols - 1) / 2, (rows - 1) / 2])
 
     def offsets(values: FloatArray) -> Offsets:
-        return replace(base, **dict(zip(FREE, values.tolist(), strict=True)))
+        return replace(base, **dict(zip(FREE, values.tolist(), strict=False)))
 
     def view(values: FloatArray) -> FloatArray:
         return np.asarray(_about_axis(pose, offsets(values)).rows[0])
@@ -301,61 +306,92 @@ def _align(
 
     start = np.array([getattr(base, name) for name in FREE])
     pitch, sdd = float(np.linalg.norm(pose.u[0])), float(pose.sdd[0])
-    scales = np.array([pitch * float(pose.sod[0]) / sdd, 2 / rows, 2 * sdd / (pitch * cols**2)])
+    ends, nominal = 2 * sdd / cols, seen(start)
+    scales = np.array(
+        [pitch * float(pose.sod[0]) / sdd, 2 / rows, ends / (pitch * cols), ends, pitch]
+    )
     sideways = math.atan(priors["dD_x"] / sdd)
     yaw = max(math.hypot(math.radians(priors["det_yaw"]), sideways), 1e-9)
-    nominal = seen(start)
-    column, ratio = first_column(turn.mean, nominal)
+    turn, rays, instead = None, None, ""
+    try:
+        turn = read_turn(image, base.angle_scale * poses.angle, present)
+    except NotIdentifiableError as error:
+        instead = f"{error.message}; "
+    if turn is not None:
+        known, start, scales = np.array([math.inf, math.inf, yaw]), start[:3], scales[:3]
+        column, ratio = first_column(turn.mean, nominal)
+        start[0] += (column - nominal) / _slopes(seen, start, scales)[0]
+    else:
+        scales[1] = 2 / cols
+        known = np.array(
+            [math.inf, math.radians(priors["det_roll"]), yaw, priors["dD_z"], priors["dD_y"]]
+        )
+        try:
+            rays = _rays(image, poses, present, shape, offsets, start, scales, known, random)
+        except NotIdentifiableError as error:
+            raise NotIdentifiableError(instead + error.message) from error
+        start, ratio = rays.first()
+        column = seen(start)
     _refuse_if(
         ratio == 0.0,
-        f"the mean is symmetric about no column within {REACH * cols:.0f} px of the nominal one "
-        f"({nominal:.1f}): the axis is elsewhere, or too much of the object is out of view",
+        f"{instead}the images are symmetric about no column within {REACH * cols:.0f} px of the "
+        f"nominal one ({nominal:.1f}): the axis is elsewhere, or too much of the object is out of "
+        "view",
     )
     _refuse_if(
         ratio < LEAST_RATIO,
-        f"the mean is about as symmetric about another column as about {column:.1f} (ratio "
-        f"{ratio:.2f}; at least {LEAST_RATIO:g})",
+        f"{instead}the images are about as symmetric about another column as about {column:.1f} "
+        f"(ratio {ratio:.2f}; at least {LEAST_RATIO:g})",
     )
-    start[0] += (column - nominal) / _slopes(seen, start, scales)[0]
-    found = find_symmetry(turn, view, start, scales, np.array([math.inf, math.inf, yaw]))
+    found = find_symmetry(turn, view, start, scales, known) if turn else rays.find(start)  # type: ignore[union-attr]
     _refuse_if(
         not found.converged,
-        "no plane of symmetry is found: too little structure for the noise, or too few columns on "
-        "both sides of the axis",
+        f"{instead}no plane of symmetry is found: too little structure for the noise, or too few "
+        "columns on both sides of the axis",
     )
     _refuse_if(
         found.asymmetry > MOST_ASYMMETRY,
-        f"{100 * found.asymmetry:.1f} % of the mean is not symmetric (at most "
-        f"{100 * MOST_ASYMMETRY:g} %): something does not turn with the stage, or the angles or "
-        "the object change during the scan",
+        f"{instead}{100 * found.asymmetry:.1f} % of the mean, or of opposite rays, is not "
+        f"symmetric (at most {100 * MOST_ASYMMETRY:g} %): something does not turn with the stage, "
+        "or the angles or the object change during the scan",
     )
-    step = (0.0, 0.0) if turn.step_px is None else turn.step_px[0]
-    covariance = found.covariance.copy()
-    covariance[0, 0] += (math.hypot(FLOOR_PX, step[0] / 2) * scales[0]) ** 2
+    values, covariance = found.values.copy(), found.covariance.copy()
+    told, beside = found.images[1:3] < known[1:3] / 2, 0.0
+    if rays is not None:  # what few rows say of the roll was up to six sigma off
+        # It moves the axis in the panel's middle row, if rows beside that were read.
+        read = rays.frames.shape[1]
+        beside = known[1] * (rays.top - (rows - read) / 2) * (read > 1)
+        told[:], values[1], covariance[1], covariance[:, 1] = False, base.det_roll, 0.0, 0.0
+        covariance[1, 1] = known[1] ** 2
+    step = (0.0, 0.0) if turn is None or turn.step_px is None else turn.step_px[0]
+    covariance[0, 0] += (math.hypot(FLOOR_PX, step[0] / 2, beside) * scales[0]) ** 2
     covariance[1, 1] += math.radians(FLOOR_DEG) ** 2 + (step[0] / rows) ** 2
-    slopes = _slopes(seen, found.values, scales)
+    slopes = _slopes(seen, values, scales)
     sigma = math.sqrt(slopes @ covariance @ slopes)
-    roll, turned = np.degrees(np.sqrt(np.diag(covariance)[1:])).tolist()
+    roll, turned = np.degrees(np.sqrt(np.diag(covariance)[1:3])).tolist()
     _refuse_if(
-        sigma > MOST_COLUMN or roll > MOST_ROLL,
-        f"the column would be known to {sigma:.2g} px and the roll to {roll:.2g} deg; allowed: "
-        f"{MOST_COLUMN:g} px and {MOST_ROLL:g} deg (more views or light help)",
+        sigma > MOST_COLUMN or (bool(told[0]) and roll > MOST_ROLL),
+        f"{instead}the column would be known to {sigma:.2g} px and the roll to {roll:.2g} deg; "
+        f"allowed: {MOST_COLUMN:g} px and {MOST_ROLL:g} deg (more views or light help)",
     )
-    parameters = {
-        "axis_column_px": AlignEstimate(seen(found.values), sigma, "px"),
-        "det_roll": AlignEstimate(math.degrees(found.values[1]), roll, "deg"),
-    }
-    refused = dict(UNTOLD)
-    if found.images[2] < yaw / 2:
-        aside = math.hypot(turned, math.degrees(sideways))
-        parameters["det_yaw"] = AlignEstimate(math.degrees(found.values[2]), aside, "deg")
-    else:
-        refused["det_yaw"] = (
-            f"the images tell it to +- {math.degrees(found.images[2]):.2g} deg, its prior to +- "
-            f"{math.degrees(yaw):.2g} deg: that is what the correction contains"
-        )
-    planes = _Planes(image, poses, turn, offsets, found.values, covariance, priors)
-    corrected, motion = offsets(found.values), None
+    parameters = {"axis_column_px": AlignEstimate(seen(values), sigma, "px")}
+    aside = math.hypot(turned, math.degrees(sideways))
+    refused, widths = dict(UNTOLD), (roll, aside)
+    for i, name in enumerate(FREE[1:3]):
+        if told[i]:
+            value = math.degrees(values[1 + i])
+            parameters[name] = AlignEstimate(value, widths[i], "deg")
+        else:
+            refused[name] = (
+                f"the images tell it to +- {math.degrees(found.images[1 + i]):.2g} deg, its prior "
+                f"to +- {math.degrees(known[1 + i]):.2g} deg: that is what the correction contains"
+            )
+    corrected, motion = offsets(values[:3]), None
+    if turn is None:
+        told_by = "a full turn of more rows tells it; the correction keeps what was in force"
+        refused |= dict.fromkeys(("det_roll", "source_row_px", "motion"), told_by)
+        return Alignment(corrected, parameters, refused, (), len(present))
+    planes = _Planes(image, poses, turn, offsets, values, covariance, priors)
     try:
         corrected, parameters["source_row_px"] = planes.row(random)
     except NotIdentifiableError as error:
@@ -367,6 +403,39 @@ def _align(
             refused["motion"] = error.message
     warnings = _warnings(turn, found, len(poses) - len(present))
     return Alignment(corrected, parameters, refused, warnings, len(turn.used), motion)
+
+
+def _rays(
+    image: Image, poses: Poses, present: tuple[int, ...], shape: tuple[int, int],
+    offsets: Callable[[FloatArray], Offsets], start: FloatArray, scales: FloatArray,
+    known: FloatArray, random: np.random.Generator,
+) -> OppositeRays:  # fmt: skip
+    """Rays near the plane of the source that two views see from opposite ends.
+
+    Raises:
+        NotIdentifiableError: there are hardly any.
+    """
+    rows, cols = shape
+    angle = offsets(start).angle_scale * poses.angle[list(present)] % (2 * np.pi)
+    order = np.array(present)[np.argsort(angle, kind="stable")][:: -(-len(present) // MOST_VIEWS)]
+    some = poses[order]
+    first = _about_axis(some[:1], offsets(start))
+    row = first.project_points([[0.0, 0.0, float(first.source[0, 2])]], shape)[0, 0, 1]
+    lean = 2 * float(some.sdd[0]) / (cols * float(np.linalg.norm(some.u[0])))
+    _refuse_if(
+        not -lean < row < rows - 1 + lean,
+        f"the source turns in the plane of row {row:.0f}: rays to rows 0 to {rows - 1} lean too "
+        f"much to be those of opposite views; allowed are regions within {lean:.0f} rows of it",
+    )
+    top, end = np.clip(np.round(row) + (-BAND, BAND + 1), (0, 1), (rows - 1, rows)).astype(int)
+    stack = np.stack([image(i)[top:end] for i in order.tolist()])
+    if end - top <= 2 * BAND:
+        stack = stack.mean(axis=1, keepdims=True)
+
+    def views(values: FloatArray) -> FloatArray:
+        return np.asarray(_about_axis(some, offsets(values)).rows)
+
+    return OppositeRays(stack, int(top), shape, views, start, scales, known, random)
 
 
 class _Planes:

@@ -99,15 +99,19 @@ def first_column(mean: FloatArray, nominal: float) -> tuple[float, float]:
         left, right = bands[:, a], bands[:, k - a]
         spread = np.square(left - left.mean(axis=1, keepdims=True)).sum()
         cost[i] = np.square(left - right).sum() / max(spread, 1e-30)
-    best = int(cost.argmin())
-    inner = cost[1:-1]
+    best, ratio = best_dip(cost, cols / LEVELS[0])
+    return twice[best] / 2, ratio
+
+
+def best_dip(cost: FloatArray, apart: float) -> tuple[int, float]:
+    """Where a cost is least, and by what factor less than in any other dip that is `apart`; 0 where
+    that is at an end."""
+    best, inner = int(cost.argmin()), cost[1:-1]
     dips = np.flatnonzero((inner <= cost[:-2]) & (inner <= cost[2:]) & np.isfinite(inner)) + 1
     if best not in dips:
-        return twice[best] / 2, 0.0
-    others = cost[dips[np.abs(dips - best) > cols / LEVELS[0]]]
-    return twice[best] / 2, float(others.min() / max(cost[best], 1e-30)) if len(
-        others
-    ) else math.inf
+        return best, 0.0
+    others = cost[dips[np.abs(dips - best) > apart]]
+    return best, float(others.min() / max(cost[best], 1e-30)) if len(others) else math.inf
 
 
 def find_symmetry(
@@ -221,7 +225,7 @@ class _MirrorPairs:
         self.level, self.here, self.at = level, here, at
         image = self.image = level._mirrored(here, at)
         variance = sum(map_coordinates(level.relative, p[::-1], order=1) for p in (at, image))
-        self.own = [_read(soft, at) for soft in level.soft]
+        self.own = [read_spline(soft, at) for soft in level.soft]
         self.white = [map_coordinates(level.white, p[::-1], order=1) for p in (at, image)]
         self.steps = [map_coordinates(i, at[::-1], order=1) for i in level.steps]
         noise = sum(self.white) / (4.0 * math.pi * level.sigma**2)
@@ -234,7 +238,7 @@ class _MirrorPairs:
         for i, e in enumerate(np.diag(0.25 * level.scales * (1.0 + level.sigma))):
             ends = [level._mirrored(here + s * e, at) for s in (1, -1)]
             self.ends.append((ends, 2.0 * e[i]))
-            low, high = (_read(level.softer, end) for end in ends)
+            low, high = (read_spline(level.softer, end) for end in ends)
             slopes[:, i] = (high - low) / (2.0 * e[i])
         self.slopes = slopes - self.odd @ (self.to_odd @ slopes)
 
@@ -245,12 +249,12 @@ class _MirrorPairs:
 
     def _residual(self, values: FloatArray, which: int = 0) -> FloatArray:
         image = self.level._mirrored(values, self.at)
-        return np.asarray(self.own[which] - _read(self.level.soft[which], image))
+        return np.asarray(self.own[which] - read_spline(self.level.soft[which], image))
 
     def score(self, values: FloatArray) -> FloatArray:
         """The estimating equation."""
         image = self.level._mirrored(values, self.at)
-        rest = self.own[0] - _read(self.level.soft[0], image)
+        rest = self.own[0] - read_spline(self.level.soft[0], image)
         both = 3.0 * self.level.sigma**2  # of the two smoothings
         power = self.w * self.white[1] / (2.0 * math.pi * both)
         noise = []
@@ -376,7 +380,8 @@ def _edges(mean: FloatArray, noise: FloatArray) -> tuple[FloatArray, float]:
     return np.where(seen, quarter, 0.0), left
 
 
-def _read(coefficients: FloatArray, at: FloatArray) -> FloatArray:
+def read_spline(coefficients: FloatArray, at: FloatArray) -> FloatArray:
+    """An image at places (column, row) (2, k), by the coefficients of its cubic spline."""
     return np.asarray(
         map_coordinates(coefficients, at[::-1], order=3, prefilter=False, mode="nearest")
     )

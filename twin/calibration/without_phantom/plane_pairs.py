@@ -179,24 +179,11 @@ class PlanePairs:
     def spread(self, parts: FloatArray, blocks: bool = False) -> FloatArray:
         """Standard deviations of `total`.
 
-        Pairs that share a frame, or one of a sector, are not independent: of squares of the sums
-        over all that do, those that count pairs twice are taken away. The largest of three counts.
-
         Args:
             parts: (..., q + distances * BLOCKS).
             blocks: whether sums over heights and over distances count too.
         """
-        n, q = len(self.sums), len(self.pairs)
-        own = parts[..., :q] - parts[..., :q].mean(axis=-1, keepdims=True)
-        worst = np.square(own).sum(axis=-1)
-        for count in (SECTORS, n):
-            low, high = np.sort(self.pairs * count // n, axis=1).T
-            both = np.zeros((*own.shape[:-1], count, count))
-            np.add.at(both, (..., low, high), own)  # type: ignore[arg-type]
-            touched = both.sum(axis=-1) + both.sum(axis=-2)
-            touched -= np.diagonal(both, axis1=-2, axis2=-1)
-            twice = np.square(np.triu(both, 1)).sum(axis=(-1, -2))
-            worst = np.maximum(worst, np.square(touched).sum(axis=-1) - twice)
+        worst = np.square(spread(parts[..., : len(self.pairs)], self.pairs, len(self.sums)))
         if blocks:
             for axis in (-2, -1):
                 squares = np.square(self.blocks(parts).sum(axis=axis))
@@ -207,18 +194,9 @@ class PlanePairs:
         return np.asarray(np.sqrt(worst))
 
     def noise(self, random: np.random.Generator) -> Float32Array:
-        """Images that are noise as large as that of the frames, laid out as `sums`.
-
-        Its variance grows as 1 / exp(-g), as that of counted photons; how large it is is the
-        median over all pixels of second differences along rows, so mostly of air.
-        """
-        images = np.diff(self.sums, axis=2)
-        power = np.exp(np.minimum(images, DARKEST))
-        change = np.square(np.diff(images, 2, axis=1)) / 6
-        size = math.sqrt(float(np.median(change / power[:, 1:-1])) / MEDIAN_OF_CHI_SQUARE)
-        white = random.standard_normal(images.shape, dtype=np.float32)
+        """Images that are noise as large as that of the frames, laid out as `sums`."""
         out = np.zeros_like(self.sums)
-        np.cumsum(size * np.sqrt(power) * white, axis=2, out=out[:, :, 1:])
+        np.cumsum(noise_like(np.diff(self.sums, axis=2), random), axis=2, out=out[:, :, 1:])
         return out
 
     def _valid(
@@ -248,6 +226,38 @@ class PlanePairs:
                     inside = (k + by >= 0) & (k + by < valid.shape[1])
                     valid[q[inside], (k + by)[inside]] = False
         return valid
+
+
+def noise_like(images: Float32Array, random: np.random.Generator) -> Float32Array:
+    """Noise as large as that of images (n, cols, rows).
+
+    Its variance grows as 1 / exp(-g), as that of counted photons; how large it is is the median
+    over all pixels of second differences along rows, so mostly of air.
+    """
+    power = np.exp(np.minimum(images, DARKEST))
+    change = np.square(np.diff(images, 2, axis=1)) / 6
+    size = math.sqrt(float(np.median(change / power[:, 1:-1])) / MEDIAN_OF_CHI_SQUARE)
+    white = random.standard_normal(images.shape, dtype=np.float32)
+    return np.asarray(size * np.sqrt(power) * white)
+
+
+def spread(parts: FloatArray, pairs: npt.NDArray[np.intp], n: int) -> FloatArray:
+    """Standard deviations of sums over pairs (q, 2) of n frames of parts (..., q).
+
+    Pairs that share a frame, or one of a sector, are not independent: of squares of the sums over
+    all that do, those that count pairs twice are taken away. The largest of three counts.
+    """
+    own = parts - parts.mean(axis=-1, keepdims=True)
+    worst = np.square(own).sum(axis=-1)
+    for count in (SECTORS, n):
+        low, high = np.sort(pairs * count // n, axis=1).T
+        both = np.zeros((*own.shape[:-1], count, count))
+        np.add.at(both, (..., low, high), own)  # type: ignore[arg-type]
+        touched = both.sum(axis=-1) + both.sum(axis=-2)
+        touched -= np.diagonal(both, axis1=-2, axis2=-1)
+        twice = np.square(np.triu(both, 1)).sum(axis=(-1, -2))
+        worst = np.maximum(worst, np.square(touched).sum(axis=-1) - twice)
+    return np.asarray(np.sqrt(worst))
 
 
 def without(

@@ -1,0 +1,247 @@
+"""Rays that two views see from opposite ends: the axis of half turns and of scans of few rows.
+
+The line through the sources of two views is a ray of both, whatever the object: where it falls on
+both panels, both must say the same. Of a whole turn every ray of the fan is one of these, of half a
+turn and the fan those of its first and last views. Beside the plane in which the source turns rays
+differ from their opposites by the little that they lean, so rows near it count as well.
+
+The estimate is the root of Z' W r: r is the difference of the two, Z its slopes, freed of what a
+flat field that is wrong by a polynomial would add. Noise is in Z too; what an image of noise alone
+gives is taken from Z' W Z, which would promise too much. Sums over all rays of a view, of a sector
+of views and of a few columns tell how much Z' W r scatters: noise, rings, jitter, sampling.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import gaussian_filter, spline_filter1d
+
+from flexdt.twin.calibration.without_phantom.mirror_symmetry import (
+    LEVELS,
+    REACH,
+    Symmetry,
+    best_dip,
+    read_spline,
+)
+from flexdt.twin.calibration.without_phantom.plane_pairs import noise_like, spread
+from flexdt.twin.calibration.without_phantom.turn import DARKEST, MEDIAN_OF_CHI_SQUARE
+from flexdt.twin.errors import NotIdentifiableError
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+
+MOST_PAIRS: Final = 30_000
+"""Pairs of views that are used, evenly chosen of more; for the first search a tenth of them."""
+FEWEST_PAIRS: Final = 50
+ROUNDS: Final = 15
+LIFT: Final = 0.25
+"""Rows beside the source's plane count where a ray that leans and its opposite are so little apart
+at the edge of the field of view [px]."""
+EDGE: Final = 2
+"""Rows around each view's that a cubic spline needs."""
+CLEAN: Final = 0.5
+"""What the slopes are made of must be so many times noise, at least."""
+
+
+class OppositeRays:
+    """Pairs of views, and the rays that both see.
+
+    Args:
+        frames: line integrals (n, rows, cols) of rows around the source's plane.
+        top: the row of the panel that is their first.
+        shape: (rows, cols) of the panel.
+        views: parameters to all views about the axis, (n, 12).
+        start: of the parameters, (k,); the first moves the image sideways.
+        scales: change of each parameter that moves the image's ends by about a pixel, (k,).
+        priors: sigma of each parameter about its start, inf for none, (k,).
+        random: for the image of noise.
+
+    Raises:
+        NotIdentifiableError: hardly two views see a line from both ends.
+    """
+
+    def __init__(
+        self, frames: Float32Array, top: int, shape: tuple[int, int],
+        views: Callable[[FloatArray], FloatArray], start: FloatArray, scales: FloatArray,
+        priors: FloatArray, random: np.random.Generator,
+    ) -> None:  # fmt: skip
+        self.frames, self.top, self.shape, self.views = frames, top, shape, views
+        self.start, self.scales, self.known = start, scales, np.diag(1.0 / np.square(priors))
+        self.noise = noise_like(frames.transpose(0, 2, 1), random).transpose(0, 2, 1)
+        rows = views(start)
+        depth = np.linalg.norm(rows[0, 3:6] - rows[0, :3])
+        fan = math.atan((0.5 + REACH) * shape[1] * np.linalg.norm(rows[0, 6:9]) / depth)
+        azimuth = np.arctan2(rows[:, 1], rows[:, 0])
+        behind = np.abs((azimuth - azimuth[:, None]) % (2 * np.pi) - np.pi) < 2 * fan
+        pairs = np.argwhere(np.triu(behind, 1))
+        self.pairs = pairs[:: -(-len(pairs) // MOST_PAIRS) or 1]
+        half = LIFT / math.tan(fan)
+        self.lifts = np.unique([-half, 0.0, half] if len(frames[0]) > 1 else [0.0])
+        if (count := int(self._places(start, self.pairs)[1].sum())) < FEWEST_PAIRS:
+            around = np.sort(azimuth % (2 * np.pi))
+            gap = float(np.diff(around, append=around[0] + 2 * np.pi).max())
+            raise NotIdentifiableError(
+                f"{count} pairs of views see a line from both ends (at least {FEWEST_PAIRS}): the "
+                f"views span {360 - math.degrees(gap):.4g} deg; half a turn and the fan, "
+                f"{180 + math.degrees(2 * fan / (1 + 2 * REACH)):.4g} deg in small steps, or a "
+                "full turn tell it"
+            )
+
+    def first(self) -> tuple[FloatArray, float]:
+        """The parameters about which rays agree best, and how much better than about the next best
+        column, as `first_column` has it."""
+        cols = self.shape[1]
+        level = _Level(self, cols / LEVELS[0])
+        some = self.pairs[:: -(-len(self.pairs) // (MOST_PAIRS // 10))]
+        half = int(2 * REACH * cols / level.sigma)
+        step = level.sigma / 2 * np.eye(len(self.start))[0] * self.scales[0]
+        tried = [self.start + k * step for k in range(-half, half + 1)]
+        best, ratio = best_dip(np.array([level.disagreement(t, some) for t in tried]), 2)
+        return tried[best], ratio
+
+    def find(self, values: FloatArray) -> Symmetry:
+        """The parameters, coarse to fine: the estimate of the level that tells the first best."""
+        found = []
+        for part in LEVELS:
+            found.append(_Level(self, max(self.shape[1] / part, 1.0)).solve(values))
+            if found[-1].converged:
+                values = found[-1].values
+        return min(found, key=lambda one: one.images[0] if one.converged else math.inf)
+
+    def _places(
+        self, values: FloatArray, pairs: npt.NDArray[np.intp]
+    ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+        """Columns and rows (2, 2, q) where each view of a pair shows the other's source, and
+        whether both panels have it."""
+        rows, out = self.views(values), np.empty((2, 2, len(pairs)))
+        middle = (np.array(self.shape[::-1]) - 1) / 2
+        for side in (0, 1):
+            v, other = rows[pairs[:, side]], rows[pairs[:, 1 - side]]
+            normal, panel = np.cross(v[:, 6:9], v[:, 9:12]), v[:, 3:6] - v[:, :3]
+            ray = other[:, :3] - v[:, :3]
+            ray *= ((panel * normal).sum(axis=1) / (ray * normal).sum(axis=1))[:, None]
+            for i, axis in enumerate((v[:, 6:9], v[:, 9:12])):
+                out[side, i] = ((ray - panel) * axis).sum(axis=1) / np.square(axis).sum(axis=1)
+            out[side] += middle[:, None]
+        inside = (out[:, 0] >= 0) & (out[:, 0] <= self.shape[1] - 1)
+        return out, np.asarray(inside.all(axis=0))
+
+
+class _Level:
+    """One smoothing of the frames."""
+
+    def __init__(self, rays: OppositeRays, sigma: float) -> None:
+        self.rays, self.sigma = rays, sigma
+        self.images, self.alone = (self._soft(i) for i in (rays.frames, rays.noise))
+
+    def _soft(self, images: Float32Array) -> FloatArray:
+        """Coefficients of a spline through all smoothed images, one below the other."""
+        soft = gaussian_filter(images, (0, self.sigma, self.sigma))
+        for axis in (1, 2):
+            soft = spline_filter1d(soft, axis=axis, output=np.float32)
+        soft = np.pad(soft, ((0, 0), (EDGE, EDGE), (0, 0)), "reflect")
+        return soft.reshape(-1, soft.shape[2])
+
+    def read(
+        self, image: FloatArray, places: FloatArray, pairs: npt.NDArray[np.intp]
+    ) -> FloatArray:
+        """What both views of pairs show, (2, q, lifts)."""
+        rows = self.rays.frames.shape[1]
+        row = places[:, 1, :, None] + self.rays.lifts - self.rays.top
+        row = np.clip(row, 0, rows - 1) + EDGE + pairs.T[:, :, None] * (rows + 2 * EDGE)
+        column = np.broadcast_to(places[:, 0, :, None], row.shape)
+        return read_spline(image, np.stack([column, row]))
+
+    def disagreement(self, values: FloatArray, pairs: npt.NDArray[np.intp]) -> float:
+        """Mean square of the differences over that of what is seen; infinite for few rays."""
+        places, inside = self.rays._places(values, pairs)
+        if inside.sum() < FEWEST_PAIRS // 2:
+            return math.inf
+        both = self.read(self.images, places[:, :, inside], pairs[inside])
+        return float(np.square(both[0] - both[1]).mean() / max(both.var(), 1e-30))
+
+    def solve(self, start: FloatArray) -> Symmetry:
+        """The root of the estimating equation from a start."""
+        rays, values, k = self.rays, start.copy(), len(start)
+        found = Symmetry(values, np.full((k, k), np.inf), np.full(k, np.inf), math.inf, False)
+        for _ in range(ROUNDS):
+            inside = rays._places(values, rays.pairs)[1]
+            if inside.sum() < FEWEST_PAIRS:
+                break
+            pairs = rays.pairs[inside]
+            rest, slopes, noise, noisy, w = self._equations(values, pairs)
+            alone = (noisy * w) @ noisy.T
+            information = (slopes * w) @ slopes.T - alone
+            if not information[0, 0] > CLEAN * alone[0, 0]:
+                break
+            score = (slopes * w) @ rest
+            scatter = self._scatter(slopes * w, rest, pairs, values)
+            kappa = scatter[0, 0] / information[0, 0]
+            inverse = np.linalg.inv(information + kappa * rays.known)
+            step = -inverse @ (score + kappa * rays.known @ (values - rays.start))
+            covariance = inverse @ (scatter + kappa**2 * rays.known) @ inverse
+            longest = float(np.abs(step / rays.scales).max())
+            values = values + step * min(1.0, 4.0 * self.sigma / max(longest, 1e-30))
+            sigmas = np.sqrt(np.abs(np.diag(covariance)))
+            # Noise comes to more by chance, of few views the most.
+            chance = 1.0 + 3.0 * math.sqrt(2.0 / len(rays.frames))
+            power = float((w * (np.square(rest) - chance * np.square(noise))).sum())
+            done = bool((np.abs(step) <= 0.05 * sigmas + 1e-5 * rays.scales)[0])
+            asymmetry = math.sqrt(max(power, 0.0) / self.structure)
+            found = Symmetry(values, covariance, sigmas, asymmetry, done)
+            if done or not np.isfinite(values).all():
+                break
+        return found
+
+    def _equations(
+        self, values: FloatArray, pairs: npt.NDArray[np.intp]
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Differences (m,) and their slopes (k, m), both of noise alone, and weights."""
+        places = self.rays._places(values, pairs)[0]
+        both = self.read(self.images, places, pairs).reshape(2, -1)
+        w = 1.0 / np.exp(np.minimum(both, DARKEST)).sum(axis=0)
+        x = (places[:, 0] / self.rays.shape[1] - 0.5)[:, :, None] + 0.0 * self.rays.lifts
+        odd = np.stack([(x[0] ** i - x[1] ** i).ravel() for i in (1, 3)])
+        to_odd = np.linalg.pinv((odd * w) @ odd.T) @ (odd * w)
+
+        def freed(lines: FloatArray) -> FloatArray:
+            return np.asarray(lines - (lines @ to_odd.T) @ odd)
+
+        def difference(image: FloatArray, where: FloatArray) -> FloatArray:
+            return np.asarray(-np.diff(self.read(image, where, pairs), axis=0).ravel())
+
+        slopes = np.empty((2, len(values), both.shape[1]))
+        for i, e in enumerate(np.diag(0.25 * self.rays.scales * (1.0 + self.sigma))):
+            ends = [self.rays._places(values + s * e, pairs)[0] for s in (1, -1)]
+            for which, image in enumerate((self.images, self.alone)):
+                low, high = (difference(image, end) for end in ends)
+                slopes[which, i] = (low - high) / (2.0 * e[i])
+        self.structure = max(float((w * np.square(both - np.average(both))).sum()) / 2, 1e-30)
+        rest, noise = freed(both[0] - both[1]), freed(difference(self.alone, places))
+        return rest, freed(slopes[0]), noise, freed(slopes[1]), w
+
+    def _scatter(
+        self, slopes: FloatArray, rest: FloatArray, pairs: npt.NDArray[np.intp], values: FloatArray
+    ) -> FloatArray:
+        """Covariance of sums over all rays of weighted slopes (k, m) times differences (m,), and of
+        what the noise of the flat field, which all frames share, adds to them."""
+        rays, of_pairs = self.rays, (len(slopes), len(pairs), -1)
+        columns = rays._places(values, pairs)[0][:, 0]
+        sums = (slopes * rest).reshape(of_pairs).sum(axis=2)
+        own = sums - sums.mean(axis=1, keepdims=True)
+        near = (np.abs(columns[0] - columns[1]) / (6.0 * self.sigma)).astype(np.intp)
+        wide = np.square([np.bincount(near, part) for part in own]).sum(axis=1)
+        wide = np.maximum(wide, np.square(spread(sums, pairs, len(rays.frames))))
+        covariance = own @ own.T
+        wider = np.sqrt(np.maximum(wide / np.maximum(np.diag(covariance), 1e-300), 1.0))
+        change = np.square(np.diff(rays.frames.mean(axis=0), 2, axis=1)) / 6
+        power = float(np.median(change)) / MEDIAN_OF_CHI_SQUARE
+        power /= max(1.0, 2.0 * math.sqrt(math.pi) * self.sigma * (len(change) > 1))
+        ends, size = columns.round().astype(np.intp), rays.shape[1]
+        of_columns = [np.bincount(ends[0], part, size) - np.bincount(ends[1], part, size)
+                      for part in slopes.reshape(of_pairs).sum(axis=2)]  # fmt: skip
+        rings = gaussian_filter(np.stack(of_columns), (0, self.sigma))
+        return np.asarray(covariance * np.outer(wider, wider) + power * (rings @ rings.T))
