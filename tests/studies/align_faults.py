@@ -81,6 +81,8 @@ class Scan:
     """Frames that the data set lacks."""
     repeats: bool = False
     """Whether frame views / 3 is there twice, and all after it come one late."""
+    swapped: tuple[int, int] | None = None
+    """A frame that is lost, and another that is exposed twice, so that their number is right."""
     nominal: Callable[[fx.ConeVec], fx.ConeVec] = lambda cone: cone
 
     def boxes_added(self, *boxes: list[float]) -> None:
@@ -365,6 +367,12 @@ def repeated(s: Scan, rng: Rng) -> None:
 
 
 @fault
+def lost_and_exposed_again(s: Scan, rng: Rng) -> None:
+    lost, again = rng.choice(s.hidden.views, 2, replace=False).tolist()
+    s.swapped = lost, again
+
+
+@fault
 def clockwise(s: Scan, rng: Rng) -> None:
     s.hidden = replace(s.hidden, span=-360.0)
 
@@ -540,6 +548,10 @@ def images(s: Scan, rng: Rng) -> tuple[np.ndarray, np.ndarray]:
     """Counts of all frames, and the flat image."""
     rows, cols = s.hidden.shape
     g = lines(s)
+    if s.swapped:
+        lost, again = s.swapped
+        order = np.insert(np.arange(s.hidden.views), again, again)
+        g = g[np.delete(order, np.flatnonzero(order == lost)[0])]
     light = np.exp(-(g - s.hardening * g**2))
     if s.scatter:
         light += s.scatter * gaussian_filter(light, (0, 15, 15))

@@ -396,7 +396,12 @@ def _align(
         corrected, parameters["source_row_px"] = planes.row(random)
     except NotIdentifiableError as error:
         refused["source_row_px"] = error.message
-    if per_frame:
+    if per_frame and turn.repeated:
+        refused["motion"] = (
+            f"frames {list(turn.repeated)} repeat the one before: from there on the others may be "
+            "a step behind their angles"
+        )
+    elif per_frame:
         try:
             motion = planes.motion(corrected, random)
         except NotIdentifiableError as error:

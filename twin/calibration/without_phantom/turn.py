@@ -28,8 +28,11 @@ DARKEST: Final = 8.0
 """Line integral above which the noise is taken for that of this one."""
 MEDIAN_OF_CHI_SQUARE: Final = 0.4549
 """Of one degree of freedom."""
-ALIKE: Final = 0.03
-"""Squared difference of neighbours, relative to the usual one, below which a frame is repeated."""
+ALIKE: Final = 0.3
+"""A frame is repeated where it differs from the one before by less than so much of what all but a
+tenth differ by, of what is usual there: the noise of two exposures remains (from drawn scans)."""
+LOST: Final = 2.5
+"""And above which one may be missing between them: with one missing it is about four."""
 STEPS: Final = 5.0
 """A step between neighbours is one when it is so many times the usual spread (assumed)."""
 CLEAR: Final = 1.5
@@ -70,7 +73,11 @@ class Turn:
 
 
 def read_turn(
-    image: Image, angle: FloatArray, present: Sequence[int], repeated: tuple[int, ...] = ()
+    image: Image,
+    angle: FloatArray,
+    present: Sequence[int],
+    repeated: tuple[int, ...] = (),
+    lost: tuple[int, ...] = (),
 ) -> Turn:
     """Read the frames, twice where some are repeated.
 
@@ -79,6 +86,7 @@ def read_turn(
         angle: of the stage in every frame, (n,) [rad].
         present: indices of the frames that are there.
         repeated: frames among them that are known to be repeated.
+        lost: frames before which one may be missing, although no angle is.
 
     Raises:
         NotIdentifiableError: they are too few, or do not close a turn.
@@ -88,11 +96,12 @@ def read_turn(
     gaps, usual = _require_turn(angle[index])
     weights = _coefficients(angle[index], gaps, usual)
     # After a repeated frame all others may be one step behind what their angles say: what was
-    # seen twice is then missing between the last frame and the first.
+    # seen twice is then missing between the last frame and the first, or where one was lost.
     ends = np.isin(index, [index.min(), index.max()]) / 2
     for one in repeated:
         near = np.abs(index - one) == np.abs(index - one).min()
-        weights = np.vstack([weights, weights[0] * (near / near.sum() - ends)])
+        for gap in (ends, *(np.isin(index, [at - 1, at]) / 2 for at in lost)):
+            weights = np.vstack([weights, weights[0] * (near / near.sum() - gap)])
     total: FloatArray | float = 0.0
     noise: FloatArray | float = 0.0
     thumbs = []
@@ -103,9 +112,9 @@ def read_turn(
         noise = noise + weight[0] * np.exp(np.minimum(g, DARKEST))
     views = np.stack(thumbs)
     if not repeated:
-        found = index[_repeated(views, gaps)].tolist()
-        if found:
-            return read_turn(image, angle, present, tuple(sorted(found)))
+        again, jumps = (index[places].tolist() for places in _repeated(views, gaps))
+        if again:
+            return read_turn(image, angle, present, tuple(sorted(again)), tuple(jumps))
     shape = np.shape(noise)
     step = _step(views, gaps, int(index.argmin()))
     if step is not None:
@@ -172,8 +181,9 @@ def _thumb(image: Float32Array) -> Float32Array:
     return np.asarray(binned_mean(image, factor), dtype=np.float32)
 
 
-def _repeated(views: Float32Array, gaps: FloatArray) -> list[int]:
-    """Places of frames that show what the one before shows although the stage turned."""
+def _repeated(views: Float32Array, gaps: FloatArray) -> tuple[list[int], list[int]]:
+    """Places of frames that show what the one before shows although the stage turned, and of those
+    that differ from it as if one were missing."""
     soft = gaussian_filter(views, (0, 2, 2))  # less noise: a copy may have been exposed anew
     rest = soft - np.roll(soft, 1, axis=0)
     change = np.empty(len(views))
@@ -184,10 +194,13 @@ def _repeated(views: Float32Array, gaps: FloatArray) -> list[int]:
         change[i] = np.square(left).mean(dtype=np.float64)
     # Usual for that part of the turn: a round body hardly changes where it turns back.
     usual = median_filter(change, 5, mode="wrap")
-    same = (change <= ALIKE * usual) & (np.roll(gaps, 1) > 1e-6)
-    if same.sum() > len(views) // 4:
-        return []
-    return [int(i) for i in np.flatnonzero(same)]
+    turned = np.roll(gaps, 1) > 1e-6
+    ratio = change / np.maximum(usual, 1e-30)
+    same = np.flatnonzero((ratio <= ALIKE * np.quantile(ratio, 0.1)) & turned)
+    if len(same) > len(views) // 4:
+        return [], []
+    jump = np.where(np.roll(gaps, 1) < 1.5 * np.median(gaps), ratio, 0.0)
+    return same.tolist(), [int(jump.argmax())] if jump.max() > LOST else []
 
 
 def _step(
