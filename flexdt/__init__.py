@@ -54,9 +54,9 @@ if not _os.path.isdir(_os.path.join(__path__[0], "twin")):
     __path__.append(_os.path.dirname(__path__[0]))
 _moved.watch()
 
-from flexdt import long_work as _long_work  # noqa: E402  (found through the path)
+from flexdt import progress_lines as _progress_lines  # noqa: E402  (found through the path)
 
-_long_work.watch()
+_progress_lines.watch()
 
 _HOMES: _typing.Final = {
     "AsyncTwinClient": "flexdt.clients",
