@@ -11,23 +11,30 @@ from contextlib import contextmanager
 from flexdt import long_work
 
 SILENT_S = 2.0
+_last = [0.0, 0.0]
+"""When the newest line was told and the newest work ended: one kernel compiles after another."""
 
 
 @contextmanager
 def told(what: str) -> Iterator[None]:
     """Tell the log, and so standard error, of work that goes on inside."""
     done, begun = threading.Event(), time.monotonic()
+    if begun > _last[1] + SILENT_S:
+        _last[0] = begun
 
     def tell() -> None:
-        while not done.wait(SILENT_S):
-            seconds = time.monotonic() - begun
-            logging.getLogger("flexdt.kernels").warning("flexdt: still %s (%.0f s)", what, seconds)
+        while not done.wait(max(0.0, _last[0] + SILENT_S - time.monotonic())):
+            _last[0] = time.monotonic()
+            logging.getLogger("flexdt.kernels").warning(
+                "flexdt: still %s (%.0f s)", what, _last[0] - begun
+            )
 
     threading.Thread(target=tell, name="flexdt-long-work", daemon=True).start()
     try:
         yield
     finally:
         done.set()
+        _last[1] = time.monotonic()
 
 
 def watch() -> None:

@@ -185,7 +185,7 @@ class Outcome:
         """
         result = self.calibration
         if not result.identifiable or result.fit is None:
-            raise TwinError("this calibration is not identifiable: there is nothing to push")
+            raise TwinError(f"this calibration offers no correction. {self.document['verdict']}")
         now = datetime.now(UTC)
         rms = result.fit.certificate.rms_px
         return NamedCorrection(

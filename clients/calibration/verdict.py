@@ -41,6 +41,8 @@ def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> s
         return f"Not to be used: {why[0]}."
     column = max((q["axis_column"] for q in seen), key=lambda e: e.sigma)
     use = "Safe to reconstruct" if column.sigma <= SHARP_PX else "Too uncertain for a sharp volume"
+    if any(f.code == "saturated" for f in result.findings):
+        use = "Geometry to be used, images not to be reconstructed (the flat field is saturated)"
     first = f"{use}: the rotation axis is known to {column.sigma:.1g} px."
     lengths = {
         n: e for n, e in result.fit.certificate.estimates.items() if e.asked and e.unit == "mm"

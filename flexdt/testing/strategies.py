@@ -24,6 +24,8 @@ package("hypothesis", "flexdt.testing.strategies", "testing")
 from hypothesis import strategies as st  # noqa: E402
 
 __all__ = ["geometries", "machines"]
+# Read here, and not by the first example that is drawn, which Hypothesis would call slow.
+MACHINES = {name: builtin_machine(name) for name in builtin_machines()}
 
 
 @st.composite
@@ -36,9 +38,9 @@ def machines(draw: st.DrawFn) -> Machine:
         ... def test_home_is_within_travel(machine: Machine) -> None:
         ...     assert all(a.lower <= a.home <= a.upper for a in machine.axes.values())
     """
-    name = draw(st.sampled_from(builtin_machines()))
+    name = draw(st.sampled_from(list(MACHINES)))
     text = f'base = "{name}"\n'
-    for motor, axis in builtin_machine(name).axes.items():
+    for motor, axis in MACHINES[name].axes.items():
         least, most, slow, soft = (draw(st.floats(0.1, 1.0)) for _ in range(4))
         text += (
             f"[axes.{motor}]\nlower = {axis.home - least * (axis.home - axis.lower)}\n"

@@ -270,7 +270,7 @@ def test_float_images_are_counts_or_line_integrals(tmp_path: Path) -> None:
         data = fx.read_tiffs(folder, scan)
         assert data.line_integrals() == pytest.approx(integrals, abs=3e-4)
     tifffile.imwrite(folder / "p1.tif", np.zeros((3, 5), np.float32))
-    with pytest.raises(TwinError, match="p1.tif has 5 x 3 pixels, the data set has 5 x 4"):
+    with pytest.raises(TwinError, match=r"p1.tif has 5 x 3 pixels, the data set has 5 x 4"):
         fx.read_tiffs(folder, scan)
     tifffile.imwrite(folder / "p1.tif", np.full((4, 5), np.nan, np.float32))
     with pytest.raises(TwinError, match=r"p1.tif has pixels that are no numbers"):
