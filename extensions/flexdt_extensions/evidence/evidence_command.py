@@ -16,8 +16,8 @@ def evidence(
 ) -> Answer:
     """Compare real, public data with their published answers.
 
-    NAME: cate, htc2022, tooth; all that are at hand where none is given. The data are
-    not part of flexdt: each case says where they come from.
+    NAME: cate, htc2022, tooth, zeiss, carm, delft; all that are at hand where none is given.
+    The data are not part of flexdt: each case says where they come from.
     """
     from flexdt_extensions.evidence.real_data import CASES
 

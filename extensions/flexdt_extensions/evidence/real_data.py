@@ -7,10 +7,12 @@ below the folder that `flexdt evidence --data` is given, and where they come fro
 from __future__ import annotations
 
 import pickle
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
@@ -55,15 +57,45 @@ class Case:
 
 
 class _Numbers(pickle.Unpickler):
-    """Reads pickled NumPy numbers and nothing else: a pickle may otherwise run anything."""
+    """Reads pickled NumPy numbers and nothing else: a pickle may otherwise run anything.
+
+    CaTE's own objects become bare names of their numbers.
+    """
 
     def find_class(self, module: str, name: str) -> Any:
+        if module.startswith("cate."):
+            return SimpleNamespace
         arrays = module.startswith("numpy.") or module == "numpy"
         if (arrays and name in ("_reconstruct", "ndarray", "dtype", "scalar")) or (
             (module, name) == ("_codecs", "encode")
         ):
             return super().find_class(module.replace("numpy.core", "numpy._core"), name)
         raise pickle.UnpicklingError(f"{module}.{name} in a file of numbers")
+
+
+def _numbers(file: Path) -> Any:
+    """What CaTE stores: one pickled dictionary in a NumPy file."""
+    with file.open("rb") as stream:
+        np.lib.format.read_magic(stream)
+        np.lib.format.read_array_header_1_0(stream)
+        return _Numbers(stream).load().item()
+
+
+def _calibrated(
+    seen: Any, frames: list[int], start: fx.ConeVec, *free: str
+) -> tuple[dict[str, Any], Array]:
+    """The report of a calibration by CaTE's marks, and the markers' places (k, 3) [mm]."""
+    marks = [
+        (k, str(name), float(column), float(row), None)
+        for k, frame in enumerate(frames)
+        for name, (column, row) in seen[frame].items()
+    ]
+    priors = {"dD_x": 0, "dD_y": 20, "dD_z": 1000 if "dD_z" in free else 0, "dO_z": 0}
+    document: Any = fx.calibrate(
+        None, "unknown", geometry=start, markers=marks, free=free, priors=priors
+    ).document
+    places = {m["name"]: m["position_mm"] for m in document["markers"]}
+    return document, np.array([places[name] for name in sorted(places)])
 
 
 VIEWS: Final[Mapping[str, int]] = {"pos_2": 3600, "pert_0": 24, "pert_2": 14, "pert_2++": 24}
@@ -81,33 +113,19 @@ def needles(files: list[Path]) -> Iterator[Figure]:
     shapes: dict[str, Array] = {}
     for file in files:
         scan = file.name.removeprefix("needle_25Sep2020_").removesuffix("_locations.npy")
-        with file.open("rb") as stream:
-            np.lib.format.read_magic(stream)
-            np.lib.format.read_array_header_1_0(stream)
-            seen = _Numbers(stream).load().item()
+        seen = _numbers(file)
         frames = sorted(seen)
-        marks = [
-            (k, "/".join(name), float(column), float(row), None)
-            for k, frame in enumerate(frames)
-            for name, (column, row) in seen[frame].items()
-        ]
         start = fx.ConeVec.circular(
             sod=600, sdd=1098, angles=[360.0 * f / VIEWS[scan] for f in frames],
             shape=(1944, 1536), pixel=0.0748,
         )  # fmt: skip
-        found = fx.calibrate(
-            None, "unknown", geometry=start, markers=marks, free=("dO_x", "dD_z"),
-            priors={"dD_x": 0, "dD_y": 20, "dD_z": 1000, "dO_z": 0},
-        )  # fmt: skip
-        document: Any = found.document
+        document, shapes[scan] = _calibrated(seen, frames, start, "dO_x", "dD_z")
         value, sigma = (document["parameters"]["dD_z"][key] for key in ("value", "sigma"))
         ours = f"{value:.2f} +- {sigma:.2f} mm" if document["identifiable"] else "refused"
         near = document["identifiable"] and abs(value - SHIFT_MM) <= 2 * sigma
         rms = document["rms_px"]
         yield Figure(f"{scan}: shift of the detector", "about -758 mm", ours, near)
         yield Figure(f"{scan}: residual", "hand-made marks", f"{rms:.2f} px rms", rms < 1.0)
-        places = {m["name"]: m["position_mm"] for m in document["markers"]}
-        shapes[scan] = np.array([places[name] for name in sorted(places)])
     for one, other in combinations(shapes, 2):
         apart, scale = _apart(shapes[one], shapes[other])
         ours = f"{apart:.3f} mm rms, {100 * (scale - 1):+.2f} % larger"
@@ -123,6 +141,131 @@ def _apart(one: Array, other: Array) -> tuple[float, float]:
 
     first, second = (float(np.linalg.norm(p - p.mean(axis=0))) for p in (one, other))
     return first * float(np.sqrt(procrustes(one, other)[2] / len(one))), second / first
+
+
+DELFT: Final = "Calibration_needle_phantom_30degsec_table474mm"
+PIXEL_MM: Final = (302 / 1524, 307 / 1548)
+SOD_MM: Final = 945.0
+SDD_MM: Final = 1215.0
+"""What Delft's script says of its panels and begins with for each source."""
+
+
+def delft(files: list[Path]) -> Iterator[Figure]:
+    """Three sources about one stage: each calibrated on its own, then how they stand."""
+    stored = _numbers(files[0].with_name(f"geom_pre_proc_{DELFT}_calibrated_on_26aug2021.npy"))
+    found: list[tuple[Array, complex, float]] = []
+    for k, file in enumerate(files, 1):
+        seen = _numbers(file)
+        frames = sorted(f for f in seen if len(seen[f]) > 1)
+        turn = [(f - frames[0]) * 360 / 773 for f in frames]  # 773 frames are one
+        start = fx.ConeVec.circular(
+            sod=SOD_MM, sdd=SDD_MM, angles=turn, shape=(1548, 550), pixel=PIXEL_MM
+        )
+        document, _ = _calibrated(seen, frames, start, "dO_x", "dD_z")
+        ours = f"sigma {document['parameters']['dD_z']['sigma'] or np.inf:.0f} mm"
+        few = not document["identifiable"]
+        yield Figure(f"{k}: SDD", "three views are too few", "refused, " * few + ours, few)
+        document, places = _calibrated(seen, frames, start, "dO_x")
+        rms, told = document["rms_px"], document["parameters"]
+        yield Figure(f"{k}: residual", "hand-made marks", f"{rms:.2f} px rms", rms < 1.5)
+        # Theirs has z down, and a length of its own: told from above, at the same SOD.
+        source, panel = (
+            getattr(stored[k], name) * [1, -1, -1] for name in ("_source", "_detector")
+        )
+        here, there = complex(*source[:2]), complex(*panel[:2])
+        unit = SOD_MM / abs(here)
+        magnified = abs(here - there) / abs(here)
+        axis = -(here.conjugate() * there).imag / abs(here) * unit / magnified
+        for what, name, theirs, allowed in (
+            ("axis right of the panel's middle", "dO_x", axis, 0.2),
+            ("panel below the source", "dD_y", (source - panel)[2] * unit, 5.0),
+        ):
+            ours, sigma = told[name]["value"], told[name]["sigma"]
+            yield Figure(
+                f"{k}: {what}", f"{theirs:.2f} mm", f"{ours:.2f} mm, sigma {sigma:.2g}",
+                abs(ours - theirs) <= allowed,
+            )  # fmt: skip
+        found.append((places, here, magnified))
+    for (k, one), (m, other) in combinations(enumerate(found, 1), 2):
+        apart, larger = _apart(one[0], other[0])
+        yield Figure(f"{k} and {m}: markers", "the same", f"{apart:.3f} mm rms", apart <= 0.2)
+        turned, more = float(np.angle(other[1] / one[1], deg=True)), other[2] / one[2]
+        flat = [(p - p.mean(axis=0)) @ [1, 1j, 0] for p in (other[0], one[0])]
+        stands = float(np.angle(np.vdot(*flat), deg=True))
+        yield Figure(
+            f"{k} and {m}: turned, magnified", f"{turned:.2f} deg, {more:.4f}",
+            f"{stands:.2f} deg, {larger:.4f}",
+            abs(stands - turned) <= 0.5 and abs(larger - more) <= SCALE,
+        )  # fmt: skip
+
+
+def _by_matrix(matrix: Array, shape: tuple[int, ...], pixel: float) -> fx.ConeVec:
+    """The geometry of a projection matrix (3, 4) to pixels whose third row is positive in front."""
+    rays = np.linalg.inv(matrix[:, :3])
+    rays *= pixel / np.linalg.norm(rays[:, 0])
+    source = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
+    middle = source + rays @ [(shape[1] - 1) / 2, (shape[0] - 1) / 2, 1.0]
+    return fx.ConeVec.from_vectors(source, middle, rays[:, 0], rays[:, 1], (shape[0], shape[1]))
+
+
+def _across(view: fx.ConeVec, image: Array, normals: Array) -> Array:
+    """Grangeat's derivative of the object's integrals over planes (k, 3) through the source.
+
+    It is that of the integrals of the image, weighted by cosines, over the planes' lines, across
+    those and over the squared cosine of the plane. Pixels are square.
+    """
+    from scipy.ndimage import map_coordinates
+
+    _, first, u, v = view.rays()[0].reshape(4, 3)
+    foot = view.piercing_points()[0]
+    far = abs(view.source_detector_distance[0]) / np.linalg.norm(u)  # px
+    off = np.indices(image.shape)[::-1] - foot[:, None, None]
+    weighted = image / np.sqrt(1 + (off**2).sum(axis=0) / far**2)
+    across = normals @ np.stack([u, v], axis=1)
+    size = np.linalg.norm(across, axis=1)
+    x, y = (across / size[:, None]).T[..., None]
+    at = -(normals @ (first + foot @ [u, v])) / size
+    along = np.arange(-sum(image.shape), sum(image.shape))
+    low, high = (
+        map_coordinates(
+            weighted, [foot[1] + d * y + along * x, foot[0] + d * x - along * y], order=1
+        )
+        for d in (at[:, None] - 1, at[:, None] + 1)
+    )
+    return (1 + (at / far) ** 2) * (high - low).sum(axis=1) / 2
+
+
+def c_arm(files: list[Path]) -> Iterator[Figure]:
+    """Two views of a C-arm by their matrices: planes through both sources have one integral."""
+    matrices, images, pixel = [], [], 1.0
+    for file in files:
+        head, _, raw = file.read_bytes().partition(b"\n\n")
+        said = dict(re.findall(r"^([^#:]+):=? *(.*?) *$", head.decode(), re.MULTILINE))
+        columns, rows = map(int, said["sizes"].split())
+        images.append(np.frombuffer(raw, "<f4", rows * columns).reshape(rows, columns))
+        numbers = said["Projection Matrix"].strip("[]").replace(";", " ").split()
+        matrices.append(np.array(numbers, float).reshape(3, 4))
+        pixel = float(said["spacings"].split()[0])
+    points = np.random.default_rng(0).uniform(-100.0, 100.0, (4, 100))
+    points[3] = 1.0
+    for lower in (0, 5):
+        matrices[-1][1] += lower * matrices[-1][2]
+        views = [_by_matrix(m, i.shape, pixel) for m, i in zip(matrices, images, strict=True)]
+        seen = np.array([(m @ points)[:2] / (m @ points)[2] for m in matrices])
+        off = np.abs([v.project_points(points[:3].T)[0].T for v in views] - seen).max()
+        yield Figure(f"points, {lower} px lower", "as by matrix", f"{off:.0e} px off", off < 1e-6)
+        one, other = (v.source[0] for v in views)
+        flat = np.cross(other - one, one + other)
+        steep = np.cross(other - one, flat) / np.linalg.norm(other - one)
+        turn = np.radians(np.linspace(-12.0, 12.0, 241))[:, None]
+        normals = (np.cos(turn) * flat + np.sin(turn) * steep) / np.linalg.norm(flat)
+        here, there = (_across(v, i, normals) for v, i in zip(views, images, strict=True))
+        apart = float(np.linalg.norm(here - there) / np.linalg.norm(here))
+        alike = float(np.corrcoef(here, there)[0, 1])
+        ours = f"{100 * apart:.1f} % apart, correlation {alike:.6f}"
+        agrees = apart > 0.1 if lower else apart < 0.02
+        what = ("the same in both", "not the same")[lower > 0]
+        yield Figure(f"planes of both sources, {lower} px lower", what, ours, agrees)
 
 
 def helsinki(files: list[Path]) -> Iterator[Figure]:
@@ -159,11 +302,22 @@ def tooth(files: list[Path]) -> Iterator[Figure]:
     data = fx.DataSet.from_arrays(counts, far, dark=dark, flat=white)
     why = data.align().alignment.refused.get("axis_column_px", "")
     yield Figure("align", "to be refused", why or "an answer", bool(why))
-    try:
-        said = str(fx.reconstruct(data, voxel=0.02))
-    except fx.TwinError as error:
-        said = str(error)
+    said = _said(lambda: fx.reconstruct(data, voxel=0.02))
     yield Figure("FDK", "to be refused", said, "180 deg" in said)
+
+
+def zeiss(files: list[Path]) -> Iterator[Figure]:
+    """Tomopy's scan of a chip in Zeiss's own format: a parallel beam, too."""
+    said = _said(lambda: fx.open(files[0])).removeprefix(f"{files[0]}: ")
+    yield Figure("open", "to be refused", said, "a parallel beam" in said)
+
+
+def _said(make: Callable[[], Any]) -> str:
+    """What flexdt makes, or why it does not."""
+    try:
+        return str(make())
+    except fx.TwinError as error:
+        return str(error)
 
 
 CASES: Final[Mapping[str, Case]] = {
@@ -173,4 +327,12 @@ CASES: Final[Mapping[str, Case]] = {
     ),
     "htc2022": Case("**/htc2022_*_full.mat", "zenodo.org/records/6984868", "CC-BY-4.0", helsinki),
     "tooth": Case("**/tooth.h5", "github.com/tomopy/tomopy", "BSD-3-Clause", tooth),
+    "zeiss": Case("**/*chip*.txrm", "github.com/tomopy/tomopy", "BSD-3-Clause", zeiss),
+    "carm": Case(
+        "**/proj0[04]0.nrrd", "github.com/aaichert/EpipolarConsistency", "Apache-2.0", c_arm
+    ),
+    "delft": Case(
+        f"**/pre_proc_{DELFT}_cam?.npy", "github.com/adriaangraas/fluidized-bed-ct, scripts/calib",
+        "GPL-3.0 (the repository's)", delft,
+    ),
 }  # fmt: skip
