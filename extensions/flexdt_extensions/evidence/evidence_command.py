@@ -43,10 +43,7 @@ def evidence(
         if not told["figures"]:
             yield f"  not at hand in {data}"
             continue
-        rows = [
-            [f["what"], f["published"], f["ours"], "yes" if f["agrees"] else "NO"]
-            for f in told["figures"]
-        ]
+        rows = [[*list(f.values())[:3], "yes" if f["agrees"] else "NO"] for f in told["figures"]]
         yield table(rows, ("what", "published", "ours", "agrees"))
     missed = sum(not f["agrees"] for told in document for f in told["figures"])
     if missed:

@@ -65,10 +65,8 @@ class _Numbers(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if module.startswith("cate."):
             return SimpleNamespace
-        arrays = module.startswith("numpy.") or module == "numpy"
-        if (arrays and name in ("_reconstruct", "ndarray", "dtype", "scalar")) or (
-            (module, name) == ("_codecs", "encode")
-        ):
+        numbers = {"numpy": ("_reconstruct", "ndarray", "dtype", "scalar"), "_codecs": ("encode",)}
+        if name in numbers.get(module.split(".")[0], ()):
             return super().find_class(module.replace("numpy.core", "numpy._core"), name)
         raise pickle.UnpicklingError(f"{module}.{name} in a file of numbers")
 
@@ -81,9 +79,7 @@ def _numbers(file: Path) -> Any:
         return _Numbers(stream).load().item()
 
 
-def _calibrated(
-    seen: Any, frames: list[int], start: fx.ConeVec, *free: str
-) -> tuple[dict[str, Any], Array]:
+def _calibrated(seen: Any, frames: Any, start: fx.ConeVec, *free: str) -> tuple[Any, Array]:
     """The report of a calibration by CaTE's marks, and the markers' places (k, 3) [mm]."""
     marks = [
         (k, str(name), float(column), float(row), None)
@@ -91,9 +87,8 @@ def _calibrated(
         for name, (column, row) in seen[frame].items()
     ]
     priors = {"dD_x": 0, "dD_y": 20, "dD_z": 1000 if "dD_z" in free else 0, "dO_z": 0}
-    document: Any = fx.calibrate(
-        None, "unknown", geometry=start, markers=marks, free=free, priors=priors
-    ).document
+    found = fx.calibrate(None, "unknown", geometry=start, markers=marks, free=free, priors=priors)
+    document: Any = found.document
     places = {m["name"]: m["position_mm"] for m in document["markers"]}
     return document, np.array([places[name] for name in sorted(places)])
 
@@ -115,10 +110,10 @@ def needles(files: list[Path]) -> Iterator[Figure]:
         scan = file.name.removeprefix("needle_25Sep2020_").removesuffix("_locations.npy")
         seen = _numbers(file)
         frames = sorted(seen)
+        turn = [360.0 * f / VIEWS[scan] for f in frames]
         start = fx.ConeVec.circular(
-            sod=600, sdd=1098, angles=[360.0 * f / VIEWS[scan] for f in frames],
-            shape=(1944, 1536), pixel=0.0748,
-        )  # fmt: skip
+            sod=600, sdd=1098, angles=turn, shape=(1944, 1536), pixel=0.0748
+        )
         document, shapes[scan] = _calibrated(seen, frames, start, "dO_x", "dD_z")
         value, sigma = (document["parameters"]["dD_z"][key] for key in ("value", "sigma"))
         ours = f"{value:.2f} +- {sigma:.2f} mm" if document["identifiable"] else "refused"
@@ -144,66 +139,56 @@ def _apart(one: Array, other: Array) -> tuple[float, float]:
 
 
 DELFT: Final = "Calibration_needle_phantom_30degsec_table474mm"
-PIXEL_MM: Final = (302 / 1524, 307 / 1548)
-SOD_MM: Final = 945.0
-SDD_MM: Final = 1215.0
-"""What Delft's script says of its panels and begins with for each source."""
+PITCH: Final = (302 / 1524, 307 / 1548)
+"""Of the pixels of Delft's panels [mm], as its script has them."""
 
 
 def delft(files: list[Path]) -> Iterator[Figure]:
     """Three sources about one stage: each calibrated on its own, then how they stand."""
     stored = _numbers(files[0].with_name(f"geom_pre_proc_{DELFT}_calibrated_on_26aug2021.npy"))
-    found: list[tuple[Array, complex, float]] = []
+    found: list[tuple[Array, Any, complex, float]] = []
     for k, file in enumerate(files, 1):
         seen = _numbers(file)
         frames = sorted(f for f in seen if len(seen[f]) > 1)
         turn = [(f - frames[0]) * 360 / 773 for f in frames]  # 773 frames are one
-        start = fx.ConeVec.circular(
-            sod=SOD_MM, sdd=SDD_MM, angles=turn, shape=(1548, 550), pixel=PIXEL_MM
-        )
-        document, _ = _calibrated(seen, frames, start, "dO_x", "dD_z")
-        ours = f"sigma {document['parameters']['dD_z']['sigma'] or np.inf:.0f} mm"
-        few = not document["identifiable"]
-        yield Figure(f"{k}: SDD", "three views are too few", "refused, " * few + ours, few)
-        document, places = _calibrated(seen, frames, start, "dO_x")
-        rms, told = document["rms_px"], document["parameters"]
+        start = fx.ConeVec.circular(sod=945, sdd=1215, angles=turn, shape=(1548, 550), pixel=PITCH)
+        free, _ = _calibrated(seen, frames, start, "dO_x", "dD_z")
+        few, sigma = not free["identifiable"], free["parameters"]["dD_z"]["sigma"] or np.inf
+        ours = f"{'refused' if few else 'an answer'}, sigma {sigma:.0f} mm"
+        yield Figure(f"{k}: SDD", "three views are too few", ours, few)
+        held, places = _calibrated(seen, frames, start, "dO_x")
+        rms, (aside, up) = held["rms_px"], (held["parameters"][key] for key in ("dO_x", "dD_y"))
         yield Figure(f"{k}: residual", "hand-made marks", f"{rms:.2f} px rms", rms < 1.5)
-        # Theirs has z down, and a length of its own: told from above, at the same SOD.
-        source, panel = (
-            getattr(stored[k], name) * [1, -1, -1] for name in ("_source", "_detector")
-        )
-        here, there = complex(*source[:2]), complex(*panel[:2])
-        unit = SOD_MM / abs(here)
-        magnified = abs(here - there) / abs(here)
-        axis = -(here.conjugate() * there).imag / abs(here) * unit / magnified
-        for what, name, theirs, allowed in (
-            ("axis right of the panel's middle", "dO_x", axis, 0.2),
-            ("panel below the source", "dD_y", (source - panel)[2] * unit, 5.0),
-        ):
-            ours, sigma = told[name]["value"], told[name]["sigma"]
-            yield Figure(
-                f"{k}: {what}", f"{theirs:.2f} mm", f"{ours:.2f} mm, sigma {sigma:.2g}",
-                abs(ours - theirs) <= allowed,
-            )  # fmt: skip
-        found.append((places, here, magnified))
+        # Theirs are cm; columns grow to the left, seen from the source, and a panel's middle is at
+        # half their number: it is told as its mirror image.
+        source, panel = (10 * getattr(stored[k], name) for name in ("_source", "_detector"))
+        here, there = complex(source[0], -source[1]), complex(panel[0], -panel[1])
+        axis = (here * there.conjugate()).imag / abs(here) + 0.5 * PITCH[0]
+        above = panel[2] - source[2] + 0.5 * PITCH[1]
+        values = aside["value"], aside["sigma"], up["value"]  # None where refused
+        x, sigma, y = np.array(values, float) * [1215 / 945, 1215 / 945, 1.0]
+        ours = f"{x:.2f} (sigma {sigma:.2g}), {y:.1f} mm"
+        near = abs(x - axis) <= 0.1 and abs(y - above) <= 2.0  # half a pixel; ten
+        yield Figure(f"{k}: axis aside, panel up", f"{axis:.2f}, {above:.1f} mm", ours, bool(near))
+        flat = (
+            (places - places.mean(axis=0)) @ [1, 1j, 0] * (1215 + 1j * x)
+        )  # the source at -90 deg
+        found.append((places, flat, here, abs(here - there) / abs(here)))
     for (k, one), (m, other) in combinations(enumerate(found, 1), 2):
         apart, larger = _apart(one[0], other[0])
         yield Figure(f"{k} and {m}: markers", "the same", f"{apart:.3f} mm rms", apart <= 0.2)
-        turned, more = float(np.angle(other[1] / one[1], deg=True)), other[2] / one[2]
-        flat = [(p - p.mean(axis=0)) @ [1, 1j, 0] for p in (other[0], one[0])]
-        stands = float(np.angle(np.vdot(*flat), deg=True))
-        yield Figure(
-            f"{k} and {m}: turned, magnified", f"{turned:.2f} deg, {more:.4f}",
-            f"{stands:.2f} deg, {larger:.4f}",
-            abs(stands - turned) <= 0.5 and abs(larger - more) <= SCALE,
-        )  # fmt: skip
+        turned, stands = np.angle([other[2] / one[2], np.vdot(other[1], one[1])], deg=True)
+        more = other[3] / one[3]
+        near = abs(stands - turned) <= 0.1 and abs(larger - more) <= SCALE
+        theirs, ours = (f"{a:.2f} deg, {b:.4f}" for a, b in ((turned, more), (stands, larger)))
+        yield Figure(f"{k} and {m}: turned, magnified", theirs, ours, bool(near))
 
 
 def _by_matrix(matrix: Array, shape: tuple[int, ...], pixel: float) -> fx.ConeVec:
     """The geometry of a projection matrix (3, 4) to pixels whose third row is positive in front."""
     rays = np.linalg.inv(matrix[:, :3])
+    source = -rays @ matrix[:, 3]
     rays *= pixel / np.linalg.norm(rays[:, 0])
-    source = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
     middle = source + rays @ [(shape[1] - 1) / 2, (shape[0] - 1) / 2, 1.0]
     return fx.ConeVec.from_vectors(source, middle, rays[:, 0], rays[:, 1], (shape[0], shape[1]))
 
@@ -221,18 +206,13 @@ def _across(view: fx.ConeVec, image: Array, normals: Array) -> Array:
     far = abs(view.source_detector_distance[0]) / np.linalg.norm(u)  # px
     off = np.indices(image.shape)[::-1] - foot[:, None, None]
     weighted = image / np.sqrt(1 + (off**2).sum(axis=0) / far**2)
-    across = normals @ np.stack([u, v], axis=1)
-    size = np.linalg.norm(across, axis=1)
-    x, y = (across / size[:, None]).T[..., None]
-    at = -(normals @ (first + foot @ [u, v])) / size
-    along = np.arange(-sum(image.shape), sum(image.shape))
-    low, high = (
-        map_coordinates(
-            weighted, [foot[1] + d * y + along * x, foot[0] + d * x - along * y], order=1
-        )
-        for d in (at[:, None] - 1, at[:, None] + 1)
-    )
-    return (1 + (at / far) ** 2) * (high - low).sum(axis=1) / 2
+    line = normals @ np.stack([u, v, first + foot @ [u, v]], axis=1)
+    line /= np.linalg.norm(line[:, :2], axis=1, keepdims=True)
+    x, y, at = line.T[..., None, None]
+    along, beside = np.arange(-sum(image.shape), sum(image.shape)), [[-1.0], [1.0]] - at
+    places = [foot[1] + beside * y + along * x, foot[0] + beside * x - along * y]
+    low, high = map_coordinates(weighted, places, order=1).sum(axis=2).T
+    return np.asarray((1 + (line[:, 2] / far) ** 2) * (high - low) / 2)
 
 
 def c_arm(files: list[Path]) -> Iterator[Figure]:
@@ -246,8 +226,7 @@ def c_arm(files: list[Path]) -> Iterator[Figure]:
         numbers = said["Projection Matrix"].strip("[]").replace(";", " ").split()
         matrices.append(np.array(numbers, float).reshape(3, 4))
         pixel = float(said["spacings"].split()[0])
-    points = np.random.default_rng(0).uniform(-100.0, 100.0, (4, 100))
-    points[3] = 1.0
+    points = np.append(np.random.default_rng(0).uniform(-100, 100, (3, 100)), np.ones((1, 100)), 0)
     for lower in (0, 5):
         matrices[-1][1] += lower * matrices[-1][2]
         views = [_by_matrix(m, i.shape, pixel) for m, i in zip(matrices, images, strict=True)]
@@ -255,16 +234,14 @@ def c_arm(files: list[Path]) -> Iterator[Figure]:
         off = np.abs([v.project_points(points[:3].T)[0].T for v in views] - seen).max()
         yield Figure(f"points, {lower} px lower", "as by matrix", f"{off:.0e} px off", off < 1e-6)
         one, other = (v.source[0] for v in views)
-        flat = np.cross(other - one, one + other)
-        steep = np.cross(other - one, flat) / np.linalg.norm(other - one)
+        base = (other - one) / np.linalg.norm(other - one)
+        flat = np.cross(base, one + other)
         turn = np.radians(np.linspace(-12.0, 12.0, 241))[:, None]
-        normals = (np.cos(turn) * flat + np.sin(turn) * steep) / np.linalg.norm(flat)
+        normals = np.cos(turn) * flat + np.sin(turn) * np.cross(base, flat)
         here, there = (_across(v, i, normals) for v, i in zip(views, images, strict=True))
         apart = float(np.linalg.norm(here - there) / np.linalg.norm(here))
-        alike = float(np.corrcoef(here, there)[0, 1])
-        ours = f"{100 * apart:.1f} % apart, correlation {alike:.6f}"
-        agrees = apart > 0.1 if lower else apart < 0.02
-        what = ("the same in both", "not the same")[lower > 0]
+        ours = f"{100 * apart:.1f} % apart, correlation {np.corrcoef(here, there)[0, 1]:.6f}"
+        what, agrees = ("not the same", apart > 0.1) if lower else ("the same", apart < 0.02)
         yield Figure(f"planes of both sources, {lower} px lower", what, ours, agrees)
 
 
@@ -328,9 +305,7 @@ CASES: Final[Mapping[str, Case]] = {
     "htc2022": Case("**/htc2022_*_full.mat", "zenodo.org/records/6984868", "CC-BY-4.0", helsinki),
     "tooth": Case("**/tooth.h5", "github.com/tomopy/tomopy", "BSD-3-Clause", tooth),
     "zeiss": Case("**/*chip*.txrm", "github.com/tomopy/tomopy", "BSD-3-Clause", zeiss),
-    "carm": Case(
-        "**/proj0[04]0.nrrd", "github.com/aaichert/EpipolarConsistency", "Apache-2.0", c_arm
-    ),
+    "carm": Case("**/proj0?0.nrrd", "github.com/aaichert/EpipolarConsistency", "Apache-2.0", c_arm),
     "delft": Case(
         f"**/pre_proc_{DELFT}_cam?.npy", "github.com/adriaangraas/fluidized-bed-ct, scripts/calib",
         "GPL-3.0 (the repository's)", delft,
