@@ -34,9 +34,8 @@ def evidence(
             figures = [asdict(figure) for figure in (case.compare(files) if files else ())]
         except (LookupError, OSError, UnpicklingError, ValueError) as error:
             raise CommandError(f"{name}: cannot read {case.files} in {data}: {error}") from None
-        document.append(
-            {"name": name, "source": case.source, "licence": case.licence, "figures": figures}
-        )
+        document.append({"name": name, "source": case.source, "licence": case.licence})
+        document[-1]["figures"] = figures
     yield {"cases": document}
     for told in document:
         yield f"{told['name']}: {told['source']}, {told['licence']}"

@@ -170,9 +170,8 @@ def delft(files: list[Path]) -> Iterator[Figure]:
         ours = f"{x:.2f} (sigma {sigma:.2g}), {y:.1f} mm"
         near = abs(x - axis) <= 0.1 and abs(y - above) <= 2.0  # half a pixel; ten
         yield Figure(f"{k}: axis aside, panel up", f"{axis:.2f}, {above:.1f} mm", ours, bool(near))
-        flat = (
-            (places - places.mean(axis=0)) @ [1, 1j, 0] * (1215 + 1j * x)
-        )  # the source at -90 deg
+        # From above, turned so that the source, about the axis, is at -90 degrees.
+        flat = (places - places.mean(axis=0)) @ [1215 + 1j * x, 1215j - x, 0]
         found.append((places, flat, here, abs(here - there) / abs(here)))
     for (k, one), (m, other) in combinations(enumerate(found, 1), 2):
         apart, larger = _apart(one[0], other[0])
