@@ -115,15 +115,18 @@ def delft(folder: Path, mirrored: float = 1.0) -> None:
 def c_arm(folder: Path, lower: int = 0) -> None:
     """Two views of four Gaussian balls and their matrices; the second image may be lower."""
     rng = np.random.default_rng(5)
-    centres, widths = rng.uniform(-40.0, 40.0, (4, 3)), rng.uniform(10.0, 16.0, 4)
+    centres, widths = rng.uniform(-40.0, 40.0, (4, 3)), rng.uniform(6.0, 10.0, 4)
     row, column = np.indices((190, 256))
-    for name, angle in (("proj000", 0.1), ("proj040", 2.4)):
-        toward = np.array([np.cos(angle), np.sin(angle), 0.05])  # rays of the middle
-        right = np.array([-np.sin(angle), np.cos(angle), 0.0])
+    # Wide, and the second panel askew, so that the weights of the two views differ.
+    for name, angle, askew, tilt in (("proj000", 0.1, 0.0, 0.05), ("proj040", 2.4, 0.4, 0.3)):
+        source, focal = -240.0 * np.array([np.cos(angle), np.sin(angle), 0.05]), 286.0
+        right = np.array([-np.sin(angle + askew), np.cos(angle + askew), 0.0])
+        toward = np.array([right[1], -right[0], tilt]) / np.hypot(1.0, tilt)
         down = np.cross(toward, right)
-        source, focal = -740.0 * toward, 883.0
-        rays = np.stack([column - 126.0, row - 96.0, np.full(row.shape, focal)], -1)
-        rays = rays @ [right, down, toward]
+        turn = np.array([right, down, toward])
+        middle = [126.0, 96.0] - focal * (turn @ source)[:2] / (turn @ source)[2]
+        rays = np.stack([column - middle[0], row - middle[1], np.full(row.shape, focal)], -1)
+        rays = rays @ turn
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         image = np.zeros(row.shape)
         for centre, width in zip(centres, widths, strict=True):
@@ -131,8 +134,7 @@ def c_arm(folder: Path, lower: int = 0) -> None:
             image += width * np.exp(-0.5 * (off / width) ** 2)
         if name == "proj040":
             image = np.roll(image, lower, axis=0)
-        turn = np.linalg.inv(np.array([right, down, toward]).T)
-        camera = np.array([[focal, 0, 126.0], [0, focal, 96.0], [0, 0, 1]]) @ turn
+        camera = np.array([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]]) @ turn
         matrix = np.column_stack([camera, -camera @ source]).tolist()
         text = "; ".join(" ".join(map(repr, line)) for line in matrix)
         head = (
