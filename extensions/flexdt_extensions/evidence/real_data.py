@@ -255,12 +255,12 @@ def helsinki(files: list[Path]) -> Iterator[Figure]:
         image = loadmat(file.with_name(f"{file.stem}_recon_fbp.mat"))["reconFullFbp"]
         turn = np.asarray(said["angles"], float)
         once = turn < turn[0] + 360.0 - 1e-6  # the last view is the first one again
+        lengths = ("distanceSourceOrigin", "distanceSourceDetector", "pixelSizePost")
+        sod, sdd, pixel, voxel = (float(said[n]) for n in (*lengths, "effectivePixelSizePost"))
+        shape = 1, scan["sinogram"].shape[1]
         geometry = fx.ConeVec.circular(
-            sod=float(said["distanceSourceOrigin"]), sdd=float(said["distanceSourceDetector"]),
-            angles=turn[once], shape=(1, scan["sinogram"].shape[1]),
-            pixel=float(said["pixelSizePost"]),
-        )  # fmt: skip
-        voxel = float(said["effectivePixelSizePost"])
+            sod=sod, sdd=sdd, angles=turn[once], shape=shape, pixel=pixel
+        )
         views = scan["sinogram"][once, None].astype(np.float32)
         ours = fx.fdk(views, geometry, fx.Grid((1, *image.shape), voxel)).data[0, ::-1]
         alike = float(np.corrcoef(ours.ravel(), image.ravel())[0, 1])
