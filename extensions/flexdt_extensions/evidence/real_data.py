@@ -258,11 +258,9 @@ def helsinki(files: list[Path]) -> Iterator[Figure]:
         lengths = ("distanceSourceOrigin", "distanceSourceDetector", "pixelSizePost")
         sod, sdd, pixel, voxel = (float(said[n]) for n in (*lengths, "effectivePixelSizePost"))
         shape = 1, scan["sinogram"].shape[1]
-        geometry = fx.ConeVec.circular(
-            sod=sod, sdd=sdd, angles=turn[once], shape=shape, pixel=pixel
-        )
+        fan = fx.ConeVec.circular(sod=sod, sdd=sdd, angles=turn[once], shape=shape, pixel=pixel)
         views = scan["sinogram"][once, None].astype(np.float32)
-        ours = fx.fdk(views, geometry, fx.Grid((1, *image.shape), voxel)).data[0, ::-1]
+        ours = fx.fdk(views, fan, fx.Grid((1, *image.shape), voxel)).data[0, ::-1]
         alike = float(np.corrcoef(ours.ravel(), image.ravel())[0, 1])
         yield Figure(f"{name}: correlation", "0.9999", f"{alike:.6f}", alike >= 0.9999)
 
