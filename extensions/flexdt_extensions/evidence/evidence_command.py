@@ -16,8 +16,8 @@ def evidence(
 ) -> Answer:
     """Compare real, public data with their published answers.
 
-    NAME: cate, htc2022, tooth; all that are at hand where none is given. The data are
-    not part of flexdt: each case says where they come from.
+    NAME: cate, htc2022, tooth, zeiss, carm, delft; all that are at hand where none is given.
+    The data are not part of flexdt: each case says where they come from.
     """
     from flexdt_extensions.evidence.real_data import CASES
 
@@ -34,19 +34,15 @@ def evidence(
             figures = [asdict(figure) for figure in (case.compare(files) if files else ())]
         except (LookupError, OSError, UnpicklingError, ValueError) as error:
             raise CommandError(f"{name}: cannot read {case.files} in {data}: {error}") from None
-        document.append(
-            {"name": name, "source": case.source, "licence": case.licence, "figures": figures}
-        )
+        document.append({"name": name, "source": case.source, "licence": case.licence})
+        document[-1]["figures"] = figures
     yield {"cases": document}
     for told in document:
         yield f"{told['name']}: {told['source']}, {told['licence']}"
         if not told["figures"]:
             yield f"  not at hand in {data}"
             continue
-        rows = [
-            [f["what"], f["published"], f["ours"], "yes" if f["agrees"] else "NO"]
-            for f in told["figures"]
-        ]
+        rows = [[*list(f.values())[:3], "yes" if f["agrees"] else "NO"] for f in told["figures"]]
         yield table(rows, ("what", "published", "ours", "agrees"))
     missed = sum(not f["agrees"] for told in document for f in told["figures"])
     if missed:

@@ -7,10 +7,12 @@ below the folder that `flexdt evidence --data` is given, and where they come fro
 from __future__ import annotations
 
 import pickle
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
@@ -55,15 +57,40 @@ class Case:
 
 
 class _Numbers(pickle.Unpickler):
-    """Reads pickled NumPy numbers and nothing else: a pickle may otherwise run anything."""
+    """Reads pickled NumPy numbers and nothing else: a pickle may otherwise run anything.
+
+    CaTE's own objects become bare names of their numbers.
+    """
 
     def find_class(self, module: str, name: str) -> Any:
-        arrays = module.startswith("numpy.") or module == "numpy"
-        if (arrays and name in ("_reconstruct", "ndarray", "dtype", "scalar")) or (
-            (module, name) == ("_codecs", "encode")
-        ):
+        if module.startswith("cate."):
+            return SimpleNamespace
+        numbers = {"numpy": ("_reconstruct", "ndarray", "dtype", "scalar"), "_codecs": ("encode",)}
+        if name in numbers.get(module.split(".")[0], ()):
             return super().find_class(module.replace("numpy.core", "numpy._core"), name)
         raise pickle.UnpicklingError(f"{module}.{name} in a file of numbers")
+
+
+def _numbers(file: Path) -> Any:
+    """What CaTE stores: one pickled dictionary in a NumPy file."""
+    with file.open("rb") as stream:
+        np.lib.format.read_magic(stream)
+        np.lib.format.read_array_header_1_0(stream)
+        return _Numbers(stream).load().item()
+
+
+def _calibrated(seen: Any, frames: Any, start: fx.ConeVec, *free: str) -> tuple[Any, Array]:
+    """The report of a calibration by CaTE's marks, and the markers' places (k, 3) [mm]."""
+    marks = [
+        (k, str(name), float(column), float(row), None)
+        for k, frame in enumerate(frames)
+        for name, (column, row) in seen[frame].items()
+    ]
+    priors = {"dD_x": 0, "dD_y": 20, "dD_z": 1000 if "dD_z" in free else 0, "dO_z": 0}
+    found = fx.calibrate(None, "unknown", geometry=start, markers=marks, free=free, priors=priors)
+    document: Any = found.document
+    places = {m["name"]: m["position_mm"] for m in document["markers"]}
+    return document, np.array([places[name] for name in sorted(places)])
 
 
 VIEWS: Final[Mapping[str, int]] = {"pos_2": 3600, "pert_0": 24, "pert_2": 14, "pert_2++": 24}
@@ -81,33 +108,19 @@ def needles(files: list[Path]) -> Iterator[Figure]:
     shapes: dict[str, Array] = {}
     for file in files:
         scan = file.name.removeprefix("needle_25Sep2020_").removesuffix("_locations.npy")
-        with file.open("rb") as stream:
-            np.lib.format.read_magic(stream)
-            np.lib.format.read_array_header_1_0(stream)
-            seen = _Numbers(stream).load().item()
+        seen = _numbers(file)
         frames = sorted(seen)
-        marks = [
-            (k, "/".join(name), float(column), float(row), None)
-            for k, frame in enumerate(frames)
-            for name, (column, row) in seen[frame].items()
-        ]
+        turn = [360.0 * f / VIEWS[scan] for f in frames]
         start = fx.ConeVec.circular(
-            sod=600, sdd=1098, angles=[360.0 * f / VIEWS[scan] for f in frames],
-            shape=(1944, 1536), pixel=0.0748,
-        )  # fmt: skip
-        found = fx.calibrate(
-            None, "unknown", geometry=start, markers=marks, free=("dO_x", "dD_z"),
-            priors={"dD_x": 0, "dD_y": 20, "dD_z": 1000, "dO_z": 0},
-        )  # fmt: skip
-        document: Any = found.document
+            sod=600, sdd=1098, angles=turn, shape=(1944, 1536), pixel=0.0748
+        )
+        document, shapes[scan] = _calibrated(seen, frames, start, "dO_x", "dD_z")
         value, sigma = (document["parameters"]["dD_z"][key] for key in ("value", "sigma"))
         ours = f"{value:.2f} +- {sigma:.2f} mm" if document["identifiable"] else "refused"
         near = document["identifiable"] and abs(value - SHIFT_MM) <= 2 * sigma
         rms = document["rms_px"]
         yield Figure(f"{scan}: shift of the detector", "about -758 mm", ours, near)
         yield Figure(f"{scan}: residual", "hand-made marks", f"{rms:.2f} px rms", rms < 1.0)
-        places = {m["name"]: m["position_mm"] for m in document["markers"]}
-        shapes[scan] = np.array([places[name] for name in sorted(places)])
     for one, other in combinations(shapes, 2):
         apart, scale = _apart(shapes[one], shapes[other])
         ours = f"{apart:.3f} mm rms, {100 * (scale - 1):+.2f} % larger"
@@ -125,6 +138,112 @@ def _apart(one: Array, other: Array) -> tuple[float, float]:
     return first * float(np.sqrt(procrustes(one, other)[2] / len(one))), second / first
 
 
+DELFT: Final = "Calibration_needle_phantom_30degsec_table474mm"
+PITCH: Final = (302 / 1524, 307 / 1548)
+"""Of the pixels of Delft's panels [mm], as its script has them."""
+
+
+def delft(files: list[Path]) -> Iterator[Figure]:
+    """Three sources about one stage: each calibrated on its own, then how they stand."""
+    stored = _numbers(files[0].with_name(f"geom_pre_proc_{DELFT}_calibrated_on_26aug2021.npy"))
+    found: list[tuple[Array, Any, complex, float]] = []
+    for k, file in enumerate(files, 1):
+        seen = _numbers(file)
+        frames = sorted(f for f in seen if len(seen[f]) > 1)
+        turn = [(f - frames[0]) * 360 / 773 for f in frames]  # 773 frames are one
+        start = fx.ConeVec.circular(sod=945, sdd=1215, angles=turn, shape=(1548, 550), pixel=PITCH)
+        free, _ = _calibrated(seen, frames, start, "dO_x", "dD_z")
+        few, sigma = not free["identifiable"], free["parameters"]["dD_z"]["sigma"] or np.inf
+        ours = f"{'refused' if few else 'an answer'}, sigma {sigma:.0f} mm"
+        yield Figure(f"{k}: SDD", "three views are too few", ours, few)
+        held, places = _calibrated(seen, frames, start, "dO_x")
+        rms, (aside, up) = held["rms_px"], (held["parameters"][key] for key in ("dO_x", "dD_y"))
+        yield Figure(f"{k}: residual", "hand-made marks", f"{rms:.2f} px rms", rms < 1.5)
+        # Theirs are cm; columns grow to the left, seen from the source, and a panel's middle is at
+        # half their number: it is told as its mirror image.
+        source, panel = (10 * getattr(stored[k], name) for name in ("_source", "_detector"))
+        here, there = complex(source[0], -source[1]), complex(panel[0], -panel[1])
+        axis = (here * there.conjugate()).imag / abs(here) + 0.5 * PITCH[0]
+        above = panel[2] - source[2] + 0.5 * PITCH[1]
+        values = aside["value"], aside["sigma"], up["value"]  # None where refused
+        x, sigma, y = np.array(values, float) * [1215 / 945, 1215 / 945, 1.0]
+        ours = f"{x:.2f} (sigma {sigma:.2g}), {y:.1f} mm"
+        near = abs(x - axis) <= 0.1 and abs(y - above) <= 2.0  # half a pixel; ten
+        yield Figure(f"{k}: axis aside, panel up", f"{axis:.2f}, {above:.1f} mm", ours, bool(near))
+        # From above, turned so that the source, about the axis, is at -90 degrees.
+        flat = (places - places.mean(axis=0)) @ [1215 + 1j * x, 1215j - x, 0]
+        found.append((places, flat, here, abs(here - there) / abs(here)))
+    for (k, one), (m, other) in combinations(enumerate(found, 1), 2):
+        apart, larger = _apart(one[0], other[0])
+        yield Figure(f"{k} and {m}: markers", "the same", f"{apart:.3f} mm rms", apart <= 0.2)
+        turned, stands = np.angle([other[2] / one[2], np.vdot(other[1], one[1])], deg=True)
+        more = other[3] / one[3]
+        near = abs(stands - turned) <= 0.1 and abs(larger - more) <= SCALE
+        theirs, ours = (f"{a:.2f} deg, {b:.4f}" for a, b in ((turned, more), (stands, larger)))
+        yield Figure(f"{k} and {m}: turned, magnified", theirs, ours, bool(near))
+
+
+def _by_matrix(matrix: Array, shape: tuple[int, ...], pixel: float) -> fx.ConeVec:
+    """The geometry of a projection matrix (3, 4) to pixels whose third row is positive in front."""
+    rays = np.linalg.inv(matrix[:, :3])
+    source = -rays @ matrix[:, 3]
+    rays *= pixel / np.linalg.norm(rays[:, 0])
+    middle = source + rays @ [(shape[1] - 1) / 2, (shape[0] - 1) / 2, 1.0]
+    return fx.ConeVec.from_vectors(source, middle, rays[:, 0], rays[:, 1], (shape[0], shape[1]))
+
+
+def _across(view: fx.ConeVec, image: Array, normals: Array) -> Array:
+    """Grangeat's derivative of the object's integrals over planes (k, 3) through the source.
+
+    It is that of the integrals of the image, weighted by cosines, over the planes' lines, across
+    those and over the squared cosine of the plane. Pixels are square.
+    """
+    from scipy.ndimage import map_coordinates
+
+    _, first, u, v = view.rays()[0].reshape(4, 3)
+    foot = view.piercing_points()[0]
+    far = abs(view.source_detector_distance[0]) / np.linalg.norm(u)  # px
+    off = np.indices(image.shape)[::-1] - foot[:, None, None]
+    weighted = image / np.sqrt(1 + (off**2).sum(axis=0) / far**2)
+    line = normals @ np.stack([u, v, first + foot @ [u, v]], axis=1)
+    line /= np.linalg.norm(line[:, :2], axis=1, keepdims=True)
+    x, y, at = line.T[..., None, None]
+    along, beside = np.arange(-sum(image.shape), sum(image.shape)), [[-1.0], [1.0]] - at
+    places = [foot[1] + beside * y + along * x, foot[0] + beside * x - along * y]
+    low, high = map_coordinates(weighted, places, order=1).sum(axis=2).T
+    return np.asarray((1 + (line[:, 2] / far) ** 2) * (high - low) / 2)
+
+
+def c_arm(files: list[Path]) -> Iterator[Figure]:
+    """Two views of a C-arm by their matrices: planes through both sources have one integral."""
+    matrices, images, pixel = [], [], 1.0
+    for file in files:
+        head, _, raw = file.read_bytes().partition(b"\n\n")
+        said = dict(re.findall(r"^([^#:]+):=? *(.*?) *$", head.decode(), re.MULTILINE))
+        columns, rows = map(int, said["sizes"].split())
+        images.append(np.frombuffer(raw, "<f4", rows * columns).reshape(rows, columns))
+        numbers = said["Projection Matrix"].strip("[]").replace(";", " ").split()
+        matrices.append(np.array(numbers, float).reshape(3, 4))
+        pixel = float(said["spacings"].split()[0])
+    points = np.append(np.random.default_rng(0).uniform(-100, 100, (3, 100)), np.ones((1, 100)), 0)
+    for lower in (0, 5):
+        matrices[-1][1] += lower * matrices[-1][2]
+        views = [_by_matrix(m, i.shape, pixel) for m, i in zip(matrices, images, strict=True)]
+        seen = np.array([(m @ points)[:2] / (m @ points)[2] for m in matrices])
+        off = np.abs([v.project_points(points[:3].T)[0].T for v in views] - seen).max()
+        yield Figure(f"points, {lower} px lower", "as by matrix", f"{off:.0e} px off", off < 1e-6)
+        one, other = (v.source[0] for v in views)
+        base = (other - one) / np.linalg.norm(other - one)
+        flat = np.cross(base, one + other)
+        turn = np.radians(np.linspace(-12.0, 12.0, 241))[:, None]
+        normals = np.cos(turn) * flat + np.sin(turn) * np.cross(base, flat)
+        here, there = (_across(v, i, normals) for v, i in zip(views, images, strict=True))
+        apart = float(np.linalg.norm(here - there) / np.linalg.norm(here))
+        ours = f"{100 * apart:.1f} % apart, correlation {np.corrcoef(here, there)[0, 1]:.6f}"
+        what, agrees = ("not the same", apart > 0.1) if lower else ("the same", apart < 0.02)
+        yield Figure(f"planes of both sources, {lower} px lower", what, ours, agrees)
+
+
 def helsinki(files: list[Path]) -> Iterator[Figure]:
     """HTC 2022: fan-beam sinograms beside the images that their authors published."""
     from scipy.io import loadmat
@@ -136,14 +255,12 @@ def helsinki(files: list[Path]) -> Iterator[Figure]:
         image = loadmat(file.with_name(f"{file.stem}_recon_fbp.mat"))["reconFullFbp"]
         turn = np.asarray(said["angles"], float)
         once = turn < turn[0] + 360.0 - 1e-6  # the last view is the first one again
-        geometry = fx.ConeVec.circular(
-            sod=float(said["distanceSourceOrigin"]), sdd=float(said["distanceSourceDetector"]),
-            angles=turn[once], shape=(1, scan["sinogram"].shape[1]),
-            pixel=float(said["pixelSizePost"]),
-        )  # fmt: skip
-        voxel = float(said["effectivePixelSizePost"])
+        lengths = ("distanceSourceOrigin", "distanceSourceDetector", "pixelSizePost")
+        sod, sdd, pixel, voxel = (float(said[n]) for n in (*lengths, "effectivePixelSizePost"))
+        shape = 1, scan["sinogram"].shape[1]
+        fan = fx.ConeVec.circular(sod=sod, sdd=sdd, angles=turn[once], shape=shape, pixel=pixel)
         views = scan["sinogram"][once, None].astype(np.float32)
-        ours = fx.fdk(views, geometry, fx.Grid((1, *image.shape), voxel)).data[0, ::-1]
+        ours = fx.fdk(views, fan, fx.Grid((1, *image.shape), voxel)).data[0, ::-1]
         alike = float(np.corrcoef(ours.ravel(), image.ravel())[0, 1])
         yield Figure(f"{name}: correlation", "0.9999", f"{alike:.6f}", alike >= 0.9999)
 
@@ -159,11 +276,22 @@ def tooth(files: list[Path]) -> Iterator[Figure]:
     data = fx.DataSet.from_arrays(counts, far, dark=dark, flat=white)
     why = data.align().alignment.refused.get("axis_column_px", "")
     yield Figure("align", "to be refused", why or "an answer", bool(why))
-    try:
-        said = str(fx.reconstruct(data, voxel=0.02))
-    except fx.TwinError as error:
-        said = str(error)
+    said = _said(lambda: fx.reconstruct(data, voxel=0.02))
     yield Figure("FDK", "to be refused", said, "180 deg" in said)
+
+
+def zeiss(files: list[Path]) -> Iterator[Figure]:
+    """Tomopy's scan of a chip in Zeiss's own format: a parallel beam, too."""
+    said = _said(lambda: fx.open(files[0])).removeprefix(f"{files[0]}: ")
+    yield Figure("open", "to be refused", said, "a parallel beam" in said)
+
+
+def _said(make: Callable[[], Any]) -> str:
+    """What flexdt makes, or why it does not."""
+    try:
+        return str(make())
+    except fx.TwinError as error:
+        return str(error)
 
 
 CASES: Final[Mapping[str, Case]] = {
@@ -173,4 +301,10 @@ CASES: Final[Mapping[str, Case]] = {
     ),
     "htc2022": Case("**/htc2022_*_full.mat", "zenodo.org/records/6984868", "CC-BY-4.0", helsinki),
     "tooth": Case("**/tooth.h5", "github.com/tomopy/tomopy", "BSD-3-Clause", tooth),
+    "zeiss": Case("**/*chip*.txrm", "github.com/tomopy/tomopy", "BSD-3-Clause", zeiss),
+    "carm": Case("**/proj0?0.nrrd", "github.com/aaichert/EpipolarConsistency", "Apache-2.0", c_arm),
+    "delft": Case(
+        f"**/pre_proc_{DELFT}_cam?.npy", "github.com/adriaangraas/fluidized-bed-ct, scripts/calib",
+        "GPL-3.0 (the repository's)", delft,
+    ),
 }  # fmt: skip
