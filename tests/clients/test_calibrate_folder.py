@@ -224,7 +224,7 @@ def test_another_phantom_is_refused(copy: Path, phantom: str, codes: set[str]) -
     assert document["identifiable"] is False
     assert {p["code"] for p in document["problems"]} & codes  # type: ignore[attr-defined]
     assert all(p["value"] is None for p in document["parameters"].values())  # type: ignore[attr-defined]
-    with pytest.raises(TwinError, match="nothing to push"):
+    with pytest.raises(TwinError, match="offers no correction"):
         _ = calibrate_datasets([load_dataset(copy)], phantom).correction
 
 

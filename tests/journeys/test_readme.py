@@ -93,7 +93,7 @@ def test_the_python_lines(servers: Servers, here: Path, monkeypatch: pytest.Monk
     names: dict[str, Any] = {}
     host, port = servers.address
     exec(client.replace("TwinClient()", f"TwinClient({host!r}, {port})"), names)
-    assert names["image"].image.shape == (760, 956)
+    assert names["image"].shape == (760, 956)
 
 
 def test_every_link_leads_somewhere() -> None:
