@@ -4,6 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+COMPILED := $(VENV)/.compiled
 TEST_STAMP := $(VENV)/.installed-test
 TYPES := .typing/.linked
 WEB := clients/viewer/web
@@ -21,11 +22,16 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: install demo kernels quick test test-extensions slow studies page failed docs web lint typecheck lowest newest clean
 
-install: $(STAMP) $(TYPES)
+install: $(COMPILED) $(TYPES)
 
 $(STAMP): pyproject.toml extensions/pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]' -e extensions
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt \
+	  -e '.[dev]' -e extensions
+	touch $@
+
+# The kernels, on all cores. The demonstration compiles its own while it starts and scans.
+$(COMPILED): $(STAMP)
 	$(BIN)/python -P -m flexdt.runtime.compile_ahead
 	touch $@
 
@@ -45,7 +51,7 @@ $(TYPES): $(STAMP) .ci/link_types.py $(wildcard flexdt/*.py)
 	$(BIN)/python .ci/link_types.py
 	touch $@
 
-demo: install
+demo: $(STAMP)
 	$(BIN)/flexdt demo --no-viewer
 
 lint: install

@@ -104,9 +104,9 @@ def run_demo(
         options = {"data": data.absolute(), "truth": path.absolute(), "speed-up": "max"}
         tell("starting the servers; the very first start compiles the projector's kernels")
         with (
+            # What calibration and reconstruction need, behind the servers' start and the scan.
+            compile_ahead.start(["--behind", *compile_ahead.ANALYSIS]) as compiling,
             Servers(options, out / "servers.log", viewer=stay is not None) as servers,
-            # While the scan runs: what calibration and reconstruction need.
-            compile_ahead.start(compile_ahead.ANALYSIS) as compiling,
         ):
             host, port = servers.address
             tell(f"twin on {host}:{port}, projector beside it, log in {out / 'servers.log'}")
