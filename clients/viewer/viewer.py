@@ -8,9 +8,11 @@ its page's own connection.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
 import time
+from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import asdict
 from functools import partial
@@ -31,6 +33,7 @@ from flexdt.clients.viewer.page import TRY_AGAIN, Page, watched, without_bytes
 from flexdt.clients.viewer.page_cameras import SceneClients
 from flexdt.clients.viewer.scenes import sample as shapes
 from flexdt.clients.viewer.scenes import standpoints as views
+from flexdt.clients.viewer.scenes import still
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.sample import NOTHING, MeshCache, SampleLook
 from flexdt.clients.viewer.scenes.world import World, beads_on, world_of
@@ -53,7 +56,9 @@ QUIET_S: Final = 0.5
 """A twin that has sent nothing for this long is asked for its state; at rest it sends none."""
 SCENES_A_PAGE: Final = 8
 """Four views, and those that are just being closed."""
-
+STILL_S, STILL_PX, STILL_BYTES, STILLS = 5.0, 1200, 60_000, 16
+"""How long a picture of the scene waits for the twin's first state; its widest side, its size, and
+how many are kept."""
 
 CLOSE_MM: Final = 20.0
 """Clearance below which the page warns."""
@@ -100,7 +105,9 @@ class Viewer:
         self.data, self.limits = data, limits or ViewerLimits()
         self.failed = asyncio.Event()
         self.grower = LiveReconstruction(self._grown)
-        self.opened = self.drawn = self.sharing = 0
+        self.opened = self.drawn = self.sharing = self._pictured = 0
+        self._placed, self._painting = asyncio.Event(), asyncio.Lock()
+        self._stills: OrderedDict[object, bytes] = OrderedDict()
         self.pages: dict[str, Page] = {}
         self.downloads: dict[str, Download] = {}
         self.lab: LabScene | None = None
@@ -150,6 +157,7 @@ class Viewer:
         self.front = Front(
             self._page, self.scenes.connect, self.scenes.html(), self.downloads, self._token,
             max_scenes=SCENES_A_PAGE * self.limits.max_pages, max_pages=self.limits.max_pages,
+            still=self.still,
         )  # fmt: skip
         await self.front.start(host, port, ssl)
         self._tasks = [
@@ -235,7 +243,7 @@ class Viewer:
             connected=self.link.connected,
             problem=self.link.problem,
             twin=str(self.twin_address),
-            cameras={name: asdict(camera) for name, camera in views.FIXED.items()},
+            cameras={name: asdict(camera) for name, camera in self.clients.cameras.items()},
             hello=hello and hello.model_dump(),
         )
 
@@ -271,6 +279,14 @@ class Viewer:
         self.state, self.world = state, world
         if sample_changed:
             await self._dress(lab, state)
+        self.clients.cameras.update(views.presets(world, self.look.radius_mm))
+        if first:  # the picture of the scene shows an image, too
+            self.feeds["line_integral"].start()
+        if lab is not before:
+            for view, camera in self.clients.cameras.items():
+                self.clients.follow(view, camera)
+            for page in self.pages.values():
+                self._tell_link(page)
         if first:  # images that came before could not be drawn
             for feed in self.feeds.values():
                 feed.again()
@@ -280,6 +296,7 @@ class Viewer:
         if lab.shown["ranges"] and time.monotonic() - self._ranges_at > RANGES_S:
             self._ranges_at = time.monotonic()
             lab.draw_ranges(state)
+        self._placed.set()
         camera, framing = views.beam_view(world)
         self.clients.follow("beam", camera)
         text = json.dumps(
@@ -309,7 +326,6 @@ class Viewer:
                     scene.show(what, visible)
                 scene.fade(self.lab.opacity)
             self.lab = scene
-            self.clients.cameras.update(views.FIXED)
             for page in self.pages.values():
                 page.say("layers", **scene.layers)
         return self.lab
@@ -348,13 +364,41 @@ class Viewer:
             small = image.pixels[::2, ::2] if coarse else image.pixels
             shown = ShownImage(small, image.kind, image.cone_vec, image.time, image.seq)
             lab.show_image(grey(shown, window), small, world)
+            self._pictured = image.seq
         assert self._loop is not None
+        if not self.pages:
+            self._loop.call_soon_threadsafe(self.refresh_feeds)
         self._loop.call_soon_threadsafe(self._send_image, image.kind, content)
 
     def _send_image(self, kind: str, content: bytes) -> None:
         for page in self.pages.values():
             if page.kind == kind and page.recorded is None:
                 page.show("image", content)
+
+    async def still(self, asked: Mapping[str, str]) -> bytes | None:
+        """The scene as it stands as a JPEG, of view `view`, `w` x `h` pixels, on a `dark` page or
+        not; None where the view has none, or nothing is known yet.
+        """
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._placed.wait(), STILL_S)
+        lab, world = self.lab, self.world
+        camera = self.clients.cameras.get(asked.get("view", ""))
+        if lab is None or world is None or camera is None:
+            return None
+        sides = [asked.get(side, "") for side in ("w", "h")]
+        width, height = (min(STILL_PX, max(32, int(n) if n.isdecimal() else 0)) for n in sides)
+        dark, look = asked.get("dark") == "1", self.look
+        key = camera, width, height, dark, self._pictured, id(look), *world.view.rows.flat
+        async with self._painting:
+            if key not in self._stills:
+                seen = views.roomy(camera, width / height)
+                painted = await asyncio.to_thread(
+                    lambda: still.drawn(lab.shapes(world), seen, (width, height), dark)
+                )
+                self._stills[key] = still.jpeg(painted, STILL_BYTES)
+                while len(self._stills) > STILLS:
+                    self._stills.popitem(last=False)
+            return self._stills[key]
 
     def _grown(self, line: str) -> None:
         surface, slices = line.split("\t")

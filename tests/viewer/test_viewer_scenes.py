@@ -16,9 +16,8 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import ConvexHull
 
 from flexdt.clients.client.client import TwinClient
-from flexdt.clients.viewer.page_cameras import roomy
 from flexdt.clients.viewer.scenes.gizmos import SIZE_M
-from flexdt.clients.viewer.scenes.standpoints import FIXED
+from flexdt.clients.viewer.scenes.standpoints import FIXED, roomy
 from tests.viewer.looking import changed, drawn, frames, picture, seen, settled, still
 
 pytestmark = pytest.mark.browser

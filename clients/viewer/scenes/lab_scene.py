@@ -18,6 +18,7 @@ from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.beam_shade import BeamShade
 from flexdt.clients.viewer.scenes.gizmos import Drag, Gizmos
 from flexdt.clients.viewer.scenes.sample import MM, SampleLook
+from flexdt.clients.viewer.scenes.still import Shape, cone, cut, image_on, placed
 from flexdt.clients.viewer.scenes.world import SCREEN, PlanDrawing, World, motors, quaternion
 from flexdt.protocol.state_model import State
 from flexdt.twin.collision.collision_scene import build_scene
@@ -70,6 +71,8 @@ class LabScene:
         self._looks: list[Any] = []
         self._sent: dict[str, tuple[float, ...]] = {}
         self._skins: list[Any] = []
+        self._solids: dict[str, list[Shape]] = {}
+        self._lit = False
         self._look: SampleLook | None = None
         self._surface: Any = None
         self._hulls: dict[str, Any] = {}
@@ -124,8 +127,10 @@ class LabScene:
             frame = scene.add_frame(f"/machine/{part.name}", show_axes=False)
             self._frames[part.name] = frame
             own = self._own.get(part.name)
+            pieces = parts.pieces_of(part)
+            self._solids[part.name] = cut(pieces)
             self._looks.append(scene.add_glb(
-                f"/machine/{part.name}/look", own or solids.glb(parts.pieces_of(part)),
+                f"/machine/{part.name}/look", own or solids.glb(pieces),
                 position=tuple(np.array(part.mesh_at_mm if own else (0.0, 0.0, 0.0)) * MM),
                 cast_shadow=False, receive_shadow=False,
             ))  # fmt: skip
@@ -239,6 +244,7 @@ class LabScene:
         if self._sent.get("beam") == key:
             return
         self._sent["beam"] = key
+        self._lit = on
         self._shade.light(on)
         a, b, c, d, e = points
         lines = [(a, b), (a, c), (a, d), (a, e), (b, c), (c, d), (d, e), (e, b)]
@@ -264,6 +270,17 @@ class LabScene:
         self._image.render_width, self._image.render_height = width, height
         self._image.wxyz = quaternion(np.stack([u, v, np.cross(u, v)], axis=1))
         self._image.position = tuple(at)
+
+    def shapes(self, world: World) -> list[Shape]:
+        """What is drawn, for a picture that needs no browser; any thread may ask."""
+        poses = dict(self._sent)
+        out = [s for name, its in list(self._solids.items()) for s in placed(its, poses[name])]
+        for skin in () if self._look is None else self._look.skins:
+            corners = np.asarray(skin.vertices, dtype=float)[skin.faces]
+            opacity = 1.0 if skin.dense else self.opacity
+            out += placed([Shape(corners, np.array(skin.color), opacity)], poses["sample"])
+        image = [image_on(np.asarray(self._image.image), world)]
+        return out + image + ([cone(world, BEAM_ON, 0.2)] if self._lit else [])
 
     # -- what is seen ------------------------------------------------------------------------
 
@@ -321,8 +338,10 @@ class LabScene:
             return
         low = mount.center_mm[2] + mount.size_mm[2] / 2 - self.machine.sample_height_mm
         high = min(float(skin.vertices[:, 2].min()) for skin in look.skins) / MM
+        self._solids["object"] = []
         if high > low:
             rod = solids.cylinder(5.0, high - low, (0.0, 0.0, 0.5 * (low + high)), solids.RUBBER)
+            self._solids["object"] = cut([rod])
             self._server.scene.add_glb(
                 name, solids.glb([rod]), cast_shadow=False, receive_shadow=False
             )
