@@ -58,6 +58,13 @@ class SceneClients:
         clients = self._server.get_clients()
         return [clients[i] for i in ids if i in clients]
 
+    def with_names(self) -> list[viser.ClientHandle]:
+        """Clients whose views have names: not the beam's eye, which shows the image's pixels."""
+        with self._lock:
+            ids = [i for i, w in self._who.items() if w.view != "beam"]
+        clients = self._server.get_clients()
+        return [clients[i] for i in ids if i in clients]
+
     def page_of(self, client_id: int | None) -> str | None:
         """The page that a client belongs to."""
         with self._lock:

@@ -49,6 +49,7 @@ class Layers(Params):
     orbit: bool | None = None
     gizmos: bool | None = None
     labels: bool | None = None
+    names: bool | None = None
     opacity: Annotated[float, Ge(0.05), Le(1)] | None = None
 
 

@@ -35,6 +35,7 @@ from flexdt.clients.viewer.scenes import sample as shapes
 from flexdt.clients.viewer.scenes import standpoints as views
 from flexdt.clients.viewer.scenes import still
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
+from flexdt.clients.viewer.scenes.labels import NameTags
 from flexdt.clients.viewer.scenes.sample import NOTHING, MeshCache, SampleLook
 from flexdt.clients.viewer.scenes.world import World, beads_on, world_of
 from flexdt.clients.viewer.viser_gate import Scenes
@@ -50,6 +51,7 @@ DRAW_HZ: Final = 30.0
 ASKED_HZ: Final = 36.0
 """States asked of the twin a second: a little more, since those that come late are dropped."""
 RANGES_S: Final = 0.2
+NAMES_S: Final = 0.25
 BEAT_S: Final = 0.25
 """Between heartbeats to the pages."""
 QUIET_S: Final = 0.5
@@ -115,7 +117,7 @@ class Viewer:
         self.world: World | None = None
         self.look: SampleLook = NOTHING
         self.window: tuple[float, float] | None = None
-        self.wardrobe = MeshCache()
+        self.wardrobe, self.tags = MeshCache(), NameTags()
         self.planners = Workers(plans.PLANNERS, plans.PLAN_BYTES, plans.PLAN_S)
         self._local = {name: partial(answer, self) for name, answer in answers.items()}
         self._raw: Mapping[str, Any] | None = None
@@ -164,6 +166,7 @@ class Viewer:
             watched(self.link.run(), "the link to the twin", self.failed.set),
             watched(self._draw(), "drawing", self.failed.set),
             watched(self._beat(), "the heartbeat", self.failed.set),
+            watched(self._name(), "names in the scenes", self.failed.set),
             watched(self._ask(), "asking a quiet twin", self.failed.set),
         ]
 
@@ -230,6 +233,17 @@ class Viewer:
             for page in self.pages.values():
                 page.show("beat", beat)
             await asyncio.sleep(BEAT_S)
+
+    async def _name(self) -> None:
+        """Keep names where they have room in each view, whatever moves: cameras do it unasked."""
+        while True:
+            await asyncio.sleep(NAMES_S)
+            lab, world = self.lab, self.world
+            if lab is not None and world is not None:
+                named = lab.named(world)
+                for client in self.clients.with_names():
+                    with contextlib.suppress(AssertionError, KeyError):  # it has just come or gone
+                        await asyncio.to_thread(self.tags.draw, client, named)
 
     def _link_changed(self) -> None:
         self._heard_at = time.monotonic()

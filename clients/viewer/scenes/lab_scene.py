@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import viser
+from scipy.spatial.transform import Rotation
 
 from flexdt.clients.viewer.scenes import parts, world
 from flexdt.clients.viewer.scenes import parts as bodies
 from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.beam_shade import BeamShade
 from flexdt.clients.viewer.scenes.gizmos import Drag, Gizmos
+from flexdt.clients.viewer.scenes.labels import Name
 from flexdt.clients.viewer.scenes.sample import MM, SampleLook
 from flexdt.clients.viewer.scenes.still import Shape, cone, cut, image_on, placed
 from flexdt.clients.viewer.scenes.world import SCREEN, PlanDrawing, World, motors, quaternion
@@ -83,7 +85,7 @@ class LabScene:
         self.shown: dict[str, bool] = {
             "beam": True, "axis": True, "panel": True, "ranges": False, "bodies": False,
             "margin": False, "sample": True, "machine": True, "orbit": True, "gizmos": False,
-            "labels": False,
+            "labels": False, "names": True,
         }  # fmt: skip
         with server.atomic():
             self._build()
@@ -172,28 +174,39 @@ class LabScene:
                 self._margins[name] = self._hull(f"/machine/{name}/margin", shell, AMBER, 0.25)
 
     def _build_labels(self) -> None:
-        """Names of parts, the world's axes, and a scale on the floor; hidden at first."""
-        scene = self._server.scene
-        (x, y, z), name = _scale_mm(self.machine), f"{SCALE_MM:g} mm"
+        """The world's axes and a scale on the floor; hidden at first."""
+        scene, (x, y, z) = self._server.scene, _scale_mm(self.machine)
         ends = np.array([[[x, y, z], [x, y + SCALE_MM, z]]]) * MM
         bar = scene.add_line_segments("/scale", ends, RANGE, thickness=5.0, **SCREEN, visible=False)
         axes = scene.add_frame(
             "/axes", axes_length=AXES_MM * MM, axes_radius=4 * MM, visible=False,
             position=tuple((np.array([x, y - 2 * AXES_MM, z]) * MM).tolist()),
         )  # fmt: skip
-        self._labels = [bar, axes, scene.add_label("/scale/label", name, position=ends[0].mean(0))]
+        self._labels = [bar, axes]
+
+    def named(self, world: World) -> list[Name]:
+        """What has a name now, and where it is."""
+        out: list[Name] = []
+        if self.shown["names"] and not self.shown["labels"]:
+            image = world.detector + world.u * (0.25 * world.shape[1]) - world.normal
+            named = (("X-ray source", world.source), ("sample", world.sample.shift))
+            out = [(words, at * MM) for words, at in (*named, ("detector", image))]
+        if not self.shown["labels"]:
+            return out
+        first = _scale_mm(self.machine)
+        out.append((f"{SCALE_MM:g} mm", (first + [0.0, 0.5 * SCALE_MM, 0.0]) * MM))
         for k, words in enumerate(("x traversal", "y source to detector", "z up")):
-            place = np.eye(3)[k] * 1.15 * AXES_MM * MM
-            self._labels.append(scene.add_label(f"/axes/{words[0]}", words, position=place))
+            out.append(
+                (words, (first - [0.0, 2 * AXES_MM, 0.0] + 1.1 * AXES_MM * np.eye(3)[k]) * MM)
+            )
         for part in self.machine.components:
-            if part.axis is None and not part.role:
-                continue
-            (x, _, z), words = part.size_mm, part.name.replace("_", " ")
-            corner = (np.array(part.center_mm) + [x / 2, 0.0, z / 2]) * MM
-            name = f"/machine/{part.name}/label"
-            self._labels.append(scene.add_label(name, words, position=corner))
-        for node in self._labels:
-            node.visible = False
+            pose = self._sent.get(part.name)
+            if pose is not None and (part.axis is not None or part.role):
+                (x, _, z), middle = part.size_mm, np.array(part.center_mm)
+                turn = Rotation.from_quat(pose[:4], scalar_first=True)
+                at = turn.apply((middle + [x / 2, 0.0, z / 2]) * MM) + pose[4:]
+                out.append((part.name.replace("_", " "), at))
+        return out
 
     def _hull(self, node: str, mesh: Any, color: tuple[int, int, int], opacity: float) -> Any:
         vertices, faces = solids.plain(mesh)

@@ -304,6 +304,7 @@ export type Layers = {
   machine?: boolean | null;
   gizmos?: boolean | null;
   labels?: boolean | null;
+  names?: boolean | null;
   opacity?: number | null;
 };
 export type Live = {
