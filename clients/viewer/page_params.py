@@ -50,6 +50,7 @@ class Layers(Params):
     gizmos: bool | None = None
     labels: bool | None = None
     names: bool | None = None
+    cabinet: bool | None = None
     opacity: Annotated[float, Ge(0.05), Le(1)] | None = None
 
 

@@ -12,7 +12,6 @@ import contextlib
 import json
 import logging
 import time
-from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import asdict
 from functools import partial
@@ -33,11 +32,11 @@ from flexdt.clients.viewer.page import TRY_AGAIN, Page, watched, without_bytes
 from flexdt.clients.viewer.page_cameras import SceneClients
 from flexdt.clients.viewer.scenes import sample as shapes
 from flexdt.clients.viewer.scenes import standpoints as views
-from flexdt.clients.viewer.scenes import still
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.labels import NameTags
 from flexdt.clients.viewer.scenes.sample import NOTHING, MeshCache, SampleLook
 from flexdt.clients.viewer.scenes.world import World, beads_on, world_of
+from flexdt.clients.viewer.stills import Stills
 from flexdt.clients.viewer.viser_gate import Scenes
 from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SafetyState, SampleState, State
@@ -58,10 +57,8 @@ QUIET_S: Final = 0.5
 """A twin that has sent nothing for this long is asked for its state; at rest it sends none."""
 SCENES_A_PAGE: Final = 8
 """Four views, and those that are just being closed."""
-STILL_S, STILL_PX, STILL_BYTES, STILLS = 5.0, 1200, 60_000, 16
-"""How long a picture of the scene waits for the twin's first state; its widest side, its size, and
-how many are kept."""
-
+STILL_S: Final = 5.0
+"""How long a picture of the scene waits for the twin's first state."""
 CLOSE_MM: Final = 20.0
 """Clearance below which the page warns."""
 
@@ -108,8 +105,7 @@ class Viewer:
         self.failed = asyncio.Event()
         self.grower = LiveReconstruction(self._grown)
         self.opened = self.drawn = self.sharing = self._pictured = 0
-        self._placed, self._painting = asyncio.Event(), asyncio.Lock()
-        self._stills: OrderedDict[object, bytes] = OrderedDict()
+        self._placed, self._stills = asyncio.Event(), Stills()
         self.pages: dict[str, Page] = {}
         self.downloads: dict[str, Download] = {}
         self.lab: LabScene | None = None
@@ -390,29 +386,21 @@ class Viewer:
                 page.show("image", content)
 
     async def still(self, asked: Mapping[str, str]) -> bytes | None:
-        """The scene as it stands as a JPEG, of view `view`, `w` x `h` pixels, on a `dark` page or
-        not; None where the view has none, or nothing is known yet.
-        """
+        """The scene as it stands, as a JPEG (see `Stills`); None: nothing is known of this view."""
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self._placed.wait(), STILL_S)
         lab, world = self.lab, self.world
         camera = self.clients.cameras.get(asked.get("view", ""))
         if lab is None or world is None or camera is None:
             return None
-        sides = [asked.get(side, "") for side in ("w", "h")]
-        width, height = (min(STILL_PX, max(32, int(n) if n.isdecimal() else 0)) for n in sides)
-        dark, look = asked.get("dark") == "1", self.look
-        key = camera, width, height, dark, self._pictured, id(look), *world.view.rows.flat
-        async with self._painting:
-            if key not in self._stills:
-                seen = views.roomy(camera, width / height)
-                painted = await asyncio.to_thread(
-                    lambda: still.drawn(lab.shapes(world), seen, (width, height), dark)
-                )
-                self._stills[key] = still.jpeg(painted, STILL_BYTES)
-                while len(self._stills) > STILLS:
-                    self._stills.popitem(last=False)
-            return self._stills[key]
+        stamp = (
+            self._pictured,
+            id(self.look),
+            lab.opacity,
+            *lab.shown.values(),
+            *world.view.rows.flat,
+        )
+        return await self._stills.picture(camera, asked, stamp, lambda: lab.shapes(world))
 
     def _grown(self, line: str) -> None:
         surface, slices = line.split("\t")

@@ -15,6 +15,7 @@ import trimesh
 from PIL import Image
 from scipy.spatial import ConvexHull
 
+from flexdt.clients.viewer.scenes.cabinet import cabinet
 from flexdt.clients.viewer.scenes.standpoints import ROOM, WIDE, Standpoint, fitted, presets, roomy
 from flexdt.clients.viewer.scenes.still import Shape, drawn
 from flexdt.clients.viewer.scenes.world import World, placed
@@ -104,6 +105,30 @@ def test_large_triangles_that_reach_behind_the_eye_do_not_break_a_picture() -> N
     grey = np.array([90, 90, 90])
     now = drawn([Shape(around.triangles, grey, lit=False)], EYE, (64, 48), True)
     assert now.shape == (48, 64, 3)
+
+
+def test_the_cabinet_never_stands_between_a_camera_outside_and_the_machine() -> None:
+    pieces, lamp = cabinet(builtin_machine(), -405.0)
+    triangles = np.concatenate([p.mesh.triangles for p in pieces if p.mesh.extents.max() < 2400.0])
+    whole = np.concatenate([p.mesh.triangles for p in pieces]).reshape(-1, 3)
+    low, high = whole.min(axis=0), whole.max(axis=0)
+    assert ((lamp > low) & (lamp < high)).all()
+    rng = np.random.default_rng(5)
+    for _ in range(300):
+        way = rng.normal(size=3)
+        way[2] = abs(way[2])
+        target = rng.uniform([-150, 0, -100], [150, 1000, 300])
+        eye = target + way * 4000.0 / np.linalg.norm(way)
+        a, b, c = np.moveaxis(triangles, 1, 0)
+        normal = np.cross(b - a, c - a)
+        ahead = target - eye
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = ((a - eye) * normal).sum(axis=1) / (normal @ ahead)
+        at = eye + along[:, None] * ahead
+        sides = [(np.cross(q - p, at - p) * normal).sum(axis=1) >= 0
+                 for p, q in ((a, b), (b, c), (c, a))]  # fmt: skip
+        front = normal @ ahead < 0.0
+        assert not (np.logical_and.reduce(sides) & front & (along > 0.0) & (along < 0.99)).any()
 
 
 @pytest.mark.browser

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import viser
-from scipy.spatial.transform import Rotation
 
 from flexdt.clients.viewer.scenes import parts, world
 from flexdt.clients.viewer.scenes import parts as bodies
 from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.beam_shade import BeamShade
+from flexdt.clients.viewer.scenes.cabinet import LAMP, cabinet
 from flexdt.clients.viewer.scenes.gizmos import Drag, Gizmos
-from flexdt.clients.viewer.scenes.labels import Name
+from flexdt.clients.viewer.scenes.labels import Name, names_of_image, names_of_parts
 from flexdt.clients.viewer.scenes.sample import MM, SampleLook
-from flexdt.clients.viewer.scenes.still import Shape, cone, cut, image_on, placed
+from flexdt.clients.viewer.scenes.still import Shape, cone, cut, image_on, placed, shape_of
 from flexdt.clients.viewer.scenes.world import SCREEN, PlanDrawing, World, motors, quaternion
 from flexdt.protocol.state_model import State
 from flexdt.twin.collision.collision_scene import build_scene
@@ -43,6 +43,8 @@ AMBER = (255, 160, 30)
 STAND = "/object/stand"
 GAP_MM = 0.6
 """Distance of the image from the panel's face, in front of which it floats."""
+HERE = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+"""The pose of what stands in the world's own frame."""
 AXIS_REACH_MM = 120.0
 SCALE_MM, AXES_MM = 500.0, 150.0
 
@@ -85,7 +87,7 @@ class LabScene:
         self.shown: dict[str, bool] = {
             "beam": True, "axis": True, "panel": True, "ranges": False, "bodies": False,
             "margin": False, "sample": True, "machine": True, "orbit": True, "gizmos": False,
-            "labels": False, "names": True,
+            "labels": False, "names": True, "cabinet": True,
         }  # fmt: skip
         with server.atomic():
             self._build()
@@ -100,6 +102,7 @@ class LabScene:
             "sample": [self._frames["sample"]],
             "machine": [*self._looks, self._stand_frame],
             "orbit": [self._paths],
+            "cabinet": self._cabinet,
             "gizmos": self._gizmos.controls,
             "labels": self._labels,
         }
@@ -136,6 +139,13 @@ class LabScene:
                 position=tuple(np.array(part.mesh_at_mm if own else (0.0, 0.0, 0.0)) * MM),
                 cast_shadow=False, receive_shadow=False,
             ))  # fmt: skip
+        pieces, lamp = cabinet(self.machine, FLOOR_MM)
+        self._solids["cabinet"], self._sent["cabinet"] = cut(pieces), HERE
+        still: Any = {"cast_shadow": False, "receive_shadow": False}
+        self._lamp = scene.add_icosphere(
+            "/cabinet/lamp", radius=0.045, color=LAMP[False], position=tuple(lamp * MM), **still
+        )
+        self._cabinet = [scene.add_glb("/cabinet/walls", solids.glb(pieces), **still), self._lamp]
         self._frames["sample"] = scene.add_frame("/sample", show_axes=False)
         self._frames["object"] = scene.add_frame("/object", show_axes=False)
         self._stand_frame = scene.add_frame(STAND, show_axes=False)
@@ -186,27 +196,14 @@ class LabScene:
 
     def named(self, world: World) -> list[Name]:
         """What has a name now, and where it is."""
-        out: list[Name] = []
-        if self.shown["names"] and not self.shown["labels"]:
-            image = world.detector + world.u * (0.25 * world.shape[1]) - world.normal
-            named = (("X-ray source", world.source), ("sample", world.sample.shift))
-            out = [(words, at * MM) for words, at in (*named, ("detector", image))]
         if not self.shown["labels"]:
-            return out
+            return names_of_image(world) if self.shown["names"] else []
         first = _scale_mm(self.machine)
-        out.append((f"{SCALE_MM:g} mm", (first + [0.0, 0.5 * SCALE_MM, 0.0]) * MM))
+        out: list[Name] = [(f"{SCALE_MM:g} mm", (first + [0.0, 0.5 * SCALE_MM, 0.0]) * MM)]
         for k, words in enumerate(("x traversal", "y source to detector", "z up")):
-            out.append(
-                (words, (first - [0.0, 2 * AXES_MM, 0.0] + 1.1 * AXES_MM * np.eye(3)[k]) * MM)
-            )
-        for part in self.machine.components:
-            pose = self._sent.get(part.name)
-            if pose is not None and (part.axis is not None or part.role):
-                (x, _, z), middle = part.size_mm, np.array(part.center_mm)
-                turn = Rotation.from_quat(pose[:4], scalar_first=True)
-                at = turn.apply((middle + [x / 2, 0.0, z / 2]) * MM) + pose[4:]
-                out.append((part.name.replace("_", " "), at))
-        return out
+            end = first - [0.0, 2 * AXES_MM, 0.0] + 1.1 * AXES_MM * np.eye(3)[k]
+            out.append((words, end * MM))
+        return out + names_of_parts(self.machine, dict(self._sent))
 
     def _hull(self, node: str, mesh: Any, color: tuple[int, int, int], opacity: float) -> Any:
         vertices, faces = solids.plain(mesh)
@@ -257,7 +254,7 @@ class LabScene:
         if self._sent.get("beam") == key:
             return
         self._sent["beam"] = key
-        self._lit = on
+        self._lit, self._lamp.color = on, LAMP[on]
         self._shade.light(on)
         a, b, c, d, e = points
         lines = [(a, b), (a, c), (a, d), (a, e), (b, c), (c, d), (d, e), (e, b)]
@@ -284,14 +281,18 @@ class LabScene:
         self._image.wxyz = quaternion(np.stack([u, v, np.cross(u, v)], axis=1))
         self._image.position = tuple(at)
 
+    @property
+    def stamp(self) -> tuple[object, ...]:
+        """What a picture of `shapes` depends on, but for sample and image."""
+        return (self.opacity, *self.shown.values(), *self._sent.items())
+
     def shapes(self, world: World) -> list[Shape]:
         """What is drawn, for a picture that needs no browser; any thread may ask."""
-        poses = dict(self._sent)
-        out = [s for name, its in list(self._solids.items()) for s in placed(its, poses[name])]
-        for skin in () if self._look is None else self._look.skins:
-            corners = np.asarray(skin.vertices, dtype=float)[skin.faces]
-            opacity = 1.0 if skin.dense else self.opacity
-            out += placed([Shape(corners, np.array(skin.color), opacity)], poses["sample"])
+        poses, shown = dict(self._sent), self.shown
+        drawn = [n for n in self._solids if shown.get(n, shown["machine"])]
+        out = [shape for n in drawn for shape in placed(self._solids[n], poses[n])]
+        skins = () if self._look is None else self._look.skins
+        out += placed([shape_of(skin, self.opacity) for skin in skins], poses["sample"])
         image = [image_on(np.asarray(self._image.image), world)]
         return out + image + ([cone(world, BEAM_ON, 0.2)] if self._lit else [])
 

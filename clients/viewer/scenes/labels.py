@@ -9,13 +9,17 @@ Where leaders cross, names change places, which shortens both leaders, for as lo
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import viser
+from scipy.spatial.transform import Rotation
 
+from flexdt.clients.viewer.scenes.sample import MM
+from flexdt.clients.viewer.scenes.world import World
 from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.machine.description import Machine
 
 WAYS, RINGS_PX = 24, (26.0, 44.0, 66.0, 92.0, 124.0, 164.0, 220.0, 300.0, 420.0)
 """Directions and distances in which a place is looked for, the near ones first."""
@@ -43,8 +47,8 @@ def laid_out(anchors: FloatArray, sizes: FloatArray, area: tuple[float, float]) 
             if not _free(corner, sizes[k], out, sizes, area):
                 continue
             covered = ((anchors > corner - GAP_PX) & (anchors < corner + sizes[k] + GAP_PX)).all(1)
-            ends = [corner + 0.5 * sizes[k], anchors[k]]
-            through = sum(_cross(*ends, *leader) for leader in _leaders(anchors, out, sizes))
+            ends = corner + 0.5 * sizes[k], anchors[k]
+            through = sum(_cross(*ends, a, b) for a, b in _leaders(anchors, out, sizes))
             cost = n // WAYS + 4.0 * (covered.sum() + through) + 0.5 * (1.0 + ways[n % WAYS, 1])
             if cost < best:
                 best, out[k] = cost, corner
@@ -114,6 +118,25 @@ Name = tuple[str, FloatArray]
 """Words, and the point (3,) that they name [m, world]."""
 
 
+def names_of_image(world: World) -> list[Name]:
+    """Source, sample and detector."""
+    image = world.detector + world.u * (0.25 * world.shape[1]) - world.normal
+    named = ("X-ray source", world.source), ("sample", world.sample.shift), ("detector", image)
+    return [(words, at * MM) for words, at in named]
+
+
+def names_of_parts(machine: Machine, poses: Mapping[str, tuple[float, ...]]) -> list[Name]:
+    """Parts that move or have a role, at a corner, from their poses (w, x, y, z, place [m])."""
+    out = []
+    for part in machine.components:
+        if (pose := poses.get(part.name)) is not None and (part.axis is not None or part.role):
+            (x, _, z), middle = part.size_mm, np.array(part.center_mm)
+            turn = Rotation.from_quat(pose[:4], scalar_first=True)
+            at = turn.apply((middle + [x / 2, 0.0, z / 2]) * MM) + pose[4:]
+            out.append((part.name.replace("_", " "), np.asarray(at)))
+    return out
+
+
 class NameTags:
     """Names in the scene of each client, as its own camera sees them."""
 
@@ -156,7 +179,7 @@ class NameTags:
                     break
                 handle.remove()
             lines = []
-            for n, k in enumerate(there):
+            for n, k in enumerate(there.tolist()):
                 place = in_space(corners[k] + 0.5 * sizes[k], k)
                 end = leader_end(anchors[k], corners[k], sizes[k])
                 lines.append([in_space(end, k), points[k]])

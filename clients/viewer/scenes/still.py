@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from flexdt.clients.viewer.scenes.sample import MM, PaintedMesh
+from flexdt.clients.viewer.scenes.sample import MM, PaintedMesh, Skin
 from flexdt.clients.viewer.scenes.standpoints import Standpoint
 from flexdt.clients.viewer.scenes.world import World
 from flexdt.twin.geometry.conventions import FloatArray
@@ -66,6 +66,12 @@ def cut(pieces: Iterable[PaintedMesh]) -> list[Shape]:
             mesh = mesh.subdivide_to_size(LARGE_MM)
         out.append(Shape(mesh.triangles * MM, np.array(piece.paint.color)))
     return out
+
+
+def shape_of(skin: Skin, opacity: float) -> Shape:
+    """A sample's mesh in its own frame, beads opaque."""
+    corners = np.asarray(skin.vertices, dtype=float)[skin.faces]
+    return Shape(corners, np.array(skin.color), 1.0 if skin.dense else opacity)
 
 
 def placed(shapes: Iterable[Shape], pose: Pose) -> list[Shape]:
