@@ -32,6 +32,11 @@ const later = window.setTimeout;
 window.setTimeout = (f, ms, ...more) => later(f, ms > 5000 ? 2 ** 31 - 1 : ms, ...more);
 """
 """Notes stay until the test ends: a slow machine may look for one later than people do."""
+KNOWN_HERE = """
+localStorage.setItem('flexdt-welcome', 'seen');
+if (!localStorage.getItem('flexdt-motors')) localStorage.setItem('flexdt-motors', 'open');
+"""
+"""A browser that has been here before: no card for first visits, motors open."""
 HARMLESS = ("ERR_FILE_NOT_FOUND", "favicon")
 
 
@@ -185,12 +190,15 @@ def open_page(chromium: Any, lab: Lab, console: list[str]) -> Iterator[Callable[
         view: str = "none",
         size: tuple[int, int] = (1280, 800),
         notes_stay: bool = True,
+        fresh: bool = False,
         **query: object,
     ) -> Any:
         page = chromium.new_page(viewport={"width": size[0], "height": size[1]})
         page.set_default_timeout(120_000)
         page.on("pageerror", lambda error: console.append(str(error)))
         page.on("console", lambda m: console.append(m.text) if _matters(m) else None)
+        if not fresh:
+            page.add_init_script(KNOWN_HERE)
         if notes_stay:
             page.add_init_script(NOTES_STAY)
         given = {"view": view, "theme": "light", "patience": PATIENCE_S, **query}

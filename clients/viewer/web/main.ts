@@ -12,6 +12,7 @@ import "./calibrate.js";
 import "./share.js";
 import "./layout.js";
 import "./volume.js";
+import "./welcome.js";
 import { asked } from "./address.js";
 import { listen, toggleHelp } from "./keys.js";
 import { layout } from "./views.js";
