@@ -104,7 +104,8 @@ class Viewer:
         self.data, self.limits = data, limits or ViewerLimits()
         self.failed = asyncio.Event()
         self.grower = LiveReconstruction(self._grown)
-        self.opened = self.drawn = self.sharing = self._pictured = 0
+        self.opened = self.drawn = self.sharing = 0
+        self._pictured: object = None
         self._placed, self._stills = asyncio.Event(), Stills()
         self.pages: dict[str, Page] = {}
         self.downloads: dict[str, Download] = {}
@@ -374,7 +375,7 @@ class Viewer:
             small = image.pixels[::2, ::2] if coarse else image.pixels
             shown = ShownImage(small, image.kind, image.cone_vec, image.time, image.seq)
             lab.show_image(grey(shown, window), small, world)
-            self._pictured = image.seq
+            self._pictured = coarse, window, image.cone_vec
         assert self._loop is not None
         if not self.pages:
             self._loop.call_soon_threadsafe(self.refresh_feeds)

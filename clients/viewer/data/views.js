@@ -72,6 +72,7 @@ on("state", (s) => {
 // Without WebGL there are no scenes; all the rest works.
 function bare() {
     document.body.dataset.webgl = "none";
+    still.hidden = true;
     $("#views").replaceChildren(el("p", { class: "bare muted" }, "This browser draws no 3-D pictures (WebGL is off). Radiograph, axes and scans work without."));
     for (const button of $$("#view-switch button"))
         button.disabled = true;

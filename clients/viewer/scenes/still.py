@@ -26,8 +26,9 @@ NEAR_M = 0.02
 LARGE_MM = 250.0
 AT_ONCE = 1 << 21
 """Places of the screen that are tested at a time: some 100 MB."""
-SMOOTH = 2
-"""Computed pixels of each side of a pixel."""
+SMOOTH, SMALL_PX = 2, 1 << 17
+"""Computed pixels of each side of a pixel, in pictures with no more pixels: a view's own would take
+three times as long, and is soon replaced."""
 SKY, KEY = (0.62, (0.55, -0.6, 0.58))
 """Light from everywhere, and the direction that the rest comes from."""
 GROUND = {False: ((248, 250, 253), (217, 225, 236)), True: ((42, 49, 64), (15, 19, 26))}
@@ -110,7 +111,8 @@ def drawn(
         size: (width, height) [px].
         dark: the page's background.
     """
-    width, height = (SMOOTH * side for side in size)
+    fine = SMOOTH if size[0] * size[1] <= SMALL_PX else 1
+    width, height = (fine * side for side in size)
     above, below = (np.array(color, dtype=np.float32) for color in GROUND[dark])
     down = np.linspace(0.0, 1.0, height, dtype=np.float32)[:, None, None]
     out = np.broadcast_to(above + down * (below - above), (height, width, 3)).reshape(-1, 3).copy()
