@@ -28,7 +28,7 @@ FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader
 SIZE = {"width": 1440, "height": 810}
 FADED_MS = 6000
 """A scene fades in once its parts have come."""
-COLORS = 160
+COLORS = 256
 PATIENCE_MS = 300_000
 WRONG = "flexdt.call('calibration.apply', {parameters: {dO_x: 0.3, dO_z: -0.4}, comment: 'wrong'})"
 """A correction by which the beads stand beside where they are seen, until a fit puts it right."""
@@ -70,7 +70,9 @@ def taken(page: Any, path: Path) -> None:
         page.locator("#veil").wait_for(state="hidden")
         last = now
     raw = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
-    raw.quantize(COLORS, dither=Image.Dither.NONE).save(path, optimize=True)
+    raw.quantize(COLORS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+        path, optimize=True
+    )
 
 
 def first(browser: Any, url: str, to: Path) -> None:
