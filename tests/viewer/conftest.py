@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import seen, until
+from tests.viewer.looking import KNOWN_HERE, seen, until
 
 CHROMIUM = "/usr/bin/chromium"
 FLAGS = [
@@ -32,11 +32,6 @@ const later = window.setTimeout;
 window.setTimeout = (f, ms, ...more) => later(f, ms > 5000 ? 2 ** 31 - 1 : ms, ...more);
 """
 """Notes stay until the test ends: a slow machine may look for one later than people do."""
-KNOWN_HERE = """
-localStorage.setItem('flexdt-welcome', 'seen');
-if (!localStorage.getItem('flexdt-motors')) localStorage.setItem('flexdt-motors', 'open');
-"""
-"""A browser that has been here before: no card for first visits, motors open."""
 HARMLESS = ("ERR_FILE_NOT_FOUND", "favicon")
 
 

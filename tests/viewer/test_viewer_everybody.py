@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import begun, seen
+from tests.viewer.looking import KNOWN_HERE, begun, seen
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]
@@ -112,6 +112,7 @@ def test_without_webgl_radiograph_axes_and_scans_work(
     chromium: Any, lab: Any, twin: TwinClient, wait: Wait
 ) -> None:
     page = chromium.new_page()
+    page.add_init_script(KNOWN_HERE)
     page.add_init_script(
         "const get = HTMLCanvasElement.prototype.getContext;"
         " HTMLCanvasElement.prototype.getContext = function (kind, ...more) {"

@@ -51,7 +51,7 @@ const closer = (view) => call("viewer.camera", { view, sample: true }).catch(() 
 export function nearSample() { for (const view of open.keys())
     if (view !== "beam")
         void closer(view); }
-const still = $("#still"), inset = el("img", { alt: "" }), INSET_MS = 1500, INSET_PX = 112;
+const still = $("#still"), inset = el("img", { alt: "" }), INSET_MS = 2500, INSET_PX = 112;
 still.addEventListener("error", () => { still.hidden = true; });
 window.addEventListener("message", (e) => {
     for (const { box, iframe } of open.values())
