@@ -70,9 +70,8 @@ def taken(page: Any, path: Path) -> None:
         page.locator("#veil").wait_for(state="hidden")
         last = now
     raw = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
-    raw.quantize(COLORS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
-        path, optimize=True
-    )
+    few = raw.quantize(COLORS, Image.Quantize.MAXCOVERAGE, kmeans=3, dither=Image.Dither.NONE)
+    few.save(path, optimize=True)
 
 
 def first(browser: Any, url: str, to: Path) -> None:
