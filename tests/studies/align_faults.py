@@ -609,9 +609,10 @@ def tried(kinds: list[str], seed: int, per_frame: bool) -> dict[str, Any]:
     told: dict[str, Any] = {"kinds": kinds, "seed": seed, "per_frame": per_frame,
                             "refused": dict(found.document["refused"]),  # type: ignore[call-overload]
                             "warnings": list(found.alignment.warnings), "pulls": {}}  # fmt: skip
+    words = " ".join([*found.alignment.warnings, *found.alignment.refused.values()])
+    told["gap"] = (s.gap[1] > 0, "between two tiles" in words)
     if not found.identifiable:
         return told
-    told["gap"] = (s.gap[1] > 0, "between two tiles" in " ".join(found.alignment.warnings))
     shift = s.shift[shown]
     true = {"axis_column_px": hidden.axis_in_image()[0], "source_row_px": hidden.source_row()}
     for i, (name, value) in enumerate(true.items()):
