@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import contextlib
+import json
 import secrets
 import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping
@@ -37,7 +38,7 @@ from flexdt.clients.viewer.viewer import PageMethod, Viewer
 from flexdt.clients.viewer.viser_gate import Scenes, look_from
 from flexdt.protocol import Code, Method, RpcError, parse_params
 from flexdt.protocol import image as wire_image
-from flexdt.protocol.fields import Nothing, Params
+from flexdt.protocol.fields import Empty, Nothing, Params
 from flexdt.protocol.methods.calibration_messages import CalibrationAlign, CalibrationFit
 from flexdt.protocol.rpc_errors import busy, link_down
 from flexdt.protocol.state_model import State
@@ -309,9 +310,30 @@ async def live(viewer: Viewer, page: Page, params: p.Live) -> object:
     return {}
 
 
-async def volume_slice(viewer: Viewer, page: Page, params: p.Slice) -> object:
-    """A slice of the volume that is reconstructed; empty while there is none."""
-    return await viewer.grower.slice(params.name, params.index) or {}
+async def volume_block(viewer: Viewer, page: Page, params: p.Block) -> object:
+    """A volume that is reconstructed as a page draws it: a head, and codes to fetch; empty while
+    there is none."""
+    head, codes = await viewer.grower.ask("block", params.name) or ({}, b"")
+    if not codes:
+        return {}
+    viewer.downloads.pop(page.block, None)  # one that was not fetched is outdated
+    offered = _offer(viewer, f"{params.name}.bin", codes)
+    page.block = str(offered["url"]).rpartition("/")[2]
+    return {**head, **offered}
+
+
+async def voxel(viewer: Viewer, page: Page, params: p.Voxel) -> object:
+    """Exact values of a voxel by the names of the volumes there are; None where no data cover."""
+    told = await viewer.grower.ask("voxel", *map(str, params.at))
+    return told[0] if told else {}
+
+
+async def volume_compare(viewer: Viewer, page: Page, params: Empty) -> object:
+    """Compare the volume with the truth of its sample; its document brings the figures."""
+    correction = None if viewer.state is None else viewer.state.correction
+    now = None if correction is None else correction.model_dump(include={"name", "parameters"})
+    await viewer.grower.ask("compare", json.dumps(now))
+    return {}
 
 
 async def compose(viewer: Viewer, page: Page, params: p.Compose) -> object:
@@ -480,7 +502,9 @@ METHODS: Mapping[str, tuple[type[Params], Answer]] = {
     "viewer.recorded": (p.Recorded, recorded),
     "viewer.recorded_image": (p.RecordedImage, recorded_image),
     "viewer.live": (p.Live, live),
-    "viewer.slice": (p.Slice, volume_slice),
+    "viewer.block": (p.Block, volume_block),
+    "viewer.voxel": (p.Voxel, voxel),
+    "viewer.compare": (Empty, volume_compare),
     "viewer.compose": (p.Compose, compose),
     "viewer.datasets": (p.Datasets, datasets),
     "viewer.scrub": (p.Scrub, scrub),

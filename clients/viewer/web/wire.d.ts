@@ -11,6 +11,9 @@ export type AxisState = {
   speed: number | null;
   virtual: boolean;
 };
+export type Block = {
+  name?: "volume" | "truth" | "difference" | "other";
+};
 export type CalibrationAlign = {
   name: string;
 };
@@ -246,6 +249,7 @@ export type GeometryState = {
 };
 export type HelloResult = {
   protocol: string;
+  server: string;
   machine: string;
   profile: string | null;
   session: string | null;
@@ -469,10 +473,6 @@ export type ScriptInput = {
 export type Scrub = {
   time_s?: number | null;
 };
-export type Slice = {
-  name: "top" | "front" | "side";
-  index: number;
-};
 export type Spectrum = {
   kV: number;
 };
@@ -542,6 +542,9 @@ export type UploadResult = {
   sample: SampleInfo | null;
   warnings: Array<string>;
 };
+export type Voxel = {
+  at: Array<number>;
+};
 export type Window = {
   low?: number | null;
   high?: number | null;
@@ -588,7 +591,9 @@ export interface Methods {
   "viewer.recorded": [Recorded, object];
   "viewer.recorded_image": [RecordedImage, object];
   "viewer.live": [Live, object];
-  "viewer.slice": [Slice, object];
+  "viewer.block": [Block, object];
+  "viewer.voxel": [Voxel, object];
+  "viewer.compare": [Empty, object];
   "viewer.compose": [Compose, object];
   "viewer.datasets": [Datasets, object];
   "viewer.scrub": [Scrub, object];
