@@ -27,6 +27,8 @@ from flexdt.twin.scanner.state import StagePlacement
 Mask = npt.NDArray[np.bool_]
 LEVELS: Final = 240
 """Bins of the attenuation's logarithm in which the sample's main material is looked for."""
+NOTHING: Final = 1e-6
+"""Less attenuation than any matter's [1/mm]."""
 ALIKE: Final = 0.1
 """Voxels are of the main material within this part of its attenuation."""
 
@@ -69,7 +71,7 @@ def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
         inside = np.tensordot(back, seen, axes=1) - np.reshape(whole.center_mm, (3, 1, 1))
         at = inside / np.reshape(whole.voxel_xyz, (3, 1, 1)) + ends.reshape(3, 1, 1) + half
         out[k] = ndimage.map_coordinates(data, at[::-1], order=1, mode="constant")
-    return out
+    return np.maximum(out, 0.0, out=out)  # what a hole takes away leaves a rounding error
 
 
 def placement(folder: Path) -> StagePlacement:
@@ -134,7 +136,7 @@ def told(value: float) -> float | None:
 
 def main_level(truth: Float32Array) -> float:
     """The attenuation that most of the sample has [1/mm]; partly filled voxels differ all."""
-    there = np.log(truth[truth > 1e-9].astype(np.float64))
+    there = np.log(truth[truth > NOTHING].astype(np.float64))
     if not there.size:
         return math.nan
     counts, edges = np.histogram(there, LEVELS)
