@@ -32,9 +32,10 @@ from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.standpoints import FREE
 from flexdt.clients.viewer.scenes.world import motors
 from flexdt.clients.viewer.viewer import PageMethod, Viewer
+from flexdt.clients.viewer.volume_process import wish
 from flexdt.protocol import Code, Method, RpcError, parse_params
 from flexdt.protocol import image as wire_image
-from flexdt.protocol.fields import Empty, Nothing, Params
+from flexdt.protocol.fields import Nothing, Params
 from flexdt.protocol.methods.calibration_messages import CalibrationAlign, CalibrationFit
 from flexdt.protocol.rpc_errors import busy, link_down
 from flexdt.protocol.state_model import State
@@ -229,30 +230,34 @@ async def live(viewer: Viewer, page: Page, params: p.Live) -> object:
     return {}
 
 
+async def _of_volume(viewer: Viewer, params: p.Live, *words: str) -> tuple[Any, bytes]:
+    """What the volume's process answers; nothing where it has another volume by now."""
+    folder = _data(viewer) / plain_name(params.name or "", "data set")
+    return await viewer.grower.ask(wish(folder, params.side, params.past), *words) or ({}, b"")
+
+
 async def volume_block(viewer: Viewer, page: Page, params: p.Block) -> object:
     """A volume that is reconstructed as a page draws it: a head, and codes to fetch; empty while
     there is none."""
-    head, codes = await viewer.grower.ask("block", params.name) or ({}, b"")
+    head, codes = await _of_volume(viewer, params, "block", params.what)
     if not codes:
         return {}
     viewer.downloads.pop(page.block, None)  # one that was not fetched is outdated
-    offered = _offer(viewer, f"{params.name}.bin", codes)
+    offered = _offer(viewer, f"{params.what}.bin", codes)
     page.block = str(offered["url"]).rpartition("/")[2]
     return {**head, **offered}
 
 
 async def voxel(viewer: Viewer, page: Page, params: p.Voxel) -> object:
     """Exact values of a voxel by the names of the volumes there are; None where no data cover."""
-    told = await viewer.grower.ask("voxel", *map(str, params.at))
-    return told[0] if told else {}
+    return (await _of_volume(viewer, params, "voxel", *map(str, params.at)))[0]
 
 
-async def volume_compare(viewer: Viewer, page: Page, params: Empty) -> object:
+async def volume_compare(viewer: Viewer, page: Page, params: p.Live) -> object:
     """Compare the volume with the truth of its sample; its document brings the figures."""
     correction = None if viewer.state is None else viewer.state.correction
     now = None if correction is None else correction.model_dump(include={"name", "parameters"})
-    await viewer.grower.ask("compare", json.dumps(now))
-    return {}
+    return (await _of_volume(viewer, params, "compare", json.dumps(now)))[0]
 
 
 async def compose(viewer: Viewer, page: Page, params: p.Compose) -> object:
@@ -428,7 +433,7 @@ METHODS: Mapping[str, tuple[type[Params], Answer]] = {
     "viewer.live": (p.Live, live),
     "viewer.block": (p.Block, volume_block),
     "viewer.voxel": (p.Voxel, voxel),
-    "viewer.compare": (Empty, volume_compare),
+    "viewer.compare": (p.Live, volume_compare),
     "viewer.compose": (p.Compose, compose),
     "viewer.datasets": (p.Datasets, datasets),
     "viewer.scrub": (p.Scrub, scrub),

@@ -127,15 +127,15 @@ class Live(Params):
     """The whole volume of a scan that was made, not one that grows."""
 
 
-class Block(Params):
-    """Which volume: the one that was asked for, its sample's truth, how far they are apart, or the
-    one with the other geometry."""
+class Block(Live):
+    """Which of its volumes: the one that was asked for, its sample's truth, how far they are apart,
+    or the one with the other geometry."""
 
-    name: Literal["volume", "truth", "difference", "other"] = "volume"
+    what: Literal["volume", "truth", "difference", "other"] = "volume"
 
 
-class Voxel(Params):
-    """A voxel of the volume that is reconstructed, by its numbers along x, y and z."""
+class Voxel(Live):
+    """A voxel of a volume, by its numbers along x, y and z."""
 
     at: Annotated[list[Index], Len(3, 3)]
 

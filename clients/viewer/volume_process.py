@@ -20,6 +20,13 @@ LINE_BYTES: Final = 4 << 20
 SINGLE: Final = {name: ones for name, ones in ENVIRONMENT.items() if not name.startswith("NUMBA")}
 """The process itself says how many threads its kernels have."""
 Answer = tuple[dict[str, Any], bytes]
+Wish = tuple[str, ...]
+"""What the process reads first."""
+
+
+def wish(folder: Path, side: int, past: bool) -> Wish:
+    """The volume of a data set, with so many voxels a side; the whole one of a past scan."""
+    return str(folder.absolute()), str(side), *(["past"] if past else [])
 
 
 class LiveReconstruction:
@@ -31,7 +38,7 @@ class LiveReconstruction:
 
     def __init__(self, tell: Callable[[str], None]) -> None:
         self._tell, self.newest = tell, ""
-        self._asked: tuple[str, ...] = ()
+        self._asked: Wish = ()
         self._task: asyncio.Task[None] | None = None
         self._ending: asyncio.Task[None] | None = None
         self._spare: asyncio.Task[asyncio.subprocess.Process] | None = None
@@ -45,7 +52,7 @@ class LiveReconstruction:
 
     def grow(self, folder: Path, side: int, past: bool = False) -> None:
         """Grow the volume of a data set, unless that is being done; the last line comes again."""
-        asked = str(folder.absolute()), str(side), *(["past"] if past else [])
+        asked = wish(folder, side, past)
         if asked == self._asked:
             if self.newest:
                 self._tell(self.newest)
@@ -78,9 +85,10 @@ class LiveReconstruction:
         while self._wanted:
             self._wanted.popleft().cancel()
 
-    async def ask(self, *words: str) -> Answer | None:
-        """What the process answers, and bytes behind it; None while there is none."""
-        if self._writer is None:
+    async def ask(self, asked: Wish, *words: str) -> Answer | None:
+        """What the process answers, and bytes behind it; None while there is none, or once it
+        has another volume than the one `asked` for."""
+        if self._writer is None or asked != self._asked:
             return None
         wanted: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
         self._wanted.append(wanted)

@@ -162,7 +162,9 @@ def test_a_past_scan_is_reconstructed_and_gone_through(
     assert (abs(x - nx / 4) < 2, y, abs(z - nz / 4) < 2) == (True, ny // 2, True)
     page.locator("#volume-at", has_text=re.compile(r"mm  -?[\d.e-]{9,} per mm")).wait_for()
     said = float(page.inner_text("#volume-at").split()[-3])
-    exact = page.evaluate("at => flexdt.call('viewer.voxel', { at })", [x, y, z])["volume"]
+    exact = page.evaluate(
+        "at => flexdt.call('viewer.voxel', { ...flexdt.volume().of, at })", [x, y, z]
+    )["volume"]
     assert said == pytest.approx(exact, rel=1e-6)
     page.select_option("#volume-tool", "profile")
     page.mouse.down()

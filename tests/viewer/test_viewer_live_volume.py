@@ -30,7 +30,7 @@ from flexdt.clients.viewer.live_volume import (
     surface,
 )
 from flexdt.clients.viewer.volume_block import TOP, block, exact
-from flexdt.clients.viewer.volume_process import LiveReconstruction
+from flexdt.clients.viewer.volume_process import LiveReconstruction, wish
 from flexdt.clients.viewer.volume_truth import figures, main_level, truth_of
 from flexdt.phantoms import load_phantom
 from flexdt.runtime.files.directory import open_data
@@ -335,16 +335,16 @@ def test_answers_come_from_the_process_until_it_is_stopped(scan: tuple[Path, lis
 
     async def body() -> None:
         told: list[str] = []
-        one = LiveReconstruction(told.append)
-        assert await one.ask("block", "volume") is None
+        one, mine = LiveReconstruction(told.append), wish(home, 120, True)
+        assert await one.ask(mine, "block", "volume") is None
         one.warm()
         one.grow(home, 120, past=True)
         while '"views"' not in one.newest:
             assert "problem" not in one.newest
             await asyncio.sleep(0.02)
         whole, voxel, none, unknown = await asyncio.gather(
-            one.ask("block", "volume"), one.ask("voxel", "3", "2", "1"), one.ask("block", "truth"),
-            one.ask("compare", "null"),
+            one.ask(mine, "block", "volume"), one.ask(mine, "voxel", "3", "2", "1"),
+            one.ask(mine, "block", "truth"), one.ask(mine, "compare", "null"),
         )  # fmt: skip
         assert whole is not None
         assert len(whole[1]) == 2 * np.prod(whole[0]["shape"])
@@ -354,10 +354,11 @@ def test_answers_come_from_the_process_until_it_is_stopped(scan: tuple[Path, lis
         value = whole[0]["low"] + (code - 1) * (whole[0]["high"] - whole[0]["low"]) / TOP
         assert voxel[0]["volume"] == pytest.approx(value, abs=1e-4)
         assert none == unknown == ({}, b"")
+        assert await one.ask(wish(home, 60, True), "voxel", "3", "2", "1") is None
         while "not_compared" not in one.newest:
             await asyncio.sleep(0.02)
         one.stop()
-        assert await one.ask("block", "volume") is None
+        assert await one.ask(mine, "block", "volume") is None
         await one.close()
 
     asyncio.run(body())

@@ -13,7 +13,7 @@ const chart = $canvas("#volume-histogram"), plot = $canvas("#volume-profile"), e
 size.addEventListener("change", choose);
 size.value = localStorage.getItem(KEY) ?? "";
 // The past scan whose volume is wanted; else it is the running one's.
-let past = null, asked = null, told = null, pointer = null, wanting = false, comparing = false;
+let past = null, asked = null, told = null, pointer = null, of = {}, wanting = false, comparing = false;
 const blocks = new Map();
 const three = slices({ top: $canvas("#slice-top"), front: $canvas("#slice-front"), side: $canvas("#slice-side") }, point, () => { solid?.cross(three.cross); drawProfile(); });
 let tried = false, solid = null;
@@ -26,8 +26,9 @@ function ask() {
     told = null;
     comparing = false;
     // The folder comes a moment after the job: what is refused is asked again.
+    of = { name, side: Number(size.value), past: past !== null };
     if (wish || before)
-        call("viewer.live", wish ? { name, side: Number(size.value), past: past !== null } : {}).catch((error) => {
+        call("viewer.live", wish ? of : {}).catch((error) => {
             if (asked !== wish)
                 return;
             setText(note, words(error));
@@ -109,7 +110,7 @@ on("volume", (m) => {
     if (thenCompare && m.past && m.done === 1 && m.comparing === undefined && !comparing)
         compare();
 });
-function compare() { comparing = true; $button("#volume-compare").disabled = true; void call("viewer.compare").catch((error) => setText(note, words(error))); }
+function compare() { comparing = true; $button("#volume-compare").disabled = true; void call("viewer.compare", of).catch((error) => setText(note, words(error))); }
 // The volume that is chosen, once; of one that grows the newest, one at a time.
 async function want() {
     if (wanting)
@@ -118,7 +119,7 @@ async function want() {
     const mine = asked, name = shown.value;
     let block = blocks.get(name) ?? null;
     if (!block) {
-        const head = await call("viewer.block", { name }).catch(() => null), raw = head?.url ? await fetch(head.url).then((r) => r.arrayBuffer(), () => null) : null;
+        const head = await call("viewer.block", { ...of, what: name }).catch(() => null), raw = head?.url ? await fetch(head.url).then((r) => r.arrayBuffer(), () => null) : null;
         if (head?.shape && raw && raw.byteLength === 2 * head.shape.reduce((a, n) => a * n) && told)
             block = { ...head, codes: new Uint16Array(raw), voxel_mm: (told.voxel_mm ?? 0) * (head.factor ?? 1) };
         if (block && name === "difference") {
@@ -226,7 +227,7 @@ function point(place) {
     say(code ? `${fixed(valueOf(b, code), 5)} per mm` : "no data cover this voxel");
     const at = place.map((v) => Math.floor((v + 0.5) * b.factor));
     due = window.setTimeout(async () => {
-        const exact = await call("viewer.voxel", { at }).catch(() => null), v = exact?.[shown.value];
+        const exact = await call("viewer.voxel", { ...of, at }).catch(() => null), v = exact?.[shown.value];
         if (pointer === place && typeof v === "number")
             say(`${v.toPrecision(8)} per mm`);
     }, EXACT_MS);
@@ -251,4 +252,4 @@ window.addEventListener("keydown", (e) => { if (e.key === "Escape" && document.b
     large(false);
 } }, true);
 // For tests: what is shown.
-export const look = () => ({ three, solid, told });
+export const look = () => ({ three, solid, told, of });

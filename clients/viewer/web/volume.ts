@@ -2,7 +2,7 @@
 // scroll and in three dimensions, and beside the truth of its sample.
 import { $, $button, $canvas, $input, $select, bars, cleared, clicks, el, fixed, keep, setText, slid, words } from "./dom.js";
 import { call, on, store } from "./link.js";
-import type { Block, Figures, Pair, Vector, VolumeMessage } from "./viewer.js";
+import type { Block, Figures, Live, Pair, Vector, VolumeMessage } from "./viewer.js";
 import { folder } from "./data.js";
 import { extent, index, slices, valueOf } from "./slices.js";
 import { raycast } from "./raycast.js";
@@ -17,7 +17,7 @@ size.addEventListener("change", choose);
 size.value = localStorage.getItem(KEY) ?? "";
 
 // The past scan whose volume is wanted; else it is the running one's.
-let past: string | null = null, asked: string | null = null, told: VolumeMessage | null = null, pointer: Vector | null = null, wanting = false, comparing = false;
+let past: string | null = null, asked: string | null = null, told: VolumeMessage | null = null, pointer: Vector | null = null, of: Live = {}, wanting = false, comparing = false;
 const blocks = new Map<string, Block>();
 const three = slices({ top: $canvas("#slice-top"), front: $canvas("#slice-front"), side: $canvas("#slice-side") }, point, () => { solid?.cross(three.cross); drawProfile(); });
 let tried = false, solid: Exclude<ReturnType<typeof raycast>, string> | null = null;
@@ -28,7 +28,8 @@ function ask() {
   const before = asked;
   asked = wish; told = null; comparing = false;
   // The folder comes a moment after the job: what is refused is asked again.
-  if (wish || before) call("viewer.live", wish ? { name, side: Number(size.value) as 128, past: past !== null } : {}).catch((error: unknown) => {
+  of = { name, side: Number(size.value) as 128, past: past !== null };
+  if (wish || before) call("viewer.live", wish ? of : {}).catch((error: unknown) => {
     if (asked !== wish) return;
     setText(note, words(error));
     setTimeout(() => { if (asked === wish) { asked = null; ask(); } }, 1000);
@@ -83,7 +84,7 @@ on("volume", (m) => {
   $button("#volume-compare").disabled = !m.past || m.comparing !== undefined;
   if (thenCompare && m.past && m.done === 1 && m.comparing === undefined && !comparing) compare();
 });
-function compare() { comparing = true; $button("#volume-compare").disabled = true; void call("viewer.compare").catch((error: unknown) => setText(note, words(error))); }
+function compare() { comparing = true; $button("#volume-compare").disabled = true; void call("viewer.compare", of).catch((error: unknown) => setText(note, words(error))); }
 
 // The volume that is chosen, once; of one that grows the newest, one at a time.
 async function want() {
@@ -92,7 +93,7 @@ async function want() {
   const mine = asked, name = shown.value as Name;
   let block = blocks.get(name) ?? null;
   if (!block) {
-    const head = await call("viewer.block", { name }).catch(() => null), raw = head?.url ? await fetch(head.url).then((r) => r.arrayBuffer(), () => null) : null;
+    const head = await call("viewer.block", { ...of, what: name }).catch(() => null), raw = head?.url ? await fetch(head.url).then((r) => r.arrayBuffer(), () => null) : null;
     if (head?.shape && raw && raw.byteLength === 2 * head.shape.reduce((a, n) => a * n) && told)
       block = { ...(head as Block), codes: new Uint16Array(raw), voxel_mm: (told.voxel_mm ?? 0) * (head.factor ?? 1) };
     if (block && name === "difference") { const end = Math.max(...(blocks.get("volume")?.window ?? [0, 1])) / 2; block.signed = true; block.window = [-end, end]; }
@@ -164,7 +165,7 @@ function point(place: Vector | null) {
   say(code ? `${fixed(valueOf(b, code), 5)} per mm` : "no data cover this voxel");
   const at = place.map((v) => Math.floor((v + 0.5) * b.factor)) as Vector;
   due = window.setTimeout(async () => {
-    const exact = await call("viewer.voxel", { at }).catch(() => null), v = exact?.[shown.value];
+    const exact = await call("viewer.voxel", { ...of, at }).catch(() => null), v = exact?.[shown.value];
     if (pointer === place && typeof v === "number") say(`${v.toPrecision(8)} per mm`);
   }, EXACT_MS);
 }
@@ -186,4 +187,4 @@ function compared(rows: Record<string, Figures>) {
 clicks({ "volume-cancel": cancel, "volume-compare": compare, "volume-large": () => large(!document.body.classList.contains("whole")), "volume-share": () => { if (three.block && told) void shared(three, solid, told); } });
 window.addEventListener("keydown", (e) => { if (e.key === "Escape" && document.body.classList.contains("whole")) { e.stopPropagation(); large(false); } }, true);
 // For tests: what is shown.
-export const look = () => ({ three, solid, told });
+export const look = () => ({ three, solid, told, of });

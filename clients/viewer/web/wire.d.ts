@@ -12,7 +12,10 @@ export type AxisState = {
   virtual: boolean;
 };
 export type Block = {
-  name?: "volume" | "truth" | "difference" | "other";
+  name?: string | null;
+  side?: 128 | 192 | 256 | 512;
+  past?: boolean;
+  what?: "volume" | "truth" | "difference" | "other";
 };
 export type CalibrationAlign = {
   name: string;
@@ -543,6 +546,9 @@ export type UploadResult = {
   warnings: Array<string>;
 };
 export type Voxel = {
+  name?: string | null;
+  side?: 128 | 192 | 256 | 512;
+  past?: boolean;
   at: Array<number>;
 };
 export type Window = {
@@ -593,7 +599,7 @@ export interface Methods {
   "viewer.live": [Live, object];
   "viewer.block": [Block, object];
   "viewer.voxel": [Voxel, object];
-  "viewer.compare": [Empty, object];
+  "viewer.compare": [Live, object];
   "viewer.compose": [Compose, object];
   "viewer.datasets": [Datasets, object];
   "viewer.scrub": [Scrub, object];
