@@ -129,11 +129,17 @@ class Live(Params):
     """The whole volume of a scan that was made, not one that grows."""
 
 
-class Slice(Params):
-    """A slice of the volume of a past scan, by its number."""
+class Block(Live):
+    """Which of its volumes: the one that was asked for, its sample's truth, how far they are apart,
+    or the one with the other geometry."""
 
-    name: Literal["top", "front", "side"]
-    index: Index
+    what: Literal["volume", "truth", "difference", "other"] = "volume"
+
+
+class Voxel(Live):
+    """A voxel of a volume, by its numbers along x, y and z."""
+
+    at: Annotated[list[Index], Len(3, 3)]
 
 
 class Compose(Params):

@@ -27,7 +27,7 @@ from flexdt.clients.client.transport import ConnectionLost
 from flexdt.clients.viewer import scrubbed_plan as plans
 from flexdt.clients.viewer.feed import ImageFeed, ShownImage, grey, packed, window_of
 from flexdt.clients.viewer.front import Download, Front
-from flexdt.clients.viewer.live_volume import LiveReconstruction, points_of
+from flexdt.clients.viewer.live_volume import points_of
 from flexdt.clients.viewer.page import TRY_AGAIN, Page, watched, without_bytes
 from flexdt.clients.viewer.page_cameras import SceneClients
 from flexdt.clients.viewer.scenes import sample as shapes
@@ -38,6 +38,7 @@ from flexdt.clients.viewer.scenes.sample import NOTHING, MeshCache, SampleLook
 from flexdt.clients.viewer.scenes.world import World, beads_on, world_of
 from flexdt.clients.viewer.stills import Stills
 from flexdt.clients.viewer.viser_gate import Scenes
+from flexdt.clients.viewer.volume_process import LiveReconstruction
 from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SafetyState, SampleState, State
 from flexdt.runtime.access import ViewerLimits
@@ -176,7 +177,7 @@ class Viewer:
             await feed.stop()
         if self.front is not None:
             await self.front.close()
-        self.grower.stop()
+        await self.grower.close()
         self.planners.close()
         await asyncio.to_thread(self.scenes.stop)
 
@@ -433,6 +434,8 @@ class Viewer:
         self.open_pages.add(page)
         self.pages[id] = page
         self._tell_link(page)
+        if self.data is not None:
+            self.grower.warm()
         if self.lab is not None:
             page.say("layers", **self.lab.layers)
         self.refresh_feeds()

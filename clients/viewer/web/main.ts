@@ -11,7 +11,8 @@ import * as data from "./data.js";
 import "./calibrate.js";
 import "./share.js";
 import "./layout.js";
-import "./volume.js";
+import { look as volume } from "./volume.js";
+import "./path.js";
 import "./welcome.js";
 import { asked } from "./address.js";
 import { listen, toggleHelp } from "./keys.js";
@@ -35,4 +36,4 @@ listen(window);
 connect();
 // The scenes' frames say which page they belong to, so the page has been registered before.
 on("connection", () => { if (store.cameras?.iso && !$("#views").childElementCount) layout(window.firstView); });
-window.flexdt = { store, call, scan, data, film, picture, value };
+window.flexdt = { store, call, scan, data, film, picture, value, volume };
