@@ -38,8 +38,10 @@ from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.projection import Volume
 from flexdt.twin.reconstruction import (
+    Bias,
     Grid,
     Truncation,
+    bias_of,
     cgls,
     em,
     fdk_parts,
@@ -47,12 +49,12 @@ from flexdt.twin.reconstruction import (
     hardening,
     layer_warnings,
     lost_layers,
-    missing_wedge,
     ring_errors,
     sart,
     sirt,
     truncation_of,
     tv,
+    with_errors,
 )
 from flexdt.twin.reconstruction.scatter_correction import scatterer_of, subtracted
 
@@ -164,6 +166,10 @@ class ScanFrames:
     def truncation(self) -> Truncation | None:
         """What of the object lies beyond the panel's edges, for FDK."""
         return truncation_of(lambda i: self.image(self.indices[i]), self.cone_vec, self.shape)
+
+    def bias(self, truncation: Truncation | None) -> Bias | None:
+        """What FDK's volume may be off by."""
+        return bias_of(lambda i: self.image(self.indices[i]), self.cone_vec, self.shape, truncation)
 
     def image(self, index: int) -> Float32Array:
         """One frame's line integrals, binned and corrected."""
@@ -312,11 +318,13 @@ def _here(
             )
             write(slab.data)
             lost += lost_layers(slab.data)
-    return [*_doubts(truncation), *layer_warnings(lost, grid.shape[0])]
+    return [*doubts_of(views, grid, truncation), *layer_warnings(lost, grid.shape[0])]
 
 
-def _doubts(truncation: Truncation | None) -> list[str]:
-    return [truncation.doubt] if truncation is not None and truncation.doubt else []
+def doubts_of(views: ScanFrames, grid: Grid, truncation: Truncation | None) -> list[str]:
+    """What is doubtful about FDK's volume on a grid."""
+    bias = views.bias(truncation)
+    return [] if bias is None else bias.doubts(grid.blank())
 
 
 def reconstruct_volume(
@@ -335,7 +343,7 @@ def reconstruct_volume(
     _require("of memory", 3 * grid.bytes, memory_bytes(), grid)
     views = _corrected(views, wanted)
     truncation = views.truncation() if wanted.algorithm == "fdk" else None
-    for doubt in (*views.doubts, *_doubts(truncation)):
+    for doubt in views.doubts:
         warnings.warn(doubt, stacklevel=2)
     if wanted.algorithm != "fdk":
         return _iterative(views, grid, wanted, tell)
@@ -343,9 +351,11 @@ def reconstruct_volume(
         views.parts, views.cone_vec, views.shape, grid.blank(), wanted.window,
         lambda done: tell(done, 1.0), truncation, errors=errors,
     )  # fmt: skip
-    for doubt in layer_warnings(lost_layers(volume.data), grid.shape[0]):
+    bias = views.bias(truncation) if errors else None
+    doubts = [] if bias is None else bias.doubts(volume)
+    for doubt in (*doubts, *layer_warnings(lost_layers(volume.data), grid.shape[0])):
         warnings.warn(doubt, stacklevel=2)
-    return volume
+    return with_errors(volume, bias=bias)
 
 
 def _task(
@@ -357,10 +367,7 @@ def _task(
     if name not in ALGORITHMS:
         raise UnknownNameError.among(f"unknown algorithm {name!r}; allowed", name, ALGORITHMS)
     views = views_of(dataset, parameters, binning=wanted.binning, every=wanted.every)
-    doubts = image_doubts(dataset, needed=True)
-    if name == "fdk":  # iterative methods need no lines of all directions
-        doubts += missing_wedge(views.cone_vec)
-    views = replace(views, doubts=tuple(doubts))
+    views = replace(views, doubts=tuple(image_doubts(dataset, needed=True)))
     return wanted, views, grid_of(views, wanted)
 
 

@@ -30,15 +30,15 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Grid, Volume, as_volume, gpu
 from flexdt.twin.projection.cpu import threads
 from flexdt.twin.projection.operators import as_cone_vec, check_projections, require_finite
+from flexdt.twin.reconstruction.bias import bias_of
 from flexdt.twin.reconstruction.coverage import (
     first_and_steps,
     layer_warnings,
     lost_layers,
-    missing_wedge,
     normalise_coverage,
 )
 from flexdt.twin.reconstruction.helix import Sharing
-from flexdt.twin.reconstruction.noise import NoiseMeter, with_noise
+from flexdt.twin.reconstruction.noise import NoiseMeter, with_errors
 from flexdt.twin.reconstruction.rectify import (
     FINER,
     is_upright,
@@ -352,6 +352,7 @@ def fdk(
     *,
     window: str = "ram-lak",
     progress: Progress | None = None,
+    errors: bool = True,
 ) -> Volume:
     """Reconstruct attenuation from line integrals of a circular or helical scan.
 
@@ -361,6 +362,7 @@ def fdk(
         like: the grid, or a volume on it, whose values are not used.
         window: of the ramp filter: ram-lak, shepp-logan, cosine, hamming, hann.
         progress: called with the fraction done.
+        errors: find `sigma` and `bias_bound` of the volume, too, and warn where that is large.
 
     Returns:
         Volume [1/mm]; its data is a (nz, ny, nx) view with z contiguous. Voxels that too few views
@@ -372,8 +374,8 @@ def fdk(
         UnknownNameError: no such window.
 
     Warns:
-        UserWarning: the panel cuts the object off, and its outline is not understood; layers of the
-            grid lie above or below what the panel sees; no lines of some directions were seen.
+        UserWarning: densities may be far off (`bias_bound`), and why; layers of the grid lie above
+            or below what the panel sees.
 
     Examples:
         A cube of 0.02 / mm, projected and reconstructed:
@@ -404,16 +406,16 @@ def fdk(
             yield part
 
     shape = (values.shape[1], values.shape[2])
-    truncation = None
+    truncation, bias = None, None
     if len(values) == len(geometry):
         truncation = truncation_of(lambda view: values[view], geometry, shape)
-        if truncation is not None and truncation.doubt:
-            warnings.warn(truncation.doubt, stacklevel=3)
-    volume = fdk_parts(parts, geometry, shape, like, window, progress, truncation)
-    layers = layer_warnings(lost_layers(volume.data), len(volume.data))
-    for doubt in (*missing_wedge(geometry), *layers):
+    volume = fdk_parts(parts, geometry, shape, like, window, progress, truncation, errors=errors)
+    if errors:
+        bias = bias_of(lambda view: values[view], geometry, shape, truncation)
+    doubts = bias.doubts(volume) if bias is not None else []
+    for doubt in (*doubts, *layer_warnings(lost_layers(volume.data), len(volume.data))):
         warnings.warn(doubt, stacklevel=3)
-    return volume
+    return with_errors(volume, bias=bias)
 
 
 def fdk_parts(
@@ -611,7 +613,7 @@ def _fdk(
                 meter.data, meter.grid, circle, table, rays, last - first, own, cut_off=cut_off
             )
     volume = replace(like, data=data.transpose(2, 0, 1))
-    return volume if meter is None else with_noise(volume, meter.found())
+    return volume if meter is None else with_errors(volume, meter.found())
 
 
 def _weighing(
