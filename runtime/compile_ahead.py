@@ -120,10 +120,6 @@ def main() -> None:
     match sys.argv[1:]:
         case ["--here", group]:
             GROUPS[group][0]()
-        case ["--behind", *groups]:
-            if hasattr(os, "nice"):  # Windows has none
-                os.nice(10)
-            compile_ahead(groups, lambda line: None)
         case groups:
             compile_ahead(groups or list(GROUPS), lambda line: print(f"flexdt: {line}", flush=True))
 

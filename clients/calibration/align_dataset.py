@@ -12,6 +12,7 @@ import numpy as np
 from scipy.ndimage import shift
 
 from flexdt.clients.datasets.data_set import DataSet
+from flexdt.clients.expose import image_doubts
 from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.without_phantom.align import STANDS, Alignment, align_turn
 from flexdt.twin.errors import NotIdentifiableError
@@ -92,6 +93,7 @@ def align_dataset(data: DataSet, per_frame: bool = False) -> Aligned:
         DatasetError: a frame cannot be read, or there is no flat image.
     """
     begun = time.perf_counter()
+    data = replace(data, warnings=(*data.warnings, *image_doubts(data)))
     base = NOMINAL if data.correction is None else data.correction.parameters
     frames, poses = _at_rest(data)
     found = align_turn(

@@ -16,6 +16,7 @@ import asyncio
 import logging
 import os
 import threading
+import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass, field
@@ -104,6 +105,8 @@ class FairQueue(Generic[T]):
             self._changed.notify_all()
 
 
+COMPILE_BACK_AFTER_S: Final = 60.0
+"""So that the first scan of a new installation has both cores."""
 BLOCK_BYTES: Final = 12 * 2**20
 """Result of one turn of a job: below a frame, and short enough to share the machine fairly."""
 BLOCK_VIEWS: Final = 32
@@ -297,6 +300,7 @@ def begin(threads: int) -> None:
 
 
 def _compile_back() -> None:
+    time.sleep(COMPILE_BACK_AFTER_S)
     os.nice(10)  # Linux: of this thread, and of the process that it starts
     if not compile_ahead.is_compiled("back projection"):
         compile_ahead.elsewhere("back projection")

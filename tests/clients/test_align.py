@@ -6,6 +6,7 @@ from __future__ import annotations
 import functools
 import json
 import math
+import dataclasses
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -340,6 +341,18 @@ def test_an_exact_copy_of_a_frame_is_left_out_by_name() -> None:
     found = fx.DataSet.from_arrays(counts, data.geometry, dark=data.dark, flat=data.flat).align()
     assert "[31] repeat" in " ".join(found.warnings)
     assert np.abs(pulls(found, scanner)).max() < 4
+
+
+def test_saturated_images_are_named() -> None:
+    scanner, lines = scan(0)
+    data = data_set(lines, DEGREES, 1e4, np.random.default_rng(1))
+    top = int(np.percentile(data.counts(), 60))
+    burnt = [np.minimum(a, top) for a in (data.counts(), data.flat)]
+    images = dataclasses.replace(
+        fx.DataSet.from_arrays(burnt[0], data.geometry, dark=data.dark, flat=burnt[1]),
+        full_scale=top,
+    )
+    assert "are saturated" in " ".join(images.align().warnings)
 
 
 def test_what_a_scan_cannot_tell_is_refused_with_the_reason() -> None:

@@ -54,6 +54,9 @@ EDGES = r"voxel_mm is \(.*; allowed: a number, \(a number, a number, a number\)"
         (lambda: fx.calibrate([], "lego"), "no data sets; allowed: one or more"),
         *((lambda f=f: f(np.zeros((0, 4, 4)), np.zeros((0, 12)), fx.Grid((4, 4, 4), 1)), "views")
           for f in (fx.fdk, fx.sirt, fx.cgls, fx.tv)),
+        *((lambda f=f: f(np.ones((16, 16, 16), np.uint16), SCAN, fx.Grid((4, 4, 4), 1)),
+           "projections are uint16, as a detector's counts are")
+          for f in (fx.fdk, fx.sirt, fx.cgls, fx.tv)),
         *((lambda n=n: fx.reconstruct(fx.simulate(BALL, SCAN), every=n), f"every {n} frames; all")
           for n in (0, -2)),
         (lambda: fx.reconstruct(fx.simulate(BALL, SCAN), every=1.5),

@@ -82,7 +82,14 @@ def test_from_scan_to_correction_and_back(page: Any, twin: TwinClient, wait: Wai
     page.fill("#fit-phantom", "lego")
     page.click("#fit")
     page.locator("#fit-report .verdict.ok").wait_for(timeout=600_000)
-    assert "13 frames" in page.inner_text("#fit-report")
+    report = page.inner_text("#fit-report")
+    assert "13 frames" in report
+    verdict = re.match(r"Safe to reconstruct: the rotation axis is known to ([0-9.e-]+) px", report)
+    assert verdict, report
+    assert "next: flexdt script new --kind calibration" in report
+    column = estimates(page)["axis_column"]
+    assert abs(column[0] - (956 - 1) / 2) < 20
+    assert float(verdict[1]) == pytest.approx(column[1], rel=0.5)
     sigmas = {name: sigma for name, (_, sigma) in estimates(page).items()}
 
     page.click("#fit-compare")

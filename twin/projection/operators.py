@@ -249,6 +249,17 @@ def check_projections(projections: npt.ArrayLike, n: int) -> Any:
     return values
 
 
+def require_line_integrals(projections: Any) -> None:
+    """Raise GeometryError for a detector's counts, which are unsigned integers."""
+    kind = getattr(projections, "dtype", None)
+    if kind is not None and kind.kind == "u":
+        raise GeometryError(
+            f"projections are {kind}, as a detector's counts are; allowed: line integrals, as "
+            "`line_integrals()` of a data set gives them, or floating-point numbers",
+            {"asked": str(kind), "allowed": "floating-point numbers"},
+        )
+
+
 def require_finite(values: Any) -> None:
     """Raise GeometryError for projections in memory that are not finite."""
     if not gpu.is_there(values) and not math.isfinite(float(values.sum())):

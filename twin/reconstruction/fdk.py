@@ -29,7 +29,12 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Grid, Volume, as_volume, gpu
 from flexdt.twin.projection.cpu import threads
-from flexdt.twin.projection.operators import as_cone_vec, check_projections, require_finite
+from flexdt.twin.projection.operators import (
+    as_cone_vec,
+    check_projections,
+    require_finite,
+    require_line_integrals,
+)
 from flexdt.twin.reconstruction.bias import bias_of
 from flexdt.twin.reconstruction.coverage import (
     first_and_steps,
@@ -394,6 +399,7 @@ def fdk(
     """
     geometry = as_cone_vec(cone_vec)
     values = np.asarray(projections)
+    require_line_integrals(values)
     if values.ndim != 3:
         values = check_projections(values, len(geometry))
 

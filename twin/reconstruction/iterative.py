@@ -26,7 +26,12 @@ from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import Grid, Volume, as_volume, back, forward, gpu, room_like
 from flexdt.twin.projection.device_arrays import DeviceArray
 from flexdt.twin.projection.linear_operator import dot as dot
-from flexdt.twin.projection.operators import as_cone_vec, check_projections, require_finite
+from flexdt.twin.projection.operators import (
+    as_cone_vec,
+    check_projections,
+    require_finite,
+    require_line_integrals,
+)
 from flexdt.twin.projection.volume import DeviceVolume
 from flexdt.twin.signatures import public
 
@@ -88,6 +93,7 @@ class LinearSystem:
         geometry = as_cone_vec(cone_vec)
         if not len(geometry):
             raise GeometryError("no views; allowed: one or more", {"asked": 0, "allowed": 1})
+        require_line_integrals(projections)
         values = check_projections(projections, len(geometry))
         require_finite(values)
         geometry.of_shape((values.shape[1], values.shape[2]))

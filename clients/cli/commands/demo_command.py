@@ -7,6 +7,7 @@ from the document.
 
 from __future__ import annotations
 
+import contextlib
 import subprocess
 import tempfile
 import time
@@ -104,8 +105,8 @@ def run_demo(
         options = {"data": data.absolute(), "truth": path.absolute(), "speed-up": "max"}
         tell("starting the servers; the very first start compiles the projector's kernels")
         with (
-            # What calibration and reconstruction need, behind the servers' start and the scan.
-            compile_ahead.start(["--behind", *compile_ahead.ANALYSIS]) as compiling,
+            # What calibration and reconstruction need, beside the servers' start and the scan.
+            compile_ahead.start(compile_ahead.ANALYSIS) as compiling,
             Servers(options, out / "servers.log", viewer=stay is not None) as servers,
         ):
             host, port = servers.address
@@ -129,6 +130,7 @@ def _stages(
     tell: Tell,
 ) -> dict[str, object]:
     from flexdt.clients.client.client import TwinClient
+    from flexdt.progress_lines import SILENT_S
 
     with TwinClient(*servers.address) as client:
         folder, seconds = scan(client, name, data, tell)
@@ -138,9 +140,10 @@ def _stages(
             "frames": len(dataset.frames),
             "scan_s": round(seconds, 3),
         }
-        if compiling.poll() is None:
+        while compiling.poll() is None:
             tell("the kernels of calibration and reconstruction are still being compiled (once)")
-            compiling.wait()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                compiling.wait(SILENT_S)
         outcome, seconds = calibrate(dataset, tell)
         push_correction(client, outcome.correction, outcome.sources)
         tell(f"correction in force on the twin: {outcome.correction.name}")

@@ -25,6 +25,7 @@ const unit = (name: string) => (name === "angle_scale" ? "" : /^(alpha|det_|axis
 const MEANS: Record<string, string | undefined> = {
   dO_x: "axis sideways", dO_y: "axis height", dO_z: "source to axis", alpha: "start angle", tau_x: "sample off the axis, sideways", tau_z: "sample off the axis, along the beam",
   dD_x: "detector sideways", dD_y: "detector height", dD_z: "source to detector", dS_x: "focal spot sideways", dS_y: "focal spot height",
+  axis_column: "image of the axis, column", axis_angle: "image of the axis, angle", magnification: "magnification",
   det_roll: "detector roll", det_pitch: "detector pitch", det_yaw: "detector yaw", axis_tilt_x: "axis towards the detector", axis_tilt_z: "axis sideways tilt", angle_scale: "scale of angles",
 };
 // Decimals that leave `digits` significant ones.
@@ -34,7 +35,7 @@ function table(parameters: Parameters, sigmas: Record<string, number | null> = {
   return el("table", { class: "plain mono" }, ...shown.map(([k, v]) => {
     const sigma = sigmas[k] ?? 0, d = sigma > 0 ? decimals(sigma, 2) : decimals((v ?? 0) - (k === "angle_scale" ? 1 : 0), 3);
     return el("tr", {}, el("td", {}, MEANS[k] ?? k, MEANS[k] ? el("span", { class: "muted small-text" }, ` ${k}`) : null), el("td", { class: "n" }, fixed(v, d)),
-      el("td", { class: "n muted" }, sigma > 0 ? `± ${fixed(sigma, d)}` : ""), el("td", { class: "muted" }, units[k] ?? unit(k)));
+      el("td", { class: "n muted" }, sigma > 0 ? `± ${fixed(sigma, d)}` : ""), el("td", { class: "muted" }, (units[k] ?? unit(k)).replace(/^1$/, "")));
   }));
 }
 export async function apply(parameters: Record<string, number>, source: string | null, comment = ""): Promise<void> {
@@ -100,10 +101,13 @@ async function estimate<M extends "calibration.fit" | "calibration.align">(metho
   const applied = { id: "fit-apply", class: "small primary", disabled: !r.identifiable || !correction, onclick: () => { if (correction) void apply(correction, names.join(", ")); } };
   const compared = { id: "fit-compare", class: "small", disabled: !scan, title: "Where the beads were predicted before and after, over the radiographs",
     onclick: () => open(scan, null, true) };
+  const [use, ...why] = (r.verdict ?? (r.identifiable ? "Identifiable" : "Not identifiable")).split(": ");
+  const left = (r.outliers ?? []).map((o) => `bead ${o.marker} of frame ${o.frame} (${fixed(o.px ?? 0, 2)} px)`);
   $("#fit-report").append(
-    el("div", {},
-      el("span", { class: `verdict ${r.identifiable ? "ok" : "bad"}` }, r.identifiable ? "Identifiable" : "Not identifiable"),
-      el("span", { class: "muted" }, figures)),
+    el("div", {}, el("span", { class: `verdict ${r.identifiable ? "ok" : "bad"}` }, use), why.length ? `: ${why.join(": ")}` : ""),
+    ...(r.next ?? []).map((line) => el("div", {}, el("span", { class: "muted" }, "next: "), el("code", {}, line))),
+    ...(r.image_space ?? []).map((q) => table(...["value", "sigma", "unit"].map((what) => Object.fromEntries(Object.entries(q).map(([k, v]) => [k, v[what as "value"]]))) as [Parameters, Parameters, Record<string, string>])),
+    el("div", { class: "muted" }, figures, left.length ? ` · left out: ${left.slice(0, 3).join(", ")}${left.length > 3 ? ` and ${left.length - 3} more` : ""}` : ""),
     table(of("value"), of("sigma"), of("unit")), ...(r.weak ?? []).map((w) => el("div", { class: "error" }, w)),
     ...Object.entries(r.refused ?? {}).map(([name, why]) => el("div", { class: "muted" }, `${name}: ${why}`)), ...(r.warnings ?? []).map((w) => el("div", { class: "error" }, w)),
     el("div", { class: "row", style: "margin-top:7px" },
