@@ -38,7 +38,6 @@ from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.projection import Volume
 from flexdt.twin.reconstruction import (
-    Bias,
     Grid,
     Truncation,
     bias_of,
@@ -49,6 +48,7 @@ from flexdt.twin.reconstruction import (
     hardening,
     layer_warnings,
     lost_layers,
+    missing_wedge,
     ring_errors,
     sart,
     sirt,
@@ -166,10 +166,6 @@ class ScanFrames:
     def truncation(self) -> Truncation | None:
         """What of the object lies beyond the panel's edges, for FDK."""
         return truncation_of(lambda i: self.image(self.indices[i]), self.cone_vec, self.shape)
-
-    def bias(self, truncation: Truncation | None) -> Bias | None:
-        """What FDK's volume may be off by."""
-        return bias_of(lambda i: self.image(self.indices[i]), self.cone_vec, self.shape, truncation)
 
     def image(self, index: int) -> Float32Array:
         """One frame's line integrals, binned and corrected."""
@@ -318,13 +314,11 @@ def _here(
             )
             write(slab.data)
             lost += lost_layers(slab.data)
-    return [*doubts_of(views, grid, truncation), *layer_warnings(lost, grid.shape[0])]
+    return [*_doubts(truncation), *layer_warnings(lost, grid.shape[0])]
 
 
-def doubts_of(views: ScanFrames, grid: Grid, truncation: Truncation | None) -> list[str]:
-    """What is doubtful about FDK's volume on a grid."""
-    bias = views.bias(truncation)
-    return [] if bias is None else bias.doubts(grid.blank())
+def _doubts(truncation: Truncation | None) -> list[str]:
+    return [truncation.doubt] if truncation is not None and truncation.doubt else []
 
 
 def reconstruct_volume(
@@ -343,7 +337,7 @@ def reconstruct_volume(
     _require("of memory", 3 * grid.bytes, memory_bytes(), grid)
     views = _corrected(views, wanted)
     truncation = views.truncation() if wanted.algorithm == "fdk" else None
-    for doubt in views.doubts:
+    for doubt in (*views.doubts, *_doubts(truncation)):
         warnings.warn(doubt, stacklevel=2)
     if wanted.algorithm != "fdk":
         return _iterative(views, grid, wanted, tell)
@@ -351,10 +345,12 @@ def reconstruct_volume(
         views.parts, views.cone_vec, views.shape, grid.blank(), wanted.window,
         lambda done: tell(done, 1.0), truncation, errors=errors,
     )  # fmt: skip
-    bias = views.bias(truncation) if errors else None
-    doubts = [] if bias is None else bias.doubts(volume)
-    for doubt in (*doubts, *layer_warnings(lost_layers(volume.data), grid.shape[0])):
+    for doubt in layer_warnings(lost_layers(volume.data), grid.shape[0]):
         warnings.warn(doubt, stacklevel=2)
+    if not errors:
+        return volume
+    image = views.image
+    bias = bias_of(lambda i: image(views.indices[i]), views.cone_vec, views.shape, truncation)
     return with_errors(volume, bias=bias)
 
 
@@ -367,7 +363,10 @@ def _task(
     if name not in ALGORITHMS:
         raise UnknownNameError.among(f"unknown algorithm {name!r}; allowed", name, ALGORITHMS)
     views = views_of(dataset, parameters, binning=wanted.binning, every=wanted.every)
-    views = replace(views, doubts=tuple(image_doubts(dataset, needed=True)))
+    doubts = image_doubts(dataset, needed=True)
+    if name == "fdk":  # iterative methods need no lines of all directions
+        doubts += missing_wedge(views.cone_vec)
+    views = replace(views, doubts=tuple(doubts))
     return wanted, views, grid_of(views, wanted)
 
 

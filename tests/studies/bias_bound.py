@@ -1,4 +1,4 @@
-"""Drawn scans: is `volume.bias_bound` a bound, how tight is it, and does it warn where it should?
+"""Drawn scans: is `volume.bias_bound` a bound, and how tight is it?
 
     python tests/studies/bias_bound.py --count 200 --seed 1
 
@@ -6,9 +6,8 @@ Solids of known attenuation are projected along rays of this file's own, through
 whole turns, parts of turns, gaps, wedges, views at random or twice; panels in the middle, aside,
 far aside, tilted; sources near and far; objects taller and wider than the panel; noise, and a flat
 that drifts. Means of small even balls, all over the object, are compared with the truth.
-Prints the part within the bound (and three times the noise), the bound over the error, scans that
-were warned of and right within 1 %, and those more than 1 % off without a warning. Exits with 1 if
-there is one of these.
+Prints the part within the bound (and three times the noise), and the bound over the error. Exits
+with 1 where more than one region of fifty is outside.
 """
 
 from __future__ import annotations
@@ -16,14 +15,20 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-import warnings
 from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 
 import flexdt as fx
-from flexdt.twin.reconstruction import field_of_view
+from flexdt.twin.projection import Grid, Volume
+from flexdt.twin.reconstruction import (
+    bias_of,
+    fdk_parts,
+    field_of_view,
+    truncation_of,
+    with_errors,
+)
 
 REGIONS = 24
 BALL = 2.6
@@ -191,20 +196,28 @@ class Judged:
     errors: np.ndarray
     bounds: np.ndarray
     noise: np.ndarray
-    warned: list[str]
     refused: str = ""
+
+
+def reconstructed(images: np.ndarray, geometry: fx.ConeVec, grid: Grid) -> Volume:
+    """As `DataSet.reconstruct` does, of plain arrays: with `sigma` and `bias_bound`."""
+    shape = images.shape[1], images.shape[2]
+    cut_off = truncation_of(lambda i: images[i], geometry, shape)
+    volume = fdk_parts(
+        lambda: [images], geometry, shape, grid, truncation=cut_off, errors=True
+    )  # fmt: skip
+    bias = bias_of(lambda i: images[i], geometry, shape, cut_off)
+    return with_errors(volume, bias=bias)
 
 
 def judged(scan: Scan) -> Judged:
     """Reconstruct, and compare."""
     none = np.zeros(0)
-    with warnings.catch_warnings(record=True) as heard:
-        warnings.simplefilter("always")
-        try:
-            grid = field_of_view(scan.geometry, scan.shape)
-            volume = fx.fdk(scan.images(), scan.geometry, grid)
-        except fx.TwinError as error:
-            return Judged(none, none, none, [], str(error))
+    try:
+        grid = field_of_view(scan.geometry, scan.shape)
+        volume = reconstructed(scan.images(), scan.geometry, grid)
+    except fx.TwinError as error:
+        return Judged(none, none, none, str(error))
     data, bound, sigma = volume.data, volume.bias_bound, volume.sigma
     assert bound is not None, scan.said
     rng = np.random.default_rng(scan.seed)
@@ -228,7 +241,7 @@ def judged(scan: Scan) -> Judged:
         if len(rows) == REGIONS:
             break
     errors, bounds, noise = np.array(rows).reshape(-1, 3).T
-    return Judged(errors, bounds, noise, [str(w.message) for w in heard])
+    return Judged(errors, bounds, noise)
 
 
 def main() -> int:
@@ -256,17 +269,14 @@ def main() -> int:
         within += good.tolist()
         all_errors += np.abs(found.errors).tolist()
         all_bounds += found.bounds.tolist()
-        off = float(excess.max()) > 0.01
-        verdict = ("warned" if found.warned else "SILENT") if off else "right"
-        verdict += ", false alarm" * (not off and bool(found.warned))
+        verdict = "more than 1 % off somewhere" if float(excess.max()) > 0.01 else "right"
         counts[verdict] += 1
-        if chosen.every or not good.all() or verdict == "SILENT":
+        if chosen.every or not good.all():
             k = int(np.argmax(excess - found.bounds))
             numbers = (found.errors[k], found.bounds[k], found.noise[k])
-            told = "; ".join(text[:60] for text in found.warned)
             print(f"{i}: {verdict}, {good.sum()} of {len(good)} within: {scan.said}\n    "
                   + "error {:+.2%}, bound {:.2%}, noise {:.2%}".format(*numbers)
-                  + f"; most {excess.max():.2%}; {told}", flush=True)  # fmt: skip
+                  + f"; most {excess.max():.2%}", flush=True)  # fmt: skip
     errors, bounds = np.array(all_errors), np.array(all_bounds)
     print(f"{np.mean(within):.2%} of {len(within)} even regions within the bound")
     for least, most in ((0.0, np.inf), (0.0, 0.003), (0.003, 0.01), (0.01, np.inf)):
@@ -277,7 +287,7 @@ def main() -> int:
     for verdict, count in counts.most_common():
         print(f"{count:6} {verdict}")
     print(f"{time.process_time() - begun:.0f} CPU s")
-    return 1 if counts["SILENT"] else 0
+    return 1 if np.mean(within) < 0.98 else 0
 
 
 if __name__ == "__main__":

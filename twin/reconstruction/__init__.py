@@ -2,7 +2,7 @@
 
 from flexdt.twin.projection.volume import Grid
 from flexdt.twin.reconstruction.bias import Bias, bias_of
-from flexdt.twin.reconstruction.coverage import layer_warnings, lost_layers
+from flexdt.twin.reconstruction.coverage import layer_warnings, lost_layers, missing_wedge
 from flexdt.twin.reconstruction.fdk import fdk, fdk_parts
 from flexdt.twin.reconstruction.iterative import Step, cgls, em, sart, sirt
 from flexdt.twin.reconstruction.noise import with_errors
@@ -33,6 +33,7 @@ __all__ = [
     "layer_warnings",
     "lost_layers",
     "minimise_tv",
+    "missing_wedge",
     "ring_errors",
     "sart",
     "sirt",

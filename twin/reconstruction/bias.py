@@ -5,7 +5,7 @@ a flaw (parallel rays from everywhere, a panel that sees all) to the one at hand
 What differs between two rungs is what that flaw does to an object like this one. Two flaws show in
 the images alone, and get a reconstruction each: what lies beyond the panel's edges, continued in
 another way, and the drift of the flat, which is seen beside the object. A voxel's bound is what all
-of them come to about it; a warning names the largest.
+of them come to about it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume
 from flexdt.twin.reconstruction.coarse_scan import CoarseScan
 from flexdt.twin.reconstruction.noise import interpolated
-from flexdt.twin.reconstruction.truncation import ACCURACY, Truncation
+from flexdt.twin.reconstruction.truncation import Truncation
 
 SAFETY: Final = 3.0
 """The coarse volume has the flaws, too, and is smooth: of what they take away it shows a third."""
@@ -45,8 +45,6 @@ CAUSES: Final = {
     "beyond": "the object is wider than the panel, and its images do not tell how it goes on",
     "drift": "the images are not dark beside the object, as of a flat that drifted",
 }
-
-SHARP: Final = ("angles", "beyond", "drift")
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,28 +71,6 @@ class Bias:
         """Bound at each voxel of a grid, NaN where it has no value, (nz, ny, nx) [1/mm]."""
         out = interpolated(self.found.like(self.total), grid)
         return np.where(np.isnan(grid.data), np.float32(np.nan), out)
-
-    def doubts(self, grid: Volume) -> list[str]:
-        """What to tell the user of a volume on a grid: of even places of the object, the bound of
-        the worst twentieth, and what contributes most there. In an object without an even place
-        blur would count, which is no flaw: there only what is no matter of it does.
-        """
-        there = self.found.data > max(float(self.found.data.mean()), 0.0)
-        axes = zip(self.found.centers(), grid.centers(), self.found.voxel_xyz, strict=True)
-        x, y, z = ((at > k.min() - step) & (at < k.max() + step) for at, k, step in axes)
-        there &= z[:, None, None] & y[:, None] & x
-        even = there & (self.even > 0.5)
-        there = even if even.any() else there
-        names = [name for name in self.causes if even.any() or name in SHARP]
-        if not there.any() or not names:
-            return []
-        flaws = np.array([self.causes[name][there] / self.found.data[there] for name in names])
-        off = FLOOR + flaws.sum(axis=0)
-        worst = float(np.quantile(off, 0.95))
-        if worst <= 2.0 * ACCURACY:
-            return []
-        cause = CAUSES[names[int(flaws[:, off >= worst].mean(axis=1).argmax())]]
-        return [f"{cause}: densities may be off by up to {100.0 * worst:.0f} per cent"]
 
 
 def bias_of(

@@ -35,11 +35,11 @@ from flexdt.twin.projection.operators import (
     require_finite,
     require_line_integrals,
 )
-from flexdt.twin.reconstruction.bias import bias_of
 from flexdt.twin.reconstruction.coverage import (
     first_and_steps,
     layer_warnings,
     lost_layers,
+    missing_wedge,
     normalise_coverage,
 )
 from flexdt.twin.reconstruction.helix import Sharing
@@ -357,7 +357,6 @@ def fdk(
     *,
     window: str = "ram-lak",
     progress: Progress | None = None,
-    errors: bool = True,
 ) -> Volume:
     """Reconstruct attenuation from line integrals of a circular or helical scan.
 
@@ -367,7 +366,6 @@ def fdk(
         like: the grid, or a volume on it, whose values are not used.
         window: of the ramp filter: ram-lak, shepp-logan, cosine, hamming, hann.
         progress: called with the fraction done.
-        errors: find `sigma` and `bias_bound` of the volume, too, and warn where that is large.
 
     Returns:
         Volume [1/mm]; its data is a (nz, ny, nx) view with z contiguous. Voxels that too few views
@@ -379,8 +377,8 @@ def fdk(
         UnknownNameError: no such window.
 
     Warns:
-        UserWarning: densities may be far off (`bias_bound`), and why; layers of the grid lie above
-            or below what the panel sees.
+        UserWarning: the panel cuts the object off, and its outline is not understood; layers of the
+            grid lie above or below what the panel sees; no lines of some directions were seen.
 
     Examples:
         A cube of 0.02 / mm, projected and reconstructed:
@@ -412,16 +410,16 @@ def fdk(
             yield part
 
     shape = (values.shape[1], values.shape[2])
-    truncation, bias = None, None
+    truncation = None
     if len(values) == len(geometry):
         truncation = truncation_of(lambda view: values[view], geometry, shape)
-    volume = fdk_parts(parts, geometry, shape, like, window, progress, truncation, errors=errors)
-    if errors:
-        bias = bias_of(lambda view: values[view], geometry, shape, truncation)
-    doubts = bias.doubts(volume) if bias is not None else []
-    for doubt in (*doubts, *layer_warnings(lost_layers(volume.data), len(volume.data))):
+        if truncation is not None and truncation.doubt:
+            warnings.warn(truncation.doubt, stacklevel=3)
+    volume = fdk_parts(parts, geometry, shape, like, window, progress, truncation)
+    layers = layer_warnings(lost_layers(volume.data), len(volume.data))
+    for doubt in (*missing_wedge(geometry), *layers):
         warnings.warn(doubt, stacklevel=3)
-    return with_errors(volume, bias=bias)
+    return volume
 
 
 def fdk_parts(

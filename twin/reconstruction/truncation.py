@@ -90,6 +90,7 @@ class Truncation:
         prisms: one a band; None where rows are whole, or fade out.
         cut_off: (b,) whether the band's rows are continued.
         others: the best of the prisms that do not explain what was seen, where none does.
+        doubt: what to tell the user where densities may be off; else None.
         fade: length over which rows fade out that no prism explains, over that of a row.
         beyond: whether no prism stands for what a panel moved to one side misses.
     """
@@ -99,6 +100,7 @@ class Truncation:
     cut_off: npt.NDArray[np.bool_]
     others: tuple[Prism | None, ...] = ()
     fade: float = 0.5
+    doubt: str | None = None
     beyond: bool = False
 
     @property
@@ -213,7 +215,11 @@ def truncation_of(
     found = found or Truncation(np.zeros(1), (None,), np.zeros(1, dtype=bool))
     known = [p is not None for p in found.prisms] >= found.cut_off
     beyond = not (found.cut_off.any() and bool(np.all(known)))
-    return replace(found, beyond=beyond, cut_off=found.cut_off & (not beyond))
+    return replace(
+        found, beyond=beyond, cut_off=found.cut_off & (not beyond),
+        doubt="the object reaches beyond the near edge of a panel moved to one side, and less than "
+        "a turn does not tell all of what is there: densities may be off by tens of per cent",
+    )  # fmt: skip
 
 
 def _seen_beyond(images: Sequence[Float32Array], there: npt.NDArray[np.bool_]) -> bool:
@@ -252,7 +258,7 @@ def _fitted(
     seen = seen.astype(np.float64)
     prisms: list[Prism | None] = [None] * len(middles)
     others: list[Prism | None] = [None] * len(middles)
-    cut_off, known = np.zeros(len(middles), dtype=bool), None
+    cut_off, off, known, why = np.zeros(len(middles), dtype=bool), 0.0, None, ""
     # Bands above and below the object hold nothing that could be off.
     least = 0.1 * ACCURACY * float(np.abs(seen).mean())
     met = seen[seen > max(0.1 * float(seen.mean()), least)]
@@ -266,9 +272,21 @@ def _fitted(
         if not helix and not even:
             prisms[k], others[k] = _fit(source, rays, band, usual, known)
             known = prisms[k] or known
+        # What a row holds beyond its edges adds as much as this to what is between them, at most.
+        at_edges = float(np.abs(band[:, [0, -1]])[:, edges_that_count].sum(axis=1).mean())
+        if prisms[k] is None and at_edges / np.pi > off * usual:
+            off = at_edges / np.pi / usual
+            why = "its outline is unlike an ellipse, or much else is in it"
+            if helix or even:
+                why = f"{'a helix does' if helix else 'images without an edge do'} not tell how far"
     if not cut_off.any():
         return None
-    return Truncation(middles, tuple(prisms), cut_off, tuple(others))
+    doubt = (
+        f"the object is wider than the panel, and {why}: densities may be off by up to "
+        f"{100.0 * off:.0f} per cent"
+    )
+    said = doubt if off > ACCURACY else None
+    return Truncation(middles, tuple(prisms), cut_off, tuple(others), doubt=said)
 
 
 def _noise(lines: npt.NDArray[np.floating]) -> float:

@@ -21,7 +21,7 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import Final, TypeVar
 
-from flexdt.clients.reconstruction.reconstruct import ScanFrames, VolumeRequest, doubts_of
+from flexdt.clients.reconstruction.reconstruct import ScanFrames, VolumeRequest
 from flexdt.extending import volume_writer
 from flexdt.measuring import gpu
 from flexdt.twin.errors import LimitError, TwinError
@@ -140,7 +140,7 @@ def fdk_on_workers(
             tell(done, len(missing))
     _finish(store, out, grid)
     shutil.rmtree(home, ignore_errors=True)
-    doubts = doubts_of(views, grid, truncation)
+    doubts = [truncation.doubt] if truncation is not None and truncation.doubt else []
     if len(kinds) > 1:
         doubts.append("some slabs were made on devices, others on processors: last digits differ")
     return doubts

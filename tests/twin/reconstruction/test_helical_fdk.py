@@ -177,7 +177,7 @@ def test_too_steep_a_helix_is_refused_with_what_is_allowed() -> None:
 def test_an_object_wider_than_the_panel_is_said() -> None:
     scan = helix(0.5, 40)
     body = Scene((Solid(Ellipsoid((0.0, 0.0, 0.0), (2 * FIELD, 2 * FIELD, 1e5)), "a", MU),))
-    with pytest.warns(UserWarning, match="wider than the panel"):
+    with pytest.warns(UserWarning, match="helix does not tell"):
         fdk(project_scene(body, scan, SHAPE), scan, Grid((1, 8, 8), 4.0).blank())
 
 
