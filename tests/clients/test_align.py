@@ -3,10 +3,10 @@ kinematics are written out here, with scanners drawn by a seed."""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
 import math
-import dataclasses
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -343,9 +343,28 @@ def test_an_exact_copy_of_a_frame_is_left_out_by_name() -> None:
     assert np.abs(pulls(found, scanner)).max() < 4
 
 
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_gap_between_tiles_is_named_and_in_the_sigma(seed: int) -> None:
+    """What the right tile shows is what lies a column and a half further to the right."""
+    scanner, lines = scan(seed)
+    true = np.array(lines, dtype=float)
+    column, width = 75, 1.5
+    beyond = np.clip(np.arange(column, SHAPE[1]) + width, 0, SHAPE[1] - 1)
+    low = np.minimum(beyond.astype(int), SHAPE[1] - 2)
+    part = beyond - low
+    seen = true.copy()
+    seen[..., column:] = (1 - part) * true[..., low] + part * true[..., low + 1]
+    found = data_set(seen, DEGREES, 1e4, np.random.default_rng(1)).align()
+    told = [*found.warnings, *found.document["refused"].values()]
+    assert f"from column {column} on" in " ".join(told)
+    if found.identifiable:
+        assert abs(pulls(found, scanner)[0]) < 2
+    whole = data_set(true, DEGREES, 1e4, np.random.default_rng(1)).align()
+    assert "between two tiles" not in " ".join(whole.warnings)
+
+
 def test_saturated_images_are_named() -> None:
-    scanner, lines = scan(0)
-    data = data_set(lines, DEGREES, 1e4, np.random.default_rng(1))
+    data = data_set(scan(0)[1], DEGREES, 1e4, np.random.default_rng(1))
     top = int(np.percentile(data.counts(), 60))
     burnt = [np.minimum(a, top) for a in (data.counts(), data.flat)]
     images = dataclasses.replace(

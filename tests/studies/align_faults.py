@@ -18,7 +18,7 @@ import math
 import sys
 import warnings
 import zlib
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -71,6 +71,8 @@ class Scan:
     scatter: float = 0.0
     blur: float = 0.0
     lag: float = 0.0
+    gap: tuple[int, float] = (0, 0.0)
+    """From this column on the panel is so many pixels further to the right."""
     growth: float = 0.0
     """Of the object during the scan."""
     loose_mm: float = 0.0
@@ -448,6 +450,12 @@ def blur(s: Scan, rng: Rng) -> None:
     s.blur = rng.uniform(0.5, 2)
 
 
+@fault
+def tiles_apart(s: Scan, rng: Rng) -> None:
+    cols = s.hidden.shape[1]
+    s.gap = (int(cols * rng.uniform(0.35, 0.65)), rng.uniform(0.5, 2))
+
+
 # The scanner
 
 
@@ -523,12 +531,21 @@ def scan(kinds: list[str], seed: int) -> tuple[Scan, Rng]:
 
 def lines(s: Scan) -> np.ndarray:
     """Line integrals (views, rows, cols)."""
+    out = seen(s, 0.0)
+    column, width = s.gap
+    if width:
+        out[:, :, column:] = seen(s, width)[:, :, column:]
+    return out
+
+
+def seen(s: Scan, beyond: float) -> np.ndarray:
+    """Of a panel that is so many pixels further to the right."""
     hidden, rays = s.hidden, s.rays
     rows, cols = hidden.shape
     out = np.empty((hidden.views, rows, cols), dtype=np.float32)
     for k in range(hidden.views):
         source, centre, u, v = hidden.placed(k + s.late[k])
-        centre = centre - s.shift[k, 0] * u - s.shift[k, 1] * v
+        centre = centre - (s.shift[k, 0] - beyond) * u - s.shift[k, 1] * v
         size = np.array([*6 * [1 + s.growth * (k / hidden.views - 0.5)], 1.0])
         e, b = s.ellipsoids * size, s.boxes * size
         if k > 0.6 * hidden.views:
@@ -538,7 +555,7 @@ def lines(s: Scan) -> np.ndarray:
         add_chords(source, centre, u / rays, v / rays, b, False, fine)
         if len(s.still):
             u, v = hidden.steps()
-            centre = np.array([hidden.panel[0], hidden.sdd, hidden.panel[1]])
+            centre = np.array([hidden.panel[0], hidden.sdd, hidden.panel[1]]) + beyond * u
             add_chords(np.zeros(3), centre, u / rays, v / rays, s.still, False, fine)
         out[k] = fine.reshape(rows, rays, cols, rays).mean(axis=(1, 3))
     return out
@@ -592,6 +609,8 @@ def tried(kinds: list[str], seed: int, per_frame: bool) -> dict[str, Any]:
     told: dict[str, Any] = {"kinds": kinds, "seed": seed, "per_frame": per_frame,
                             "refused": dict(found.document["refused"]),  # type: ignore[call-overload]
                             "warnings": list(found.alignment.warnings), "pulls": {}}  # fmt: skip
+    words = " ".join([*found.alignment.warnings, *found.alignment.refused.values()])
+    told["gap"] = (s.gap[1] > 0, "between two tiles" in words)
     if not found.identifiable:
         return told
     shift = s.shift[shown]
@@ -649,6 +668,10 @@ def summary(runs: list[dict[str, Any]], sigmas: float) -> int:
             cells.append(f"{len(pulls):5d} {max(pulls):8.2f}" if pulls else f"{'-':>14s}")
         print(f"{kind:26s}{len(some):5d}  " + "  ".join(cells))
     far = [run for run in runs if any(abs(p) > sigmas for p in run["pulls"].values())]
+    gaps = Counter(run["gap"] for run in runs if "gap" in run)
+    of = [gaps[there, True] + gaps[there, False] for there in (True, False)]
+    print(f"gaps between tiles: {gaps[True, True]} of {of[0]} named, warned in "
+          f"{gaps[False, True]} of {of[1]} scans without one")  # fmt: skip
     for run in far:
         print(f"more than {sigmas:g}: {run['kinds']}, seed {run['seed']}, {run['pulls']}")
     return int(bool(far))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import beam_faults
 import cv2
 import numpy as np
 import prior_coverage as own
@@ -73,3 +74,12 @@ def test_beads_of_another_size_are_still_refused(
 ) -> None:
     result, _ = scanned(monkeypatch, 2, 1.0, 0.4, (0.7, 0.7), 1e4, cast)
     assert [f.code for f in result.errors] == ["bead_size"]
+
+
+@pytest.mark.slow
+def test_faults_of_beam_and_detector_mislead_nobody(capsys: pytest.CaptureFixture[str]) -> None:
+    kinds = "spectrum_aluminium,blurred_one_way,scattered_light,radial,larger_balls"
+    assert beam_faults.main(["--each", "1", "--kinds", kinds]) == 0
+    told = capsys.readouterr().out
+    assert "of them refused: 0" in told, told
+    assert "faults: 2, of them named: 2" in told, told

@@ -20,7 +20,6 @@ import numpy as np
 from flexdt.twin.calibration.fit.image_quantities import axis_in_image
 from flexdt.twin.calibration.without_phantom.mirror_symmetry import (
     REACH,
-    Symmetry,
     find_symmetry,
     first_column,
     sharpness,
@@ -28,6 +27,7 @@ from flexdt.twin.calibration.without_phantom.mirror_symmetry import (
 from flexdt.twin.calibration.without_phantom.opposite_rays import OppositeRays
 from flexdt.twin.calibration.without_phantom.plane_pairs import PlanePairs, without
 from flexdt.twin.calibration.without_phantom.source_row import find_height
+from flexdt.twin.calibration.without_phantom.tile_gap import FRAMES, averaged_rows, find_gap
 from flexdt.twin.calibration.without_phantom.turn import Image, Turn, read_turn
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import NotIdentifiableError
@@ -343,6 +343,11 @@ def _align(
         f"{instead}the images are about as symmetric about another column as about {column:.1f} "
         f"(ratio {ratio:.2f}; at least {LEAST_RATIO:g})",
     )
+    gap = None
+    if turn is not None:
+        some = turn.used[:: -(-len(turn.used) // FRAMES)]
+        gap = find_gap([averaged_rows(image(i)) for i in some])
+        instead = f"{_apart(gap)}; " if gap else ""
     found = find_symmetry(turn, view, start, scales, known) if turn else rays.find(start)  # type: ignore[union-attr]
     _refuse_if(
         not found.converged,
@@ -364,7 +369,9 @@ def _align(
         told[:], values[1], covariance[1], covariance[:, 1] = False, base.det_roll, 0.0, 0.0
         covariance[1, 1] = known[1] ** 2
     step = (0.0, 0.0) if turn is None or turn.step_px is None else turn.step_px[0]
-    covariance[0, 0] += (math.hypot(FLOOR_PX, step[0] / 2, beside) * scales[0]) ** 2
+    covariance[0, 0] += (
+        math.hypot(FLOOR_PX, step[0] / 2, beside, gap[1] if gap else 0.0) * scales[0]
+    ) ** 2
     covariance[1, 1] += math.radians(FLOOR_DEG) ** 2 + (step[0] / rows) ** 2
     slopes = _slopes(seen, values, scales)
     sigma = math.sqrt(slopes @ covariance @ slopes)
@@ -406,7 +413,7 @@ def _align(
             motion = planes.motion(corrected, random)
         except NotIdentifiableError as error:
             refused["motion"] = error.message
-    warnings = _warnings(turn, found, len(poses) - len(present))
+    warnings = _warnings(turn, gap, len(poses) - len(present))
     return Alignment(corrected, parameters, refused, warnings, len(turn.used), motion)
 
 
@@ -580,8 +587,18 @@ def _refuse_if(wrong: bool, why: str) -> None:
         raise NotIdentifiableError(why)
 
 
-def _warnings(turn: Turn, found: Symmetry, missing: int) -> tuple[str, ...]:
+def _apart(gap: tuple[int, float]) -> str:
+    return (
+        f"from column {gap[0]} on everything appears too near by up to {gap[1]:.1f} px, as behind "
+        "a gap between two tiles of the panel (a calibration with a phantom measures it, and its "
+        "correction closes it)"
+    )
+
+
+def _warnings(turn: Turn, gap: tuple[int, float] | None, missing: int) -> tuple[str, ...]:
     out = []
+    if gap is not None:
+        out.append(f"{_apart(gap)}; the sigma of the axis column contains it")
     if turn.repeated:
         out.append(f"frames {list(turn.repeated)} repeat the one before and are left out")
     if missing:

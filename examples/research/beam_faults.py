@@ -1,0 +1,349 @@
+"""Faults of detector and beam in the images: are they named, and is no answer confidently wrong?
+
+`python examples/research/beam_faults.py [--each 5] [--seed 0] [--kinds a,b] [--json]` makes
+radiographs of balls in a body, with all seventeen offsets drawn from their priors, and calibrates
+from them. Light of three energies, a detector's blur, lag, distortion, tiles, dead pixels and
+scattered light are written out here, with the rays and planes of `prior_coverage`; nothing of
+flexdt is in the images. An offset, the axis's image or the magnification that is offered and more
+than four sigmas off is a confident wrong answer, and the command fails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import re
+import warnings
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import prior_coverage as own
+from scipy import ndimage
+
+from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.fit.image_quantities import image_quantities
+from flexdt.twin.calibration.frame_source import ArrayFrames
+from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
+from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.poses import Poses
+
+Array = npt.NDArray[np.float64]
+Rng = np.random.Generator
+
+WRONG_SIGMAS: Final = 4.0
+ENERGIES: Final = {40.0: 0.35, 60.0: 0.40, 90.0: 0.25}
+"""Photon energies of the beam [keV] and their parts of the signal."""
+ATTENUATION: Final = {
+    "steel": (2.86, 0.948, 0.372), "glass": (0.160, 0.0715, 0.0475),
+    "aluminium": (0.153, 0.0750, 0.0493), "pmma": (0.0279, 0.0229, 0.0199), "air": (0.0,) * 3,
+}  # fmt: skip
+"""Linear attenuation at those energies [1/mm] (NIST XCOM; glass as quartz of 2.2 g/cm3)."""
+
+
+@dataclass(frozen=True)
+class Laboratory:
+    """What is scanned with what.
+
+    Attributes:
+        ball, body: materials.
+        radius_mm: of the balls; cast_mm: what they really have.
+        body_mm: radius of the upright cylinder that holds the balls.
+        mono: light of one energy, the middle one.
+        photons: of an open pixel in a frame.
+        blur_px: standard deviations of the detector's blur, and the angle of the first [deg].
+        lag: part of a frame that the next one still shows.
+        scatter: light from everywhere, as part of the open beam; wide and even.
+        shift: of the panel's picture, (rows, cols) -> two maps [px], or none.
+        dead: part of the pixels without a signal.
+        drift: of the beam's brightness over the scan.
+        ceiling: largest count as part of the open beam.
+    """
+
+    ball: str = "steel"
+    body: str = "air"
+    radius_mm: float = 1.0
+    cast_mm: float = 1.0
+    body_mm: float = 15.0
+    mono: bool = False
+    photons: float = 2e4
+    blur_px: tuple[float, float, float] = (0.7, 0.7, 0.0)
+    lag: float = 0.0
+    scatter: float = 0.0
+    shift: tuple[Array, Array] | None = None
+    dead: float = 0.0
+    drift: float = 0.0
+    ceiling: float = math.inf
+
+
+def rays(truth: Mapping[str, float], step: int = 1) -> Array:
+    """Unit vectors from the source through every `step`-th pixel, (rows, cols, 3)."""
+    panel, across, down = own.places(np.zeros((1, 3)), np.zeros(1), own.SOD, truth)[1]
+    column = np.arange(0, own.SHAPE[1], step) - (own.SHAPE[1] - 1) / 2
+    row = np.arange(0, own.SHAPE[0], step) - (own.SHAPE[0] - 1) / 2
+    out = panel + column[None, :, None] * across + row[:, None, None] * down
+    return np.asarray(out / np.linalg.norm(out, axis=2, keepdims=True))
+
+
+def cylinder(ray: Array, low: Array, high: Array, radius: float) -> Array:
+    """Chords of rays from the origin in the endless cylinder about the line from low to high."""
+    way = (high - low) / np.linalg.norm(high - low)
+    across = ray - (ray @ way)[..., None] * way
+    start = low - (low @ way) * way
+    a, b = (across**2).sum(axis=-1), across @ start
+    return np.asarray(2.0 * np.sqrt(np.maximum(b * b - a * (start @ start - radius**2), 0.0)) / a)
+
+
+def radiographs(
+    lab: Laboratory, rng: Rng, beads: Array, angles: Array, truth: Mapping[str, float]
+) -> list[npt.NDArray[np.float32]]:
+    """Line integrals as a camera makes them, from flat-corrected counts."""
+    ends = np.array([[0.0, 0.0, -30.0], [0.0, 0.0, 30.0]])
+    at, (panel, across, down) = own.places(np.concatenate([beads, ends]), angles, own.SOD, truth)
+    energies = [1] if lab.mono else [0, 1, 2]
+    parts = np.array(list(ENERGIES.values()))[energies]
+    parts /= parts.sum()
+    ball, body = (np.array(ATTENUATION[m])[energies] for m in (lab.ball, lab.body))
+    straight = rays(truth)
+    reach = int(1.4 * lab.cast_mm * own.SDD / (0.7 * own.SOD) / own.PIXEL)
+    size, fine = 2 * reach + 1, 4
+    offsets = (np.arange(fine * size) + 0.5) / fine - 0.5 - reach
+    dead = rng.random(own.SHAPE) < lab.dead
+    before, out = None, []
+    middles = own.pixels(beads, angles, own.SOD, truth)
+    for i in range(len(angles)):
+        shown = np.zeros(own.SHAPE)
+        inside = cylinder(straight, *at[i, -2:], lab.body_mm) if lab.body != "air" else 0.0 * shown
+        through = [np.zeros(own.SHAPE) for _ in energies]
+        for place, centre in zip(at[i, :-2], np.rint(middles[i]).astype(int), strict=True):
+            columns, rows = (c - reach + np.arange(size) for c in centre)
+            a = (centre[0] + offsets - (own.SHAPE[1] - 1) / 2)[None, :, None]
+            b = (centre[1] + offsets - (own.SHAPE[0] - 1) / 2)[:, None, None]
+            ray = panel + a * across + b * down
+            ray /= np.linalg.norm(ray, axis=2, keepdims=True)
+            chord = 2 * np.sqrt(
+                np.maximum(lab.cast_mm**2 - place @ place + (ray @ place) ** 2, 0.0)
+            )
+            ok = [
+                ((c >= 0) & (c < n)).nonzero()[0]
+                for c, n in ((rows, own.SHAPE[0]), (columns, own.SHAPE[1]))
+            ]
+            for e in range(len(energies)):  # a ball takes its place in the body
+                part = np.exp(-(ball[e] - body[e]) * chord)
+                part = part.reshape(size, fine, size, fine).mean(axis=(1, 3))
+                through[e][np.ix_(rows[ok[0]], columns[ok[1]])] -= np.log(part[np.ix_(*ok)])
+        for e, weight in enumerate(parts):
+            shown += weight * np.exp(-body[e] * inside - through[e])
+        if lab.shift is not None:
+            shown = _shifted(shown, lab.shift)
+        shown = _blurred(shown, lab.blur_px) + lab.scatter
+        lagging = shown if before is None else (1 - lab.lag) * shown + lab.lag * before
+        before = shown
+        beam = lab.photons * (1.0 + lab.drift * i / len(angles))
+        counts = np.minimum(rng.poisson(beam * lagging), lab.ceiling * lab.photons)
+        counts = np.where(dead, 0.0, counts)
+        out.append((-np.log(np.maximum(counts, 0.5) / lab.photons)).astype(np.float32))
+    return out
+
+
+def _blurred(image: Array, blur: tuple[float, float, float]) -> Array:
+    """With a Gaussian of two widths, the first along a line at an angle to the rows."""
+    one, two, angle = blur
+    if one == two:
+        return np.asarray(cv2.GaussianBlur(image, (0, 0), one))
+    n = int(4 * max(one, two)) + 1
+    y, x = np.mgrid[-n : n + 1, -n : n + 1].astype(float)
+    c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+    kernel = np.exp(-0.5 * (((c * x + s * y) / one) ** 2 + ((c * y - s * x) / two) ** 2))
+    return np.asarray(cv2.filter2D(image, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REFLECT))
+
+
+def _shifted(image: Array, shift: tuple[Array, Array]) -> Array:
+    """What is at a place appears `shift` (rows, columns) further on."""
+    row, column = np.mgrid[: own.SHAPE[0], : own.SHAPE[1]].astype(float)
+    places = np.array([row - shift[0], column - shift[1]])
+    return np.asarray(ndimage.map_coordinates(image, places, order=3, mode="nearest"))
+
+
+def _radial(rng: Rng) -> tuple[Array, Array]:
+    row, column = np.mgrid[: own.SHAPE[0], : own.SHAPE[1]].astype(float)
+    y, x = (row - (own.SHAPE[0] - 1) / 2) / 305.0, (column - (own.SHAPE[1] - 1) / 2) / 305.0
+    size = float(rng.choice([-1, 1]) * rng.uniform(0.3, 1.0)) * (x * x + y * y)
+    return size * y, size * x
+
+
+def _tiles(rng: Rng) -> tuple[Array, Array]:
+    """Beyond a border the picture comes nearer by the gap."""
+    row, column = np.mgrid[: own.SHAPE[0], : own.SHAPE[1]].astype(float)
+    axis, gap = int(rng.integers(2)), float(rng.uniform(0.5, 2.0))
+    border = own.SHAPE[axis] * rng.uniform(0.4, 0.6)
+    moved = np.where((row, column)[axis] > border, -gap, 0.0)
+    return (moved, 0.0 * moved) if axis == 0 else (0.0 * moved, moved)
+
+
+Change = Callable[[Laboratory, Rng], Laboratory]
+
+
+def _with(**fields: object) -> Change:
+    return lambda lab, rng: replace(lab, **fields)  # type: ignore[arg-type]
+
+
+BODY: Final = {"body": "pmma", "body_mm": 30.0}
+METAL: Final = {"body": "aluminium", "body_mm": 20.0}
+KINDS: Final[Mapping[str, tuple[Change, str]]] = {
+    # Right scans: to be offered. "" allows any warning; what is offered must be true.
+    "one_energy": (_with(mono=True), ""),
+    "spectrum": (_with(), ""),
+    "spectrum_pmma": (_with(**BODY), ""),
+    "spectrum_aluminium": (_with(**METAL), ""),
+    "glass_balls": (_with(ball="glass", radius_mm=1.5, cast_mm=1.5), ""),
+    "glass_in_pmma": (_with(ball="glass", radius_mm=1.5, cast_mm=1.5, **BODY), ""),
+    "faint_in_pmma": (_with(ball="glass", photons=4e3, **BODY), ""),
+    "steel_one_energy_aluminium": (_with(**METAL, mono=True), ""),
+    "small_balls": (_with(radius_mm=0.5, cast_mm=0.5), ""),
+    "blurred": (lambda lab, rng: replace(lab, blur_px=(b := rng.uniform(2, 4), b, 0.0)), ""),
+    "blurred_one_way": (
+        lambda lab, rng: replace(
+            lab, blur_px=(rng.uniform(0.6, 1.2), rng.uniform(2, 4), rng.uniform(0, 180))
+        ), "",
+    ),
+    "low_dose": (lambda lab, rng: replace(lab, photons=rng.uniform(100, 1000)), ""),
+    "scattered_light": (lambda lab, rng: replace(lab, **BODY, scatter=rng.uniform(0.02, 0.2)), ""),
+    "brightness_drifts": (lambda lab, rng: replace(lab, drift=rng.uniform(-0.2, 0.2)), ""),
+    "dead_pixels": (lambda lab, rng: replace(lab, dead=rng.uniform(1e-4, 3e-3)), ""),
+    "saturated": (lambda lab, rng: replace(lab, **BODY, ceiling=rng.uniform(0.3, 0.9)), ""),
+    "lag": (lambda lab, rng: replace(lab, lag=rng.uniform(0.01, 0.1)), ""),
+    "lag_in_aluminium": (
+        lambda lab, rng: replace(lab, lag=rng.uniform(0.01, 0.1), **METAL), "",
+    ),
+    # Faults: to be named.
+    "radial": (lambda lab, rng: replace(lab, shift=_radial(rng)), "panel_distorted"),
+    "tiles_apart": (lambda lab, rng: replace(lab, shift=_tiles(rng)), "panel_distorted"),
+    "radial_in_pmma": (
+        lambda lab, rng: replace(lab, shift=_radial(rng), **BODY), "panel_distorted",
+    ),
+    "larger_balls": (_with(cast_mm=1.08), "bead_size"),
+    "smaller_balls": (_with(cast_mm=0.92), "bead_size"),
+    "larger_in_aluminium": (
+        _with(cast_mm=1.08, **METAL), "bead_size",
+    ),
+}  # fmt: skip
+"""Each kind: what it changes, and what names it."""
+
+
+@dataclass(frozen=True)
+class Scored:
+    """What came of one scan: the largest error of what was offered [sigma], and what was said."""
+
+    kind: str
+    seed: int
+    offered: bool
+    named: bool
+    worst: float
+    where: str
+    said: tuple[str, ...]
+
+
+def magnification(truth: Mapping[str, float]) -> float:
+    """Of a short line across the beam and along the panel's rows, on the axis."""
+    _, (panel, across, down) = own.places(np.zeros((1, 3)), np.zeros(1), own.SOD, truth)
+    tau = np.array([truth["tau_x"], truth["tau_z"], 0.0])
+    foot = own.places(tau[None], np.zeros(1), own.SOD, truth)[0][0, 0]
+    step = across / np.linalg.norm(across)
+    columns = []
+    for place in (foot - 0.5 * step, foot + 0.5 * step):
+        columns.append(np.linalg.solve(np.stack([place, -across, -down], axis=1), panel)[1])
+    return float((columns[1] - columns[0]) * own.PIXEL)
+
+
+def scored(kind: str, seed: int, frames: int = 24) -> Scored:
+    """Make the scan, calibrate it and judge."""
+    rng = np.random.default_rng([seed, *kind.encode()])
+    change, name = KINDS[kind]
+    lab = change(Laboratory(), rng)
+    beads = own.spread(rng, 4.5 * lab.radius_mm)
+    if lab.body != "air":
+        beads[:, :2] *= min(1.0, 0.8 * lab.body_mm / 17.0)
+    truth = own.drawn(rng, 1.0, False)
+    angles = 360.0 * np.arange(frames) / frames
+    images = radiographs(lab, rng, beads, angles, truth)
+    poses = Poses.upright(
+        [0, 0, 0], [0, own.SOD, 0], [0, own.SDD, 0], own.PIXEL, np.radians(angles)
+    )
+    model = BeadModel(beads, np.full(len(beads), lab.radius_mm))
+    try:
+        result = calibrate(
+            [Scan(ArrayFrames(images, own.SHAPE), poses)], model, CalibrationRequest()
+        )
+    except TwinError as error:
+        return Scored(kind, seed, False, False, 0.0, "", (f"refused: {error}",))
+    said = tuple(f"{f.code}: {f.text}" for f in result.findings)
+    worst, where = _worst(result, truth) if result.identifiable else (0.0, "")
+    named = any(re.match(name, one) for one in said) if name else True
+    return Scored(kind, seed, result.identifiable, named, worst, where, said)
+
+
+def _worst(result: Calibration, truth: Mapping[str, float]) -> tuple[float, str]:
+    fit = result.fit
+    assert fit is not None
+    axis = np.array([truth["tau_x"], truth["tau_z"], 0.0])
+    ends = np.array([axis - [0, 0, 9], axis + [0, 0, 9]])
+    ((low, high),) = own.pixels(ends, np.zeros(1), own.SOD, truth)
+    slope = (high[0] - low[0]) / (low[1] - high[1])
+    true = {
+        **truth,
+        "axis_column": low[0] + slope * (low[1] - (own.SHAPE[0] - 1) / 2),
+        "axis_angle": math.degrees(math.atan(slope)),
+        "magnification": magnification(truth),
+    }
+    found = {**fit.certificate.estimates, **image_quantities(fit)[0]}
+    off = {
+        n: abs(e.value - true[n]) / e.sigma for n, e in found.items() if e.sigma > 0 and n in true
+    }
+    where = max(off, key=lambda n: off[n])
+    return off[where], where
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--each", type=int, default=5, help="scans of each kind")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--kinds", default=",".join(KINDS))
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args(argv)
+    warnings.simplefilter("ignore")
+    scans: list[Scored] = []
+    if not args.json:
+        print(f"{'kind':28}{'offered':>8}{'named':>7}{'worst':>7}  what was said")
+    for kind in args.kinds.split(","):
+        some = [scored(kind, args.seed + i) for i in range(args.each)]
+        scans += some
+        worst = max(some, key=lambda s: s.worst)
+        codes = Counter(line.partition(":")[0] for s in some for line in s.said)
+        said = ", ".join(f"{code} {n}" for code, n in codes.most_common())
+        if not args.json:
+            print(f"{kind:28}{sum(s.offered for s in some):8}{sum(s.named for s in some):7}"
+                  f"{worst.worst:7.1f}  {worst.where}; {said}", flush=True)  # fmt: skip
+    wrong = [s for s in scans if s.worst > WRONG_SIGMAS]
+    right = [s for s in scans if not KINDS[s.kind][1]]
+    faults = [s for s in scans if KINDS[s.kind][1]]
+    summary = {
+        "scans": len(scans), "confidently wrong": len(wrong),
+        "right scans": len(right), "of them refused": sum(not s.offered for s in right),
+        "faults": len(faults), "of them named": sum(s.named for s in faults),
+    }  # fmt: skip
+    if args.json:
+        print(json.dumps({**summary, "each": [asdict(s) for s in scans]}))
+    else:
+        print(", ".join(f"{n}: {v}" for n, v in summary.items()))
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
