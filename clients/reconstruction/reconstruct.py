@@ -40,6 +40,7 @@ from flexdt.twin.projection import Volume
 from flexdt.twin.reconstruction import (
     Grid,
     Truncation,
+    bias_of,
     cgls,
     em,
     fdk_parts,
@@ -53,6 +54,7 @@ from flexdt.twin.reconstruction import (
     sirt,
     truncation_of,
     tv,
+    with_errors,
 )
 from flexdt.twin.reconstruction.scatter_correction import scatterer_of, subtracted
 
@@ -345,7 +347,11 @@ def reconstruct_volume(
     )  # fmt: skip
     for doubt in layer_warnings(lost_layers(volume.data), grid.shape[0]):
         warnings.warn(doubt, stacklevel=2)
-    return volume
+    if not errors:
+        return volume
+    image = views.image
+    bias = bias_of(lambda i: image(views.indices[i]), views.cone_vec, views.shape, truncation)
+    return with_errors(volume, bias=bias)
 
 
 def _task(

@@ -308,8 +308,17 @@ class Volume:
         """Standard deviation of the noise in each voxel, (nz, ny, nx) [1/mm], as the images show it
         (`reconstruct("fdk")`); None where it was not found. It is computed at each call.
         """
-        noise: Any = getattr(self, "_noise", None)  # of `noise.with_noise`
+        noise: Any = getattr(self, "_noise", None)  # of `noise.with_errors`
         found: Float32Array | None = None if noise is None else noise.sigma(self)
+        return found
+
+    @property
+    def bias_bound(self) -> Float32Array | None:
+        """Bound of what each voxel is off by beside the noise, (nz, ny, nx) [1/mm], NaN where no
+        data cover it (`reconstruct("fdk")`); None where it was not found. Computed at each call.
+        """
+        bias: Any = getattr(self, "_bias", None)  # of `noise.with_errors`
+        found: Float32Array | None = None if bias is None else bias.bound(self)
         return found
 
     @property

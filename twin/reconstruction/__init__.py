@@ -1,9 +1,11 @@
 """Volumes back from projections."""
 
 from flexdt.twin.projection.volume import Grid
+from flexdt.twin.reconstruction.bias import Bias, bias_of
 from flexdt.twin.reconstruction.coverage import layer_warnings, lost_layers, missing_wedge
 from flexdt.twin.reconstruction.fdk import fdk, fdk_parts
 from flexdt.twin.reconstruction.iterative import Step, cgls, em, sart, sirt
+from flexdt.twin.reconstruction.noise import with_errors
 from flexdt.twin.reconstruction.rectify import field_of_view
 from flexdt.twin.reconstruction.scatter_correction import (
     Hardening,
@@ -15,11 +17,13 @@ from flexdt.twin.reconstruction.truncation import Truncation, truncation_of
 from flexdt.twin.reconstruction.tv import Minimised, minimise_tv, tv
 
 __all__ = [
+    "Bias",
     "Grid",
     "Hardening",
     "Minimised",
     "Step",
     "Truncation",
+    "bias_of",
     "cgls",
     "em",
     "fdk",
@@ -35,5 +39,6 @@ __all__ = [
     "sirt",
     "truncation_of",
     "tv",
+    "with_errors",
     "without_scatter",
 ]

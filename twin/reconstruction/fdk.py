@@ -43,7 +43,7 @@ from flexdt.twin.reconstruction.coverage import (
     normalise_coverage,
 )
 from flexdt.twin.reconstruction.helix import Sharing
-from flexdt.twin.reconstruction.noise import NoiseMeter, with_noise
+from flexdt.twin.reconstruction.noise import NoiseMeter, with_errors
 from flexdt.twin.reconstruction.rectify import (
     FINER,
     is_upright,
@@ -617,7 +617,7 @@ def _fdk(
                 meter.data, meter.grid, circle, table, rays, last - first, own, cut_off=cut_off
             )
     volume = replace(like, data=data.transpose(2, 0, 1))
-    return volume if meter is None else with_noise(volume, meter.found())
+    return volume if meter is None else with_errors(volume, meter.found())
 
 
 def _weighing(

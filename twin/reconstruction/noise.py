@@ -21,6 +21,7 @@ from flexdt.twin.projection.volume import Volume
 from flexdt.twin.reconstruction.trajectory import Circle
 
 if TYPE_CHECKING:
+    from flexdt.twin.reconstruction.bias import Bias
     from flexdt.twin.reconstruction.fdk import Views
 
 NODES: Final = 32
@@ -57,27 +58,35 @@ class Noise:
 
     def sigma(self, grid: Volume) -> Float32Array:
         """Standard deviation at each voxel of a grid, (nz, ny, nx) [1/mm]."""
-        from scipy.ndimage import map_coordinates
-
-        x, y, z = grid.centers()
-        at = [
-            np.interp(places, nodes, np.arange(len(nodes)))
-            for places, nodes in zip((z, y, x), self.views.centers()[::-1], strict=True)
-        ]
+        x, y, _ = grid.centers()
         flat = np.hypot(x - self.centre[0], (y - self.centre[1])[:, None])
-        shared = np.interp(flat, self.radii, self.shared)
-        out = np.empty(grid.shape, np.float32)
-        across = np.meshgrid(at[1], at[2], indexing="ij")
-        for layer, k in enumerate(at[0]):
-            where = [np.full(flat.shape, k), *across]
-            out[layer] = np.sqrt(map_coordinates(self.views.data, where, order=1) + shared)
+        out = interpolated(self.views, grid)
+        np.sqrt(out + np.interp(flat, self.radii, self.shared), out=out, casting="same_kind")
         return np.where(np.isnan(grid.data), np.float32(np.nan), out)
 
 
-def with_noise(volume: Volume, noise: Noise | None) -> Volume:
-    """The same volume with a `sigma`. Volumes that are made of it have none: it is no field."""
+def interpolated(nodes: Volume, grid: Volume) -> Float32Array:
+    """Values on a coarse grid, linearly between them, at the voxels of another, (nz, ny, nx)."""
+    from scipy.ndimage import map_coordinates
+
+    at = [
+        np.interp(places, known, np.arange(len(known)))
+        for places, known in zip(grid.centers()[::-1], nodes.centers()[::-1], strict=True)
+    ]
+    out = np.empty(grid.shape, np.float32)
+    across = np.meshgrid(at[1], at[2], indexing="ij")
+    for layer, k in enumerate(at[0]):
+        map_coordinates(nodes.data, [np.full_like(across[0], k), *across], out[layer], order=1)
+    return out
+
+
+def with_errors(volume: Volume, noise: Noise | None = None, bias: Bias | None = None) -> Volume:
+    """The same volume with a `sigma` and a `bias_bound`, besides those it has. Volumes that are
+    made of it have none: they are no fields.
+    """
     found = replace(volume)
-    object.__setattr__(found, "_noise", noise)
+    object.__setattr__(found, "_noise", noise or getattr(volume, "_noise", None))
+    object.__setattr__(found, "_bias", bias or getattr(volume, "_bias", None))
     return found
 
 

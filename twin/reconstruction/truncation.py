@@ -89,15 +89,41 @@ class Truncation:
         rows: (b,) middle row of each band.
         prisms: one a band; None where rows are whole, or fade out.
         cut_off: (b,) whether the band's rows are continued.
+        others: the best of the prisms that do not explain what was seen, where none does.
         doubt: what to tell the user where densities may be off; else None.
+        fade: length over which rows fade out that no prism explains, over that of a row.
         beyond: whether no prism stands for what a panel moved to one side misses.
     """
 
     rows: FloatArray
     prisms: tuple[Prism | None, ...]
     cut_off: npt.NDArray[np.bool_]
+    others: tuple[Prism | None, ...] = ()
+    fade: float = 0.5
     doubt: str | None = None
     beyond: bool = False
+
+    @property
+    def nothing(self) -> Truncation:
+        """The same panel, of an object that it sees whole."""
+        none = np.zeros(1, dtype=bool)
+        return replace(self, rows=np.zeros(1), prisms=(None,), cut_off=none, others=())
+
+    @property
+    def explained(self) -> bool:
+        """Whether a prism stands for each band whose rows are continued."""
+        return all(p is not None for p, cut in zip(self.prisms, self.cut_off, strict=True) if cut)
+
+    @property
+    def otherwise(self) -> Truncation:
+        """Rows continued in another way: they fade out, or follow the best of the prisms that do
+        not explain what was seen, or fade out later.
+        """
+        if self.explained:
+            return replace(self, prisms=(None,) * len(self.prisms))
+        pairs = zip(self.prisms, self.others or self.prisms, strict=True)
+        prisms = tuple(prism or other for prism, other in pairs)
+        return replace(self, prisms=prisms, fade=2.0 * self.fade)
 
     def columns(self, cone_vec: ConeVec, cols: int) -> tuple[int, int]:
         """Columns before the first and after the last into which the object's shadow reaches."""
@@ -131,9 +157,8 @@ class Truncation:
         edge = _edge(cols)
         ends = np.r_[panel.start : panel.start + edge, panel.stop - edge : panel.stop]
         used = np.r_[off, ends]
-        # What no prism explains fades out over half the length of a row.
         away = np.where(off < panel.start, panel.start - off, off - panel.stop + 1) - 0.5
-        fade = 0.5 + 0.5 * np.cos(np.pi * np.minimum(away / max(0.5 * cols, 1.0), 1.0))
+        fade = 0.5 + 0.5 * np.cos(np.pi * np.minimum(away / max(self.fade * cols, 1.0), 1.0))
         fade = (share @ self.cut_off)[:, None] * fade
         for i, image in enumerate(images):
             flat = [
@@ -232,6 +257,7 @@ def _fitted(
     seen /= np.sqrt(1.0 + up[:, :, None] ** 2 / (rays**2).sum(axis=-1)[:, None])
     seen = seen.astype(np.float64)
     prisms: list[Prism | None] = [None] * len(middles)
+    others: list[Prism | None] = [None] * len(middles)
     cut_off, off, known, why = np.zeros(len(middles), dtype=bool), 0.0, None, ""
     # Bands above and below the object hold nothing that could be off.
     least = 0.1 * ACCURACY * float(np.abs(seen).mean())
@@ -244,7 +270,7 @@ def _fitted(
             continue
         even = max(float(np.ptp(band.mean(axis=axis))) for axis in (0, 1)) < ACCURACY * usual
         if not helix and not even:
-            prisms[k] = _fit(source, rays, band, usual, known)
+            prisms[k], others[k] = _fit(source, rays, band, usual, known)
             known = prisms[k] or known
         # What a row holds beyond its edges adds as much as this to what is between them, at most.
         at_edges = float(np.abs(band[:, [0, -1]])[:, edges_that_count].sum(axis=1).mean())
@@ -259,7 +285,8 @@ def _fitted(
         f"the object is wider than the panel, and {why}: densities may be off by up to "
         f"{100.0 * off:.0f} per cent"
     )
-    return Truncation(middles, tuple(prisms), cut_off, doubt if off > ACCURACY else None)
+    said = doubt if off > ACCURACY else None
+    return Truncation(middles, tuple(prisms), cut_off, tuple(others), doubt=said)
 
 
 def _noise(lines: npt.NDArray[np.floating]) -> float:
@@ -291,8 +318,8 @@ def _cut_off(band: FloatArray, least: float, usual: float) -> npt.NDArray[np.boo
 
 def _fit(
     source: FloatArray, rays: FloatArray, seen: FloatArray, usual: float, near: Prism | None
-) -> Prism | None:
-    """The prism that explains what was seen, or None if none does.
+) -> tuple[Prism | None, Prism | None]:
+    """The prism that explains what was seen, or else the one that does best.
 
     Args:
         source: (n, 1, 2) [mm].
@@ -305,7 +332,7 @@ def _fit(
 
     hit = seen > 0.1 * ACCURACY * usual  # of dead columns a prism elsewhere is right
     if not hit.any():
-        return None
+        return None, None
     ends = rays[:, [0, -1]]
     aside = source[..., 0] * ends[..., 1] - source[..., 1] * ends[..., 0]
     field = float(np.abs(aside / np.sqrt((ends**2).sum(axis=-1))).max())
@@ -346,8 +373,10 @@ def _fit(
     # Both are estimates; the ratio of their squares varies by 4.9 over the root of their number.
     by_noise *= np.sqrt(1.0 + 0.5 * SIGNIFICANT * 4.9 / np.sqrt(seen.size))
     if np.sqrt(max(best**2 - by_noise**2, 0.0)) <= 0.5 * ACCURACY * usual:
-        return Prism.of(x, field)
-    return None if near is None else _fit(source, rays, seen, usual, None)
+        return Prism.of(x, field), None
+    if near is not None:
+        return _fit(source, rays, seen, usual, None)
+    return None, Prism.of(x, field)
 
 
 def _edge(cols: int) -> int:

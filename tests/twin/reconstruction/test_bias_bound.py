@@ -1,0 +1,115 @@
+"""A volume's bias bound beside the truth: scans drawn, and projected, by the study's own code."""
+
+from __future__ import annotations
+
+
+import bias_bound
+import numpy as np
+import pytest
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.projection import Grid
+from flexdt.twin.reconstruction import bias_of, fdk_parts, truncation_of
+
+SHAPE = (24, 48)
+
+
+@pytest.mark.parametrize(
+    "first", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (8, 16, 24, 32))]
+)
+def test_even_regions_are_within_the_bound(first: int) -> None:
+    """Of drawn scans, 19 of 20; the study draws hundreds."""
+    within = []
+    for number in range(first, first + (8 if first else 3)):
+        scan = bias_bound.drawn(3, number)
+        found = bias_bound.judged(scan)
+        excess = np.abs(found.errors) - 3.0 * found.noise
+        within += (excess <= found.bounds).tolist()
+    assert np.mean(within) >= 0.95
+
+
+def scan_of(angles: np.ndarray, sod: float = 200.0, aside: float = 0.0) -> ConeVec:
+    return ConeVec.circular(
+        sod=sod, sdd=2.0 * sod, angles=angles, shape=SHAPE, pixel=2.0, offset=(aside, 0.0)
+    )
+
+
+def images_of(scan: ConeVec, half: tuple[float, float, float]) -> Float32Array:
+    """Of a box of 0.02/mm."""
+    box = bias_bound.Solid("box", np.zeros(3), np.array(half), 0.3, 0.02)
+    return bias_bound.Scan("", scan, SHAPE, [box], 0.0, 0.0, 0).images()
+
+
+TURN = np.arange(90) * 4.0
+
+
+@pytest.mark.parametrize(
+    ("half", "turn", "most"),
+    [
+        ((14.0, 10.0, 9.0), TURN, "cone"),
+        ((14.0, 10.0, 9.0), np.random.default_rng(1).uniform(0.0, 360.0, 30), "angles"),
+        ((30.0, 26.0, 9.0), TURN, "beyond"),
+    ],
+)
+def test_the_cause_that_contributes_most(
+    half: tuple[float, float, float], turn: np.ndarray, most: str
+) -> None:
+    scan = scan_of(turn)
+    images = images_of(scan, half)
+    cut_off = truncation_of(lambda i: images[i], scan, SHAPE)
+    bias = bias_of(lambda i: images[i], scan, SHAPE, cut_off)
+    assert bias is not None
+    middle = tuple(n // 2 for n in bias.found.shape)
+    assert max(bias.causes, key=lambda name: bias.causes[name][middle]) == most
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.1])
+def test_a_flat_that_drifted_is_in_the_bound(drift: float) -> None:
+    scan = scan_of(TURN)
+    clean = images_of(scan, (10.0, 8.0, 8.0))
+    grid, found = Grid((3, 9, 9), 1.0), []
+    for images in (clean, clean + np.float32(drift)):
+        volume = bias_bound.reconstructed(images, scan, grid)
+        assert volume.bias_bound is not None
+        found.append((volume.data, volume.bias_bound))
+    (true, before), (data, after) = found
+    assert (after - before >= 0.9 * np.abs(data - true) - 1e-7).all()
+    assert (after - before <= 3.0 * np.abs(data - true) + 1e-7).all()
+
+
+def test_the_order_of_views_does_not_matter() -> None:
+    scan = scan_of(np.delete(TURN, range(20, 30)))
+    images = images_of(scan, (14.0, 10.0, 9.0))
+    order = np.random.default_rng(2).permutation(len(images))
+    bounds = []
+    for chosen in (np.arange(len(images)), order):
+        listed = images[chosen]
+        bias = bias_of(lambda i, listed=listed: listed[i], scan[chosen], SHAPE)
+        assert bias is not None
+        bounds.append(bias.total)
+    np.testing.assert_allclose(bounds[0], bounds[1], rtol=1e-3, atol=1e-7)
+
+
+def test_what_no_data_cover_is_nan_and_what_was_not_asked_for_is_none() -> None:
+    scan = scan_of(TURN, 60.0)
+    images = images_of(scan, (14.0, 10.0, 30.0))
+    volume = bias_bound.reconstructed(images, scan, Grid((60, 24, 24), 1.0))
+    assert volume.bias_bound is not None
+    assert (np.isnan(volume.bias_bound) == np.isnan(volume.data)).all()
+    assert np.isnan(volume.bias_bound).any()
+    assert volume.like(np.zeros(volume.shape)).bias_bound is None
+    assert fdk_parts(lambda: [images], scan, SHAPE, Grid((5, 24, 24), 1.0)).bias_bound is None
+
+
+def test_images_on_their_side_have_the_same_bound() -> None:
+    """Rows and columns swapped, and the panel with them."""
+    scan = scan_of(TURN)
+    images = images_of(scan, (14.0, 10.0, 9.0))
+    rows = scan.rows.copy()
+    rows[:, 6:9], rows[:, 9:12] = scan.rows[:, 9:12], scan.rows[:, 6:9]
+    upright = bias_of(lambda i: images[i], scan, SHAPE)
+    turned = bias_of(lambda i: images[i].T, ConeVec(rows), SHAPE[::-1])
+    assert upright is not None
+    assert turned is not None
+    np.testing.assert_allclose(upright.total, turned.total, rtol=1e-4, atol=1e-8)

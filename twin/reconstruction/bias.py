@@ -1,0 +1,158 @@
+"""A bound of the bias in a volume of FDK, from the geometry and some of the images.
+
+A coarse volume of the object is projected and reconstructed on a ladder of scans: from one without
+a flaw (parallel rays from everywhere, a panel that sees all) to the one at hand, one flaw a rung.
+What differs between two rungs is what that flaw does to an object like this one. Two flaws show in
+the images alone, and get a reconstruction each: what lies beyond the panel's edges, continued in
+another way, and the drift of the flat, which is seen beside the object. A voxel's bound is what all
+of them come to about it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.errors import GeometryError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.projection import Volume
+from flexdt.twin.reconstruction.coarse_scan import CoarseScan
+from flexdt.twin.reconstruction.noise import interpolated
+from flexdt.twin.reconstruction.truncation import Truncation
+
+SAFETY: Final = 3.0
+"""The coarse volume has the flaws, too, and is smooth: of what they take away it shows a third."""
+TRUSTED: Final = 0.15
+"""Part of what a prism adds beyond the edges that may be wrong where it explains what was seen."""
+FLOOR: Final = 0.003
+"""What FDK without a flaw is off by, of the attenuation about a voxel."""
+SMOOTH: Final = 1.5
+"""Standard deviation of what the coarse volume is smoothed with [nodes]: steps between its voxels
+would show as flaws of their own."""
+STEEP: Final = 0.05
+"""Change between nodes, over the largest value, at an edge, where blur hides what a flaw does."""
+CAUSES: Final = {
+    "angles": "no view sees lines of some directions",
+    "aside": "the panel, moved to one side, sees few columns beyond the rotation axis",
+    "cone": "the cone beam is wide, and a circle says little of what lies far above or below it",
+    "rows": "some views see parts of the object above or below the panel",
+    "beyond": "the object is wider than the panel, and its images do not tell how it goes on",
+    "drift": "the images are not dark beside the object, as of a flat that drifted",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Bias:
+    """What may be off in a volume, on a coarse grid.
+
+    Attributes:
+        found: attenuation, smooth [1/mm].
+        causes: name in `CAUSES` -> what it changes at most [1/mm], (nz, ny, nx).
+        even: weights from 0 to 1, little where an edge is near, (nz, ny, nx).
+    """
+
+    found: Volume
+    causes: dict[str, FloatArray]
+    even: FloatArray
+
+    @cached_property
+    def total(self) -> Float32Array:
+        """Bound at the nodes [1/mm]."""
+        flaws = np.sum(list(self.causes.values()), axis=0)
+        return np.asarray(FLOOR * np.abs(self.found.data) + flaws, np.float32)
+
+    def bound(self, grid: Volume) -> Float32Array:
+        """Bound at each voxel of a grid, NaN where it has no value, (nz, ny, nx) [1/mm]."""
+        out = interpolated(self.found.like(self.total), grid)
+        return np.where(np.isnan(grid.data), np.float32(np.nan), out)
+
+
+def bias_of(
+    image: Callable[[int], npt.NDArray[np.generic]],
+    cone_vec: ConeVec,
+    shape: tuple[int, int],
+    truncation: Truncation | None = None,
+) -> Bias | None:
+    """Find what may be off in FDK's volume of a scan.
+
+    Args:
+        image: gives the line integrals of a view, (rows, cols), by its number.
+        cone_vec: of all views.
+        shape: (rows, cols).
+        truncation: of `truncation_of`.
+
+    Returns:
+        None where a coarse scan cannot be reconstructed, as of a steep helix.
+
+    Raises:
+        GeometryError: neither a circle nor a helix.
+    """
+    scan = CoarseScan.of(image, cone_vec, shape, truncation)
+    try:
+        return _bias_of(scan)
+    except GeometryError:
+        return None
+
+
+def _bias_of(scan: CoarseScan) -> Bias:
+    from scipy.ndimage import gaussian_filter
+
+    data = scan.fdk(scan.images, scan.cone_vec, scan.truncation)
+    sharp = np.where(scan.rim, np.float32(0.0), data)
+    smooth = (min(SMOOTH, (len(data) - 1) / 4), SMOOTH, SMOOTH)
+    found = gaussian_filter(sharp, smooth, mode="nearest")
+    even = np.where(scan.rim, 0.0, _evenness(found)) + 1e-3  # a mean needs some weight
+    causes: dict[str, FloatArray] = {}
+    if scan.uneven:
+        # Streaks come from edges, and do not cancel about a node.
+        wide = (max(scan.ends),) * 2
+        best, ours = (scan.seen(sharp, scan.parallel("", wide, even=e)) for e in (True, False))
+        causes["angles"] = _about(np.abs(ours - best), even)
+    before = None
+    for rung in scan.ladder():
+        after = scan.seen(found, rung)
+        if before is not None:
+            more = SAFETY * _about(after - before, even)
+            causes[rung.flaw] = causes.get(rung.flaw, 0.0) + more
+        before = after
+    truncation = scan.truncation
+    if truncation is not None and truncation.cut_off.any():
+        other = scan.fdk(scan.images, scan.cone_vec, truncation.otherwise)
+        share = TRUSTED if truncation.explained else SAFETY
+        causes["beyond"] = share * _about(other - data, even)
+    else:
+        causes["drift"] = _about(scan.fdk(_drift(scan.images), scan.cone_vec), even)
+    return Bias(scan.grid.like(found), causes, even)
+
+
+def _drift(images: Float32Array) -> Float32Array:
+    """What images (n, rows, cols) show beside the object, in every pixel."""
+    ends = images[:, :, [0, -1]].mean(axis=1)
+    beside = np.take_along_axis(ends, np.abs(ends).argmin(axis=1)[:, None], axis=1)
+    return np.ascontiguousarray(np.broadcast_to(beside[:, :, None], images.shape))
+
+
+def _evenness(values: Float32Array) -> FloatArray:
+    """Weights of nodes, little where values change fast."""
+    from scipy.ndimage import gaussian_gradient_magnitude
+
+    steep = gaussian_gradient_magnitude(values.astype(np.float64), 0.5, mode="nearest")
+    most = STEEP * max(float(np.abs(values).max()), float(np.finfo(np.float32).tiny))
+    return np.asarray(np.exp(-np.square(steep / most)))
+
+
+def _about(values: Float32Array, weights: FloatArray) -> FloatArray:
+    """Root of the mean square about each node: what differs has places where it is zero."""
+    from scipy.ndimage import gaussian_filter
+
+    def mean(what: FloatArray) -> FloatArray:
+        total = gaussian_filter(weights * what, 1.0, mode="nearest")
+        return np.asarray(total / gaussian_filter(weights, 1.0, mode="nearest"))
+
+    return np.asarray(np.sqrt(np.maximum(mean(np.square(mean(values.astype(np.float64)))), 0.0)))

@@ -1,0 +1,208 @@
+"""A coarse copy of a scan, and a ladder of scans that leads to it from one without a flaw."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.projection import Volume, forward
+from flexdt.twin.reconstruction.rectify import field_of_view, on_its_side, swapped, upright, window
+from flexdt.twin.reconstruction.trajectory import Circle, circle_of, fan_angles, reach
+from flexdt.twin.reconstruction.truncation import ACCURACY, Truncation
+
+NODES: Final = 40
+"""Columns, rows and voxels along the longest side, at most: what is off changes smoothly."""
+FEWEST: Final = 4.0
+"""Columns on either side of the axis, where the panel has so many: a narrow overlap stays one."""
+VIEWS: Final = 180
+"""Views, at most: enough for so many nodes and a panel moved aside."""
+AWAY: Final = 50.0
+"""Distance of a source whose rays are parallel, over the radius of the scan."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rung:
+    """A scan of the ladder.
+
+    Attributes:
+        flaw: what it has and the one before does not.
+        cone_vec: its views.
+        shape: (rows, cols).
+    """
+
+    flaw: str
+    cone_vec: ConeVec
+    shape: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class CoarseScan:
+    """A scan of few views and pixels.
+
+    Attributes:
+        images: (n, rows, cols) line integrals.
+        cone_vec: of these.
+        circle: of all views of the scan.
+        angles: (n,) along it [rad].
+        truncation: what lies beyond the edges of these images.
+    """
+
+    images: Float32Array
+    cone_vec: ConeVec
+    circle: Circle
+    angles: FloatArray
+    truncation: Truncation | None
+
+    @classmethod
+    def of(
+        cls,
+        image: Callable[[int], npt.NDArray[np.generic]],
+        cone_vec: ConeVec,
+        shape: tuple[int, int],
+        truncation: Truncation | None,
+    ) -> CoarseScan:
+        """Of a scan; arguments as for `bias.bias_of`."""
+        circle = circle_of(cone_vec)
+        flip = on_its_side(cone_vec)
+        if flip:
+            cone_vec, shape = swapped(cone_vec), (shape[1], shape[0])
+        _, places = np.unique(circle.angle.round(9), return_index=True)
+        chosen = places[:: -(-len(places) // VIEWS)]
+        low, high = reach(fan_angles(circle, upright(cone_vec), shape[1]))
+        overlap = min(low, high) / (low + high) * shape[1]
+        across = min(-(-shape[1] // NODES), max(1, int(overlap / FEWEST)))
+        down = max(min(-(-shape[1] // NODES), shape[0] // 2), -(-shape[0] // NODES), 1)
+        rows, cols = shape[0] // down, shape[1] // across
+        part = window(cone_vec[chosen], shape, (0, rows * down), (0, cols * across))
+        images = np.empty((len(chosen), rows, cols), np.float32)
+        for k, view in enumerate(chosen.tolist()):
+            full = np.asarray(image(view), np.float32)
+            full = (full.T if flip else full)[: rows * down, : cols * across]
+            images[k] = full.reshape(rows, down, cols, across).mean(axis=(1, 3))
+        if truncation is not None:
+            truncation = replace(truncation, rows=(truncation.rows + 0.5) / down - 0.5)
+        scan = ConeVec.from_vectors(part.source, part.detector, part.u * across, part.v * down)
+        return cls(images, scan, circle, circle.angle[chosen], truncation)
+
+    @cached_property
+    def level(self) -> ConeVec:
+        """The same views with upright panels."""
+        return upright(self.cone_vec)
+
+    @cached_property
+    def ends(self) -> tuple[float, float]:
+        """Distances from the axis that the panel sees on its two sides [mm]."""
+        fan = fan_angles(circle_of(self.cone_vec), self.level, self.images.shape[2])
+        low, high = reach(fan)
+        return float(self.circle.radius * np.sin(low)), float(self.circle.radius * np.sin(high))
+
+    @cached_property
+    def grid(self) -> Volume:
+        """The field of view, in layers as high as rows; without values."""
+        view = field_of_view(self.cone_vec, self.images.shape[1:])
+        pitches = np.linalg.norm([self.cone_vec.u[0], self.cone_vec.v[0]], axis=1)
+        tall = view.voxel_mm * float(pitches[1] / pitches[0])
+        wide = view.shape[1] * view.voxel_mm
+        across = round(wide / max(view.voxel_mm, wide / NODES))
+        x, y, z = view.center_mm
+        blank = np.zeros((self.images.shape[1], across, across), np.float32)
+        middle = (x, y, z * tall / view.voxel_mm)
+        return Volume(blank, (wide / across, wide / across, tall), middle)
+
+    @cached_property
+    def rim(self) -> npt.NDArray[np.bool_]:
+        """Where some views do not see the grid, (ny, nx)."""
+        x, y, _ = self.grid.centers()
+        away = np.hypot(x - self.circle.centre[0], (y - self.circle.centre[1])[:, None])
+        return np.asarray(away > max(self.ends) - 1.5 * self.grid.voxel_xyz[0])
+
+    @cached_property
+    def more(self) -> int:
+        """Layers by which the object goes on above and below the grid, as far as views see."""
+        count = self.images.shape[1]
+        ends = float(np.abs(self.images[:, [0, -1]]).mean())
+        if count == 1 or ends <= ACCURACY * float(np.abs(self.images).mean()):
+            return 0
+        nearest = max(self.circle.radius - max(self.ends), 0.5 * self.circle.radius)
+        return int(min(np.ceil(count * max(self.ends) / nearest), count))
+
+    @cached_property
+    def uneven(self) -> bool:
+        """Whether the views of a circle leave directions out."""
+        step = self.circle.step
+        apart = float(np.ptp(step)) > float(np.median(step))
+        return not self.circle.rise and (apart or not self.circle.full)
+
+    def fdk(
+        self, images: Float32Array, cone_vec: ConeVec, truncation: Truncation | None = None
+    ) -> Float32Array:
+        """The grid's values from some images."""
+        from flexdt.twin.reconstruction.fdk import OnProcessor, fdk_parts
+
+        shape = (images.shape[1], images.shape[2])
+        volume = fdk_parts(
+            lambda: [images.copy()], cone_vec, shape, self.grid, truncation=truncation,
+            target=OnProcessor(self.grid), outside=True,
+        )  # fmt: skip
+        return np.nan_to_num(volume.data)
+
+    def seen(self, thing: Float32Array, rung: Rung) -> Float32Array:
+        """Values on the grid, (nz, ny, nx), projected and reconstructed."""
+        higher = np.pad(thing, ((self.more, self.more), (0, 0), (0, 0)), "edge")
+        volume = Volume(higher, self.grid.voxel_mm, self.grid.center_mm)
+        # Two rays a column: the steps of voxels would show as a flaw of their own.
+        views, (rows, cols) = rung.cone_vec, rung.shape
+        finer = ConeVec.from_vectors(views.source, views.detector, 0.5 * views.u, views.v)
+        rays = forward(volume, finer, (rows, 2 * cols))
+        truncation = self.truncation
+        if truncation is not None:
+            truncation = truncation.nothing if rung.flaw and truncation.beyond else None
+        return self.fdk(0.5 * (rays[:, :, ::2] + rays[:, :, 1::2]), views, truncation)
+
+    def parallel(self, flaw: str, ends: tuple[float, float], *, even: bool = False) -> Rung:
+        """Parallel views of a panel that sees some distances from the axis on its two sides [mm].
+
+        Args:
+            flaw: of the rung.
+            ends: these distances.
+            even: from everywhere, instead of from the scan's angles.
+        """
+        turn = np.linspace(0.0, 2.0 * np.pi, VIEWS, endpoint=False) if even else self.angles
+        side, _, tall = self.grid.voxel_xyz
+        away = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(len(turn))])
+        u = np.column_stack([-away[:, 1], away[:, 0], np.zeros(len(turn))])
+        centre = np.append(self.circle.centre, self.grid.center_mm[2])
+        far = AWAY * self.circle.radius * away
+        # As far behind the object as the source is before it: twice as large.
+        panel, down = centre - far + u * (ends[1] - ends[0]), (0.0, 0.0, -2.0 * tall)
+        views = ConeVec.from_vectors(centre + far, panel, 2.0 * side * u, [down] * len(u))
+        return Rung(flaw, views, (self.grid.shape[0] + 2 * self.more, int(sum(ends) / side) + 2))
+
+    def ladder(self) -> list[Rung]:
+        """From parallel rays of a panel in the middle to the scan; flaws that it does not have are
+        no rungs.
+        """
+        rows, cols = self.images.shape[1:]
+        low, high = self.ends
+        rungs = [self.parallel("", (max(low, high),) * 2, even=bool(self.circle.rise))]
+        # Rays that climb less than a row across the object are a fan, whose flaw are its angles.
+        climb = 0.5 * self.grid.size_mm[2] / self.circle.radius * 2.0 * max(low, high)
+        fan = self.uneven and climb < self.grid.voxel_xyz[2]
+        cone = "angles" if fan else "cone"
+        if not self.circle.rise:
+            if abs(high - low) > (low + high) / cols:
+                rungs.append(self.parallel("aside", self.ends))
+            if self.more:
+                reached = (-self.more, rows + self.more)
+                taller = window(self.level, (rows, cols), reached, (0, cols))
+                rungs.append(Rung(cone, taller, (rows + 2 * self.more, cols)))
+        if rows > 1:
+            rungs.append(Rung("rows" if self.more else cone, self.level, (rows, cols)))
+        return rungs if len(rungs) > 1 else []
