@@ -1,7 +1,7 @@
 """Volumes back from projections."""
 
 from flexdt.twin.projection.volume import Grid
-from flexdt.twin.reconstruction.bias import Bias, bias_of
+from flexdt.twin.reconstruction.bias_bound import Bias, bias_of
 from flexdt.twin.reconstruction.coverage import layer_warnings, lost_layers, missing_wedge
 from flexdt.twin.reconstruction.fdk import fdk, fdk_parts
 from flexdt.twin.reconstruction.iterative import Step, cgls, em, sart, sirt
