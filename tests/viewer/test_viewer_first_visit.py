@@ -88,9 +88,10 @@ def look_along_the_beam(v: Visitor) -> None:
 
 
 def move_the_sample(v: Visitor) -> None:
-    """the readouts follow: SOD 500.00 mm"""
-    v.write("Source to sample", "500")
-    until(lambda: v.readout("SOD") == "500.00 mm", "the distance")
+    """the readouts follow: SOD 514.92 mm"""
+    v.write("mag_obj value", "500")
+    # The axis stands 14.92 mm behind what the motor counts from.
+    until(lambda: v.readout("SOD") == "514.92 mm", "the distance")
 
 
 def turn_the_sample(v: Visitor) -> None:
@@ -203,7 +204,7 @@ def calibrate(v: Visitor) -> None:
     v.tab("Data")
     v.click(v.page.get_by_role("button", name=re.compile("^past scan")))
     v.button("Calibrate")
-    v.sees(re.compile("^Safe to reconstruct"))
+    v.sees(re.compile("^Identifiable$"))
     v.button("Compare over a radiograph")
     whole = v.page.locator(".figure").filter(has_text="whole scan")
     until(lambda: whole.inner_text().count(" px") == 2, "the errors")
@@ -290,7 +291,7 @@ def test_a_task_of_a_first_visit(
     task: str, quiet: None, open_page: Callable[..., Any], table: dict[str, str], tmp_path: Path
 ) -> None:
     do = TASKS[task]
-    page = open_page(view="iso" if do is look_along_the_beam else "none", fresh=True)
+    page = open_page(view="iso" if do is look_along_the_beam else "none")
     visitor = Visitor(page, tmp_path)
     do(visitor)
     page.close()

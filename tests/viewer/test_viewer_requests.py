@@ -121,9 +121,7 @@ WRONG = [
     ("calibration.apply", {"parameters": {"alpha": 2**70}}),
     ("viewer.screenshot", {"width": 10**9}),
     ("viewer.export", {"format": "exe"}),
-    ("viewer.block", {"name": "a", "what": "below"}),
-    ("viewer.voxel", {"name": "a", "at": [0, 0, -1]}),
-    ("viewer.compare", {"truth": "hidden"}),
+    ("viewer.slice", {"name": "below", "index": 0}),
     ("calibration.apply", {"parameters": {}}),
     ("calibration.apply", {"parameters": {"alpha": "0.2"}}),
 ]
