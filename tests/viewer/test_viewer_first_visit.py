@@ -204,7 +204,7 @@ def calibrate(v: Visitor) -> None:
     v.tab("Data")
     v.click(v.page.get_by_role("button", name=re.compile("^past scan")))
     v.button("Calibrate")
-    v.sees(re.compile("^Identifiable$"))
+    v.sees(re.compile("^Safe to reconstruct"))
     v.button("Compare over a radiograph")
     whole = v.page.locator(".figure").filter(has_text="whole scan")
     until(lambda: whole.inner_text().count(" px") == 2, "the errors")
