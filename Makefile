@@ -63,7 +63,7 @@ typecheck: install $(TEST_STAMP)
 	$(BIN)/mypy -p flexdt -p flexdt_extensions
 
 # The kernels that most tests run: compiled once, not by all workers and by each server they start.
-kernels: $(TEST_STAMP)
+kernels: $(TEST_STAMP) $(COMPILED)
 	$(BIN)/python tests/support/compile_kernels.py
 
 quick: lint typecheck

@@ -93,7 +93,9 @@ def align_dataset(data: DataSet, per_frame: bool = False) -> Aligned:
         DatasetError: a frame cannot be read, or there is no flat image.
     """
     begun = time.perf_counter()
-    data = replace(data, warnings=(*data.warnings, *image_doubts(data)))
+    # Once, also where a result is aligned again.
+    doubts = dict.fromkeys((*data.warnings, *image_doubts(data)))
+    data = replace(data, warnings=tuple(doubts))
     base = NOMINAL if data.correction is None else data.correction.parameters
     frames, poses = _at_rest(data)
     found = align_turn(

@@ -165,7 +165,11 @@ class ScanFrames:
 
     def truncation(self) -> Truncation | None:
         """What of the object lies beyond the panel's edges, for FDK."""
-        return truncation_of(lambda i: self.image(self.indices[i]), self.cone_vec, self.shape)
+        return truncation_of(self.view, self.cone_vec, self.shape)
+
+    def view(self, number: int) -> Float32Array:
+        """As `image`, by the number among those that are reconstructed."""
+        return self.image(self.indices[number])
 
     def image(self, index: int) -> Float32Array:
         """One frame's line integrals, binned and corrected."""
@@ -349,8 +353,7 @@ def reconstruct_volume(
         warnings.warn(doubt, stacklevel=2)
     if not errors:
         return volume
-    image = views.image
-    bias = bias_of(lambda i: image(views.indices[i]), views.cone_vec, views.shape, truncation)
+    bias = bias_of(views.view, views.cone_vec, views.shape, truncation)
     return with_errors(volume, bias=bias)
 
 

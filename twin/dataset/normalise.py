@@ -76,17 +76,18 @@ def _nearest(dead: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
     return np.asarray(flat, dtype=np.intp)
 
 
-def binned_mean(images: npt.NDArray[Any], factor: int) -> npt.NDArray[Any]:
-    """Mean over factor x factor pixels; surplus rows and columns are cut off.
+def binned_mean(images: npt.NDArray[Any], factor: int | tuple[int, int]) -> npt.NDArray[Any]:
+    """Mean over blocks of pixels; surplus rows and columns are cut off.
 
     Args:
         images: (..., rows, cols).
-        factor: pixels a side.
+        factor: pixels a side of a block; or its rows and columns.
     """
-    if factor == 1:
+    down, across = (factor, factor) if isinstance(factor, int) else factor
+    if down == across == 1:
         return images
-    rows, cols = (n // factor for n in images.shape[-2:])
-    cut = images[..., : rows * factor, : cols * factor]
-    blocks = cut.reshape(*images.shape[:-2], rows, factor, cols, factor)
+    rows, cols = images.shape[-2] // down, images.shape[-1] // across
+    cut = images[..., : rows * down, : cols * across]
+    blocks = cut.reshape(*images.shape[:-2], rows, down, cols, across)
     mean: Float32Array = blocks.mean(axis=(-3, -1), dtype=np.float32)
     return mean

@@ -27,7 +27,7 @@ from flexdt.twin.calibration.without_phantom.mirror_symmetry import (
 from flexdt.twin.calibration.without_phantom.opposite_rays import OppositeRays
 from flexdt.twin.calibration.without_phantom.plane_pairs import PlanePairs, without
 from flexdt.twin.calibration.without_phantom.source_row import find_height
-from flexdt.twin.calibration.without_phantom.tile_gap import FRAMES, averaged_rows, find_gap
+from flexdt.twin.calibration.without_phantom.tile_gap import Gap, find_gap
 from flexdt.twin.calibration.without_phantom.turn import Image, Turn, read_turn
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import NotIdentifiableError
@@ -345,8 +345,7 @@ def _align(
     )
     gap = None
     if turn is not None:
-        some = turn.used[:: -(-len(turn.used) // FRAMES)]
-        gap = find_gap([averaged_rows(image(i)) for i in some])
+        gap = find_gap(turn.samples)
         instead = f"{_apart(gap)}; " if gap else ""
     found = find_symmetry(turn, view, start, scales, known) if turn else rays.find(start)  # type: ignore[union-attr]
     _refuse_if(
@@ -369,9 +368,8 @@ def _align(
         told[:], values[1], covariance[1], covariance[:, 1] = False, base.det_roll, 0.0, 0.0
         covariance[1, 1] = known[1] ** 2
     step = (0.0, 0.0) if turn is None or turn.step_px is None else turn.step_px[0]
-    covariance[0, 0] += (
-        math.hypot(FLOOR_PX, step[0] / 2, beside, gap[1] if gap else 0.0) * scales[0]
-    ) ** 2
+    apart = gap.width if gap else 0.0
+    covariance[0, 0] += (math.hypot(FLOOR_PX, step[0] / 2, beside, apart) * scales[0]) ** 2
     covariance[1, 1] += math.radians(FLOOR_DEG) ** 2 + (step[0] / rows) ** 2
     slopes = _slopes(seen, values, scales)
     sigma = math.sqrt(slopes @ covariance @ slopes)
@@ -587,15 +585,15 @@ def _refuse_if(wrong: bool, why: str) -> None:
         raise NotIdentifiableError(why)
 
 
-def _apart(gap: tuple[int, float]) -> str:
+def _apart(gap: Gap) -> str:
     return (
-        f"from column {gap[0]} on everything appears too near by up to {gap[1]:.1f} px, as behind "
-        "a gap between two tiles of the panel (a calibration with a phantom measures it, and its "
-        "correction closes it)"
+        f"from column {gap.column} on everything appears too near by up to {gap.width:.1f} px, as "
+        "behind a gap between two tiles of the panel (a calibration with a phantom measures it, "
+        "and its correction closes it)"
     )
 
 
-def _warnings(turn: Turn, gap: tuple[int, float] | None, missing: int) -> tuple[str, ...]:
+def _warnings(turn: Turn, gap: Gap | None, missing: int) -> tuple[str, ...]:
     out = []
     if gap is not None:
         out.append(f"{_apart(gap)}; the sigma of the axis column contains it")

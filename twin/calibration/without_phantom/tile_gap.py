@@ -11,10 +11,11 @@ less.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
+from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 SIDE: Final = 4
@@ -30,16 +31,22 @@ STANDS_OUT: Final = 1.7
 drawn scans with a gap of 0.5 to 2 px, up to 1.6 in 24 without."""
 
 
+class Gap(NamedTuple):
+    """Between two tiles: the first column beyond it, and how wide it is at most [px]. Drawn gaps
+    were half to all of that.
+    """
+
+    column: int
+    width: float
+
+
 def averaged_rows(image: Float32Array) -> Float32Array:
-    """A frame with at most ROWS rows."""
-    factor = -(-len(image) // ROWS)
-    rows = len(image) // factor
-    parts = image[: rows * factor].reshape(rows, factor, -1)
-    return np.asarray(parts.mean(axis=1), dtype=np.float32)
+    """A frame with about ROWS rows, if it has more."""
+    return binned_mean(image, (-(-len(image) // ROWS), 1))
 
 
-def find_gap(frames: Sequence[Float32Array]) -> tuple[int, float] | None:
-    """The first column beyond a gap and about how wide it is, at most twice as wide [px].
+def find_gap(frames: Sequence[Float32Array]) -> Gap | None:
+    """The gap that stands out, if there is one.
 
     Args:
         frames: line integrals of `averaged_rows`, some of a turn.
@@ -57,7 +64,7 @@ def find_gap(frames: Sequence[Float32Array]) -> tuple[int, float] | None:
     elsewhere = np.abs(np.arange(len(explained)) - border) > SIDE
     if explained[border] < STANDS_OUT * explained[elsewhere].max():
         return None
-    return border + SIDE, float(WIDTHS[left[:, border].argmin()])
+    return Gap(border + SIDE, float(WIDTHS[left[:, border].argmin()]))
 
 
 def _moments(window: FloatArray) -> FloatArray:

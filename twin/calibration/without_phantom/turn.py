@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter, median_filter
 
+from flexdt.twin.calibration.without_phantom.tile_gap import FRAMES, averaged_rows
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
@@ -59,6 +60,7 @@ class Turn:
             or what a repeated frame may.
         noise: relative variance of a pixel of `mean`, (rows, cols).
         used: indices of the frames in the mean.
+        samples: some of these frames, their rows averaged: `tile_gap.averaged_rows`.
         repeated: indices of frames left out as repeated.
         step_px: (columns, rows) by which the images step at most between neighbouring frames, and
             after which frame; None where no step is significant or none can be told.
@@ -68,6 +70,7 @@ class Turn:
     doubts: FloatArray
     noise: FloatArray
     used: tuple[int, ...]
+    samples: tuple[Float32Array, ...]
     repeated: tuple[int, ...]
     step_px: tuple[tuple[float, float], int] | None
 
@@ -104,10 +107,13 @@ def read_turn(
             weights = np.vstack([weights, weights[0] * (near / near.sum() - gap)])
     total: FloatArray | float = 0.0
     noise: FloatArray | float = 0.0
-    thumbs = []
+    used, thumbs, samples = tuple(sorted(kept)), [], []
+    sampled = set(used[:: -(-len(used) // FRAMES)])
     for weight, i in zip(weights.T, index.tolist(), strict=True):
         g = image(i)
         thumbs.append(_thumb(g))
+        if i in sampled:
+            samples.append(averaged_rows(g))
         total = total + weight[:, None, None] * g.astype(np.float64)
         noise = noise + weight[0] * np.exp(np.minimum(g, DARKEST))
     views = np.stack(thumbs)
@@ -122,7 +128,7 @@ def read_turn(
         across, along = shape[1] / views.shape[2], shape[0] / views.shape[1]
         step = (right * across, down * along), int(index[after])
     images = np.asarray(total)
-    return Turn(images[0], images[1:], np.asarray(noise), tuple(sorted(kept)), repeated, step)
+    return Turn(images[0], images[1:], np.asarray(noise), used, tuple(samples), repeated, step)
 
 
 def _require_turn(angle: FloatArray) -> tuple[FloatArray, float]:

@@ -37,14 +37,6 @@ SMOOTH: Final = 1.5
 would show as flaws of their own."""
 STEEP: Final = 0.05
 """Change between nodes, over the largest value, at an edge, where blur hides what a flaw does."""
-CAUSES: Final = {
-    "angles": "no view sees lines of some directions",
-    "aside": "the panel, moved to one side, sees few columns beyond the rotation axis",
-    "cone": "the cone beam is wide, and a circle says little of what lies far above or below it",
-    "rows": "some views see parts of the object above or below the panel",
-    "beyond": "the object is wider than the panel, and its images do not tell how it goes on",
-    "drift": "the images are not dark beside the object, as of a flat that drifted",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,13 +45,12 @@ class Bias:
 
     Attributes:
         found: attenuation, smooth [1/mm].
-        causes: name in `CAUSES` -> what it changes at most [1/mm], (nz, ny, nx).
-        even: weights from 0 to 1, little where an edge is near, (nz, ny, nx).
+        causes: angles, aside, cone, rows, beyond or drift -> what it changes at most [1/mm], (nz,
+            ny, nx).
     """
 
     found: Volume
     causes: dict[str, FloatArray]
-    even: FloatArray
 
     @cached_property
     def total(self) -> Float32Array:
@@ -128,7 +119,7 @@ def _bias_of(scan: CoarseScan) -> Bias:
         causes["beyond"] = share * _about(other - data, even)
     else:
         causes["drift"] = _about(scan.fdk(_drift(scan.images), scan.cone_vec), even)
-    return Bias(scan.grid.like(found), causes, even)
+    return Bias(scan.grid.like(found), causes)
 
 
 def _drift(images: Float32Array) -> Float32Array:

@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume, forward
@@ -84,8 +85,7 @@ class CoarseScan:
         images = np.empty((len(chosen), rows, cols), np.float32)
         for k, view in enumerate(chosen.tolist()):
             full = np.asarray(image(view), np.float32)
-            full = (full.T if flip else full)[: rows * down, : cols * across]
-            images[k] = full.reshape(rows, down, cols, across).mean(axis=(1, 3))
+            images[k] = binned_mean(full.T if flip else full, (down, across))
         if truncation is not None:
             truncation = replace(truncation, rows=(truncation.rows + 0.5) / down - 0.5)
         scan = ConeVec.from_vectors(part.source, part.detector, part.u * across, part.v * down)
