@@ -107,7 +107,8 @@ async function estimate(method, params, names, title) {
     if (!r)
         return;
     const scan = know(r.tracks?.datasets ?? []), { correction, parameters = {} } = r;
-    const of = (what) => Object.fromEntries(Object.entries(parameters).map(([k, v]) => [k, v[what]]));
+    const of = (some, what) => Object.fromEntries(Object.entries(some).map(([k, v]) => [k, v[what]]));
+    const shown = (some) => table(of(some, "value"), of(some, "sigma"), of(some, "unit"));
     const figures = r.tracks ? `  rms ${fixed(r.rms_px, 3)} px · ${r.frames} frames · sum of squares ${fixed(Math.abs(r.cost_reduction_pct ?? 0), 1)} % ${(r.cost_reduction_pct ?? 0) < 0 ? "above" : "below"} that before` : `  ${names[0]}, without a phantom`;
     const applied = { id: "fit-apply", class: "small primary", disabled: !r.identifiable || !correction, onclick: () => { if (correction)
             void apply(correction, names.join(", ")); } };
@@ -115,7 +116,7 @@ async function estimate(method, params, names, title) {
         onclick: () => open(scan, null, true) };
     const [use, ...why] = (r.verdict ?? (r.identifiable ? "Identifiable" : "Not identifiable")).split(": ");
     const left = (r.outliers ?? []).map((o) => `bead ${o.marker} of frame ${o.frame} (${fixed(o.px ?? 0, 2)} px)`);
-    $("#fit-report").append(el("div", {}, el("span", { class: `verdict ${r.identifiable ? "ok" : "bad"}` }, use), why.length ? `: ${why.join(": ")}` : ""), ...(r.next ?? []).map((line) => el("div", {}, el("span", { class: "muted" }, "next: "), el("code", {}, line))), ...(r.image_space ?? []).map((q) => table(...["value", "sigma", "unit"].map((what) => Object.fromEntries(Object.entries(q).map(([k, v]) => [k, v[what]]))))), el("div", { class: "muted" }, figures, left.length ? ` · left out: ${left.slice(0, 3).join(", ")}${left.length > 3 ? ` and ${left.length - 3} more` : ""}` : ""), table(of("value"), of("sigma"), of("unit")), ...(r.weak ?? []).map((w) => el("div", { class: "error" }, w)), ...Object.entries(r.refused ?? {}).map(([name, why]) => el("div", { class: "muted" }, `${name}: ${why}`)), ...(r.warnings ?? []).map((w) => el("div", { class: "error" }, w)), el("div", { class: "row", style: "margin-top:7px" }, el("button", applied, "Apply"), r.tracks ? el("button", compared, "Compare over a radiograph") : null));
+    $("#fit-report").append(el("div", {}, el("span", { class: `verdict ${r.identifiable ? "ok" : "bad"}` }, use), why.length ? `: ${why.join(": ")}` : ""), ...(r.next ?? []).map((line) => el("div", {}, el("span", { class: "muted" }, "next: "), el("code", {}, line))), ...(r.image_space ?? []).map(shown), el("div", { class: "muted" }, figures, left.length ? ` · left out: ${left.slice(0, 3).join(", ")}${left.length > 3 ? ` and ${left.length - 3} more` : ""}` : ""), shown(parameters), ...(r.weak ?? []).map((w) => el("div", { class: "error" }, w)), ...Object.entries(r.refused ?? {}).map(([name, why]) => el("div", { class: "muted" }, `${name}: ${why}`)), ...(r.warnings ?? []).map((w) => el("div", { class: "error" }, w)), el("div", { class: "row", style: "margin-top:7px" }, el("button", applied, "Apply"), r.tracks ? el("button", compared, "Compare over a radiograph") : null));
 }
 on("calibrate", async (dataset, sample, markers) => {
     emit("show-tab", "calibrate");

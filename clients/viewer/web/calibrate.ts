@@ -96,7 +96,8 @@ async function estimate<M extends "calibration.fit" | "calibration.align">(metho
   $button("#fit").disabled = false; $("#fit-note").textContent = "";
   if (!r) return;
   const scan = know(r.tracks?.datasets ?? []), { correction, parameters = {} } = r;
-  const of = <W extends keyof Estimated>(what: W) => Object.fromEntries(Object.entries(parameters).map(([k, v]) => [k, v[what]]));
+  const of = <W extends "value" | "sigma" | "unit">(some: Record<string, Pick<Estimated, W>>, what: W) => Object.fromEntries(Object.entries(some).map(([k, v]) => [k, v[what]]));
+  const shown = (some: Record<string, Pick<Estimated, "value" | "sigma" | "unit">>) => table(of(some, "value"), of(some, "sigma"), of(some, "unit"));
   const figures = r.tracks ? `  rms ${fixed(r.rms_px, 3)} px · ${r.frames} frames · sum of squares ${fixed(Math.abs(r.cost_reduction_pct ?? 0), 1)} % ${(r.cost_reduction_pct ?? 0) < 0 ? "above" : "below"} that before` : `  ${names[0]}, without a phantom`;
   const applied = { id: "fit-apply", class: "small primary", disabled: !r.identifiable || !correction, onclick: () => { if (correction) void apply(correction, names.join(", ")); } };
   const compared = { id: "fit-compare", class: "small", disabled: !scan, title: "Where the beads were predicted before and after, over the radiographs",
@@ -106,9 +107,9 @@ async function estimate<M extends "calibration.fit" | "calibration.align">(metho
   $("#fit-report").append(
     el("div", {}, el("span", { class: `verdict ${r.identifiable ? "ok" : "bad"}` }, use), why.length ? `: ${why.join(": ")}` : ""),
     ...(r.next ?? []).map((line) => el("div", {}, el("span", { class: "muted" }, "next: "), el("code", {}, line))),
-    ...(r.image_space ?? []).map((q) => table(...["value", "sigma", "unit"].map((what) => Object.fromEntries(Object.entries(q).map(([k, v]) => [k, v[what as "value"]]))) as [Parameters, Parameters, Record<string, string>])),
+    ...(r.image_space ?? []).map(shown),
     el("div", { class: "muted" }, figures, left.length ? ` · left out: ${left.slice(0, 3).join(", ")}${left.length > 3 ? ` and ${left.length - 3} more` : ""}` : ""),
-    table(of("value"), of("sigma"), of("unit")), ...(r.weak ?? []).map((w) => el("div", { class: "error" }, w)),
+    shown(parameters), ...(r.weak ?? []).map((w) => el("div", { class: "error" }, w)),
     ...Object.entries(r.refused ?? {}).map(([name, why]) => el("div", { class: "muted" }, `${name}: ${why}`)), ...(r.warnings ?? []).map((w) => el("div", { class: "error" }, w)),
     el("div", { class: "row", style: "margin-top:7px" },
       el("button", applied, "Apply"), r.tracks ? el("button", compared, "Compare over a radiograph") : null));

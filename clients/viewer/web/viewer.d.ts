@@ -1,5 +1,5 @@
 // What the viewer says beside the wire: its messages, its own methods' answers, and what the page makes of them.
-import type { CalibrationFitResult, CheckStep, DatasetListResult, DatasetResult, HelloResult, ImageFlags, JobStatus, Mark, Methods, State } from "./wire.js";
+import type { CalibrationFitResult, CheckStep, DatasetListResult, DatasetResult, Estimated, HelloResult, ImageFlags, JobStatus, Mark, Methods, State } from "./wire.js";
 
 export type * from "./wire.js";
 
@@ -52,7 +52,7 @@ export interface TrackedFrame { file: string; measured: Array<Pair | null>; befo
 export interface TrackedScan { dataset: string; folder: string; before: string; rms_before_px: number | null; rms_after_px: number | null; frames: TrackedFrame[] }
 // What `flexdt calibrate --json` writes beside what the wire names.
 export interface FitReport extends Omit<CalibrationFitResult, "tracks"> {
-  verdict: string; next: string[]; image_space?: Array<Record<string, { value: number; sigma: number; unit: string }>>; outliers: Array<{ frame: number; marker: number; px: number | null }>;
+  verdict: string; next: string[]; image_space?: Array<Record<string, Pick<Estimated, "value" | "sigma" | "unit">>>; outliers: Array<{ frame: number; marker: number; px: number | null }>;
   frames: number; cost_reduction_pct: number | null; weak: string[]; tracks: { phantom: string; datasets: TrackedScan[] } | null;
 }
 
