@@ -140,8 +140,10 @@ def _stages(
             "frames": len(dataset.frames),
             "scan_s": round(seconds, 3),
         }
+        begun = time.monotonic()
         while compiling.poll() is None:
-            tell("the kernels of calibration and reconstruction are still being compiled (once)")
+            waited = time.monotonic() - begun
+            tell(f"still compiling the kernels of calibration and reconstruction ({waited:.0f} s)")
             with contextlib.suppress(subprocess.TimeoutExpired):
                 compiling.wait(SILENT_S)
         outcome, seconds = calibrate(dataset, tell)
