@@ -104,15 +104,12 @@ def radiographs(
 ) -> list[npt.NDArray[np.float32]]:
     """Line integrals as a camera makes them, from flat-corrected counts."""
     ends = np.array([[0.0, 0.0, -30.0], [0.0, 0.0, 30.0]])
-    at, (panel, across, down) = own.places(np.concatenate([beads, ends]), angles, own.SOD, truth)
+    at, panel = own.places(np.concatenate([beads, ends]), angles, own.SOD, truth)
     energies = [1] if lab.mono else [0, 1, 2]
     parts = np.array(list(ENERGIES.values()))[energies]
     parts /= parts.sum()
     ball, body = (np.array(ATTENUATION[m])[energies] for m in (lab.ball, lab.body))
     straight = rays(truth)
-    reach = int(1.4 * lab.cast_mm * own.SDD / (0.7 * own.SOD) / own.PIXEL)
-    size, fine = 2 * reach + 1, 4
-    offsets = (np.arange(fine * size) + 0.5) / fine - 0.5 - reach
     dead = rng.random(own.SHAPE) < lab.dead
     before, out = None, []
     middles = own.pixels(beads, angles, own.SOD, truth)
@@ -120,23 +117,10 @@ def radiographs(
         shown = np.zeros(own.SHAPE)
         inside = cylinder(straight, *at[i, -2:], lab.body_mm) if lab.body != "air" else 0.0 * shown
         through = [np.zeros(own.SHAPE) for _ in energies]
-        for place, centre in zip(at[i, :-2], np.rint(middles[i]).astype(int), strict=True):
-            columns, rows = (c - reach + np.arange(size) for c in centre)
-            a = (centre[0] + offsets - (own.SHAPE[1] - 1) / 2)[None, :, None]
-            b = (centre[1] + offsets - (own.SHAPE[0] - 1) / 2)[:, None, None]
-            ray = panel + a * across + b * down
-            ray /= np.linalg.norm(ray, axis=2, keepdims=True)
-            chord = 2 * np.sqrt(
-                np.maximum(lab.cast_mm**2 - place @ place + (ray @ place) ** 2, 0.0)
-            )
-            ok = [
-                ((c >= 0) & (c < n)).nonzero()[0]
-                for c, n in ((rows, own.SHAPE[0]), (columns, own.SHAPE[1]))
-            ]
+        for place, centre in zip(at[i, :-2], middles[i], strict=True):
+            where, passed = own.shadow(place, centre, panel, lab.cast_mm, own.SOD)
             for e in range(len(energies)):  # a ball takes its place in the body
-                part = np.exp(-(ball[e] - body[e]) * chord)
-                part = part.reshape(size, fine, size, fine).mean(axis=(1, 3))
-                through[e][np.ix_(rows[ok[0]], columns[ok[1]])] -= np.log(part[np.ix_(*ok)])
+                through[e][where] -= np.log(passed(ball[e] - body[e]))
         for e, weight in enumerate(parts):
             shown += weight * np.exp(-body[e] * inside - through[e])
         if lab.shift is not None:
@@ -291,14 +275,9 @@ def scored(kind: str, seed: int, frames: int = 24) -> Scored:
 def _worst(result: Calibration, truth: Mapping[str, float]) -> tuple[float, str]:
     fit = result.fit
     assert fit is not None
-    axis = np.array([truth["tau_x"], truth["tau_z"], 0.0])
-    ends = np.array([axis - [0, 0, 9], axis + [0, 0, 9]])
-    ((low, high),) = own.pixels(ends, np.zeros(1), own.SOD, truth)
-    slope = (high[0] - low[0]) / (low[1] - high[1])
     true = {
         **truth,
-        "axis_column": low[0] + slope * (low[1] - (own.SHAPE[0] - 1) / 2),
-        "axis_angle": math.degrees(math.atan(slope)),
+        **own.axis_in_image(truth),
         "magnification": magnification(truth),
     }
     found = {**fit.certificate.estimates, **image_quantities(fit)[0]}

@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 import cv2
@@ -106,29 +106,63 @@ def radiographs(
     attenuation: float = ATTENUATION,
 ) -> list[npt.NDArray[np.float32]]:
     """Line integrals of balls: each pixel counts the photons of RAYS x RAYS rays; blurred."""
-    at, (panel, across, down) = places(beads, angles, sod, truth)
-    reach = int(1.3 * radius * SDD / (0.7 * sod) / PIXEL)
-    n = 2 * reach + 1
-    fine = (np.arange(RAYS * n) + 0.5) / RAYS - 0.5 - reach
+    at, panel = places(beads, angles, sod, truth)
     out = []
     for balls, centres in zip(at, pixels(beads, angles, sod, truth), strict=True):
         passing = np.ones(SHAPE)
-        for ball, centre in zip(balls, np.rint(centres).astype(int), strict=True):
-            a = (centre[0] + fine - (SHAPE[1] - 1) / 2)[None, :, None]
-            b = (centre[1] + fine - (SHAPE[0] - 1) / 2)[:, None, None]
-            ray = panel + a * across + b * down
-            ray /= np.linalg.norm(ray, axis=2, keepdims=True)
-            chord = 2 * np.sqrt(np.maximum(radius**2 - ball @ ball + (ray @ ball) ** 2, 0.0))
-            part = np.exp(-attenuation * chord).reshape(n, RAYS, n, RAYS).mean(axis=(1, 3))
-            columns, rows = (c - reach + np.arange(n) for c in centre)
-            ok = (
-                ((rows >= 0) & (rows < SHAPE[0])).nonzero()[0],
-                ((columns >= 0) & (columns < SHAPE[1])).nonzero()[0],
-            )
-            passing[np.ix_(rows[ok[0]], columns[ok[1]])] *= part[np.ix_(*ok)]
+        for ball, centre in zip(balls, centres, strict=True):
+            where, passed = shadow(ball, centre, panel, radius, sod)
+            passing[where] *= passed(attenuation)
         seen = PHOTONS * cv2.GaussianBlur(passing, (0, 0), BLUR_PX)
         out.append((-np.log(np.maximum(rng.poisson(seen), 0.5) / PHOTONS)).astype(np.float32))
     return out
+
+
+def shadow(
+    ball: Array, centre: Array, panel: Array, radius: float, sod: float
+) -> tuple[tuple[Array, ...], Callable[[float], Array]]:
+    """Pixels about a ball's image, as an index, and what part of light passes it there.
+
+    Args:
+        ball: its centre [mm]; centre: of its image [px].
+        panel: as of `places`.
+        radius: [mm].
+        sod: of the axis [mm].
+
+    Returns:
+        The index, and a function of an attenuation [1/mm]: means of RAYS x RAYS rays.
+    """
+    middle, across, down = panel
+    reach = int(1.3 * radius * SDD / (0.7 * sod) / PIXEL)
+    n = 2 * reach + 1
+    fine = (np.arange(RAYS * n) + 0.5) / RAYS - 0.5 - reach
+    column, row = np.rint(centre).astype(int)
+    a = (column + fine - (SHAPE[1] - 1) / 2)[None, :, None]
+    b = (row + fine - (SHAPE[0] - 1) / 2)[:, None, None]
+    ray = middle + a * across + b * down
+    ray /= np.linalg.norm(ray, axis=2, keepdims=True)
+    chord = 2 * np.sqrt(np.maximum(radius**2 - ball @ ball + (ray @ ball) ** 2, 0.0))
+    columns, rows = (c - reach + np.arange(n) for c in (column, row))
+    ok = (
+        ((rows >= 0) & (rows < SHAPE[0])).nonzero()[0],
+        ((columns >= 0) & (columns < SHAPE[1])).nonzero()[0],
+    )
+
+    def passed(attenuation: float) -> Array:
+        part = np.exp(-attenuation * chord).reshape(n, RAYS, n, RAYS).mean(axis=(1, 3))
+        return np.asarray(part[np.ix_(*ok)])
+
+    return np.ix_(rows[ok[0]], columns[ok[1]]), passed
+
+
+def axis_in_image(truth: Mapping[str, float], angle: float = 0.0) -> dict[str, float]:
+    """Where the rotation axis appears: its column in the middle row [px], and its angle [deg]."""
+    axis = np.array([truth["tau_x"], truth["tau_z"], 0.0])
+    ends = np.array([axis - [0, 0, 9], axis + [0, 0, 9]])
+    ((low, high),) = pixels(ends, np.array([angle]), SOD, truth)
+    slope = (high[0] - low[0]) / (low[1] - high[1])
+    column = low[0] + slope * (low[1] - (SHAPE[0] - 1) / 2)
+    return {"axis_column": column, "axis_angle": math.degrees(math.atan(slope))}
 
 
 def drawn(rng: np.random.Generator, wider: float, skewed: bool) -> dict[str, float]:
@@ -156,11 +190,7 @@ def scan(
     turn = np.radians(angles)
     poses = [Poses.upright([0, 0, 0], [0, s, 0], [0, SDD, 0], PIXEL, turn) for s in sods]
     priors = exact() if sure else ASSUMED
-    axis = np.array([truth["tau_x"], truth["tau_z"], 0.0])
-    ((low, high),) = pixels(np.array([axis - [0, 0, 9], axis + [0, 0, 9]]), angles[:1], SOD, truth)
-    slope = (high[0] - low[0]) / (low[1] - high[1])
-    column = low[0] + slope * (low[1] - (SHAPE[0] - 1) / 2)
-    seen = {"axis_column": column, "axis_angle": math.degrees(math.atan(slope))}
+    seen = axis_in_image(truth, float(angles[0]))
     if images:
         scans = [
             Scan(ArrayFrames(radiographs(rng, beads, angles, s, truth), SHAPE), p, str(s))
