@@ -25,7 +25,7 @@ const unit = (name: string) => (name === "angle_scale" ? "" : /^(alpha|det_|axis
 const MEANS: Record<string, string | undefined> = {
   dO_x: "axis sideways", dO_y: "axis height", dO_z: "source to axis", alpha: "start angle", tau_x: "sample off the axis, sideways", tau_z: "sample off the axis, along the beam",
   dD_x: "detector sideways", dD_y: "detector height", dD_z: "source to detector", dS_x: "focal spot sideways", dS_y: "focal spot height",
-  axis_column: "image of the axis, column", axis_angle: "image of the axis, angle", magnification: "magnification",
+  axis_column: "image of the axis, column", axis_angle: "image of the axis, angle",
   det_roll: "detector roll", det_pitch: "detector pitch", det_yaw: "detector yaw", axis_tilt_x: "axis towards the detector", axis_tilt_z: "axis sideways tilt", angle_scale: "scale of angles",
 };
 // Decimals that leave `digits` significant ones.
