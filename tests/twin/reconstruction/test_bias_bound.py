@@ -14,18 +14,15 @@ from flexdt.twin.reconstruction import bias_of, fdk_parts, truncation_of
 SHAPE = (24, 48)
 
 
-@pytest.mark.parametrize(
-    "first", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (8, 16, 24, 32))]
-)
-def test_even_regions_are_within_the_bound(first: int) -> None:
-    """Of drawn scans, 19 of 20; the study draws hundreds."""
-    within = []
-    for number in range(first, first + (8 if first else 3)):
-        scan = bias_bound.drawn(3, number)
-        found = bias_bound.judged(scan)
-        excess = np.abs(found.errors) - 3.0 * found.noise
-        within += (excess <= found.bounds).tolist()
-    assert np.mean(within) >= 0.95
+@pytest.mark.parametrize("count", [3, pytest.param(24, marks=pytest.mark.slow)])
+def test_even_regions_are_within_the_bound(count: int) -> None:
+    """As the study asks of its hundreds: all but one of fifty, of scans that chose no constant."""
+    excess = []
+    for number in range(count):
+        found = bias_bound.judged(bias_bound.drawn(7, number))
+        excess += (np.abs(found.errors) - 3.0 * found.noise - found.bounds).tolist()
+    assert len(excess) >= 15 * count
+    assert np.mean(np.array(excess) <= 0.0) >= 0.98
 
 
 def scan_of(angles: np.ndarray, sod: float = 200.0, aside: float = 0.0) -> ConeVec:
