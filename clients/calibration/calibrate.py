@@ -269,7 +269,8 @@ def calibrate_datasets(
     result = replace(result, findings=(*result.findings, *saturated))
     seconds = time.perf_counter() - start
     document = calibration_document(result, seconds) | told
-    document["next"] = next_commands(result, [d.where for d in datasets], target.name)
+    given = phantom if isinstance(phantom, str) else target.name
+    document["next"] = next_commands(result, [d.where for d in datasets], given)
     if result.identifiable and result.motions:
         document["motion"] = [m.to_dict() for m in result.motions]
         datasets = [d.with_motion(m) for d, m in zip(datasets, result.motions, strict=True)]
@@ -337,6 +338,7 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
         "iterations": None,
         "frames": frames,
         "detections": result.detections,
+        "expected": frames * len(result.model),
         "outliers": [],
         "seconds": round(seconds, 4),
         "problems": [

@@ -41,9 +41,11 @@ def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> s
         return f"Not to be used: {why[0]}."
     column = max((q["axis_column"] for q in seen), key=lambda e: e.sigma)
     use = "Safe to reconstruct" if column.sigma <= SHARP_PX else "Too uncertain for a sharp volume"
+    if result.fit.panel is not None:
+        use += " with this correction, which undoes the panel's distortion"
     if any(f.code == "saturated" for f in result.findings):
         use = "Geometry to be used, images not to be reconstructed (the flat field is saturated)"
-    first = f"{use}: the rotation axis is known to {column.sigma:.1g} px."
+    first = f"{use}: the rotation axis is known to {rounded_up(column.sigma)} px."
     lengths = {
         n: e for n, e in result.fit.certificate.estimates.items() if e.asked and e.unit == "mm"
     }
@@ -65,13 +67,24 @@ def next_commands(result: Calibration, data: Sequence[str], phantom: str) -> lis
         free = ",".join(name for name, e in estimates.items() if e.asked)
         lines = NEXT.get(result.errors[0].code, (_COMPARE,))
         return [line.format(data=names, phantom=shlex.quote(phantom), free=free) for line in lines]
+    target = shlex.quote(phantom)
+    use = [
+        f"flexdt calibrate {names} --phantom {target} --report calibration.json",
+        "flexdt reconstruct SAMPLE --correction calibration.json --out volume.tif",
+    ]
     if result.identifiable and not any(_by_priors(e) for e in asked):
-        return []
+        return use
     sod = float(result.scans[0].poses.sod.mean())
     places = f"--position {sod:.0f} --position {ELSEWHERE * sod:.0f}"
-    return [
+    closer = [
         f"flexdt script new --kind calibration {places} --out two-places.txt",
-        f"flexdt calibrate PLACE-1 PLACE-2 --phantom {shlex.quote(phantom)}",
+        f"flexdt calibrate PLACE-1 PLACE-2 --phantom {target}",
+    ]
+    if not result.identifiable:
+        return closer
+    return [
+        *use,
+        *(f"{line}  # for the absolute position, which volumes do not need" for line in closer),
     ]
 
 
@@ -84,6 +97,14 @@ def digits(value: float | None, sigma: float | None) -> str:
     if value is None or sigma is None or not sigma > 0:
         return "-"
     return f"{value:.{min(max(1 - math.floor(math.log10(sigma)), 0), 9)}f}"
+
+
+def rounded_up(sigma: float) -> str:
+    """A sigma to one digit, never a smaller one: 0.012 is 0.02."""
+    if not sigma > 0:
+        return "0"
+    place = math.floor(math.log10(sigma))
+    return f"{math.ceil(sigma / 10.0**place) * 10.0**place:.1g}"
 
 
 def ranges(numbers: Iterable[int]) -> str:

@@ -10,7 +10,7 @@ import pytest
 from typer.main import get_command
 
 import flexdt as fx
-from flexdt.clients.calibration.verdict import NEXT, digits, ranges
+from flexdt.clients.calibration.verdict import NEXT, digits, ranges, rounded_up
 from flexdt.clients.cli.command_tree import build
 from flexdt.clients.cli.commands.calibrate_commands import show
 
@@ -24,7 +24,7 @@ def data() -> fx.DataSet:
 
 def known(line: str) -> None:
     """The command and its options exist."""
-    words = shlex.split(line)
+    words = shlex.split(line, comments=True)
     assert words.pop(0) == "flexdt"
     command: Any = get_command(build())
     while words and words[0] in getattr(command, "commands", {}):
@@ -37,9 +37,9 @@ def known(line: str) -> None:
 def test_a_good_calibration_says_what_it_is_good_for(data: fx.DataSet) -> None:
     document: Any = data.calibrate("lego").document
     (seen,) = document["image_space"]
-    sigma = seen["axis_column"]["sigma"]
+    sigma = rounded_up(seen["axis_column"]["sigma"])
     assert document["verdict"].startswith(
-        f"Safe to reconstruct: the rotation axis is known to {sigma:.1g} px. Absolute position: to "
+        f"Safe to reconstruct: the rotation axis is known to {sigma} px. Absolute position: to "
     )
     asked = {n: p for n, p in document["parameters"].items() if p["asked"] and p["unit"] == "mm"}
     widest = max(asked, key=lambda name: asked[name]["sigma"])
@@ -83,7 +83,7 @@ def test_marks_that_were_left_out_are_named() -> None:
     for at, by in moved.items():
         assert found[at] == pytest.approx(np.hypot(*by), abs=0.6)
     text = "\n".join(show(document))
-    assert "2 left out" in text
+    assert "2 of these left out" in text
     assert "bead 0 of frames 15" in text
     assert "bead 2 of frames 7" in text
 
@@ -94,6 +94,14 @@ def test_ranges_hold_the_numbers(seed: int) -> None:
     numbers = set(rng.integers(0, 30, 12).tolist())
     words = [word.split("-") for word in ranges(numbers).split(", ")]
     assert {n for a, *b in words for n in range(int(a), int(b[0] if b else a) + 1)} == numbers
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_rounded_sigma_is_never_a_smaller_one(seed: int) -> None:
+    for sigma in 10.0 ** np.random.default_rng(seed).uniform(-8.0, 2.0, 50):
+        said = float(rounded_up(float(sigma)))
+        assert 1.0 - 1e-9 <= said / sigma <= 2.0
+        assert len(f"{said:e}".partition("e")[0].rstrip("0.").replace(".", "")) == 1
 
 
 def test_digits_are_those_of_the_sigma() -> None:

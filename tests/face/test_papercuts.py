@@ -132,10 +132,10 @@ def test_messages_are_ours_and_not_a_librarys() -> None:
 def test_a_calibration_without_a_fit_prints_no_figures() -> None:
     out = "\n".join(show(
         {"verdict": "Not to be used: no beads.", "parameters": {}, "frames": 12, "detections": 3,
-         "rms_px": None, "outliers": [], "seconds": 0.5, "weak": []}
+         "expected": 60, "rms_px": None, "outliers": [], "seconds": 0.5, "weak": []}
     ))  # fmt: skip
     assert "None" not in out
-    assert "12 frames, 3 beads seen: no fit" in out
+    assert "12 frames, 3 of 60 beads seen: no fit" in out
 
 
 def test_calibrate_without_a_phantom_lists_them(capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 
 from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model, spot_radii
 from flexdt.twin.calibration.detect.detection import SpotFinder
+from flexdt.twin.calibration.detect.lag import Lag, lag_of, without_lag
 from flexdt.twin.calibration.detect.refine import FEW_WINDOWS, Refined, contrast_of, measure_beads
 from flexdt.twin.calibration.detect.windows import mended, plan_windows
 from flexdt.twin.calibration.diagnose.data import (
@@ -32,6 +33,7 @@ from flexdt.twin.calibration.diagnose.fitted import (
     explain_residuals,
     judge_body,
     judge_first_size,
+    judge_lag,
     judge_offsets,
     judge_places,
     judge_size,
@@ -175,6 +177,7 @@ class Calibration:
         scans: what was calibrated, with the motion found in their poses.
         model: the phantom's beads.
         motion: what was found to move; None if it was not asked for.
+        lags: of the camera in each scan, taken out of what was measured.
     """
 
     fit: FitResult | None
@@ -185,6 +188,7 @@ class Calibration:
     scans: tuple[Scan, ...]
     model: BeadModel
     motion: MotionFit | None = None
+    lags: tuple[Lag, ...] = ()
 
     @property
     def motions(self) -> tuple[Motion, ...]:
@@ -280,6 +284,7 @@ def calibrate(
         if want.known_sizes:
             findings += _sizes(state, fit)
         findings += _given(judge_body(state.measured))
+        findings += [judge_lag(lag) for lag in state.lags if lag.seen]
         if want.per_frame:
             state, fit = _with_motion(state, want, fit)
     implausible = judge_offsets(fit)
@@ -562,6 +567,7 @@ def _second_look(
     With few frames the first fit is rough, so that a draft comes before the measurement.
     """
     iterations = 0
+    lags = [Lag() for _ in state.scans]
     windows = sum(len(s.frames) for s in state.scans) * len(state.model)
     draft = windows <= FEW_WINDOWS
     for _ in range(4):
@@ -573,12 +579,15 @@ def _second_look(
             model = BeadModel(fit.beads, state.model.bead_radius_mm)
             plan = plan_windows(model, cone, scan.frames.shape)
             contrast = contrast_of([look.detections.contrast for look in state.looks[g]])
-            images = scan.frames.windows(plan)
+            if not state.measured:
+                lags[g] = lag_of(scan.frames, plan)
+            seen = lags[g].seen
+            images = without_lag(scan.frames, plan, lags[g]) if seen else scan.frames.windows(plan)
             images[[look.state is not FrameState.USABLE for look in state.looks[g]]] = np.nan
             images = mended(images, plan)
             measured.append(measure_beads(images, plan, cone, model, contrast, solids, draft=draft))
             plans.append(plan)
-        state = replace(state, measured=tuple(measured))
+        state = replace(state, measured=tuple(measured), lags=tuple(lags))
         fit = _fit(state, want, fit.group_parameters)
         iterations += fit.iterations
         for g, (scan, plan) in enumerate(zip(state.scans, plans, strict=True)):

@@ -116,7 +116,8 @@ def calibrate(
     for problem in document["problems"]:
         note(f"{problem['severity']}: {problem['text']} [{problem['code']}]")
     if not document["identifiable"]:
-        raise CommandError("not identifiable: these numbers must not be used", NOT_IDENTIFIABLE)
+        codes = ", ".join(p["code"] for p in document["problems"] if p["severity"] == "error")
+        raise CommandError(f"not to be used{codes and ': '}{codes}", NOT_IDENTIFIABLE)
     if push:
         _push(twin, outcome.correction, outcome.sources, document)
 
@@ -320,13 +321,17 @@ def show(document: Mapping[str, Any]) -> Iterator[str]:
     ]
     if rows:
         yield table(rows, ("in the images", "value", "sigma", "unit"))
-    seen = f"{document['frames']} frames, {document['detections']} beads seen"
+    beads = f"{document['detections']} of {document['expected']} beads"
+    seen = f"{document['frames']} frames, {beads} seen"
     if document["rms_px"] is None:
         yield f"{seen}: no fit, {_number(document['seconds'], 2)} s"
         return
-    yield table(parameter_rows(document), ("parameter", "value", "sigma", "of images", "unit"))
+    if document["identifiable"]:
+        heads = ("parameter", "value", "sigma", "of images", "unit")
+        yield table(parameter_rows(document), heads)
+        yield "(name): not asked for; of images: the part of sigma that is the images' noise"
     rms, seconds = _number(document["rms_px"], 4), _number(document["seconds"], 2)
-    yield f"{seen}, {len(document['outliers'])} left out, rms {rms} px, {seconds} s"
+    yield f"{seen}, {len(document['outliers'])} of these left out, rms {rms} px, {seconds} s"
     from flexdt.clients.calibration.verdict import ranges
 
     frames: dict[int, list[int]] = {}

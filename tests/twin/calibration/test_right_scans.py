@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import beam_faults
 import cv2
 import numpy as np
@@ -83,3 +85,31 @@ def test_faults_of_beam_and_detector_mislead_nobody(capsys: pytest.CaptureFixtur
     told = capsys.readouterr().out
     assert "of them refused: 0" in told, told
     assert "faults: 2, of them named: 2" in told, told
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [
+        ("lag", 2),  # was refused: residuals of 0.27 px
+        pytest.param("lag", 5, marks=pytest.mark.slow),
+        pytest.param("lag_in_aluminium", 3, marks=pytest.mark.slow),
+    ],
+)
+def test_lag_is_taken_out_and_said(kind: str, seed: int) -> None:
+    """Each frame shows part of the one before; how much is drawn."""
+    rng = np.random.default_rng([seed, *kind.encode()])
+    true = beam_faults.KINDS[kind][0](beam_faults.Laboratory(), rng).lag
+    found = beam_faults.scored(kind, seed)
+    assert found.offered
+    assert found.worst < 3.5
+    (said,) = (line for line in found.said if line.startswith("lag:"))
+    part = re.search(r"shows ([0-9.]+) % of the frame before", said)
+    assert part is not None
+    assert float(part[1]) / 100.0 == pytest.approx(true, rel=0.1)
+
+
+@pytest.mark.parametrize("kind", ["spectrum", "spectrum_aluminium"])
+def test_a_camera_without_lag_is_not_said_to_have_it(kind: str) -> None:
+    found = beam_faults.scored(kind, 1)
+    assert found.offered
+    assert not any(line.startswith("lag:") for line in found.said)

@@ -279,7 +279,8 @@ def _alternative(
     trials += [
         ("mirrored_phantom", "the phantom is the mirror image of its model", model.mirrored(),
          poses, detections),
-        ("angle_reversed", "the stage turns the other way than the angles say", model,
+        ("angle_reversed", "the stage turns the other way than the angles say: "
+         "negate the angles of the settings or of the geometry", model,
          replace(poses, angle=-poses.angle), detections),
         ("image_mirrored", "the images are mirrored left to right", model, poses,
          _flipped(detections, 0)),

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtri
 
+from flexdt.twin.calibration.detect.lag import Lag
 from flexdt.twin.calibration.detect.refine import Refined
 from flexdt.twin.calibration.diagnose.distortion import better_panel, distorted
 from flexdt.twin.calibration.diagnose.finding import Finding, Severity, error, warning
@@ -163,8 +164,9 @@ def judge_size(measured: Refined, radius_px: float) -> Finding | None:
 def _other_size(ratio: float, or_else: str = "") -> Finding:
     return error(
         "bead_size",
-        f"the shadows are {100 * (ratio - 1):+.0f} % off the size the phantom's beads cast at the "
-        f"fitted geometry: beads of another size, or a phantom of another scale{or_else}",
+        f"the shadows are {100 * abs(ratio - 1):.0f} % {'larger' if ratio > 1 else 'smaller'} than "
+        "those that the phantom's beads cast at the fitted geometry: beads of another size, or a "
+        f"phantom of another scale{or_else}",
     )
 
 
@@ -188,6 +190,16 @@ def judge_body(measured: Sequence[Refined]) -> Finding | None:
                 f"stands {x:+.2f}, {y:+.2f}, {z:+.2f} mm from there; it was subtracted so",
             )
     return None
+
+
+def judge_lag(lag: Lag) -> Finding:
+    """The camera shows part of the frame before."""
+    return warning(
+        "lag",
+        f"the camera still shows {100 * lag.part:.2g} % of the frame "
+        "before: it was taken out of what was measured here; a volume is blurred by it along the "
+        "turn, less so with a pause before each image",
+    )
 
 
 def explain_residuals(
@@ -245,14 +257,16 @@ def explain_residuals(
         explained = moving(fit, lambda motion: refit(motion=motion))
         if explained is not None:
             return fit, [*_lost_beads(fit), explained]
-        out.append(
+        # What else the residuals show has no meaning where no cause explains them.
+        return fit, [
+            *_lost_beads(fit),
             error(
                 "misfit",
-                f"the fit leaves residuals of {certificate.rms_px:.2f} px that follow no known "
-                "cause (angles, bead positions): the numbers cannot be trusted; if something moves "
-                "during the scan, name it: --per-frame dO_x,dO_y,alpha",
-            )
-        )
+                f"the fit leaves residuals of {certificate.rms_px:.2f} px, and no cause that is "
+                "looked for explains them: check that nothing is loose, or let frames differ, "
+                "--per-frame dO_x,dO_y,alpha",
+            ),
+        ]
     return fit, out
 
 
