@@ -2,7 +2,8 @@
 
 SIRT, SART (ordered subsets), CGLS and EM (maximum likelihood for positive data). Each algorithm is
 one function; all see geometry through `forward` and `back` only. Everything is held in memory. The
-caller chooses the number of iterations; there is no stopping rule.
+caller chooses the number of iterations. SIRT and SART weigh line integrals by variances that are
+given, and then end once what is left is no more than that noise.
 
 A `LinearSystem` is what every method has in hand: data, geometry and grid, and the matched pair of
 operators on plain arrays. Where a CUDA device has room for all that a method holds, the same method
@@ -65,11 +66,19 @@ Watch = Callable[[Step], None]
 
 @dataclass(frozen=True, eq=False)
 class LinearSystem:
-    """Data, geometry and grid, with the pair of operators on plain arrays."""
+    """Data, geometry and grid, with the pair of operators on plain arrays.
+
+    Attributes:
+        measured: (n, rows, cols) line integrals.
+        geometry: n views.
+        like: the grid.
+        weights: (n, rows, cols) one over the variances of the line integrals; None: all alike.
+    """
 
     measured: Float32Array
     geometry: ConeVec
     like: Volume
+    weights: Float32Array | None = None
 
     @classmethod
     def of(
@@ -78,11 +87,12 @@ class LinearSystem:
         cone_vec: ConeVec | npt.ArrayLike,
         like: Volume | Grid,
         iterations: int,
+        variances: npt.ArrayLike | None = None,
     ) -> LinearSystem:
         """From checked arguments.
 
         Raises:
-            GeometryError: no views, or shapes that do not fit.
+            GeometryError: no views, shapes that do not fit, or variances that are not above 0.
             LimitError: no iterations.
         """
         if iterations < 1:
@@ -97,7 +107,17 @@ class LinearSystem:
         values = check_projections(projections, len(geometry))
         require_finite(values)
         geometry.of_shape((values.shape[1], values.shape[2]))
-        return cls(values, geometry, as_volume(like))
+        weights = None
+        if variances is not None:
+            spread = np.asarray(variances, dtype=np.float32)
+            if spread.shape != values.shape or not (np.isfinite(spread) & (spread > 0.0)).all():
+                raise GeometryError(
+                    f"variances of shape {spread.shape}, least {spread.min(initial=np.inf):g}; "
+                    f"allowed: one above 0 for each line integral, {values.shape}",
+                    {"asked": list(spread.shape), "allowed": list(values.shape)},
+                )
+            weights = 1.0 / spread
+        return cls(values, geometry, as_volume(like), weights)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -132,15 +152,23 @@ class LinearSystem:
         """Memory for the adjoint."""
         return room_like(self.like)
 
-    def inverse_sums(self, geometry: ConeVec) -> tuple[Float32Array, Float32Array]:
-        """Inverse sums of the projector's rows and columns, zero where (nearly) nothing is."""
-        rows = self.project(ones(self.first(None)), geometry)
-        columns = self.spread(ones(rows), geometry)
-        return inverse(rows), inverse(columns)
+    def scales(self, views: slice | npt.NDArray[np.intp]) -> tuple[Float32Array, Float32Array]:
+        """Factors of the residuals of some views, and of what they add to the voxels.
 
-    def part(self, views: slice | npt.NDArray[np.intp]) -> Float32Array:
-        """The measured line integrals of some views."""
-        return self.measured[views]
+        Without weights inverse sums of the projector's rows and columns. With weights those, and
+        one over the curvature of a paraboloid above the weighted squares, which no step overshoots
+        (Erdogan and Fessler 1999). Zero where (nearly) nothing is.
+        """
+        geometry = self.geometry[views]
+        rows = self.project(ones(self.first(None)), geometry)
+        if self.weights is None:
+            return inverse(rows), inverse(self.spread(ones(rows), geometry))
+        weights = self.part(self.weights, views)
+        return weights, inverse(self.spread(weights * rows, geometry))
+
+    def part(self, images: Any, views: slice | npt.NDArray[np.intp]) -> Any:
+        """Some views of images."""
+        return images[views]
 
     def volume(self, x: Float32Array) -> Volume:
         """The voxels that were found, on their grid."""
@@ -166,7 +194,11 @@ class DeviceProblem(LinearSystem):
     def of_host(cls, problem: LinearSystem) -> DeviceProblem:
         """With the line integrals moved there, unless they are there."""
         there: Any = DeviceArray.of_images(problem.measured)
-        return cls(there, problem.geometry, problem.like, not gpu.is_there(problem.measured))
+        weights: Any = problem.weights
+        if weights is not None:
+            weights = DeviceArray.of_images(weights)
+        home = not gpu.is_there(problem.measured)
+        return cls(there, problem.geometry, problem.like, weights, home)
 
     def first(self, start: Volume | None) -> Any:
         """See `LinearSystem`."""
@@ -185,10 +217,9 @@ class DeviceProblem(LinearSystem):
         found: Any = back(y.images, geometry, self.like)
         return DeviceArray.of_volume(found)
 
-    def part(self, views: slice | npt.NDArray[np.intp]) -> Any:
+    def part(self, images: Any, views: slice | npt.NDArray[np.intp]) -> Any:
         """See `LinearSystem`."""
-        all_of_them: Any = self.measured
-        return all_of_them if isinstance(views, slice) else all_of_them.images_of(views)
+        return images if isinstance(views, slice) else images.images_of(views)
 
     def volume(self, x: Any) -> Any:
         """See `LinearSystem`; a `DeviceVolume` where the images were on the device."""
@@ -243,18 +274,24 @@ def sirt(
     iterations: int = 50,
     start: Volume | None = None,
     nonnegative: bool = False,
+    variances: npt.ArrayLike | None = None,
     watch: Watch | None = None,
 ) -> Volume:
     """Simultaneous iterative reconstruction: x += C A' R (b - A x), R and C inverse row and
     column sums. The residual weighted with R never grows.
 
+    With `variances`, weighted least squares: R holds one over them, C one over the curvature. It
+    ends with the first iteration that finds no more than noise left: squares over variances that
+    are 1 in the mean.
+
     Args:
         projections: (n, rows, cols) line integrals.
         cone_vec: ConeVec or (n, 12) [mm].
         like: the grid, or a volume on it, whose values are not used.
-        iterations: how many.
+        iterations: how many; with `variances` at most.
         start: first guess on the same grid; zero by default.
         nonnegative: clip at zero after each iteration.
+        variances: (n, rows, cols) of the line integrals; of N photons counted, about 1 / N.
         watch: called in every iteration.
 
     Returns:
@@ -275,7 +312,7 @@ def sirt(
         >>> bool(abs(found.data - 0.02).max() < 0.002)
         True
     """
-    problem = LinearSystem.of(projections, cone_vec, like, iterations)
+    problem = LinearSystem.of(projections, cone_vec, like, iterations, variances)
     return solved(
         problem,
         lambda p: _subset_steps(p, [slice(None)], 1.0, iterations, start, nonnegative, watch),
@@ -292,12 +329,13 @@ def sart(
     relaxation: float = 0.7,
     start: Volume | None = None,
     nonnegative: bool = False,
+    variances: npt.ArrayLike | None = None,
     watch: Watch | None = None,
 ) -> Volume:
     """SIRT's step on one subset of views after another: faster at first, noisier in the end.
 
     Args:
-        projections, cone_vec, like, start, nonnegative, watch: as for `sirt`.
+        projections, cone_vec, like, start, nonnegative, variances, watch: as for `sirt`.
         iterations: passes through all views.
         subsets: number of subsets; each takes every k-th view, so it sees all directions.
         relaxation: part of each step that is taken.
@@ -310,7 +348,7 @@ def sart(
         >>> bool(abs(found.data - 0.02).max() < 0.002)
         True
     """
-    problem = LinearSystem.of(projections, cone_vec, like, iterations)
+    problem = LinearSystem.of(projections, cone_vec, like, iterations, variances)
     count = min(subsets, len(problem.geometry))
     if count < 1 or not 0.0 < relaxation < 2.0:
         raise LimitError(
@@ -335,20 +373,24 @@ def _subset_steps(
     watch: Watch | None,
 ) -> Volume:
     """SIRT's step on the views of one part after another, for each iteration."""
-    sums = [problem.inverse_sums(problem.geometry[part]) for part in parts]
+    sums = [problem.scales(part) for part in parts]
+    weighted = problem.weights is not None
     x = problem.first(start)
     for i in range(iterations):
-        squares = 0.0
+        squares = noise = 0.0
         for part, (rows, columns) in zip(parts, sums, strict=True):
             geometry = problem.geometry[part]
-            rest = problem.part(part) - problem.project(x, geometry)
+            rest = problem.part(problem.measured, part) - problem.project(x, geometry)
             squares += 0.0 if watch is None else dot(rest, rest)
-            rest *= rows
-            x = x + np.float32(relaxation) * columns * problem.spread(rest, geometry)
+            scaled = rows * rest
+            noise += dot(rest, scaled) if weighted else 0.0
+            x = x + np.float32(relaxation) * columns * problem.spread(scaled, geometry)
             if nonnegative:
                 np.maximum(x, 0.0, out=x)
         if watch is not None:
             watch(Step(i + 1, iterations, float(np.sqrt(squares / problem.measured.size))))
+        if weighted and noise <= problem.measured.size:
+            break
     return problem.volume(x)
 
 

@@ -265,7 +265,9 @@ class _Objective:
         for k in far_apart(count):
             part = np.arange(k, n, count)
             geometry = self.problem.geometry[part]
-            rest = self.problem.project(x, geometry) - self.problem.part(part)
+            rest = self.problem.project(x, geometry) - self.problem.part(
+                self.problem.measured, part
+            )
             x -= np.float32(step * n / len(part)) * self.problem.spread(rest, geometry)
         return self.regular.proximal(x, count * step * self.strength)
 

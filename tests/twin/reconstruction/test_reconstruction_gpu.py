@@ -135,6 +135,7 @@ with gpu.switched_off():
     images = forward(volume, scan, (5, 6))
 for method, options in (
     (sirt, {"nonnegative": True, "start": start}), (sart, {"subsets": 2}),
+    (sart, {"subsets": 2, "variances": 1e-9 * (0.1 + rng.random(images.shape))}),
     (cgls, {"start": start}), (em, {"start": start}), (tv, {"tolerance": 0, "weight": 0.05}),
     (tv, {"tolerance": 0, "weight": 0.3, "mask": data > 0.3, "nonnegative": False, "subsets": 2}),
 ):

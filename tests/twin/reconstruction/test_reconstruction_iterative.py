@@ -65,6 +65,49 @@ def test_cgls_solves_least_squares():
     )
 
 
+def test_weights_solve_weighted_least_squares():
+    """Beside the explicit matrix, with and without ordered subsets."""
+    rng = np.random.default_rng(4)
+    like, scan, shape = Grid((3, 3, 3), 4.0).blank(), circle(8, pixel=3.0), (9, 9)
+    unit = np.eye(27, dtype=np.float32).reshape(27, 3, 3, 3)
+    matrix = np.array([forward(Volume(u, 4.0), scan, shape).ravel() for u in unit], float).T
+    true = rng.uniform(0.01, 0.05, 27)
+    variances = 10.0 ** rng.uniform(-4, -1, matrix.shape[0])
+    data = matrix @ true + rng.normal(0.0, np.sqrt(variances))
+    root = 1.0 / np.sqrt(variances)
+    wanted = np.linalg.lstsq(root[:, None] * matrix, root * data, rcond=None)[0]
+    even = np.linalg.lstsq(matrix, data, rcond=None)[0]
+    images, given = (a.reshape(8, *shape).astype(np.float32) for a in (data, variances))
+    # Smaller variances, of the same ratios: or it would end at the noise, before the solution.
+    found = sirt(images, scan, like, iterations=3000, variances=0.01 * given).data.ravel()
+    assert np.abs(found - wanted).max() < 0.02 * np.abs(even - wanted).max()
+    exact = (matrix @ true).reshape(8, *shape).astype(np.float32)
+    subsets = sart(exact, scan, like, iterations=300, subsets=4, variances=1e-9 * given)
+    np.testing.assert_allclose(subsets.data.ravel(), true, atol=2e-4)
+
+
+@pytest.mark.parametrize("method", [sirt, sart])
+def test_weighted_iterations_end_at_the_noise(images, method):
+    rng = np.random.default_rng(5)
+    variances = 10.0 ** rng.uniform(-5, -3, images.shape)
+    noisy = (images + rng.normal(0.0, np.sqrt(variances))).astype(np.float32)
+    steps = []
+    found = method(noisy, SCAN, LIKE, iterations=200, variances=variances, watch=steps.append)
+    assert 2 < len(steps) < 200
+
+    def left(volume):
+        return float(((noisy - forward(volume, SCAN, SHAPE)) ** 2 / variances).mean())
+
+    assert left(found) <= 1.0
+    assert (
+        method is sart
+        or left(method(noisy, SCAN, LIKE, iterations=len(steps) - 2, variances=variances)) > 1.0
+    )
+    for wrong in (variances[1:], 0.0 * variances, -variances):
+        with pytest.raises(GeometryError, match="above 0 for each line integral"):
+            method(noisy, SCAN, LIKE, variances=wrong)
+
+
 def test_any_trajectory_will_do():
     rows = SCAN.rows.copy()
     rows[:, [2, 5]] += np.linspace(-12, 12, len(rows))[:, None]  # a helix
