@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from scipy.ndimage import shift
 
+from flexdt import long_work
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.expose import image_doubts
 from flexdt.twin.calibration.fit.priors import prior_widths
@@ -98,10 +99,11 @@ def align_dataset(data: DataSet, per_frame: bool = False) -> Aligned:
     data = replace(data, warnings=tuple(doubts))
     base = NOMINAL if data.correction is None else data.correction.parameters
     frames, poses = _at_rest(data)
-    found = align_turn(
-        frames, poses, data.present, data.shape, base,
-        prior_widths(data.machine, data.profile), np.random.default_rng(0), per_frame,
-    )  # fmt: skip
+    with long_work.during("aligning"):
+        found = align_turn(
+            frames, poses, data.present, data.shape, base,
+            prior_widths(data.machine, data.profile), np.random.default_rng(0), per_frame,
+        )  # fmt: skip
     document: dict[str, object] = {
         "identifiable": found.identifiable,
         "parameters": {name: told._asdict() for name, told in found.parameters.items()},

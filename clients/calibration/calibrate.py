@@ -18,6 +18,7 @@ from typing import Final, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from flexdt import long_work
 from flexdt.clients.calibration.markers import (
     Mark,
     Scale,
@@ -264,7 +265,8 @@ def calibrate_datasets(
                 Scan(f, d.poses, d.name, prior_widths(d.machine, d.profile))
                 for f, d in zip(frames, datasets, strict=True)
             ]
-            result = calibrate(scans, target, want, detector=sought)
+            with long_work.during("calibrating"):
+                result = calibrate(scans, target, want, detector=sought)
     saturated = [f for d in datasets if (f := saturation(d)) is not None]
     result = replace(result, findings=(*result.findings, *saturated))
     seconds = time.perf_counter() - start

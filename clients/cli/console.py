@@ -102,7 +102,7 @@ def size(count: float) -> str:
     return f"{count:.1f} TB"
 
 
-PLAIN_INTERVAL_S = 5.0
+PLAIN_INTERVAL_S = 2.0
 
 
 class ProgressBar:

@@ -85,7 +85,7 @@ def test_plain_progress_counts_and_estimates(capsys: pytest.CaptureFixture[str])
     assert captured.out == ""
     assert captured.err.splitlines() == [
         "scanning ...",
-        "scanning: 25 of 100 frames (25 %), about 30.0 s left",
+        f"scanning: 25 of 100 frames (25 %), about {6 * PLAIN_INTERVAL_S:.1f} s left",
     ]
 
 

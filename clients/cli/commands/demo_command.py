@@ -17,6 +17,7 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from flexdt import long_work
 from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
 from flexdt.clients.cli.commands.calibrate_commands import (
     parameter_rows,
@@ -104,11 +105,12 @@ def run_demo(
         truth = hidden.read(path)
         options = {"data": data.absolute(), "truth": path.absolute(), "speed-up": "max"}
         tell("starting the servers; the very first start compiles the projector's kernels")
-        with (
+        with contextlib.ExitStack() as running:
             # What calibration and reconstruction need, beside the servers' start and the scan.
-            compile_ahead.start(compile_ahead.ANALYSIS) as compiling,
-            Servers(options, out / "servers.log", viewer=stay is not None) as servers,
-        ):
+            compiling = running.enter_context(compile_ahead.start(compile_ahead.ANALYSIS))
+            servers = Servers(options, out / "servers.log", viewer=stay is not None)
+            with long_work.during("starting the servers"):
+                running.enter_context(servers)
             host, port = servers.address
             tell(f"twin on {host}:{port}, projector beside it, log in {out / 'servers.log'}")
             if servers.viewer_url is not None:
@@ -130,7 +132,6 @@ def _stages(
     tell: Tell,
 ) -> dict[str, object]:
     from flexdt.clients.client.client import TwinClient
-    from flexdt.progress_lines import SILENT_S
 
     with TwinClient(*servers.address) as client:
         folder, seconds = scan(client, name, data, tell)
@@ -140,12 +141,8 @@ def _stages(
             "frames": len(dataset.frames),
             "scan_s": round(seconds, 3),
         }
-        begun = time.monotonic()
-        while compiling.poll() is None:
-            waited = time.monotonic() - begun
-            tell(f"still compiling the kernels of calibration and reconstruction ({waited:.0f} s)")
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                compiling.wait(SILENT_S)
+        with long_work.during("compiling the kernels of calibration and reconstruction"):
+            compiling.wait()
         outcome, seconds = calibrate(dataset, tell)
         push_correction(client, outcome.correction, outcome.sources)
         tell(f"correction in force on the twin: {outcome.correction.name}")
@@ -218,7 +215,8 @@ def preview(dataset: DataSet, outcome: Outcome, out: Path, tell: Tell) -> dict[s
 
     fit = outcome.calibration.fit
     assert fit is not None
-    document = reconstruct(dataset, out, parameters=fit.parameters)
+    with long_work.during("making a preview"):
+        document = reconstruct(dataset, out, parameters=fit.parameters)
     tell(f"preview {out}: {duration(document['seconds'])}")
     return document
 
