@@ -46,7 +46,7 @@ from tests.support.phantom_texts import SCENE_FILE
 
 SHAPE = (48, 64)
 PIXEL = 0.4
-SHARP = Detector.ideal(bits=16, electrons_per_count=800.0)
+SHARP = Detector.ideal(bits=16, electrons_per_count=800.0, response=())
 SCENE = [
     {"kind": "cylinder", "center": [0, 0, 0], "radius": 6, "height": 40, "material": "pmma"},
     {"kind": "sphere", "center": [0, 0, 0], "radius": 1.5, "material": "Al@2.70",
@@ -186,12 +186,16 @@ def mu(formula: str, density: float) -> np.ndarray:
     return sum(m / total * table.total[table.elements[s]] for s, m in mass.items()) * density / 10
 
 
-def test_noise_has_the_variance_of_a_compound_poisson_process() -> None:
+@pytest.mark.parametrize("ideal", [True, False])
+def test_noise_has_the_variance_of_a_compound_poisson_process(ideal: bool) -> None:
+    """Of a scintillator, and of an ideal detector, in which every photon leaves all it has."""
     one = ConeVec.from_vectors([0, -300, 0], [0, 200, 0], [PIXEL, 0, 0], [0, 0, -PIXEL])
     cone = ConeVec(np.repeat(one.rows, 120, axis=0))
+    gain = 400.0 if ideal else 100.0
     detector = Detector.ideal(
-        bits=16, electrons_per_count=100.0, read_noise_e=3e4, averages=2, exposure_ms=20.0
-    )
+        bits=16, electrons_per_count=gain, read_noise_e=3e4, averages=2, exposure_ms=20.0,
+        **({} if ideal else {"response": (), "swank": 0.9}),
+    )  # fmt: skip
     slab = {"kind": "box", "center": [0, 0, 0], "size": [200, 4, 200], "material": "pmma"}
     scan = simulate(slab, cone, tube=Tube(kV=60, spot_mm=0.0), detector=detector, noise=5,
                     shape=SHAPE)  # fmt: skip
@@ -203,13 +207,14 @@ def test_noise_has_the_variance_of_a_compound_poisson_process() -> None:
     flux = PIXEL**2 / 100 * (1000.0 * d / 500.0) ** 2 * d * (50 / 60 * 0.02)
     there = photons * behind * flux[..., None]
     kept = deposited(Filter(Substance.of("CsI", "CsI", 4.51 * 0.8), 0.15))
+    part, square = (1.0, 1.0) if ideal else (kept.mean, kept.square / 0.9)
     charge = 16.0 * energy
-    variance = there @ (kept.square * charge**2 / 0.9 + kept.mean * charge) / 2 + 3e4**2 / 2
-    in_counts = variance / 100.0**2 + 1.0 / 12.0
+    variance = there @ (square * charge**2 + part * charge) / 2 + 3e4**2 / 2
+    in_counts = variance / gain**2 + 1.0 / 12.0
     measured = scan.counts().astype(float).var(axis=0, ddof=1)
     assert (measured / in_counts).mean() == pytest.approx(1.0, abs=5 * np.sqrt(2 / 119 / 3072))
     mean = scan.counts().mean(axis=0) - 100.0
-    assert (mean / (there @ (kept.mean * charge) / 100.0)).mean() == pytest.approx(1.0, abs=1e-3)
+    assert (mean / (there @ (part * charge) / gain)).mean() == pytest.approx(1.0, abs=1e-3)
     again = simulate(slab, cone[:3], tube=Tube(kV=60, spot_mm=0.0), detector=detector, noise=5,
                      shape=SHAPE)  # fmt: skip
     # No view depends on the others.

@@ -193,7 +193,7 @@ def cupping() -> None:
     takes its own defaults. Cupping: what the mean within a quarter of the radius lacks of the mean
     between 0.7 and 0.85 of it, in the middle layer.
     """
-    detector = fx.Detector.ideal(bits=16)
+    detector = fx.Detector.ideal(bits=16, response=(), swank=0.9)  # caesium iodide
     truth = ScatterSettings(seed=77, error=0.01, voxels=100_000, nodes=1500, step_deg=10.0)
     for (sod, sdd), (material, radius), mono_keV in product(GAPS, CYLINDERS, (60.0, None)):
         geometry = fx.ConeVec.circular(sod=sod, sdd=sdd, angles=360, shape=(152, 191),

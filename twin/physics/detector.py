@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -149,20 +149,23 @@ class Detector:
             object.__setattr__(self, name, int(getattr(self, name)))
 
     @classmethod
-    def ideal(cls, **figures: float) -> Detector:
-        """A detector whose only noise is that of the X-rays: no blur, pattern, dark charge,
-        dead pixels or read noise; `figures` replace fields.
+    def ideal(cls, **figures: Any) -> Detector:
+        """A detector whose only noise is that of the X-rays: every photon leaves all of its energy,
+        and there is no blur, pattern, dark charge, dead pixel or read noise; `figures` replace
+        fields (`response=()`: that of its scintillator).
 
         Example:
-            >>> Detector.ideal(bits=16).blur_mm
-            0.0
+            >>> mean, _ = Detector.ideal(bits=16).charge_of_photons()
+            >>> bool(np.allclose(mean, tables().energy_keV * 16.0))
+            True
         """
         nothing = dict.fromkeys(
             ("read_noise_e", "dark_e_per_s", "blur_mm", "gain_sigma", "offset_sigma_counts",
              "dead_fraction"),
             0.0,
         )  # fmt: skip
-        return cls(**{**nothing, **figures})  # type: ignore[arg-type]
+        all_of_it = ((0.1, 0.1), (1e4, 1e4))
+        return cls(**{"swank": 1.0, "response": all_of_it, **nothing, **figures})
 
     def of_pixels(self, pixels: PixelGrid) -> Detector:
         """This detector with the pixels of a geometry, each with the charge that its area has.
