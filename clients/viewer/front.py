@@ -64,6 +64,7 @@ POLICY: Final = (
 
 PageHandler = Callable[[str, ServerConnection], Awaitable[None]]
 """Serves a page's connection until it ends: the page's id, the connection."""
+Still = Callable[[Mapping[str, str]], Awaitable[bytes | None]]
 Connect = Callable[[str, Subprotocol | None], AbstractAsyncContextManager[ClientConnection]]
 """A connection to viser for a frame's path and subprotocol."""
 
@@ -87,6 +88,7 @@ class Front:
         token: a browser must show it once (`/?token=...`); None for none.
         max_scenes: views open at a time.
         max_pages: pages open at a time; bounds connections, and `page` closes further pages.
+        still: answers `/still.jpg`, the scene as a picture, from the query; None: not yet.
     """
 
     def __init__(
@@ -98,6 +100,7 @@ class Front:
         token: str | None = None,
         max_scenes: int = 256,
         max_pages: int = 64,
+        still: Still | None = None,
     ) -> None:
         self._page, self._connect = page, connect
         self.doorkeeper = MessageFilter()
@@ -106,7 +109,7 @@ class Front:
         self._turn, self._relayed_at = asyncio.Lock(), 0.0
         self._guessing, self._closing = asyncio.Lock(), asyncio.Event()
         self.wrong_tokens = 0
-        self._downloads, self._token = downloads, token
+        self._downloads, self._token, self._still = downloads, token, still
         more = b"<style>%s</style><script>%s</script>" % (_data("scene.css"), _data("scene.js"))
         bare, self._program = parted(scene_html)
         self._program_path = f"/viser-{hashlib.sha256(self._program).hexdigest()[:16]}.js"
@@ -165,6 +168,11 @@ class Front:
             denied = self._foreign(request) or await self._stranger(connection, request, url)
         except (ValueError, LookupError):  # brackets, bytes or headers that belong nowhere
             return _plain(http.HTTPStatus.BAD_REQUEST, "this request cannot be read")
+        if denied is None and url.path == "/still.jpg" and self._still is not None:
+            picture = await self._still({k: v[-1] for k, v in parse_qs(url.query).items()})
+            if picture is None:
+                return _response(b"", "image/jpeg", status=http.HTTPStatus.NO_CONTENT)
+            return _kept(request, picture, "image/jpeg")
         return denied or self._content(request, url)
 
     def _content(self, request: Request, url: SplitResult) -> Response | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -120,7 +121,8 @@ def test_frames_are_gone_through_with_the_machine(page: Any, scans: Any) -> None
 def test_a_past_scan_is_reconstructed_and_gone_through(
     page: Any, scans: Any, twin: TwinClient, wait: Wait
 ) -> None:
-    """In two clicks, or with the reason why not; slices come by slider and wheel."""
+    """In two clicks, or with the reason why not; slices scroll by wheel, keys and drag without
+    asking, the value under the pointer is exact, and what no data cover is said."""
     find(page, "whole")
     page.locator(".data-set[data-name='whole scan']").click()
     shows(page, 2)
@@ -136,18 +138,46 @@ def test_a_past_scan_is_reconstructed_and_gone_through(
     # Its process is behind all others (nice), so that a busy machine makes it wait.
     page.locator("#volume-title", has_text="Volume of turned once").wait_for(timeout=400_000)
     page.locator("#volume-note", has_text="flexdt reconstruct --binning").wait_for(timeout=400_000)
-    at = page.locator("#at-top")
-    last = int(at.get_attribute("max"))
-    assert int(at.input_value()) == (last + 1) // 2
+    page.wait_for_function("flexdt.volume().three.block && flexdt.volume().solid")
+    nx, ny, nz = page.evaluate("flexdt.volume().told.size")
+    cross = "flexdt.volume().three.cross"
+    assert page.evaluate(cross) == [nx // 2, ny // 2, nz // 2]
+    page.locator("#slice-top").scroll_into_view_if_needed()
+    wait(lambda: page.locator("#slice-top").get_attribute("data-index") == str(nz // 2), "a slice")
     before = page.evaluate("document.querySelector('#slice-top').toDataURL()")
-    at.evaluate("e => { e.value = e.max; e.dispatchEvent(new Event('input')); }")
-    wait(lambda: page.locator("#slice-top").get_attribute("data-index") == str(last), "its slice")
-    assert page.evaluate("document.querySelector('#slice-top').toDataURL()") != before
+    sent = page.evaluate("flexdt.call('state.get').then(() => 0)")
+    page.locator("#slice-top").focus()
+    page.keyboard.press("PageUp")
+    page.keyboard.press("ArrowUp")
     page.locator("#slice-top").hover()
-    page.mouse.wheel(0, -100)
-    wait(lambda: page.locator("#slice-top").get_attribute("data-index") == str(last - 1), "wheel")
+    page.mouse.wheel(0, 100)
+    wait(lambda: page.evaluate(cross) == [nx // 2, ny // 2, nz // 2 + 10 + sent], "keys and wheel")
+    wait(lambda: page.evaluate("document.querySelector('#slice-top').toDataURL()") != before, "it")
+    box = page.locator("#slice-front").bounding_box()
+    page.mouse.move(box["x"] + box["width"] * 0.5, box["y"] + box["height"] * 0.5)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] * 0.25, box["y"] + box["height"] * 0.75)
+    page.mouse.up()
+    x, y, z = page.evaluate(cross)
+    assert (abs(x - nx / 4) < 2, y, abs(z - nz / 4) < 2) == (True, ny // 2, True)
+    page.locator("#volume-at", has_text=re.compile(r"mm  -?[\d.e-]{9,} per mm")).wait_for()
+    said = float(page.inner_text("#volume-at").split()[-3])
+    exact = page.evaluate(
+        "at => flexdt.call('viewer.voxel', { ...flexdt.volume().of, at })", [x, y, z]
+    )["volume"]
+    assert said == pytest.approx(exact, rel=1e-6)
+    page.select_option("#volume-tool", "profile")
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] * 0.75, box["y"] + box["height"] * 0.5)
+    page.mouse.up()
+    page.locator("#volume-profile").wait_for()
+    page.evaluate("const v = flexdt.volume().three; v.block.codes.fill(0); v.go(v.cross)")
+    page.locator("#volume-at", has_text="no data along this line").wait_for()
+    page.select_option("#volume-tool", "")
+    page.mouse.move(box["x"] + 20, box["y"] + 20)
+    page.locator("#volume-at", has_text="no data cover this voxel").wait_for()
     page.click("#volume-cancel")
-    page.locator("#volume-title", has_text="Slices so far").wait_for()
+    page.locator("#volume-title", has_text=re.compile("^Volume")).wait_for()
     assert not page.locator("#slice-top").is_visible()
     page.click("#record-close")
     shutil.rmtree(scans / "turned once")

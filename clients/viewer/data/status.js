@@ -1,5 +1,5 @@
 // Bar, readouts, warnings and notes: who holds control, how near things are, what went wrong.
-import { $, $$, $button, $dialog, $input, el, fixed, isNumber, setText } from "./dom.js";
+import { $, $$, $button, $dialog, $input, el, fixed, isNumber, setText, term } from "./dom.js";
 import { command, OLD_S, on, person, rename, store } from "./link.js";
 const ROWS = [
     ["SOD", (s) => `${fixed(s.geometry.SOD_mm, 2)} mm`], ["SDD", (s) => `${fixed(s.geometry.SDD_mm, 2)} mm`],
@@ -10,7 +10,12 @@ const ROWS = [
     ["axis column", (s) => `${fixed(s.geometry.axis_column_px, 1)} px`],
     ["beam", (s) => (s.tube.on ? !s.tube.ready && s.tube.ready_in_s !== null ? `ready in ${fixed(s.tube.ready_in_s, 0)} s` : `${fixed(s.tube.kV, 0)} kV, ${fixed(s.tube.power_W, 0)} W` : "off")],
 ];
-const cells = ROWS.map(([name]) => { const dd = el("dd"); $("#readouts").append(el("dt", {}, name), dd); return dd; });
+const TIPS = {
+    SOD: "Source to object: from the focal spot to the rotation axis", SDD: "Source to detector: from the focal spot to the panel",
+    magnification: "SDD / SOD", voxel: "A pixel of the image, as large as it is at the sample", "field of view": "What of the sample the image holds, width × height",
+    "cone angle": "Opening of the beam that meets the image", "piercing point": "Pixel (column, row) in which the perpendicular from the focal spot meets the panel", "axis column": "Column in which the rotation axis appears",
+};
+const cells = ROWS.map(([name]) => { const dd = el("dd"), tip = TIPS[name]; $("#readouts").append(el("dt", {}, tip ? term(name, tip) : name), dd); return dd; });
 export function note(kind, title, body = "", life = kind === "error" ? 12000 : 6000) {
     const box = $("#notes");
     $$("#notes > *").find((n) => n.dataset.key === title + body)?.remove();
