@@ -256,6 +256,7 @@ def test_a_recorded_image_beside_the_virtual_one(
     cut = round(cols / 4)
     assert np.array_equal(seen[:cut], recorded[20, :cut])
     assert np.array_equal(seen[cut:], virtual[20, cut:])
+    page.locator("#film-canvas").scroll_into_view_if_needed()
     box = page.locator("#film-canvas").bounding_box()  # dragged in the picture, too
     page.mouse.move(box["x"] + box["width"] / 4, box["y"] + box["height"] / 2)
     page.mouse.down()

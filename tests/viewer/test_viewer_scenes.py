@@ -55,7 +55,7 @@ def layers(page: Any, **values: object) -> None:
 
 def outline_error(scene: Any, lab: Any, wait: Wait) -> float:
     """How far [px of the screen] the drawn sample's outline lies from its shadow's, at worst."""
-    hidden = {"machine": False, "panel": False, "beam": False, "axis": False, "orbit": False}
+    hidden = dict.fromkeys(HIDDEN, False)
     layers(scene, **hidden, opacity=1.0)
     scene.evaluate("flexdt.call('camera.set', {roi: [32, 8, 1943, 1527], mode: 'HW2SW1High'})")
     with lab.client() as client:
@@ -555,19 +555,19 @@ def test_names_axes_scale_and_a_look_at_the_sample(scene: Any) -> None:
 def test_parts_about_to_touch_are_highlighted(scene: Any, twin: TwinClient, wait: Wait) -> None:
     """Their collision bodies turn red, and lose it when they are apart again."""
     box = show(scene, "side")
-    layers(scene, sample=False)  # which is red itself
     red = lambda now: int((now[..., 0] - now[..., 1:].max(axis=2) > 40.0).sum())  # noqa: E731
-    settled(box, lambda now: red(now) < 200)
+    layers(scene, sample=False)  # which is red itself
+    apart = red(still(box))
     into = "flexdt.call('axes.move', {targets: {mag_det: 300}}).then(() => null, (e) => e.code)"
     try:
         assert scene.evaluate(into) == -32002
         scene.locator("#near .meter.touch").wait_for()
-        settled(box, lambda now: red(now) > 1000)
+        settled(box, lambda now: red(now) > apart + 1000)
     finally:
         scene.evaluate("flexdt.call('safety.reset')")
         scene.evaluate("flexdt.call('axes.move', {targets: {mag_det: 1000}})")
         wait(lambda: abs(twin.state().axes["mag_det"].position - 1000.0) < 1e-6)
-    settled(box, lambda now: red(now) < 200)
+    settled(box, lambda now: red(now) < apart + 200)
     layers(scene, sample=True)
 
 

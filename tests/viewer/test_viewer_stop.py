@@ -53,7 +53,7 @@ def the_button(page: Any) -> tuple[Any, str, str]:
     return box, button.inner_text(), button.evaluate("e => getComputedStyle(e).backgroundColor")
 
 
-@pytest.mark.parametrize("size", [(1366, 768), (800, 600), (360, 640)])
+@pytest.mark.parametrize("size", [(1366, 768), (1000, 700), (800, 600), (741, 600), (360, 640)])
 def test_the_emergency_stop_never_changes(
     open_page: Callable[..., Any], lab: Any, twin: TwinClient, wait: Wait, size: tuple[int, int]
 ) -> None:

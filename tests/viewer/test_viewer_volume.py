@@ -21,7 +21,7 @@ from tests.viewer.looking import picture
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 BLOCK = "flexdt.volume().three.block"
-CORRECTION = {"dO_x": 0.4}
+CORRECTION, NAME = {"dO_x": 0.4}, "wrong for a volume"
 """A wrong correction, so that the volume without it is the better one [mm]."""
 
 
@@ -31,7 +31,7 @@ def lego(lab: Any) -> None:
     with lab.client() as twin:
         twin.control("force")
         twin.set_sample("lego")
-        twin.apply_calibration(CORRECTION, "wrong")
+        twin.apply_calibration(CORRECTION, NAME)
         twin.control("release")
 
 
@@ -41,7 +41,7 @@ def test_from_nothing_to_a_volume_beside_its_truth(
     """At most four clicks: a sample is chosen by two, the rest by one each."""
     twin.control("force")
     twin.set_sample("lego")
-    twin.apply_calibration(CORRECTION, "wrong")
+    twin.apply_calibration(CORRECTION, NAME)
     twin.control("release")
     page = open_page(size=(1366, 768))
     begun = time.monotonic()
@@ -70,7 +70,7 @@ def test_from_nothing_to_a_volume_beside_its_truth(
     print(f"\n{clicks} clicks: {said}; load average {os.getloadavg()[0]:.1f}")
     assert clicks <= 4
     told = page.evaluate("flexdt.volume().told.compared")
-    wrong, nominal = told["correction “wrong”"], told["no correction"]
+    wrong, nominal = told[f"correction “{NAME}”"], told["no correction"]
     # ABS at the energy at which phantoms state it, and the bricks' size.
     assert nominal["attenuation"] == pytest.approx([0.021, 0.021], rel=0.02)
     x, y, _ = load_phantom("lego").size_mm

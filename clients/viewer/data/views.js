@@ -19,13 +19,14 @@ export const software = (() => {
 })();
 const GAP_MS = Number(query.get("gap") ?? (software ? 400 : 0));
 const DPR = query.get("dpr") ?? (devicePixelRatio > 1.5 && !software ? "" : "1");
-// The preset from the start, so that nothing jumps when the viewer sets it again.
+// The preset from the start, so that nothing jumps when the viewer sets it again. The beam's eye has none: it moves
+// with the machine, and the camera that this page was told is the one of the moment in which it connected.
 function preset(view, box) {
     const camera = store.cameras?.[view];
-    if (!camera)
+    if (!camera || view === "beam")
         return "";
     const { position: p, look_at: l, fov } = camera, aspect = box.clientWidth / Math.max(1, box.clientHeight);
-    const wider = view === "beam" ? 1 : Math.max(1, WIDE / Math.max(aspect, 0.3));
+    const wider = Math.max(1, WIDE / Math.max(aspect, 0.3));
     return `initialCameraPosition=${p.join()}&initialCameraLookAt=${l.join()}&initialCameraFov=${2 * Math.atan(wider * Math.tan(fov / 2))}&`;
 }
 function frame(view) {
