@@ -12,7 +12,7 @@ import contextlib
 import json
 import secrets
 import time
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -42,8 +42,10 @@ from flexdt.protocol.state_model import State
 from flexdt.runtime.wire_errors import explain
 from flexdt.twin.dataset.dataset_errors import plain_name
 from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.physics.spectrum import tube_of, tube_spectrum
+from flexdt.twin.scanner.readout import readout_of
 from flexdt.twin.script.compose import ScanRequest, compose_script
 
 APART: Final = 0.01
@@ -195,6 +197,8 @@ async def recorded_image(viewer: Viewer, page: Page, params: p.RecordedImage) ->
         about["problem"] = f"the virtual image has {virtual.shape} pixels, not {pixels.shape}"
         virtual = None
     cone = tuple(told["cone_vec"] or ())
+    about["geometry"] = _readout(cone, pixels.shape)
+    about["tube"] = told["tube"]
     shot = ShownImage(
         pixels, told["kind"], cone, told["time_s"] or 0.0, params.index, virtual=virtual
     )
@@ -207,6 +211,16 @@ async def recorded_image(viewer: Viewer, page: Page, params: p.RecordedImage) ->
     if page.plan is not None and about["positions"]:
         lab.plan.ghost(clients, about["positions"])
     return about
+
+
+def _readout(cone: Sequence[float], shape: tuple[int, ...]) -> Mapping[str, object] | None:
+    """What follows from the nominal geometry of a recorded image; None: nothing is known of it."""
+    if not cone:
+        return None
+    view = ConeVec(np.array([cone]))
+    pitch = float(np.linalg.norm(view.u[0])), float(np.linalg.norm(view.v[0]))
+    found = readout_of(view, (shape[0], shape[1]), pitch, np.zeros(3))
+    return None if found is None else vars(found)
 
 
 async def _virtual(page: Page, told: Mapping[str, Any]) -> Any:

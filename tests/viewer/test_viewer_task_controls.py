@@ -122,6 +122,25 @@ def test_a_telephone_shows_the_tabs_at_once(open_page: Callable[..., Any]) -> No
     page.close()
 
 
+@pytest.mark.parametrize("size", [(320, 568), (390, 844), (800, 600)])
+def test_a_small_screen_offers_one_way_to_a_volume_at_a_time(
+    open_page: Callable[..., Any], size: tuple[int, int]
+) -> None:
+    page = open_page(size=size, fresh=True)
+    assert page.locator("#welcome").is_visible()
+    assert not page.locator("#volume-path").is_visible()
+    page.click("#welcome-no")
+    page.locator("#path-scan").scroll_into_view_if_needed()
+    boxes = [page.locator(f"#path-{part}").bounding_box() for part in ("sample", "quality", "scan")]
+    for k, a in enumerate(boxes):
+        assert a["x"] >= 0.0
+        assert a["x"] + a["width"] <= size[0]
+        for b in boxes[k + 1 :]:
+            beside = a["x"] + a["width"] <= b["x"] or b["x"] + b["width"] <= a["x"]
+            assert beside or a["y"] + a["height"] <= b["y"]
+    page.close()
+
+
 def test_three_clicks_of_a_first_visit_end_with_a_volume(
     open_page: Callable[..., Any], twin: TwinClient
 ) -> None:

@@ -1,5 +1,5 @@
 // What the viewer says beside the wire: its messages, its own methods' answers, and what the page makes of them.
-import type { CalibrationFitResult, CheckStep, DatasetListResult, DatasetResult, Estimated, HelloResult, ImageFlags, JobStatus, Mark, Methods, State } from "./wire.js";
+import type { CalibrationFitResult, CheckStep, DatasetListResult, DatasetResult, Estimated, GeometryState, HelloResult, ImageFlags, JobStatus, Mark, Methods, State } from "./wire.js";
 
 export type * from "./wire.js";
 
@@ -15,7 +15,7 @@ export interface Framing { width: number; height: number; left: number; top: num
 export interface Near { mm: number | null; pair: string[]; close: boolean }
 
 // A recorded image, and what cannot be said of it.
-export interface AboutImage { name: string; index: number; file: string; image: "dark" | "flat" | "projection"; projection: number | null; time_s: number | null; positions: Record<string, number> | null; problem: string }
+export interface AboutImage { name: string; index: number; file: string; image: "dark" | "flat" | "projection"; projection: number | null; time_s: number | null; positions: Record<string, number> | null; problem: string; geometry: GeometryState | null; tube: { kV: number | null; power_W: number | null; on: boolean } | null }
 export interface ImageHead {
   kind: Kind; code: "jpeg" | "deflate"; shape: Pair; pair: boolean; full: Pair; low: number; scale: number; time: number; cone_vec: number[]; seq: number;
   flags: ImageFlags | null; window: Pair; beads: Pair[]; at: number; recorded?: AboutImage;
