@@ -41,6 +41,8 @@ MAX_FROM_PAGE: Final = 16 << 20
 """Bytes of a message of a browser: a script of 8 MiB as JSON, a piece of an upload, a picture."""
 SPARE: Final = 64
 """Connections beside pages and views: plain requests, and handshakes under way."""
+LAST: Final = {"Connection": "close"}
+"""websockets closes after a plain answer; who is not told sends the next request into nothing."""
 MAX_HELD: Final = 256 << 20
 """Bytes of messages that have begun and not ended, of all connections together."""
 FAIR: Final = 1 << 20
@@ -374,7 +376,7 @@ def _data(name: str) -> bytes:
 def _kept(request: Request, body: bytes, kind: str, how_long: str = "no-cache") -> Response:
     """What a browser may keep: it is sent again only where it has changed."""
     tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
-    more = {"ETag": tag, "Cache-Control": how_long}
+    more = {"ETag": tag, "Cache-Control": how_long, **LAST}
     if tag in request.headers.get("If-None-Match", ""):
         return Response(http.HTTPStatus.NOT_MODIFIED.value, "Not Modified", Headers(more), b"")
     return _response(body, kind, more)
@@ -394,6 +396,7 @@ def _response(
             "Content-Security-Policy": POLICY,
             "X-Content-Type-Options": "nosniff",
             "Referrer-Policy": "no-referrer",
+            **LAST,
             **(more or {}),
         }
     )

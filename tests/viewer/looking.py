@@ -22,6 +22,9 @@ if (!localStorage.getItem('flexdt-motors')) localStorage.setItem('flexdt-motors'
 """
 """A browser that has been here before: no card for first visits, motors open."""
 
+USUAL = {"mode": "HW2SW1High", "roi": (32, 8, 1943, 1527)}
+"""The camera that most tests expect."""
+
 
 def until(condition: Callable[[], Any], what: str = "", seconds: float = 120.0) -> Any:
     """The first true value of `condition`."""

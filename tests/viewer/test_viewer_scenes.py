@@ -150,7 +150,7 @@ def held(box: Any) -> bool:
 def with_handles(scene: Any, twin: TwinClient, wait: Wait, view: str) -> Any:
     """Show a view at its preset with handles, the stages apart."""
     scene.evaluate("flexdt.call('session.control', {action: 'force'})")
-    scene.evaluate("flexdt.call('axes.move', {targets: {mag_det: 900, mag_obj: 450}})")
+    scene.evaluate("flexdt.call('axes.move', {targets: {mag_det: 900, mag_obj: 450, tra_obj: 0}})")
     wait(lambda: not any(a.moving for a in twin.state().axes.values()))
     box = show(scene, view)
     scene.click("#tabs [data-tab=move]")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import pytest
 
 from flexdt.clients.client.client import TwinClient
 from flexdt.phantoms import load_phantom
-from tests.viewer.looking import picture
+from tests.viewer.looking import USUAL, picture
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 BLOCK = "flexdt.volume().three.block"
@@ -25,24 +25,24 @@ CORRECTION, NAME = {"dO_x": 0.4}, "wrong for a volume"
 """A wrong correction, so that the volume without it is the better one [mm]."""
 
 
-@pytest.fixture(scope="module")
-def lego(lab: Any) -> None:
-    """The machine at full speed, with a phantom on its stage and a wrong correction in force."""
-    with lab.client() as twin:
-        twin.control("force")
-        twin.set_sample("lego")
-        twin.apply_calibration(CORRECTION, NAME)
-        twin.control("release")
-
-
-def test_from_nothing_to_a_volume_beside_its_truth(
-    lego: None, open_page: Callable[..., Any], twin: TwinClient, tmp_path: Path
-) -> None:
-    """At most four clicks: a sample is chosen by two, the rest by one each."""
+@pytest.fixture
+def lego(twin: TwinClient) -> Iterator[None]:
+    """A phantom on the stage, and a wrong correction in force."""
     twin.control("force")
+    twin.set_camera(**USUAL)
     twin.set_sample("lego")
     twin.apply_calibration(CORRECTION, NAME)
     twin.control("release")
+    yield
+    twin.control("force")
+    twin.revert_calibration()
+    twin.control("release")
+
+
+def test_from_nothing_to_a_volume_beside_its_truth(
+    lego: None, open_page: Callable[..., Any], tmp_path: Path
+) -> None:
+    """At most four clicks: a sample is chosen by two, the rest by one each."""
     page = open_page(size=(1366, 768))
     begun = time.monotonic()
     clicks, at = 0, {}
@@ -89,9 +89,6 @@ def test_from_nothing_to_a_volume_beside_its_truth(
     scrolls_and_turns(page)
     is_shared(page, tmp_path)
     page.close()
-    twin.control("force")
-    twin.revert_calibration()
-    twin.control("release")
 
 
 def scrolls_and_turns(page: Any) -> None:
@@ -100,8 +97,8 @@ def scrolls_and_turns(page: Any) -> None:
     per_s = page.evaluate(
         "() => new Promise((done) => { const v = flexdt.volume().three, n = 60; let k = 0;"
         " const begun = performance.now(); const next = () => { v.go([k, 2 * k, k]);"
-        " requestAnimationFrame(() => requestAnimationFrame(() => ++k < n ? next()"
-        " : done(1000 * n / (performance.now() - begun)))); }; next(); })"
+        " requestAnimationFrame(() => ++k < n ? next()"  # after the slices of this picture
+        " : done(1000 * n / (performance.now() - begun))); }; next(); })"
     )
     print(f"{per_s:.0f} times all three slices a second")
     before = picture(page.locator("#volume-ray"))
