@@ -52,6 +52,8 @@ RELAYED_HZ: Final = 500.0
 RELAYED_AT_ONCE: Final = 100
 SILENT_S: Final = 60.0
 """A browser that does not answer a ping within this time has gone; busy machines are slow."""
+STILL_S: Final = 8.0
+"""A picture that takes longer is none: websockets cuts a connection that has no answer for 10 s."""
 GUESS_S: Final = 0.4
 """How long the answer to a wrong token takes; wrong ones wait for each other."""
 PAGE_PATH: Final = re.compile(r"/ws/([0-9a-f]{8,64})")
@@ -171,7 +173,9 @@ class Front:
         except (ValueError, LookupError):  # brackets, bytes or headers that belong nowhere
             return _plain(http.HTTPStatus.BAD_REQUEST, "this request cannot be read")
         if denied is None and url.path == "/still.jpg" and self._still is not None:
-            picture = await self._still({k: v[-1] for k, v in parse_qs(url.query).items()})
+            asked, picture = {k: v[-1] for k, v in parse_qs(url.query).items()}, None
+            with contextlib.suppress(TimeoutError):
+                picture = await asyncio.wait_for(self._still(asked), STILL_S)
             if picture is None:
                 return _response(b"", "image/jpeg", status=http.HTTPStatus.NO_CONTENT)
             return _kept(request, picture, "image/jpeg")
