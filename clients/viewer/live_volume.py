@@ -59,7 +59,7 @@ TELL_S: Final = 0.4
 COARSE: Final = 64
 """Cells along the longest side of the grid on which the surface is looked for."""
 MOST_POINTS: Final = 12_000
-NICENESS: Final = 10
+NICENESS: Final = 5
 
 Tell = Callable[[dict[str, Any]], None]
 

@@ -13,7 +13,7 @@ const chart = $canvas("#volume-histogram"), plot = $canvas("#volume-profile"), e
 size.addEventListener("change", choose);
 size.value = localStorage.getItem(KEY) ?? "";
 // The past scan whose volume is wanted; else it is the running one's.
-let past = null, asked = null, told = null, pointer = null, of = {}, wanting = false, comparing = false;
+let past = null, asked = null, told = null, pointer = null, of = {}, wanting = false, late = false, comparing = false;
 const blocks = new Map();
 const three = slices({ top: $canvas("#slice-top"), front: $canvas("#slice-front"), side: $canvas("#slice-side") }, point, () => { solid?.cross(three.cross); drawProfile(); });
 let tried = false, solid = null;
@@ -111,11 +111,14 @@ on("volume", (m) => {
         compare();
 });
 function compare() { comparing = true; $button("#volume-compare").disabled = true; void call("viewer.compare", of).catch((error) => setText(note, words(error))); }
-// The volume that is chosen, once; of one that grows the newest, one at a time.
+// The volume that is chosen, once; of one that grows the newest, one at a time: what is told meanwhile is fetched afterwards.
 async function want() {
-    if (wanting)
+    if (wanting) {
+        late = true;
         return;
+    }
     wanting = true;
+    late = false;
     const mine = asked, name = shown.value;
     let block = blocks.get(name) ?? null;
     if (!block) {
@@ -131,11 +134,9 @@ async function want() {
             blocks.set(name, block);
     }
     wanting = false;
-    if (mine !== asked)
-        return;
-    if (block)
+    if (mine === asked && block)
         show(block);
-    if (name !== shown.value)
+    if (late || (mine === asked && name !== shown.value))
         void want();
 }
 function show(block) {

@@ -17,7 +17,7 @@ size.addEventListener("change", choose);
 size.value = localStorage.getItem(KEY) ?? "";
 
 // The past scan whose volume is wanted; else it is the running one's.
-let past: string | null = null, asked: string | null = null, told: VolumeMessage | null = null, pointer: Vector | null = null, of: Live = {}, wanting = false, comparing = false;
+let past: string | null = null, asked: string | null = null, told: VolumeMessage | null = null, pointer: Vector | null = null, of: Live = {}, wanting = false, late = false, comparing = false;
 const blocks = new Map<string, Block>();
 const three = slices({ top: $canvas("#slice-top"), front: $canvas("#slice-front"), side: $canvas("#slice-side") }, point, () => { solid?.cross(three.cross); drawProfile(); });
 let tried = false, solid: Exclude<ReturnType<typeof raycast>, string> | null = null;
@@ -86,10 +86,10 @@ on("volume", (m) => {
 });
 function compare() { comparing = true; $button("#volume-compare").disabled = true; void call("viewer.compare", of).catch((error: unknown) => setText(note, words(error))); }
 
-// The volume that is chosen, once; of one that grows the newest, one at a time.
+// The volume that is chosen, once; of one that grows the newest, one at a time: what is told meanwhile is fetched afterwards.
 async function want() {
-  if (wanting) return;
-  wanting = true;
+  if (wanting) { late = true; return; }
+  wanting = true; late = false;
   const mine = asked, name = shown.value as Name;
   let block = blocks.get(name) ?? null;
   if (!block) {
@@ -100,9 +100,8 @@ async function want() {
     if (block && past) blocks.set(name, block);
   }
   wanting = false;
-  if (mine !== asked) return;
-  if (block) show(block);
-  if (name !== shown.value) void want();
+  if (mine === asked && block) show(block);
+  if (late || (mine === asked && name !== shown.value)) void want();
 }
 function show(block: Block) {
   const first = !three.block;
