@@ -11,7 +11,6 @@ own window: it gets 16-bit integers with a scale, deflated, or, while things mov
 from __future__ import annotations
 
 import asyncio
-import base64
 import json
 import logging
 import struct
@@ -77,11 +76,6 @@ def window_of(image: ShownImage) -> tuple[float, float]:
 def grey(image: ShownImage, window: tuple[float, float]) -> npt.NDArray[np.uint8]:
     """8-bit RGB (rows, cols, 3); line integrals are drawn as a film: matter bright on black."""
     return np.repeat(_byte(image.pixels, window)[:, :, None], 3, axis=2)
-
-
-def base64_grey(pixels: npt.NDArray[np.generic], window: tuple[float, float]) -> str:
-    """8-bit grey (rows, cols) for a page's JSON."""
-    return base64.b64encode(_byte(pixels, window).tobytes()).decode("ascii")
 
 
 def _byte(pixels: npt.NDArray[np.generic], window: tuple[float, float]) -> npt.NDArray[np.uint8]:

@@ -41,6 +41,8 @@ MAX_FROM_PAGE: Final = 16 << 20
 """Bytes of a message of a browser: a script of 8 MiB as JSON, a piece of an upload, a picture."""
 SPARE: Final = 64
 """Connections beside pages and views: plain requests, and handshakes under way."""
+LAST: Final = {"Connection": "close"}
+"""websockets closes after a plain answer; who is not told sends the next request into nothing."""
 MAX_HELD: Final = 256 << 20
 """Bytes of messages that have begun and not ended, of all connections together."""
 FAIR: Final = 1 << 20
@@ -50,6 +52,8 @@ RELAYED_HZ: Final = 500.0
 RELAYED_AT_ONCE: Final = 100
 SILENT_S: Final = 60.0
 """A browser that does not answer a ping within this time has gone; busy machines are slow."""
+STILL_S: Final = 8.0
+"""A picture that takes longer is none: websockets cuts a connection that has no answer for 10 s."""
 GUESS_S: Final = 0.4
 """How long the answer to a wrong token takes; wrong ones wait for each other."""
 PAGE_PATH: Final = re.compile(r"/ws/([0-9a-f]{8,64})")
@@ -64,6 +68,7 @@ POLICY: Final = (
 
 PageHandler = Callable[[str, ServerConnection], Awaitable[None]]
 """Serves a page's connection until it ends: the page's id, the connection."""
+Still = Callable[[Mapping[str, str]], Awaitable[bytes | None]]
 Connect = Callable[[str, Subprotocol | None], AbstractAsyncContextManager[ClientConnection]]
 """A connection to viser for a frame's path and subprotocol."""
 
@@ -87,6 +92,7 @@ class Front:
         token: a browser must show it once (`/?token=...`); None for none.
         max_scenes: views open at a time.
         max_pages: pages open at a time; bounds connections, and `page` closes further pages.
+        still: answers `/still.jpg`, the scene as a picture, from the query; None: not yet.
     """
 
     def __init__(
@@ -98,6 +104,7 @@ class Front:
         token: str | None = None,
         max_scenes: int = 256,
         max_pages: int = 64,
+        still: Still | None = None,
     ) -> None:
         self._page, self._connect = page, connect
         self.doorkeeper = MessageFilter()
@@ -106,7 +113,7 @@ class Front:
         self._turn, self._relayed_at = asyncio.Lock(), 0.0
         self._guessing, self._closing = asyncio.Lock(), asyncio.Event()
         self.wrong_tokens = 0
-        self._downloads, self._token = downloads, token
+        self._downloads, self._token, self._still = downloads, token, still
         more = b"<style>%s</style><script>%s</script>" % (_data("scene.css"), _data("scene.js"))
         bare, self._program = parted(scene_html)
         self._program_path = f"/viser-{hashlib.sha256(self._program).hexdigest()[:16]}.js"
@@ -165,6 +172,13 @@ class Front:
             denied = self._foreign(request) or await self._stranger(connection, request, url)
         except (ValueError, LookupError):  # brackets, bytes or headers that belong nowhere
             return _plain(http.HTTPStatus.BAD_REQUEST, "this request cannot be read")
+        if denied is None and url.path == "/still.jpg" and self._still is not None:
+            asked, picture = {k: v[-1] for k, v in parse_qs(url.query).items()}, None
+            with contextlib.suppress(TimeoutError):
+                picture = await asyncio.wait_for(self._still(asked), STILL_S)
+            if picture is None:
+                return _response(b"", "image/jpeg", status=http.HTTPStatus.NO_CONTENT)
+            return _kept(request, picture, "image/jpeg")
         return denied or self._content(request, url)
 
     def _content(self, request: Request, url: SplitResult) -> Response | None:
@@ -366,7 +380,7 @@ def _data(name: str) -> bytes:
 def _kept(request: Request, body: bytes, kind: str, how_long: str = "no-cache") -> Response:
     """What a browser may keep: it is sent again only where it has changed."""
     tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
-    more = {"ETag": tag, "Cache-Control": how_long}
+    more = {"ETag": tag, "Cache-Control": how_long, **LAST}
     if tag in request.headers.get("If-None-Match", ""):
         return Response(http.HTTPStatus.NOT_MODIFIED.value, "Not Modified", Headers(more), b"")
     return _response(body, kind, more)
@@ -386,6 +400,7 @@ def _response(
             "Content-Security-Policy": POLICY,
             "X-Content-Type-Options": "nosniff",
             "Referrer-Policy": "no-referrer",
+            **LAST,
             **(more or {}),
         }
     )

@@ -1,45 +1,55 @@
-"""A volume that grows while its scan runs: FDK of the images so far, in a process of its own.
+"""A volume that grows while its scan runs, and those of past scans: FDK in a process of its own.
 
-`python -m flexdt.clients.viewer.live_volume FOLDER SIDE [past]` follows a data set and prints a
-line of JSON whenever its slices have changed: views so far and of how many, the three middle slices
-as 8-bit grey, and points on the surface of what is dense, for the scenes. The geometry of all
-images is written when a scan begins, so each view has its final weight at once, and the values of a
-grown volume are those of the finished one.
+`python -m flexdt.clients.viewer.live_volume` loads what it needs and reads a line, FOLDER, SIDE and
+perhaps `past`, tabs between them. It follows that data set then and prints a
+line of JSON whenever its volume has changed: views so far and of how many, its size, and points on
+the surface of what is dense, for the scenes. The geometry of all images is written when a scan
+begins, so each view has its final weight at once, and the values of a grown volume are those of the
+finished one.
 
-With `past` it is the volume of `flexdt reconstruct` from the images that are there, whose slices
-are then read by number.
+With `past` it is the volume of `flexdt reconstruct` from the images that are there.
 
-The process has a low priority and one thread, and ends with its viewer: neither twin nor viewer
-waits for it.
+Further lines ask for more: `block NAME` for a volume as a page draws it, `voxel X Y
+Z` for exact values, `compare` with the correction that is in force now for the volume beside the
+truth of its sample, with a correction and without.
+
+The process has a low priority, beside a scan one thread, and ends with its viewer: neither twin
+nor viewer waits for it.
 """
 
 from __future__ import annotations
 
-import asyncio
 import base64
 import json
 import os
 import sys
+import threading
 import time
-from collections import deque
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
+import numba
 import numpy as np
 
+from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.datasets.dataset import load_dataset
-from flexdt.clients.viewer.feed import base64_grey
-from flexdt.clients.viewer.page import watched
+from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_volume
+from flexdt.clients.viewer.volume_block import MOST_GROWING, MOST_VOXELS, block, exact
+from flexdt.clients.viewer.volume_truth import figures, truth_of
 from flexdt.runtime.files.dataset_folder import read_image
-from flexdt.runtime.workers import ENVIRONMENT
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
-from flexdt.twin.projection import as_volume
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.projection import Volume, as_volume
 from flexdt.twin.reconstruction.fdk import OnProcessor, fdk_parts
 from flexdt.twin.reconstruction.rectify import field_of_view
+from flexdt.twin.scanner.state import NamedCorrection
 
 MOST_VIEWS: Final = 360
 """Of a longer scan every n-th image is taken."""
@@ -49,27 +59,53 @@ TELL_S: Final = 0.4
 COARSE: Final = 64
 """Cells along the longest side of the grid on which the surface is looked for."""
 MOST_POINTS: Final = 12_000
-LINE_BYTES: Final = 4 << 20
-SIDES: Final = ("top", "front", "side")
-NICENESS: Final = 10
+NICENESS: Final = 5
 
 Tell = Callable[[dict[str, Any]], None]
 
 
-def grow(folder: Path, side: int, tell: Tell, alive: Callable[[], bool] = lambda: True) -> None:
+@dataclass
+class Held:
+    """The volumes of the process by name, (z, y, x), and what it says of them.
+
+    `volume` is the one that was asked for, `truth` its sample's and `other` the one with the other
+    geometry, once they have been compared.
+    """
+
+    tell: Tell
+    about: dict[str, Any]
+    volumes: dict[str, Float32Array] = field(default_factory=dict)
+    grid: Volume | None = None
+    dataset: DataSet | None = None
+    request: VolumeRequest | None = None
+
+    def say(self, **more: Any) -> None:
+        """Tell all that is known so far, and `more`."""
+        self.tell({"type": "volume", **self.about, **more})
+
+    def keep(self, **more: Any) -> None:
+        """As `say`; `more` stays true."""
+        self.about |= more
+        self.say()
+
+    def hold(self, data: Float32Array, grid: Volume) -> None:
+        """A volume to be asked for."""
+        self.grid, self.volumes = grid, {"volume": data}
+        self.about |= {"size": list(data.shape[::-1]), "voxel_mm": float(np.max(grid.voxel_mm))}
+
+
+def grow(held: Held, folder: Path, side: int, alive: Callable[[], bool] = lambda: True) -> None:
     """Reconstruct a data set while it comes into being.
 
     Args:
+        held: gets the volume, which is there before the first image.
         folder: of the data set.
         side: voxels along x and y, about; along z as many as the panel's height gives.
-        tell: called with each new document.
         alive: whether somebody still waits.
 
     Raises:
         TwinError: no circular scan, or images that cannot be read.
     """
-    from flexdt.twin.reconstruction import fdk_kernels  # noqa: F401 - compiled while nothing waits
-
     _wait(folder / "flexdt.json", alive)
     data = load_dataset(folder)
     indices = range(0, len(data), max(1, -(-len(data) // MOST_VIEWS)))
@@ -80,6 +116,7 @@ def grow(folder: Path, side: int, tell: Tell, alive: Callable[[], bool] = lambda
     voxel_mm = whole.shape[2] * float(np.max(whole.voxel_mm)) / side
     like = as_volume(field_of_view(cone_vec, shape, voxel_mm))
     target, told = OnProcessor(like), 0.0
+    held.hold(target.volume().transpose(2, 0, 1), like)
 
     def parts() -> Iterator[Float32Array]:
         normalise = None
@@ -97,87 +134,92 @@ def grow(folder: Path, side: int, tell: Tell, alive: Callable[[], bool] = lambda
             return
         told = time.monotonic()
         views = round(done * len(indices))
-        tell(
-            {
-                "type": "volume",
-                "views": views,
-                "of": len(indices),
-                "name": folder.name,
-                "side": side,
-                "voxel_mm": voxel_mm,
-                **slices(target.volume()),
-                "surface": surface(target.volume(), like.voxel_mm, like.center_mm),
-            }
+        held.say(
+            views=views,
+            of=len(indices),
+            surface=surface(target.volume(), like.voxel_mm, like.center_mm),
         )
 
-    fdk_parts(parts, cone_vec, shape, like, progress=progress, target=target)
+    volume = fdk_parts(parts, cone_vec, shape, like, progress=progress, target=target)
+    held.hold(volume.data, like)  # what no view has covered is no number now
+    held.keep(done=1.0, views=len(indices), of=len(indices))
 
 
-def reconstruct(folder: Path, side: int, tell: Tell) -> Callable[[str, int], dict[str, Any]]:
+def reconstruct(held: Held, folder: Path, side: int) -> None:
     """The volume of a past scan, as `flexdt reconstruct` makes it of binned images.
 
     Args:
+        held: gets the volume, and tells the progress.
         folder: of the data set.
-        side: columns to which images are binned.
-        tell: called with the progress, and with the middle slices in the end.
-
-    Returns:
-        A slice by the name of its side and its number from below, the source or the left.
+        side: columns to which images are binned, about.
 
     Raises:
         TwinError: as `reconstruct_volume`.
     """
-    from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_volume
-
     data = load_dataset(folder)
-    binning, about = max(1, data.shape[1] // side), {"name": folder.name, "side": side}
-    steps: dict[str, Any] = {"type": "volume", **about, "past": True}
-    request = VolumeRequest(binning=binning)
-    volume = reconstruct_volume(data, request, progress=lambda a, b: tell(steps | {"done": a / b}))
-    grown = volume.data.transpose(1, 2, 0)
-    found = slices(grown)
-    size, voxel_mm = (
-        dict(zip(SIDES, np.roll(grown.shape, 1).tolist(), strict=True)),
-        volume.voxel_xyz,
+    held.dataset, held.request = data, VolumeRequest(binning=max(1, round(data.shape[1] / side)))
+    with warnings.catch_warnings(record=True) as doubts:
+        warnings.simplefilter("always")
+        volume = reconstruct_volume(data, held.request, progress=_share(held, "done"))
+    held.hold(volume.data, volume)
+    held.keep(
+        done=1.0,
+        views=len(data.present),
+        of=len(data),
+        binning=held.request.binning,
+        geometry=_named(data.correction),
+        doubts=[str(doubt.message) for doubt in doubts],
+        uncovered=float(1.0 - np.isfinite(volume.data).mean()),
+        **_facts(data),
     )
-    shown = {"size": size, "voxel_mm": voxel_mm[0], "binning": binning, **found}
-    tell(steps | {"done": 1.0, "views": len(data.present), "of": len(data)} | shown)
-
-    def cut(name: str, index: int) -> dict[str, Any]:
-        part = _slice(grown, name, min(index, size[name] - 1))
-        data = base64_grey(part, (found["low"], found["high"]))
-        return {"shape": list(part.shape), "data": data}
-
-    return cut
 
 
-def _slice(grown: Float32Array, name: str, k: int) -> Float32Array:
-    """Slice `k` of a volume (y, x, z) as it is seen from above (+x to the right, +y up), from the
-    source (+x to the right, +z up) or from +x, as the view from the side (+y to the right, +z up).
-    """
-    if name == "top":
-        return grown[::-1, :, k]
-    return (grown[k] if name == "front" else grown[:, k]).T[::-1]
+def _share(held: Held, name: str) -> Callable[[float, float], None]:
+    return lambda done, whole: held.say(**{name: done / whole})
 
 
-def slices(grown: Float32Array) -> dict[str, Any]:
-    """The three middle slices of a volume (y, x, z), and the values that are black and white."""
-    ny, nx, nz = grown.shape
-    middle = {
-        name: _slice(grown, name, n // 2) for name, n in zip(SIDES, (nz, ny, nx), strict=True)
-    }
-    every = np.concatenate([part.reshape(-1) for part in middle.values()])
-    known = every[np.isfinite(every)]  # what no view has seen is no number
-    low, high = (float(v) for v in np.percentile(known, (1.0, 99.8))) if known.size else (0.0, 0.0)
-    high = max(high, low + 1e-9)
+def _named(correction: NamedCorrection | None) -> str:
+    return "no correction" if correction is None else f"correction “{correction.name}”"
+
+
+def _facts(data: DataSet) -> dict[str, Any]:
+    """What a person wants to read beside a volume; where nobody has said it: nothing."""
+    settings, document = data.settings, data.document
     return {
-        "low": low,
-        "high": high,
-        "slices": {
-            name: {"shape": list(part.shape), "data": base64_grey(part, (low, high))}
-            for name, part in middle.items()
-        },
+        "sample": "" if document is None else document.sample.name,
+        "started": "" if document is None else f"{document.started:%Y-%m-%d %H:%M}",
+        "kV": None if settings is None else settings.kV,
     }
+
+
+def compare(held: Held, now: NamedCorrection | None) -> None:
+    """A past scan's volume beside the truth of its sample, with a correction and without.
+
+    Args:
+        held: gets the volumes `truth` and, where there is a correction, `other`; tells the figures.
+        now: the correction in force, for a scan that was made without one.
+
+    Raises:
+        TwinError: the truth is not known, or there is no volume of a past scan.
+    """
+    data, grid, request = held.dataset, held.grid, held.request
+    if data is None or grid is None or request is None:
+        raise TwinError("only the finished volume of a past scan is compared with its truth", {})
+    voxel_mm = float(np.max(grid.voxel_mm))
+    held.say(comparing=0.0)
+    truth = held.volumes.setdefault("truth", truth_of(data, grid))
+    held.volumes["difference"] = held.volumes["volume"] - truth
+    rows = {_named(data.correction): figures(held.volumes["volume"], truth, voxel_mm)}
+    other = NOMINAL if data.correction is not None else None if now is None else now.parameters
+    if other is not None:
+        same = replace(request, voxel_mm=voxel_mm, shape=grid.shape, center_mm=grid.center_mm)
+        progress = _share(held, "comparing")
+        made = reconstruct_volume(data, same, parameters=other, progress=progress)
+        held.volumes["other"] = made.data
+        rows[_named(None if data.correction is not None else now)] = figures(
+            made.data, truth, voxel_mm
+        )
+    held.keep(comparing=1.0, compared=rows)
 
 
 def surface(grown: Float32Array, voxel_mm: Any, center_mm: Any) -> dict[str, Any]:
@@ -221,105 +263,83 @@ def _wait(path: Path, alive: Callable[[], bool]) -> None:
         time.sleep(LOOK_S)
 
 
-class LiveReconstruction:
-    """The one process of a viewer, for the data set that was asked for last.
+class Served:
+    """Standard output of the process: documents and answers, one at a time."""
 
-    Args:
-        tell: gets its lines.
-    """
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
 
-    def __init__(self, tell: Callable[[str], None]) -> None:
-        self._tell, self.newest = tell, ""
-        self._asked: tuple[str, ...] = ()
-        self._task: asyncio.Task[None] | None = None
-        self._writer: asyncio.StreamWriter | None = None
-        self._wanted: deque[asyncio.Future[dict[str, Any]]] = deque()
+    def say(self, document: dict[str, Any]) -> None:
+        """The surface is the viewer's; what comes after it goes to pages as it is."""
+        self._write(json.dumps(document.pop("surface", None)), json.dumps(document))
 
-    def grow(self, folder: Path, side: int, past: bool = False) -> None:
-        """Grow the volume of a data set, unless that is being done; the last line comes again."""
-        asked = str(folder.absolute()), str(side), *(["past"] if past else [])
-        if asked == self._asked:
-            if self.newest:
-                self._tell(self.newest)
-            return
-        self.stop()
-        self._asked = asked
-        self._task = watched(self._follow(*asked), "a live reconstruction")
+    def answer(self, told: object, content: bytes = b"") -> None:
+        """To what was asked, in order."""
+        self._write("answer", str(len(content)), json.dumps(told), content=content)
 
-    def stop(self) -> None:
-        """End what is under way."""
-        if self._task is not None:
-            self._task.cancel()
-        self._task, self._asked, self.newest = None, (), ""
-        self._hang_up()
-
-    def _hang_up(self) -> None:
-        """Nobody answers any more who has been asked for a slice."""
-        self._writer = None
-        while self._wanted:
-            self._wanted.popleft().cancel()
-
-    async def slice(self, name: str, index: int) -> dict[str, Any] | None:
-        """A slice of the volume of a past scan; None while there is none."""
-        if self._writer is None or "size" not in self.newest:
-            return None
-        wanted: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
-        self._wanted.append(wanted)
-        self._writer.write(f"{name} {index}\n".encode())
-        with suppress(asyncio.CancelledError):  # somebody has asked for another volume
-            return await wanted
-        return None
-
-    async def _follow(self, *asked: str) -> None:
-        process = await asyncio.create_subprocess_exec(
-            sys.executable, "-P", "-m", __name__, *asked,
-            stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.DEVNULL,
-            env={**os.environ, **ENVIRONMENT}, limit=LINE_BYTES,
-        )  # fmt: skip
-        assert process.stdout is not None
-        self._writer = process.stdin
-        try:
-            async for line in process.stdout:
-                kind, _, content = line.decode().partition("\t")
-                if kind == "slice":
-                    if not (wanted := self._wanted.popleft()).done():
-                        wanted.set_result(json.loads(content))
-                else:
-                    self.newest = line.decode()
-                    self._tell(self.newest)
-            self._hang_up()
-            await process.wait()  # to kill what has just ended would take its code from the loop
-        finally:
-            if process.returncode is None:
-                process.kill()
-            await process.wait()
+    def _write(self, *words: str, content: bytes = b"") -> None:
+        with self._lock, suppress(OSError):
+            sys.stdout.buffer.write("\t".join(words).encode() + b"\n" + content)
+            sys.stdout.buffer.flush()
 
 
-def main(folder: str, side: str, past: str = "") -> None:
-    """The process."""
-    parent = os.getppid()
-    os.nice(NICENESS)
+def answer(held: Held, served: Served, asked: list[str]) -> None:
+    """Answer one line of standard input."""
+    match asked:
+        case ["block", name] if name in held.volumes:
+            most = MOST_VOXELS if held.about["past"] else MOST_GROWING
+            served.answer(*block(held.volumes[name], most))
+        case ["voxel", x, y, z]:
+            at = int(x), int(y), int(z)
+            served.answer({name: exact(data, at) for name, data in held.volumes.items()})
+        case ["compare", now]:
+            served.answer({})
+            parameters = json.loads(now)
+            given = parameters and NamedCorrection(
+                parameters["name"], "", Offsets.from_edge(parameters["parameters"])
+            )
+            _told(held, lambda: compare(held, given), "not_compared")
+        case _:
+            served.answer({})
 
-    def say(document: dict[str, Any]) -> None:
-        # The surface is the viewer's, what comes after it goes to pages as it is.
-        print(json.dumps(document.pop("surface", None)), json.dumps(document), sep="\t", flush=True)
 
+def _told(held: Held, work: Callable[[], object], problem: str = "problem") -> None:
     try:
-        if not past:
-            grow(Path(folder), int(side), say, lambda: os.getppid() == parent)
-            return
-        cut = reconstruct(Path(folder), int(side), say)
-        for line in sys.stdin:
-            name, index = line.split()
-            print("slice", json.dumps(cut(name, int(index))), sep="\t", flush=True)
+        work()
     except Exception as error:  # whatever it is, the page says it instead of waiting for ever
         known = isinstance(error, (TwinError, OSError, ValueError))
-        problem = str(error) if known else f"{type(error).__name__}: {error}"
-        with suppress(OSError):
-            name = Path(folder).name
-            say({"type": "volume", "name": name, "past": bool(past), "problem": problem})
+        held.keep(**{problem: str(error) if known else f"{type(error).__name__}: {error}"})
+
+
+def main() -> None:
+    """The process: what was asked for in a thread, questions from standard input meanwhile."""
+    parent, served = os.getppid(), Served()
+    os.nice(NICENESS)
+    warm()
+    if not (line := sys.stdin.readline()):
+        return  # nobody needed it
+    folder, side, *past = line.rstrip("\n").split("\t")
+    about = {"name": Path(folder).name, "side": int(side), "past": bool(past)}
+    held = Held(served.say, about)
+
+    def work() -> None:
+        if past:
+            reconstruct(held, Path(folder), int(side))
+            return
+        numba.set_num_threads(1)  # of this thread: the scan has the others
+        grow(held, Path(folder), int(side), lambda: os.getppid() == parent)
+
+    threading.Thread(target=_told, args=(held, work), daemon=True).start()
+    for line in sys.stdin:
+        answer(held, served, line.rstrip("\n").split("\t"))
+
+
+def warm() -> None:
+    """Load the compiled kernels, which takes seconds, by a volume of a few voxels."""
+    scan = ConeVec.circular(sod=100, sdd=200, angles=4, shape=(4, 4), pixel=1)
+    like = as_volume(field_of_view(scan, (4, 4)))
+    fdk_parts(lambda: [np.zeros((4, 4, 4), np.float32)], scan, (4, 4), like)
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

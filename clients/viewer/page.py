@@ -108,6 +108,8 @@ class Page:
         """The focal spot's path over the plan, for the scenes of this page that open later."""
         self.recorded: str | None = None
         """The data set whose images this page shows instead of live ones."""
+        self.block = ""
+        """The key of the last block of a volume that it was offered."""
         self._connection, self._local = connection, local
         self.link = KeptConnection(address, person, on_change=self._link_changed)
         self._notes: deque[str] = deque()

@@ -1,7 +1,7 @@
 """Which of viser's clients shows which view of which page, and their cameras.
 
 Each view is a browser frame under `/scene/PAGE/VIEW`, so the path of a connection identifies it.
-The free view belongs to its user; only the page's preset button moves its camera.
+But for the beam's eye, a view belongs to its user; only the page's buttons move its camera.
 """
 
 from __future__ import annotations
@@ -16,14 +16,12 @@ import viser
 
 from flexdt.clients.viewer.front import SCENE_PATH
 from flexdt.clients.viewer.scenes.sample import MM
-from flexdt.clients.viewer.scenes.standpoints import FIXED, Standpoint
+from flexdt.clients.viewer.scenes.standpoints import Standpoint, roomy
 from flexdt.clients.viewer.viser_gate import Scenes
 from flexdt.twin.geometry.conventions import FloatArray
 
 FILLS = 1.3
 """Of the distance at which a ball that is looked at fills the picture."""
-WIDE = 1.35
-"""Aspect (width over height) for which the fixed cameras are made."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +55,13 @@ class SceneClients:
         """Clients that show `view` (any, if None) of `page`."""
         with self._lock:
             ids = [i for i, w in self._who.items() if w.page == page and view in (None, w.view)]
+        clients = self._server.get_clients()
+        return [clients[i] for i in ids if i in clients]
+
+    def with_names(self) -> list[viser.ClientHandle]:
+        """Clients whose views have names: not the beam's eye, which shows the image's pixels."""
+        with self._lock:
+            ids = [i for i, w in self._who.items() if w.view != "beam"]
         clients = self._server.get_clients()
         return [clients[i] for i in ids if i in clients]
 
@@ -108,8 +113,8 @@ class SceneClients:
         client = self._server.get_clients().get(id)
         if client is not None:
             self._sent[id] = camera
-            fixed = self._who.get(id) is not None and self._who[id].view in FIXED
-            aim(client, roomy(camera, client.camera.aspect) if fixed else camera)
+            beam = self._who.get(id) is not None and self._who[id].view == "beam"
+            aim(client, camera if beam else roomy(camera, client.camera.aspect))
 
     def _connected(self, client: viser.ClientHandle) -> None:
         path = self._scenes.path_of(client.client_id)
@@ -128,15 +133,6 @@ class SceneClients:
         with self._lock:
             self._who.pop(client.client_id, None)
             self._sent.pop(client.client_id, None)
-
-
-def roomy(camera: Standpoint, aspect: float) -> Standpoint:
-    """Farther away where the picture is narrow, so that the machine still fits."""
-    if aspect >= WIDE:
-        return camera
-    away = np.subtract(camera.position, camera.look_at) * (WIDE / max(aspect, 0.3))
-    x, y, z = (np.asarray(camera.look_at) + away).tolist()
-    return replace(camera, position=(x, y, z))
 
 
 def aim(client: viser.ClientHandle, camera: Standpoint) -> None:

@@ -9,32 +9,30 @@ from __future__ import annotations
 import asyncio
 import base64
 import contextlib
+import json
 import secrets
 import time
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import viser
 
 from flexdt.clients.client.async_client import AsyncTwinClient
 from flexdt.clients.client.flows import Ask
+from flexdt.clients.viewer import exports
 from flexdt.clients.viewer import page_params as p
 from flexdt.clients.viewer import scrubbed_plan as plans
 from flexdt.clients.viewer.feed import ShownImage, packed
 from flexdt.clients.viewer.front import Download
 from flexdt.clients.viewer.page import Page, without_bytes
-from flexdt.clients.viewer.page_params import Form
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
-from flexdt.clients.viewer.scenes.sample import SampleLook
 from flexdt.clients.viewer.scenes.standpoints import FREE
-from flexdt.clients.viewer.scenes.world import motors, world_of
-from flexdt.clients.viewer.scrubbed_plan import Scrubbed, positions_at
+from flexdt.clients.viewer.scenes.world import motors
 from flexdt.clients.viewer.viewer import PageMethod, Viewer
-from flexdt.clients.viewer.viser_gate import Scenes, look_from
+from flexdt.clients.viewer.volume_process import wish
 from flexdt.protocol import Code, Method, RpcError, parse_params
 from flexdt.protocol import image as wire_image
 from flexdt.protocol.fields import Nothing, Params
@@ -44,86 +42,11 @@ from flexdt.protocol.state_model import State
 from flexdt.runtime.wire_errors import explain
 from flexdt.twin.dataset.dataset_errors import plain_name
 from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import Roi
-from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.physics.spectrum import tube_of, tube_spectrum
+from flexdt.twin.scanner.readout import readout_of
 from flexdt.twin.script.compose import ScanRequest, compose_script
-
-# Exports of the viewer: pictures of a view, the current scene, and a scan as a replay.
-#
-# A replay is drawn in a viser server of its own without clients, so that recording does not disturb
-# the live scene. Both file formats open without any server. The page saves what it receives;
-# nothing is written here.
-
-FRAMES: Final = 240
-REPLAY_S: Final = 12.0
-LIGHT, DARK = (246, 248, 251), (16, 19, 25)
-
-
-def picture(client: viser.ClientHandle, width: int, height: int, dark: bool) -> bytes:
-    """A view as PNG, on the page's background.
-
-    Raises:
-        RuntimeError, TimeoutError: the browser does not answer.
-    """
-    import imageio.v3 as iio
-
-    rgba = client.get_render(height, width, transport_format="png", timeout=30.0).astype(np.float32)
-    alpha = rgba[:, :, 3:4] / 255.0 if rgba.shape[2] == 4 else np.ones_like(rgba[:, :, :1])
-    flat = rgba[:, :, :3] * alpha + np.array(DARK if dark else LIGHT) * (1.0 - alpha)
-    return bytes(iio.imwrite("<bytes>", flat.astype(np.uint8), extension=".png"))
-
-
-def scene_file(server: viser.ViserServer, form: Form, dark: bool) -> bytes:
-    """The live scene as a file."""
-    serializer = server.get_scene_serializer()
-    look_from(serializer, FREE)
-    return _file(serializer, form, dark)
-
-
-def replay_file(
-    machine: Machine,
-    profile: Profile,
-    state: State,
-    look: SampleLook,
-    planned: Scrubbed,
-    looks: Mapping[str, bytes] | None,
-    form: Form,
-    dark: bool,
-) -> bytes:
-    """A plan, or a scan that was made, as a file that plays it."""
-    scenes = Scenes()
-    server = scenes.server
-    try:
-        server.initial_camera.position = FREE.position
-        server.initial_camera.look_at = FREE.look_at
-        scene = LabScene(server, machine, profile, looks=looks)
-        scene.wear(look)
-        serializer = server.get_scene_serializer()
-        for time_s in np.linspace(0.0, planned.duration_s, FRAMES):
-            moved = at_positions(state, positions_at(planned, float(time_s)))
-            scene.update(moved, world_of(machine, profile, moved))
-            serializer.insert_sleep(REPLAY_S / FRAMES)
-    finally:
-        scenes.stop()
-    return _file(serializer, form, dark)
-
-
-def _file(serializer: Any, form: Form, dark: bool) -> bytes:
-    if form == "html":
-        return str(serializer.as_html(dark_mode=dark)).encode()
-    return bytes(serializer.serialize())
-
-
-def at_positions(state: State, positions: dict[str, float]) -> State:
-    """The state with its motors elsewhere and X-rays on."""
-    axes = {
-        name: axis.model_copy(update={"position": positions.get(name, axis.position)})
-        for name, axis in state.axes.items()
-    }
-    tube = state.tube.model_copy(update={"on": True})
-    return state.model_copy(update={"axes": axes, "tube": tube})
-
 
 APART: Final = 0.01
 """Of two positions that are not the same [mm, deg]."""
@@ -274,6 +197,8 @@ async def recorded_image(viewer: Viewer, page: Page, params: p.RecordedImage) ->
         about["problem"] = f"the virtual image has {virtual.shape} pixels, not {pixels.shape}"
         virtual = None
     cone = tuple(told["cone_vec"] or ())
+    about["geometry"] = _readout(cone, pixels.shape)
+    about["tube"] = told["tube"]
     shot = ShownImage(
         pixels, told["kind"], cone, told["time_s"] or 0.0, params.index, virtual=virtual
     )
@@ -286,6 +211,16 @@ async def recorded_image(viewer: Viewer, page: Page, params: p.RecordedImage) ->
     if page.plan is not None and about["positions"]:
         lab.plan.ghost(clients, about["positions"])
     return about
+
+
+def _readout(cone: Sequence[float], shape: tuple[int, ...]) -> Mapping[str, object] | None:
+    """What follows from the nominal geometry of a recorded image; None: nothing is known of it."""
+    if not cone:
+        return None
+    view = ConeVec(np.array([cone]))
+    pitch = float(np.linalg.norm(view.u[0])), float(np.linalg.norm(view.v[0]))
+    found = readout_of(view, (shape[0], shape[1]), pitch, np.zeros(3))
+    return None if found is None else vars(found)
 
 
 async def _virtual(page: Page, told: Mapping[str, Any]) -> Any:
@@ -309,9 +244,34 @@ async def live(viewer: Viewer, page: Page, params: p.Live) -> object:
     return {}
 
 
-async def volume_slice(viewer: Viewer, page: Page, params: p.Slice) -> object:
-    """A slice of the volume that is reconstructed; empty while there is none."""
-    return await viewer.grower.slice(params.name, params.index) or {}
+async def _of_volume(viewer: Viewer, params: p.Live, *words: str) -> tuple[Any, bytes]:
+    """What the volume's process answers; nothing where it has another volume by now."""
+    folder = _data(viewer) / plain_name(params.name or "", "data set")
+    return await viewer.grower.ask(wish(folder, params.side, params.past), *words) or ({}, b"")
+
+
+async def volume_block(viewer: Viewer, page: Page, params: p.Block) -> object:
+    """A volume that is reconstructed as a page draws it: a head, and codes to fetch; empty while
+    there is none."""
+    head, codes = await _of_volume(viewer, params, "block", params.what)
+    if not codes:
+        return {}
+    viewer.downloads.pop(page.block, None)  # one that was not fetched is outdated
+    offered = _offer(viewer, f"{params.what}.bin", codes)
+    page.block = str(offered["url"]).rpartition("/")[2]
+    return {**head, **offered}
+
+
+async def voxel(viewer: Viewer, page: Page, params: p.Voxel) -> object:
+    """Exact values of a voxel by the names of the volumes there are; None where no data cover."""
+    return (await _of_volume(viewer, params, "voxel", *map(str, params.at)))[0]
+
+
+async def volume_compare(viewer: Viewer, page: Page, params: p.Live) -> object:
+    """Compare the volume with the truth of its sample; its document brings the figures."""
+    correction = None if viewer.state is None else viewer.state.correction
+    now = None if correction is None else correction.model_dump(include={"name", "parameters"})
+    return (await _of_volume(viewer, params, "compare", json.dumps(now)))[0]
 
 
 async def compose(viewer: Viewer, page: Page, params: p.Compose) -> object:
@@ -405,7 +365,7 @@ async def screenshot(viewer: Viewer, page: Page, params: p.Screenshot) -> object
         raise RpcError(Code.INVALID_PARAMS, f"the view {params.view!r} is not open")
     with _room(viewer):
         content = await asyncio.to_thread(
-            picture, clients[0], params.width, params.height, page.dark
+            exports.picture, clients[0], params.width, params.height, page.dark
         )
     return _offer(viewer, f"flexdt-{params.view}-{_stamp()}.png", content)
 
@@ -414,13 +374,18 @@ async def export(viewer: Viewer, page: Page, params: p.Export) -> object:
     """The scene, or a replay of this page's plan, as one file: html or viser."""
     lab, form = _lab(viewer), params.format
     if not params.replay:
-        make = partial(scene_file, viewer.viser)
+        seen = next(iter(viewer.clients.of(page.id, "free") or viewer.clients.of(page.id)), None)
+        camera = FREE if seen is None else exports.standpoint(seen)
+        make = partial(
+            exports.scene_file, viewer.viser, camera, exports.title_of(viewer.state, "scene"),
+            exports.beside(viewer.state, viewer.feeds["line_integral"].newest),
+        )  # fmt: skip
     elif page.plan is None or viewer.state is None:
         raise RpcError(Code.INVALID_PARAMS, "plan a script first: there is nothing to replay")
     else:
         make = partial(
-            replay_file, lab.machine, lab.profile, viewer.state, viewer.look, page.plan,
-            viewer.looks,
+            exports.replay_file, lab.machine, lab.profile, viewer.state, viewer.look, page.plan,
+            viewer.looks, exports.title_of(viewer.state, "replay"),
         )  # fmt: skip
     with _room(viewer):
         content = await asyncio.to_thread(make, form, page.dark)
@@ -480,7 +445,9 @@ METHODS: Mapping[str, tuple[type[Params], Answer]] = {
     "viewer.recorded": (p.Recorded, recorded),
     "viewer.recorded_image": (p.RecordedImage, recorded_image),
     "viewer.live": (p.Live, live),
-    "viewer.slice": (p.Slice, volume_slice),
+    "viewer.block": (p.Block, volume_block),
+    "viewer.voxel": (p.Voxel, voxel),
+    "viewer.compare": (p.Live, volume_compare),
     "viewer.compose": (p.Compose, compose),
     "viewer.datasets": (p.Datasets, datasets),
     "viewer.scrub": (p.Scrub, scrub),

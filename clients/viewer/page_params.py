@@ -49,6 +49,8 @@ class Layers(Params):
     orbit: bool | None = None
     gizmos: bool | None = None
     labels: bool | None = None
+    names: bool | None = None
+    cabinet: bool | None = None
     opacity: Annotated[float, Ge(0.05), Le(1)] | None = None
 
 
@@ -127,11 +129,17 @@ class Live(Params):
     """The whole volume of a scan that was made, not one that grows."""
 
 
-class Slice(Params):
-    """A slice of the volume of a past scan, by its number."""
+class Block(Live):
+    """Which of its volumes: the one that was asked for, its sample's truth, how far they are apart,
+    or the one with the other geometry."""
 
-    name: Literal["top", "front", "side"]
-    index: Index
+    what: Literal["volume", "truth", "difference", "other"] = "volume"
+
+
+class Voxel(Live):
+    """A voxel of a volume, by its numbers along x, y and z."""
+
+    at: Annotated[list[Index], Len(3, 3)]
 
 
 class Compose(Params):

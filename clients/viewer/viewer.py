@@ -8,6 +8,7 @@ its page's own connection.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
 import time
@@ -26,15 +27,18 @@ from flexdt.clients.client.transport import ConnectionLost
 from flexdt.clients.viewer import scrubbed_plan as plans
 from flexdt.clients.viewer.feed import ImageFeed, ShownImage, grey, packed, window_of
 from flexdt.clients.viewer.front import Download, Front
-from flexdt.clients.viewer.live_volume import LiveReconstruction, points_of
+from flexdt.clients.viewer.live_volume import points_of
 from flexdt.clients.viewer.page import TRY_AGAIN, Page, watched, without_bytes
 from flexdt.clients.viewer.page_cameras import SceneClients
 from flexdt.clients.viewer.scenes import sample as shapes
 from flexdt.clients.viewer.scenes import standpoints as views
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
+from flexdt.clients.viewer.scenes.labels import NameTags
 from flexdt.clients.viewer.scenes.sample import NOTHING, MeshCache, SampleLook
 from flexdt.clients.viewer.scenes.world import World, beads_on, world_of
+from flexdt.clients.viewer.stills import Stills
 from flexdt.clients.viewer.viser_gate import Scenes
+from flexdt.clients.viewer.volume_process import LiveReconstruction
 from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SafetyState, SampleState, State
 from flexdt.runtime.access import ViewerLimits
@@ -47,14 +51,15 @@ DRAW_HZ: Final = 30.0
 ASKED_HZ: Final = 36.0
 """States asked of the twin a second: a little more, since those that come late are dropped."""
 RANGES_S: Final = 0.2
+NAMES_S: Final = 0.25
 BEAT_S: Final = 0.25
 """Between heartbeats to the pages."""
 QUIET_S: Final = 0.5
 """A twin that has sent nothing for this long is asked for its state; at rest it sends none."""
 SCENES_A_PAGE: Final = 8
 """Four views, and those that are just being closed."""
-
-
+STILL_S: Final = 5.0
+"""How long a picture of the scene waits for the twin's first state."""
 CLOSE_MM: Final = 20.0
 """Clearance below which the page warns."""
 
@@ -101,6 +106,8 @@ class Viewer:
         self.failed = asyncio.Event()
         self.grower = LiveReconstruction(self._grown)
         self.opened = self.drawn = self.sharing = 0
+        self._pictured: object = None
+        self._placed, self._stills = asyncio.Event(), Stills()
         self.pages: dict[str, Page] = {}
         self.downloads: dict[str, Download] = {}
         self.lab: LabScene | None = None
@@ -108,7 +115,7 @@ class Viewer:
         self.world: World | None = None
         self.look: SampleLook = NOTHING
         self.window: tuple[float, float] | None = None
-        self.wardrobe = MeshCache()
+        self.wardrobe, self.tags = MeshCache(), NameTags()
         self.planners = Workers(plans.PLANNERS, plans.PLAN_BYTES, plans.PLAN_S)
         self._local = {name: partial(answer, self) for name, answer in answers.items()}
         self._raw: Mapping[str, Any] | None = None
@@ -150,12 +157,14 @@ class Viewer:
         self.front = Front(
             self._page, self.scenes.connect, self.scenes.html(), self.downloads, self._token,
             max_scenes=SCENES_A_PAGE * self.limits.max_pages, max_pages=self.limits.max_pages,
+            still=self.still,
         )  # fmt: skip
         await self.front.start(host, port, ssl)
         self._tasks = [
             watched(self.link.run(), "the link to the twin", self.failed.set),
             watched(self._draw(), "drawing", self.failed.set),
             watched(self._beat(), "the heartbeat", self.failed.set),
+            watched(self._name(), "names in the scenes", self.failed.set),
             watched(self._ask(), "asking a quiet twin", self.failed.set),
         ]
 
@@ -168,7 +177,7 @@ class Viewer:
             await feed.stop()
         if self.front is not None:
             await self.front.close()
-        self.grower.stop()
+        await self.grower.close()
         self.planners.close()
         await asyncio.to_thread(self.scenes.stop)
 
@@ -223,6 +232,17 @@ class Viewer:
                 page.show("beat", beat)
             await asyncio.sleep(BEAT_S)
 
+    async def _name(self) -> None:
+        """Keep names where they have room in each view, whatever moves: cameras do it unasked."""
+        while True:
+            await asyncio.sleep(NAMES_S)
+            lab, world = self.lab, self.world
+            if lab is not None and world is not None:
+                named = lab.named(world)
+                for client in self.clients.with_names():
+                    with contextlib.suppress(AssertionError, KeyError):  # it has just come or gone
+                        await asyncio.to_thread(self.tags.draw, client, named)
+
     def _link_changed(self) -> None:
         self._heard_at = time.monotonic()
         for page in self.pages.values():
@@ -235,7 +255,7 @@ class Viewer:
             connected=self.link.connected,
             problem=self.link.problem,
             twin=str(self.twin_address),
-            cameras={name: asdict(camera) for name, camera in views.FIXED.items()},
+            cameras={name: asdict(camera) for name, camera in self.clients.cameras.items()},
             hello=hello and hello.model_dump(),
         )
 
@@ -271,6 +291,14 @@ class Viewer:
         self.state, self.world = state, world
         if sample_changed:
             await self._dress(lab, state)
+        self.clients.cameras.update(views.presets(world, self.look.radius_mm))
+        if first:  # the picture of the scene shows an image, too
+            self.feeds["line_integral"].start()
+        if lab is not before:
+            for view, camera in self.clients.cameras.items():
+                self.clients.follow(view, camera)
+            for page in self.pages.values():
+                self._tell_link(page)
         if first:  # images that came before could not be drawn
             for feed in self.feeds.values():
                 feed.again()
@@ -280,6 +308,7 @@ class Viewer:
         if lab.shown["ranges"] and time.monotonic() - self._ranges_at > RANGES_S:
             self._ranges_at = time.monotonic()
             lab.draw_ranges(state)
+        self._placed.set()
         camera, framing = views.beam_view(world)
         self.clients.follow("beam", camera)
         text = json.dumps(
@@ -309,7 +338,6 @@ class Viewer:
                     scene.show(what, visible)
                 scene.fade(self.lab.opacity)
             self.lab = scene
-            self.clients.cameras.update(views.FIXED)
             for page in self.pages.values():
                 page.say("layers", **scene.layers)
         return self.lab
@@ -348,13 +376,33 @@ class Viewer:
             small = image.pixels[::2, ::2] if coarse else image.pixels
             shown = ShownImage(small, image.kind, image.cone_vec, image.time, image.seq)
             lab.show_image(grey(shown, window), small, world)
+            self._pictured = coarse, window, image.cone_vec
         assert self._loop is not None
+        if not self.pages:
+            self._loop.call_soon_threadsafe(self.refresh_feeds)
         self._loop.call_soon_threadsafe(self._send_image, image.kind, content)
 
     def _send_image(self, kind: str, content: bytes) -> None:
         for page in self.pages.values():
             if page.kind == kind and page.recorded is None:
                 page.show("image", content)
+
+    async def still(self, asked: Mapping[str, str]) -> bytes | None:
+        """The scene as it stands, as a JPEG (see `Stills`); None: nothing is known of this view."""
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._placed.wait(), STILL_S)
+        lab, world = self.lab, self.world
+        camera = self.clients.cameras.get(asked.get("view", ""))
+        if lab is None or world is None or camera is None:
+            return None
+        stamp = (
+            self._pictured,
+            id(self.look),
+            lab.opacity,
+            *lab.shown.values(),
+            *world.view.rows.flat,
+        )
+        return await self._stills.picture(camera, asked, stamp, lambda: lab.shapes(world))
 
     def _grown(self, line: str) -> None:
         surface, slices = line.split("\t")
@@ -386,6 +434,8 @@ class Viewer:
         self.open_pages.add(page)
         self.pages[id] = page
         self._tell_link(page)
+        if self.data is not None:
+            self.grower.warm()
         if self.lab is not None:
             page.say("layers", **self.lab.layers)
         self.refresh_feeds()

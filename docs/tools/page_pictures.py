@@ -3,13 +3,14 @@
     python docs/tools/page_pictures.py [--out docs/images] [--url http://127.0.0.1:8080/]
 
 Starts a lab of its own, unless it is given the address of one whose machine stands at home. Writes
-viewer-four-views.png, viewer-scan.png, viewer-design.png and viewer-virtual.png. Needs Debian's
-chromium and playwright.
+viewer-first.png, viewer-four-views.png, viewer-scan.png, viewer-design.png and viewer-virtual.png,
+in COLORS colours. Needs Debian's chromium, playwright and Pillow.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import signal
 import subprocess
@@ -20,11 +21,14 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
+
 CHROMIUM = "/usr/bin/chromium"
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic"]
 SIZE = {"width": 1440, "height": 810}
 FADED_MS = 6000
 """A scene fades in once its parts have come."""
+COLORS = 256
 PATIENCE_MS = 300_000
 WRONG = "flexdt.call('calibration.apply', {parameters: {dO_x: 0.3, dO_z: -0.4}, comment: 'wrong'})"
 """A correction by which the beads stand beside where they are seen, until a fit puts it right."""
@@ -47,8 +51,10 @@ def lab() -> Iterator[str]:
             process.wait(30)
 
 
-def opened(browser: Any, url: str, view: str, tab: str) -> Any:
+def opened(browser: Any, url: str, view: str, tab: str, fresh: bool = False) -> Any:
     page = browser.new_page(viewport=SIZE)
+    if not fresh:
+        page.add_init_script("localStorage.setItem('flexdt-welcome', 'seen')")
     page.set_default_timeout(PATIENCE_MS)
     page.goto(f"{url}?view={view}&tab={tab}&theme=light&patience=60")
     page.wait_for_function("window.flexdt?.store.image && flexdt.store.session")
@@ -63,7 +69,18 @@ def taken(page: Any, path: Path) -> None:
         page.wait_for_timeout(FADED_MS)
         page.locator("#veil").wait_for(state="hidden")
         last = now
-    page.screenshot(path=path)
+    raw = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
+    few = raw.quantize(COLORS, Image.Quantize.MAXCOVERAGE, kmeans=3, dither=Image.Dither.NONE)
+    few.save(path, optimize=True)
+
+
+def first(browser: Any, url: str, to: Path) -> None:
+    page = opened(browser, url, "iso", "move", fresh=True)
+    page.evaluate("flexdt.call('tube.set', {on: true})")
+    page.locator("#beam", has_text="ON").wait_for()
+    taken(page, to / "viewer-first.png")
+    page.evaluate("flexdt.call('tube.set', {on: false})")
+    page.close()
 
 
 def four_views(browser: Any, url: str, to: Path) -> None:
@@ -118,7 +135,7 @@ def main() -> None:
     chosen.out.mkdir(parents=True, exist_ok=True)
     with nullcontext(chosen.url) if chosen.url else lab() as url, sync_playwright() as play:
         browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        for picture in (four_views, scan, virtual):
+        for picture in (first, four_views, scan, virtual):
             picture(browser, url, chosen.out)
         browser.close()
 

@@ -31,10 +31,12 @@ def measured(twin: fx.TwinClient, data: Path, side: int, frames: int) -> str:
     name = f"slices-{side}"
     job = twin.submit_script(script, name, 1.0).job
     grower = subprocess.Popen(
-        [sys.executable, "-m", "flexdt.clients.viewer.live_volume", str(data / name), str(side)],
-        stdout=subprocess.PIPE, text=True, env={**os.environ, **ENVIRONMENT},
+        [sys.executable, "-m", "flexdt.clients.viewer.live_volume"],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**os.environ, **ENVIRONMENT},
     )  # fmt: skip
+    assert grower.stdin is not None
     assert grower.stdout is not None
+    print(data / name, side, sep="\t", file=grower.stdin, flush=True)
     last = data / name / f"scan_{frames - 1:06d}.tif"
     steps, views, behind, voxel_mm, ended = [], [], 0.0, 0.0, 0.0
     for line in grower.stdout:
@@ -43,6 +45,9 @@ def measured(twin: fx.TwinClient, data: Path, side: int, frames: int) -> str:
         steps.append(now)
         views.append(told["views"])
         voxel_mm, ended = told["voxel_mm"], time.time()
+        if "done" in told:
+            break
+    grower.stdin.close()
     grower.wait()
     assert twin.wait_job(job).state == "done"
     behind = ended - last.stat().st_mtime

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import seen, until
+from tests.viewer.looking import KNOWN_HERE, seen, until
 
 CHROMIUM = "/usr/bin/chromium"
 FLAGS = [
@@ -185,12 +185,15 @@ def open_page(chromium: Any, lab: Lab, console: list[str]) -> Iterator[Callable[
         view: str = "none",
         size: tuple[int, int] = (1280, 800),
         notes_stay: bool = True,
+        fresh: bool = False,
         **query: object,
     ) -> Any:
         page = chromium.new_page(viewport={"width": size[0], "height": size[1]})
         page.set_default_timeout(120_000)
         page.on("pageerror", lambda error: console.append(str(error)))
         page.on("console", lambda m: console.append(m.text) if _matters(m) else None)
+        if not fresh:
+            page.add_init_script(KNOWN_HERE)
         if notes_stay:
             page.add_init_script(NOTES_STAY)
         given = {"view": view, "theme": "light", "patience": PATIENCE_S, **query}

@@ -221,7 +221,7 @@ def test_help_lists_every_key(page: Any) -> None:
     text = page.inner_text("#help-dialog")
     assert "source up" in text
     assert "emergency stop" in text
-    assert page.locator("#help-dialog kbd").count() == 22
+    assert page.locator("#help-dialog kbd").count() == 23
     page.click("#help-dialog button")
     assert not page.locator("#help-dialog").is_visible()
 

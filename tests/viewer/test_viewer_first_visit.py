@@ -88,10 +88,9 @@ def look_along_the_beam(v: Visitor) -> None:
 
 
 def move_the_sample(v: Visitor) -> None:
-    """the readouts follow: SOD 514.92 mm"""
-    v.write("mag_obj value", "500")
-    # The axis stands 14.92 mm behind what the motor counts from.
-    until(lambda: v.readout("SOD") == "514.92 mm", "the distance")
+    """the readouts follow: SOD 500.00 mm"""
+    v.write("Source to sample", "500")
+    until(lambda: v.readout("SOD") == "500.00 mm", "the distance")
 
 
 def turn_the_sample(v: Visitor) -> None:
@@ -291,7 +290,7 @@ def test_a_task_of_a_first_visit(
     task: str, quiet: None, open_page: Callable[..., Any], table: dict[str, str], tmp_path: Path
 ) -> None:
     do = TASKS[task]
-    page = open_page(view="iso" if do is look_along_the_beam else "none")
+    page = open_page(view="iso" if do is look_along_the_beam else "none", fresh=True)
     visitor = Visitor(page, tmp_path)
     do(visitor)
     page.close()

@@ -89,6 +89,28 @@ def test_pages_scripts_and_downloads() -> None:
     with_front(work)
 
 
+def test_a_picture_that_takes_too_long_is_answered_with_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "STILL_S", 0.05)
+
+    async def slow(asked: object) -> bytes:
+        await asyncio.sleep(30.0)
+        return b"late"
+
+    async def work() -> None:
+        front = Front(echo, nowhere, HTML, {}, still=slow)
+        await front.start("127.0.0.1", 0)
+        try:
+            status, headers, body = await fetch(front.port, "/still.jpg?view=iso")
+            assert (status, body) == (204, b"")
+            assert headers["Connection"] == "close"  # no further request goes into nothing
+        finally:
+            await front.close()
+
+    asyncio.run(work())
+
+
 def test_what_has_not_changed_is_not_sent_again() -> None:
     """viser's program, nearly all of each view, is one file under a name made of its content."""
     program = '<script data-p="ab!c" data-ss="7">run(document.currentScript.dataset.p)</script>'

@@ -100,7 +100,7 @@ def test_slices_of_another_page_and_answers_that_come_late(page: Any) -> None:
     const note = document.querySelector('#volume-note');
     const choose = (v) => { size.value = v; size.dispatchEvent(new Event('change')); };
     """
-    told = {"name": "none", "views": 5, "of": 9, "voxel_mm": 0.1, "low": 0, "high": 1, "slices": {}}
+    told = {"name": "none", "past": False, "views": 5, "of": 9, "voxel_mm": 0.1, "size": [9, 9, 9]}
     own, other = (("volume", {**told, "side": side}) for side in (128, 256))
     emitted(page, ("job", job), then=f"{choose} choose('128'); 0")
     assert "another page" not in emitted(page, own, then=f"{choose} note.textContent")

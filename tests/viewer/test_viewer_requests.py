@@ -121,7 +121,9 @@ WRONG = [
     ("calibration.apply", {"parameters": {"alpha": 2**70}}),
     ("viewer.screenshot", {"width": 10**9}),
     ("viewer.export", {"format": "exe"}),
-    ("viewer.slice", {"name": "below", "index": 0}),
+    ("viewer.block", {"name": "a", "what": "below"}),
+    ("viewer.voxel", {"name": "a", "at": [0, 0, -1]}),
+    ("viewer.compare", {"truth": "hidden"}),
     ("calibration.apply", {"parameters": {}}),
     ("calibration.apply", {"parameters": {"alpha": "0.2"}}),
 ]

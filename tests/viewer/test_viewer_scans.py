@@ -314,6 +314,9 @@ def test_replay_and_scene_files_open_without_a_server(
         assert path.stat().st_size > 20_000
         if path.suffix == ".html":
             assert b"__VISER_EMBED" in path.read_bytes()
+            told = re.search(r"<title>(.*?)</title>", path.read_text("utf-8"))
+            assert told is not None
+            assert re.fullmatch(r"[\w-]+ · [\d-]{10} \d\d:\d\d · flexdt \w+", told[1])
         if path.suffix == ".viser":  # it opens where the machine is seen, not from viser's default
             messages = contents(path)
             first = [m["position"] for _, m in messages if m["type"] == "SetCameraPositionMessage"]
@@ -328,6 +331,9 @@ def test_replay_and_scene_files_open_without_a_server(
             canvas = alone.locator("canvas").first
             canvas.wait_for()
             wait(lambda on=canvas: drawn(picture(on)), f"the machine in the {kind}")
+            if kind == "scene":
+                assert alone.locator("img[alt=radiograph]").evaluate("e => e.naturalWidth") >= 200
+                assert "source to detector: " in alone.locator("aside").inner_text()
             if kind == "replay":
                 first = picture(canvas)
                 wait(lambda on=canvas, was=first: changed(picture(on), was) > 200, "it plays")

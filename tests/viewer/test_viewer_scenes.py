@@ -16,9 +16,11 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import ConvexHull
 
 from flexdt.clients.client.client import TwinClient
-from flexdt.clients.viewer.page_cameras import roomy
 from flexdt.clients.viewer.scenes.gizmos import SIZE_M
-from flexdt.clients.viewer.scenes.standpoints import FIXED
+from flexdt.clients.viewer.scenes.standpoints import FIXED, Standpoint, presets, roomy
+from flexdt.clients.viewer.scenes.world import world_of
+from flexdt.protocol.state_model import State
+from flexdt.twin.machine.description import builtin_machine, profile_of
 from tests.viewer.looking import changed, drawn, frames, picture, seen, settled, still
 
 pytestmark = pytest.mark.browser
@@ -53,7 +55,7 @@ def layers(page: Any, **values: object) -> None:
 
 def outline_error(scene: Any, lab: Any, wait: Wait) -> float:
     """How far [px of the screen] the drawn sample's outline lies from its shadow's, at worst."""
-    hidden = {"machine": False, "panel": False, "beam": False, "axis": False, "orbit": False}
+    hidden = dict.fromkeys(HIDDEN, False)
     layers(scene, **hidden, opacity=1.0)
     scene.evaluate("flexdt.call('camera.set', {roi: [32, 8, 1943, 1527], mode: 'HW2SW1High'})")
     with lab.client() as client:
@@ -148,7 +150,7 @@ def held(box: Any) -> bool:
 def with_handles(scene: Any, twin: TwinClient, wait: Wait, view: str) -> Any:
     """Show a view at its preset with handles, the stages apart."""
     scene.evaluate("flexdt.call('session.control', {action: 'force'})")
-    scene.evaluate("flexdt.call('axes.move', {targets: {mag_det: 900, mag_obj: 450}})")
+    scene.evaluate("flexdt.call('axes.move', {targets: {mag_det: 900, mag_obj: 450, tra_obj: 0}})")
     wait(lambda: not any(a.moving for a in twin.state().axes.values()))
     box = show(scene, view)
     scene.click("#tabs [data-tab=move]")
@@ -241,11 +243,20 @@ def _handles(scene: Any, twin: TwinClient) -> dict[str, npt.NDArray[np.float64]]
     return {stage: np.array([0.0, y, z]) * 0.001 for stage, (y, z) in along.items()}
 
 
+def overview(page: Any) -> Standpoint:
+    """The isometric view's preset with the block on the stage, from the state that a page shows."""
+    machine = builtin_machine()
+    state = State.model_validate(page.evaluate("flexdt.store.state"))
+    world = world_of(machine, profile_of(machine), state)
+    return presets(world, 0.5 * float(np.linalg.norm(BLOCK_MM)))["iso"]
+
+
 def _on_screen(
-    frame: dict[str, float], view: str, point: npt.NDArray[np.float64]
+    frame: dict[str, float], preset: str | Standpoint, point: npt.NDArray[np.float64]
 ) -> tuple[float, float]:
     """Where a point of the world [m] appears on the page, in a view that is at its preset."""
-    camera = roomy(FIXED[view], frame["width"] / frame["height"])
+    preset = FIXED[preset] if isinstance(preset, str) else preset
+    camera = roomy(preset, frame["width"] / frame["height"])
     eye = np.asarray(camera.position)
     ahead = np.asarray(camera.look_at) - eye
     ahead /= np.linalg.norm(ahead)
@@ -339,7 +350,7 @@ def test_four_views_at_once(scene: Any) -> None:
 
 
 BLOCK_MM = (120.0, 80.0, 30.0)
-HIDDEN = ("machine", "panel", "beam", "axis", "orbit")
+HIDDEN = ("names", "cabinet", "machine", "panel", "beam", "axis", "orbit")
 MIDDLE = {"tra_obj": 0.0, "tra_tube": 0.0, "tra_det": 24.1, "ver_tube": 50.0, "ver_det": 60.0,
           "mag_obj": 500.0, "mag_det": 1000.0, "rot_obj": 25.0}  # fmt: skip
 PINK = (255.0, 60.0, 160.0)
@@ -381,7 +392,8 @@ def off_outline(box: Any, layer: str, view: str, points: npt.NDArray[np.float64]
     The points are projected here, with the pinhole of the view's camera alone.
     """
     frame = {**box.bounding_box(), "x": 0.0, "y": 0.0}
-    corners = np.array([_on_screen(frame, view, p) for p in points])
+    preset = overview(box.page) if view == "iso" else FIXED[view]
+    corners = np.array([_on_screen(frame, preset, p) for p in points])
     wanted = inside_hull(corners, int(frame["height"]), int(frame["width"]))
     assert 200 < wanted.sum() < 0.2 * wanted.size
     depth = np.where(wanted, distance_transform_edt(wanted), distance_transform_edt(~wanted))
@@ -481,7 +493,7 @@ def test_a_clicked_pixels_ray_is_drawn_and_says_what_it_goes_through(
 
         wait(said, f"{inside} mm of abs at {column} {row}")
     here, there = (
-        np.array(_on_screen({**box.bounding_box(), "x": 0.0, "y": 0.0}, "iso", point))
+        np.array(_on_screen({**box.bounding_box(), "x": 0.0, "y": 0.0}, overview(block), point))
         for point in (_handles(block, twin)["source"], place_of(twin, (column, row)))
     )
     shown = settled(box, lambda now: pink(now).sum() > PATH_PX)
@@ -543,19 +555,19 @@ def test_names_axes_scale_and_a_look_at_the_sample(scene: Any) -> None:
 def test_parts_about_to_touch_are_highlighted(scene: Any, twin: TwinClient, wait: Wait) -> None:
     """Their collision bodies turn red, and lose it when they are apart again."""
     box = show(scene, "side")
-    layers(scene, sample=False)  # which is red itself
     red = lambda now: int((now[..., 0] - now[..., 1:].max(axis=2) > 40.0).sum())  # noqa: E731
-    settled(box, lambda now: red(now) < 200)
+    layers(scene, sample=False)  # which is red itself
+    apart = red(still(box))
     into = "flexdt.call('axes.move', {targets: {mag_det: 300}}).then(() => null, (e) => e.code)"
     try:
         assert scene.evaluate(into) == -32002
         scene.locator("#near .meter.touch").wait_for()
-        settled(box, lambda now: red(now) > 1000)
+        settled(box, lambda now: red(now) > apart + 1000)
     finally:
         scene.evaluate("flexdt.call('safety.reset')")
         scene.evaluate("flexdt.call('axes.move', {targets: {mag_det: 1000}})")
         wait(lambda: abs(twin.state().axes["mag_det"].position - 1000.0) < 1e-6)
-    settled(box, lambda now: red(now) < 200)
+    settled(box, lambda now: red(now) < apart + 200)
     layers(scene, sample=True)
 
 

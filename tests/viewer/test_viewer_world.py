@@ -25,7 +25,7 @@ from flexdt.clients.viewer.scenes import parts
 from flexdt.clients.viewer.scenes import parts as bodies
 from flexdt.clients.viewer.scenes import sample as shapes
 from flexdt.clients.viewer.scenes import sample as solids
-from flexdt.clients.viewer.scenes.beam_shade import MOST, fans
+from flexdt.clients.viewer.scenes.beam_shade import HULL, MOST, SIDES, fans
 from flexdt.clients.viewer.scenes.gizmos import Gizmos
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.sample import MeshCache
@@ -429,6 +429,32 @@ def test_the_beam_in_the_air_has_the_transmission_of_the_pixels_behind_it() -> N
                 assert plane.rgba[r, c, 3] == pytest.approx(MOST * light, abs=1.0)
                 seen += light > 0.0
             assert seen > 60
+
+
+def test_the_beam_is_never_a_wall() -> None:
+    """Along looks from anywhere to anywhere in it, half of what lies behind is still seen."""
+    rng = np.random.default_rng(7)
+    world = placed(MACHINE, PROFILE, CAMERA, AT)
+    sheets = fans(world, np.zeros(world.shape), 25.0)
+    hull = np.vstack([world.source, world.corners])[SIDES]
+    most = 0.0
+    for _ in range(3000):
+        part = rng.uniform(0.02, 0.98)
+        target = world.source + part * (rng.dirichlet(np.ones(4)) @ world.corners - world.source)
+        way = rng.normal(size=3)
+        eye, kept = target - way * rng.uniform(5.0, 800.0) / np.linalg.norm(way), 1.0
+        for sheet in sheets:
+            a, b, _ = np.linalg.solve(
+                np.column_stack([sheet.axes[:, :2], eye - target]), eye - sheet.center
+            ) / (*sheet.size, 1.0)
+            row, column = int((b + 0.5) * 160 // 1), int((a + 0.5) * 192 // 1)
+            if 0 <= row < 160 and 0 <= column < 192:
+                kept *= 1.0 - sheet.rgba[row, column, 3] / 255.0
+        for p, q, r in hull:
+            a, b, along = np.linalg.solve(np.column_stack([q - p, r - p, eye - target]), eye - p)
+            kept *= 1.0 - HULL * (min(a, b) >= 0.0 and a + b <= 1.0 and along > 0.0)
+        most = max(most, 1.0 - kept)
+    assert 0.3 < most < 0.5
 
 
 def test_what_is_drawn_of_axis_and_beam_follows_stage_and_tube() -> None:

@@ -10,6 +10,8 @@ import math
 
 import numpy as np
 
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings, PixelGrid
@@ -31,17 +33,31 @@ def readout(
         The readout, or None where there is none: the axis or the detector is not in front of
         the focal spot.
     """
-    rows, cols = camera.shape
     cone = poses[:1].cone_vec(parameters)
-    sdd = float(cone.source_detector_distance[0])
     # The axis in the object's frame: through tau, whose direction tau_y does not matter here.
     tau = np.array([parameters.tau_x, parameters.tau_z, 0.0]) - poses.mount[0]
-    sod = float((tau - cone.source[0]) @ cone.normal[0])
+    return readout_of(cone, camera.shape, camera.pixels_mm(sensor), tau)
+
+
+def readout_of(
+    cone: ConeVec, shape: tuple[int, int], pixels_mm: tuple[float, float], axis: FloatArray
+) -> Readout | None:
+    """Derived quantities of the first view of a geometry, or None as `readout` has it.
+
+    Args:
+        cone: in the object's frame.
+        shape: of the image, (rows, cols).
+        pixels_mm: pitch along columns and along rows.
+        axis: a point (3,) of the rotation axis, which is parallel to z [mm].
+    """
+    rows, cols = shape
+    pixel, row_pixel = pixels_mm
+    sdd = float(cone.source_detector_distance[0])
+    sod = float((axis - cone.source[0]) @ cone.normal[0])
     if sod <= 0.0 or sdd <= 0.0:
         return None
-    pixel, row_pixel = camera.pixels_mm(sensor)
     column, row = cone.piercing_points((rows, cols))[0]
-    on_axis = [tau[0], tau[1], cone.source[0, 2]]
+    on_axis = [axis[0], axis[1], cone.source[0, 2]]
     axis_column = cone.project_points(on_axis, (rows, cols))[0, 0, 0]
     scale = sod / sdd
     up, down = (x * row_pixel / sdd for x in (row + 0.5, rows - 0.5 - row))

@@ -144,6 +144,8 @@ export function chosen(input, take) {
     input.addEventListener("change", () => { const file = input.files?.[0]; if (file)
         void take(file); input.value = ""; });
 }
+// A term that explains itself where it stands: under the pointer, when tapped, and when the keyboard comes to it.
+export const term = (words, tip) => el("button", { type: "button", class: "term", "aria-description": tip, "data-tip": tip }, words);
 // What went wrong, in words.
 export const words = (error) => (error instanceof Error ? error.message : String(error));
 // The element of a kind that an event happened within; elements of other frames are of other classes.

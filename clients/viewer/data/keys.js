@@ -3,7 +3,7 @@ import { $dialog, $input, el, keep, within } from "./dom.js";
 import { jogStart, jogStop, jogStopAll } from "./axes.js";
 import { command, on, store } from "./link.js";
 import { estop } from "./status.js";
-import { layout } from "./views.js";
+import { layout, nearSample } from "./views.js";
 // Key -> axis, direction, what it does.
 export const JOGS = {
     KeyI: ["ver_tube", 1, "source up"], KeyK: ["ver_tube", -1, "source down"],
@@ -62,6 +62,11 @@ function down(e) {
         layout(LAYOUTS[e.code]);
         return;
     }
+    if (e.altKey && e.code === "Digit0") {
+        e.preventDefault();
+        nearSample();
+        return;
+    }
     if (e.altKey || !byKey.checked)
         return; // single letters move nothing until somebody wishes it
     const jog = JOGS[e.code.replace("Numpad", "Digit")];
@@ -91,7 +96,7 @@ export function toggleHelp() {
     if (!dialog.childElementCount) {
         const grid = el("div", { class: "keys" });
         const jogs = Object.entries(JOGS).map(([code, [, , what]]) => [name(code), what]);
-        for (const [key, what] of [...jogs, ["Space", "stop all axes"], ["Shift+Space", "emergency stop"], ["Alt+1…5", "views"], ["F1", "this help"]])
+        for (const [key, what] of [...jogs, ["Space", "stop all axes"], ["Shift+Space", "emergency stop"], ["Alt+1…5", "views"], ["Alt+0", "the sample, near"], ["F1", "this help"]])
             grid.append(el("kbd", {}, key), el("span", {}, what));
         dialog.append(el("h2", {}, "Keys"), grid, el("p", { class: "muted" }, HELP), el("div", { class: "row between" }, el("a", { href: "https://viser.studio", target: "_blank", class: "muted" }, "3-D by viser"), el("button", { class: "primary", onclick: () => dialog.close() }, "Close")));
     }

@@ -11,7 +11,9 @@ import * as data from "./data.js";
 import "./calibrate.js";
 import "./share.js";
 import "./layout.js";
-import "./volume.js";
+import { look as volume } from "./volume.js";
+import "./path.js";
+import "./welcome.js";
 import { asked } from "./address.js";
 import { listen, toggleHelp } from "./keys.js";
 import { layout } from "./views.js";
@@ -22,8 +24,6 @@ function theme(dark, tell = true) {
         call("viewer.theme", { dark }).catch(() => { });
 }
 const dark = () => document.documentElement.dataset.theme === "dark";
-const wanted = asked("theme") ?? localStorage.getItem("flexdt-theme") ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
-theme(wanted === "dark", false);
 $button("#theme").addEventListener("click", () => theme(!dark()));
 $button("#help").addEventListener("click", toggleHelp);
 on("open", () => theme(dark()));
@@ -33,6 +33,6 @@ tab(known(asked("tab")));
 listen(window);
 connect();
 // The scenes' frames say which page they belong to, so the page has been registered before.
-on("connection", () => { if (store.cameras && !$("#views").childElementCount)
-    layout(asked("view") ?? localStorage.getItem("flexdt-layout") ?? "iso"); });
-window.flexdt = { store, call, scan, data, film, picture, value };
+on("connection", () => { if (store.cameras?.iso && !$("#views").childElementCount)
+    layout(window.firstView); });
+window.flexdt = { store, call, scan, data, film, picture, value, volume };

@@ -1,7 +1,23 @@
 "use strict";
-// Runs in each viser frame before viser. Without a graphics processor (`gap` > 0, the page's choice)
+// Runs in each viser frame before viser. It tells the page when something has been drawn: an empty scene takes fewer
+// calls than ENOUGH a picture, or all is hidden. Without a graphics processor (`gap` > 0, the page's choice)
 // a picture is drawn at most every `gap` ms and without smoothed edges, so that the rest stays quick.
 (() => {
+    const ENOUGH = 3, LATE_MS = 5000, ask = window.requestAnimationFrame.bind(window), gl = WebGL2RenderingContext.prototype;
+    // eslint-disable-next-line @typescript-eslint/unbound-method -- it is called with its context below
+    const draw = gl.drawElements;
+    let calls = 0, first = Infinity;
+    gl.drawElements = function (...all) { calls++; first = Math.min(first, performance.now()); draw.apply(this, all); };
+    const look = () => {
+        if (calls >= ENOUGH || performance.now() > first + LATE_MS) {
+            gl.drawElements = draw;
+            parent.postMessage("drawn", location.origin);
+            return;
+        }
+        calls = 0;
+        ask(look);
+    };
+    ask(look);
     const gap = Number(new URLSearchParams(location.search).get("gap") ?? 0);
     if (!(gap > 0))
         return;
@@ -10,7 +26,6 @@
     HTMLCanvasElement.prototype.getContext = function (kind, options) {
         return context.call(this, kind, /^webgl/.test(kind) ? { ...options, antialias: false } : options);
     };
-    const ask = window.requestAnimationFrame.bind(window);
     let queue = new Map(), next = 1, last = -Infinity, due = false;
     const run = (time) => {
         const now = queue;

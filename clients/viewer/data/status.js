@@ -1,16 +1,22 @@
 // Bar, readouts, warnings and notes: who holds control, how near things are, what went wrong.
-import { $, $$, $button, $dialog, $input, el, fixed, isNumber, setText } from "./dom.js";
+import { $, $$, $button, $dialog, $input, el, fixed, isNumber, setText, term } from "./dom.js";
 import { command, OLD_S, on, person, rename, store } from "./link.js";
 const ROWS = [
-    ["SOD", (s) => `${fixed(s.geometry.SOD_mm, 2)} mm`], ["SDD", (s) => `${fixed(s.geometry.SDD_mm, 2)} mm`],
-    ["magnification", (s) => `${fixed(s.geometry.magnification, 4)}×`], ["voxel", (s) => `${fixed(s.geometry.voxel_size_mm * 1000, 2)} µm`],
-    ["field of view", (s) => s.geometry.field_of_view_mm.map((v) => fixed(v, 1)).join(" × ") + " mm"],
-    ["cone angle", (s) => `${fixed(s.geometry.cone_angle_deg, 2)}°`],
-    ["piercing point", (s) => s.geometry.piercing_point_px.map((v) => fixed(v, 1)).join(", ") + " px"],
-    ["axis column", (s) => `${fixed(s.geometry.axis_column_px, 1)} px`],
-    ["beam", (s) => (s.tube.on ? !s.tube.ready && s.tube.ready_in_s !== null ? `ready in ${fixed(s.tube.ready_in_s, 0)} s` : `${fixed(s.tube.kV, 0)} kV, ${fixed(s.tube.power_W, 0)} W` : "off")],
+    ["SOD", (g) => `${fixed(g.SOD_mm, 2)} mm`], ["SDD", (g) => `${fixed(g.SDD_mm, 2)} mm`],
+    ["magnification", (g) => `${fixed(g.magnification, 4)}×`], ["voxel", (g) => `${fixed(g.voxel_size_mm * 1000, 2)} µm`],
+    ["field of view", (g) => g.field_of_view_mm.map((v) => fixed(v, 1)).join(" × ") + " mm"],
+    ["cone angle", (g) => `${fixed(g.cone_angle_deg, 2)}°`],
+    ["piercing point", (g) => g.piercing_point_px.map((v) => fixed(v, 1)).join(", ") + " px"],
+    ["axis column", (g) => `${fixed(g.axis_column_px, 1)} px`],
 ];
-const cells = ROWS.map(([name]) => { const dd = el("dd"); $("#readouts").append(el("dt", {}, name), dd); return dd; });
+const beam = (t) => (t.on ? !t.ready && t.ready_in_s !== null ? `ready in ${fixed(t.ready_in_s, 0)} s` : power(t) : "off");
+const power = (t) => `${fixed(t.kV, 0)} kV, ${fixed(t.power_W, 0)} W`;
+const TIPS = {
+    SOD: "Source to object: from the focal spot to the rotation axis", SDD: "Source to detector: from the focal spot to the panel",
+    magnification: "SDD / SOD", voxel: "A pixel of the image, as large as it is at the sample", "field of view": "What of the sample the image holds, width × height",
+    "cone angle": "Opening of the beam that meets the image", "piercing point": "Pixel (column, row) in which the perpendicular from the focal spot meets the panel", "axis column": "Column in which the rotation axis appears",
+};
+const cells = [...ROWS.map(([name]) => name), "beam"].map((name) => { const dd = el("dd"), tip = TIPS[name]; $("#readouts").append(el("dt", {}, tip ? term(name, tip) : name), dd); return dd; });
 export function note(kind, title, body = "", life = kind === "error" ? 12000 : 6000) {
     const box = $("#notes");
     $$("#notes > *").find((n) => n.dataset.key === title + body)?.remove();
@@ -74,13 +80,21 @@ function warnings(s) {
 }
 const share = (part) => (part < 0.01 ? "some" : `${fixed(100 * part, 0)} %`);
 let lastWarnings = "";
+// Of the machine or, while a data set is open, of the image of it that is shown: nominal, as it was scanned.
+function readouts() {
+    const s = store.state, name = store.recorded, about = store.image?.recorded;
+    if (!s)
+        return;
+    const g = name === null ? s.geometry : about?.geometry, tube = about?.tube;
+    ROWS.forEach(([, f], k) => { setText(cells[k], g ? f(g) : "–"); });
+    setText(cells[ROWS.length], name === null ? beam(s.tube) : !tube ? "–" : tube.on ? power(tube) : "off");
+    setText($("#geometry-of"), name === null ? "" : `of ${name}${about ? `, image ${about.index + 1}` : ""}: ${g ? "nominal" : "not known"}`);
+    $("#near-live").hidden = name === null;
+}
+on("image", readouts);
+on("recorded", readouts);
 on("state", (s) => {
-    ROWS.forEach(([, f], i) => { let t; try {
-        t = f(s);
-    }
-    catch {
-        t = "–";
-    } setText(cells[i], t); });
+    readouts();
     const list = warnings(s), key = JSON.stringify(list);
     if (key !== lastWarnings) {
         lastWarnings = key;

@@ -3,7 +3,7 @@ import { $, $$, el } from "./dom.js";
 import { call, emit, on, pageId, store } from "./link.js";
 import { remember } from "./address.js";
 const NAMES = { iso: "Isometric", beam: "Beam’s eye", side: "Side", free: "Free" };
-const WIDE = 1.35; // aspect for which the fixed cameras are made, as in clients.py
+const WIDE = 1.35; // aspect for which the cameras are made, as in standpoints.py
 const open = new Map();
 $("#view-switch").append(...Object.entries({ four: "Four views", ...NAMES }).map(([name, words]) => el("button", { "data-layout": name, onclick: () => layout(name, true) }, words)));
 export let current = null;
@@ -19,15 +19,15 @@ export const software = (() => {
 })();
 const GAP_MS = Number(query.get("gap") ?? (software ? 400 : 0));
 const DPR = query.get("dpr") ?? (devicePixelRatio > 1.5 && !software ? "" : "1");
-// The preset from the start, so that nothing jumps when the viewer sets it again.
+// The preset from the start, so that nothing jumps when the viewer sets it again. The beam's eye has none: it moves
+// with the machine, and the camera that this page was told is the one of the moment in which it connected.
 function preset(view, box) {
     const camera = store.cameras?.[view];
-    if (!camera)
+    if (!camera || view === "beam")
         return "";
     const { position: p, look_at: l, fov } = camera, aspect = box.clientWidth / Math.max(1, box.clientHeight);
-    const away = view === "beam" ? 1 : Math.max(1, WIDE / Math.max(aspect, 0.3));
-    const from = p.map((v, i) => (l[i] + (v - l[i]) * away).toFixed(4));
-    return `initialCameraPosition=${from.join()}&initialCameraLookAt=${l.join()}&initialCameraFov=${fov}&`;
+    const wider = Math.max(1, WIDE / Math.max(aspect, 0.3));
+    return `initialCameraPosition=${p.join()}&initialCameraLookAt=${l.join()}&initialCameraFov=${2 * Math.atan(wider * Math.tan(fov / 2))}&`;
 }
 function frame(view) {
     const src = `/scene/${pageId}/${view}?${DPR ? `fixedDpr=${DPR}&` : ""}gap=${GAP_MS}`;
@@ -42,13 +42,38 @@ function frame(view) {
         return { box, iframe, crop, tag, src };
     }
     const home = el("button", { class: "home", title: "Back to this view's preset", onclick: () => call("viewer.camera", { view }) }, "⌂");
-    const look = el("button", { class: "look", title: "Look at the sample", onclick: () => call("viewer.camera", { view, sample: true }) }, "◎");
-    box.append(iframe, tag, home, look);
+    const near = { title: "Look at the sample (Alt+0)", onclick: () => closer(view) };
+    box.append(iframe, tag, home, el("button", { class: "look", ...near }, "◎"));
+    if (view === "iso")
+        box.append(el("button", { class: "inset", "aria-label": "Look at the sample", ...near }, inset));
     return { box, iframe, tag, src };
 }
+const closer = (view) => call("viewer.camera", { view, sample: true }).catch(() => { });
+export function nearSample() { for (const view of open.keys())
+    if (view !== "beam")
+        void closer(view); }
+const still = $("#still"), inset = el("img", { alt: "" }), INSET_MS = 2500, INSET_PX = 112;
+still.addEventListener("error", () => { still.hidden = true; });
+window.addEventListener("message", (e) => {
+    for (const { box, iframe } of open.values())
+        if (e.source === iframe.contentWindow && e.data === "drawn") {
+            box.classList.add("live");
+            still.hidden = true;
+        }
+});
+let posed = "", seenAt = -Infinity;
+on("state", (s) => {
+    const now = JSON.stringify([s.sample, s.correction, Object.values(s.axes).map((a) => a.position.toFixed(1)), document.documentElement.dataset.theme]);
+    if (now === posed || !inset.isConnected || performance.now() < seenAt + INSET_MS)
+        return;
+    posed = now;
+    seenAt = performance.now();
+    window.still(inset, "sample", { clientWidth: INSET_PX, clientHeight: INSET_PX });
+});
 // Without WebGL there are no scenes; all the rest works.
 function bare() {
     document.body.dataset.webgl = "none";
+    still.hidden = true;
     $("#views").replaceChildren(el("p", { class: "bare muted" }, "This browser draws no 3-D pictures (WebGL is off). Radiograph, axes and scans work without."));
     for (const button of $$("#view-switch button"))
         button.disabled = true;
@@ -65,6 +90,12 @@ export function layout(asked, step = false) {
     }
     const wanted = which === "none" ? [] : which === "four" ? ["iso", "beam", "side", "free"] : [which];
     const views = $("#views");
+    if (views.childElementCount && wanted.length === 1 && which !== "beam" && !open.has(wanted[0])) {
+        still.hidden = false;
+        window.still(still, which, views);
+    }
+    else if (wanted.length !== 1 || which === "beam")
+        still.hidden = true;
     views.dataset.layout = which;
     for (const [view, parts] of open)
         if (!wanted.includes(view)) {

@@ -1,22 +1,34 @@
-// Three slices of a volume: of the one that grows while a scan runs, or of a past scan's, which is reconstructed on request.
-import { $, $button, $canvas, $input, $select, clicks, fixed, keep, putImage, setText, words } from "./dom.js";
+// A volume: the one that grows while a scan runs, or a past scan's, as flexdt reconstruct makes it. It comes here as a whole, as slices that
+// scroll and in three dimensions, and beside the truth of its sample.
+import { $, $button, $canvas, $input, $select, bars, cleared, clicks, el, fixed, keep, setText, slid, words } from "./dom.js";
 import { call, on, store } from "./link.js";
 import { folder } from "./data.js";
-const KEY = "flexdt-volume", STARTING = "starting; dark, flat and a first image are needed", SIDES = ["top", "front", "side"];
-const size = $select("#volume-side"), note = $("#volume-note"), progress = $("#volume-progress");
+import { extent, index, slices, valueOf } from "./slices.js";
+import { raycast } from "./raycast.js";
+import { shared } from "./shared.js";
+const KEY = "flexdt-volume", STARTING = "starting; dark, flat and a first image are needed", EXACT_MS = 60;
+const SHOWN = { volume: "volume", other: "the other geometry", truth: "truth of the sample", difference: "volume − truth" };
+const size = $select("#volume-side"), note = $("#volume-note"), progress = $("#volume-progress"), shown = $select("#volume-shown");
+const chart = $canvas("#volume-histogram"), plot = $canvas("#volume-profile"), ends = [$input("#volume-low"), $input("#volume-high")], level = $input("#volume-level");
 size.addEventListener("change", choose);
 size.value = localStorage.getItem(KEY) ?? "";
 // The past scan whose volume is wanted; else it is the running one's.
-let past = null, asked = null, voxel_mm = 0;
+let past = null, asked = null, told = null, pointer = null, of = {}, wanting = false, late = false, comparing = false;
+const blocks = new Map();
+const three = slices({ top: $canvas("#slice-top"), front: $canvas("#slice-front"), side: $canvas("#slice-side") }, point, () => { solid?.cross(three.cross); drawProfile(); });
+let tried = false, solid = null;
 function ask() {
     const running = store.job?.dataset && store.job.state !== "queued" ? folder(store.job) : null, name = past ?? running, wish = size.value && name ? `${name} ${size.value} ${past ? "past" : ""}` : "";
     if (wish === (asked ?? ""))
         return;
     const before = asked;
     asked = wish;
+    told = null;
+    comparing = false;
     // The folder comes a moment after the job: what is refused is asked again.
+    of = { name, side: Number(size.value), past: past !== null };
     if (wish || before)
-        call("viewer.live", wish ? { name, side: Number(size.value), past: past !== null } : {}).catch((error) => {
+        call("viewer.live", wish ? of : {}).catch((error) => {
             if (asked !== wish)
                 return;
             setText(note, words(error));
@@ -25,96 +37,220 @@ function ask() {
                 ask();
             } }, 1000);
         });
-    $(".slices").hidden = true;
+    forget();
     progress.hidden = past === null;
     progress.value = 0;
     $button("#volume-cancel").hidden = past === null;
     setText($button("#volume-cancel"), "Cancel");
-    setText($("#volume-title"), past ? `Volume of ${past}` : "Slices so far");
+    setText($("#volume-title"), past ? `Volume of ${past}` : wish ? "Volume so far" : "Volume");
     setText(note, !wish ? "" : past ? "reading the images …" : STARTING);
+}
+function forget() {
+    blocks.clear();
+    three.show(null);
+    kept = null;
+    for (const id of [".slices", "#volume-tools", "#volume-large"])
+        $(id).hidden = true;
+    $("#volume-compared").textContent = "";
+    shown.replaceChildren(el("option", { value: "volume" }, SHOWN.volume));
+    large(false);
 }
 function choose() { if (!size.value)
     past = null; if (!past)
     keep(KEY, size.value); ask(); }
 function cancel() { past = null; size.value = localStorage.getItem(KEY) ?? ""; ask(); }
-clicks({ "volume-cancel": cancel });
-on("reconstruct", (name) => {
+function large(to) { document.body.classList.toggle("whole", to); $("#volume-large").ariaPressed = String(to); three.draw(); solid?.draw(); }
+// With `compared` the truth is asked for as soon as the volume is there.
+let thenCompare = false, reveal = false, kept = null;
+export function reconstruct(name, compared = false) {
     past = name;
-    size.value ||= "256";
-    $("#volume-card").hidden = false;
+    thenCompare = compared;
+    if (!size.value || size.value === "128")
+        size.value = "256";
+    reveal = true;
     ask();
     $("#volume-card").scrollIntoView({ block: "nearest" });
-});
+}
+export function watch() { size.value ||= "128"; past = null; reveal = true; ask(); }
+on("reconstruct", (name) => reconstruct(name));
 on("job", (job) => {
-    $("#volume-card").hidden = false;
     ask();
     if (note.textContent === STARTING && ["done", "failed", "aborted", "incomplete"].includes(job.state))
         setText(note, `the scan has ended (${job.state}) before its first slices`);
 });
-on("state", (s) => { if (s.job) {
-    $("#volume-card").hidden = false;
-    ask();
-} });
+on("state", (s) => { if (s.job)
+    ask(); });
 on("open", () => { asked = null; });
 on("volume", (m) => {
-    if (!asked?.startsWith(`${m.name} `) || Boolean(m.past) !== (past !== null))
+    if (!asked?.startsWith(`${m.name} `) || m.past !== (past !== null))
         return;
     if (m.problem) {
         setText(note, m.problem);
         progress.hidden = true;
         return;
     }
-    progress.value = m.done ?? 0;
-    const other = m.side === Number(size.value) ? "" : `${m.side} voxels a side, as another page chose · `;
-    if (!m.slices) {
+    told = m;
+    const other = m.side === Number(size.value) ? "" : `${m.side} voxels a side, as another page chose · `, working = m.comparing !== undefined && m.comparing < 1 && !m.not_compared;
+    progress.hidden = m.past ? m.done === 1 && !working : true;
+    progress.value = working ? m.comparing ?? 0 : m.done ?? 0;
+    if (!m.size) {
         setText(note, `${other}reconstructing: ${fixed(100 * (m.done ?? 0), 0)} %`);
         return;
     }
-    progress.hidden = true;
-    setText($button("#volume-cancel"), "Close");
-    voxel_mm = m.voxel_mm;
-    $(".slices").hidden = false;
-    setText(note, `${other}${m.views} of ${m.of} views · voxels of ${fixed(1000 * m.voxel_mm, 0)} µm · ${fixed(m.low, 4)} to ${fixed(m.high, 4)} per mm${m.binning ? ` · flexdt reconstruct --binning ${m.binning}` : ""}`);
-    for (const side of SIDES) {
-        const slider = $input(`#at-${side}`), count = m.size?.[side] ?? 0;
-        const grey = m.slices[side];
-        if (grey)
-            putImage($canvas(`#slice-${side}`), grey);
-        slider.hidden = !count;
-        slider.max = String(count - 1);
-        slider.value = String(Math.floor(count / 2));
-        where(side);
-    }
+    if (m.past)
+        setText($button("#volume-cancel"), "Close");
+    const facts = [`${m.views ?? "–"} of ${m.of ?? "–"} views`, `${m.size.join(" × ")} voxels of ${fixed(1000 * (m.voxel_mm ?? 0), 0)} µm`, m.geometry, m.uncovered && m.uncovered > 5e-4 ? `${fixed(100 * m.uncovered, 1)} % without data (grey)` : "",
+        m.binning ? `flexdt reconstruct --binning ${m.binning}` : "", working ? `comparing: ${fixed(100 * (m.comparing ?? 0), 0)} %` : "", m.not_compared, ...(m.doubts ?? [])];
+    setText(note, other + facts.filter(Boolean).join(" · "));
+    if (m.views !== undefined && (!m.past || !blocks.size))
+        void want();
+    if (m.compared)
+        compared(m.compared);
+    $button("#volume-compare").disabled = !m.past || m.comparing !== undefined;
+    if (thenCompare && m.past && m.done === 1 && m.comparing === undefined && !comparing)
+        compare();
 });
-// Slices are as far apart as voxels are wide, and counted from below, from the source, from the left.
-function where(side) { const slider = $input(`#at-${side}`); setText($(`#is-${side}`), slider.hidden ? "" : `${fixed((Number(slider.value) - Number(slider.max) / 2) * voxel_mm, 2)} mm`); }
-const busy = new Set();
-// The newest slice asked for wins; one is on its way at a time.
-async function turn(side) {
-    where(side);
-    if (busy.has(side))
+function compare() { comparing = true; $button("#volume-compare").disabled = true; void call("viewer.compare", of).catch((error) => setText(note, words(error))); }
+// The volume that is chosen, once; of one that grows the newest, one at a time: what is told meanwhile is fetched afterwards.
+async function want() {
+    if (wanting) {
+        late = true;
         return;
-    busy.add(side);
-    const slider = $input(`#at-${side}`), canvas = $canvas(`#slice-${side}`);
-    let index = "";
-    while (index !== slider.value && !slider.hidden) {
-        index = slider.value;
-        const s = await call("viewer.slice", { name: side, index: Number(index) }).catch(() => null);
-        if (s?.shape && s.data !== undefined && !slider.hidden) {
-            putImage(canvas, { shape: s.shape, data: s.data });
-            canvas.dataset.index = index;
-        }
     }
-    busy.delete(side);
+    wanting = true;
+    late = false;
+    const mine = asked, name = shown.value;
+    let block = blocks.get(name) ?? null;
+    if (!block) {
+        const head = await call("viewer.block", { ...of, what: name }).catch(() => null), raw = head?.url ? await fetch(head.url).then((r) => r.arrayBuffer(), () => null) : null;
+        if (head?.shape && raw && raw.byteLength === 2 * head.shape.reduce((a, n) => a * n) && told)
+            block = { ...head, codes: new Uint16Array(raw), voxel_mm: (told.voxel_mm ?? 0) * (head.factor ?? 1) };
+        if (block && name === "difference") {
+            const end = Math.max(...(blocks.get("volume")?.window ?? [0, 1])) / 2;
+            block.signed = true;
+            block.window = [-end, end];
+        }
+        if (block && past)
+            blocks.set(name, block);
+    }
+    wanting = false;
+    if (mine === asked && block)
+        show(block);
+    if (late || (mine === asked && name !== shown.value))
+        void want();
 }
-for (const side of SIDES) {
-    const slider = $input(`#at-${side}`);
-    slider.addEventListener("input", () => void turn(side));
-    $(`#slice-${side}`).addEventListener("wheel", (e) => {
-        if (slider.hidden)
-            return;
-        e.preventDefault();
-        slider.value = String(Number(slider.value) + Math.sign(e.deltaY));
-        void turn(side);
-    }, { passive: false });
+function show(block) {
+    const first = !three.block;
+    for (const id of [".slices", "#volume-tools", "#volume-large"])
+        $(id).hidden = false;
+    // The window is kept between volume, truth and the other geometry; while one grows it is chosen anew.
+    const same = kept && past && !block.signed;
+    three.show(block, same ? kept ?? block.window : block.window);
+    if (!tried) {
+        tried = true;
+        const made = raycast($canvas("#volume-ray"), Number(new URLSearchParams(location.search).get("rays")) || 0);
+        if (typeof made === "string")
+            $("#volume-ray").replaceWith(el("p", { class: "muted small-text" }, made));
+        else
+            solid = made;
+    }
+    if (!block.signed)
+        solid?.show(block);
+    put();
+    if (!same && !block.signed)
+        surface();
+    if (first && reveal) {
+        reveal = false;
+        $("#volume-card").scrollIntoView({ block: "start" });
+    }
 }
+shown.addEventListener("change", () => void want());
+// Ends of the window and the surface's value, in parts of the block's range about its window.
+const range = () => { const b = three.block; if (!b)
+    return [0, 1]; const [l, h] = b.window, d = h - l; return [Math.max(b.low, l - 0.3 * d), Math.min(b.high, h + 1.5 * d)]; };
+const part = (v) => { const [l, h] = range(); return (1000 * (v - l)) / (h - l); }, value = (p) => { const [l, h] = range(); return l + (p * (h - l)) / 1000; };
+function put() { ends.forEach((end, k) => { end.value = String(part(three.window[k])); }); seen(); }
+function seen() { if (!three.block?.signed) {
+    kept = three.window;
+    solid?.window(kept);
+} drawHistogram(); drawProfile(); point(pointer); }
+function surface() { if (!three.block)
+    return; level.value = String(part(three.block.window[1] / 2)); turned(); }
+function turned() { if (!solid)
+    return; solid.level = value(level.valueAsNumber); solid.cut = Number($select("#volume-cut").value); solid.most = $select("#volume-way").value === "most"; solid.cross(three.cross); solid.draw(); drawHistogram(); }
+for (const end of ends)
+    end.addEventListener("input", () => { const [l, h] = ends.map((e) => value(e.valueAsNumber)); three.look([l, Math.max(h, l + 1e-6)]); seen(); });
+for (const id of ["#volume-level", "#volume-cut", "#volume-way"])
+    $(id).addEventListener("input", turned);
+$select("#volume-tool").addEventListener("change", () => { three.profiling = $select("#volume-tool").value === "profile"; drawProfile(); });
+slid(chart, (at) => { const to = 1000 * at, [l, h] = ends.map((e) => Math.abs(e.valueAsNumber - to)), end = ends[l <= h ? 0 : 1]; end.value = String(to); end.dispatchEvent(new Event("input")); });
+function drawHistogram() {
+    const b = three.block, room = cleared(chart), style = getComputedStyle(chart), [l, h] = range();
+    if (!b)
+        return;
+    const counts = three.histogram([l, h]), step = (h - l) / counts.length;
+    room[0].fillStyle = style.getPropertyValue("--accent");
+    bars(room, counts, (k) => { const v = l + (k + 0.5) * step; room[0].globalAlpha = v < three.window[0] || v > three.window[1] ? 0.3 : 1; });
+    room[0].globalAlpha = 1;
+    room[0].fillStyle = style.getPropertyValue("--warn");
+    room[0].fillRect((room[1] * level.valueAsNumber) / 1000, 0, 2, room[2]);
+}
+function drawProfile() {
+    const line = three.profiling ? three.profile() : null;
+    plot.hidden = !line;
+    if (three.profiling && !line)
+        setText($("#volume-at"), "drag a line in a slice");
+    if (!line)
+        return;
+    const known = line.values.filter(Number.isFinite), low = Math.min(...known), high = Math.max(...known), [x, w, h] = cleared(plot);
+    x.strokeStyle = getComputedStyle(plot).getPropertyValue("--accent");
+    x.lineWidth = 1.5 * devicePixelRatio;
+    x.beginPath();
+    line.values.forEach((v, k) => { if (Number.isFinite(v))
+        x.lineTo((w * k) / (line.values.length - 1), h - 3 - ((h - 6) * (v - low)) / (high - low || 1)); });
+    x.stroke();
+    setText($("#volume-at"), known.length ? `${fixed(line.mm, 2)} mm · ${fixed(low, 5)} to ${fixed(high, 5)} per mm` : "no data along this line");
+}
+// The value under the pointer: of the codes at once, and as exact as the volume is when the pointer rests.
+let due;
+function point(place) {
+    const b = three.block;
+    pointer = place;
+    clearTimeout(due);
+    if (three.profiling)
+        return;
+    if (!b || !place) {
+        setText($("#volume-at"), "point at a slice");
+        return;
+    }
+    const mm = place.map((v, k) => fixed((v + 0.5 - extent(b)[k] / 2) * b.voxel_mm, 2)).join(", "), code = b.codes[index(b, place)];
+    const say = (text) => setText($("#volume-at"), `(${mm}) mm  ${text}`);
+    say(code ? `${fixed(valueOf(b, code), 5)} per mm` : "no data cover this voxel");
+    const at = place.map((v) => Math.floor((v + 0.5) * b.factor));
+    due = window.setTimeout(async () => {
+        const exact = await call("viewer.voxel", { ...of, at }).catch(() => null), v = exact?.[shown.value];
+        if (pointer === place && typeof v === "number")
+            say(`${v.toPrecision(8)} per mm`);
+    }, EXACT_MS);
+}
+// As measured with each geometry, beside the truth.
+const ROWS = [["attenuation", "attenuation", 1, 5, "/mm"], ["void", "void within outlines", 100, 2, "%"], ["x_mm", "size along x", 1, 2, "mm"], ["y_mm", "along y", 1, 2, "mm"], ["z_mm", "along z", 1, 2, "mm"]];
+export function table(rows) {
+    const made = Object.entries(rows), cell = (tag, text) => el(tag, {}, text);
+    return el("table", {}, el("tr", {}, cell("th", ""), cell("th", "truth"), ...made.map(([name]) => cell("th", name))), ...ROWS.map(([key, text, times, digits, unit]) => el("tr", {}, cell("td", `${text} [${unit}]`), cell("td", fixed(times * made[0][1][key][1], digits)), ...made.map(([, f]) => cell("td", fixed(times * f[key][0], digits))))), el("tr", {}, cell("td", "rms difference [/mm]"), cell("td", "–"), ...made.map(([, f]) => cell("td", fixed(f.rms, 5)))));
+}
+function compared(rows) {
+    if ($("#volume-compared").childElementCount)
+        return;
+    $("#volume-compared").replaceChildren(table(rows));
+    const names = Object.keys(SHOWN).filter((name) => name !== "other" || Object.keys(rows).length > 1);
+    shown.replaceChildren(...names.map((name) => el("option", { value: name }, name === "other" ? Object.keys(rows)[1] : SHOWN[name])));
+}
+clicks({ "volume-cancel": cancel, "volume-compare": compare, "volume-large": () => large(!document.body.classList.contains("whole")), "volume-share": () => { if (three.block && told)
+        void shared(three, solid, told); } });
+window.addEventListener("keydown", (e) => { if (e.key === "Escape" && document.body.classList.contains("whole")) {
+    e.stopPropagation();
+    large(false);
+} }, true);
+// For tests: what is shown.
+export const look = () => ({ three, solid, told, of });

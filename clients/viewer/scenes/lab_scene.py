@@ -16,8 +16,11 @@ from flexdt.clients.viewer.scenes import parts, world
 from flexdt.clients.viewer.scenes import parts as bodies
 from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.beam_shade import BeamShade
+from flexdt.clients.viewer.scenes.cabinet import LAMP, cabinet
 from flexdt.clients.viewer.scenes.gizmos import Drag, Gizmos
+from flexdt.clients.viewer.scenes.labels import Name, names_of_image, names_of_parts
 from flexdt.clients.viewer.scenes.sample import MM, SampleLook
+from flexdt.clients.viewer.scenes.still import Shape, cone, cut, image_on, placed, shape_of
 from flexdt.clients.viewer.scenes.world import SCREEN, PlanDrawing, World, motors, quaternion
 from flexdt.protocol.state_model import State
 from flexdt.twin.collision.collision_scene import build_scene
@@ -40,6 +43,8 @@ AMBER = (255, 160, 30)
 STAND = "/object/stand"
 GAP_MM = 0.6
 """Distance of the image from the panel's face, in front of which it floats."""
+HERE = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+"""The pose of what stands in the world's own frame."""
 AXIS_REACH_MM = 120.0
 SCALE_MM, AXES_MM = 500.0, 150.0
 
@@ -70,6 +75,8 @@ class LabScene:
         self._looks: list[Any] = []
         self._sent: dict[str, tuple[float, ...]] = {}
         self._skins: list[Any] = []
+        self._solids: dict[str, list[Shape]] = {}
+        self._lit = False
         self._look: SampleLook | None = None
         self._surface: Any = None
         self._hulls: dict[str, Any] = {}
@@ -80,7 +87,7 @@ class LabScene:
         self.shown: dict[str, bool] = {
             "beam": True, "axis": True, "panel": True, "ranges": False, "bodies": False,
             "margin": False, "sample": True, "machine": True, "orbit": True, "gizmos": False,
-            "labels": False,
+            "labels": False, "names": True, "cabinet": True,
         }  # fmt: skip
         with server.atomic():
             self._build()
@@ -95,6 +102,7 @@ class LabScene:
             "sample": [self._frames["sample"]],
             "machine": [*self._looks, self._stand_frame],
             "orbit": [self._paths],
+            "cabinet": self._cabinet,
             "gizmos": self._gizmos.controls,
             "labels": self._labels,
         }
@@ -124,11 +132,20 @@ class LabScene:
             frame = scene.add_frame(f"/machine/{part.name}", show_axes=False)
             self._frames[part.name] = frame
             own = self._own.get(part.name)
+            pieces = parts.pieces_of(part)
+            self._solids[part.name] = cut(pieces)
             self._looks.append(scene.add_glb(
-                f"/machine/{part.name}/look", own or solids.glb(parts.pieces_of(part)),
+                f"/machine/{part.name}/look", own or solids.glb(pieces),
                 position=tuple(np.array(part.mesh_at_mm if own else (0.0, 0.0, 0.0)) * MM),
                 cast_shadow=False, receive_shadow=False,
             ))  # fmt: skip
+        pieces, lamp = cabinet(self.machine, FLOOR_MM)
+        self._solids["cabinet"], self._sent["cabinet"] = cut(pieces), HERE
+        still: Any = {"cast_shadow": False, "receive_shadow": False}
+        self._lamp = scene.add_icosphere(
+            "/cabinet/lamp", radius=0.045, color=LAMP[False], position=tuple(lamp * MM), **still
+        )
+        self._cabinet = [scene.add_glb("/cabinet/walls", solids.glb(pieces), **still), self._lamp]
         self._frames["sample"] = scene.add_frame("/sample", show_axes=False)
         self._frames["object"] = scene.add_frame("/object", show_axes=False)
         self._stand_frame = scene.add_frame(STAND, show_axes=False)
@@ -167,28 +184,26 @@ class LabScene:
                 self._margins[name] = self._hull(f"/machine/{name}/margin", shell, AMBER, 0.25)
 
     def _build_labels(self) -> None:
-        """Names of parts, the world's axes, and a scale on the floor; hidden at first."""
-        scene = self._server.scene
-        (x, y, z), name = _scale_mm(self.machine), f"{SCALE_MM:g} mm"
+        """The world's axes and a scale on the floor; hidden at first."""
+        scene, (x, y, z) = self._server.scene, _scale_mm(self.machine)
         ends = np.array([[[x, y, z], [x, y + SCALE_MM, z]]]) * MM
         bar = scene.add_line_segments("/scale", ends, RANGE, thickness=5.0, **SCREEN, visible=False)
         axes = scene.add_frame(
             "/axes", axes_length=AXES_MM * MM, axes_radius=4 * MM, visible=False,
             position=tuple((np.array([x, y - 2 * AXES_MM, z]) * MM).tolist()),
         )  # fmt: skip
-        self._labels = [bar, axes, scene.add_label("/scale/label", name, position=ends[0].mean(0))]
+        self._labels = [bar, axes]
+
+    def named(self, world: World) -> list[Name]:
+        """What has a name now, and where it is."""
+        if not self.shown["labels"]:
+            return names_of_image(world) if self.shown["names"] else []
+        first = _scale_mm(self.machine)
+        out: list[Name] = [(f"{SCALE_MM:g} mm", (first + [0.0, 0.5 * SCALE_MM, 0.0]) * MM)]
         for k, words in enumerate(("x traversal", "y source to detector", "z up")):
-            place = np.eye(3)[k] * 1.15 * AXES_MM * MM
-            self._labels.append(scene.add_label(f"/axes/{words[0]}", words, position=place))
-        for part in self.machine.components:
-            if part.axis is None and not part.role:
-                continue
-            (x, _, z), words = part.size_mm, part.name.replace("_", " ")
-            corner = (np.array(part.center_mm) + [x / 2, 0.0, z / 2]) * MM
-            name = f"/machine/{part.name}/label"
-            self._labels.append(scene.add_label(name, words, position=corner))
-        for node in self._labels:
-            node.visible = False
+            end = first - [0.0, 2 * AXES_MM, 0.0] + 1.1 * AXES_MM * np.eye(3)[k]
+            out.append((words, end * MM))
+        return out + names_of_parts(self.machine, dict(self._sent))
 
     def _hull(self, node: str, mesh: Any, color: tuple[int, int, int], opacity: float) -> Any:
         vertices, faces = solids.plain(mesh)
@@ -239,6 +254,7 @@ class LabScene:
         if self._sent.get("beam") == key:
             return
         self._sent["beam"] = key
+        self._lit, self._lamp.color = on, LAMP[on]
         self._shade.light(on)
         a, b, c, d, e = points
         lines = [(a, b), (a, c), (a, d), (a, e), (b, c), (c, d), (d, e), (e, b)]
@@ -264,6 +280,21 @@ class LabScene:
         self._image.render_width, self._image.render_height = width, height
         self._image.wxyz = quaternion(np.stack([u, v, np.cross(u, v)], axis=1))
         self._image.position = tuple(at)
+
+    @property
+    def stamp(self) -> tuple[object, ...]:
+        """What a picture of `shapes` depends on, but for sample and image."""
+        return (self.opacity, *self.shown.values(), *self._sent.items())
+
+    def shapes(self, world: World) -> list[Shape]:
+        """What is drawn, for a picture that needs no browser; any thread may ask."""
+        poses, shown = dict(self._sent), self.shown
+        drawn = [n for n in self._solids if shown.get(n, shown["machine"])]
+        out = [shape for n in drawn for shape in placed(self._solids[n], poses[n])]
+        skins = () if self._look is None else self._look.skins
+        out += placed([shape_of(skin, self.opacity) for skin in skins], poses["sample"])
+        image = [image_on(np.asarray(self._image.image), world)]
+        return out + image + ([cone(world, BEAM_ON, 0.2)] if self._lit else [])
 
     # -- what is seen ------------------------------------------------------------------------
 
@@ -321,8 +352,10 @@ class LabScene:
             return
         low = mount.center_mm[2] + mount.size_mm[2] / 2 - self.machine.sample_height_mm
         high = min(float(skin.vertices[:, 2].min()) for skin in look.skins) / MM
+        self._solids["object"] = []
         if high > low:
             rod = solids.cylinder(5.0, high - low, (0.0, 0.0, 0.5 * (low + high)), solids.RUBBER)
+            self._solids["object"] = cut([rod])
             self._server.scene.add_glb(
                 name, solids.glb([rod]), cast_shadow=False, receive_shadow=False
             )

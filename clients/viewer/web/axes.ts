@@ -1,19 +1,31 @@
 // The Move tab: a slider, a number and two hold-to-jog buttons for every axis, and the keys.
-import { $, $input, $select, el, field, fixed, parsed, setText } from "./dom.js";
+import { $, $input, $select, el, field, fixed, keep, parsed, setText, term } from "./dom.js";
 import type { AxisState, State } from "./viewer.js";
 import { call, command, emit, Failure, on, store } from "./link.js";
 
 const LEASE_S = 0.5, MOST_S = 10, RENEW_MS = 180, SETTLE_MS = 400;
 const GROUPS: Array<[title: string, tint: string, axes: Record<string, string>]> = [
   ["Source", "#ffb020", { ver_tube: "height", tra_tube: "sideways" }],
-  ["Sample", "#3aa0ff", { mag_obj: "to the detector", tra_obj: "sideways", rot_obj: "turn", ver_obj: "beam height" }],
+  ["Sample", "#3aa0ff", { mag_obj: "to the detector", tra_obj: "sideways", ver_obj: "beam height" }],
   ["Detector", "#7a5cff", { mag_det: "distance", ver_det: "height", tra_det: "to the left" }],
 ];
+const TURN = { rot_obj: "turn of sample" }; // with what is set most
 const JOG_FALLBACK = { mm: 50, deg: 45 };
 interface Row {
   name: string; box: HTMLElement; slider: HTMLInputElement; number: HTMLInputElement; now: HTMLElement;
   low: number; high: number; from: number; to: number; turn: number; dragging: boolean; asked: number; waiting: number;
 }
+// What a scan is planned by; setting one moves motors by as much. Only a machine with all of them has it.
+interface Main { words: string; unit: string; digits: number; tip: string; now: (s: State) => number; axes: string[]; shift: (s: State, v: number) => number }
+const sod = (s: State) => s.geometry.SOD_mm, sdd = (s: State) => s.geometry.SDD_mm, high = () => store.framing?.sample_height_mm ?? NaN;
+const MAINS: Main[] = [
+  { words: "Source to sample", unit: "mm", digits: 2, tip: "SOD: from the focal spot to the rotation axis, along the beam. Setting it moves the sample.", now: sod, axes: ["mag_obj"], shift: (s, v) => v - sod(s) },
+  { words: "Source to detector", unit: "mm", digits: 2, tip: "SDD: from the focal spot to the panel. Setting it moves the detector.", now: sdd, axes: ["mag_det"], shift: (s, v) => v - sdd(s) },
+  { words: "Magnification", unit: "×", digits: 3, tip: "How much larger the sample is on the panel: SDD / SOD. Setting it moves the sample.", now: (s) => s.geometry.magnification, axes: ["mag_obj"], shift: (s, v) => sdd(s) / v - sod(s) },
+  { words: "Voxel size", unit: "µm", digits: 2, tip: "A pixel of the image, as large as it is at the sample: pixel / magnification. Setting it moves the sample.", now: (s) => 1000 * s.geometry.voxel_size_mm, axes: ["mag_obj"], shift: (s, v) => sod(s) * (v / (1000 * s.geometry.voxel_size_mm) - 1) },
+  { words: "Sample above beam", unit: "mm", digits: 2, tip: "Height of the sample's reference point above the focal spot. Setting it moves source and detector together.", now: high, axes: ["ver_tube", "ver_det"], shift: (_, v) => high() - v },
+];
+const mains: Array<[main: Main, field: HTMLInputElement]> = [];
 const rows = new Map<string, Row>();
 const held = new Map<string, { axis: string; timer: number }>();
 
@@ -53,11 +65,36 @@ function title(axis: string, error: unknown) {
   return Object.keys(halts).length ? `${axis} halts on its way` : `${axis} does not move`;
 }
 
-// Whether the axis was sent there.
-async function move(axis: string, value: number) {
-  const answer = await command("axes.move", { targets: { [axis]: value }, plan: $input("#around").checked }, (error) => title(axis, error));
+// Whether the axes were sent there; the first one names them.
+async function send(targets: Record<string, number>) {
+  const [axis] = Object.keys(targets);
+  const answer = await command("axes.move", { targets, plan: $input("#around").checked }, (error) => title(axis, error));
   for (const warning of answer?.warnings ?? []) emit("note", "warning-note", axis, warning);
   return answer !== null;
+}
+const move = (axis: string, value: number) => send({ [axis]: value });
+function mainRow(main: Main, state: State) {
+  const { words, unit, tip, axes, shift } = main;
+  if (axes.some((name) => !(name in state.axes))) return [];
+  const input = field({ "aria-label": words }, enter, () => input.blur());
+  function enter() {
+    const text = input.value, value = parsed(text), s = store.state;
+    input.blur();
+    if (!s || !(value > 0 || (axes.length > 1 && Number.isFinite(value)))) { emit("note", "error", `${words} stays`, `“${text}” is not a number above 0`); return; }
+    const by = shift(s, value);
+    void send(Object.fromEntries(axes.map((name) => [name, s.axes[name].position + by])));
+  }
+  input.addEventListener("blur", () => { if (store.state) drawMains(store.state); });
+  mains.push([main, input]);
+  return [el("div", { class: "main-row" }, term(words, tip), el("span", {}, input, el("span", { class: "unit" }, unit)))];
+}
+function drawMains(state: State) {
+  for (const [{ now, digits }, input] of mains) {
+    if (document.activeElement === input) continue;
+    const text = fixed(now(state), digits);
+    if (input.value !== text) input.value = text;
+    input.classList.remove("typed");
+  }
 }
 
 function jogButton(axis: string, direction: number, sign: string) {
@@ -73,8 +110,10 @@ function jogButton(axis: string, direction: number, sign: string) {
 }
 
 function build(state: State) {
-  const others = Object.keys(state.axes).filter((name) => !GROUPS.some(([, , axes]) => name in axes));
-  const box = $("#axes"); box.textContent = ""; rows.clear();
+  const others = Object.keys(state.axes).filter((name) => !(name in TURN) && !GROUPS.some(([, , axes]) => name in axes));
+  const box = $("#axes"); box.textContent = ""; rows.clear(); mains.length = 0;
+  const turn = Object.entries(TURN).filter(([name]) => name in state.axes).map(([name, what]) => axisRow(name, state.axes[name], what));
+  $("#mains").replaceChildren(...MAINS.flatMap((main) => mainRow(main, state)), ...turn);
   for (const [title, tint, axes] of [...GROUPS, ["Others", "#999", Object.fromEntries(others.map((name) => [name, ""]))] as const]) {
     const found = Object.entries(axes).filter(([name]) => name in state.axes).map(([name, what]) => axisRow(name, state.axes[name], what));
     if (found.length) box.append(el("div", { class: "group", style: `--tint:${tint}` }, el("h2", {}, title), ...found));
@@ -128,7 +167,12 @@ function refresh(state: State) {
   pace(state);
   if (!rows.size || Object.keys(state.axes).some((n) => !rows.has(n))) build(state);
   for (const row of rows.values()) draw(row);
+  drawMains(state);
 }
+// Motors are one level below; this browser remembers whether they are open.
+const motors = $<HTMLDetailsElement>("#motors"), MOTORS = "flexdt-motors";
+motors.open = localStorage.getItem(MOTORS) === "open";
+motors.addEventListener("toggle", () => keep(MOTORS, motors.open ? "open" : "closed"));
 
 // A slider over many turns is of no use: it goes over the present one.
 function turned(row: Row, position: number) {

@@ -120,6 +120,8 @@ export function slid(canvas: HTMLCanvasElement, to: (part: number) => unknown): 
 export function chosen(input: HTMLInputElement, take: (file: File) => unknown): void {
   input.addEventListener("change", () => { const file = input.files?.[0]; if (file) void take(file); input.value = ""; });
 }
+// A term that explains itself where it stands: under the pointer, when tapped, and when the keyboard comes to it.
+export const term = (words: string, tip: string): HTMLElement => el("button", { type: "button", class: "term", "aria-description": tip, "data-tip": tip }, words);
 // What went wrong, in words.
 export const words = (error: unknown): string => (error instanceof Error ? error.message : String(error));
 // The element of a kind that an event happened within; elements of other frames are of other classes.

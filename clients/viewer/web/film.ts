@@ -70,10 +70,11 @@ function develop(i: Shown) {
   const out = pixels2d.createImageData(cols, rows), data = new Uint32Array(out.data.buffer);
   const low = windowed[0], high = windowed[1] > low ? windowed[1] : low + 1e-6;
   const a = (255 * i.scale) / (high - low), b = (255 * (i.low - low)) / (high - low), flip = $input("#invert").checked;
+  const gamma = i.signed ? 1 : $input("#gamma").valueAsNumber, tone = Uint8Array.from({ length: 256 }, (_, g) => Math.round(255 * (g / 255) ** (1 / gamma)));
   const counts = i.kind === "counts", flags = $input("#show-flags").checked && !i.signed && !(counts && unlit(i)), p = i.pixels;
   const [least, most] = good(i).map((v) => (v - i.low) / i.scale), top = most - (i.code === "jpeg" ? 128.5 : 0.5); // half a step of the code
   for (let k = 0; k < data.length; k++) {
-    let g = a * p[k] + b; g = g < 0 ? 0 : g > 255 ? 255 : g | 0;
+    let g = a * p[k] + b; g = tone[g < 0 ? 0 : g > 255 ? 255 : g | 0];
     if (flip) g = 255 - g;
     data[k] = i.signed ? signed(g) : 0xff000000 | (g << 16) | (g << 8) | g;
     if (flags) { if (p[k] < least) data[k] = counts ? STARVED : SATURATED; else if (p[k] >= top) data[k] = counts ? SATURATED : STARVED; }
@@ -285,6 +286,7 @@ for (const id of ["#low", "#high", "#auto-window"]) $(id).addEventListener("chan
   call("viewer.window", own ? { low: windowed[0], high: windowed[1] } : {}).catch(() => {}); ask();
 });
 for (const id of ["#invert", "#show-beads", "#show-flags", "#auto-window", "#difference"]) $(id).addEventListener("change", ask);
+$input("#gamma").addEventListener("input", () => { setText($("#gamma-is"), fixed($input("#gamma").valueAsNumber)); ask(); });
 $select("#kind").addEventListener("change", () => { $input("#auto-window").checked = true; call("viewer.feed", { kind: $select("#kind").value as Kind }).catch(() => {}); });
 on("image", ask);
 on("open", () => { if ($select("#kind").value !== "line_integral") call("viewer.feed", { kind: $select("#kind").value as Kind }).catch(() => {}); });

@@ -3,7 +3,7 @@ import { $dialog, $input, el, keep, within } from "./dom.js";
 import { jogStart, jogStop, jogStopAll } from "./axes.js";
 import { command, on, store } from "./link.js";
 import { estop } from "./status.js";
-import { layout } from "./views.js";
+import { layout, nearSample } from "./views.js";
 
 // Key -> axis, direction, what it does.
 export const JOGS: Record<string, [axis: string, direction: number, what: string]> = {
@@ -37,6 +37,7 @@ function down(e: KeyboardEvent) {
   if (e.key === "F1") { e.preventDefault(); toggleHelp(); return; }
   if (typing(e) || e.ctrlKey || e.metaKey || $dialog("#help-dialog").open) return;
   if (e.altKey && LAYOUTS[e.code]) { e.preventDefault(); layout(LAYOUTS[e.code]); return; }
+  if (e.altKey && e.code === "Digit0") { e.preventDefault(); nearSample(); return; }
   if (e.altKey || !byKey.checked) return; // single letters move nothing until somebody wishes it
   const jog = JOGS[e.code.replace("Numpad", "Digit")];
   if (jog && !e.repeat && jog[0] in (store.state?.axes ?? {})) { e.preventDefault(); jogStart(jog[0], jog[1], `key:${e.code}`); }
@@ -58,7 +59,7 @@ export function toggleHelp(): void {
   if (!dialog.childElementCount) {
     const grid = el("div", { class: "keys" });
     const jogs = Object.entries(JOGS).map(([code, [, , what]]) => [name(code), what]);
-    for (const [key, what] of [...jogs, ["Space", "stop all axes"], ["Shift+Space", "emergency stop"], ["Alt+1…5", "views"], ["F1", "this help"]]) grid.append(el("kbd", {}, key), el("span", {}, what));
+    for (const [key, what] of [...jogs, ["Space", "stop all axes"], ["Shift+Space", "emergency stop"], ["Alt+1…5", "views"], ["Alt+0", "the sample, near"], ["F1", "this help"]]) grid.append(el("kbd", {}, key), el("span", {}, what));
     dialog.append(
       el("h2", {}, "Keys"), grid,
       el("p", { class: "muted" }, HELP),

@@ -11,20 +11,20 @@ import * as data from "./data.js";
 import "./calibrate.js";
 import "./share.js";
 import "./layout.js";
-import "./volume.js";
+import { look as volume } from "./volume.js";
+import "./path.js";
+import "./welcome.js";
 import { asked } from "./address.js";
 import { listen, toggleHelp } from "./keys.js";
 import { layout } from "./views.js";
 
-declare global { interface Window { flexdt: unknown } }
+declare global { interface Window { flexdt: unknown; firstView: string } }
 function theme(dark: boolean, tell = true) {
   document.documentElement.dataset.theme = dark ? "dark" : "light";
   localStorage.setItem("flexdt-theme", dark ? "dark" : "light");
   if (tell) call("viewer.theme", { dark }).catch(() => {});
 }
 const dark = () => document.documentElement.dataset.theme === "dark";
-const wanted = asked("theme") ?? localStorage.getItem("flexdt-theme") ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
-theme(wanted === "dark", false);
 $button("#theme").addEventListener("click", () => theme(!dark()));
 $button("#help").addEventListener("click", toggleHelp);
 on("open", () => theme(dark()));
@@ -35,5 +35,5 @@ tab(known(asked("tab")));
 listen(window);
 connect();
 // The scenes' frames say which page they belong to, so the page has been registered before.
-on("connection", () => { if (store.cameras && !$("#views").childElementCount) layout(asked("view") ?? localStorage.getItem("flexdt-layout") ?? "iso"); });
-window.flexdt = { store, call, scan, data, film, picture, value };
+on("connection", () => { if (store.cameras?.iso && !$("#views").childElementCount) layout(window.firstView); });
+window.flexdt = { store, call, scan, data, film, picture, value, volume };

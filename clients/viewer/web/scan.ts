@@ -23,6 +23,7 @@ for (const action of ["pause", "resume", "step", "abort"] as const) clicks({ [`j
 function marks() {
   written = text.value.split("\n"); worst = new Map();
   for (const id of ["#check", "#run", "#plan"]) $button(id).disabled = !text.value.trim();
+  $("#empty-note").hidden = text.value.trim() !== "";
   for (const p of problems) {
     if (p.line) worst.set(p.line, worst.get(p.line) === "hit" || p.severity === "error" ? "hit" : "soft");
   }

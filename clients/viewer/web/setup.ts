@@ -181,8 +181,9 @@ function show(state: State) {
   if (predicted !== null && predicted !== predictable(state)) { predicted = null; $("#predicted").textContent = "sample, beam, camera or distances have changed: predict again"; }
   void spectrum(state.tube.kV);
   put("kV", state.tube.kV, 2); put("power", state.tube.power_W, 2);
-  const xrays = $button("#beam");
-  xrays.textContent = state.tube.on ? "X-rays are ON" : "X-rays on"; xrays.classList.toggle("beam-on", state.tube.on);
+  const xrays = $button("#beam"), { on, ready } = state.tube;
+  xrays.textContent = on ? (ready ? "X-rays are ON" : "X-rays warm up") : "X-rays on"; xrays.classList.toggle("beam-on", on);
+  xrays.title = on ? "Switch X-rays off" : "Switch X-rays on";
   const c = state.camera;
   put("exposure", c.exposure_ms, 3); put("averages", c.averages); ROI.forEach((k, i) => put(`roi-${k}`, c.roi[i]));
   put("mode", c.mode);

@@ -1,5 +1,5 @@
 // What the viewer says beside the wire: its messages, its own methods' answers, and what the page makes of them.
-import type { CalibrationFitResult, CheckStep, DatasetListResult, DatasetResult, Estimated, HelloResult, ImageFlags, JobStatus, Mark, Methods, State } from "./wire.js";
+import type { CalibrationFitResult, CheckStep, DatasetListResult, DatasetResult, Estimated, GeometryState, HelloResult, ImageFlags, JobStatus, Mark, Methods, State } from "./wire.js";
 
 export type * from "./wire.js";
 
@@ -15,7 +15,7 @@ export interface Framing { width: number; height: number; left: number; top: num
 export interface Near { mm: number | null; pair: string[]; close: boolean }
 
 // A recorded image, and what cannot be said of it.
-export interface AboutImage { name: string; index: number; file: string; image: "dark" | "flat" | "projection"; projection: number | null; time_s: number | null; positions: Record<string, number> | null; problem: string }
+export interface AboutImage { name: string; index: number; file: string; image: "dark" | "flat" | "projection"; projection: number | null; time_s: number | null; positions: Record<string, number> | null; problem: string; geometry: GeometryState | null; tube: { kV: number | null; power_W: number | null; on: boolean } | null }
 export interface ImageHead {
   kind: Kind; code: "jpeg" | "deflate"; shape: Pair; pair: boolean; full: Pair; low: number; scale: number; time: number; cone_vec: number[]; seq: number;
   flags: ImageFlags | null; window: Pair; beads: Pair[]; at: number; recorded?: AboutImage;
@@ -25,11 +25,16 @@ export interface Shown extends ImageHead {
   pixels: Uint16Array; virtual?: Uint16Array; at_ms: number; signed?: boolean; of?: Shown; from?: Uint16Array | number;
 }
 
-export interface Grey { shape: Pair; data: string }
+// A volume as a page has it: codes [z][y][x], 0 where no data cover, from 1 for `low` to 65535 for `high`; of cubes of `factor` voxels a side.
+export interface BlockHead { shape: Vector; factor: number; low: number; high: number; window: Pair }
+export interface Block extends BlockHead { codes: Uint16Array<ArrayBuffer>; voxel_mm: number; signed?: boolean }
+// As measured and as true [1/mm, part, mm], and the rms difference.
+export interface Figures { attenuation: Pair; void: Pair; x_mm: Pair; y_mm: Pair; z_mm: Pair; rms: number }
 export interface VolumeMessage {
-  name: string; problem?: string; side: number; voxel_mm: number; views: number; of: number; low: number; high: number; slices?: Record<string, Grey>;
-  // Of a past scan: how much of the work is done, and then how many slices there are.
-  past?: boolean; done?: number; size?: Record<string, number>; binning?: number;
+  name: string; side: number; past: boolean; problem?: string; views?: number; of?: number; size?: Vector; voxel_mm?: number;
+  // Of a finished one: how much of the work is done, and then what it was made of.
+  done?: number; binning?: number; geometry?: string; doubts?: string[]; uncovered?: number; sample?: string; started?: string; kV?: number | null;
+  comparing?: number; compared?: Record<string, Figures>; not_compared?: string;
 }
 interface Failure { code: number; message: string; data?: unknown }
 // Messages by their type.
@@ -66,7 +71,8 @@ export interface Answers extends WireAnswers {
   "viewer.plan": PlanDocument;
   "viewer.recorded": DatasetResult;
   "viewer.recorded_image": AboutImage;
-  "viewer.slice": Partial<Grey>;
+  "viewer.block": Partial<BlockHead & Offer>;
+  "viewer.voxel": Record<string, number | null>;
   "viewer.compose": { text: string; moved: Record<string, Pair> };
   "viewer.datasets": DatasetListResult;
   "viewer.scrub": { positions: Record<string, number> | null };

@@ -5,7 +5,7 @@ import { call, emit, on, pageId, store } from "./link.js";
 import { remember } from "./address.js";
 
 const NAMES: Record<View, string> = { iso: "Isometric", beam: "Beam’s eye", side: "Side", free: "Free" };
-const WIDE = 1.35; // aspect for which the fixed cameras are made, as in clients.py
+const WIDE = 1.35; // aspect for which the cameras are made, as in standpoints.py
 type Layout = View | "four" | "none";
 interface Frame { box: HTMLElement; iframe: HTMLIFrameElement; crop?: HTMLElement; tag: HTMLElement; src: string }
 const open = new Map<View, Frame>();
@@ -25,14 +25,14 @@ export const software = (() => {
 const GAP_MS = Number(query.get("gap") ?? (software ? 400 : 0));
 const DPR = query.get("dpr") ?? (devicePixelRatio > 1.5 && !software ? "" : "1");
 
-// The preset from the start, so that nothing jumps when the viewer sets it again.
+// The preset from the start, so that nothing jumps when the viewer sets it again. The beam's eye has none: it moves
+// with the machine, and the camera that this page was told is the one of the moment in which it connected.
 function preset(view: View, box: HTMLElement) {
   const camera = store.cameras?.[view];
-  if (!camera) return "";
+  if (!camera || view === "beam") return "";
   const { position: p, look_at: l, fov } = camera, aspect = box.clientWidth / Math.max(1, box.clientHeight);
-  const away = view === "beam" ? 1 : Math.max(1, WIDE / Math.max(aspect, 0.3));
-  const from = p.map((v, i) => (l[i] + (v - l[i]) * away).toFixed(4));
-  return `initialCameraPosition=${from.join()}&initialCameraLookAt=${l.join()}&initialCameraFov=${fov}&`;
+  const wider = Math.max(1, WIDE / Math.max(aspect, 0.3));
+  return `initialCameraPosition=${p.join()}&initialCameraLookAt=${l.join()}&initialCameraFov=${2 * Math.atan(wider * Math.tan(fov / 2))}&`;
 }
 
 function frame(view: View): Frame {
@@ -47,14 +47,32 @@ function frame(view: View): Frame {
     return { box, iframe, crop, tag, src };
   }
   const home = el("button", { class: "home", title: "Back to this view's preset", onclick: () => call("viewer.camera", { view }) }, "⌂");
-  const look = el("button", { class: "look", title: "Look at the sample", onclick: () => call("viewer.camera", { view, sample: true }) }, "◎");
-  box.append(iframe, tag, home, look);
+  const near = { title: "Look at the sample (Alt+0)", onclick: () => closer(view) };
+  box.append(iframe, tag, home, el("button", { class: "look", ...near }, "◎"));
+  if (view === "iso") box.append(el("button", { class: "inset", "aria-label": "Look at the sample", ...near }, inset));
   return { box, iframe, tag, src };
 }
+const closer = (view: View) => call("viewer.camera", { view, sample: true }).catch(() => {});
+export function nearSample(): void { for (const view of open.keys()) if (view !== "beam") void closer(view); }
+
+// What the viewer computes: the view until its frame has drawn the machine, and the sample, large, beside it.
+declare global { interface Window { still: (image: HTMLImageElement, view: string, size: { clientWidth: number; clientHeight: number }) => void } }
+const still = $<HTMLImageElement>("#still"), inset = el("img", { alt: "" }), INSET_MS = 2500, INSET_PX = 112;
+still.addEventListener("error", () => { still.hidden = true; });
+window.addEventListener("message", (e) => {
+  for (const { box, iframe } of open.values()) if (e.source === iframe.contentWindow && e.data === "drawn") { box.classList.add("live"); still.hidden = true; }
+});
+let posed = "", seenAt = -Infinity;
+on("state", (s) => {
+  const now = JSON.stringify([s.sample, s.correction, Object.values(s.axes).map((a) => a.position.toFixed(1)), document.documentElement.dataset.theme]);
+  if (now === posed || !inset.isConnected || performance.now() < seenAt + INSET_MS) return;
+  posed = now; seenAt = performance.now();
+  window.still(inset, "sample", { clientWidth: INSET_PX, clientHeight: INSET_PX });
+});
 
 // Without WebGL there are no scenes; all the rest works.
 function bare() {
-  document.body.dataset.webgl = "none";
+  document.body.dataset.webgl = "none"; still.hidden = true;
   $("#views").replaceChildren(el("p", { class: "bare muted" }, "This browser draws no 3-D pictures (WebGL is off). Radiograph, axes and scans work without."));
   for (const button of $$<HTMLButtonElement>("#view-switch button")) button.disabled = true;
 }
@@ -67,6 +85,8 @@ export function layout(asked: string, step = false): void {
   if (!webgl) { bare(); return; }
   const wanted: View[] = which === "none" ? [] : which === "four" ? ["iso", "beam", "side", "free"] : [which];
   const views = $("#views");
+  if (views.childElementCount && wanted.length === 1 && which !== "beam" && !open.has(wanted[0])) { still.hidden = false; window.still(still, which, views); }
+  else if (wanted.length !== 1 || which === "beam") still.hidden = true;
   views.dataset.layout = which;
   for (const [view, parts] of open) if (!wanted.includes(view)) { parts.box.remove(); open.delete(view); }
   for (const view of wanted) {

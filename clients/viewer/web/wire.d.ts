@@ -11,6 +11,12 @@ export type AxisState = {
   speed: number | null;
   virtual: boolean;
 };
+export type Block = {
+  name?: string | null;
+  side?: 128 | 192 | 256 | 512;
+  past?: boolean;
+  what?: "volume" | "truth" | "difference" | "other";
+};
 export type CalibrationAlign = {
   name: string;
 };
@@ -246,6 +252,7 @@ export type GeometryState = {
 };
 export type HelloResult = {
   protocol: string;
+  server: string;
   machine: string;
   profile: string | null;
   session: string | null;
@@ -304,6 +311,7 @@ export type Layers = {
   machine?: boolean | null;
   gizmos?: boolean | null;
   labels?: boolean | null;
+  names?: boolean | null;
   opacity?: number | null;
 };
 export type Live = {
@@ -469,10 +477,6 @@ export type ScriptInput = {
 export type Scrub = {
   time_s?: number | null;
 };
-export type Slice = {
-  name: "top" | "front" | "side";
-  index: number;
-};
 export type Spectrum = {
   kV: number;
 };
@@ -542,6 +546,12 @@ export type UploadResult = {
   sample: SampleInfo | null;
   warnings: Array<string>;
 };
+export type Voxel = {
+  name?: string | null;
+  side?: 128 | 192 | 256 | 512;
+  past?: boolean;
+  at: Array<number>;
+};
 export type Window = {
   low?: number | null;
   high?: number | null;
@@ -588,7 +598,9 @@ export interface Methods {
   "viewer.recorded": [Recorded, object];
   "viewer.recorded_image": [RecordedImage, object];
   "viewer.live": [Live, object];
-  "viewer.slice": [Slice, object];
+  "viewer.block": [Block, object];
+  "viewer.voxel": [Voxel, object];
+  "viewer.compare": [Live, object];
   "viewer.compose": [Compose, object];
   "viewer.datasets": [Datasets, object];
   "viewer.scrub": [Scrub, object];

@@ -1,0 +1,223 @@
+import { bar, codeOf, drawBar, extent } from "./slices.js";
+const BRICK = 8, SLOW_MS = 90, ROOM = 1.75; // rays see so many times the box's longest side
+const VERTEX = "#version 300 es\nin vec2 a; out vec2 at; void main() { at = a; gl_Position = vec4(a, 0., 1.); }";
+// Bricks whose greatest value is too low are left out: those are most of the rays' way. `near` is where a ray enters the box, on a cut
+// face as grey values. Steps are of a voxel; a surface is found between two of them.
+const FRAGMENT = `#version 300 es
+precision highp float; precision highp sampler3D;
+uniform sampler3D whole, bricks; uniform vec3 side, count, grid, low, high, right, up, ahead; uniform vec2 room, grey; uniform float level; uniform int cut, most;
+in vec2 at; out vec4 color;
+float value(vec3 p) { return texture(whole, p).r; }
+void main() {
+  vec3 from = (right * at.x * room.x + up * at.y * room.y - 2. * ahead) / side + .5, way = ahead / side;
+  vec3 one = 1. / (way + vec3(equal(way, vec3(0.))) * 1e-9), a = (low - from) * one, b = (high - from) * one, first = min(a, b), last = max(a, b);
+  float near = max(max(first.x, first.y), first.z), far = min(min(last.x, last.y), last.z), d = near + 1e-5, found = 0., before = 0., step = .8 / max(max(count.x * abs(way.x), count.y * abs(way.y)), count.z * abs(way.z));
+  color = vec4(0.);
+  if (near >= far) return;
+  bool face = cut >= 0 && first[cut] >= near - 1e-6;
+  if (face) { float v = value(from + way * d); if (v >= level && most == 0) { color = vec4(vec3(clamp((v - grey.x) * grey.y, .06, 1.)) * vec3(1., .96, .9), 1.); return; } }
+  for (int i = 0; i < 1500 && d < far; i++) {
+    vec3 p = from + way * d;
+    if (texelFetch(bricks, min(ivec3(p * grid), textureSize(bricks, 0) - 1), 0).r < (most == 1 ? max(found, 1e-3) : level)) {
+      vec3 e = ((floor(p * grid) + vec3(greaterThan(way, vec3(0.)))) / grid - p) * one;
+      d += max(min(min(e.x, e.y), e.z), 0.) + step * .2; before = 0.; continue;
+    }
+    float v = value(p);
+    if (most == 1) found = max(found, v);
+    else if (v >= level) {
+      if (before > 0. && v > before) p -= way * step * (v - level) / (v - before);
+      vec3 h = 1.2 / count, n = vec3(value(p + vec3(h.x, 0., 0.)) - value(p - vec3(h.x, 0., 0.)), value(p + vec3(0., h.y, 0.)) - value(p - vec3(0., h.y, 0.)), value(p + vec3(0., 0., h.z)) - value(p - vec3(0., 0., h.z)));
+      n = -n / (length(n) + 1e-6);
+      float light = max(dot(n, normalize(-ahead + .5 * up - .3 * right)), 0.);
+      color = vec4(vec3(.86, .84, .8) * (.22 + .78 * light) + .25 * pow(light, 24.), 1.); return;
+    }
+    before = v; d += step;
+  }
+  if (most == 1) color = vec4(vec3(clamp((found - grey.x) * grey.y, 0., 1.)), 1.);
+}`;
+export function raycast(canvas, side = 0) {
+    const glass = document.createElement("canvas"), gl = glass.getContext("webgl2", { antialias: false, alpha: true, premultipliedAlpha: false, preserveDrawingBuffer: true });
+    if (!gl)
+        return "this browser has no WebGL 2: slices only";
+    const info = gl.getExtension("WEBGL_debug_renderer_info"), software = /swiftshader|llvmpipe|software/i.test(String(info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : ""));
+    const largest = side || (software ? 128 : 256), program = gl.createProgram();
+    for (const [kind, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
+        const shader = gl.createShader(kind);
+        if (!shader)
+            return "no shader";
+        gl.shaderSource(shader, source);
+        gl.compileShader(shader);
+        gl.attachShader(program, shader);
+    }
+    gl.linkProgram(program);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS))
+        return gl.getProgramInfoLog(program) ?? "no shader";
+    gl.useProgram(program);
+    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-1, -1, 3, -1, -1, 3]), gl.STATIC_DRAW);
+    gl.enableVertexAttribArray(0);
+    gl.bindAttribLocation(program, 0, "a");
+    gl.vertexAttribPointer(gl.getAttribLocation(program, "a"), 2, gl.FLOAT, false, 0, 0);
+    const place = (name) => gl.getUniformLocation(program, name);
+    gl.uniform1i(place("whole"), 0);
+    gl.uniform1i(place("bricks"), 1);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    function texture(unit, [nx, ny, nz], data, filter) {
+        if (!gl)
+            return;
+        gl.activeTexture(gl.TEXTURE0 + unit);
+        gl.deleteTexture(held[unit]);
+        gl.bindTexture(gl.TEXTURE_3D, (held[unit] = gl.createTexture()));
+        for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T, gl.TEXTURE_WRAP_R])
+            gl.texParameteri(gl.TEXTURE_3D, name, gl.CLAMP_TO_EDGE);
+        for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
+            gl.texParameteri(gl.TEXTURE_3D, name, filter);
+        gl.texImage3D(gl.TEXTURE_3D, 0, gl.R8, nx, ny, nz, 0, gl.RED, gl.UNSIGNED_BYTE, data);
+    }
+    const one = new Uint8Array(4), held = [null, null];
+    let block = null, due = false, seen = [0, 1], spot = [0, 0, 0], scale = 1, resting, held_down = false;
+    const me = {
+        yaw: 0.5, pitch: 0.4, zoom: 1, level: 0.5, most: false, cut: -1, ms: 0, software,
+        // 8 bits between the ends of the block's window, and half as much again beyond; the rest of the work is the shader's.
+        show(b) {
+            block = b;
+            if (!b)
+                return;
+            const size = extent(b), f = Math.max(1, Math.ceil(Math.max(...size) / largest)), n = size.map((v) => Math.max(1, Math.floor(v / f)));
+            const [lo, hi] = ends(b).map((v) => codeOf(b, v)), data = new Uint8Array(n[0] * n[1] * n[2]), grid = n.map((v) => Math.ceil(v / BRICK)), bricks = new Uint8Array(grid[0] * grid[1] * grid[2]);
+            const put = (x, y, z, v) => { const k = (z * grid[1] + y) * grid[0] + x; if (v > bricks[k])
+                bricks[k] = v; };
+            for (let z = 0, o = 0; z < n[2]; z++)
+                for (let y = 0; y < n[1]; y++)
+                    for (let x = 0; x < n[0]; x++, o++) {
+                        let sum = 0, known = 0;
+                        for (let c = 0; c < f; c++)
+                            for (let r = 0; r < f; r++)
+                                for (let k = 0, at = ((z * f + c) * size[1] + y * f + r) * size[0] + x * f; k < f; k++, at++)
+                                    if (b.codes[at]) {
+                                        sum += b.codes[at];
+                                        known++;
+                                    }
+                        const v = known ? 1 + Math.min(254, Math.max(0, (254 * (sum / known - lo)) / (hi - lo))) : 0;
+                        data[o] = v;
+                        // What lies at the edge of a brick is seen from the next one, too.
+                        const [i, j, l] = [x, y, z].map((q) => Math.floor(q / BRICK));
+                        put(i, j, l, v);
+                        for (const [at, step] of [[x, 0], [y, 1], [z, 2]]) {
+                            const edge = at % BRICK === 0 ? -1 : at % BRICK === BRICK - 1 ? 1 : 0, to = [i, j, l];
+                            to[step] += edge;
+                            if (edge && to[step] >= 0 && to[step] < grid[step])
+                                put(to[0], to[1], to[2], v);
+                        }
+                    }
+            texture(0, n, data, gl.LINEAR);
+            texture(1, grid, bricks, gl.NEAREST);
+            gl.uniform3fv(place("count"), n);
+            gl.uniform3fv(place("grid"), n.map((v) => v / BRICK));
+            me.draw();
+        },
+        window(window) { seen = window; me.draw(); },
+        cross(at) { spot = at; if (me.cut >= 0)
+            me.draw(); },
+        draw() { if (!due) {
+            due = true;
+            requestAnimationFrame(() => { due = false; paint(); });
+        } },
+    };
+    const ends = (b) => [b.window[0], b.window[1] + 0.5 * (b.window[1] - b.window[0])];
+    const axes = () => {
+        const [c, s, p, q] = [Math.cos(me.yaw), Math.sin(me.yaw), Math.cos(me.pitch), Math.sin(me.pitch)];
+        return [[c, s, 0], [-s * q, c * q, p], [-s * p, c * p, -q]]; // right, up, ahead
+    };
+    function paint() {
+        const b = block, x = canvas.getContext("2d");
+        if (!gl || !b || !x || !canvas.clientWidth)
+            return;
+        const unit = Math.min(devicePixelRatio, 2), w = Math.round(canvas.clientWidth * unit), h = Math.round(canvas.clientHeight * unit);
+        if (canvas.width !== w || canvas.height !== h) {
+            canvas.width = w;
+            canvas.height = h;
+        }
+        const begun = performance.now(), size = extent(b), most = Math.max(...size), box = size.map((v) => v / most), [right, up, ahead] = axes();
+        glass.width = Math.max(1, Math.round(w * scale));
+        glass.height = Math.max(1, Math.round(h * scale));
+        gl.viewport(0, 0, glass.width, glass.height);
+        const reach = ROOM / 2 / me.zoom, room = w > h ? [(reach * w) / h, reach] : [reach, (reach * h) / w], span = 254 / 255, [lo, hi] = ends(b), low = [0, 0, 0], high = [1, 1, 1];
+        const tone = (v) => 1 / 255 + (span * (v - lo)) / (hi - lo);
+        if (me.cut >= 0)
+            (ahead[me.cut] > 0 ? low : high)[me.cut] = (spot[me.cut] + 0.5) / size[me.cut];
+        for (const [name, v] of Object.entries({ side: box, low, high, right, up, ahead }))
+            gl.uniform3fv(place(name), v);
+        gl.uniform2fv(place("room"), room);
+        gl.uniform2f(place("grey"), tone(seen[0]), 1 / Math.max(1e-6, tone(seen[1]) - tone(seen[0])));
+        gl.uniform1f(place("level"), Math.max(tone(me.level), 2 / 255));
+        gl.uniform1i(place("cut"), me.cut);
+        gl.uniform1i(place("most"), me.most ? 1 : 0);
+        gl.drawArrays(gl.TRIANGLES, 0, 3);
+        if (software)
+            gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, one); // waits, so that what it takes is known
+        x.fillStyle = "#0b0e13";
+        x.fillRect(0, 0, w, h);
+        x.imageSmoothingEnabled = true;
+        x.drawImage(glass, 0, 0, w, h);
+        // The box, its axes' names, the scale.
+        const at = (v) => { const p = v.map((q, k) => (q - 0.5) * box[k]), dot = (a) => p[0] * a[0] + p[1] * a[1] + p[2] * a[2]; return [(w / 2) * (1 + dot(right) / room[0]), (h / 2) * (1 - dot(up) / room[1])]; };
+        x.lineWidth = unit;
+        x.font = `${12 * unit}px system-ui, sans-serif`;
+        x.textAlign = "center";
+        x.textBaseline = "middle";
+        for (const k of [0, 1, 2])
+            for (const corner of [0, 1, 2, 3]) {
+                const from = [0, 0, 0], to = [0, 0, 0], [i, j] = [(k + 1) % 3, (k + 2) % 3];
+                from[i] = to[i] = corner & 1;
+                from[j] = to[j] = corner >> 1;
+                to[k] = 1;
+                const [p, q] = [at(from), at(to)];
+                x.strokeStyle = corner ? "#5ab0ff40" : "#5ab0ff";
+                x.beginPath();
+                x.moveTo(...p);
+                x.lineTo(...q);
+                x.stroke();
+                if (!corner) {
+                    x.fillStyle = "#8fc8ff";
+                    x.fillText("xyz"[k], q[0] + 8 * unit * Math.sign(q[0] - p[0] || 1), q[1] + 8 * unit * Math.sign(q[1] - p[1]));
+                }
+            }
+        const px = w / (2 * room[0] * most * b.voxel_mm), mm = bar(w / px);
+        drawBar(x, mm, mm * px, unit);
+        me.ms = performance.now() - begun;
+        // Coarser while it is turned on a slow machine, whole again at rest.
+        if (held_down && me.ms > SLOW_MS && scale > 0.3)
+            scale *= 0.7;
+        clearTimeout(resting);
+        if (scale < 1)
+            resting = window.setTimeout(() => { if (!held_down) {
+                scale = 1;
+                me.draw();
+            } }, 250);
+    }
+    const turn = (yaw, pitch) => { me.yaw += yaw; me.pitch = Math.min(1.55, Math.max(-1.55, me.pitch + pitch)); me.draw(); };
+    canvas.addEventListener("pointerdown", (e) => { canvas.setPointerCapture(e.pointerId); held_down = true; });
+    canvas.addEventListener("pointermove", (e) => { if (canvas.hasPointerCapture(e.pointerId))
+        turn(-e.movementX / 120, e.movementY / 120); });
+    for (const end of ["pointerup", "pointercancel"])
+        canvas.addEventListener(end, () => { held_down = false; me.draw(); });
+    canvas.addEventListener("wheel", (e) => { if (e.ctrlKey)
+        return; e.preventDefault(); me.zoom = Math.min(8, Math.max(0.5, me.zoom * Math.exp(-e.deltaY / 500))); me.draw(); }, { passive: false });
+    const STEPS = { ArrowLeft: [0.1, 0], ArrowRight: [-0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] };
+    canvas.addEventListener("keydown", (e) => {
+        const step = STEPS[e.key], times = { "+": 1.25, "=": 1.25, "-": 0.8 }[e.key];
+        if (e.ctrlKey || e.altKey || (!step && !times))
+            return;
+        e.preventDefault();
+        e.stopPropagation();
+        if (step)
+            turn(...step);
+        else {
+            me.zoom *= times ?? 1;
+            me.draw();
+        }
+    });
+    new ResizeObserver(() => me.draw()).observe(canvas);
+    return me;
+}

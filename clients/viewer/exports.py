@@ -1,0 +1,145 @@
+"""Exports of the viewer: pictures of a view, the current scene, and a scan as a replay.
+
+A replay is drawn in a viser server of its own without clients, so that recording does not disturb
+the live scene. Both file formats open without any server. The page saves what it receives;
+nothing is written here.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import re
+import time
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import viser
+
+from flexdt.clients.viewer.feed import ShownImage, grey, window_of
+from flexdt.clients.viewer.page_params import Form
+from flexdt.clients.viewer.scenes.lab_scene import LabScene
+from flexdt.clients.viewer.scenes.sample import SampleLook
+from flexdt.clients.viewer.scenes.standpoints import FREE, Standpoint
+from flexdt.clients.viewer.scenes.world import world_of
+from flexdt.clients.viewer.scrubbed_plan import Scrubbed, positions_at
+from flexdt.clients.viewer.viser_gate import Scenes, look_from
+from flexdt.protocol.state_model import State
+from flexdt.twin.machine.description import Machine, Profile
+
+FRAMES: Final = 240
+REPLAY_S: Final = 12.0
+LIGHT, DARK = (246, 248, 251), (16, 19, 25)
+
+
+def picture(client: viser.ClientHandle, width: int, height: int, dark: bool) -> bytes:
+    """A view as PNG, on the page's background.
+
+    Raises:
+        RuntimeError, TimeoutError: the browser does not answer.
+    """
+    rgba = client.get_render(height, width, transport_format="png", timeout=30.0).astype(np.float32)
+    alpha = rgba[:, :, 3:4] / 255.0 if rgba.shape[2] == 4 else np.ones_like(rgba[:, :, :1])
+    flat = rgba[:, :, :3] * alpha + np.array(DARK if dark else LIGHT) * (1.0 - alpha)
+    return _png(flat.astype(np.uint8))
+
+
+def _png(pixels: npt.NDArray[np.uint8]) -> bytes:
+    import imageio.v3 as iio
+
+    return bytes(iio.imwrite("<bytes>", pixels, extension=".png"))
+
+
+def scene_file(
+    server: viser.ViserServer, camera: Standpoint, title: str, beside: str, form: Form, dark: bool
+) -> bytes:
+    """The live scene as a file: from where the page sees it, and `beside` over it (HTML)."""
+    serializer = server.get_scene_serializer()
+    look_from(serializer, camera)
+    return _file(serializer, form, dark, title, beside)
+
+
+def replay_file(
+    machine: Machine,
+    profile: Profile,
+    state: State,
+    look: SampleLook,
+    planned: Scrubbed,
+    looks: Mapping[str, bytes] | None,
+    title: str,
+    form: Form,
+    dark: bool,
+) -> bytes:
+    """A plan, or a scan that was made, as a file that plays it."""
+    scenes = Scenes()
+    server = scenes.server
+    try:
+        server.initial_camera.position = FREE.position
+        server.initial_camera.look_at = FREE.look_at
+        scene = LabScene(server, machine, profile, looks=looks)
+        scene.wear(look)
+        serializer = server.get_scene_serializer()
+        for time_s in np.linspace(0.0, planned.duration_s, FRAMES):
+            moved = at_positions(state, positions_at(planned, float(time_s)))
+            scene.update(moved, world_of(machine, profile, moved))
+            serializer.insert_sleep(REPLAY_S / FRAMES)
+    finally:
+        scenes.stop()
+    return _file(serializer, form, dark, title)
+
+
+def _file(serializer: Any, form: Form, dark: bool, title: str, beside: str = "") -> bytes:
+    if form != "html":
+        return bytes(serializer.serialize())
+    page = re.sub(r"<title>.*?</title>", "", str(serializer.as_html(dark_mode=dark)), count=1)
+    head = f"<head><title>{html.escape(title)}</title>"
+    return page.replace("<head>", head, 1).replace("</body>", f"{beside}</body>", 1).encode()
+
+
+def title_of(state: State | None, what: str) -> str:
+    """Of a file: the sample, when it was made, and what it is."""
+    sample = (state.sample.name if state is not None else "") or "no sample"
+    return f"{sample} · {time.strftime('%Y-%m-%d %H:%M')} · flexdt {what}"
+
+
+def beside(state: State | None, image: ShownImage | None) -> str:
+    """A radiograph and the values that belong to it, as HTML over a scene."""
+    if state is None:
+        return ""
+    at = state.geometry
+    rows = {
+        "source to sample": f"{at.SOD_mm:.2f} mm", "source to detector": f"{at.SDD_mm:.2f} mm",
+        "magnification": f"{at.magnification:.4f}", "voxel": f"{1000 * at.voxel_size_mm:.2f} µm",
+        "beam": f"{state.tube.kV:.0f} kV, {state.tube.power_W:.0f} W",
+        "correction": "none" if state.correction is None else state.correction.name,
+        "axes": "x right, y to the detector, z up",
+    }  # fmt: skip
+    lines = "<br>".join(f"{name}: {html.escape(value)}" for name, value in rows.items())
+    film = "" if image is None else base64.b64encode(_png(grey(image, window_of(image)))).decode()
+    source = f"data:image/png;base64,{film}"
+    return (
+        '<aside style="position:fixed;left:8px;bottom:8px;width:230px;padding:8px;'
+        'border-radius:8px;font:12px/1.5 system-ui,sans-serif;background:#fffd;color:#17202c">'
+        f'<img alt="radiograph" style="width:100%" src="{source}">{lines}</aside>'
+    )
+
+
+def at_positions(state: State, positions: dict[str, float]) -> State:
+    """The state with its motors elsewhere and X-rays on."""
+    axes = {
+        name: axis.model_copy(update={"position": positions.get(name, axis.position)})
+        for name, axis in state.axes.items()
+    }
+    tube = state.tube.model_copy(update={"on": True})
+    return state.model_copy(update={"axes": axes, "tube": tube})
+
+
+def standpoint(client: viser.ClientHandle) -> Standpoint:
+    """Where somebody looks from now."""
+    c = client.camera
+    position, look_at, up = (
+        (float(v[0]), float(v[1]), float(v[2])) for v in (c.position, c.look_at, c.up_direction)
+    )
+    return Standpoint(position, look_at, up, float(c.fov))

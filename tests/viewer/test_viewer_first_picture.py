@@ -1,0 +1,167 @@
+"""What a page shows first: cameras that hold what matters, a picture that the viewer computes."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import trimesh
+from PIL import Image
+from scipy.spatial import ConvexHull
+
+from flexdt.clients.viewer.scenes.cabinet import cabinet
+from flexdt.clients.viewer.scenes.standpoints import ROOM, WIDE, Standpoint, fitted, presets, roomy
+from flexdt.clients.viewer.scenes.still import Shape, drawn
+from flexdt.clients.viewer.scenes.world import World, placed
+from flexdt.twin.machine.camera import CameraSettings, Roi
+from flexdt.twin.machine.description import builtin_machine, profile_of
+from tests.viewer.looking import picture
+
+HOME = {"ver_tube": 26.29, "mag_obj": 600.0, "mag_det": 1059.0, "ver_det": 20.0, "tra_det": 25.32}
+Points = npt.NDArray[np.float64]
+
+
+def world_at(**targets: float) -> World:
+    machine = builtin_machine()
+    motors = {name: axis.home for name, axis in machine.axes.items()} | HOME | targets
+    camera = CameraSettings("HW2SW1High", Roi(32, 8, 1943, 1527))
+    return placed(machine, profile_of(machine), camera, motors)
+
+
+def seen_at(points: Points, camera: Standpoint, aspect: float) -> Points:
+    """Places (n, 2) in the picture, from -1 to 1, by a matrix as graphics libraries make it."""
+    eye = np.asarray(camera.position)
+    back = eye - np.asarray(camera.look_at)
+    back /= np.linalg.norm(back)
+    right = np.cross(camera.up, back)
+    right /= np.linalg.norm(right)
+    look = np.stack([right, np.cross(back, right), back])
+    slope = math.tan(camera.fov / 2.0)
+    lens = np.array([[1 / slope / aspect, 0, 0], [0, 1 / slope, 0], [0, 0, -1]])
+    x, y, w = lens @ look @ (points - eye).T
+    assert (w > 0).all()
+    return np.stack([x / w, y / w], axis=1)
+
+
+@pytest.mark.parametrize("aspect", [0.45, 0.72, 1.0, WIDE, 2.2])
+@pytest.mark.parametrize(
+    "targets", [{}, {"mag_obj": 200.0}, {"mag_det": 700.0, "mag_obj": 300.0, "ver_tube": 200.0}]
+)
+def test_the_overview_holds_source_sample_and_image(
+    targets: dict[str, float], aspect: float
+) -> None:
+    world = world_at(**targets)
+    iso = roomy(presets(world, 45.0)["iso"], aspect)
+    middle, up = world.sample.shift, np.array([0.0, 0.0, 45.0])
+    points = np.concatenate([[world.source, middle - up, middle + up], world.corners])
+    assert np.abs(seen_at(0.001 * points, iso, aspect)).max() <= ROOM + 1e-9
+    # The image on the panel is seen from its front.
+    assert (np.asarray(iso.position) - 0.001 * world.detector) @ world.normal < 0.0
+
+
+def test_no_nearer_camera_holds_all_points() -> None:
+    points = np.random.default_rng(3).normal(size=(40, 3))
+    way = (-0.5, 0.7, -0.4)
+    camera = fitted(points, way, 0.7, np.zeros(3))
+    ahead = np.asarray(way) / np.linalg.norm(way)
+    reach = np.abs(seen_at(points, camera, WIDE)).max(axis=0)
+    assert reach.max() == pytest.approx(ROOM)
+    eye = np.asarray(camera.position) + 0.01 * ahead
+    closer = replace(camera, position=tuple(eye.tolist()))
+    assert np.abs(seen_at(points, closer, WIDE)).max() > ROOM
+
+
+EYE = Standpoint((0.3, -2.0, 0.4), (0.1, 0.1, 0.05), (0.0, 0.0, 1.0), 0.6)
+
+
+def test_a_solid_covers_the_hull_of_its_corners_and_hides_what_lies_behind() -> None:
+    box = trimesh.creation.box((0.5, 0.3, 0.4))
+    ball = trimesh.creation.icosphere(radius=0.1)
+    ball.apply_translation((0.0, 0.6, 0.0))
+    red, blue = np.array([250, 0, 0]), np.array([0, 0, 250])
+    behind = Shape(ball.triangles, blue, lit=False)
+    size = (300, 200)
+    now = drawn([behind, Shape(box.triangles, red, lit=False)], EYE, size, False).astype(int)
+    is_red = (now[..., 0] > 200) & (now[..., 2] < 60)
+    corners = seen_at(np.asarray(box.vertices), EYE, 1.5) * [150.0, 100.0]
+    assert is_red.sum() == pytest.approx(ConvexHull(corners).volume, rel=0.02)  # area, in 2-D
+    assert not ((now[..., 2] > 200) & (now[..., 0] < 60)).any()
+    glass = Shape(box.triangles, red, 0.4, lit=False)
+    through = drawn([behind, glass], EYE, size, False).astype(int)
+    middle = seen_at(np.array([[0.0, 0.6, 0.0]]), EYE, 1.5)[0]
+    row, column = int(100 - 100 * middle[1]), int(150 + 150 * middle[0])
+    assert through[row, column] == pytest.approx([100, 0, 150], abs=3)
+
+
+def test_large_triangles_that_reach_behind_the_eye_do_not_break_a_picture() -> None:
+    around = trimesh.creation.box((9.0, 9.0, 9.0))
+    around.invert()
+    grey = np.array([90, 90, 90])
+    now = drawn([Shape(around.triangles, grey, lit=False)], EYE, (64, 48), True)
+    assert now.shape == (48, 64, 3)
+
+
+def test_the_cabinet_never_stands_between_a_camera_outside_and_the_machine() -> None:
+    pieces, lamp = cabinet(builtin_machine(), -405.0)
+    triangles = np.concatenate([p.mesh.triangles for p in pieces if p.mesh.extents.max() < 2400.0])
+    whole = np.concatenate([p.mesh.triangles for p in pieces]).reshape(-1, 3)
+    low, high = whole.min(axis=0), whole.max(axis=0)
+    assert ((lamp > low) & (lamp < high)).all()
+    rng = np.random.default_rng(5)
+    for _ in range(300):
+        way = rng.normal(size=3)
+        way[2] = abs(way[2])
+        target = rng.uniform([-150, 0, -100], [150, 1000, 300])
+        eye = target + way * 4000.0 / np.linalg.norm(way)
+        a, b, c = np.moveaxis(triangles, 1, 0)
+        normal = np.cross(b - a, c - a)
+        ahead = target - eye
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = ((a - eye) * normal).sum(axis=1) / (normal @ ahead)
+        at = eye + along[:, None] * ahead
+        sides = [(np.cross(q - p, at - p) * normal).sum(axis=1) >= 0
+                 for p, q in ((a, b), (b, c), (c, a))]  # fmt: skip
+        front = normal @ ahead < 0.0
+        assert not (np.logical_and.reduce(sides) & front & (along > 0.0) & (along < 0.99)).any()
+
+
+@pytest.mark.browser
+def test_the_viewer_paints_the_scene_until_the_live_one_is_there(
+    open_page: Callable[..., Any], lab: Any
+) -> None:
+    page = open_page("iso", (1366, 768), notes_stay=False)
+    box = page.locator(".view[data-view=iso]")
+    page.wait_for_function("document.querySelector('#still').complete")
+    url = page.evaluate("document.querySelector('#still').src")
+    raw = page.request.get(url).body()
+    assert len(raw) <= 60_000
+    still = Image.open(io.BytesIO(raw))
+    assert still.format == "JPEG"
+    frame = box.bounding_box()
+    assert still.size == (round(frame["width"]), round(frame["height"]))
+    page.locator(".view.live").wait_for()
+    page.locator("#still").wait_for(state="hidden")
+    # Both pictures are of one scene, from one place: edges of the one are edges of the other.
+    page.wait_for_timeout(1500)
+    live = picture(box).mean(axis=2)
+    own = np.asarray(still.convert("L"), dtype=np.float32)
+    part = np.s_[60:-130, 130:-20]  # without buttons, tag and the sample's picture
+    assert np.corrcoef(live[part].ravel(), own[part].ravel())[0, 1] > 0.8
+    page.locator(".view .inset").click()
+    page.keyboard.press("Alt+0")
+    page.close()
+
+
+@pytest.mark.browser
+def test_a_still_of_no_view_is_empty(open_page: Callable[..., Any], lab: Any) -> None:
+    page = open_page()
+    for asked in ("view=none", "view=iso&w=x", ""):
+        answer = page.request.get(f"{lab.url}still.jpg?{asked}")
+        assert answer.status == (200 if asked.startswith("view=iso") else 204)
+    page.close()

@@ -1,0 +1,74 @@
+"""Names in a picture: none covers another, and leaders do not cross."""
+
+from __future__ import annotations
+
+import itertools
+import time
+
+import numpy as np
+import pytest
+
+from flexdt.clients.viewer.scenes.labels import laid_out, leader_end
+
+AREA = (520.0, 700.0)
+
+
+def crossing(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> bool:
+    """By linear algebra: where the two straight lines meet, within both."""
+    matrix = np.column_stack([b - a, c - d])
+    if abs(np.linalg.det(matrix)) < 1e-9:
+        return False
+    s, t = np.linalg.solve(matrix, c - a)
+    return bool(1e-9 < s < 1 - 1e-9 and 1e-9 < t < 1 - 1e-9)
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_no_name_covers_another_or_leaves_the_picture(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, 16))
+    middle, spread = rng.uniform(100, 420, 2), rng.uniform(5, 250)
+    anchors = np.clip(rng.normal(middle, spread, (count, 2)), 1, np.array(AREA) - 1)
+    sizes = np.column_stack([rng.uniform(30, 150, count), np.full(count, 22.0)])
+    corners = laid_out(anchors, sizes, AREA)
+    assert not np.isnan(corners).any()
+    for (p, s), (q, t) in itertools.combinations(zip(corners, sizes, strict=True), 2):
+        over = np.minimum(p + s, q + t) - np.maximum(p, q)
+        assert over.min() <= 0.0
+    assert (corners >= 0).all()
+    assert (corners + sizes <= AREA).all()
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_leaders_of_names_of_one_size_never_cross(seed: int) -> None:
+    rng = np.random.default_rng(100 + seed)
+    count = int(rng.integers(2, 14))
+    anchors = rng.uniform(150, 370, 2) + rng.uniform(-90, 90, (count, 2))
+    sizes = np.tile([90.0, 20.0], (count, 1))
+    corners = laid_out(anchors, sizes, AREA)
+    ends = corners + 0.5 * sizes
+    for i, j in itertools.combinations(range(count), 2):
+        assert not crossing(ends[i], anchors[i], ends[j], anchors[j])
+
+
+def test_what_is_out_of_sight_has_no_name_and_a_full_picture_fewer() -> None:
+    anchors = np.array([[np.nan, 5.0], [-3.0, 40.0], [50.0, 40.0]])
+    sizes = np.tile([60.0, 20.0], (3, 1))
+    there = ~np.isnan(laid_out(anchors, sizes, (200.0, 120.0))[:, 0])
+    assert there.tolist() == [False, False, True]
+    crowd = np.tile([60.0, 40.0], (30, 1)) + np.arange(30)[:, None] * 0.1
+    placed = laid_out(crowd, np.tile([70.0, 22.0], (30, 1)), (200.0, 120.0))
+    assert 2 <= (~np.isnan(placed[:, 0])).sum() < 30
+
+
+def test_a_leader_ends_at_its_box() -> None:
+    corner, size = np.array([10.0, 20.0]), np.array([40.0, 10.0])
+    for anchor, end in (([0, 0], [10, 20]), ([30, 90], [30, 30]), ([99, 25], [50, 25])):
+        assert leader_end(np.array(anchor, dtype=float), corner, size).tolist() == end
+
+
+def test_three_names_take_a_few_milliseconds() -> None:
+    anchors, sizes = np.array([[80.0, 400], [250, 300], [420, 200]]), np.tile([90.0, 22.0], (3, 1))
+    begun = time.process_time()
+    for _ in range(5):
+        laid_out(anchors, sizes, AREA)
+    assert (time.process_time() - begun) / 5 < 0.2

@@ -1,0 +1,174 @@
+"""The controls of a task: distances, magnification, voxel and height by their names, what terms
+mean, the film's gamma, and a first visit's three clicks to a volume."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from flexdt.clients.client.client import TwinClient
+from tests.viewer.looking import until
+
+pytestmark = pytest.mark.browser
+Wait = Callable[..., Any]
+
+
+def rests(twin: TwinClient) -> bool:
+    return not any(axis.moving for axis in twin.state().axes.values())
+
+
+@pytest.mark.parametrize(
+    ("label", "value", "told"),
+    [
+        ("Source to sample", 480.0, lambda g: g.SOD_mm),
+        ("Source to detector", 1010.0, lambda g: g.SDD_mm),
+        ("Magnification", 2.1, lambda g: g.SDD_mm / g.SOD_mm),
+        ("Voxel size", 70.0, lambda g: 1000.0 * g.voxel_size_mm),
+    ],
+)
+def test_a_scan_is_set_by_what_it_is_planned_by(
+    page: Any, twin: TwinClient, label: str, value: float, told: Callable[[Any], float]
+) -> None:
+    page.click("#tabs [data-tab=move]")
+    field = page.get_by_label(label, exact=True)
+    field.fill(f"{value:g}")
+    field.press("Enter")
+    until(lambda: abs(told(twin.state().geometry) - value) < 1e-3 * value, label)
+    until(lambda: rests(twin), "the motors rest")
+    assert told(twin.state().geometry) == pytest.approx(value, rel=2e-6)
+    until(
+        lambda: float(field.input_value()) == pytest.approx(value, abs=0.005), "the field follows"
+    )
+
+
+def test_the_height_moves_source_and_detector_together(page: Any, twin: TwinClient) -> None:
+    page.click("#tabs [data-tab=move]")
+    before = twin.state().axes
+    field = page.get_by_label("Sample above beam", exact=True)
+    wanted = float(field.input_value()) - 4.0
+    field.fill(f"{wanted:.2f}")
+    field.press("Enter")
+    up = lambda axis: twin.state().axes[axis].position - before[axis].position  # noqa: E731
+    until(lambda: up("ver_tube") == pytest.approx(4.0, abs=0.006) and rests(twin), "the source")
+    assert up("ver_det") == pytest.approx(up("ver_tube"), abs=1e-6)
+    seen = "flexdt.store.framing.sample_height_mm"
+    until(lambda: page.evaluate(seen) == pytest.approx(wanted, abs=1e-6), "the height")
+    field.fill("high")
+    field.press("Enter")
+    page.locator(".note.error", has_text="Sample above beam stays").wait_for()
+    page.evaluate("t => flexdt.call('axes.move', {targets: t})",
+                  {a: before[a].position for a in ("ver_tube", "ver_det")})  # fmt: skip
+    until(lambda: rests(twin) and abs(up("ver_tube")) < 1e-6, "back")
+
+
+def test_terms_explain_themselves_to_pointer_and_keyboard(page: Any) -> None:
+    page.click("#tabs [data-tab=move]")
+    shown = "e => getComputedStyle(e, '::after').content"
+    terms = page.locator(".term:visible").all()
+    assert len(terms) >= 12
+    for term in terms:
+        page.mouse.move(1, 1)
+        page.evaluate("document.activeElement.blur()")
+        assert term.evaluate(shown) == "none"
+        term.focus()
+        tip = term.evaluate(shown).strip('"')
+        assert tip == term.get_attribute("aria-description")
+        assert len(tip) > 8
+    terms[0].hover()
+    page.evaluate("document.activeElement.blur()")
+    assert terms[0].evaluate(shown) != "none"
+
+
+def test_an_empty_script_says_why_it_does_not_run(page: Any) -> None:
+    page.click("#tabs [data-tab=scan]")
+    page.fill("#script", "")
+    for button in ("#check", "#run"):
+        assert page.locator(button).is_disabled()
+        why = page.locator(f"#{page.locator(button).get_attribute('aria-describedby')}")
+        assert why.is_visible()
+        assert "Write" in why.inner_text()
+    page.fill("#script", "x")
+    assert page.locator("#run").is_enabled()
+    assert not page.locator("#empty-note").is_visible()
+    page.fill("#script", "")
+
+
+def test_gamma_brightens_what_is_thin_and_keeps_black_and_white(page: Any) -> None:
+    def set_to(value: float) -> np.ndarray:
+        page.locator("#gamma").evaluate(
+            "(e, v) => { e.value = v; e.dispatchEvent(new Event('input')); }", value
+        )
+        url = page.evaluate("flexdt.picture()")  # pixel by pixel, nothing drawn over it
+        return np.asarray(Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))))[..., 0]
+
+    page.wait_for_function("flexdt.store.image && flexdt.store.image.code === 'deflate'")
+    plain, bright = set_to(1.0), set_to(2.0)
+    np.testing.assert_allclose(bright, 255.0 * np.sqrt(plain / 255.0), atol=0.51)
+    assert bright.mean() > plain.mean() + 1.0
+    np.testing.assert_array_equal(set_to(1.0), plain)
+
+
+def test_a_telephone_shows_the_tabs_at_once(open_page: Callable[..., Any]) -> None:
+    page = open_page(size=(390, 844), fresh=True)
+    box = page.locator("#tabs").bounding_box()
+    assert box["y"] + box["height"] < 844
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    page.close()
+
+
+@pytest.mark.parametrize("size", [(320, 568), (390, 844), (800, 600)])
+def test_a_small_screen_offers_one_way_to_a_volume_at_a_time(
+    open_page: Callable[..., Any], size: tuple[int, int]
+) -> None:
+    page = open_page(size=size, fresh=True)
+    assert page.locator("#welcome").is_visible()
+    assert not page.locator("#volume-path").is_visible()
+    page.click("#welcome-no")
+    page.locator("#path-scan").scroll_into_view_if_needed()
+    boxes = [page.locator(f"#path-{part}").bounding_box() for part in ("sample", "quality", "scan")]
+    for k, a in enumerate(boxes):
+        assert a["x"] >= 0.0
+        assert a["x"] + a["width"] <= size[0]
+        for b in boxes[k + 1 :]:
+            beside = a["x"] + a["width"] <= b["x"] or b["x"] + b["width"] <= a["x"]
+            assert beside or a["y"] + a["height"] <= b["y"]
+    page.close()
+
+
+def test_three_clicks_of_a_first_visit_end_with_a_volume(
+    open_page: Callable[..., Any], twin: TwinClient
+) -> None:
+    twin.control("force")
+    twin.set_camera(mode="HW4SW1High")
+    twin.control("release")
+    page = open_page(fresh=True)
+    go = page.locator("#welcome-go")
+    for _ in range(3):
+        until(lambda: go.is_enabled(), "the next step", 240)
+        go.click()
+    page.locator("#welcome").wait_for(state="hidden")
+    page.locator("#volume-card").wait_for()
+    slices = "[...document.querySelectorAll('#volume-card canvas')]"
+    there = f"{slices}.some((c) => c.offsetWidth && c.width > 32)"
+    until(lambda: page.evaluate(there), "slices of the scan", 240)
+    page.reload()
+    page.wait_for_function("window.flexdt?.store.state")
+    assert not page.locator("#welcome").is_visible()
+    page.close()
+
+
+def test_the_card_of_a_first_visit_is_dismissed_for_good(open_page: Callable[..., Any]) -> None:
+    page = open_page(fresh=True)
+    assert page.locator("#welcome").is_visible()
+    page.click("#welcome-no")
+    assert not page.locator("#welcome").is_visible()
+    page.reload()
+    page.wait_for_function("window.flexdt?.store.state")
+    assert not page.locator("#welcome").is_visible()
+    page.close()
