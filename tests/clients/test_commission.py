@@ -46,6 +46,7 @@ def test_a_laboratory_is_found_and_every_planted_contradiction_named(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_six_laboratories() -> None:
     outcomes = list(laboratories.laboratories(6, seed=7))
     assert len(outcomes) == 6
