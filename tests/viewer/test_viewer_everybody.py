@@ -20,14 +20,21 @@ SIZES = [(390, 844), (768, 1024), (1024, 768), (1280, 800), (1600, 900)]
 
 
 def findings(page: Any) -> list[str]:
-    """What axe-core finds in our part of the page."""
+    """What axe-core finds in our part of the page, which is dimmed while no server answers, as on
+    a busy machine: then once more."""
     if not page.evaluate("'axe' in window"):
         page.evaluate(AXE.read_text())
-    found = page.evaluate(
-        "values => axe.run({ exclude: ['#views iframe'] }, { runOnly: { type: 'tag', values } })"
-        ".then((r) => r.violations.flatMap((v) => v.nodes.map((n) => `${v.id}: ${n.target}`)))",
-        RULES,
-    )
+    old, found = True, []
+    while old:
+        page.wait_for_function("document.body.dataset.old === 'false'")
+        found, old = page.evaluate(
+            "async (values) => { const r = await axe.run({ exclude: ['#views iframe'] },"
+            " { runOnly: { type: 'tag', values } });"
+            " const found = r.violations.flatMap((v) =>"
+            " v.nodes.map((n) => `${v.id}: ${n.target}`)); "
+            " return [found, document.body.dataset.old !== 'false']; }",
+            RULES,
+        )
     return list(found)
 
 
