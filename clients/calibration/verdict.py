@@ -67,10 +67,10 @@ def next_commands(result: Calibration, data: Sequence[str], phantom: str) -> lis
         free = ",".join(name for name, e in estimates.items() if e.asked)
         lines = NEXT.get(result.errors[0].code, (_COMPARE,))
         return [line.format(data=names, phantom=shlex.quote(phantom), free=free) for line in lines]
-    target = shlex.quote(phantom)
+    # Whatever options the calibration had: its own report is used, not another calibration.
     use = [
-        f"flexdt calibrate {names} --phantom {target} --report calibration.json",
-        "flexdt reconstruct SAMPLE --correction calibration.json --out volume.tif",
+        "flexdt reconstruct SAMPLE --correction REPORT.json --out volume.tif"
+        "  # REPORT.json: of this command with --report"
     ]
     if result.identifiable and not any(_by_priors(e) for e in asked):
         return use
@@ -78,7 +78,7 @@ def next_commands(result: Calibration, data: Sequence[str], phantom: str) -> lis
     places = f"--position {sod:.0f} --position {ELSEWHERE * sod:.0f}"
     closer = [
         f"flexdt script new --kind calibration {places} --out two-places.txt",
-        f"flexdt calibrate PLACE-1 PLACE-2 --phantom {target}",
+        f"flexdt calibrate PLACE-1 PLACE-2 --phantom {shlex.quote(phantom)}",
     ]
     if not result.identifiable:
         return closer

@@ -579,10 +579,11 @@ def _second_look(
             model = BeadModel(fit.beads, state.model.bead_radius_mm)
             plan = plan_windows(model, cone, scan.frames.shape)
             contrast = contrast_of([look.detections.contrast for look in state.looks[g]])
+            images = scan.frames.windows(plan)
             if not state.measured:
-                lags[g] = lag_of(scan.frames, plan)
-            seen = lags[g].seen
-            images = without_lag(scan.frames, plan, lags[g]) if seen else scan.frames.windows(plan)
+                lags[g] = lag_of(images, scan.frames, plan)
+            if lags[g].seen:
+                images = without_lag(scan.frames, plan, lags[g])
             images[[look.state is not FrameState.USABLE for look in state.looks[g]]] = np.nan
             images = mended(images, plan)
             measured.append(measure_beads(images, plan, cone, model, contrast, solids, draft=draft))

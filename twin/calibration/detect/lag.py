@@ -46,14 +46,15 @@ class Lag:
         return self.part > max(SURE * self.sigma, SEEN_AT_LEAST)
 
 
-def lag_of(frames: Frames, plan: Windows) -> Lag:
+def lag_of(images: Float32Array, frames: Frames, plan: Windows) -> Lag:
     """Lag of a scan, from places that no bead of the frame itself is near.
 
     Args:
+        images: (n, k, side, side) windows of the plan, line integrals.
         frames: of the scan, in the order in which they were taken.
         plan: windows round the beads of each frame.
     """
-    light = np.exp(-frames.windows(plan))
+    light = np.exp(-images)
     sums, some = [], slice(None, None, max(1, len(light) // SAMPLE))
     for step in (1, -1):
         there = _rolled(plan, step)
