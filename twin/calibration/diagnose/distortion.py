@@ -12,6 +12,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+import numpy.typing as npt
 from scipy.special import chdtri
 
 from flexdt.twin.calibration.diagnose.finding import Finding, warning
@@ -134,8 +135,9 @@ def _by_chance(panel: PanelModel | None) -> float:
     """What a distortion explains of white noise once in ten thousand fits."""
     if panel is None:
         return 0.0
-    # The place of a border is chosen, too.
-    return float(chdtri(len(panel.names), CHANCE)) + 2 * len(panel.borders) * math.log(2 * CUTS)
+    # The place of a border is chosen, too, among all columns and rows.
+    places = 2 * len(panel.borders) * math.log(sum(panel.shape))
+    return float(chdtri(len(panel.names), CHANCE)) + places
 
 
 def _among(fits: Sequence[FitResult], fit: FitResult) -> float:
@@ -163,21 +165,36 @@ def _hinted(fit: FitResult, model: PanelModel) -> bool:
 
 
 def _border(fit: FitResult) -> Border:
-    """Where the border of a tile explains most of the residuals, to first order."""
+    """Where the border of a tile explains most of the residuals, to first order.
+
+    The order of the positions is the predicted one: a border through measured positions of a bead
+    that keeps its row would part them by their noise, and explain that.
+    """
     left, places = _left(fit)
     basis = _basis(fit)
+    predicted = fit.problem.residuals(fit.solution.x)[0][fit.problem.seen]
+
+    def gain(order: npt.NDArray[np.intp], first: int) -> float:
+        beyond = np.zeros(len(order))
+        beyond[order[first:]] = 1.0
+        push, grown = _beyond(basis, left, _rows(fit, beyond[:, None, None] * np.eye(2)))
+        gram = grown.T @ grown
+        return float((c := grown.T @ push) @ np.linalg.pinv(gram, rcond=1e-6) @ c)
+
     best, most = Border(0, 0.0), -1.0
     for axis in (0, 1):
-        along = np.unique(places[:, axis])
-        middle = (along[1:] + along[:-1]) / 2
-        for at in middle[np.linspace(0, len(middle) - 1, min(CUTS, len(middle))).astype(int)]:
-            border = Border(axis, float(at))
-            beyond = (places[:, axis] >= at).astype(np.float64)
-            push, grown = _beyond(basis, left, _rows(fit, beyond[:, None, None] * np.eye(2)))
-            gram = grown.T @ grown
-            gain = float((c := grown.T @ push) @ np.linalg.pinv(gram, rcond=1e-6) @ c)
-            if gain > most:
-                best, most = border, gain
+        order = np.argsort(predicted[:, axis], kind="stable")
+        low, high = 1, len(order) - 1
+        while high - low > 1:  # few are tried, then few between the best one's neighbours
+            tried = np.unique(np.linspace(low, high, CUTS).astype(int))
+            gains = [gain(order, first) for first in tried]
+            k = int(np.argmax(gains))
+            if gains[k] > most:
+                at = places[order[tried[k] - 1 : tried[k] + 1], axis].mean()
+                best, most = Border(axis, float(at)), gains[k]
+            if high - low < CUTS:
+                break
+            low, high = int(tried[max(k - 1, 0)]), int(tried[min(k + 1, len(tried) - 1)])
     return best
 
 
