@@ -17,7 +17,7 @@ import struct
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -183,30 +183,24 @@ class ImageFeed:
         self._take, self._died = take, died
         self._raw: Mapping[str, object] | None = None
         self._due = asyncio.Event()
-        self._link = KeptConnection(
-            address,
-            f"flexdt viewer ({kind})",
-            self._arrived,
-            subscription={
-                "topics": ["projection"],
-                "max_rate_hz": IMAGE_HZ,
-                "projection_kind": kind,
-            },
-        )
+        self._address = address
         self._tasks: list[asyncio.Task[None]] = []
 
     def start(self) -> None:
         """Listen from now on."""
         if not self._tasks:
+            wish = {"topics": ["projection"], "max_rate_hz": IMAGE_HZ, "projection_kind": self.kind}
+            name = f"flexdt viewer ({self.kind})"
+            link = KeptConnection(self._address, name, self._arrived, subscription=wish)
             what = f"the feed of {self.kind} images"
-            self._tasks = [watched(w, what, self._died) for w in (self._link.run(), self._work())]
+            self._tasks = [watched(w, what, self._died) for w in (link.run(), self._work())]
 
-    async def stop(self) -> None:
-        """Listen no longer."""
+    def stop(self) -> asyncio.Future[Any]:
+        """Listen no longer, from now on; done once the connection has ended."""
         tasks, self._tasks = self._tasks, []
         for task in tasks:
             task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        return asyncio.gather(*tasks, return_exceptions=True)
 
     @property
     def running(self) -> bool:

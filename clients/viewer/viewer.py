@@ -141,7 +141,6 @@ class Viewer:
         self.clients.joined = self._joined
         self._tasks: list[asyncio.Task[None]] = []
         self._fetching: asyncio.Task[None] | None = None
-        self._stopping: asyncio.Task[None] | None = None
         self.open_pages: set[Page] = set()
         self.front: Front | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -460,7 +459,7 @@ class Viewer:
                 feed.start()
                 feed.again()
             elif feed.running:
-                self._stopping = watched(feed.stop(), "stopping a feed")
+                feed.stop()
 
     def _joined(self, client: viser.ClientHandle, id: str) -> None:
         """In one of viser's threads: a page opens a view, which shows its plan's path, too."""

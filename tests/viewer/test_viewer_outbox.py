@@ -9,6 +9,7 @@ from collections import deque
 from typing import Any, cast
 
 from flexdt.clients.client.kept_connection import TwinAddress
+from flexdt.clients.viewer.feed import ImageFeed
 from flexdt.clients.viewer.page import ON_THE_WAY, Page
 
 
@@ -81,5 +82,31 @@ def test_few_states_and_parts_of_images_are_on_their_way() -> None:
         assert len(images) > 5
         assert all(len(i) == 100_001 and len(set(i)) == 1 for i in images)
         serving.cancel()
+
+    asyncio.run(run())
+
+
+def test_a_page_that_comes_as_the_last_one_leaves_gets_images() -> None:
+    """The feed stops and starts before its connection has ended."""
+    pixels = {"dtype": "uint16", "shape": [2, 2], "data": bytes(8)}
+    data = {**pixels, "kind": "counts", "cone_vec": [0.0] * 12}
+    event = {"topic": "projection", "seq": 7, "time": 0.0, "data": data}
+
+    async def run() -> None:
+        shown = asyncio.Queue[int]()
+        loop = asyncio.get_running_loop()
+        feed = ImageFeed(
+            TwinAddress("127.0.0.1", 9), "counts",
+            lambda image, coarse: loop.call_soon_threadsafe(shown.put_nowait, image.seq),
+        )  # fmt: skip
+        feed.start()
+        await settled()
+        ended = feed.stop()
+        feed.start()
+        await ended
+        await settled()
+        feed._arrived("projection", event)
+        assert await shown.get() == 7
+        await feed.stop()
 
     asyncio.run(run())
