@@ -1,5 +1,5 @@
-# make install | demo | quick | test | test-extensions | slow (studies, page) | failed | docs | web |
-# lint | typecheck | lowest | newest. Everything lives in .venv; PYTHON picks another interpreter.
+# make install | demo | quick | test | test-extensions | slow (studies, page, campaigns) | failed | docs |
+# web | lint | typecheck | lowest | newest. Everything lives in .venv; PYTHON picks another interpreter.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -20,7 +20,7 @@ QUICK := tests/protocol tests/twin/script $(TWIN:%=tests/twin/test_%.py) \
 # each worker every test and its assertions, anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install demo kernels quick test test-extensions slow studies page failed docs web lint typecheck lowest newest clean
+.PHONY: install demo kernels quick test test-extensions slow studies page campaigns failed docs web lint typecheck lowest newest clean
 
 install: $(COMPILED) $(TYPES)
 
@@ -79,17 +79,23 @@ test-extensions: lint typecheck $(TEST_STAMP)
 	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder extensions/tests \
 	  --junitxml=build/durations/extensions.xml
 
-slow: studies page
+slow: studies page campaigns
 
-# Studies in their short form, the demonstration, the site.
+# Tests that take more than a second or two: servers as processes, the demonstration, the site, studies
+# in their short form.
 studies: $(TEST_STAMP)
-	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'slow and not browser' \
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'slow and not browser and not night' \
 	  --junitxml=build/durations/studies.xml
 
 # The page in a browser, which draws on all cores: nothing else runs beside it.
 page: $(TEST_STAMP)
-	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m browser \
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m 'browser and not night' \
 	  --junitxml=build/durations/page.xml
+
+# Every seed and every case: hours in all. Nothing waits for it.
+campaigns: $(TEST_STAMP)
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m night \
+	  --junitxml=build/durations/campaigns.xml
 
 # What failed in the last of these, once more and one after the other.
 failed: lint typecheck $(TEST_STAMP)

@@ -187,6 +187,7 @@ def test_the_installed_command_answers(installed: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_a_folder_of_its_name_does_not_stand_in_an_installed_flexdts_way(
     installed: Path, tmp_path: Path
 ) -> None:

@@ -10,6 +10,8 @@ import pytest
 from flexdt.clients.cli.entry import run
 from flexdt.clients.launch.processes import Servers
 
+pytestmark = pytest.mark.slow
+
 TLS = Path(__file__).parents[1] / "data" / "tls"
 CERTIFICATE = TLS / "test-only-cert.pem"
 TOKEN = "a token of many letters"

@@ -144,6 +144,7 @@ def flexdt(*words: str, **environment: str) -> subprocess.Popen[bytes]:
 
 
 @pytest.mark.parametrize(("volts", "code"), [(90, 0), (1000, 3)])
+@pytest.mark.daily(1)
 def test_a_reader_that_leaves_changes_neither_the_exit_code_nor_says_anything(
     tmp_path: Path, volts: int, code: int
 ) -> None:
@@ -204,6 +205,7 @@ def test_each_process_takes_its_port_by_the_name_that_up_has(
         (["projector", "--port", "0", "--token-file", "nope"], 1, "token file nope: No such file"),
     ],
 )
+@pytest.mark.slow
 def test_a_program_of_its_own_tells_a_wrong_option_in_one_line(
     argv: list[str], code: int, says: str
 ) -> None:

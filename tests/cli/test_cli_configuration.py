@@ -177,6 +177,7 @@ def test_commands_read_their_tables(
     "words", [["job", "status", "7"], ["move", "a=1", "--relative"], ["camera", "--roi", "1,2,3,4"]]
 )
 @pytest.mark.parametrize("form", [["--server", NOBODY], [f"--server={NOBODY}"]])
+@pytest.mark.daily(4)
 def test_options_of_flexdt_itself_may_stand_anywhere(
     words: list[str], form: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -229,6 +230,7 @@ def test_a_file_that_is_named_must_be_there() -> None:
     assert config_file({}) == Path("~/.config/flexdt/config.toml").expanduser()
 
 
+@pytest.mark.slow
 def test_a_shell_completes_commands_and_options() -> None:
     def offered(words: str) -> set[str]:
         done = subprocess.run(

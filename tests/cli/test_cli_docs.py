@@ -10,6 +10,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import pytest
 from typer.main import get_command
 
 from flexdt.clients.cli.command_tree import SECTIONS, build
@@ -103,6 +104,7 @@ def test_options_that_the_pages_name_are_taken() -> None:
     assert [each for *each, there in found if not there] == []
 
 
+@pytest.mark.slow
 def test_h_is_help_and_every_section_names_commands() -> None:
     for words in (["-h"], ["move", "-h"], ["job", "-h"], ["job", "list", "-h"], ["twin", "-h"]):
         done = subprocess.run(

@@ -27,6 +27,7 @@ def written(folder: Path, exposure: float, kV: float = 90.0, frames: int = 3) ->
     ("exposure", "kV", "expected"),
     [(100.0, 90.0, []), (2000.0, 90.0, ["saturated"]), (20.0, 25.0, ["starved"])],
 )
+@pytest.mark.daily(2)
 def test_check_foresees_saturated_and_starved_pixels(
     exposure: float, kV: float, expected: list[str], tmp_path: Path, capsys: Capture
 ) -> None:
@@ -53,6 +54,7 @@ def share(text: str, name: str) -> float:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_run_and_snap_say_what_their_images_are(tmp_path: Path, capsys: Capture) -> None:
     """Against the counts that they saved."""
     options = {"data": tmp_path / "data", "speed-up": "max", "physics": "poly"}

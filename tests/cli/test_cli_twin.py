@@ -52,6 +52,7 @@ def script(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_state_as_text_and_as_json(flexdt: Flexdt, document: Document) -> None:
     code, out, _ = flexdt("state")
     assert code == 0
@@ -79,6 +80,7 @@ def test_move_relative(flexdt: Flexdt, document: Document) -> None:
     assert document("state")["axes"]["mag_obj"]["position"] == pytest.approx(592.75)
 
 
+@pytest.mark.slow
 def test_a_stop_ends_the_waiting_of_a_move_that_does_not_arrive(
     flexdt: Flexdt, document: Document, servers: Servers
 ) -> None:
@@ -145,6 +147,7 @@ def test_stop_estop_reset(flexdt: Flexdt, document: Document) -> None:
     assert flexdt("move", "tra_obj=1")[0] == 0
 
 
+@pytest.mark.slow
 def test_a_mesh_file_is_sent_and_put_on_the_stage(
     flexdt: Flexdt, document: Document, tmp_path: Path
 ) -> None:
@@ -215,6 +218,7 @@ def test_detached_run_can_be_watched_and_aborted(
     document("job", "abort", job)  # an aborted scan can be taken up again, so end it for good
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_the_scan_running(document: Document, script: Path, servers: Servers) -> None:
     script.write_bytes(SCRIPT.encode() + b"scanner\tpause\t3600000\t\tACK\t\t\r\n")
     address = "{}:{}".format(*servers.address)
@@ -452,6 +456,7 @@ def test_nothing_is_called_nothing(flexdt: Flexdt) -> None:
     flexdt("sample", "lego")
 
 
+@pytest.mark.slow
 def test_phantom_and_scene_files_stand_on_the_stage(
     flexdt: Callable[..., Answer], document: Callable[..., Any], tmp_path: Path
 ) -> None:

@@ -164,6 +164,7 @@ def test_column_and_roll_are_where_they_are(k: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("photons", "column", "roll"), [(1e4, 0.04, 0.06), (100, 0.15, 0.3)])
+@pytest.mark.campaign
 def test_column_and_roll_are_where_they_are_within_their_sigmas(
     photons: float, column: float, roll: float
 ) -> None:
@@ -218,6 +219,8 @@ def test_the_row_is_right_above_and_below_the_panel_and_refused_beside_it(
     [(0.3, 1e4), pytest.param(0.0, 1e4, marks=pytest.mark.slow),
      pytest.param(0.3, 300, marks=pytest.mark.slow)],
 )  # fmt: skip
+@pytest.mark.slow
+@pytest.mark.campaign
 def test_shifts_of_single_frames_are_found_with_their_sigmas(size: float, photons: float) -> None:
     rng, degrees = np.random.default_rng(7), np.arange(120) * 3.0
     scanner = Scanner.drawn(rng)
@@ -246,7 +249,7 @@ def test_shifts_of_single_frames_are_found_with_their_sigmas(size: float, photon
         assert 0.4 < left[:, i].std() / sigma[i] < 1.3
 
 
-@pytest.mark.daily(2)
+@pytest.mark.daily(1)
 @pytest.mark.parametrize("k", range(2))
 @pytest.mark.parametrize("spoilt", ["ramp", "missing frames", "missed step"])
 def test_a_ramp_of_the_flat_field_and_missing_frames_do_not_mislead(spoilt: str, k: int) -> None:
@@ -275,6 +278,7 @@ def test_what_slips_aside_and_stays_is_told(k: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rays", [1, 3])
+@pytest.mark.campaign(1)
 def test_flat_ends_along_the_rows_in_images_of_few_rays_a_pixel_do_not_mislead(
     rays: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -318,6 +322,7 @@ def box_lines(scanner: Scanner, low: np.ndarray, high: np.ndarray, rays: int) ->
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_what_spoils_scans_misleads_nobody(capsys: pytest.CaptureFixture[str]) -> None:
     assert align_faults.main(["--count", "8", "--seed", "4"]) == 0, capsys.readouterr().out
     assert re.search(r"^all +8 +[5-8] ", capsys.readouterr().out, re.MULTILINE)
@@ -333,6 +338,7 @@ def test_a_round_body_that_turns_back_is_no_repeated_frame() -> None:
     assert np.abs(pulls(found, scanner)).max() < 4
 
 
+@pytest.mark.slow
 def test_an_exact_copy_of_a_frame_is_left_out_by_name() -> None:
     scanner, lines = scan(0)
     data = data_set(lines, DEGREES, 1e4, np.random.default_rng(1))
@@ -344,6 +350,7 @@ def test_an_exact_copy_of_a_frame_is_left_out_by_name() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_a_gap_between_tiles_is_named_and_in_the_sigma(seed: int) -> None:
     """What the right tile shows is what lies a column and a half further to the right."""
     scanner, lines = scan(seed)
@@ -374,6 +381,7 @@ def test_saturated_images_are_named() -> None:
     assert "are saturated" in " ".join(images.align().warnings)
 
 
+@pytest.mark.slow
 def test_what_a_scan_cannot_tell_is_refused_with_the_reason() -> None:
     _, lines = scan(0)
     rng = np.random.default_rng(1)
@@ -400,6 +408,8 @@ def test_what_a_scan_cannot_tell_is_refused_with_the_reason() -> None:
     assert "one circle" in helix.document["refused"]["axis_column_px"]
 
 
+@pytest.mark.slow
+@pytest.mark.campaign
 def test_the_command_writes_a_correction_that_reconstruct_takes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -16,6 +16,7 @@ import flexdt as fx
 @pytest.mark.parametrize(
     ("kind", "seeds"), [("one_row", (3, 6)), ("symmetric", (1,)), ("half_turn", (3,))]
 )
+@pytest.mark.daily(1)
 def test_the_column_of_one_row_and_of_half_a_turn_is_within_its_sigma(
     kind: str, seeds: tuple[int, ...]
 ) -> None:
@@ -29,6 +30,7 @@ def test_the_column_of_one_row_and_of_half_a_turn_is_within_its_sigma(
 @pytest.mark.parametrize(
     ("kind", "count"), [("one_row", 100), ("symmetric", 60), ("half_turn", 60)]
 )
+@pytest.mark.campaign
 def test_errors_are_as_large_as_their_sigmas_say(kind: str, count: int) -> None:
     assert row_align.main(["--kind", kind, "--count", str(count)]) == 0
 

@@ -67,6 +67,7 @@ def test_unknown_markers_are_found_in_foreign_float_images(
     assert p["dO_z"]["sigma"] > 25  # nothing says how far the axis is
 
 
+@pytest.mark.slow
 def test_annotations_by_hand_are_fitted_by_one_command(
     written: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -186,6 +187,7 @@ def test_compressed_images_of_another_writer_are_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_sigmas_of_unknown_markers_are_true() -> None:
     """Pulls over random truths, noise and missing markers: their root mean square is 1."""
     rows = [study.annotated(seed) for seed in range(24)]
@@ -202,6 +204,7 @@ def seen(written: Path) -> tuple[fx.DataSet, list[Detections]]:
     return data, [detect_beads(image) for image in data]
 
 
+@pytest.mark.slow
 def test_linking_finds_what_turns(seen: tuple[fx.DataSet, list[Detections]]) -> None:
     data, spots = seen
     index, places, _ = link(spots, data.poses, NOMINAL)
@@ -330,6 +333,7 @@ def test_files_of_markers(tmp_path: Path) -> None:
         (lambda tracks: np.repeat(tracks[:1], len(tracks), axis=0), "not_turning"),
     ],
 )
+@pytest.mark.daily(1)
 def test_what_is_wrong_with_unknown_markers_is_named(change: Any, code: str | None) -> None:
     """And where nothing is, nothing is said: the markers' own frame is no value held exactly."""
     _, angles, _, markers = study.marked(1, 12, 8, 0.1, 0.0)

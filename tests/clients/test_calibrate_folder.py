@@ -121,6 +121,7 @@ def test_the_truth_is_nowhere_in_the_data_set(folder: Path) -> None:
     assert digits[0] == b"9123456"  # what is looked for is what repr() would write
 
 
+@pytest.mark.slow
 def test_two_scans_in_one_fit(copy: Path, folder: Path) -> None:
     with pytest.raises(TwinError, match=r"scans 1 and 2 .* same images"):
         calibrate_datasets([load_dataset(copy), load_dataset(folder)], "lego")
@@ -141,6 +142,7 @@ def test_two_scans_in_one_fit(copy: Path, folder: Path) -> None:
     assert apart["alpha@1"]["value"] == pytest.approx(33.0, abs=0.1)  # type: ignore[index]
 
 
+@pytest.mark.slow
 def test_the_command_knows_readings_scans_and_what_is_held(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -219,6 +221,7 @@ def test_half_a_scan_in_the_dark(copy: Path) -> None:
     ("phantom", "codes"),
     [("compact-4", {"wrong_phantom"}), ("normal-5", {"wrong_phantom", "no_beads"})],
 )
+@pytest.mark.daily(1)
 def test_another_phantom_is_refused(copy: Path, phantom: str, codes: set[str]) -> None:
     document = calibrate_datasets([load_dataset(copy)], phantom).document
     assert document["identifiable"] is False
@@ -238,6 +241,7 @@ def test_a_phantom_must_exist_and_have_beads(tmp_path: Path) -> None:
     assert len(find_phantom(str(file)).beads) == 4
 
 
+@pytest.mark.slow
 def test_compare_shows_the_correction_removing_the_difference(copy: Path, tmp_path: Path) -> None:
     comparison = compare_folder(copy, "lego", 0.5)
     document = comparison.document
@@ -255,6 +259,7 @@ def test_compare_shows_the_correction_removing_the_difference(copy: Path, tmp_pa
         compare_folder(copy, "compact-4")
 
 
+@pytest.mark.slow
 def test_tracks_tell_where_the_beads_are_before_and_after(folder: Path, tmp_path: Path) -> None:
     outcome = calibrate_datasets([load_dataset(folder)], "lego")
     write_tracks(outcome, tmp_path / "tracks.json")

@@ -36,6 +36,7 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, fx.ConeVec]:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_a_screw_is_followed_from_calibration_to_volume(
     scan: tuple[Path, fx.ConeVec], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

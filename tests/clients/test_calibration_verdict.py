@@ -34,6 +34,7 @@ def known(line: str) -> None:
     assert {word for word in words if word.startswith("--")} <= options, line
 
 
+@pytest.mark.slow
 def test_a_good_calibration_says_what_it_is_good_for(data: fx.DataSet) -> None:
     document: Any = data.calibrate("lego").document
     (seen,) = document["image_space"]
@@ -49,6 +50,7 @@ def test_a_good_calibration_says_what_it_is_good_for(data: fx.DataSet) -> None:
         known(line)
 
 
+@pytest.mark.slow
 def test_what_forbids_a_calibration_is_said_first_with_what_to_type(data: fx.DataSet) -> None:
     document: Any = data.calibrate("normal").document
     assert document["verdict"].startswith("Not to be used: ")

@@ -28,7 +28,7 @@ from flexdt.clients.client.transport import TcpTransport
 from flexdt.clients.launch.processes import Servers
 from flexdt.protocol import METHODS, Codec, Message, Request, RpcError
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.timeout(300), pytest.mark.slow]
 
 POSE = {"tra_obj": 0.5405, "mag_obj": 585.0, "mag_det": 1000.0}
 CUBE = b"""solid corner
@@ -116,6 +116,7 @@ def shell(request: pytest.FixtureRequest, servers: Servers) -> Iterator[Shell]:
     made.end()
 
 
+@pytest.mark.daily(1)
 def test_both_clients_do_every_method_of_the_wire(shell: Shell, tmp_path: Path) -> None:
     twin = shell
     assert twin.control("acquire").yours

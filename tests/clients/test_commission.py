@@ -34,8 +34,9 @@ def require_right(out: laboratories.Outcome) -> None:
     assert out.false == []
 
 
-@pytest.mark.daily(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 8])
+@pytest.mark.campaign
 def test_a_laboratory_is_found_and_every_planted_contradiction_named(
     seed: int, tmp_path: Path
 ) -> None:
@@ -47,6 +48,7 @@ def test_a_laboratory_is_found_and_every_planted_contradiction_named(
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
+@pytest.mark.campaign
 def test_six_laboratories() -> None:
     outcomes = list(laboratories.laboratories(6, seed=7))
     assert len(outcomes) == 6
@@ -63,6 +65,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> tuple[Laboratory, list[Path
     return made, made.write(tmp_path_factory.mktemp("past"))
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_machine_a_profile_and_a_report(
     lab: tuple[Laboratory, list[Path]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -95,6 +98,7 @@ def test_the_command_writes_a_machine_a_profile_and_a_report(
     assert asked["c_obj"] == "beads"
 
 
+@pytest.mark.slow
 def test_the_scans_that_it_proposes_can_be_made(
     lab: tuple[Laboratory, list[Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -116,6 +120,7 @@ def test_the_scans_that_it_proposes_can_be_made(
                     "--profile", "lab/profile.toml"]) == 0  # fmt: skip
 
 
+@pytest.mark.slow
 def test_scans_of_the_twin_agree_with_themselves_and_tell_its_hidden_axis(tmp_path: Path) -> None:
     folder = bead_scan(tmp_path, {"dO_x": 0.31}, 31)
     found = commission([folder], None, read_log_file)
@@ -188,6 +193,7 @@ def test_errors_are_sentences_and_nothing_is_left(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["empty", "taken"]
 
 
+@pytest.mark.slow
 def test_a_scan_that_cannot_be_read_is_named_and_the_others_count(
     tmp_path: Path, lab: tuple[Laboratory, list[Path]]
 ) -> None:

@@ -170,6 +170,7 @@ def test_what_cannot_be_is_an_error_with_what_is_allowed(
     assert "Traceback" not in err
 
 
+@pytest.mark.slow
 def test_the_command_says_the_same(forecast: Any, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["expose", "--sample", "chiral", "--kV", "60", "--kV", "90", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)

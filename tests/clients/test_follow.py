@@ -205,6 +205,7 @@ def test_a_log_of_the_public_monitor_is_heard(
     assert run(["follow", "tcp://x", "--replay", str(EXAMPLE)]) == 2
 
 
+@pytest.mark.slow
 def test_a_follower_that_is_busy_for_seconds_finds_a_healthy_machine_healthy() -> None:
     """Its loop stands still while a motor moves and tells of it: times are those of arrival."""
     made, alarms = session()

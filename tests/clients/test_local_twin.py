@@ -17,6 +17,7 @@ def gone(address: tuple[str, int]) -> bool:
         return probe.connect_ex(address) != 0
 
 
+@pytest.mark.slow
 def test_an_exception_inside_ends_the_servers_and_the_temporary_data() -> None:
     local = fx.LocalTwin(sample="normal-2")
     seen = []

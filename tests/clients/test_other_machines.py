@@ -126,6 +126,7 @@ REQUESTS = {
 
 
 @pytest.mark.parametrize("name", MACHINES)
+@pytest.mark.daily(1)
 def test_a_machine_scans_calibrates_and_reconstructs(name: str, tmp_path: Path) -> None:
     place, sdd, (cols, rows), pitch = MACHINES[name]
     machine = builtin_machine(name)
@@ -215,6 +216,7 @@ def test_what_no_motor_does_is_said() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_servers_run_a_machine_with_a_fixed_detector(tmp_path: Path) -> None:
     """A fixed detector passed `check` and ended `flexdt up` in a KeyError."""
     name = "micro_ct"

@@ -100,6 +100,7 @@ def bead_errors(volume: Volume) -> np.ndarray:
     return np.array(errors)
 
 
+@pytest.mark.slow
 def test_beads_are_where_the_phantom_has_them(folders: dict[str, Path], tmp_path: Path) -> None:
     told: list[float] = []
     made = reconstruct_dataset(
@@ -115,6 +116,7 @@ def test_beads_are_where_the_phantom_has_them(folders: dict[str, Path], tmp_path
     assert bead_errors(read_volume(tmp_path / "v.tif")).max() < 0.15
 
 
+@pytest.mark.slow
 def test_the_correction_in_force_is_used(folders: dict[str, Path], tmp_path: Path) -> None:
     data = load_dataset(folders["corrected"])
     request = Request(voxel_mm=VOXEL, shape=SHAPE)
@@ -128,6 +130,7 @@ def test_the_correction_in_force_is_used(folders: dict[str, Path], tmp_path: Pat
     assert bad.max() > 1.0
 
 
+@pytest.mark.slow
 def test_the_texts_alone_are_as_good(folders: dict[str, Path], tmp_path: Path) -> None:
     request = Request(voxel_mm=VOXEL, shape=SHAPE)
     for name, texts in (("json.mha", False), ("texts.mha", True)):
@@ -167,6 +170,7 @@ def _list(value: object) -> list[object]:
     return value
 
 
+@pytest.mark.slow
 def test_iterative_corrections_and_what_is_refused(
     folders: dict[str, Path], tmp_path: Path
 ) -> None:
@@ -239,6 +243,7 @@ def test_hardening_is_corrected_where_there_is_some(
 COARSE = ["--voxel", "1.2", "--shape", "8,24,24", "--binning", "8", "--every", "6", "--texts"]
 
 
+@pytest.mark.slow
 def test_scatter_is_subtracted_from_what_a_scanner_wrote(
     folders: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -300,6 +305,7 @@ def run(words: list[str]) -> int:
     return int(str(left.value.code or 0))
 
 
+@pytest.mark.slow
 def test_the_command(
     folders: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

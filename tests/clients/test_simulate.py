@@ -469,6 +469,7 @@ RODS = [
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_scatter_is_subtracted_from_a_scan_of_two_materials() -> None:
     """Scatter by other photons, a finer grid and more nodes than the correction's own."""
     cone = ConeVec.circular(sod=300, sdd=400, angles=72, shape=(48, 64), pixel=1.2)

@@ -40,8 +40,9 @@ def test_square_pixels_stay_what_they_are() -> None:
     assert squared(data) is data
 
 
-@pytest.mark.daily(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 1, 0])
+@pytest.mark.campaign
 def test_a_right_scan_with_oblong_pixels_is_offered(seed: int) -> None:
     """It was refused as beads of another size, or none was found."""
     rng = np.random.default_rng(seed)

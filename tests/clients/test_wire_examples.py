@@ -20,7 +20,7 @@ from flexdt.clients.cli.entry import run
 from flexdt.clients.launch.processes import Servers
 from flexdt.clients.reconstruction.volume_files import read_volume
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.timeout(300), pytest.mark.slow]
 
 WIRE = Path(__file__).resolve().parents[2] / "examples" / "wire"
 

@@ -518,6 +518,7 @@ def strategy_of(field: str) -> st.SearchStrategy[object]:
 
 
 @given(st.fixed_dictionaries({f.name: strategy_of(f.name) for f in fields(ScanSettings)}))
+@pytest.mark.slow
 def test_settings_come_back_equal(values: dict[str, object]) -> None:
     settings = ScanSettings(**values)  # type: ignore[arg-type]
     assert parse_scan_settings(format_scan_settings(settings)) == settings
@@ -535,6 +536,7 @@ KEY = st.from_regex(r"[A-Za-z][A-Za-z0-9_()#. ]{0,20}[a-z]", fullmatch=True)
 
 
 @given(st.dictionaries(KEY, st.dictionaries(KEY, VALUE, max_size=5), min_size=1, max_size=4))
+@pytest.mark.slow
 def test_sections_come_back_equal(sections: dict[str, dict[str, bool | int | float | str]]) -> None:
     back = parse_xre(format_sections(sections)).sections
     assert set(back) == set(sections)

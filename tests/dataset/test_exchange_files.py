@@ -57,6 +57,7 @@ Run = Callable[..., tuple[int, str, str]]
 
 @pytest.mark.parametrize(("format", "ending"), [*ENDINGS.items(), ("astra", "txt")])
 @pytest.mark.parametrize("nominal", [False, True])
+@pytest.mark.daily(5)
 def test_there_and_back(
     format: str, ending: str, nominal: bool, folder: Path, tmp_path: Path, flexdt: Run
 ) -> None:
@@ -231,6 +232,7 @@ def test_nxtomo_holds_images_and_the_geometry_asked_for(
         ),
     ],
 )
+@pytest.mark.daily(10)
 def test_errors(
     words: tuple[str, ...], code: int, says: str, folder: Path, tmp_path: Path, flexdt: Run,
     monkeypatch: pytest.MonkeyPatch,

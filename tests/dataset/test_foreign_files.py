@@ -42,6 +42,7 @@ def xtekct(
 
 
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.daily(1)
 def test_nikon_scans_come_back_as_they_are(seed: int, tmp_path: Path) -> None:
     rng = np.random.default_rng(seed)
     path = xtekct(
@@ -57,6 +58,7 @@ def test_nikon_scans_come_back_as_they_are(seed: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("wrong", ["sense", "ObjectOffsetX", "ObjectRoll", "mirrored"])
+@pytest.mark.daily(1)
 def test_the_phantom_would_show_a_wrong_convention(wrong: str, tmp_path: Path) -> None:
     """What the reader must not do is seen by the test above."""
     other = {"ObjectOffsetX": -1.0, "ObjectRoll": -0.12 * 180 / np.pi}

@@ -112,6 +112,7 @@ def test_what_the_tests_write_is_an_ole2_file(seed: int, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(("seed", "kind"), [(0, 5), (1, 10), (2, 3)])
+@pytest.mark.daily(1)
 def test_zeiss_scans_come_back_as_they_are(seed: int, kind: int, tmp_path: Path) -> None:
     path, center = balls(tmp_path / "tooth.txrm", seed, kind)
     data = fx.open(path)
@@ -127,12 +128,14 @@ def test_zeiss_scans_come_back_as_they_are(seed: int, kind: int, tmp_path: Path)
 @pytest.mark.parametrize(
     "wrong", ["Angles", "X-Shifts", "Y-Shifts", "CenterShift", "rows", "columns", "mirrored"]
 )
+@pytest.mark.daily(1)
 def test_the_phantom_would_show_a_wrong_sign(wrong: str, tmp_path: Path) -> None:
     path, _ = balls(tmp_path / "scan.txrm", 0, wrong=wrong)
     volume = fx.open(path).reconstruct("fdk", voxel=0.2, shape=(40, 60, 60))
     assert np.abs(found(volume) - 1.0).max() > 0.1
 
 
+@pytest.mark.slow
 def test_align_finds_the_axis_of_a_panel_that_steps_about(tmp_path: Path) -> None:
     """With each view's shift, and a CenterShift that points the other way."""
     data = fx.open(balls(tmp_path / "scan.txrm", 0, wrong="CenterShift")[0])

@@ -64,6 +64,7 @@ def test_the_page_has_five_tasks_of_ten_lines_and_two_imports() -> None:
 
 
 @pytest.mark.parametrize("name", BLOCKS)
+@pytest.mark.daily(2)
 def test_the_block_runs(name: str, there: Path) -> None:
     space: dict[str, object] = {}
     exec(compile(BLOCKS[name], name, "exec"), space)
@@ -79,6 +80,7 @@ def test_the_block_runs(name: str, there: Path) -> None:
         assert miss[1].max() > 1.0
 
 
+@pytest.mark.slow
 def test_the_readmes_lines_run(there: Path, capsys: pytest.CaptureFixture[str]) -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     (block,) = [b for b in re.findall(r"```python\n(.*?)```", readme, re.S) if "flexdt as fx" in b]
@@ -94,6 +96,7 @@ def test_every_name_of_the_face_is_on_the_page() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_a_stranger_needs_one_import_and_finds_every_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -91,6 +91,7 @@ def test_every_block_has_ten_lines_and_two_imports() -> None:
 @pytest.mark.parametrize(
     "name", ["NXtomo", *(pytest.param(n, marks=pytest.mark.slow) for n in MAKERS if n != "NXtomo")]
 )
+@pytest.mark.campaign(1)
 def test_a_scan_becomes_a_volume(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -247,6 +248,7 @@ def test_tigre_sees_the_balls_where_they_are(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scan", ["nikon", "zeiss"])
+@pytest.mark.campaign
 def test_rtk_sees_the_balls_where_they_are(
     scan: str, scans: dict[str, fx.DataSet], tmp_path: Path
 ) -> None:

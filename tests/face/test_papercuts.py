@@ -237,6 +237,7 @@ def test_beads_stand_where_their_positions_say() -> None:
             fx.phantoms.beads(wrong)
 
 
+@pytest.mark.slow
 def test_a_volume_is_shown_and_handed_to_xarray() -> None:
     xarray = pytest.importorskip("xarray")
     volume = fx.Volume(np.arange(60.0).reshape(3, 4, 5), 0.5, (1.0, 0.0, -2.0))

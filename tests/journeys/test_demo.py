@@ -134,6 +134,7 @@ def test_the_truth_is_nowhere_in_what_the_servers_wrote(
         (None, "No such file"),
     ],
 )
+@pytest.mark.daily(1)
 def test_a_bad_truth_file_is_refused(content: str | None, says: str, tmp_path: Path) -> None:
     truth = tmp_path / "truth.toml"
     if content is not None:
@@ -144,6 +145,7 @@ def test_a_bad_truth_file_is_refused(content: str | None, says: str, tmp_path: P
     assert "Traceback" not in process.stderr
 
 
+@pytest.mark.slow
 def test_a_truth_inside_the_data_directory_is_refused(tmp_path: Path) -> None:
     truth = tmp_path / "data" / "truth.toml"
     truth.parent.mkdir()
@@ -153,6 +155,7 @@ def test_a_truth_inside_the_data_directory_is_refused(tmp_path: Path) -> None:
     assert "inside the data directory" in process.stderr
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_the_demo_and_its_servers(tmp_path: Path) -> None:
     words = ["demo", "--no-viewer", "--out", str(tmp_path)]
     with subprocess.Popen(

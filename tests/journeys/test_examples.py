@@ -12,6 +12,8 @@ import pytest
 
 from flexdt.clients.launch.processes import Servers
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
@@ -32,7 +34,7 @@ def test_drive_from_python(servers: Servers) -> None:
     assert "projection (760, 956)" in out
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_several_projectors() -> None:
     out = run("several_projectors.py", "--projectors", 2, "--frames", 24)
     assert out.startswith("26 images: ")  # 24 poses, dark and flat

@@ -20,6 +20,8 @@ import tifffile
 
 from flexdt.clients.launch.processes import Servers
 
+pytestmark = pytest.mark.slow
+
 Plain = Any
 LINUX = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs Linux's /proc")
 
@@ -139,7 +141,6 @@ def test_abort_marks_the_data_set_incomplete(
 @pytest.mark.parametrize(
     "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
 )
-@pytest.mark.slow
 def test_up_stops_cleanly(number: signal.Signals, tmp_path: Path) -> None:
     words = ["up", "--port", "0", "--projector-port", "0", "--viewer-port", "0",
              "--data", str(tmp_path)]  # fmt: skip
@@ -181,8 +182,8 @@ FOUR = ("flexdt.server.projector.main", "flexdt.server.twin.main",
         "flexdt.clients.viewer.main", "flexdt.clients.gateway.main")  # fmt: skip
 
 
-@pytest.mark.slow
 @LINUX
+@pytest.mark.campaign
 def test_servers_killed_while_they_start_come_back_on_their_ports(tmp_path: Path) -> None:
     """Each of the four twice before it is ready, and twice more once the lab stands."""
     words = ("--port", "0", "--projector-port", "0", "--viewer-port", "0", "--gateway-port", "0",

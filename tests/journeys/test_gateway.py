@@ -27,6 +27,8 @@ from flexdt.clients.launch.processes import Servers
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 
+pytestmark = pytest.mark.slow
+
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "acquila_client.py"
 FIELDS = {"component", "comp_phys", "command", "arg1", "arg2", "reply", "reply type", "comp_type",
           "tick count", "UUID"}  # fmt: skip
@@ -393,7 +395,7 @@ def test_a_component_of_somebody_else_takes_part_in_a_scripted_scan(
     heater.close()
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_who_follows_the_gateway_sees_where_its_machine_differs(
     ports: tuple[int, int], plain: Any
 ) -> None:

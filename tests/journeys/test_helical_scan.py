@@ -17,6 +17,7 @@ BEADS = lego_phantom().beads
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_a_helical_scan_reconstructs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     script, out = tmp_path / "helix.txt", tmp_path / "v.tif"
     words = ["--kind", "helical", "--frames", "181", "--rise", "24", "--averages", "4"]

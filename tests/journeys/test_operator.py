@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import tifffile
 
 Plain = Any
 FRAMES = 121
 
 
+@pytest.mark.slow
 def test_pause_move_resume(
     plain: Plain,
     servers: Any,
@@ -68,6 +70,7 @@ def settled(plain: Plain, job: str) -> int:
     return done
 
 
+@pytest.mark.slow
 def test_step_by_step(plain: Plain, fly_script: Callable[..., str], data_dir: Path) -> None:
     text = fly_script(FRAMES, exposure_ms=100)
     job = plain.call("script.submit", text=text, name="stepped", speed_up=4)["job"]
@@ -87,6 +90,7 @@ def test_step_by_step(plain: Plain, fly_script: Callable[..., str], data_dir: Pa
     assert json.loads((data_dir / "stepped" / "flexdt.json").read_text())["complete"] is False
 
 
+@pytest.mark.slow
 def test_the_same_script_under_the_same_name_takes_up_where_it_stopped(
     plain: Plain, fly_script: Callable[..., str], data_dir: Path
 ) -> None:

@@ -15,6 +15,8 @@ import tifffile
 from flexdt.clients.cli.entry import run
 from flexdt.clients.launch.processes import Servers
 
+pytestmark = pytest.mark.slow
+
 README = (Path(__file__).resolve().parents[2] / "README.md").read_text()
 
 

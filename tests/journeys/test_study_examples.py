@@ -82,6 +82,7 @@ def test_detector_figures() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_reference_scan(tmp_path: Path) -> None:
     """A tenth of the frames at half the resolution: servers, poly physics, both texts."""
     words = ("--out", tmp_path, "--frames", 96, "--voxel", 0.2, "--physics", "poly")
@@ -98,6 +99,7 @@ def test_reference_scan(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_compare_fdk() -> None:
     if importlib.util.find_spec("itk") is None:
         pytest.skip("itk-rtk is not installed")

@@ -191,6 +191,7 @@ def self_signed(folder: Path, name: str) -> tuple[Path, Path]:
 
 
 @pytest.mark.timeout(180)
+@pytest.mark.slow
 def test_a_twin_and_a_projector_on_another_host_speak_tls(tmp_path: Path) -> None:
     certificate, key = self_signed(tmp_path, "projector")
     stranger, _ = self_signed(tmp_path, "stranger")

@@ -59,6 +59,7 @@ def correction(data: Path, name: str) -> Path:
     return next((data / "corrections").glob(f"*{name}.json"))
 
 
+@pytest.mark.slow
 def test_files_that_claim_any_size_are_not_read(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -170,6 +171,7 @@ def test_an_upload_may_come_again_after_it_was_set_aside(whole: Path, tmp_path: 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
+@pytest.mark.campaign
 def test_a_server_starts_whatever_bit_is_another_one(whole: Path, tmp_path: Path) -> None:
     rng = random.Random(6)
     for number in range(25):

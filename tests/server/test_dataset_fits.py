@@ -22,6 +22,8 @@ from flexdt.server.storage.past_scans import PastScans
 from flexdt.twin.calibration.fit.covariance_steps import covariance_by_step
 from flexdt.twin.machine.description import profile_of
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 25
 TRUTH = {"dO_x": 0.9, "dO_y": -0.6, "dO_z": 2.5, "alpha": 33.0, "tau_x": 0.4, "tau_z": -0.3}
 
@@ -238,6 +240,7 @@ def test_what_is_not_there_is_refused(data: Path, served: Served, tmp_path: Path
     served(body)
 
 
+@pytest.mark.campaign
 def test_a_fit_that_nobody_waits_for_ends(data: Path) -> None:
     """Its process is ended, and the next fit is answered."""
 

@@ -59,6 +59,7 @@ def test_shares_of_saturated_and_starved_pixels_are_told() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_a_twin_predicts_its_own_images() -> None:
     with fx.LocalTwin(physics="poly", sample="normal-5") as twin:
         told = twin.predict_exposure(detail="void:0.2")
@@ -87,8 +88,9 @@ def test_a_twin_predicts_its_own_images() -> None:
     assert METHODS["exposure.predict"].safe
 
 
-@pytest.mark.daily(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
+@pytest.mark.campaign(1)
 def test_prediction_report_and_finished_data_set_are_one(tmp_path: Path, seed: int) -> None:
     """In drawn camera modes, regions and kinds of scan: bytes to the byte, and time."""
     rng = np.random.default_rng(4300 + seed)

@@ -38,6 +38,8 @@ from flexdt.protocol.acquila import (
 from flexdt.protocol.rpc_errors import RpcError
 from flexdt.twin.dataset.dataset_errors import DatasetError
 
+pytestmark = pytest.mark.slow
+
 NUMBERS = [0, -1, 2**31, 2**63, 2**64, 2**70, -(2**70), 10**400, 1e300, -1e300, 1e-300]
 TEXTS = ["", " ", "\x00", "\ud800", "tube\ud800", "\udfff", "x" * 1000, "x" * 100_000, "NaN",
          "1e999", "1" * 5000, "\u2028", "../../etc/passwd", "%s%n", "{}", "\n" * 50]  # fmt: skip

@@ -17,7 +17,7 @@ import pytest
 import trimesh
 from lab import Process, Refused, Wire, twin
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.timeout(300), pytest.mark.slow]
 
 MARGIN_MM = 1.0
 SLOW = 0.01
@@ -86,6 +86,7 @@ def warned(warnings: list[str], *parts: str) -> None:
 
 
 @pytest.mark.parametrize("how", ["move", "jog"])
+@pytest.mark.daily(1)
 def test_a_bar_put_on_a_turning_stage_halts_it_before_the_panel(wire: Wire, how: str) -> None:
     wire.call("clock.set", speed_up=SLOW)
     if how == "move":

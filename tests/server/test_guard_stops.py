@@ -53,6 +53,7 @@ def test_a_stop_and_a_resume_at_once_return_to_the_plan(tmp_path: Path, stop: st
 
 @pytest.mark.parametrize("stop", ["axes.stop", "safety.estop"])
 @pytest.mark.parametrize("turns", [1, 3, 10])
+@pytest.mark.daily(3)
 def test_a_stop_while_the_rest_of_a_scan_is_swept_pauses_it(
     tmp_path: Path, stop: str, turns: int
 ) -> None:

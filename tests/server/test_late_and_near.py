@@ -28,6 +28,7 @@ def logged(wire: Wire, count: int) -> list[dict[str, Any]]:
         assert time.monotonic() < until, f"{len(heard)} of {count}"
 
 
+@pytest.mark.slow
 def test_who_comes_late_gets_the_last_entries_of_the_log_once(server: Process) -> None:
     early, late = Wire(server.port), Wire(server.port)
     early.call("state.subscribe", topics=["log"])
@@ -49,6 +50,7 @@ def test_who_comes_late_gets_the_last_entries_of_the_log_once(server: Process) -
     late.close()
 
 
+@pytest.mark.slow
 def test_a_correction_that_would_bring_parts_too_close_is_refused(server: Process) -> None:
     wire = Wire(server.port)
     refused = wire.ask("axes.move", targets={"mag_det": 100.0})["error"]

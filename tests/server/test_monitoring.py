@@ -79,6 +79,7 @@ def page(process: Process) -> str:
 
 
 @pytest.mark.timeout(240)
+@pytest.mark.slow
 def test_every_figure_label_and_state_exists(shown: dict[str, set[tuple[str, str]]]) -> None:
     # The reader of expressions finds what is wrong.
     assert parts('sum by (x) (rate(no_such{a="b"}[5m])) > 1e9') == (

@@ -15,6 +15,8 @@ from wire_rules import data_with_samples, read_here, run_wire_episode
 from flexdt.server.scans.stage import Stage
 from flexdt.server.storage import stored_samples as store
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def uploads(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -68,6 +68,7 @@ def listed(root: Path, **how: Any) -> list[dict[str, Any]]:
     return list(asked(root, DatasetList(**how))["datasets"])
 
 
+@pytest.mark.slow
 def test_a_scan_is_told_as_its_folder_says(server: Process, data: Path) -> None:
     """Against its own files, read here by json and tifffile alone."""
     folder = data / "first scan"
@@ -225,6 +226,7 @@ def lost(folder: Path, rng: random.Random) -> None:
 
 
 @pytest.mark.parametrize("file", ["flexdt.json", "io000000.tif", "scan_000001.tif", "none of all"])
+@pytest.mark.daily(1)
 def test_replies_do_not_say_where_the_data_lie(server: Process, data: Path, file: str) -> None:
     """Errors and warnings about damaged files name them below the data directory."""
     folder = data / "spoilt"

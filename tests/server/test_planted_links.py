@@ -292,6 +292,7 @@ def test_no_link_is_followed(trace: Trace, tmp_path: Path, kind: str, when: str)
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("when", ["begin", "restart"])
+@pytest.mark.campaign(1)
 def test_no_single_link_is_followed_or_disturbs_the_rest(
     trace: Trace, tmp_path: Path, when: str
 ) -> None:

@@ -44,6 +44,7 @@ def refused(options: Sequence[str], env: dict[str, str] | None = None) -> tuple[
     return done.returncode, done.stderr
 
 
+@pytest.mark.slow
 def test_ready_line_service_and_sigterm() -> None:
     process = start("--port", "0", "--threads", "1", "--memory-limit", "64M")
     try:
@@ -72,6 +73,7 @@ def test_ready_line_service_and_sigterm() -> None:
     assert "Traceback" not in err
 
 
+@pytest.mark.slow
 def test_what_it_refuses_is_one_line_and_a_code() -> None:
     code, text = refused(["--host", "0.0.0.0", "--port", "0"], {"FLEXDT_TOKEN": ""})
     assert code == 2
@@ -100,6 +102,7 @@ def test_memory_sizes_that_are_none(text: str) -> None:
         memory_size(text)
 
 
+@pytest.mark.slow
 def test_a_projector_that_hangs_is_given_up_and_used_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -130,6 +133,7 @@ def test_a_projector_that_hangs_is_given_up_and_used_again(
         process.communicate(timeout=30)
 
 
+@pytest.mark.slow
 def test_a_projector_that_computes_for_long_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(wire, "SILENT_S", 2.0)
     monkeypatch.setattr(wire, "ASK_AGAIN_S", 0.3)

@@ -658,6 +658,7 @@ assert projected(Volume(rng.random((5, 5, 3), dtype=np.float32), 0.5), 4)[1] == 
 """
 
 
+@pytest.mark.slow
 def test_the_volume_of_a_scan_goes_to_the_device_once_its_blocks_pay_for_that() -> None:
     run_simulated(DEVICES)
 

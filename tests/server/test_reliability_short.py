@@ -31,6 +31,7 @@ def test_kill_9_loses_nothing() -> None:
     assert "0 completed frames lost, 0 corrupt files" in run("kills.py", "--kills", "4")
 
 
+@pytest.mark.campaign
 def test_servers_whose_disk_fails_do_nothing_by_halves() -> None:
     assert "0 things were wrong" in run("faults.py", "writes", "--count", "2", "--seed", "4")
 
@@ -40,16 +41,19 @@ def test_absurd_values_in_every_field(tmp_path: Path) -> None:
     assert "0 problems" in run("fuzz_schema.py", *options)
 
 
+@pytest.mark.campaign
 def test_attacks_get_nothing() -> None:
     """All but those that take long: see docs/reliability.md for the whole list."""
     out = run("attacks.py", *QUICK)
     assert f"{len(QUICK)} of {len(QUICK)} attacks failed; 0 unhandled exceptions" in out
 
 
+@pytest.mark.campaign
 def test_new_clients_are_answered_beside_a_flood_of_connections() -> None:
     run("floods.py", "--connections", "40")  # it fails without an answer, or with a long log
 
 
+@pytest.mark.campaign
 def test_many_clients_keep_their_order() -> None:
     out = run("load.py", "--clients", "30", "--seconds", "3")
     assert out.count("0 out of order, 0 cut off") == 2
@@ -61,5 +65,6 @@ def test_an_estop_is_answered_beside_every_load() -> None:
     assert "0 beyond their limits; 0 unhandled exceptions" in out
 
 
+@pytest.mark.campaign
 def test_a_few_simulated_hours() -> None:
     assert "0 unhandled exceptions" in run("soak.py", "--hours", "2", "--uses", "9")

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from lab import Process, Refused, Wire, digests, fly_script, twin
 
-pytestmark = pytest.mark.timeout(240)
+pytestmark = [pytest.mark.timeout(240), pytest.mark.slow]
 
 
 def restarted(process: Process, rays: Process, data: Path, *options: object) -> Process:
@@ -136,6 +136,7 @@ def test_an_estop_survives_a_kill_and_positions_in_flight_are_nearly_kept(
 
 @pytest.mark.daily(1)
 @pytest.mark.parametrize("content", [b"{", b"", b"null", b'{"schema": 99}', b"\xff" * 99])
+@pytest.mark.campaign(1)
 def test_a_broken_memory_is_set_aside_and_the_twin_starts(
     content: bytes, rays: Process, tmp_path: Path
 ) -> None:
@@ -151,7 +152,6 @@ def test_a_broken_memory_is_set_aside_and_the_twin_starts(
         assert process.end() == 0
 
 
-@pytest.mark.slow
 def test_two_twins_do_not_share_a_data_directory(rays: Process, tmp_path: Path) -> None:
     first = twin(rays.port, tmp_path)
     try:

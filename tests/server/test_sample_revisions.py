@@ -87,6 +87,7 @@ def scene(tmp_path: Path) -> Any:
 
 
 @pytest.mark.parametrize("material", [None, "pmma"])
+@pytest.mark.daily(1)
 def test_a_paused_scan_goes_on_with_the_file_it_began_with(
     scene: Scene, material: str | None
 ) -> None:
@@ -123,6 +124,7 @@ def test_a_running_scan_of_what_stands_no_longer_on_the_stage_notices_another_fi
 
 
 @pytest.mark.parametrize("method", ["job.resume", "script.submit"])
+@pytest.mark.daily(1)
 def test_an_interrupted_scan_is_refused_while_another_file_has_the_name(
     scene: Scene, method: str
 ) -> None:

@@ -43,6 +43,7 @@ def store_of(folder: Path, raw: bytes, form: str, name: str = "thing") -> Sample
 
 
 @pytest.mark.parametrize("form", ["toml", "json"])
+@pytest.mark.daily(1)
 def test_a_scene_is_read_apart_kept_and_read_again(tmp_path: Path, form: str) -> None:
     made = bead_phantom("normal", 3)
     raw = BEAD_FILE.encode() if form == "toml" else json.dumps(made.to_dict()).encode()

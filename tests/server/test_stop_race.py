@@ -153,6 +153,7 @@ def played(folder: Path, logic: Logic, episodes: int) -> Room:
 
 
 @pytest.mark.parametrize("episodes", [100, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_no_interleaving_releases_a_stop_that_was_not_seen(tmp_path: Path, episodes: int) -> None:
     room = played(tmp_path, page, episodes)
     assert room.outcomes[True, False] == 0, "unintended releases"
@@ -163,5 +164,6 @@ def test_no_interleaving_releases_a_stop_that_was_not_seen(tmp_path: Path, episo
 
 
 @pytest.mark.parametrize("logic", [toggle, unnumbered])
+@pytest.mark.daily(1)
 def test_the_same_people_with_other_pages_release_stops(tmp_path: Path, logic: Logic) -> None:
     assert played(tmp_path, logic, 50).outcomes[True, False] > 10

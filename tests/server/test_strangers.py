@@ -33,6 +33,8 @@ from flexdt.server.network import tcp
 from flexdt.server.network.shell_parts import Peer, Room, neighbourhood
 from flexdt.server.network.tcp import TcpServer, serve
 
+pytestmark = pytest.mark.slow
+
 TOKEN = "sixteen letters or more"
 PEER, OTHER = "127.0.0.2", "127.0.0.3"
 
@@ -96,6 +98,7 @@ NEW = ("session.hello", "session.ping", "safety.estop")
 
 
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.daily(2)
 def test_new_clients_are_served_whatever_peers_without_the_token_do(
     seed: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -26,6 +26,8 @@ from flexdt.runtime import process as processes
 from flexdt.runtime import supervisor as module
 from flexdt.runtime.supervisor import Addresses, Service, ServiceError, Supervisor
 
+pytestmark = pytest.mark.slow
+
 FAKE = """
 import json, os, signal, socket, sys, time
 mode, folder, port = sys.argv[1], sys.argv[2], int(sys.argv[3])
@@ -304,7 +306,6 @@ def test_a_service_that_says_nothing_is_ended_and_started_again(
     assert not any(alive(pid) for pid in started(tmp_path, "mute"))
 
 
-@pytest.mark.slow
 def test_a_start_may_take_as_long_as_it_works(
     tmp_path: Path, fake: Callable[..., Service], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -151,6 +151,7 @@ def test_a_scene_comes_back_whole(tmp_path: Path) -> None:
     run(tmp_path, body)
 
 
+@pytest.mark.slow
 def test_uploads_come_in_chunks_and_stay_after_a_restart(tmp_path: Path) -> None:
     import trimesh
 

@@ -136,6 +136,7 @@ def test_move_projection_and_script_over_plain_lines(rays: Any, tmp_path: Path) 
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_a_projector_killed_in_mid_scan_comes_back_and_nothing_is_lost(tmp_path: Path) -> None:
     first = Process("flexdt.server.projector.main", "--port", "0", "--threads", "1")
     process = twin(first, tmp_path / "data", "--speed-up", "60")
@@ -168,6 +169,7 @@ def test_a_projector_killed_in_mid_scan_comes_back_and_nothing_is_lost(tmp_path:
             second.end()
 
 
+@pytest.mark.slow
 def test_sigterm_in_mid_scan_ends_cleanly_and_the_data_set_says_incomplete(
     rays: Any, tmp_path: Path
 ) -> None:
@@ -200,6 +202,7 @@ def test_sigterm_in_mid_scan_ends_cleanly_and_the_data_set_says_incomplete(
         (["--sample", "unicorn"], 1, "lego"),
     ],
 )
+@pytest.mark.campaign(4)
 def test_a_bad_configuration_is_one_readable_line(
     options: list[str], code: int, says: str, tmp_path: Path
 ) -> None:

@@ -67,6 +67,7 @@ def same(a: ScanPlan, b: ScanPlan) -> bool:
     ScanSource(script(2500).encode() + long_script(600)),
     ScanSource.of_poses([{"rot_obj": i * 0.1, "mag_obj": 500.0} for i in range(700)], 50.0),
 ], ids=["script", "poses"])  # fmt: skip
+@pytest.mark.daily(1)
 def test_a_plan_made_apart_is_the_plan_made_here(wish: ScanSource) -> None:
     async def body(checks: Checks) -> None:
         there = matter(wish)
@@ -167,6 +168,7 @@ def light() -> CheckInput:
     return matter(ScanSource(long_script(1)))
 
 
+@pytest.mark.slow
 def test_work_beyond_its_time_is_ended_and_says_what_is_allowed() -> None:
     async def body(workers: Workers) -> None:
         await workers.ask(checking.in_pieces, light())
@@ -181,6 +183,8 @@ def test_work_beyond_its_time_is_ended_and_says_what_is_allowed() -> None:
     worked(body)
 
 
+@pytest.mark.slow
+@pytest.mark.campaign
 def test_work_on_a_busy_machine_has_the_time_that_it_has_alone() -> None:
     """A process that is stopped for most of the time is one of a busy machine."""
 
@@ -211,6 +215,7 @@ def test_work_on_a_busy_machine_has_the_time_that_it_has_alone() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_work_beyond_its_memory_says_what_is_allowed() -> None:
     async def body(workers: Workers) -> None:
         with pytest.raises(RpcError) as refused:
@@ -223,6 +228,8 @@ def test_work_beyond_its_memory_says_what_is_allowed() -> None:
     worked(body, memory_bytes=600 << 20)
 
 
+@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_process_that_is_killed_costs_who_asked_an_error_and_nobody_else() -> None:
     async def body(workers: Workers) -> None:
         await workers.ask(checking.in_pieces, light())
@@ -240,6 +247,7 @@ def test_a_process_that_is_killed_costs_who_asked_an_error_and_nobody_else() -> 
 
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="looks for the process in /proc")
+@pytest.mark.slow
 def test_work_that_nobody_waits_for_any_more_is_stopped() -> None:
     async def body(workers: Workers) -> None:
         await workers.ask(checking.in_pieces, light())
@@ -272,6 +280,7 @@ def request(method: str, params: object) -> bytes:
     return json.dumps(document).encode()
 
 
+@pytest.mark.slow
 def test_poses_read_apart_are_two_strings() -> None:
     poses = [{"rot_obj": i / 4} for i in range(3000)]
     call = read(request("trajectory.submit", {"poses": poses, "seed": 5})).thawed()
@@ -281,6 +290,7 @@ def test_poses_read_apart_are_two_strings() -> None:
     assert call.params.poses.decoded() == poses
 
 
+@pytest.mark.slow
 def test_parameters_that_do_not_fit_say_so_in_a_few_words() -> None:
     raw = request("trajectory.check", {"poses": [{"rot_obj": "x"}] * 200_000})
     call = read(raw).thawed()
@@ -288,6 +298,7 @@ def test_parameters_that_do_not_fit_say_so_in_a_few_words() -> None:
     assert len(json.dumps(call.params.data)) < 20_000
 
 
+@pytest.mark.slow
 def test_large_parameters_of_a_method_that_needs_none_are_refused() -> None:
     raw = request("session.hello", {"protocol": "1.0", "client": "x" * (2 * MAX_PARAMS)})
     assert read(raw).thawed().params.code in (Code.INVALID_PARAMS, Code.TOO_LARGE)
@@ -323,6 +334,7 @@ def test_poses_of_a_beginning_come_back(tmp_path: Path) -> None:
     assert JobRecord.read(open_data(tmp_path), "a").wish.poses == wish.poses
 
 
+@pytest.mark.slow
 def test_a_plan_comes_in_pieces_that_are_read_at_once() -> None:
     plan = matter(ScanSource(script(60_000))).report().plan
     pieces = checking._pieces_of(plan)

@@ -34,29 +34,41 @@ settings.register_profile(
 settings.load_profile("same")
 
 
-def keep_some_daily(items: list[pytest.Item]) -> None:
-    """Of a test marked `daily(n)`, n cases run every day and the others are marked `slow`.
+def spread_out(items: list[pytest.Item]) -> None:
+    """Which cases of a test run when: marked `daily(n)`, n are part of `make test` and the others
+    are `slow`; of slow cases and of the page's those that `campaign(n)` keeps run in CI, the others
+    at night.
 
     The n cases lie evenly among all, so that each kind of a table is met.
     """
     cases: dict[tuple[Path, str], list[pytest.Item]] = {}
     for item in items:
-        if item.get_closest_marker("daily") is not None:
+        if {"daily", "campaign"} & {mark.name for mark in item.iter_markers()}:
             name = getattr(item, "originalname", None) or item.name
             cases.setdefault((item.path, name), []).append(item)
     for every in cases.values():
-        mark = every[0].get_closest_marker("daily")
-        assert mark is not None
-        kept = {len(every) * i // mark.args[0] for i in range(mark.args[0])}
+        daily, campaign = (_kept(every, name) for name in ("daily", "campaign"))
         for number, item in enumerate(every):
-            if number not in kept:
+            if daily is not None and number not in daily:
                 item.add_marker(pytest.mark.slow)
+            slow = {"slow", "browser"} & {mark.name for mark in item.iter_markers()}
+            if slow and campaign is not None and number not in campaign:
+                item.add_marker(pytest.mark.night)
+
+
+def _kept(every: list[pytest.Item], name: str) -> set[int] | None:
+    """Numbers of the cases that a mark keeps; None without the mark."""
+    mark = every[0].get_closest_marker(name)
+    if mark is None:
+        return None
+    count = mark.args[0] if mark.args else 0
+    return {len(every) * i // count for i in range(count)}
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Modules that take long begin first, then those of many tests: no worker is left with one."""
-    keep_some_daily(items)
+    spread_out(items)
     long = {item.path for item in items if item.get_closest_marker("slow") is not None}
     count = Counter(item.path for item in items)
     items.sort(key=lambda item: (item.path not in long, -count[item.path]))

@@ -72,6 +72,7 @@ def distance_to_path(
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(legs, min_size=2, max_size=3), st.floats(0.0, 1.0), st.booleans())
+@pytest.mark.slow
 def test_a_stop_along_the_path_stays_on_it_and_within_each_motors_limits(
     motors: list[list[tuple[float, float, float, float, bool]]], when: float, hard: bool
 ) -> None:

@@ -310,6 +310,7 @@ def test_pairs_are_neither_fixed_to_each_other_nor_allowed() -> None:
     assert not pairs & {frozenset(p) for p in M.allowed_contacts}
 
 
+@pytest.mark.slow
 def test_pairs_set_aside_cannot_touch_anywhere_in_the_travel() -> None:
     s = scene(M.default_profile, box((40, 60, 80)))
     rng = np.random.default_rng(0)

@@ -36,6 +36,7 @@ def check(total: dict) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_short_study(study: ModuleType, tmp_path: Path) -> None:
     file = tmp_path / "study.json"
     assert study.main(["--sweeps", "200", "--moves", "80", "--json", str(file)]) == 0

@@ -364,6 +364,7 @@ def test_bounds_of_many_pairs_are_lower_bounds() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
+@pytest.mark.daily(2)
 def test_a_turn_that_begins_the_other_way_meets_what_it_turns_into(seed: int) -> None:
     """What rounding leaves of the velocity where a motor turns round pointed the old way, and the
     rest of the turn counted as turning back: a contact was passed unseen."""
@@ -455,8 +456,9 @@ def drawn_motion(rng: np.random.Generator, reach: float) -> Trajectory:
     return motion.joined(legs)
 
 
-@pytest.mark.daily(2)
+@pytest.mark.daily(1)
 @pytest.mark.parametrize("seed", range(24))
+@pytest.mark.campaign(2)
 def test_drawn_motions_against_distances_at_many_times(seed: int) -> None:
     """Where they touch first, and how near they come: least squares at 1200 times say the same.
 
@@ -605,6 +607,7 @@ def gaps_along(
     slide=st.sampled_from([-3.0, 0.0, 0.5, 3.0, 30.0]),
     seed=st.integers(0, 2**31),
 )
+@pytest.mark.slow
 def test_an_overlap_never_deepens_and_once_free_keeps_the_margin(
     corners: int, off: float, depth: float, turn: float, slide: float, seed: int
 ) -> None:

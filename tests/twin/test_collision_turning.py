@@ -66,7 +66,7 @@ def distance(positions: dict[str, float]) -> float:
     return float(np.hypot(np.maximum(np.abs(x) - 100.0, 0.0), np.maximum(y, 0.0)).min())
 
 
-@pytest.mark.daily(4)
+@pytest.mark.daily(1)
 @pytest.mark.parametrize("seed", range(8))
 def test_what_turns_round_between_two_turntables_is_seen(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -75,6 +75,7 @@ def inside_ball(rng: np.random.Generator) -> FloatArray:
     ],
     ids=["L", "torus", "ball", "lego"],
 )
+@pytest.mark.daily(2)
 def test_pieces_hold_the_whole_solid(
     mesh: Mesh, inside: Callable[[np.random.Generator], FloatArray]
 ) -> None:
@@ -482,6 +483,7 @@ def random_script(rng: np.random.Generator) -> str:
 
 
 @pytest.mark.parametrize("seed", range(40))
+@pytest.mark.daily(26)
 def test_random_scripts_against_dense_sampling(seed: int) -> None:
     """Whatever starts while what else still runs: no pose of a passed plan is within the margin."""
     plan = plan_script(parse_script(random_script(np.random.default_rng(seed))), M, P)

@@ -362,6 +362,7 @@ def test_astras_dictionary_goes_both_ways() -> None:
         scan.with_shape(None).to_astra()
 
 
+@pytest.mark.slow
 def test_a_plot_shows_sources_and_panels() -> None:
     matplotlib = pytest.importorskip("matplotlib", reason="the extra `plots`")
     matplotlib.use("Agg")

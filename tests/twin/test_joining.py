@@ -93,8 +93,9 @@ def changed(
     return s, scene, now, "free" if halted is None else "halted", before, longest > 2
 
 
-@pytest.mark.daily(10)
+@pytest.mark.daily(4)
 @pytest.mark.parametrize("seed", range(60))
+@pytest.mark.campaign(10)
 def test_what_is_under_way_is_free_of_a_new_stage_or_halted_or_the_stage_refused(
     seed: int,
 ) -> None:
@@ -275,6 +276,7 @@ def test_a_jog_that_is_cut_short_runs_no_faster_than_it_was_asked_to() -> None:
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.tuples(st.floats(-50, 50), st.floats(0.0, 6.0)), min_size=1, max_size=6))
+@pytest.mark.slow
 def test_joined_trajectories_do_what_they_do_one_after_the_other(
     legs: list[tuple[float, float]],
 ) -> None:

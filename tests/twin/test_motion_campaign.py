@@ -43,6 +43,7 @@ def test_no_request_brings_anything_into_contact_or_past_a_limit(machine: str, s
         pytest.fail(f"episode {number}: {what}\n{script_of(start, history)}")
 
 
+@pytest.mark.slow
 def test_the_two_contacts_that_were_seen_are_none_any_more() -> None:
     """Issue 13: a refused move stopped one of two motors, and a stop braked each by itself."""
     home = {name: axis["home"] for name, axis in model("flexray").data["axes"].items()}
@@ -83,6 +84,7 @@ def test_coupled_motors_keep_in_step_when_a_move_takes_over_from_a_brake() -> No
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_what_stands_in_a_part_after_a_restart_comes_out_and_never_goes_deeper() -> None:
     """Turned boxes and cylinders: their boxes along the axes part while they themselves do not."""
     rng = np.random.default_rng(7)

@@ -239,6 +239,7 @@ def test_what_begins_too_near_may_stay_and_part_but_not_come_nearer() -> None:
     assert [v.kind for v in look(back, 3.0)] == ["margin"]
 
 
+@pytest.mark.slow
 def test_closed_forms_and_fcl_and_the_second_opinion_agree() -> None:
     """Random upright bodies: the three ways to a distance know nothing of each other."""
     rng = np.random.default_rng(4)

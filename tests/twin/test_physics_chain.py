@@ -83,6 +83,7 @@ def assert_holds(beam, signal, noise, substances, thickest) -> None:
     ],
 )
 @pytest.mark.parametrize("kV", [40.0, 90.0])
+@pytest.mark.daily(5)
 def test_few_energies_hold_the_full_spectrum(substances, thickest, kV):
     signal, noise = weights_of(Chain(Detector()), kV)
     beam = effective_beam(signal, noise, substances, thickest)

@@ -77,6 +77,7 @@ def do(s: ScannerTwin, command, now: float) -> None:
 @settings(max_examples=150, deadline=None)
 @given(commands)
 @example([(0.0, ("move", {"ver_tube": 0.0})), (1.0, ("stop", None))])
+@pytest.mark.slow
 def test_any_commands_at_any_times_keep_motion_continuous_and_within_limits(script) -> None:
     s = scanner()
     now = 0.0

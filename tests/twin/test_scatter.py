@@ -231,6 +231,7 @@ def analog(size, atoms, density, energy, source, panel_y, half_panel, photons, r
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_forced_detection_counts_what_analog_photons_count() -> None:
     """Water, 60 keV, a near panel: photons on it after one and after more interactions, absorbed
     and interacting, within four standard errors and 2 %."""
@@ -283,6 +284,7 @@ def test_the_image_does_not_depend_on_the_number_of_threads() -> None:
     assert not np.array_equal(alone.mean, scene(2).mean)
 
 
+@pytest.mark.slow
 def test_standard_errors_hold_and_photons_and_energy_are_kept() -> None:
     images = [scene(seed) for seed in range(20)]
     truth = scene(1000, 0.008).mean
@@ -302,6 +304,7 @@ def test_standard_errors_hold_and_photons_and_energy_are_kept() -> None:
     assert (balances[:, 1:3] > 0.1).all()
 
 
+@pytest.mark.slow
 def test_views_between_simulated_ones_are_interpolated(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scatter_kernels, "ORDERS_AT_MOST", 1)
     thing = box(WATER, 1.0, (20, 30, 20))
@@ -426,6 +429,7 @@ def cupping(line_integrals: np.ndarray, size: float) -> tuple[float, float]:
 @pytest.mark.parametrize(
     ("atoms", "density", "radius"), [(PMMA, 1.19, 35.0), ({"Al": 1}, 2.7, 15.0)]
 )
+@pytest.mark.campaign(1)
 def test_subtracted_scatter_leaves_no_cupping(
     atoms: dict[str, int], density: float, radius: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -165,6 +165,7 @@ def test_every_module_has_a_source() -> None:
 
 
 @pytest.mark.usefixtures("tools")
+@pytest.mark.slow
 def test_what_browsers_get_is_what_the_source_says(tmp_path: Path) -> None:
     build(tmp_path)
     built = {path.name: path.read_text("utf-8") for path in BUILT.glob("*.js")}

@@ -327,6 +327,7 @@ def test_sample_chooser(page: Any, twin: TwinClient, wait: Wait) -> None:
 
 
 @pytest.mark.parametrize(("form", "name"), [("stl", "rod"), ("glb", "试样"), ("off", "..rod")])
+@pytest.mark.campaign(1)
 def test_upload_of_a_mesh(
     page: Any, twin: TwinClient, wait: Wait, tmp_path: Path, form: str, name: str
 ) -> None:

@@ -115,6 +115,7 @@ def test_every_size_has_all_parts_and_the_stop(
     page.close()
 
 
+@pytest.mark.campaign
 def test_without_webgl_radiograph_axes_and_scans_work(
     chromium: Any, lab: Any, twin: TwinClient, wait: Wait
 ) -> None:
@@ -170,6 +171,7 @@ def test_a_plan_is_gone_through_by_keyboard(page: Any, wait: Wait) -> None:
     page.click("#tabs [data-tab=move]")
 
 
+@pytest.mark.campaign
 def test_four_views_fetch_the_program_once(open_page: Callable[..., Any], wait: Wait) -> None:
     page = open_page("four")
     page.locator(".view iframe").nth(3).wait_for()

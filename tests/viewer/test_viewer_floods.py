@@ -14,6 +14,7 @@ STUDY = Path(__file__).parents[1] / "studies" / "floods.py"
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs Linux's /proc")
+@pytest.mark.campaign
 def test_floods_end_nothing_and_others_are_answered() -> None:
     names = ["endless_messages", "cameras", "commands"]
     done = subprocess.run(

@@ -395,6 +395,7 @@ SILENCE_S = 300
 """So long without any message means that none will come."""
 
 
+@pytest.mark.slow
 def test_two_pages_at_the_socket(lab: Any) -> None:
     """States and images reach every page; a page may not call what is not its business."""
 

@@ -167,6 +167,7 @@ def ports_of(pid: int) -> set[int]:
     return found
 
 
+@pytest.mark.slow
 def test_a_viewer_listens_on_its_own_port_and_no_other(lab: Any) -> None:
     assert ports_of(lab.viewer.process.pid) == {lab.viewer.port}
 

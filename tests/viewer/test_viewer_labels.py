@@ -39,6 +39,7 @@ def test_no_name_covers_another_or_leaves_the_picture(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(25))
+@pytest.mark.daily(15)
 def test_leaders_of_names_of_one_size_never_cross(seed: int) -> None:
     rng = np.random.default_rng(100 + seed)
     count = int(rng.integers(2, 14))

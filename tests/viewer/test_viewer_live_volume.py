@@ -117,6 +117,7 @@ def middle(volume: npt.NDArray[np.float32]) -> float:
     return float(volume[around].mean())
 
 
+@pytest.mark.slow
 def test_it_grows_with_every_image_to_the_true_values(
     scan: tuple[Path, list[Path]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -195,6 +196,7 @@ def test_a_surface_has_few_points_whatever_the_volume() -> None:
     assert to_face.max() < size
 
 
+@pytest.mark.slow
 def test_nobody_waits_for_a_scan_that_nobody_looks_at(scan: tuple[Path, list[Path]]) -> None:
     with pytest.raises(SystemExit):
         grow(held(lambda document: None), scan[0], SIDE, alive=lambda: False)
@@ -328,6 +330,7 @@ def test_a_scan_of_what_nobody_knows_is_not_compared(scan: tuple[Path, list[Path
         compare(made, None)
 
 
+@pytest.mark.slow
 def test_answers_come_from_the_process_until_it_is_stopped(scan: tuple[Path, list[Path]]) -> None:
     home, files = scan
     for file in files:

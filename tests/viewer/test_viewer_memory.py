@@ -39,6 +39,7 @@ def growth(values: list[float]) -> float:
     return statistics.median(values[half:]) - statistics.median(values[:half])
 
 
+@pytest.mark.campaign
 def test_memory_is_flat_over_a_minute_of_motion(open_page: Callable[..., Any], lab: Any) -> None:
     page = open_page("side", (900, 600))
     session = page.context.new_cdp_session(page)

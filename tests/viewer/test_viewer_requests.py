@@ -32,6 +32,8 @@ from flexdt.process_settings import Address, UpSettings, ViewerSettings, parse
 from flexdt.protocol import METHODS as WIRE
 from flexdt.protocol import Connection, Notification, Request, Response
 
+pytestmark = pytest.mark.slow
+
 PATIENCE_S = 60.0
 NOWHERE = TwinAddress("127.0.0.1", 1)
 
@@ -277,7 +279,7 @@ HUGE = "camera\tset number of frames\t1000000\t\tACK\t\t\r\n" + "".join(
 )
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_plan_that_takes_too_much_is_refused_and_the_pages_go_on(lab: Any) -> None:
     """Sixty million images: planned in a process of its own, with limits."""
 
@@ -463,6 +465,7 @@ def comes_in(port: int) -> bool:
     return True
 
 
+@pytest.mark.campaign
 def test_pages_beyond_the_limit_are_told_why_and_figures_count_them(
     lab: Any, wait: Callable[..., Any]
 ) -> None:

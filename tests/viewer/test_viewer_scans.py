@@ -641,6 +641,7 @@ def test_a_bar_of_the_designer_rewrites_the_script(page: Any, twin: TwinClient, 
 
 
 @pytest.mark.parametrize("kind", ["fly", "tiled"])
+@pytest.mark.campaign(1)
 def test_the_designer_says_what_the_report_says_in_every_mode(
     page: Any, twin: TwinClient, wait: Wait, kind: str
 ) -> None:

@@ -111,6 +111,7 @@ def test_what_another_client_uploads_is_drawn_in_its_shape(
     scene.evaluate("flexdt.call('sample.set', {name: 'lego'})")
 
 
+@pytest.mark.campaign
 def test_a_fixed_view_goes_back_to_its_preset(scene: Any, twin: TwinClient) -> None:
     box = show(scene, "side")
     before = still(box)
@@ -166,6 +167,7 @@ def with_handles(scene: Any, twin: TwinClient, wait: Wait, view: str) -> Any:
     [("ver_tube", "source", "z"), ("mag_obj", "object", "y"), ("mag_det", "detector", "y"),
      ("ver_det", "detector", "z")],
 )  # fmt: skip
+@pytest.mark.campaign(1)
 def test_dragging_a_handle_moves_its_stage(
     scene: Any, twin: TwinClient, wait: Wait, axis: str, stage: str, along: str
 ) -> None:
@@ -281,6 +283,7 @@ def test_scrubbing_shows_a_ghost(scene: Any) -> None:
     settled(box, lambda back: np.abs(back - before).mean() < 1.0)
 
 
+@pytest.mark.campaign
 def test_a_planned_trajectory_is_its_own_pages_in_every_view(
     scene: Any, open_page: Callable[..., Any]
 ) -> None:
@@ -342,6 +345,7 @@ def test_a_picture_of_a_view_is_a_download(scene: Any) -> None:
     assert np.asarray(image.convert("L"), dtype=float).std() > 5.0
 
 
+@pytest.mark.campaign
 def test_four_views_at_once(scene: Any) -> None:
     scene.click("#view-switch [data-layout=four]")
     assert scene.locator(".view iframe").count() == 4
@@ -420,6 +424,7 @@ def inside_hull(corners: npt.NDArray[np.float64], rows: int, cols: int) -> npt.N
 
 
 @pytest.mark.parametrize("view", ["iso", "side", "free"])
+@pytest.mark.campaign(1)
 def test_a_view_shows_sample_and_image_where_the_geometry_puts_them(
     block: Any, twin: TwinClient, view: str
 ) -> None:
@@ -534,6 +539,7 @@ def click_pixel(page: Any, column: int, row: int, shape: tuple[int, int]) -> Non
     page.mouse.click(x, y)
 
 
+@pytest.mark.campaign
 def test_names_axes_scale_and_a_look_at_the_sample(scene: Any) -> None:
     box = show(scene, "iso")
     bare = still(box)

@@ -54,6 +54,7 @@ def the_button(page: Any) -> tuple[Any, str, str]:
 
 
 @pytest.mark.parametrize("size", [(1366, 768), (1000, 700), (800, 600), (360, 640)])
+@pytest.mark.campaign(1)
 def test_the_emergency_stop_never_changes(
     open_page: Callable[..., Any], lab: Any, twin: TwinClient, wait: Wait, size: tuple[int, int]
 ) -> None:

@@ -89,6 +89,7 @@ def test_a_hung_server_is_seen(page: Any, lab: Any, wait: Wait, name: str) -> No
 
 
 @pytest.mark.parametrize("name", ["twin", "viewer"])
+@pytest.mark.campaign(1)
 def test_a_killed_server_is_seen(page: Any, lab: Any, wait: Wait, name: str) -> None:
     shown = []
     while not shown or (min(shown) >= SHOWN_S and len(shown) < TRIES):

@@ -146,6 +146,7 @@ def test_far_off_axis_the_beams_eye_says_that_it_is_not_exact() -> None:
 
 
 @pytest.mark.parametrize("name", builtin_machines())
+@pytest.mark.daily(1)
 def test_every_component_has_a_look_in_metres(name: str) -> None:
     for part in builtin_machine(name).components:
         content = solids.glb(parts.pieces_of(part))
@@ -304,6 +305,7 @@ def test_the_margin_is_the_body_and_what_is_within_the_clearance_of_it() -> None
     assert outside.min() > 1.9
 
 
+@pytest.mark.slow
 def test_the_scene_draws_the_machines_own_margin() -> None:
     """Bare bodies and bodies grown by the clearance that the guard keeps are two layers."""
     with redirect_stdout(io.StringIO()):

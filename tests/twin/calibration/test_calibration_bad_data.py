@@ -31,6 +31,7 @@ def outcome(kind: str, seed: int = 0) -> Outcome:
         pytest.param("not_turning", "not_turning", marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.campaign
 def test_refused_and_named(kind: str, code: str) -> None:
     found = outcome(kind, 3)
     assert found.refused
@@ -51,6 +52,7 @@ SURVIVED = (
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "code"), SURVIVED)
+@pytest.mark.campaign
 def test_survived_within_its_own_sigmas(kind: str, code: str | None) -> None:
     found = outcome(kind, 5)
     assert not found.refused
@@ -82,5 +84,6 @@ DRAWN = ("frames_repeated", "vibration", "angle_slip", "angle_jitter", "angle_sc
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [k for k in SURVIVABLE if k not in (*dict(SURVIVED), *DRAWN)])
+@pytest.mark.campaign(1)
 def test_never_confidently_wrong(kind: str) -> None:
     assert not outcome(kind, 1001).wrong

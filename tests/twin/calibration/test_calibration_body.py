@@ -84,6 +84,7 @@ def calibrated(
         (2.5 * PLASTIC, 0.0, 0.5, "body_differs", 2.5),
     ],
 )
+@pytest.mark.campaign(1)
 def test_the_body_is_subtracted_as_the_images_have_it(
     plastic: float, turn_deg: float, aside_mm: float, code: str | None, factor: float
 ) -> None:

@@ -56,8 +56,9 @@ def test_beads_that_are_lost_are_named() -> None:
     assert "bead 0, 3 of 'lego' has no spot in any frame" in told.text
 
 
-@pytest.mark.daily(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [0.0, 37.0])
+@pytest.mark.campaign
 def test_a_stage_that_turns_the_other_way_is_not_called_turned_images(first: float) -> None:
     """Four of the five beads fit images turned by 180 deg, too, and more closely."""
     detections = spots(first - ANGLES, [0, 1, 2, 3, 4])
@@ -69,8 +70,9 @@ def test_steps_of_a_turn_over_one_frame_less_are_named() -> None:
     assert codes(spots(ANGLES * 36 / 35, [0, 1, 2, 3, 4])) == [("angle_endpoint", "error")]
 
 
-@pytest.mark.daily(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("at", [15, 21, None])
+@pytest.mark.campaign
 def test_a_gap_in_the_numbers_is_not_another_phantom(at: int | None) -> None:
     """20 deg more from this frame on; without one, the frames are shuffled."""
     if at is None:
@@ -90,6 +92,7 @@ SOME = (
 
 @pytest.mark.daily(4)
 @pytest.mark.parametrize("kind", SOME)
+@pytest.mark.campaign(2)
 def test_a_drawn_fault_has_its_name(kind: str) -> None:
     found = scored(kind, 40)
     assert found.verdict == "right", found.said
@@ -98,6 +101,7 @@ def test_a_drawn_fault_has_its_name(kind: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in SOME][::2])
+@pytest.mark.campaign(4)
 def test_no_other_drawn_fault_is_offered_wrong(kind: str) -> None:
     """A second draw where the first is too mild to be named; more: docs/calibration.md."""
     found = scored(kind, 50)
@@ -144,12 +148,14 @@ def test_what_is_held_exactly_and_wrongly_is_never_offered_in_silence(kind: str)
         ("scanner_held", 303),
     ],
 )
+@pytest.mark.campaign(1)
 def test_what_once_had_another_name_beside_or_instead(kind: str, seed: int) -> None:
     found = scored(kind, seed)
     assert found.verdict == "right", found.said
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_a_large_motion_that_may_be_followed_is() -> None:
     """A screw of 1.3 mm was called a drift and refused although it was to be followed."""
     scan = drawn("screw", 303)

@@ -169,6 +169,7 @@ def second_look_errors(
     return error, sigma, plan.whole
 
 
+@pytest.mark.slow
 def test_second_look_removes_the_pull_of_the_body() -> None:
     for name in ("lego", "normal-5", "compact-3"):
         phantom = load_phantom(name)

@@ -76,6 +76,7 @@ def test_beads_on_a_line_parallel_to_the_axis_do_not_fix_the_angle() -> None:
 
 @pytest.mark.daily(1)
 @pytest.mark.parametrize(("beads", "frames"), [(2, 3), (3, 36)])
+@pytest.mark.campaign
 def test_joint_95_ellipsoid_covers_95_percent(beads: int, frames: int) -> None:
     poses, truth = scenario("G0", frames)
     model = spiral(NORMAL, beads)
@@ -92,6 +93,7 @@ def test_joint_95_ellipsoid_covers_95_percent(beads: int, frames: int) -> None:
     assert 930 <= intervals <= 970
 
 
+@pytest.mark.slow
 def test_predicted_sigma_is_the_scatter_of_the_estimates() -> None:
     poses, truth = scenario("G4", 24)
     model = spiral(NORMAL, 4)

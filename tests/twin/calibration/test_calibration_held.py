@@ -73,7 +73,7 @@ def calibrated(scan: tuple[Poses, Float32Array], request: CalibrationRequest) ->
     return calibrate([Scan(ArrayFrames(list(images), SHAPE), poses)], LEGO, request)
 
 
-@pytest.mark.daily(3)
+@pytest.mark.daily(1)
 @pytest.mark.parametrize("tolerance", [None, 0.0, 0.005])
 @pytest.mark.parametrize(
     ("free", "says"),
@@ -83,6 +83,7 @@ def calibrated(scan: tuple[Poses, Float32Array], request: CalibrationRequest) ->
         (("dO_x",), "tau_z is held at 0 mm, the data say 0."),
     ],
 )
+@pytest.mark.campaign(4)
 def test_a_held_parameter_that_is_off_is_no_confident_answer(
     scan: tuple[Poses, Float32Array], free: tuple[str, ...], says: str, tolerance: float | None
 ) -> None:
@@ -129,6 +130,7 @@ def test_a_cause_that_looks_like_another_is_named_beside_it() -> None:
 
 @pytest.mark.parametrize("reading", list(Reading))
 @pytest.mark.parametrize("held", [("tau_x", "tau_z"), ("dO_y", "dO_z", "alpha", "tau_x", "tau_z")])
+@pytest.mark.daily(2)
 def test_a_parameter_held_where_it_is_stays_held(
     scan: tuple[Poses, Float32Array], held: tuple[str, ...], reading: Reading
 ) -> None:
@@ -163,6 +165,7 @@ def test_the_last_look_at_the_bounds_of_doubt_widens_the_intervals(
     assert result.fit.sigmas["dO_x"] > moved
 
 
+@pytest.mark.slow
 def test_a_detector_that_is_elsewhere_is_named() -> None:
     """Ten standard deviations of its prior away: no prior of the scanner says that."""
     poses, _ = careful_scan(np.random.default_rng(7), FRAMES)

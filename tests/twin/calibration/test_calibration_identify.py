@@ -15,11 +15,12 @@ from flexdt.twin.calibration.identify import assign, identify, identify_beads
 from flexdt.twin.errors import TwinError
 
 
-@pytest.mark.daily(2)
+@pytest.mark.daily(1)
 @pytest.mark.parametrize(
     ("beads", "frames", "missing", "false"),
     [(5, 36, 0.0, 0), (3, 3, 0.0, 0), (2, 12, 0.0, 0), (5, 36, 0.4, 3), (3, 5, 0.0, 1)],
 )
+@pytest.mark.campaign(2)
 def test_beads_are_told_apart_at_any_start_angle(
     beads: int, frames: int, missing: float, false: int
 ) -> None:

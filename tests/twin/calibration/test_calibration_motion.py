@@ -18,6 +18,7 @@ from flexdt.twin.geometry.motion import MOVABLE, Motion
 
 
 @pytest.mark.parametrize("kind", sorted(study.ASKED))
+@pytest.mark.daily(3)
 def test_what_moves_is_found_and_what_does_not_is_not(kind: str) -> None:
     found = study.one(7, kind, images=False)
     assert found["missed"] == found["false"] == 0
@@ -29,6 +30,7 @@ def test_what_moves_is_found_and_what_does_not_is_not(kind: str) -> None:
         assert np.sqrt(np.mean(np.square(found["deviation_pulls"]))) < 3.0
 
 
+@pytest.mark.slow
 def test_a_drift_that_breaks_off_is_no_turn_of_the_table() -> None:
     """Errors over sigmas of tau_z, of deviations: drifts level at the ends made them 2.6, 1.9."""
     rows = [study.one(seed, "spot", images=False) for seed in range(1, 6)]
@@ -38,6 +40,7 @@ def test_a_drift_that_breaks_off_is_no_turn_of_the_table() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_a_runout_is_found_in_radiographs() -> None:
     found = study.one(3, "runout", images=True)
     assert found["before_px"] > 0.05

@@ -83,6 +83,7 @@ def test_where_the_images_say_nothing_the_estimate_is_todays_plus_the_prior() ->
 
 # Seed 5's balls overlap in a fifth of 12 images, which is refused as a wrong phantom.
 @pytest.mark.parametrize(("images", "frames", "seed"), [(False, 36, 5), (True, 12, 6)])
+@pytest.mark.daily(1)
 def test_what_a_reconstruction_needs_is_known_far_better(
     images: bool, frames: int, seed: int
 ) -> None:
@@ -99,6 +100,7 @@ def test_what_a_reconstruction_needs_is_known_far_better(
     assert fit.sigmas["dO_x"] / PIXEL > 20 * found["axis_column"].sigma
 
 
+@pytest.mark.slow
 def test_intervals_and_regions_hold_for_detectors_drawn_from_the_priors() -> None:
     found = study(40, seed=3)
     assert found["refused"] == 0
@@ -108,6 +110,7 @@ def test_intervals_and_regions_hold_for_detectors_drawn_from_the_priors() -> Non
     assert exact["inside_pct"]["joint region of the six"] < 30
 
 
+@pytest.mark.slow
 def test_two_placements_make_the_priors_matter_little() -> None:
     found = study(20, count=2, seed=4)
     assert found["rms_error"]["dO_x"] < 0.02

@@ -53,6 +53,8 @@ def scanned(
         pytest.param(1.0, 4.0, (0.7, 0.7), 50.0, marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.slow
+@pytest.mark.campaign(1)
 def test_a_right_scan_is_offered(
     monkeypatch: pytest.MonkeyPatch,
     radius: float,
@@ -71,6 +73,7 @@ def test_a_right_scan_is_offered(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cast", [0.93, 1.07])
+@pytest.mark.campaign(1)
 def test_beads_of_another_size_are_still_refused(
     monkeypatch: pytest.MonkeyPatch, cast: float
 ) -> None:
@@ -79,6 +82,7 @@ def test_beads_of_another_size_are_still_refused(
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_faults_of_beam_and_detector_mislead_nobody(capsys: pytest.CaptureFixture[str]) -> None:
     kinds = "spectrum_aluminium,blurred_one_way,scattered_light,radial,larger_balls"
     assert beam_faults.main(["--each", "1", "--kinds", kinds]) == 0
@@ -95,6 +99,8 @@ def test_faults_of_beam_and_detector_mislead_nobody(capsys: pytest.CaptureFixtur
         pytest.param("lag_in_aluminium", 3, marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.slow
+@pytest.mark.campaign(1)
 def test_lag_is_taken_out_and_said(kind: str, seed: int) -> None:
     """Each frame shows part of the one before; how much is drawn."""
     rng = np.random.default_rng([seed, *kind.encode()])
@@ -109,6 +115,7 @@ def test_lag_is_taken_out_and_said(kind: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("kind", ["spectrum", "spectrum_aluminium"])
+@pytest.mark.daily(1)
 def test_a_camera_without_lag_is_not_said_to_have_it(kind: str) -> None:
     found = beam_faults.scored(kind, 1)
     assert found.offered

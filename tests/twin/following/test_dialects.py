@@ -30,12 +30,14 @@ def test_there_are_ten_dialects_and_every_fault_and_slip_is_drawn() -> None:
 
 
 @each
+@pytest.mark.daily(3)
 def test_every_fault_is_told_within_a_second_and_nothing_else_is(dialect: Dialect) -> None:
     for seed in range(DRAWN):
         assert missed(conversation(dialect, seed)) == [], f"seed {seed}"
 
 
 @each
+@pytest.mark.daily(2)
 def test_healthy_traffic_raises_no_error_and_at_most_one_warning(dialect: Dialect) -> None:
     messages = sorted(healthy(dialect, 1, 3600.0 * HOURS), key=lambda message: message[0])
     listener = Listener().hear(messages)
@@ -50,6 +52,7 @@ def test_healthy_traffic_raises_no_error_and_at_most_one_warning(dialect: Dialec
 
 
 @each
+@pytest.mark.daily(5)
 def test_a_listener_that_does_not_read_for_seconds_finds_no_fault(dialect: Dialect) -> None:
     rng = random.Random(dialect.name)
     stalls, at = [], 0.0

@@ -311,6 +311,7 @@ def test_the_rest_of_the_script_is_checked_from_where_the_machine_really_is() ->
 # -- a day -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_day_leaves_nothing_behind() -> None:
     """24 hours of scans on a clock of the test's own: what is kept is as large as after one."""
     follow = follower(script=parse_script(SCRIPT.format(mag=600)))

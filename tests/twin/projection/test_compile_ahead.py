@@ -41,6 +41,7 @@ assert not seen, seen
 
 
 @pytest.mark.slow  # half a minute of processor time: it begins with an empty cache
+@pytest.mark.campaign
 def test_nothing_compiles_after_it_was_compiled_ahead(tmp_path: Path) -> None:
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     ahead = [sys.executable, "-P", "-m", "flexdt.runtime.compile_ahead"]

@@ -71,6 +71,7 @@ assert np.array_equal(back(y, geometry, volume).data, fits)
 """
 
 
+@pytest.mark.slow
 def test_host_logic_and_kernels_in_the_simulator() -> None:
     run_simulated(SIMULATED)
 
@@ -181,6 +182,7 @@ def test_compiled_kernels_keep_their_budget() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_kernels_are_exact_in_the_simulator() -> None:
     run_simulated(DRAWN)
 
@@ -315,6 +317,7 @@ def test_each_material_of_voxels_goes_to_the_device_once() -> None:
     run_simulated(MATERIALS)
 
 
+@pytest.mark.slow
 def test_volumes_on_a_device_stay_there_and_copies_are_counted() -> None:
     run_simulated(THERE)
 
@@ -557,6 +560,7 @@ assert len(met) > 6, met
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_a_driver_that_fails_at_any_call_in_any_way_leaves_it_to_the_processor() -> None:
     run_simulated(ATTACKED, "20261123", "20")
 

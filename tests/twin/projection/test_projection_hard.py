@@ -114,7 +114,7 @@ def build(name, circle):
     return Volume(random(shape), voxel, center), circle(*args, **options)
 
 
-@pytest.mark.daily(16)
+@pytest.mark.daily(11)
 @pytest.mark.parametrize("walk", [0, 1, 2, 3], indirect=True)
 @pytest.mark.parametrize("name", CASES)
 def test_hard_cases_are_exact_forward_and_back(name, siddon, circle) -> None:

@@ -14,7 +14,9 @@ from flexdt.twin.reconstruction import bias_of, fdk_parts, truncation_of
 SHAPE = (24, 48)
 
 
-@pytest.mark.parametrize("count", [3, pytest.param(24, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [3, 24])
+@pytest.mark.campaign
 def test_even_regions_are_within_the_bound(count: int) -> None:
     """As the study asks of its hundreds: all but one of fifty, of scans that chose no constant."""
     excess = []
@@ -48,6 +50,7 @@ TURN = np.arange(90) * 4.0
         ((30.0, 26.0, 9.0), TURN, "beyond"),
     ],
 )
+@pytest.mark.daily(2)
 def test_the_cause_that_contributes_most(
     half: tuple[float, float, float], turn: np.ndarray, most: str
 ) -> None:
@@ -61,6 +64,7 @@ def test_the_cause_that_contributes_most(
 
 
 @pytest.mark.parametrize("drift", [0.0, 0.1])
+@pytest.mark.daily(1)
 def test_a_flat_that_drifted_is_in_the_bound(drift: float) -> None:
     scan = scan_of(TURN)
     clean = images_of(scan, (10.0, 8.0, 8.0))

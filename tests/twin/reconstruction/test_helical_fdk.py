@@ -60,6 +60,7 @@ def errors(parts: list[tuple[np.ndarray, np.ndarray, float]], scan: ConeVec, z: 
     return ((fdk(images, scan, grid.blank()).data[0] - truth) / MU)[even]
 
 
+@pytest.mark.slow
 def test_long_objects_come_back_from_any_helix() -> None:
     """Up and down, clockwise or not, panels aside and tilted, beside a circle round the layer."""
     rng = np.random.default_rng(7)

@@ -79,6 +79,7 @@ NEAR = Grid((52, 52, 52), 0.4, CENTRE).blank()  # twice as wide as the ball
     ids=["full", "repeated", "clockwise", "right", "left", "short", "short-clockwise", "longer",
          "two-turns", "yaw", "axis", "tilted"],
 )  # fmt: skip
+@pytest.mark.daily(5)
 def test_a_ball_comes_back(scan):
     found, centre = measure(fdk(ball(scan, SHAPE), scan, NEAR))
     assert found == pytest.approx(1.0, abs=0.01)
@@ -312,7 +313,7 @@ def with_four_dense_things(seed: int, field: float) -> list[Ellipse]:
     return parts
 
 
-@pytest.mark.daily(2)
+@pytest.mark.daily(1)
 @pytest.mark.parametrize("seed", [0, 2, 4, 11])
 def test_dense_things_do_not_pull_the_outline_unsaid(seed):
     """Seeds 4 and 11 are hard: most rays meet something dense, and no quarter of them is clean."""
@@ -339,7 +340,7 @@ def upright_prism(turns: np.ndarray, distances: np.ndarray) -> ConvexPolyhedron:
     )
 
 
-@pytest.mark.daily(5)
+@pytest.mark.daily(4)
 @pytest.mark.parametrize("corners", [3, 4, 6, 8])
 @pytest.mark.parametrize("seed", range(3))
 def test_what_is_off_by_more_than_a_per_cent_is_said(corners: int, seed: int) -> None:
@@ -382,6 +383,7 @@ def test_a_ball_wider_than_the_panel_comes_out_even():
 
 @pytest.mark.parametrize("noise", [0.0, 0.004])
 @pytest.mark.parametrize("core", [0.30, 0.001])
+@pytest.mark.daily(2)
 def test_a_thin_jacket_that_is_cut_off_is_as_dense_as_a_wider_panel_finds(
     core: float, noise: float
 ) -> None:
@@ -406,6 +408,7 @@ def test_a_thin_jacket_that_is_cut_off_is_as_dense_as_a_wider_panel_finds(
 
 
 @pytest.mark.parametrize("drift", [-0.05, 0.02, 0.05])
+@pytest.mark.daily(2)
 def test_a_flat_that_drifted_is_no_object(drift: float) -> None:
     """It adds a little everywhere; an object that the panel sees whole stays right, and unsaid."""
     scan = circle(120, pixel=0.8, sod=300.0, sdd=600.0)
@@ -421,6 +424,7 @@ def test_a_flat_that_drifted_is_no_object(drift: float) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("blur", [0.0, 0.7])
+@pytest.mark.campaign(1)
 def test_noise_at_the_edges_is_no_truncation(blur):
     """Boxes that fit, in 12 to 80 views of panels of any size with 200 to 20 000 photons a pixel;
     and boxes that do not fit, in the same noise."""
@@ -795,6 +799,7 @@ def test_pitch_may_change_from_view_to_view(pitch: np.ndarray) -> None:
 @pytest.mark.parametrize(("degrees", "told"), [
     (352.0, True), pytest.param(220.0, True, marks=pytest.mark.slow), (360.0, False),
 ])  # fmt: skip
+@pytest.mark.daily(1)
 def test_less_than_a_turn_does_not_tell_what_lies_beyond_a_near_edge(
     degrees: float, told: bool
 ) -> None:

@@ -173,6 +173,7 @@ assert not gpu.availability().present and "lost" in gpu.availability().reason
         pytest.param(ITERATED, id="iterative", marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.campaign
 def test_what_runs_in_the_simulator_gives_the_processors_numbers(program: str) -> None:
     run_simulated(program)
 

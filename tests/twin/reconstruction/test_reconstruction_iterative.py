@@ -27,6 +27,7 @@ def images():
     [(sirt, {"iterations": 40}), (sart, {"iterations": 5}), (cgls, {"iterations": 10}),
      (em, {"iterations": 25})],
 )  # fmt: skip
+@pytest.mark.daily(3)
 def test_a_ball_comes_back_and_residuals_fall(images, method, options):
     steps = []
     volume = method(images, SCAN, LIKE, watch=steps.append, **options)
@@ -65,6 +66,7 @@ def test_cgls_solves_least_squares():
     )
 
 
+@pytest.mark.slow
 def test_weights_solve_weighted_least_squares():
     """Beside the explicit matrix, with and without ordered subsets."""
     rng = np.random.default_rng(4)
@@ -87,6 +89,7 @@ def test_weights_solve_weighted_least_squares():
 
 
 @pytest.mark.parametrize("method", [sirt, sart])
+@pytest.mark.daily(1)
 def test_weighted_iterations_end_at_the_noise(images, method):
     rng = np.random.default_rng(5)
     variances = 10.0 ** rng.uniform(-5, -3, images.shape)

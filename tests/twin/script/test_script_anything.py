@@ -58,6 +58,7 @@ anything = st.one_of(
 
 @settings(max_examples=300, deadline=None)
 @given(anything)
+@pytest.mark.slow
 def test_reading_anything_raises_nothing_but_script_error(data: str | bytes) -> None:
     script, problems = read_script(data)
     assert [p.line for p in problems] == sorted(p.line for p in problems)

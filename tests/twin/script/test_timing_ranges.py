@@ -17,6 +17,7 @@ from flexdt.twin.script.planning.log_fit import LogRow
 from flexdt.twin.script.planning.plan import total_range
 
 
+@pytest.mark.slow
 def test_ranges_hold_the_next_scan_of_50_machines() -> None:
     found = timing_ranges.study(50, seed=17)
     inside = {group: share["percent"] for group, share in found["inside"].items()}
@@ -55,6 +56,7 @@ def test_what_a_total_is_uncertain_by(n: int, count: int, squares: float) -> Non
     assert low == 0.0  # no scan takes less than no time
 
 
+@pytest.mark.slow
 def test_rare_kinds_of_families_that_nothing_was_chosen_by() -> None:
     """A kind with one or two lines a scan, known from three to eight times."""
     found = timing_ranges.study(48, seed=17, families=timing_ranges.UNSEEN)
