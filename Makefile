@@ -74,9 +74,9 @@ test: lint typecheck kernels $(WEB_STAMP)
 	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'not slow and not browser' \
 	  --junitxml=build/durations/test.xml
 
-# The second distribution's own tests, the long ones included.
+# The second distribution's own tests, the slow ones included.
 test-extensions: lint typecheck $(TEST_STAMP)
-	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder extensions/tests \
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m 'not night' extensions/tests \
 	  --junitxml=build/durations/extensions.xml
 
 slow: studies page campaigns
@@ -94,7 +94,7 @@ page: $(TEST_STAMP)
 
 # Every seed and every case: hours in all. Nothing waits for it.
 campaigns: $(TEST_STAMP)
-	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m night \
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m night tests extensions/tests \
 	  --junitxml=build/durations/campaigns.xml
 
 # What failed in the last of these, once more and one after the other.

@@ -118,6 +118,7 @@ def test_two_numbers_of_processes_give_equal_manifests_and_chunks(
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_a_killed_batch_goes_on_where_it_was(
     plan_file: Callable[..., Path], tmp_path: Path
 ) -> None:

@@ -303,6 +303,7 @@ main(["bench", "--device", "--out", sys.argv[1]])
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_the_page_of_a_device_has_every_target(tmp_path) -> None:
     run_simulated(DEVICE, str(tmp_path))
     document = json.loads((tmp_path / "device.json").read_text("utf-8"))

@@ -34,6 +34,8 @@ def test_the_open_beam_falls_off_as_it_should(tmp_path: Path) -> None:
     assert numbers(r"Max Absolute GV Difference: (\S+)", case(tmp_path, "2D-FB-2"))[0] < 2.0
 
 
+@pytest.mark.slow
+@pytest.mark.campaign
 def test_duplex_wires_show_the_resolution_asked_for(tmp_path: Path) -> None:
     found = numbers(r"iSRb: (\S+)", case(tmp_path, "2D-DW-1", "SR75"))
     assert found == pytest.approx([0.075], rel=0.05)

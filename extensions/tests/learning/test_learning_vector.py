@@ -40,6 +40,8 @@ def close(one: Any, other: Any) -> None:
     ],
 )
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.slow
+@pytest.mark.campaign(3)
 def test_each_is_the_single_environment_step_by_step(
     name: str, words: dict[str, Any], mode: AutoresetMode
 ) -> None:

@@ -37,6 +37,8 @@ def calibrated(folder: Path, capsys: pytest.CaptureFixture[str], *options: str) 
 @pytest.mark.daily(1)
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.slow
+@pytest.mark.campaign(1)
 def test_the_job_ends_early_and_its_data_set_is_worth_what_was_asked(
     rays: Process, tmp_path: Path, capsys: pytest.CaptureFixture[str], seed: int
 ) -> None:

@@ -261,6 +261,7 @@ def test_dask_workers_write_the_same_bytes_however_many(
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
+@pytest.mark.campaign
 def test_kill_9_at_random_moments() -> None:
     pytest.importorskip("distributed", reason="the extra `batch`")
     words = ["kills", "--kills", "2", "--seed", "3", "--views", "24", "--panel", "60,80",
