@@ -67,11 +67,13 @@ def _kept(every: list[pytest.Item], name: str) -> set[int] | None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Modules that take long begin first, then those of many tests: no worker is left with one."""
+    """Modules that take long begin first, those of few slow tests, which are the slowest, before
+    all, then those of many tests: no worker is left with one."""
     spread_out(items)
-    long = {item.path for item in items if item.get_closest_marker("slow") is not None}
+    slow = Counter(item.path for item in items if item.get_closest_marker("slow") is not None)
     count = Counter(item.path for item in items)
-    items.sort(key=lambda item: (item.path not in long, -count[item.path]))
+    few = {path for path, number in slow.items() if number <= 2}
+    items.sort(key=lambda i: (i.path not in few, i.path not in slow, -count[i.path]))
 
 
 BEGUN = pytest.StashKey[float]()
