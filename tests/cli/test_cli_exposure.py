@@ -54,7 +54,6 @@ def share(text: str, name: str) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign
 def test_run_and_snap_say_what_their_images_are(tmp_path: Path, capsys: Capture) -> None:
     """Against the counts that they saved."""
     options = {"data": tmp_path / "data", "speed-up": "max", "physics": "poly"}

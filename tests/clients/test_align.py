@@ -220,7 +220,7 @@ def test_the_row_is_right_above_and_below_the_panel_and_refused_beside_it(
      pytest.param(0.3, 300, marks=pytest.mark.slow)],
 )  # fmt: skip
 @pytest.mark.slow
-@pytest.mark.campaign
+@pytest.mark.campaign(1)
 def test_shifts_of_single_frames_are_found_with_their_sigmas(size: float, photons: float) -> None:
     rng, degrees = np.random.default_rng(7), np.arange(120) * 3.0
     scanner = Scanner.drawn(rng)
@@ -409,7 +409,6 @@ def test_what_a_scan_cannot_tell_is_refused_with_the_reason() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign
 def test_the_command_writes_a_correction_that_reconstruct_takes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -36,7 +36,7 @@ def require_right(out: laboratories.Outcome) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 8])
-@pytest.mark.campaign
+@pytest.mark.campaign(1)
 def test_a_laboratory_is_found_and_every_planted_contradiction_named(
     seed: int, tmp_path: Path
 ) -> None:

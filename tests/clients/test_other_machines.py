@@ -216,7 +216,6 @@ def test_what_no_motor_does_is_said() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign
 def test_servers_run_a_machine_with_a_fixed_detector(tmp_path: Path) -> None:
     """A fixed detector passed `check` and ended `flexdt up` in a KeyError."""
     name = "micro_ct"

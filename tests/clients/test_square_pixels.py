@@ -42,7 +42,7 @@ def test_square_pixels_stay_what_they_are() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 1, 0])
-@pytest.mark.campaign
+@pytest.mark.campaign(1)
 def test_a_right_scan_with_oblong_pixels_is_offered(seed: int) -> None:
     """It was refused as beads of another size, or none was found."""
     rng = np.random.default_rng(seed)

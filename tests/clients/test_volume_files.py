@@ -48,7 +48,6 @@ for name in sys.argv[1:]:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign
 def test_itk_sees_one_place_in_all_formats(tmp_path: Path) -> None:
     """ITK's axes point left, back and up: x and y of ours with the other sign. It runs in a process
     of its own, because its HDF5 and h5py's cannot live in one."""

@@ -96,7 +96,6 @@ def test_every_name_of_the_face_is_on_the_page() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign
 def test_a_stranger_needs_one_import_and_finds_every_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

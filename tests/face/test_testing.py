@@ -82,7 +82,6 @@ def test_the_examples_hold() -> None:
 @settings(max_examples=15, deadline=None, phases=[Phase.generate], database=None)  # no shrinking
 @given(machine=machines(), draw=st.data(), to=st.floats(0.0, 1.0), part=st.floats(0.0, 1.2))
 @pytest.mark.slow
-@pytest.mark.campaign
 def test_any_machines_motors_move_as_its_file_says(
     machine: Machine, draw: st.DataObject, to: float, part: float
 ) -> None:

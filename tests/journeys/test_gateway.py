@@ -395,7 +395,6 @@ def test_a_component_of_somebody_else_takes_part_in_a_scripted_scan(
     heater.close()
 
 
-@pytest.mark.campaign
 def test_who_follows_the_gateway_sees_where_its_machine_differs(
     ports: tuple[int, int], plain: Any
 ) -> None:

@@ -115,7 +115,7 @@ def _problems(data: Any) -> list[dict[str, Any]]:
 def test_a_watcher_sees_projections_flow_while_an_axis_moves(
     plain: Plain, servers: Any, connect: Callable[..., Plain]
 ) -> None:
-    """During a 10 s move more arrive than those of its ends; the last is the final pose's."""
+    """During a move at least 20 distinct projections arrive; the last is the final pose's."""
     plain.call("clock.set", speed_up=1)
     plain.call("sample.set", name="normal-5")
     plain.call("axes.move", targets={"rot_obj": 0, "tra_obj": 0, "mag_obj": 600})
@@ -124,7 +124,7 @@ def test_a_watcher_sees_projections_flow_while_an_axis_moves(
     plain.call("clock.set", speed_up=1)
     watcher = connect(servers.address)
     watcher.call("state.subscribe", topics=["projection"], projection_binning=4)
-    plain.call("axes.set", axis="rot_obj", speed=10.0)
+    plain.call("axes.set", axis="rot_obj", speed=4.0)  # a busy machine projects twice a second
     moved = plain.call("axes.move", targets={"rot_obj": 96}, wait=False)
     assert moved["duration_s"] > 9.5
     seen: dict[bytes, int] = {}
@@ -137,7 +137,7 @@ def test_a_watcher_sees_projections_flow_while_an_axis_moves(
         assert event["topic"] == "projection"
         last = event["data"]
         seen[hashlib.sha256(last["data"].encode()).digest()] = event["seq"]
-    assert len(seen) > 2
+    assert len(seen) >= 20
     assert last["data"] == final["data"]
     plain.call("clock.set", speed_up="max")
 

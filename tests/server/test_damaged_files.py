@@ -171,7 +171,6 @@ def test_an_upload_may_come_again_after_it_was_set_aside(whole: Path, tmp_path: 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-@pytest.mark.campaign
 def test_a_server_starts_whatever_bit_is_another_one(whole: Path, tmp_path: Path) -> None:
     rng = random.Random(6)
     for number in range(25):

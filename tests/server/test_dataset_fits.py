@@ -240,7 +240,6 @@ def test_what_is_not_there_is_refused(data: Path, served: Served, tmp_path: Path
     served(body)
 
 
-@pytest.mark.campaign
 def test_a_fit_that_nobody_waits_for_ends(data: Path) -> None:
     """Its process is ended, and the next fit is answered."""
 

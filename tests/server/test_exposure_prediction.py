@@ -59,7 +59,6 @@ def test_shares_of_saturated_and_starved_pixels_are_told() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign
 def test_a_twin_predicts_its_own_images() -> None:
     with fx.LocalTwin(physics="poly", sample="normal-5") as twin:
         told = twin.predict_exposure(detail="void:0.2")

@@ -65,7 +65,6 @@ def test_limits_that_are_none(word: str) -> None:
 
 @pytest.mark.timeout(120)
 @pytest.mark.slow
-@pytest.mark.campaign
 def test_limits_hold_in_a_process(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rays = projector("--limit", "max_clients=9")
     options = [f"--limit={w}" for w in ("max_jobs=2", "max_upload=1000", "disk_quota=30e6",

@@ -234,7 +234,6 @@ def views(process: Process) -> dict[str, float]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(400)
-@pytest.mark.campaign
 def test_a_scan_survives_kill_and_stop_of_projectors_with_the_bytes_of_one(
     pool: list[Process], tmp_path: Path
 ) -> None:

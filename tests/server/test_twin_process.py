@@ -136,7 +136,6 @@ def test_move_projection_and_script_over_plain_lines(rays: Any, tmp_path: Path) 
 
 
 @pytest.mark.slow
-@pytest.mark.campaign
 def test_a_projector_killed_in_mid_scan_comes_back_and_nothing_is_lost(tmp_path: Path) -> None:
     first = Process("flexdt.server.projector.main", "--port", "0", "--threads", "1")
     process = twin(first, tmp_path / "data", "--speed-up", "60")

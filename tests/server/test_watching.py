@@ -142,7 +142,6 @@ def test_clients_that_send_half_a_request_hold_up_nobody(rays: Process, tmp_path
         assert time.monotonic() - begun < 60.0
 
 
-@pytest.mark.campaign
 def test_beyond_the_loopback_metrics_want_the_token(rays: Process, tmp_path: Path) -> None:
     token = tmp_path / "token"
     token.write_text("a-token-of-some-length\n")
@@ -201,7 +200,6 @@ def test_a_reader_of_the_log_that_is_stuck_stops_nobody() -> None:
     assert 5 <= len(written) <= 6
 
 
-@pytest.mark.campaign
 def test_a_twin_whose_log_nobody_reads_goes_on(rays: Process, tmp_path: Path) -> None:
     read, write = os.pipe()
     fcntl.fcntl(write, fcntl.F_SETPIPE_SZ, 4096)

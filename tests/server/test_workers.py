@@ -184,7 +184,6 @@ def test_work_beyond_its_time_is_ended_and_says_what_is_allowed() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign
 def test_work_on_a_busy_machine_has_the_time_that_it_has_alone() -> None:
     """A process that is stopped for most of the time is one of a busy machine."""
 
@@ -215,7 +214,6 @@ def test_work_on_a_busy_machine_has_the_time_that_it_has_alone() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign
 def test_work_beyond_its_memory_says_what_is_allowed() -> None:
     async def body(workers: Workers) -> None:
         with pytest.raises(RpcError) as refused:
@@ -229,7 +227,6 @@ def test_work_beyond_its_memory_says_what_is_allowed() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign
 def test_a_process_that_is_killed_costs_who_asked_an_error_and_nobody_else() -> None:
     async def body(workers: Workers) -> None:
         await workers.ask(checking.in_pieces, light())

@@ -35,11 +35,11 @@ settings.load_profile("same")
 
 
 def spread_out(items: list[pytest.Item]) -> None:
-    """Which cases of a test run when: marked `daily(n)`, n are part of `make test` and the others
-    are `slow`; of slow cases and of the page's those that `campaign(n)` keeps run in CI, the others
-    at night.
+    """Mark the cases of a test by when they run.
 
-    The n cases lie evenly among all, so that each kind of a table is met.
+    `daily(n)` leaves n cases in `make test` and marks the others `slow`. `campaign(n)` leaves n
+    cases in CI and marks the other slow ones, and the page's, `night`. The n cases are spread
+    evenly over the table, so that each kind of case is met.
     """
     cases: dict[tuple[Path, str], list[pytest.Item]] = {}
     for item in items:
@@ -67,13 +67,16 @@ def _kept(every: list[pytest.Item], name: str) -> set[int] | None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Modules that take long begin first, those of few slow tests, which are the slowest, before
-    all, then those of many tests: no worker is left with one."""
+    """Modules that may take longest begin first, then those with slow tests, then those with many:
+    no worker is left with one at the end."""
     spread_out(items)
-    slow = Counter(item.path for item in items if item.get_closest_marker("slow") is not None)
+    slow = {item.path for item in items if item.get_closest_marker("slow") is not None}
     count = Counter(item.path for item in items)
-    few = {path for path, number in slow.items() if number <= 2}
-    items.sort(key=lambda i: (i.path not in few, i.path not in slow, -count[i.path]))
+    allowed_s: dict[Path, float] = {}
+    for item in items:
+        if (mark := item.get_closest_marker("timeout")) is not None:
+            allowed_s[item.path] = max(mark.args[0], allowed_s.get(item.path, 0.0))
+    items.sort(key=lambda i: (-allowed_s.get(i.path, 0.0), i.path not in slow, -count[i.path]))
 
 
 BEGUN = pytest.StashKey[float]()

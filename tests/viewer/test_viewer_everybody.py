@@ -115,7 +115,6 @@ def test_every_size_has_all_parts_and_the_stop(
     page.close()
 
 
-@pytest.mark.campaign
 def test_without_webgl_radiograph_axes_and_scans_work(
     chromium: Any, lab: Any, twin: TwinClient, wait: Wait
 ) -> None:

@@ -419,7 +419,6 @@ def test_every_control_has_a_name_and_tabs_go_by_arrow(page: Any) -> None:
     assert page.locator("#tabs [tabindex='0']").count() == 1
 
 
-@pytest.mark.campaign
 def test_a_page_too_many_is_told_why_and_comes_in_when_there_is_room(
     chromium: Any, lab: Any
 ) -> None:

@@ -279,7 +279,6 @@ HUGE = "camera\tset number of frames\t1000000\t\tACK\t\t\r\n" + "".join(
 )
 
 
-@pytest.mark.campaign
 def test_a_plan_that_takes_too_much_is_refused_and_the_pages_go_on(lab: Any) -> None:
     """Sixty million images: planned in a process of its own, with limits."""
 
@@ -465,7 +464,6 @@ def comes_in(port: int) -> bool:
     return True
 
 
-@pytest.mark.campaign
 def test_pages_beyond_the_limit_are_told_why_and_figures_count_them(
     lab: Any, wait: Callable[..., Any]
 ) -> None:

@@ -577,6 +577,21 @@ def test_parts_about_to_touch_are_highlighted(scene: Any, twin: TwinClient, wait
     layers(scene, sample=True)
 
 
+def test_nothing_is_drawn_while_nothing_changes(scene: Any, wait: Wait) -> None:
+    """By viser's own count of its pictures; left to itself it draws one every second."""
+    frame = show(scene, "side").locator("iframe").element_handle().content_frame()
+
+    def pictures() -> int:
+        return int(frame.evaluate("window.__viserTestpoints.rendererInfo.render.frame"))
+
+    def at_rest() -> bool:
+        before = pictures()
+        scene.wait_for_timeout(4000)
+        return pictures() == before
+
+    wait(at_rest, "four seconds without a picture")
+
+
 def test_light_and_dark(scene: Any) -> None:
     box = show(scene, "side")
     light = still(box).mean()

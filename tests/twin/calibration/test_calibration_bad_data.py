@@ -52,7 +52,7 @@ SURVIVED = (
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "code"), SURVIVED)
-@pytest.mark.campaign
+@pytest.mark.campaign(1)
 def test_survived_within_its_own_sigmas(kind: str, code: str | None) -> None:
     found = outcome(kind, 5)
     assert not found.refused

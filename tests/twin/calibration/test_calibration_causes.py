@@ -58,7 +58,7 @@ def test_beads_that_are_lost_are_named() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("first", [0.0, 37.0])
-@pytest.mark.campaign
+@pytest.mark.campaign(1)
 def test_a_stage_that_turns_the_other_way_is_not_called_turned_images(first: float) -> None:
     """Four of the five beads fit images turned by 180 deg, too, and more closely."""
     detections = spots(first - ANGLES, [0, 1, 2, 3, 4])
@@ -72,7 +72,7 @@ def test_steps_of_a_turn_over_one_frame_less_are_named() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("at", [15, 21, None])
-@pytest.mark.campaign
+@pytest.mark.campaign(1)
 def test_a_gap_in_the_numbers_is_not_another_phantom(at: int | None) -> None:
     """20 deg more from this frame on; without one, the frames are shuffled."""
     if at is None:
@@ -155,7 +155,6 @@ def test_what_once_had_another_name_beside_or_instead(kind: str, seed: int) -> N
 
 
 @pytest.mark.slow
-@pytest.mark.campaign
 def test_a_large_motion_that_may_be_followed_is() -> None:
     """A screw of 1.3 mm was called a drift and refused although it was to be followed."""
     scan = drawn("screw", 303)

@@ -77,7 +77,6 @@ def test_the_document_comes_back_and_what_is_none_is_refused() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign
 def test_a_barrel_in_the_images_is_found_and_undone() -> None:
     """Images of a renderer of its own are warped; the map then puts the spots where they were."""
     rng = np.random.default_rng(3)

@@ -16,7 +16,7 @@ SHAPE = (24, 48)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [3, 24])
-@pytest.mark.campaign
+@pytest.mark.campaign(1)
 def test_even_regions_are_within_the_bound(count: int) -> None:
     """As the study asks of its hundreds: all but one of fifty, of scans that chose no constant."""
     excess = []

@@ -404,7 +404,6 @@ def test_trigger_without_pos_is_said() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign
 def test_a_long_line_is_read_in_linear_time_and_its_message_is_short() -> None:
     for filler in ("x" * 2_000_000, " " * 2_000_000, "ACK " * 400_000, "\t" * 500_000):
         for _, problem in enumerate(read_script("tube nonsense " + filler + " end")[1]):
