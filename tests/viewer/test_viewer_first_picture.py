@@ -15,13 +15,14 @@ import trimesh
 from PIL import Image
 from scipy.spatial import ConvexHull
 
+from flexdt.clients.client.client import TwinClient
 from flexdt.clients.viewer.scenes.cabinet import cabinet
 from flexdt.clients.viewer.scenes.standpoints import ROOM, WIDE, Standpoint, fitted, presets, roomy
 from flexdt.clients.viewer.scenes.still import Shape, drawn
 from flexdt.clients.viewer.scenes.world import World, placed
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import builtin_machine, profile_of
-from tests.viewer.looking import picture
+from tests.viewer.looking import changed, picture, until
 
 HOME = {"ver_tube": 26.29, "mag_obj": 600.0, "mag_det": 1059.0, "ver_det": 20.0, "tra_det": 25.32}
 Points = npt.NDArray[np.float64]
@@ -141,20 +142,35 @@ def test_the_viewer_paints_the_scene_until_the_live_one_is_there(
     url = page.evaluate("document.querySelector('#still').src")
     raw = page.request.get(url).body()
     assert len(raw) <= 60_000
-    still = Image.open(io.BytesIO(raw))
-    assert still.format == "JPEG"
+    painted = Image.open(io.BytesIO(raw))
+    assert painted.format == "JPEG"
     frame = box.bounding_box()
-    assert still.size == (round(frame["width"]), round(frame["height"]))
+    assert painted.size == (round(frame["width"]), round(frame["height"]))
     page.locator(".view.live").wait_for()
     page.locator("#still").wait_for(state="hidden")
     # Both pictures are of one scene, from one place: edges of the one are edges of the other.
     page.wait_for_timeout(1500)
     live = picture(box).mean(axis=2)
-    own = np.asarray(still.convert("L"), dtype=np.float32)
+    own = np.asarray(painted.convert("L"), dtype=np.float32)
     part = np.s_[60:-130, 130:-20]  # without buttons, tag and the sample's picture
     assert np.corrcoef(live[part].ravel(), own[part].ravel())[0, 1] > 0.8
     page.locator(".view .inset").click()
     page.keyboard.press("Alt+0")
+    page.close()
+
+
+@pytest.mark.browser
+def test_the_samples_own_picture_turns_with_it(
+    open_page: Callable[..., Any], twin: TwinClient
+) -> None:
+    page = open_page("iso", (1366, 768), notes_stay=False)
+    inset = page.locator(".view .inset img")
+    page.wait_for_function("document.querySelector('.inset img').naturalWidth > 0")
+    before = picture(inset)
+    twin.control("force")
+    twin.move({"rot_obj": 70}, relative=True, wait=True)
+    twin.control("release")
+    until(lambda: changed(picture(inset), before) > 200, "the turned sample")
     page.close()
 
 
