@@ -21,6 +21,7 @@ import viser
 from flexdt.clients.viewer.feed import ShownImage, grey, window_of
 from flexdt.clients.viewer.page_params import Form
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
+from flexdt.clients.viewer.scenes.layers import Nodes
 from flexdt.clients.viewer.scenes.sample import SampleLook
 from flexdt.clients.viewer.scenes.standpoints import FREE, Standpoint
 from flexdt.clients.viewer.scenes.world import world_of
@@ -53,11 +54,12 @@ def _png(pixels: npt.NDArray[np.uint8]) -> bytes:
 
 
 def scene_file(
-    server: viser.ViserServer, camera: Standpoint, title: str, beside: str, form: Form, dark: bool
-) -> bytes:
-    """The live scene as a file: from where the page sees it, and `beside` over it (HTML)."""
+    server: viser.ViserServer, camera: Standpoint, nodes: Nodes, title: str, beside: str,
+    form: Form, dark: bool,
+) -> bytes:  # fmt: skip
+    """The live scene as a file: as the page sees it, and `beside` over it (HTML)."""
     serializer = server.get_scene_serializer()
-    look_from(serializer, camera)
+    look_from(serializer, camera, nodes)
     return _file(serializer, form, dark, title, beside)
 
 

@@ -28,6 +28,7 @@ from websockets.exceptions import ConnectionClosed
 
 from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress, Unsendable
 from flexdt.clients.client.transport import ConnectionLost
+from flexdt.clients.viewer.scenes.layers import Shown
 from flexdt.protocol import METHODS, Code, RpcError, parse_params
 from flexdt.protocol.rpc_errors import busy, clip, internal, link_down
 from flexdt.runtime.log import log, traced
@@ -103,6 +104,7 @@ class Page:
         self.id = id
         self.kind = "line_integral"
         self.dark = self.live = False
+        self.shown = Shown()
         self.plan: Any = None
         self.orbit: Any = None
         """The focal spot's path over the plan, for the scenes of this page that open later."""

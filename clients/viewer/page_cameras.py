@@ -15,9 +15,11 @@ import numpy as np
 import viser
 
 from flexdt.clients.viewer.front import SCENE_PATH
+from flexdt.clients.viewer.scenes.layers import Nodes
+from flexdt.clients.viewer.scenes.light import SKY, light_finely
 from flexdt.clients.viewer.scenes.sample import MM
 from flexdt.clients.viewer.scenes.standpoints import Standpoint, roomy
-from flexdt.clients.viewer.viser_gate import Scenes
+from flexdt.clients.viewer.viser_gate import Scenes, set_nodes
 from flexdt.twin.geometry.conventions import FloatArray
 
 FILLS = 1.3
@@ -44,7 +46,10 @@ class SceneClients:
         self._lock = threading.Lock()
         self._who: dict[int, Who] = {}
         self._sent: dict[int, Standpoint] = {}
-        self._dark: dict[str, bool] = {}
+        self._theme: dict[str, tuple[bool, bool]] = {}
+        """Page -> whether its frames are dark, and finely lit."""
+        self._shown: dict[int, tuple[int, Nodes]] = {}
+        """Client -> what was built when, and how its nodes stand."""
         self.cameras: dict[str, Standpoint] = {}
         self.joined: Callable[[viser.ClientHandle, str], None] = lambda client, page: None
         """Called in one of viser's threads with a new frame and its page."""
@@ -58,12 +63,28 @@ class SceneClients:
         clients = self._server.get_clients()
         return [clients[i] for i in ids if i in clients]
 
-    def with_names(self) -> list[viser.ClientHandle]:
-        """Clients whose views have names: not the beam's eye, which shows the image's pixels."""
+    def with_names(self) -> list[tuple[viser.ClientHandle, str]]:
+        """Clients whose views have names, and their pages: the beam's eye shows pixels."""
         with self._lock:
-            ids = [i for i, w in self._who.items() if w.view != "beam"]
+            whose = {i: w.page for i, w in self._who.items() if w.view != "beam"}
         clients = self._server.get_clients()
-        return [clients[i] for i in ids if i in clients]
+        return [(clients[i], page) for i, page in whose.items() if i in clients]
+
+    def show(self, page: str, nodes: Nodes, plain: Nodes, built: int) -> None:
+        """Have a page's frames show nodes so, from a thread that alone calls this.
+
+        Args:
+            page: whose frames; one that has not got all that is built yet is left for later.
+            nodes, plain: as they are wanted, and as they are built.
+            built: what had been said to all when they were (`Scenes.said`).
+        """
+        for client in self.of(page):
+            if not self._scenes.heard(id := client.client_id, built):
+                continue
+            when, stand = self._shown.get(id, (built, plain))
+            known = (stand,) if when == built else (stand, plain)
+            set_nodes(client, {n: s for n, s in nodes.items() if any(k.get(n) != s for k in known)})
+            self._shown[id] = built, nodes
 
     def page_of(self, client_id: int | None) -> str | None:
         """The page that a client belongs to."""
@@ -97,15 +118,15 @@ class SceneClients:
             x, y, z = (middle + far * way / np.linalg.norm(way)).tolist()
             aim(client, replace(preset, position=(x, y, z), look_at=tuple(middle.tolist())))
 
-    def theme(self, page: str, dark: bool) -> None:
-        """Light or dark, for all frames of a page."""
-        self._dark[page] = dark
+    def theme(self, page: str, dark: bool, fine: bool) -> None:
+        """Light or dark, plainly or finely lit, for all frames of a page."""
+        self._theme[page] = dark, fine
         for client in self.of(page):
-            _theme(client, dark)
+            _theme(client, dark, fine)
 
     def forget(self, page: str) -> None:
         """Drop the clients of a page that has closed."""
-        self._dark.pop(page, None)
+        self._theme.pop(page, None)
 
     def _aim(self, id: int, camera: Standpoint) -> None:
         if self._sent.get(id) == camera:
@@ -126,13 +147,14 @@ class SceneClients:
             self._who[client.client_id] = who
         if who.view in self.cameras:
             self._aim(client.client_id, self.cameras[who.view])
-        _theme(client, self._dark.get(who.page, False))
+        _theme(client, *self._theme.get(who.page, (False, False)))
         self.joined(client, who.page)
 
     def _gone(self, client: viser.ClientHandle) -> None:
         with self._lock:
             self._who.pop(client.client_id, None)
             self._sent.pop(client.client_id, None)
+            self._shown.pop(client.client_id, None)
 
 
 def aim(client: viser.ClientHandle, camera: Standpoint) -> None:
@@ -144,5 +166,7 @@ def aim(client: viser.ClientHandle, camera: Standpoint) -> None:
         client.camera.fov = camera.fov
 
 
-def _theme(client: viser.ClientHandle, dark: bool) -> None:
+def _theme(client: viser.ClientHandle, dark: bool, fine: bool) -> None:
     client.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=dark)
+    if fine and client.scene.get_handle_by_name(SKY) is None:
+        light_finely(client.scene)

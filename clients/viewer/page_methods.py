@@ -55,25 +55,19 @@ MAX_SHARED: Final = 2
 
 
 async def layers(viewer: Viewer, page: Page, params: p.Layers) -> object:
-    """Show or hide layers on all pages; maps a layer's name to whether it is shown."""
-    scene = _lab(viewer)
-    for name, visible in params.model_dump(exclude_none=True, exclude={"opacity"}).items():
-        scene.show(name, visible)
-    if params.opacity is not None:
-        scene.fade(params.opacity)
-    if viewer.state is not None:
-        scene.draw_ranges(viewer.state)
-        if viewer.world is not None:
-            scene.update(viewer.state, viewer.world)
-    for other in viewer.pages.values():
-        other.say("layers", shown=scene.shown, opacity=scene.opacity)
+    """Show or hide layers on this page; maps a layer's name to whether it is shown."""
+    page.shown = page.shown.changed(**params.model_dump())
+    if viewer.lab is not None and viewer.state is not None and "ranges" in page.shown:
+        viewer.lab.draw_ranges(viewer.state)
+    viewer.show_layers()
+    page.say("layers", **page.shown.told)
     return {}
 
 
 async def theme(viewer: Viewer, page: Page, params: p.Theme) -> object:
-    """Light or dark, for this page's scenes."""
+    """Light or dark, plain or fine, for this page's scenes."""
     page.dark = params.dark
-    viewer.clients.theme(page.id, page.dark)
+    viewer.clients.theme(page.id, page.dark, params.fine)
     return {}
 
 
@@ -377,7 +371,8 @@ async def export(viewer: Viewer, page: Page, params: p.Export) -> object:
         seen = next(iter(viewer.clients.of(page.id, "free") or viewer.clients.of(page.id)), None)
         camera = FREE if seen is None else exports.standpoint(seen)
         make = partial(
-            exports.scene_file, viewer.viser, camera, exports.title_of(viewer.state, "scene"),
+            exports.scene_file, viewer.viser, camera, lab.nodes(page.shown),
+            exports.title_of(viewer.state, "scene"),
             exports.beside(viewer.state, viewer.feeds["line_integral"].newest),
         )  # fmt: skip
     elif page.plan is None or viewer.state is None:

@@ -36,7 +36,7 @@ Index = Annotated[int, Ge(0), Le(10**6)]
 
 
 class Layers(Params):
-    """Layers to show or hide on all pages; omitted ones stay as they are."""
+    """Layers to show or hide on this page; omitted ones stay as they are."""
 
     beam: bool | None = None
     axis: bool | None = None
@@ -55,9 +55,10 @@ class Layers(Params):
 
 
 class Theme(Params):
-    """Light or dark."""
+    """Light or dark, and whether a graphics processor can afford `fine` lighting."""
 
     dark: bool = False
+    fine: bool = False
 
 
 class Camera(Params):

@@ -12,7 +12,7 @@ import contextlib
 import json
 import logging
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -34,6 +34,7 @@ from flexdt.clients.viewer.scenes import sample as shapes
 from flexdt.clients.viewer.scenes import standpoints as views
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.labels import NameTags
+from flexdt.clients.viewer.scenes.layers import Shown
 from flexdt.clients.viewer.scenes.sample import NOTHING, MeshCache, SampleLook
 from flexdt.clients.viewer.scenes.world import World, beads_on, world_of
 from flexdt.clients.viewer.stills import Stills
@@ -122,7 +123,8 @@ class Viewer:
         self._due = asyncio.Event()
         self._twin_time, self._told = 0.0, -1
         self._heard_at = time.monotonic()
-        self._ranges_at = 0.0
+        self._ranges_at, self._built = 0.0, 0
+        self._near: Sequence[str] = ()
         self.link = KeptConnection(
             address,
             "flexdt viewer (scene)",
@@ -237,10 +239,19 @@ class Viewer:
             await asyncio.sleep(NAMES_S)
             lab, world = self.lab, self.world
             if lab is not None and world is not None:
-                named = lab.named(world)
-                for client in self.clients.with_names():
+                self.show_layers()
+                for client, id in self.clients.with_names():
+                    named = lab.named(world, self.pages[id].shown if id in self.pages else Shown())
                     with contextlib.suppress(AssertionError, KeyError):  # it has just come or gone
                         await asyncio.to_thread(self.tags.draw, client, named)
+
+    def show_layers(self) -> None:
+        """Have the frames show what their pages want, as soon as they have got what is built."""
+        if (lab := self.lab) is None:
+            return
+        for page in self.pages.values():
+            nodes = lab.nodes(page.shown, self._near)
+            self.clients.show(page.id, nodes, lab.plain, self._built)
 
     def _link_changed(self) -> None:
         self._heard_at = time.monotonic()
@@ -303,8 +314,9 @@ class Viewer:
                 feed.again()
         near = nearest(state.safety)
         lab.update(state, world)
-        lab.highlight(near["pair"] if near["close"] else ())
-        if lab.shown["ranges"] and time.monotonic() - self._ranges_at > RANGES_S:
+        self._near = near["pair"] if near["close"] else ()
+        ranges = any("ranges" in page.shown for page in self.pages.values())
+        if ranges and time.monotonic() - self._ranges_at > RANGES_S:
             self._ranges_at = time.monotonic()
             lab.draw_ranges(state)
         self._placed.set()
@@ -332,18 +344,15 @@ class Viewer:
             scene = await asyncio.to_thread(
                 LabScene, self.viser, machine, profile, self._dragged, self.looks
             )
-            if self.lab is not None:  # what was shown stays shown
-                for what, visible in self.lab.shown.items():
-                    scene.show(what, visible)
-                scene.fade(self.lab.opacity)
-            self.lab = scene
+            self.lab, self._built = scene, self.scenes.said
             for page in self.pages.values():
-                page.say("layers", **scene.layers)
+                page.say("layers", **page.shown.told)
         return self.lab
 
     async def _dress(self, lab: LabScene, state: State) -> None:
         self.look = await asyncio.to_thread(self.wardrobe.look, state.sample)
         lab.wear(self.look)
+        self._built = self.scenes.said
         if self.wardrobe.lacks(state.sample):
             self._fetching = watched(self._fetch(lab, state.sample), "fetching a shape")
 
@@ -394,14 +403,10 @@ class Viewer:
         camera = self.clients.cameras.get(asked.get("view", ""))
         if lab is None or world is None or camera is None:
             return None
-        stamp = (
-            self._pictured,
-            id(self.look),
-            lab.opacity,
-            *lab.shown.values(),
-            *world.view.rows.flat,
-        )
-        return await self._stills.picture(camera, asked, stamp, lambda: lab.shapes(world))
+        page = self.pages.get(asked.get("page", ""))
+        shown = Shown() if page is None else page.shown
+        stamp = (self._pictured, id(self.look), shown, *world.view.rows.flat)
+        return await self._stills.picture(camera, asked, stamp, lambda: lab.shapes(world, shown))
 
     def _grown(self, line: str) -> None:
         surface, slices = line.split("\t")
@@ -436,7 +441,7 @@ class Viewer:
         if self.data is not None:
             self.grower.warm()
         if self.lab is not None:
-            page.say("layers", **self.lab.layers)
+            page.say("layers", **page.shown.told)
         self.refresh_feeds()
         self._due.set()
         try:

@@ -31,14 +31,18 @@ import websockets.asyncio.server as library
 from annotated_types import Ge, Gt, Le, MaxLen
 from pydantic import Field, ValidationError
 from viser._messages import (
+    Message,
+    SceneNodeUpdateMessage,
     SetCameraLookAtMessage,
     SetCameraPositionMessage,
+    SetSceneNodeVisibilityMessage,
     ShareUrlDisconnect,
     ShareUrlRequest,
 )
 from websockets.asyncio.client import ClientConnection, unix_connect
 from websockets.typing import Subprotocol
 
+from flexdt.clients.viewer.scenes.layers import Nodes
 from flexdt.clients.viewer.scenes.standpoints import Standpoint
 from flexdt.protocol.fields import Params
 from flexdt.runtime.log import log
@@ -110,6 +114,16 @@ class Scenes:
         request = None if connection is None else connection.request
         return None if request is None else str(request.path.partition("?")[0])
 
+    @property
+    def said(self) -> int:
+        """How much has been said to all clients so far."""
+        return self.server._websock_server._broadcast_buffer.message_counter
+
+    def heard(self, client_id: int, said: int) -> bool:
+        """Whether a client was sent all of that: what is said to it alone may overtake the rest."""
+        at = self.server._websock_server._broadcast_buffer.generator_cursors.get(client_id, -1)
+        return at >= said - 1
+
     def stop(self) -> None:
         """End it; blocks for a second at most."""
         with redirect_stdout(io.StringIO()):
@@ -129,13 +143,30 @@ def clear_left_behind(folder: Path) -> None:
                 shutil.rmtree(left, ignore_errors=True)
 
 
-def look_from(serializer: Any, camera: Standpoint) -> None:
-    """Set the first camera of a recorded scene.
+def set_nodes(client: viser.ClientHandle, nodes: Nodes) -> None:
+    """Give nodes that all clients have other properties in the frame of one."""
+    with client.atomic():
+        for message in _changes(nodes):
+            client._websock_connection.queue_message(message)
+
+
+def _changes(nodes: Nodes) -> Iterator[Message]:
+    for name, properties in nodes.items():
+        if (rest := dict(properties)).pop("visible", None) is not None:
+            yield SetSceneNodeVisibilityMessage(name, properties["visible"])
+        if rest:
+            yield SceneNodeUpdateMessage(name, rest)
+
+
+def look_from(serializer: Any, camera: Standpoint, nodes: Nodes) -> None:
+    """Set the first camera of a recorded scene, and what is shown of it.
 
     `server.initial_camera` would say it too, but also overrule the cameras of pages that come.
     """
     serializer._insert_message(SetCameraPositionMessage(camera.position, initial=True))
     serializer._insert_message(SetCameraLookAtMessage(camera.look_at, initial=True))
+    for message in _changes(nodes):
+        serializer._insert_message(message)
 
 
 MARK: Final = b"<!-- program -->"

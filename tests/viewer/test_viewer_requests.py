@@ -424,7 +424,6 @@ def test_an_internal_error_is_in_the_log_under_its_id(capsys: pytest.CaptureFixt
 
 
 OF_THE_TWIN: list[tuple[str, dict[str, object]]] = [
-    ("viewer.layers", {"beam": True}),
     ("viewer.ray", {"pixel": [1.0, 2.0]}),
     ("viewer.spectrum", {"kV": 90.0}),
     ("viewer.plan", {"text": "tube\txrayon"}),

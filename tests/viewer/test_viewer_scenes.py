@@ -33,6 +33,8 @@ def scene(open_page: Callable[..., Any]) -> Iterator[Any]:
     page = open_page("none", SIZE, notes_stay=False)  # they lie over the views
     # The places of handles on the screen are told for views of this size.
     page.evaluate("document.querySelector('main').style.setProperty('--right', '274px')")
+    # The sample's own picture over the isometric view changes in its own time.
+    page.add_style_tag(content=".inset { visibility: hidden }")
     yield page
     page.close()
 

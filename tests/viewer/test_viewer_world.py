@@ -28,6 +28,7 @@ from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.beam_shade import HULL, MOST, SIDES, fans
 from flexdt.clients.viewer.scenes.gizmos import Gizmos
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
+from flexdt.clients.viewer.scenes.layers import LAYERS, Shown
 from flexdt.clients.viewer.scenes.sample import MeshCache
 from flexdt.clients.viewer.scenes.standpoints import beam_view
 from flexdt.clients.viewer.scenes.world import World, beads_on, placed, quaternion
@@ -321,22 +322,27 @@ def test_the_scene_draws_the_machines_own_margin() -> None:
                 np.testing.assert_allclose(grown.min(axis=0), bare.min(axis=0) - margin, atol=1e-3)
                 np.testing.assert_allclose(grown.max(axis=0), bare.max(axis=0) + margin, atol=1e-3)
         assert not any(h.visible for h in (*scene._margins.values(), *scene._hulls.values()))
-        scene.show("margin", True)
-        assert all(h.visible for h in scene._margins.values())
-        assert not any(h.visible for h in scene._hulls.values())
-        scene.show("margin", False)
-        scene.highlight(("xray_source", "sample_holder"))
-        for layer in (scene._margins, scene._hulls):
-            assert {n for n, h in layer.items() if h.visible} == {"xray_source", "sample_holder"}
+
+        def seen(kind: str, shown: Shown, near: tuple[str, ...] = ()) -> set[str]:
+            nodes = scene.nodes(shown, near)
+            return {n.split("/")[2] for n in nodes if n.endswith(kind) and nodes[n]["visible"]}
+
+        margins = Shown().changed(margin=True)
+        assert seen("/margin", margins) == set(scene._margins)
+        assert not seen("/body", margins)
+        for kind in ("/margin", "/body"):
+            near = ("xray_source", "sample_holder")
+            assert seen(kind, Shown(), near) == set(near)
         for points in (np.ones((3, 3)), np.arange(6.0).reshape(2, 3), None, None):
             scene.show_surface(points, 2.0)
             there = server.scene.get_handle_by_name("/object/surface")
             assert (there is None) == (points is None)
             if points is not None:
                 np.testing.assert_allclose(there.points, points / 1000.0, atol=1e-5)
-        for layer, drawn in scene.shown.items():
-            scene.show(layer, not drawn)
-            assert scene.shown[layer] is not drawn
+        for layer, on in LAYERS.items():  # each is a choice of nodes of its own, or of names
+            other = Shown().changed(**{layer: not on})
+            assert (layer in other) is not on
+            assert (scene.nodes(other) != scene.plain) is (layer != "names")
     finally:
         with redirect_stdout(io.StringIO()):
             server.stop()

@@ -1,7 +1,7 @@
 // The page's connection to its viewer: requests with answers, newest states and images, how old they are,
 // reconnection.
 import { keep, words } from "./dom.js";
-export const pageId = [...crypto.getRandomValues(new Uint8Array(12))].map((b) => b.toString(16).padStart(2, "0")).join("");
+export const pageId = window.pageId = [...crypto.getRandomValues(new Uint8Array(12))].map((b) => b.toString(16).padStart(2, "0")).join("");
 export const store = {
     state: null, framing: null, near: null, hello: null, session: null,
     twin: false, viewer: false, layers: {}, opacity: 1, image: null, recorded: null, hidden: false,

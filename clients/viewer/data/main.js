@@ -16,12 +16,12 @@ import "./path.js";
 import "./welcome.js";
 import { asked } from "./address.js";
 import { listen, toggleHelp } from "./keys.js";
-import { layout } from "./views.js";
+import { fine, layout } from "./views.js";
 function theme(dark, tell = true) {
     document.documentElement.dataset.theme = dark ? "dark" : "light";
     localStorage.setItem("flexdt-theme", dark ? "dark" : "light");
     if (tell)
-        call("viewer.theme", { dark }).catch(() => { });
+        call("viewer.theme", { dark, fine }).catch(() => { });
 }
 const dark = () => document.documentElement.dataset.theme === "dark";
 $button("#theme").addEventListener("click", () => theme(!dark()));

@@ -5,7 +5,7 @@ Only changes are sent. Setters may be called from any one thread at a time.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,8 @@ from flexdt.clients.viewer.scenes.beam_shade import BeamShade
 from flexdt.clients.viewer.scenes.cabinet import LAMP, cabinet
 from flexdt.clients.viewer.scenes.gizmos import Drag, Gizmos
 from flexdt.clients.viewer.scenes.labels import Name, names_of_image, names_of_parts
+from flexdt.clients.viewer.scenes.layers import Nodes, Shown
+from flexdt.clients.viewer.scenes.light import light_plainly
 from flexdt.clients.viewer.scenes.sample import MM, SampleLook
 from flexdt.clients.viewer.scenes.still import Shape, cone, cut, image_on, placed, shape_of
 from flexdt.clients.viewer.scenes.world import SCREEN, PlanDrawing, World, motors, quaternion
@@ -27,11 +29,6 @@ from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine, Profile
 
-LIGHTS = (
-    ("key", 2.5, (1.8, -2.2, 3.2)),
-    ("fill", 0.8, (-2.6, 1.4, 1.2)),
-)
-"""Name, intensity, where it comes from [m]."""
 FLOOR_MM = -405.0
 BEAM_ON = (255, 176, 32)
 BEAM_OFF = (120, 140, 165)
@@ -81,14 +78,7 @@ class LabScene:
         self._surface: Any = None
         self._hulls: dict[str, Any] = {}
         self._margins: dict[str, Any] = {}
-        self._hot: frozenset[str] = frozenset()
         self.plan = PlanDrawing(machine, self._collision)
-        self.opacity = 0.5
-        self.shown: dict[str, bool] = {
-            "beam": True, "axis": True, "panel": True, "ranges": False, "bodies": False,
-            "margin": False, "sample": True, "machine": True, "orbit": True, "gizmos": False,
-            "labels": False, "names": True, "cabinet": True,
-        }  # fmt: skip
         with server.atomic():
             self._build()
             self._build_bodies()
@@ -107,6 +97,8 @@ class LabScene:
             "labels": self._labels,
         }
         """Layer -> nodes to show or hide; those of bodies and margin depend on what is near."""
+        self.plain = self.nodes(Shown())
+        """How all nodes are built; each frame is told what its page shows otherwise."""
 
     # -- building ----------------------------------------------------------------------------
 
@@ -114,13 +106,7 @@ class LabScene:
         scene = self._server.scene
         scene.set_up_direction("+z")
         scene.configure_default_lights(enabled=False, cast_shadow=False)
-        # No environment map: without a graphics processor it makes pictures ten times slower.
-        scene.configure_environment_map(None)
-        scene.add_light_hemisphere(
-            "/lights/sky", sky_color=(236, 242, 255), ground_color=(120, 116, 112), intensity=1.35
-        )
-        for name, intensity, position in LIGHTS:
-            scene.add_light_directional(f"/lights/{name}", intensity=intensity, position=position)
+        light_plainly(scene)
         scene.world_axes.visible = False
         scene.add_grid(
             "/floor", width=8.0, height=8.0, cell_size=0.25, section_size=1.0,
@@ -137,7 +123,6 @@ class LabScene:
             self._looks.append(scene.add_glb(
                 f"/machine/{part.name}/look", own or solids.glb(pieces),
                 position=tuple(np.array(part.mesh_at_mm if own else (0.0, 0.0, 0.0)) * MM),
-                cast_shadow=False, receive_shadow=False,
             ))  # fmt: skip
         pieces, lamp = cabinet(self.machine, FLOOR_MM)
         self._solids["cabinet"], self._sent["cabinet"] = cut(pieces), HERE
@@ -145,7 +130,10 @@ class LabScene:
         self._lamp = scene.add_icosphere(
             "/cabinet/lamp", radius=0.045, color=LAMP[False], position=tuple(lamp * MM), **still
         )
-        self._cabinet = [scene.add_glb("/cabinet/walls", solids.glb(pieces), **still), self._lamp]
+        self._cabinet = [
+            scene.add_glb("/cabinet/walls", solids.glb(pieces), cast_shadow=False),
+            self._lamp,
+        ]
         self._frames["sample"] = scene.add_frame("/sample", show_axes=False)
         self._frames["object"] = scene.add_frame("/object", show_axes=False)
         self._stand_frame = scene.add_frame(STAND, show_axes=False)
@@ -194,10 +182,10 @@ class LabScene:
         )  # fmt: skip
         self._labels = [bar, axes]
 
-    def named(self, world: World) -> list[Name]:
+    def named(self, world: World, shown: Shown) -> list[Name]:
         """What has a name now, and where it is."""
-        if not self.shown["labels"]:
-            return names_of_image(world) if self.shown["names"] else []
+        if "labels" not in shown:
+            return names_of_image(world) if "names" in shown else []
         first = _scale_mm(self.machine)
         out: list[Name] = [(f"{SCALE_MM:g} mm", (first + [0.0, 0.5 * SCALE_MM, 0.0]) * MM)]
         for k, words in enumerate(("x traversal", "y source to detector", "z up")):
@@ -281,18 +269,13 @@ class LabScene:
         self._image.wxyz = quaternion(np.stack([u, v, np.cross(u, v)], axis=1))
         self._image.position = tuple(at)
 
-    @property
-    def stamp(self) -> tuple[object, ...]:
-        """What a picture of `shapes` depends on, but for sample and image."""
-        return (self.opacity, *self.shown.values(), *self._sent.items())
-
-    def shapes(self, world: World) -> list[Shape]:
+    def shapes(self, world: World, shown: Shown) -> list[Shape]:
         """What is drawn, for a picture that needs no browser; any thread may ask."""
-        poses, shown = dict(self._sent), self.shown
-        drawn = [n for n in self._solids if shown.get(n, shown["machine"])]
+        poses = dict(self._sent)
+        drawn = [n for n in self._solids if (n if n == "cabinet" else "machine") in shown]
         out = [shape for n in drawn for shape in placed(self._solids[n], poses[n])]
-        skins = () if self._look is None else self._look.skins
-        out += placed([shape_of(skin, self.opacity) for skin in skins], poses["sample"])
+        skins = () if self._look is None or "sample" not in shown else self._look.skins
+        out += placed([shape_of(skin, shown.opacity) for skin in skins], poses["sample"])
         image = [image_on(np.asarray(self._image.image), world)]
         return out + image + ([cone(world, BEAM_ON, 0.2)] if self._lit else [])
 
@@ -333,13 +316,13 @@ class LabScene:
             self._skins = [
                 self._server.scene.add_mesh_simple(
                     f"/sample/{skin.name}", skin.vertices, skin.faces, color=skin.color,
-                    opacity=None if skin.dense or self.opacity >= 1.0 else self.opacity,
-                    side="double" if self.opacity < 1.0 else "front",
-                    wireframe=not look.exact, cast_shadow=False, receive_shadow=False,
+                    **_clear(Shown().opacity, skin.dense),
+                    wireframe=not look.exact, cast_shadow=look.exact, receive_shadow=look.exact,
                 )
                 for skin in look.skins
             ]  # fmt: skip
             self._stand(look)
+        self.plain = self.nodes(Shown())
 
     def _stand(self, look: SampleLook) -> None:
         """A thin rod from the mount to the sample: drawn only, X-rays do not see it."""
@@ -356,43 +339,20 @@ class LabScene:
         if high > low:
             rod = solids.cylinder(5.0, high - low, (0.0, 0.0, 0.5 * (low + high)), solids.RUBBER)
             self._solids["object"] = cut([rod])
-            self._server.scene.add_glb(
-                name, solids.glb([rod]), cast_shadow=False, receive_shadow=False
-            )
+            self._server.scene.add_glb(name, solids.glb([rod]))
 
-    def fade(self, opacity: float) -> None:
-        """Draw the sample's body more or less transparent."""
-        look, self.opacity = self._look, opacity
-        if look is not None:
-            self._look = None
-            self.wear(look)
+    def nodes(self, shown: Shown, near: Collection[str] = ()) -> Nodes:
+        """The nodes of all layers, for frames of a page that shows `shown`.
 
-    @property
-    def layers(self) -> dict[str, object]:
-        """What is shown, for pages."""
-        return {"shown": self.shown, "opacity": self.opacity}
-
-    def show(self, what: str, visible: bool) -> None:
-        """Switch a layer, one of `shown`."""
-        self.shown[what] = visible
-        with self._server.atomic():
-            for handle in self._layers.get(what, ()):
-                handle.visible = visible
-            self._heat()
-
-    def highlight(self, names: Sequence[str]) -> None:
-        """Draw these components' collision bodies and margins (those near a contact)."""
-        hot = frozenset(names)
-        if hot != self._hot:
-            self._hot = hot
-            self._heat()
-
-    def _heat(self) -> None:
+        Args:
+            near: components near a contact, whose collision bodies and margins are drawn, too.
+        """
+        out = {h.name: {"visible": n in shown} for n, hs in self._layers.items() for h in hs}
         for layer, handles in (("bodies", self._hulls), ("margin", self._margins)):
-            for name, handle in handles.items():
-                visible = self.shown[layer] or name in self._hot
-                if handle.visible != visible:
-                    handle.visible = visible
+            out |= {h.name: {"visible": layer in shown or n in near} for n, h in handles.items()}
+        skins = () if self._look is None else self._look.skins
+        clear = {f"/sample/{skin.name}": _clear(shown.opacity, skin.dense) for skin in skins}
+        return {**out, **clear}
 
     def draw_ranges(self, state: State) -> None:
         """Draw the remaining travel of each stage as a line through its position."""
@@ -413,6 +373,13 @@ class LabScene:
         if lines:
             self._ranges.points = (np.array(lines) * MM).astype(np.float32)
             self._ranges.colors = np.full((len(lines), 2, 3), RANGE, dtype=np.uint8)
+
+
+def _clear(opacity: float, dense: bool) -> dict[str, Any]:
+    """Of a skin: what is dense stays opaque; the rear of what is not is seen, too."""
+    opaque = opacity >= 1.0
+    side = "front" if opaque else "double"
+    return {"opacity": None if dense or opaque else opacity, "side": side}
 
 
 def _scale_mm(machine: Machine) -> FloatArray:

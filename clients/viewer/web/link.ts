@@ -3,7 +3,8 @@
 import { keep, words } from "./dom.js";
 import type { Answers, Camera, Events, Framing, HelloResult, ImageHead, JobStatus, Messages, Near, Pair, Requests, Shown, State } from "./viewer.js";
 
-export const pageId = [...crypto.getRandomValues(new Uint8Array(12))].map((b) => b.toString(16).padStart(2, "0")).join("");
+declare global { interface Window { pageId: string } }
+export const pageId = window.pageId = [...crypto.getRandomValues(new Uint8Array(12))].map((b) => b.toString(16).padStart(2, "0")).join("");
 export const store = {
   state: null as State | null, framing: null as Framing | null, near: null as Near | null, hello: null as HelloResult | null, session: null as string | null,
   twin: false, viewer: false, layers: {} as Record<string, boolean>, opacity: 1, image: null as Shown | null, recorded: null as string | null, hidden: false,

@@ -16,13 +16,13 @@ import "./path.js";
 import "./welcome.js";
 import { asked } from "./address.js";
 import { listen, toggleHelp } from "./keys.js";
-import { layout } from "./views.js";
+import { fine, layout } from "./views.js";
 
 declare global { interface Window { flexdt: unknown; firstView: string } }
 function theme(dark: boolean, tell = true) {
   document.documentElement.dataset.theme = dark ? "dark" : "light";
   localStorage.setItem("flexdt-theme", dark ? "dark" : "light");
-  if (tell) call("viewer.theme", { dark }).catch(() => {});
+  if (tell) call("viewer.theme", { dark, fine }).catch(() => {});
 }
 const dark = () => document.documentElement.dataset.theme === "dark";
 $button("#theme").addEventListener("click", () => theme(!dark()));

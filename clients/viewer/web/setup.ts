@@ -1,5 +1,5 @@
 // The Setup tab: tube, camera, sample on the stage (with upload), layers of the scene.
-import { $, $$, $button, $canvas, $input, $select, base64, cleared, clicks, el, fixed, numeric, parsed, words } from "./dom.js";
+import { $, $$, $button, $canvas, $input, $select, base64, cleared, clicks, el, fixed, keep, numeric, parsed, words } from "./dom.js";
 import type { ExposurePrediction, Placement, PredictedSetting, Requests, SampleUpload, State, UploadResult } from "./viewer.js";
 import { call, command, emit, on, store } from "./link.js";
 
@@ -16,7 +16,7 @@ for (const list of [$select("#mode"), $select("#sample")]) {
 }
 for (const box of $$<HTMLInputElement>("#layers input")) box.addEventListener("change", () => void showLayer(box.id.replace("layer-", ""), box.checked));
 const opacity = $input("#opacity");
-opacity.addEventListener("change", () => void command("viewer.layers", { opacity: Number(opacity.value) }));
+opacity.addEventListener("change", () => void reveal({ opacity: Number(opacity.value) }));
 clicks({
   "tube-apply": setTube, "camera-apply": setCamera, "sample-apply": setSample, predict, "mesh-upload": sendMesh,
   "beam": () => command("tube.set", { on: !store.state?.tube.on }, "The tube refuses"),
@@ -195,11 +195,16 @@ function show(state: State) {
   if (listed !== s.name) { listed = s.name; void list(); }
 }
 
+// What somebody wants to see is theirs alone, and this browser remembers it.
+const SHOWN = "flexdt-shown";
+type Seen = Requests["viewer.layers"];
+const reveal = async (wanted: Seen) => { if (await command("viewer.layers", wanted)) keep(SHOWN, JSON.stringify({ ...store.layers, opacity: store.opacity })); };
+on("open", () => { const seen = localStorage.getItem(SHOWN); if (seen) call("viewer.layers", JSON.parse(seen) as Seen).catch(() => {}); });
 // A box keeps what was chosen last until the viewer has answered: states that it sent before that are older.
 const choosing = new Map<string, number>();
 async function showLayer(name: string, visible: boolean) {
   choosing.set(name, (choosing.get(name) ?? 0) + 1);
-  await command("viewer.layers", { [name]: visible });
+  await reveal({ [name]: visible });
   choosing.set(name, (choosing.get(name) ?? 1) - 1);
   drawLayers();
 }

@@ -22,6 +22,8 @@ export const software = (() => {
   gl?.getExtension("WEBGL_lose_context")?.loseContext();
   return !gl || /swiftshader|llvmpipe|software|basic render/i.test(name);
 })();
+// With one the scenes have shadows and an environment that shines in metal; `?light=fine` or `plain` says otherwise.
+export const fine = query.has("light") ? query.get("light") === "fine" : !software;
 const GAP_MS = Number(query.get("gap") ?? (software ? 400 : 0));
 const DPR = query.get("dpr") ?? (devicePixelRatio > 1.5 && !software ? "" : "1");
 
@@ -64,7 +66,7 @@ window.addEventListener("message", (e) => {
 });
 let posed = "", seenAt = -Infinity;
 on("state", (s) => {
-  const now = JSON.stringify([s.sample, s.correction, Object.values(s.axes).map((a) => a.position.toFixed(1)), document.documentElement.dataset.theme]);
+  const now = JSON.stringify([s.sample, s.correction, store.layers, store.opacity, Object.values(s.axes).map((a) => a.position.toFixed(1)), document.documentElement.dataset.theme]);
   if (now === posed || !inset.isConnected || performance.now() < seenAt + INSET_MS) return;
   posed = now; seenAt = performance.now();
   window.still(inset, "sample", { clientWidth: INSET_PX, clientHeight: INSET_PX });

@@ -515,6 +515,7 @@ export type SubmitResult = {
 };
 export type Theme = {
   dark?: boolean;
+  fine?: boolean;
 };
 export type TransmissionShares = {
   least: number;
