@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
+import gzip
 import hashlib
 import hmac
 import http
@@ -378,12 +380,19 @@ def _data(name: str) -> bytes:
 
 
 def _kept(request: Request, body: bytes, kind: str, how_long: str = "no-cache") -> Response:
-    """What a browser may keep: it is sent again only where it has changed."""
+    """What a browser may keep: it is sent again only where it has changed, and packed."""
     tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
-    more = {"ETag": tag, "Cache-Control": how_long, **LAST}
+    more = {"ETag": tag, "Cache-Control": how_long, "Vary": "Accept-Encoding", **LAST}
     if tag in request.headers.get("If-None-Match", ""):
         return Response(http.HTTPStatus.NOT_MODIFIED.value, "Not Modified", Headers(more), b"")
+    if "gzip" in request.headers.get("Accept-Encoding", ""):
+        body, more["Content-Encoding"] = _packed(body), "gzip"
     return _response(body, kind, more)
+
+
+@functools.lru_cache(64)
+def _packed(body: bytes) -> bytes:
+    return gzip.compress(body, mtime=0)
 
 
 def _response(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gzip
 import json
 import re
 import ssl
@@ -128,6 +129,9 @@ def test_what_has_not_changed_is_not_sent_again() -> None:
             tag = {"If-None-Match": headers["ETag"]}
             assert (await fetch(port, asked, **tag))[::2] == (304, b"")
             assert (await fetch(port, asked, **{"If-None-Match": '"another"'}))[2] == body
+            _, headers, packed = await fetch(port, asked, **{"Accept-Encoding": "br, gzip"})
+            assert headers["Content-Encoding"] == "gzip"
+            assert gzip.decompress(packed) == body
         script = (await fetch(port, path))[2].decode()
         assert script.endswith("run(document.currentScript.dataset.p)")
         assert '{"p": "ab!c", "ss": "7"}' in script
