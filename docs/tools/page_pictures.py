@@ -56,7 +56,7 @@ def opened(browser: Any, url: str, view: str, tab: str, fresh: bool = False) -> 
     if not fresh:
         page.add_init_script("localStorage.setItem('flexdt-welcome', 'seen')")
     page.set_default_timeout(PATIENCE_MS)
-    page.goto(f"{url}?view={view}&tab={tab}&theme=light&patience=60")
+    page.goto(f"{url}?view={view}&tab={tab}&theme=light&light=fine&patience=60")
     page.wait_for_function("window.flexdt?.store.image && flexdt.store.session")
     page.wait_for_timeout(FADED_MS)
     return page

@@ -121,7 +121,7 @@ def switch_x_rays_on(v: Visitor) -> None:
     v.sees("X-rays off: drawn as though on")
     v.tab("Setup")
     v.write("voltage [kV]", "60")
-    v.button("X-rays on")
+    v.button("Switch X-rays on")
     v.sees("60 kV, behind the filters")
     until(lambda: v.readout("beam").startswith("60 kV"), "the beam")
     v.sees_no_more("X-rays off: drawn as though on")

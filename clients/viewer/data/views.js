@@ -55,7 +55,9 @@ export function nearSample() { for (const view of open.keys())
     if (view !== "beam")
         void closer(view); }
 const still = $("#still"), inset = el("img", { alt: "" }), INSET_MS = 2500, INSET_PX = 112;
-still.addEventListener("error", () => { still.hidden = true; });
+for (const image of [still, inset])
+    image.addEventListener("error", () => { image.hidden = true; });
+inset.addEventListener("load", () => { inset.hidden = false; });
 window.addEventListener("message", (e) => {
     for (const { box, iframe } of open.values())
         if (e.source === iframe.contentWindow && e.data === "drawn") {

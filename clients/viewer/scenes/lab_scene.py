@@ -27,7 +27,7 @@ from flexdt.clients.viewer.scenes.world import SCREEN, PlanDrawing, World, motor
 from flexdt.protocol.state_model import State
 from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.machine.description import Component, Machine, Profile
 
 FLOOR_MM = -405.0
 BEAM_ON = (255, 176, 32)
@@ -114,6 +114,7 @@ class LabScene:
             section_thickness=0.9, fade_distance=5.0, fade_strength=2.0,
             position=(0.0, 0.55, FLOOR_MM * MM),
         )  # fmt: skip
+        ground = _ground(self.machine)
         for part in self.machine.components:
             frame = scene.add_frame(f"/machine/{part.name}", show_axes=False)
             self._frames[part.name] = frame
@@ -123,6 +124,7 @@ class LabScene:
             self._looks.append(scene.add_glb(
                 f"/machine/{part.name}/look", own or solids.glb(pieces),
                 position=tuple(np.array(part.mesh_at_mm if own else (0.0, 0.0, 0.0)) * MM),
+                receive_shadow=part is ground,  # a part's shadow on itself has stripes
             ))  # fmt: skip
         pieces, lamp = cabinet(self.machine, FLOOR_MM)
         self._solids["cabinet"], self._sent["cabinet"] = cut(pieces), HERE
@@ -317,7 +319,7 @@ class LabScene:
                 self._server.scene.add_mesh_simple(
                     f"/sample/{skin.name}", skin.vertices, skin.faces, color=skin.color,
                     **_clear(Shown().opacity, skin.dense),
-                    wireframe=not look.exact, cast_shadow=look.exact, receive_shadow=look.exact,
+                    wireframe=not look.exact, cast_shadow=look.exact, receive_shadow=False,
                 )
                 for skin in look.skins
             ]  # fmt: skip
@@ -339,7 +341,7 @@ class LabScene:
         if high > low:
             rod = solids.cylinder(5.0, high - low, (0.0, 0.0, 0.5 * (low + high)), solids.RUBBER)
             self._solids["object"] = cut([rod])
-            self._server.scene.add_glb(name, solids.glb([rod]))
+            self._server.scene.add_glb(name, solids.glb([rod]), receive_shadow=False)
 
     def nodes(self, shown: Shown, near: Collection[str] = ()) -> Nodes:
         """The nodes of all layers, for frames of a page that shows `shown`.
@@ -382,9 +384,14 @@ def _clear(opacity: float, dense: bool) -> dict[str, Any]:
     return {"opacity": None if dense or opaque else opacity, "side": side}
 
 
+def _ground(machine: Machine) -> Component:
+    """The part on which the others stand."""
+    return max(machine.components, key=lambda part: part.size_mm[0] * part.size_mm[1])
+
+
 def _scale_mm(machine: Machine) -> FloatArray:
-    """Where the scale begins: beside the machine's largest part, on its top."""
-    ground = max(machine.components, key=lambda part: part.size_mm[0] * part.size_mm[1])
+    """Where the scale begins: beside the part on which the others stand, on its top."""
+    ground = _ground(machine)
     (x, y, z), middle = ground.size_mm, np.array(ground.center_mm)
     return np.asarray(middle + [0.45 * x, -0.4 * y, z / 2 + 2.0])
 

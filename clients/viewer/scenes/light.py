@@ -32,5 +32,5 @@ def light_finely(scene: viser.SceneApi) -> None:
         scene: of one client; its lamps take the place of those that all have.
     """
     scene.configure_environment_map("studio", environment_intensity=0.1)
-    scene.add_light_hemisphere(SKY, sky_color=SKY_COLOR, ground_color=GROUND, intensity=0.9)
-    scene.add_light_directional(KEY, intensity=2.2, position=KEY_AT, cast_shadow=True)
+    scene.add_light_hemisphere(SKY, sky_color=SKY_COLOR, ground_color=GROUND, intensity=1.1)
+    scene.add_light_directional(KEY, intensity=1.9, position=KEY_AT, cast_shadow=True)

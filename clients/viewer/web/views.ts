@@ -60,7 +60,8 @@ export function nearSample(): void { for (const view of open.keys()) if (view !=
 // What the viewer computes: the view until its frame has drawn the machine, and the sample, large, beside it.
 declare global { interface Window { still: (image: HTMLImageElement, view: string, size: { clientWidth: number; clientHeight: number }) => void } }
 const still = $<HTMLImageElement>("#still"), inset = el("img", { alt: "" }), INSET_MS = 2500, INSET_PX = 112;
-still.addEventListener("error", () => { still.hidden = true; });
+for (const image of [still, inset]) image.addEventListener("error", () => { image.hidden = true; });
+inset.addEventListener("load", () => { inset.hidden = false; });
 window.addEventListener("message", (e) => {
   for (const { box, iframe } of open.values()) if (e.source === iframe.contentWindow && e.data === "drawn") { box.classList.add("live"); still.hidden = true; }
 });

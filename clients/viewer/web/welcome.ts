@@ -1,12 +1,12 @@
 // A first visit: the LEGO phantom from nothing to a volume in three clicks. Dismissed for good, or done, it does not
 // come back in this browser.
-import { $, $button, $select, keep, setText } from "./dom.js";
+import { $, $button, $input, $select, keep, setText } from "./dom.js";
 import { command, emit, on, store } from "./link.js";
 import { folder } from "./data.js";
 
 const KEY = "flexdt-welcome", card = $("#welcome"), go = $button("#welcome-go");
 const STEPS: Array<[button: string, what: string, act: () => boolean | Promise<boolean>]> = [
-  ["1  Write a scan", "LEGO bricks with steel beads stand on the stage: turn them once, 73 images.", write],
+  ["1  Write a scan", "LEGO bricks with steel beads stand on the stage: turn them once, 91 images.", write],
   ["2  Run it", "The script is below, and its dry run says whether it may run. As fast as this machine computes.", run],
   ["3  Make the volume", "Its slices appear beside the radiograph when the scan is done.", reconstruct],
 ];
@@ -15,7 +15,7 @@ let step = 0, before: string | undefined;
 async function write() {
   emit("show-tab", "scan");
   if (store.state?.sample.name !== "lego" && !(await command("sample.set", { name: "lego" }, "The sample stays"))) return false;
-  $select("#wish-kind").value = "fly"; $button("#compose").click();
+  $select("#wish-kind").value = "fly"; $input("#wish-frames").value = "91"; $button("#compose").click();
   return true;
 }
 function run() { before = store.job?.job; $select("#speed-up").value = "max"; $button("#run").click(); return true; }
