@@ -162,9 +162,12 @@ class LinearSystem:
         geometry, measured = self.geometry[views], self.part(self.measured, views)
         if self.hardening is None:
             return measured - self.project(x, geometry), np.float32(1)
-        paths = [self.project(part, geometry) for part in self.hardening.amounts(x)]
-        expected, ratio = self.hardening.line_integrals(np.stack(paths))
-        return measured - expected, ratio
+        paths = np.stack([self.project(one, geometry) for one in self.hardening.amounts(x)])
+        rest, more = np.empty_like(measured), np.empty_like(measured)
+        for view, image in enumerate(measured):
+            expected, more[view] = self.hardening.line_integrals(paths[:, view])
+            rest[view] = image - expected
+        return rest, more
 
     @cached_property
     def room(self) -> Float32Array:

@@ -14,7 +14,7 @@ and Beekman, IEEE Trans. Med. Imaging 25 (2006) 817). Grids are coarse, since sc
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
@@ -190,15 +190,15 @@ class Polychromatic:
         beam = effective_beam(signal, noise, materials, [THICKEST_MM] * len(mu), FINE)
         return cls(mu, beam, energy_keV)
 
-    def amounts(self, values: Float32Array) -> Float32Array:
-        """Densities of the materials in voxels (...) of these values [1/mm], relative to those that
-        were named, (m, ...).
+    def amounts(self, values: Float32Array) -> Iterator[Float32Array]:
+        """Of each material the density in voxels (...) of these values [1/mm], relative to the one
+        that was named.
         """
         order = np.argsort(self.mu)
         halfway = (self.mu[order][1:] + self.mu[order][:-1]) / 2.0
         of = order[np.searchsorted(halfway, values)]
-        found = [np.where(of == m, values / np.float32(mu), 0.0) for m, mu in enumerate(self.mu)]
-        return np.stack(found, dtype=np.float32)
+        for m, mu in enumerate(self.mu.astype(np.float32)):
+            yield np.where(of == m, values / mu, np.float32(0))
 
     def line_integrals(self, paths_mm: Float32Array) -> tuple[Float32Array, Float32Array]:
         """What the spectrum measures, and how many times as much one energy would have.
@@ -210,16 +210,15 @@ class Polychromatic:
             Two float32 arrays (...).
         """
         mean = self.beam.mu @ self.beam.signal / self.beam.signal.sum()
-        thin, straight = (
-            np.tensordot(mu.astype(np.float32), paths_mm, 1) for mu in (mean, self.mu)
-        )
-        least = np.reshape(-THIN / mean, (-1, *[1] * (paths_mm.ndim - 1)))
-        seen, _ = self.beam.transmit(np.maximum(paths_mm, least).astype(np.float32))
-        dark = np.maximum(seen / self.beam.signal.sum(), np.exp(-BLACK))
+        thin, straight = np.tensordot(np.array([mean, self.mu], np.float32), paths_mm, 1)
+        least = (-THIN / mean).astype(np.float32).reshape(-1, *[1] * (paths_mm.ndim - 1))
+        seen, _ = self.beam.transmit(np.maximum(paths_mm, least))
+        dark = np.maximum(seen / np.float32(self.beam.signal.sum()), np.float32(np.exp(-BLACK)))
         found = np.where(thin > THIN, -np.log(dark), thin)
-        none = np.abs(thin) < THIN * THIN
-        ratio = np.where(none, self.mu[0] / mean[0], straight / np.where(none, 1.0, found))
-        return found.astype(np.float32), ratio.astype(np.float32)
+        none, light = np.abs(thin) < THIN * THIN, int(np.argmin(self.mu))
+        limit = self.mu[light] / mean[light]
+        ratio = np.where(none, limit, straight / np.where(none, 1.0, found))
+        return found, ratio.astype(np.float32)
 
 
 def require_apart(materials: Sequence[Substance], mu: FloatArray) -> None:
