@@ -35,6 +35,8 @@ from flexdt.twin.reconstruction.scatter_correction import Polychromatic
 
 SMALLEST = 1e-6
 """Sums of weights below this part of the largest are not divided by."""
+MOST_FINER = 100
+"""Times as many voxels about a region as were asked for, at most: none is larger than it."""
 STACKS, VOLUMES = 4, 5
 """How many stacks of images, and volumes, a method holds at a time, at most."""
 
@@ -268,7 +270,8 @@ class RegionSystem(LinearSystem):
         """The system of a region, with surroundings out to `about` of voxels about as large as its.
 
         Raises:
-            GeometryError: `about` does not reach beyond the region.
+            GeometryError: `about` does not reach beyond the region, or that is too thin for voxels
+                of nearly that size.
         """
         wanted, (low, high) = as_volume(about), inner.like.boxes[0]
         parts = np.maximum(np.round((high - low) / wanted.voxel_xyz), 1.0)
@@ -281,7 +284,15 @@ class RegionSystem(LinearSystem):
                 "reaches beyond it",
                 {"asked": list(wanted.shape), "allowed": "> region"},
             )
-        nx, ny, nz = (int(n) for n in below + parts + above)
+        counts = below + parts + above
+        most = MOST_FINER * (math.prod(wanted.shape) + math.prod(inner.like.shape))
+        if counts.prod() > most:
+            raise GeometryError(
+                f"{counts.prod():.3g} surrounding voxels, none larger than the region, "
+                f"{inner.like!r}; allowed: {most}, by a larger region or nearer surroundings",
+                {"asked": counts.tolist(), "allowed": most},
+            )
+        nx, ny, nz = (int(n) for n in counts)
         outside = np.ones((nz, ny, nx), dtype=np.bool_)
         cut = [slice(int(b), int(b + p)) for b, p in zip(below, parts, strict=True)]
         outside[tuple(reversed(cut))] = False

@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.attenuation.tables import tables
-from flexdt.twin.errors import LimitError
+from flexdt.twin.errors import LimitError, require_within
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.physics.chain import Chain, weights_of
@@ -37,6 +37,7 @@ from flexdt.twin.projection.operators import as_cone_vec, check_projections, req
 from flexdt.twin.reconstruction.fdk import fdk_parts
 from flexdt.twin.reconstruction.rectify import field_of_view
 from flexdt.twin.reconstruction.truncation import truncation_of
+from flexdt.twin.signatures import public
 
 RING_WIDTH = 9
 """Columns over which a pixel is compared with its neighbours."""
@@ -142,15 +143,17 @@ def hardening(
     return Hardening(measured, depth * mu[at], float(energies[at]), material.name)
 
 
+@public
 @dataclass(frozen=True, eq=False)
 class Polychromatic:
     """What a spectrum measures behind several materials, for `sirt` and `sart`.
 
-    A voxel is of the material whose attenuation at one energy is next to its value, as dense as
-    this value says (Joseph and Spital, J. Comput. Assist. Tomogr. 2 (1978) 100). Paths through the
-    materials so give the line integrals that the volume has at this energy, and what the spectrum
-    would have measured. A mixture in proportion instead would take noise of a light material for
-    traces of a heavy one, which harden the beam, on average too much.
+    A voxel is of one material, as dense as its value says (Joseph and Spital, J. Comput. Assist.
+    Tomogr. 2 (1978) 100); the border between two is the geometric mean of their attenuation at one
+    energy. Paths through the materials so give the line integrals that the volume has at this
+    energy, and what the spectrum would have measured. Mixtures in proportion instead would take
+    noise of plastic for traces of metal, which harden the beam, on average too much; a border
+    halfway would take metal, which looks thin before it is corrected, for dense plastic for good.
 
     Attributes:
         mu: (m,) attenuation of each material at `energy_keV` [1/mm].
@@ -181,8 +184,11 @@ class Polychromatic:
         """From tube and detector as modelled; arguments as for `hardening`, of several materials.
 
         Raises:
-            LimitError: no material, two that attenuate alike, or no spectrum for `kV`.
+            LimitError: no material, two that attenuate alike, no spectrum for `kV`, or an energy
+                that the tables do not have.
         """
+        ends = tables().energy_keV[[0, -1]]
+        require_within("energy_keV", energy_keV, float(ends[0]), float(ends[1]), "keV")
         chain = Chain(Detector() if panel is None else panel, TubeModel() if tube is None else tube)
         signal, noise = weights_of(chain, kV)
         mu = np.array([one.attenuation_at(energy_keV) for one in materials])
@@ -195,8 +201,7 @@ class Polychromatic:
         that was named.
         """
         order = np.argsort(self.mu)
-        halfway = (self.mu[order][1:] + self.mu[order][:-1]) / 2.0
-        of = order[np.searchsorted(halfway, values)]
+        of = order[np.searchsorted(np.sqrt(self.mu[order][1:] * self.mu[order][:-1]), values)]
         for m, mu in enumerate(self.mu.astype(np.float32)):
             yield np.where(of == m, values / mu, np.float32(0))
 

@@ -122,3 +122,10 @@ def test_first_guesses_and_what_is_refused(images):
             sirt(images[0], SCAN, FINE, surroundings=wrong)
     with pytest.raises(GeometryError, match="surroundings"):
         sirt(images[0], SCAN, FINE, surroundings=3)
+    thin = Grid((1, 4, 5), 0.002, FINE.center_mm)
+    with pytest.raises(GeometryError, match="none larger than the region"):
+        sirt(images[0], SCAN, thin, surroundings=COARSE)
+    images = images[0].copy()
+    images[0, 0, 0] = np.nan
+    with pytest.raises(GeometryError, match="not finite"):
+        sirt(images, SCAN, FINE, surroundings=COARSE)

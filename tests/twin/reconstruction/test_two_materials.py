@@ -74,7 +74,7 @@ def test_iterations_are_those_of_the_explicit_matrix(drawn):
     r[~np.isfinite(r)] = 0.0
     x = np.zeros(matrix.shape[1])
     for _ in range(12):
-        dense = x > BOTH.mu.mean()
+        dense = x > np.sqrt(BOTH.mu.prod())
         paths = np.stack([matrix @ (x * ~dense), matrix @ (x * dense)], 1) / BOTH.mu
         seen = polychromatic(paths)
         more = np.divide(
@@ -106,3 +106,26 @@ def test_noise_ends_it_and_what_is_refused(drawn):
 
     with pytest.raises(GeometryError, match="hardening"):
         sirt(images, SCAN, GRID, hardening="pmma,steel")
+    for wrong in (np.nan, 0.0, 1e6):
+        with pytest.raises(LimitError, match="energy_keV is"):
+            Polychromatic.of((PMMA, STEEL), KV, wrong)
+    with pytest.raises(GeometryError, match="a Substance"):
+        Polychromatic.of(("pmma", "steel"), KV, KEV)
+
+
+@pytest.mark.parametrize("energy", [30.0, 85.0])
+@pytest.mark.daily(1)
+def test_metal_that_looks_thin_at_first_is_found(energy):
+    """At low energies metal attenuates several times as much as it seems to before it is known."""
+    scan, grid, shape = circle(24, pixel=0.9), Grid((1, 12, 12), 0.5), (1, 24)
+    both = Polychromatic.of((STEEL, PMMA), KV, energy)
+    truth = np.zeros(grid.shape)
+    truth[0, 3:9, 3:9] = both.mu[1]
+    truth[0, 5, 4:8] = both.mu[0]
+    matrix = lengths(scan, shape, grid)
+    steel = truth.ravel() == both.mu[0]
+    pmma = truth.ravel() == both.mu[1]
+    images = polychromatic(matrix @ np.stack([pmma, steel], 1)).reshape(len(scan), *shape)
+    options = {"iterations": 25, "relaxation": 1.5, "nonnegative": True}
+    found = sart(images, scan, grid, hardening=both, **options).data
+    np.testing.assert_allclose(found, truth, atol=0.02 * both.mu[0])
