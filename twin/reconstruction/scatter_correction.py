@@ -209,21 +209,23 @@ class Polychromatic:
         """What the spectrum measures, and how many times as much one energy would have.
 
         Args:
-            paths_mm: float32 (m, ...) through the materials; small negative ones are noise.
+            paths_mm: float32 (m, ...) through the materials; negative ones, of voxels below zero,
+                harden nothing.
 
         Returns:
             Two float32 arrays (...).
         """
         mean = self.beam.mu @ self.beam.signal / self.beam.signal.sum()
-        thin, straight = np.tensordot(np.array([mean, self.mu], np.float32), paths_mm, 1)
-        least = (-THIN / mean).astype(np.float32).reshape(-1, *[1] * (paths_mm.ndim - 1))
-        seen, _ = self.beam.transmit(np.maximum(paths_mm, least))
+        least = np.maximum(paths_mm, np.float32(0))
+        thin, straight = np.tensordot(np.array([mean, self.mu], np.float32), least, 1)
+        seen, _ = self.beam.transmit(least)
         dark = np.maximum(seen / np.float32(self.beam.signal.sum()), np.float32(np.exp(-BLACK)))
         found = np.where(thin > THIN, -np.log(dark), thin)
-        none, light = np.abs(thin) < THIN * THIN, int(np.argmin(self.mu))
-        limit = self.mu[light] / mean[light]
-        ratio = np.where(none, limit, straight / np.where(none, 1.0, found))
-        return found, ratio.astype(np.float32)
+        none, light = thin < THIN * THIN, int(np.argmin(self.mu))
+        limit = np.float32(self.mu[light] / mean[light])
+        ratio = np.where(none, limit, straight / np.where(none, np.float32(1), found))
+        total = np.tensordot(self.mu.astype(np.float32), paths_mm, 1)
+        return np.asarray(total / ratio, dtype=np.float32), ratio
 
 
 def require_apart(materials: Sequence[Substance], mu: FloatArray) -> None:

@@ -48,7 +48,9 @@ def test_line_integrals_are_the_sum_over_the_spectrum(drawn):
     assert not air.any()
     thin = BOTH.line_integrals(np.array([[0.06], [0.0]], np.float32))[1]
     assert limit == pytest.approx(float(thin[0]), rel=0.01)
-    assert np.isfinite(BOTH.line_integrals(np.array([[-1e6, 1e6], [1e6, 1e6]], np.float32))).all()
+    seen, more = BOTH.line_integrals(np.array([[-1e6, 1e6, -5.0], [1e6, 1e6, 1.0]], np.float32))
+    assert np.isfinite(seen).all()
+    assert (more > 0.0).all()  # a step in the wrong direction diverges
 
 
 @pytest.mark.slow
