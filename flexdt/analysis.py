@@ -116,7 +116,7 @@ def reconstruct(
     iterations: int | None = None,
     weight: float | None = None,
     window: str = "ram-lak",
-    material: str | None = None,
+    material: str | Sequence[str] | None = None,
     scatter_correction: str | Sequence[str] | None = None,
     tube: Tube | None = None,
     parameters: Offsets | None = None,
@@ -137,7 +137,8 @@ def reconstruct(
         iterations: of an iterative algorithm; default: its own.
         weight: of the total variation (tv); default: its own.
         window: of FDK's ramp filter: ram-lak, shepp-logan, cosine, hamming, hann.
-        material: the object is made of this alone: correct beam hardening.
+        material: the object is made of this alone: correct beam hardening. For sirt and sart also
+            all the materials it is made of.
         scatter_correction: the material that the object is made of, or all of them: simulate its
             scatter and subtract it (a circular scan).
         tube: of the scan, for the two corrections; default: what the data set says.
@@ -160,8 +161,8 @@ def reconstruct(
     names = [scatter_correction] if isinstance(scatter_correction, str) else scatter_correction
     request = VolumeRequest(
         algorithm=algorithm, voxel_mm=voxel, shape=shape, binning=binning, every=every,
-        iterations=iterations, window=window, center_mm=center, material=material, weight=weight,
-        tube=tube,
+        iterations=iterations, window=window, center_mm=center, weight=weight, tube=tube,
+        material=material if material is None or isinstance(material, str) else tuple(material),
         scatter_correction=None if names is None else tuple(names),
     )  # fmt: skip
     tell = None if progress is None else lambda done, whole: progress(done / whole)

@@ -480,7 +480,7 @@ class DataSet:
         iterations: int | None = None,
         weight: float | None = None,
         window: str = "ram-lak",
-        material: str | None = None,
+        material: str | Sequence[str] | None = None,
         scatter_correction: str | Sequence[str] | None = None,
         tube: Tube | None = None,
         parameters: Offsets | None = None,

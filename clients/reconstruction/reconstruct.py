@@ -39,6 +39,7 @@ from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.projection import Volume
 from flexdt.twin.reconstruction import (
     Grid,
+    Polychromatic,
     Truncation,
     bias_of,
     cgls,
@@ -100,7 +101,8 @@ class VolumeRequest:
             where `shape` is given.
         rings: correct for rings (full turns).
         material: the object is made of this alone: correct beam hardening with the data set's
-            tube (the default one where it names none); None for no correction.
+            tube (the default one where it names none); several with `sirt` and `sart` (see
+            `Polychromatic`); None for no correction.
         kV: of the scan, for `material` and `scatter_correction`; None is the voltage in the data
             set.
         png: write the three middle slices beside the volume.
@@ -119,7 +121,7 @@ class VolumeRequest:
     window: str = "ram-lak"
     center_mm: tuple[float, float, float] | None = None
     rings: bool = False
-    material: str | None = None
+    material: str | tuple[str, ...] | None = None
     kV: float | None = None
     png: bool = False
     weight: float | None = None
@@ -138,6 +140,7 @@ class ScanFrames:
         binning: pixels a side that are averaged.
         rings: (rows, cols) to subtract from the line integrals, or None.
         harden: straightens line integrals of one material, or None.
+        mixture: what the spectrum does behind several, for iterations; or None.
         scatter: of each of the m frames, to subtract, or None.
         doubts: what is doubtful about the images, the trajectory and the corrections.
     """
@@ -148,6 +151,7 @@ class ScanFrames:
     binning: int
     rings: Float32Array | None = None
     harden: Hardening | None = None
+    mixture: Polychromatic | None = None
     scatter: ScanScatter | None = None
     doubts: tuple[str, ...] = ()
 
@@ -365,6 +369,13 @@ def _task(
     name = wanted.algorithm
     if name not in ALGORITHMS:
         raise UnknownNameError.among(f"unknown algorithm {name!r}; allowed", name, ALGORITHMS)
+    several = _names(wanted.material)
+    if len(several) > 1 and name not in ("sirt", "sart"):
+        raise LimitError(
+            f"materials {', '.join(several)} with {name}; allowed: one, or several with sirt or "
+            "sart, which follow each through the volume",
+            {"asked": [name, *several], "allowed": ["sirt", "sart"]},
+        )
     views = views_of(dataset, parameters, binning=wanted.binning, every=wanted.every)
     doubts = image_doubts(dataset, needed=True)
     if name == "fdk":  # iterative methods need no lines of all directions
@@ -403,14 +414,22 @@ def _corrected(views: ScanFrames, request: VolumeRequest) -> ScanFrames:
     if request.rings:
         views = replace(views, rings=ring_errors(views.image(i) for i in views.indices))
     if request.material is not None:
-        from flexdt.phantoms import material
+        from flexdt.phantoms.materials import material, stated_keV
 
-        made_of = material(request.material)
+        made_of = [material(name) for name in _names(request.material)]
         kV, tube, mono_keV = _source(views.dataset, request)
-        if mono_keV is None:
-            harden = hardening(made_of.substance, kV, made_of.effective_energy_keV, tube=tube)
+        substances = [one.substance for one in made_of]
+        if mono_keV is None and len(made_of) == 1:
+            harden = hardening(substances[0], kV, made_of[0].effective_energy_keV, tube=tube)
             views = replace(views, harden=harden)
+        elif mono_keV is None:
+            mixture = Polychromatic.of(substances, kV, stated_keV(), tube=tube)
+            views = replace(views, mixture=mixture)
     return views
+
+
+def _names(given: str | tuple[str, ...] | None) -> tuple[str, ...]:
+    return (given,) if isinstance(given, str) else given or ()
 
 
 def _without_scatter(
@@ -511,6 +530,8 @@ def _require(where: str, need: int, free: int, grid: Grid) -> None:
 def _iterative(views: ScanFrames, grid: Grid, request: VolumeRequest, tell: Progress) -> Volume:
     # Stacks of images and grids of voxels that the algorithm holds at a time.
     stacks, grids = (6, 13) if request.algorithm == "tv" else (3, 5)
+    if views.mixture is not None:
+        stacks, grids = stacks + 2 * len(views.mixture.mu), grids + 3
     need = stacks * 4 * len(views.indices) * math.prod(views.shape) + grids * grid.bytes
     memory = memory_bytes()
     if need > 0.8 * memory:
@@ -520,7 +541,9 @@ def _iterative(views: ScanFrames, grid: Grid, request: VolumeRequest, tell: Prog
             {"asked": need, "allowed": int(0.8 * memory)},
         )
 
-    asked = {"iterations": request.iterations, "weight": request.weight}
+    asked = {
+        "iterations": request.iterations, "weight": request.weight, "hardening": views.mixture,
+    }  # fmt: skip
     return ITERATIVE[request.algorithm](
         np.concatenate(list(views.parts())),
         views.cone_vec,

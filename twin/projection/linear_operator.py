@@ -321,8 +321,9 @@ def _same_grid(a: Volume | DeviceVolume, b: Volume) -> bool:
 
 @singledispatch
 def dot(a: Any, b: Any) -> float:
-    """Inner product of two stacks or volumes, summed in double precision."""
-    return float(np.einsum("ijk,ijk->", a, b, dtype=np.float64))
+    """Inner product of two arrays of one shape, summed in double precision."""
+    axes = [*range(a.ndim)]
+    return float(np.einsum(a, axes, b, axes, [], dtype=np.float64))
 
 
 dot.register(DeviceArray, DeviceArray.dot)

@@ -4,11 +4,13 @@ from flexdt.twin.projection.volume import Grid
 from flexdt.twin.reconstruction.bias_bound import Bias, bias_of
 from flexdt.twin.reconstruction.coverage import layer_warnings, lost_layers, missing_wedge
 from flexdt.twin.reconstruction.fdk import fdk, fdk_parts
-from flexdt.twin.reconstruction.iterative import Step, cgls, em, sart, sirt
+from flexdt.twin.reconstruction.iterative import cgls, em, sart, sirt
+from flexdt.twin.reconstruction.linear_system import Step
 from flexdt.twin.reconstruction.noise import with_errors
 from flexdt.twin.reconstruction.rectify import field_of_view
 from flexdt.twin.reconstruction.scatter_correction import (
     Hardening,
+    Polychromatic,
     hardening,
     ring_errors,
     without_scatter,
@@ -21,6 +23,7 @@ __all__ = [
     "Grid",
     "Hardening",
     "Minimised",
+    "Polychromatic",
     "Step",
     "Truncation",
     "bias_of",

@@ -1,263 +1,33 @@
 """Iterative reconstruction on the matched pair of projector and adjoint, for any trajectory.
 
 SIRT, SART (ordered subsets), CGLS and EM (maximum likelihood for positive data). Each algorithm is
-one function; all see geometry through `forward` and `back` only. Everything is held in memory. The
+one function; all see geometry through `LinearSystem` only. Everything is held in memory. The
 caller chooses the number of iterations. SIRT and SART weigh line integrals by variances that are
-given, and then end once what is left is no more than that noise.
-
-A `LinearSystem` is what every method has in hand: data, geometry and grid, and the matched pair of
-operators on plain arrays. Where a CUDA device has room for all that a method holds, the same method
-runs on a `DeviceProblem`, whose arrays are there from the first iteration to the last.
+given, and then end once what is left is no more than that noise; they take the spectrum's hardening
+in several materials into account. SIRT, SART and CGLS solve a fine region in coarse surroundings.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import cached_property, singledispatch
-from typing import Any, TypeVar
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.errors import GeometryError, LimitError
+from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.projection import Grid, Volume, as_volume, back, forward, gpu, room_like
-from flexdt.twin.projection.device_arrays import DeviceArray
-from flexdt.twin.projection.linear_operator import dot as dot
-from flexdt.twin.projection.operators import (
-    as_cone_vec,
-    check_projections,
-    require_finite,
-    require_line_integrals,
+from flexdt.twin.projection import Grid, Volume
+from flexdt.twin.projection.linear_operator import dot
+from flexdt.twin.reconstruction.linear_system import (
+    LinearSystem,
+    Step,
+    Watch,
+    ones,
+    ratio,
+    solved,
 )
-from flexdt.twin.projection.volume import DeviceVolume
+from flexdt.twin.reconstruction.scatter_correction import Polychromatic
 from flexdt.twin.signatures import public
-
-SMALLEST = 1e-6
-"""Sums of weights below this part of the largest are not divided by."""
-STACKS, VOLUMES = 4, 5
-"""How many stacks of images, and volumes, a method holds at a time, at most."""
-
-
-Found = TypeVar("Found")
-
-
-@dataclass(frozen=True)
-class Step:
-    """What happened in one iteration.
-
-    Attributes:
-        iteration: from 1.
-        of: iterations in all.
-        residual: root mean square of measured minus projected line integrals, before this
-            iteration's correction.
-    """
-
-    iteration: int
-    of: int
-    residual: float
-
-
-Watch = Callable[[Step], None]
-
-
-@dataclass(frozen=True, eq=False)
-class LinearSystem:
-    """Data, geometry and grid, with the pair of operators on plain arrays.
-
-    Attributes:
-        measured: (n, rows, cols) line integrals.
-        geometry: n views.
-        like: the grid.
-        weights: (n, rows, cols) one over the variances of the line integrals; None: all alike.
-    """
-
-    measured: Float32Array
-    geometry: ConeVec
-    like: Volume
-    weights: Float32Array | None = None
-
-    @classmethod
-    def of(
-        cls,
-        projections: npt.ArrayLike,
-        cone_vec: ConeVec | npt.ArrayLike,
-        like: Volume | Grid,
-        iterations: int,
-        variances: npt.ArrayLike | None = None,
-    ) -> LinearSystem:
-        """From checked arguments.
-
-        Raises:
-            GeometryError: no views, shapes that do not fit, or variances that are not above 0.
-            LimitError: no iterations.
-        """
-        if iterations < 1:
-            raise LimitError(
-                f"iterations is {iterations!r}; allowed: a whole number from 1",
-                {"asked": repr(iterations), "allowed": 1},
-            )
-        geometry = as_cone_vec(cone_vec)
-        if not len(geometry):
-            raise GeometryError("no views; allowed: one or more", {"asked": 0, "allowed": 1})
-        require_line_integrals(projections)
-        values = check_projections(projections, len(geometry))
-        require_finite(values)
-        geometry.of_shape((values.shape[1], values.shape[2]))
-        weights = None
-        if variances is not None:
-            spread = np.asarray(variances, dtype=np.float32)
-            if spread.shape != values.shape or not (np.isfinite(spread) & (spread > 0.0)).all():
-                raise GeometryError(
-                    f"variances of shape {spread.shape}, least {spread.min(initial=np.inf):g}; "
-                    f"allowed: one above 0 for each line integral, {values.shape}",
-                    {"asked": list(spread.shape), "allowed": list(values.shape)},
-                )
-            weights = 1.0 / spread
-        return cls(values, geometry, as_volume(like), weights)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(rows, cols) of the detector."""
-        return self.measured.shape[1], self.measured.shape[2]
-
-    def first(self, start: Volume | None) -> Float32Array:
-        """Values to begin with: a copy of the first guess, or zeros."""
-        if start is None:
-            return np.zeros(self.like.shape, np.float32)
-        if start.shape != self.like.shape or not np.allclose(
-            [start.voxel_xyz, start.center_mm], [self.like.voxel_xyz, self.like.center_mm]
-        ):
-            raise GeometryError(
-                f"the first guess is {start!r}; allowed: on the grid of {self.like!r}",
-                {"asked": list(start.shape), "allowed": list(self.like.shape)},
-            )
-        return np.array(start.data, dtype=np.float32)
-
-    def project(self, x: Float32Array, geometry: ConeVec | None = None) -> Float32Array:
-        """Projections of voxels, for the whole scan or for `geometry`."""
-        geometry = self.geometry if geometry is None else geometry
-        return forward(replace(self.like, data=x), geometry, self.shape)
-
-    def spread(self, y: Float32Array, geometry: ConeVec | None = None) -> Float32Array:
-        """The adjoint, in memory that the next call overwrites."""
-        geometry = self.geometry if geometry is None else geometry
-        return back(y, geometry, self.like, self.room).data
-
-    @cached_property
-    def room(self) -> Float32Array:
-        """Memory for the adjoint."""
-        return room_like(self.like)
-
-    def scales(self, views: slice | npt.NDArray[np.intp]) -> tuple[Float32Array, Float32Array]:
-        """Factors of the residuals of some views, and of what they add to the voxels.
-
-        Without weights inverse sums of the projector's rows and columns. With weights those, and
-        one over the curvature of a paraboloid above the weighted squares, which no step overshoots
-        (Erdogan and Fessler 1999). Zero where (nearly) nothing is.
-        """
-        geometry = self.geometry[views]
-        rows = self.project(ones(self.first(None)), geometry)
-        if self.weights is None:
-            return inverse(rows), inverse(self.spread(ones(rows), geometry))
-        weights = self.part(self.weights, views)
-        return weights, inverse(self.spread(weights * rows, geometry))
-
-    def part(self, images: Any, views: slice | npt.NDArray[np.intp]) -> Any:
-        """Some views of images."""
-        return images[views]
-
-    def volume(self, x: Float32Array) -> Volume:
-        """The voxels that were found, on their grid."""
-        return replace(self.like, data=x)
-
-    def tell(self, watch: Watch | None, i: int, of: int, rest: Float32Array) -> None:
-        """Report iteration i (from 0) with the residual `rest`."""
-        if watch is not None:
-            watch(Step(i + 1, of, float(np.sqrt(dot(rest, rest) / rest.size))))
-
-
-@dataclass(frozen=True, eq=False)
-class DeviceProblem(LinearSystem):
-    """The same on a CUDA device: every array is a `DeviceArray`.
-
-    Attributes:
-        returns: whether the volume goes back to the host, where the images came from.
-    """
-
-    returns: bool = True
-
-    @classmethod
-    def of_host(cls, problem: LinearSystem) -> DeviceProblem:
-        """With the line integrals moved there, unless they are there."""
-        there: Any = DeviceArray.of_images(problem.measured)
-        weights: Any = problem.weights
-        if weights is not None:
-            weights = DeviceArray.of_images(weights)
-        home = not gpu.is_there(problem.measured)
-        return cls(there, problem.geometry, problem.like, weights, home)
-
-    def first(self, start: Volume | None) -> Any:
-        """See `LinearSystem`."""
-        if start is None:
-            return DeviceArray.of_volume(DeviceVolume.blank(self.like))
-        return DeviceArray.of_voxels(replace(self.like, data=super().first(start)))
-
-    def project(self, x: Any, geometry: ConeVec | None = None) -> Any:
-        """See `LinearSystem`."""
-        geometry = self.geometry if geometry is None else geometry
-        return DeviceArray.of_images(forward(x.volume, geometry, self.shape))
-
-    def spread(self, y: Any, geometry: ConeVec | None = None) -> Any:
-        """See `LinearSystem`; in memory of its own."""
-        geometry = self.geometry if geometry is None else geometry
-        found: Any = back(y.images, geometry, self.like)
-        return DeviceArray.of_volume(found)
-
-    def part(self, images: Any, views: slice | npt.NDArray[np.intp]) -> Any:
-        """See `LinearSystem`."""
-        return images if isinstance(views, slice) else images.images_of(views)
-
-    def volume(self, x: Any) -> Any:
-        """See `LinearSystem`; a `DeviceVolume` where the images were on the device."""
-        return x.volume.to("cpu") if self.returns else x.volume
-
-
-def solved(problem: LinearSystem, method: Callable[[LinearSystem], Found]) -> Found:
-    """By a method on the device, if images are there or it has room, or else on the processor."""
-    if gpu.is_there(problem.measured):
-        return method(DeviceProblem.of_host(problem))
-    voxels = 4 * int(np.prod(problem.like.shape))
-    need = STACKS * problem.measured.nbytes + VOLUMES * voxels
-    if gpu.availability().present and gpu.has_room(need):
-        with suppress(gpu.DeviceError):
-            return method(DeviceProblem.of_host(problem))
-    return method(problem)
-
-
-def ones(like: Any) -> Any:
-    """Ones of the form of an array, which may be on a device."""
-    return like * np.float32(0) + np.float32(1)
-
-
-def inverse(values: Float32Array) -> Float32Array:
-    """One over sums of weights, zero where (nearly) nothing is."""
-    found: Float32Array = ratio(ones(values), values)
-    return found
-
-
-@singledispatch
-def ratio(a: Any, b: Any) -> Any:
-    """a / b, zero where (nearly) nothing is in b."""
-    return np.divide(a, b, out=np.zeros_like(b), where=b > SMALLEST * float(b.max()))
-
-
-@ratio.register
-def _(a: DeviceArray, b: DeviceArray) -> DeviceArray:
-    return a.over(b, SMALLEST * b.max())
 
 
 def far_apart(count: int) -> list[int]:
@@ -275,6 +45,8 @@ def sirt(
     start: Volume | None = None,
     nonnegative: bool = False,
     variances: npt.ArrayLike | None = None,
+    hardening: Polychromatic | None = None,
+    surroundings: Volume | Grid | None = None,
     watch: Watch | None = None,
 ) -> Volume:
     """Simultaneous iterative reconstruction: x += C A' R (b - A x), R and C inverse row and
@@ -284,6 +56,16 @@ def sirt(
     ends with the first iteration that finds no more than noise left: squares over variances that
     are 1 in the mean.
 
+    With `hardening`, A x is what the spectrum would have measured through the materials of x, which
+    are told apart by value in every iteration anew. The residual is then scaled by line integrals
+    at one energy over those of the spectrum. (Their difference added to b would have the same
+    solution, but diverges where thin steel attenuates more than twice as much as at that energy.)
+    The volume has the attenuation at this energy.
+
+    With `surroundings`, coarse voxels about the grid are found along with it, so that what lies
+    beyond it is not pressed into it. They fill the space out to `surroundings`, in voxels
+    of about its size, of which a whole number fills the grid along each axis (so none is larger).
+
     Args:
         projections: (n, rows, cols) line integrals.
         cone_vec: ConeVec or (n, 12) [mm].
@@ -292,13 +74,16 @@ def sirt(
         start: first guess on the same grid; zero by default.
         nonnegative: clip at zero after each iteration.
         variances: (n, rows, cols) of the line integrals; of N photons counted, about 1 / N.
+        hardening: spectrum and materials of the object, `Polychromatic.of`; line integrals are then
+            those measured, uncorrected.
+        surroundings: grid of the whole object, coarser than `like`, which lies in it.
         watch: called in every iteration.
 
     Returns:
         Volume [1/mm] on the grid of `like`.
 
     Raises:
-        GeometryError: shapes that do not fit.
+        GeometryError: shapes that do not fit, or surroundings that do not reach beyond the grid.
         LimitError: no iterations.
 
     Examples:
@@ -312,7 +97,9 @@ def sirt(
         >>> bool(abs(found.data - 0.02).max() < 0.002)
         True
     """
-    problem = LinearSystem.of(projections, cone_vec, like, iterations, variances)
+    problem = LinearSystem.of(
+        projections, cone_vec, like, iterations, variances, hardening, surroundings
+    )
     return solved(
         problem,
         lambda p: _subset_steps(p, [slice(None)], 1.0, iterations, start, nonnegative, watch),
@@ -330,12 +117,15 @@ def sart(
     start: Volume | None = None,
     nonnegative: bool = False,
     variances: npt.ArrayLike | None = None,
+    hardening: Polychromatic | None = None,
+    surroundings: Volume | Grid | None = None,
     watch: Watch | None = None,
 ) -> Volume:
     """SIRT's step on one subset of views after another: faster at first, noisier in the end.
 
     Args:
-        projections, cone_vec, like, start, nonnegative, variances, watch: as for `sirt`.
+        projections, cone_vec, like, start, nonnegative, variances, hardening, surroundings, watch:
+            as for `sirt`.
         iterations: passes through all views.
         subsets: number of subsets; each takes every k-th view, so it sees all directions.
         relaxation: part of each step that is taken.
@@ -348,7 +138,9 @@ def sart(
         >>> bool(abs(found.data - 0.02).max() < 0.002)
         True
     """
-    problem = LinearSystem.of(projections, cone_vec, like, iterations, variances)
+    problem = LinearSystem.of(
+        projections, cone_vec, like, iterations, variances, hardening, surroundings
+    )
     count = min(subsets, len(problem.geometry))
     if count < 1 or not 0.0 < relaxation < 2.0:
         raise LimitError(
@@ -380,11 +172,11 @@ def _subset_steps(
         squares = noise = 0.0
         for part, (rows, columns) in zip(parts, sums, strict=True):
             geometry = problem.geometry[part]
-            rest = problem.part(problem.measured, part) - problem.project(x, geometry)
+            rest, more = problem.misfit(x, part)
             squares += 0.0 if watch is None else dot(rest, rest)
             scaled = rows * rest
             noise += dot(rest, scaled) if weighted else 0.0
-            x = x + np.float32(relaxation) * columns * problem.spread(scaled, geometry)
+            x = x + np.float32(relaxation) * columns * problem.spread(more * scaled, geometry)
             if nonnegative:
                 np.maximum(x, 0.0, out=x)
         if watch is not None:
@@ -402,6 +194,7 @@ def cgls(
     *,
     iterations: int = 15,
     start: Volume | None = None,
+    surroundings: Volume | Grid | None = None,
     watch: Watch | None = None,
 ) -> Volume:
     """Conjugate gradients for least squares: the residual falls at every iteration.
@@ -419,7 +212,7 @@ def cgls(
         >>> bool(abs(found.data - 0.02).max() < 0.002)
         True
     """
-    problem = LinearSystem.of(projections, cone_vec, like, iterations)
+    problem = LinearSystem.of(projections, cone_vec, like, iterations, surroundings=surroundings)
     return solved(problem, lambda p: _cgls(p, iterations, start, watch))
 
 

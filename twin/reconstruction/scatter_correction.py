@@ -1,8 +1,9 @@
 """What is taken out of a scan's line integrals before reconstruction: rings, hardening, scatter.
 
 A ring comes from a pixel whose error stays the same in all views. Beam hardening comes from low
-energies being absorbed first; its correction is for objects of a single material. Flat field and
-logarithm are in `flexdt.twin.dataset`.
+energies being absorbed first; its correction is for objects of a single material, and iterative
+methods take the hardening in several into account (`Polychromatic`). Flat field and logarithm are
+in `flexdt.twin.dataset`.
 
 Scatter is found from the scan itself: FDK says how much the object attenuates, the names of its
 materials what it scatters. That scatter is simulated (`flexdt.twin.physics.scatter`) and subtracted
@@ -13,7 +14,7 @@ and Beekman, IEEE Trans. Med. Imaging 25 (2006) 817). Grids are coarse, since sc
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
@@ -23,11 +24,12 @@ import numpy.typing as npt
 
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.attenuation.tables import tables
-from flexdt.twin.errors import LimitError
+from flexdt.twin.errors import LimitError, require_within
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.physics.chain import Chain, weights_of
 from flexdt.twin.physics.detector import Detector
+from flexdt.twin.physics.effective import EffectiveBeam, effective_beam
 from flexdt.twin.physics.scatter.simulation import Beam, Object, ScatterSettings, scan_scatter
 from flexdt.twin.physics.spectrum import TubeModel
 from flexdt.twin.projection import Grid, Volume
@@ -35,12 +37,18 @@ from flexdt.twin.projection.operators import as_cone_vec, check_projections, req
 from flexdt.twin.reconstruction.fdk import fdk_parts
 from flexdt.twin.reconstruction.rectify import field_of_view
 from flexdt.twin.reconstruction.truncation import truncation_of
+from flexdt.twin.signatures import public
 
 RING_WIDTH = 9
 """Columns over which a pixel is compared with its neighbours."""
 RING_GROUP = 24
 """Views held at a time: the median over all is taken as that of such groups' medians."""
 DEPTHS = 400
+THIN: Final = 1e-3
+"""Line integral below which a spectrum attenuates as its mean does."""
+THICKEST_MM, FINE = 1e4, 2e-4
+"""Paths through a material that effective energies hold for (they stop where nothing gets through),
+and the relative error of the signal that they may have."""
 
 
 def ring_errors(views: Iterable[Float32Array], width: int = RING_WIDTH) -> Float32Array:
@@ -133,6 +141,108 @@ def hardening(
     depth = thick * np.linspace(0.0, 1.0, DEPTHS) ** 2
     measured = -np.log(np.exp(-np.outer(depth, mu)) @ signal / signal.sum())
     return Hardening(measured, depth * mu[at], float(energies[at]), material.name)
+
+
+@public
+@dataclass(frozen=True, eq=False)
+class Polychromatic:
+    """What a spectrum measures behind several materials, for `sirt` and `sart`.
+
+    A voxel is of one material, as dense as its value says (Joseph and Spital, J. Comput. Assist.
+    Tomogr. 2 (1978) 100); the border between two is the geometric mean of their attenuation at one
+    energy. Paths through the materials so give the line integrals that the volume has at this
+    energy, and what the spectrum would have measured. Mixtures in proportion instead would take
+    noise of plastic for traces of metal, which harden the beam, on average too much; a border
+    halfway would take metal, which looks thin before it is corrected, for dense plastic for good.
+
+    Attributes:
+        mu: (m,) attenuation of each material at `energy_keV` [1/mm].
+        beam: effective energies of the spectrum behind the materials.
+        energy_keV: whose attenuation the volume will have.
+
+    Example:
+        >>> pmma, steel = Substance.parse("C5H8O2@1.18"), Substance.parse("Fe@7.87")
+        >>> both = Polychromatic.of((pmma, steel), kV=90.0, energy_keV=60.0)
+        >>> seen, straighter = both.line_integrals(np.array([[40.0], [1.0]], np.float32))  # mm
+        >>> round(float(seen[0]), 2), round(float(straighter[0]), 2)
+        (2.91, 0.64)
+    """
+
+    mu: FloatArray
+    beam: EffectiveBeam
+    energy_keV: float
+
+    @classmethod
+    def of(
+        cls,
+        materials: Sequence[Substance],
+        kV: float,
+        energy_keV: float,
+        panel: Detector | None = None,
+        tube: TubeModel | None = None,
+    ) -> Polychromatic:
+        """From tube and detector as modelled; arguments as for `hardening`, of several materials.
+
+        Raises:
+            LimitError: no material, two that attenuate alike, no spectrum for `kV`, or an energy
+                that the tables do not have.
+        """
+        ends = tables().energy_keV[[0, -1]]
+        require_within("energy_keV", energy_keV, float(ends[0]), float(ends[1]), "keV")
+        chain = Chain(Detector() if panel is None else panel, TubeModel() if tube is None else tube)
+        signal, noise = weights_of(chain, kV)
+        mu = np.array([one.attenuation_at(energy_keV) for one in materials])
+        require_apart(materials, mu)
+        beam = effective_beam(signal, noise, materials, [THICKEST_MM] * len(mu), FINE)
+        return cls(mu, beam, energy_keV)
+
+    def amounts(self, values: Float32Array) -> Iterator[Float32Array]:
+        """Of each material the density in voxels (...) of these values [1/mm], relative to the one
+        that was named.
+        """
+        order = np.argsort(self.mu)
+        of = order[np.searchsorted(np.sqrt(self.mu[order][1:] * self.mu[order][:-1]), values)]
+        for m, mu in enumerate(self.mu.astype(np.float32)):
+            yield np.where(of == m, values / mu, np.float32(0))
+
+    def line_integrals(self, paths_mm: Float32Array) -> tuple[Float32Array, Float32Array]:
+        """What the spectrum measures, and how many times as much one energy would have.
+
+        Args:
+            paths_mm: float32 (m, ...) through the materials; negative ones, of voxels below zero,
+                harden nothing.
+
+        Returns:
+            Two float32 arrays (...).
+        """
+        mean = self.beam.mu @ self.beam.signal / self.beam.signal.sum()
+        least = np.maximum(paths_mm, np.float32(0))
+        thin, straight = np.tensordot(np.array([mean, self.mu], np.float32), least, 1)
+        seen, _ = self.beam.transmit(least)
+        dark = np.maximum(seen / np.float32(self.beam.signal.sum()), np.float32(np.exp(-BLACK)))
+        found = np.where(thin > THIN, -np.log(dark), thin)
+        none, light = thin < THIN * THIN, int(np.argmin(self.mu))
+        limit = np.float32(self.mu[light] / mean[light])
+        ratio = np.where(none, limit, straight / np.where(none, np.float32(1), found))
+        total = np.tensordot(self.mu.astype(np.float32), paths_mm, 1)
+        return np.asarray(total / ratio, dtype=np.float32), ratio
+
+
+def require_apart(materials: Sequence[Substance], mu: FloatArray) -> None:
+    """Check that there are materials, and that a volume tells them apart.
+
+    Raises:
+        LimitError: it does not.
+    """
+    if not len(materials):
+        raise LimitError("no material; allowed: one or more", {"asked": 0, "allowed": "> 0"})
+    for one, other in pairwise(np.argsort(mu)):
+        if mu[other] - mu[one] < APART * mu[other]:
+            names = [materials[i].name for i in (one, other)]
+            raise LimitError(
+                f"{' and '.join(names)} attenuate alike: a volume does not tell them apart; "
+                f"allowed: {100 * APART:g} % apart", {"asked": names, "allowed": APART},
+            )  # fmt: skip
 
 
 ROUNDS, SETTLED = 8, 0.01
@@ -313,20 +423,11 @@ def attenuations(
 ) -> tuple[FloatArray, Callable[[Float32Array], Float32Array]]:
     """Attenuation of the materials at one energy, (m,) [1/mm], and what straightens line integrals
     to that of the first one."""
-    if not chain.substances:
-        raise LimitError("no material to simulate scatter with", {"asked": 0, "allowed": "> 0"})
     signal = weights_of(chain, kV)[0]
     energies = np.arange(len(signal))
     at = round(float(energies @ signal / signal.sum()))
     mu = np.array([one.attenuation()[at] for one in chain.substances])
-    order = np.argsort(mu)
-    for one, other in pairwise(order):
-        if mu[other] - mu[one] < APART * mu[other]:
-            names = [chain.substances[i].name for i in (one, other)]
-            raise LimitError(
-                f"{' and '.join(names)} attenuate alike: a volume does not tell them apart; "
-                f"allowed: {100 * APART:g} % apart", {"asked": names, "allowed": APART},
-            )  # fmt: skip
+    require_apart(chain.substances, mu)
     if chain.mono_keV is not None:
         return mu, lambda line_integrals: line_integrals
     keV = float(tables().energy_keV[at])

@@ -25,13 +25,12 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import Grid, Volume, gpu
 from flexdt.twin.projection.device_arrays import DeviceArray
-from flexdt.twin.projection.linear_operator import norm_of
-from flexdt.twin.reconstruction.iterative import (
+from flexdt.twin.projection.linear_operator import dot, norm_of
+from flexdt.twin.reconstruction.iterative import far_apart
+from flexdt.twin.reconstruction.linear_system import (
     DeviceProblem,
     LinearSystem,
     Watch,
-    dot,
-    far_apart,
     ones,
     solved,
 )

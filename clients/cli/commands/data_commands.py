@@ -55,7 +55,11 @@ def reconstruct(
     center: str | None = option(None, "Put the volume's centre there [mm].", metavar="X,Y,Z"),
     texts: options.Texts = False,
     rings: bool = option(False, "Correct the images for rings.", "--rings"),
-    material: str | None = option(None, "Correct beam hardening of an object of this material."),
+    material: str | None = option(
+        None,
+        "Correct beam hardening of this material; sirt, sart: of several.",
+        metavar="MATERIALS",
+    ),
     scatter_correction: str | None = option(
         None,
         "Subtract the scatter of an object of these, e.g. pmma,aluminium.",
@@ -86,13 +90,14 @@ def reconstruct(
 
     voxels = None if shape is None else _shape(shape)
     scattering = None if scatter_correction is None else option_values.names(scatter_correction)
+    made_of = None if material is None else option_values.names(material)
     middle = "X,Y,Z, e.g. 0,0,-5.5"
     request = VolumeRequest(
         algorithm=algorithm or "fdk", voxel_mm=voxel, shape=voxels, binning=binning or 1,
         every=every or 1, iterations=iterations, weight=weight,
         window=chosen(ReconstructSettings).window,
         center_mm=None if center is None else option_values.triple(center, "center", middle),
-        rings=rings, material=material, kV=kv, scatter_correction=scattering, png=png,
+        rings=rings, material=made_of, kV=kv, scatter_correction=scattering, png=png,
     )  # fmt: skip
     option_values.require_folder(out)
     parameters, report = _correction(correction, twin)

@@ -74,3 +74,27 @@ def measure(volume) -> tuple[float, np.ndarray]:
     found = np.array([(weight * axis).sum() / weight.sum() for axis in (x, y, z)])
     inside = data[distance < 0.8 * RADIUS]
     return float(inside.mean() / MU), (found - CENTRE) / size
+
+
+def lengths(geometry: ConeVec, shape: tuple[int, int], grid) -> np.ndarray:
+    """Length of each ray in each voxel of a grid [mm], (n * rows * cols, nz * ny * nx).
+
+    A ray meets a box between the last of the near and the first of the far faces, one voxel at a
+    time: nothing of the projectors is used.
+    """
+    rows, cols = shape
+    c, r = np.arange(cols) - (cols - 1) / 2, np.arange(rows) - (rows - 1) / 2
+    volume = grid.blank()
+    half = np.array(volume.voxel_xyz) / 2
+    x, y, z = volume.centers()
+    centers = np.stack(np.meshgrid(z, y, x, indexing="ij"), -1)[..., ::-1].reshape(-1, 3)
+    out = []
+    for row in geometry.rows:
+        source, panel, u, v = row.reshape(4, 3)
+        ray = (panel + c[None, :, None] * u + r[:, None, None] * v - source).reshape(-1, 1, 3)
+        with np.errstate(divide="ignore"):
+            one, other = ((centers + side * half - source) / ray for side in (-1, 1))
+        near = np.minimum(one, other).max(axis=2)
+        far = np.maximum(one, other).min(axis=2)
+        out.append(np.maximum(far - near, 0.0) * np.linalg.norm(ray, axis=2))
+    return np.concatenate(out)

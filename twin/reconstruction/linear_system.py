@@ -1,0 +1,385 @@
+"""What every iterative method has in hand: data, geometry, grid, and the pair of operators.
+
+A `LinearSystem` works on plain arrays. A `RegionSystem` is one of two grids, a fine region and
+coarse surroundings, whose voxels are one array. Where a CUDA device has room for all that a method
+holds, the same method runs on a `DeviceProblem`, whose arrays are there from the first iteration to
+the last.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property, singledispatch
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.errors import GeometryError, LimitError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.projection import Grid, Volume, as_volume, back, forward, gpu, room_like
+from flexdt.twin.projection.device_arrays import DeviceArray
+from flexdt.twin.projection.linear_operator import dot
+from flexdt.twin.projection.operators import (
+    as_cone_vec,
+    check_projections,
+    require_finite,
+    require_line_integrals,
+)
+from flexdt.twin.projection.volume import DeviceVolume
+from flexdt.twin.reconstruction.scatter_correction import Polychromatic
+
+SMALLEST = 1e-6
+"""Sums of weights below this part of the largest are not divided by."""
+MOST_FINER = 100
+"""Times as many voxels about a region as were asked for, at most: none is larger than it."""
+STACKS, VOLUMES = 4, 5
+"""How many stacks of images, and volumes, a method holds at a time, at most."""
+
+
+Found = TypeVar("Found")
+
+
+@dataclass(frozen=True)
+class Step:
+    """What happened in one iteration.
+
+    Attributes:
+        iteration: from 1.
+        of: iterations in all.
+        residual: root mean square of measured minus projected line integrals, before this
+            iteration's correction.
+    """
+
+    iteration: int
+    of: int
+    residual: float
+
+
+Watch = Callable[[Step], None]
+
+
+@dataclass(frozen=True, eq=False)
+class LinearSystem:
+    """Data, geometry and grid, with the pair of operators on plain arrays.
+
+    Attributes:
+        measured: (n, rows, cols) line integrals.
+        geometry: n views.
+        like: the grid.
+        weights: (n, rows, cols) one over the variances of the line integrals; None: all alike.
+        hardening: what the spectrum does to line integrals through materials; None: nothing.
+    """
+
+    measured: Float32Array
+    geometry: ConeVec
+    like: Volume
+    weights: Float32Array | None = None
+    hardening: Polychromatic | None = None
+
+    @classmethod
+    def of(
+        cls,
+        projections: npt.ArrayLike,
+        cone_vec: ConeVec | npt.ArrayLike,
+        like: Volume | Grid,
+        iterations: int,
+        variances: npt.ArrayLike | None = None,
+        hardening: Polychromatic | None = None,
+        surroundings: Volume | Grid | None = None,
+    ) -> LinearSystem:
+        """From checked arguments.
+
+        Raises:
+            GeometryError: no views, shapes that do not fit, variances that are not above 0,
+                surroundings within the region, or either with images on a device.
+            LimitError: no iterations.
+        """
+        if iterations < 1:
+            raise LimitError(
+                f"iterations is {iterations!r}; allowed: a whole number from 1",
+                {"asked": repr(iterations), "allowed": 1},
+            )
+        geometry = as_cone_vec(cone_vec)
+        if not len(geometry):
+            raise GeometryError("no views; allowed: one or more", {"asked": 0, "allowed": 1})
+        require_line_integrals(projections)
+        values = check_projections(projections, len(geometry))
+        require_finite(values)
+        geometry.of_shape((values.shape[1], values.shape[2]))
+        weights = None
+        if variances is not None:
+            spread = np.asarray(variances, dtype=np.float32)
+            if spread.shape != values.shape or not (np.isfinite(spread) & (spread > 0.0)).all():
+                raise GeometryError(
+                    f"variances of shape {spread.shape}, least {spread.min(initial=np.inf):g}; "
+                    f"allowed: one above 0 for each line integral, {values.shape}",
+                    {"asked": list(spread.shape), "allowed": list(values.shape)},
+                )
+            weights = 1.0 / spread
+        system = cls(values, geometry, as_volume(like), weights, hardening)
+        if gpu.is_there(values) and (hardening is not None or surroundings is not None):
+            raise GeometryError(
+                "images on a device, with hardening or surroundings; allowed: images of the host",
+                {"asked": "device", "allowed": "host"},
+            )
+        return system if surroundings is None else RegionSystem.within(system, surroundings)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, cols) of the detector."""
+        return self.measured.shape[1], self.measured.shape[2]
+
+    def first(self, start: Volume | None) -> Float32Array:
+        """Values to begin with: a copy of the first guess, or zeros."""
+        if start is None:
+            return np.zeros(self.like.shape, np.float32)
+        if start.shape != self.like.shape or not np.allclose(
+            [start.voxel_xyz, start.center_mm], [self.like.voxel_xyz, self.like.center_mm]
+        ):
+            raise GeometryError(
+                f"the first guess is {start!r}; allowed: on the grid of {self.like!r}",
+                {"asked": list(start.shape), "allowed": list(self.like.shape)},
+            )
+        return np.array(start.data, dtype=np.float32)
+
+    def project(self, x: Float32Array, geometry: ConeVec | None = None) -> Float32Array:
+        """Projections of voxels, for the whole scan or for `geometry`."""
+        geometry = self.geometry if geometry is None else geometry
+        return forward(replace(self.like, data=x), geometry, self.shape)
+
+    def spread(self, y: Float32Array, geometry: ConeVec | None = None) -> Float32Array:
+        """The adjoint, in memory that the next call overwrites."""
+        geometry = self.geometry if geometry is None else geometry
+        return back(y, geometry, self.like, self.room).data
+
+    def misfit(self, x: Any, views: slice | npt.NDArray[np.intp]) -> tuple[Any, Any]:
+        """Measured less expected line integrals of some views, and how many times as much a step
+        must add to straight ones: straight over expected, 1 without `hardening`.
+        """
+        geometry, measured = self.geometry[views], self.part(self.measured, views)
+        if self.hardening is None:
+            return measured - self.project(x, geometry), np.float32(1)
+        paths = np.stack([self.project(one, geometry) for one in self.hardening.amounts(x)])
+        rest, more = np.empty_like(measured), np.empty_like(measured)
+        for view, image in enumerate(measured):
+            expected, more[view] = self.hardening.line_integrals(paths[:, view])
+            rest[view] = image - expected
+        return rest, more
+
+    @cached_property
+    def room(self) -> Float32Array:
+        """Memory for the adjoint."""
+        return room_like(self.like)
+
+    def scales(self, views: slice | npt.NDArray[np.intp]) -> tuple[Float32Array, Float32Array]:
+        """Factors of the residuals of some views, and of what they add to the voxels.
+
+        Without weights inverse sums of the projector's rows and columns. With weights those, and
+        one over the curvature of a paraboloid above the weighted squares, which no step overshoots
+        (Erdogan and Fessler 1999). Zero where (nearly) nothing is.
+        """
+        geometry = self.geometry[views]
+        rows = self.project(ones(self.first(None)), geometry)
+        if self.weights is None:
+            return inverse(rows), inverse(self.spread(ones(rows), geometry))
+        weights = self.part(self.weights, views)
+        return weights, inverse(self.spread(weights * rows, geometry))
+
+    def part(self, images: Any, views: slice | npt.NDArray[np.intp]) -> Any:
+        """Some views of images."""
+        return images[views]
+
+    def volume(self, x: Float32Array) -> Volume:
+        """The voxels that were found, on their grid."""
+        return replace(self.like, data=x)
+
+    def tell(self, watch: Watch | None, i: int, of: int, rest: Float32Array) -> None:
+        """Report iteration i (from 0) with the residual `rest`."""
+        if watch is not None:
+            watch(Step(i + 1, of, float(np.sqrt(dot(rest, rest) / rest.size))))
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceProblem(LinearSystem):
+    """The same on a CUDA device: every array is a `DeviceArray`.
+
+    Attributes:
+        returns: whether the volume goes back to the host, where the images came from.
+    """
+
+    returns: bool = True
+
+    @classmethod
+    def of_host(cls, problem: LinearSystem) -> DeviceProblem:
+        """With the line integrals moved there, unless they are there."""
+        there: Any = DeviceArray.of_images(problem.measured)
+        weights: Any = problem.weights
+        if weights is not None:
+            weights = DeviceArray.of_images(weights)
+        home = not gpu.is_there(problem.measured)
+        return cls(there, problem.geometry, problem.like, weights, returns=home)
+
+    def first(self, start: Volume | None) -> Any:
+        """See `LinearSystem`."""
+        if start is None:
+            return DeviceArray.of_volume(DeviceVolume.blank(self.like))
+        return DeviceArray.of_voxels(replace(self.like, data=super().first(start)))
+
+    def project(self, x: Any, geometry: ConeVec | None = None) -> Any:
+        """See `LinearSystem`."""
+        geometry = self.geometry if geometry is None else geometry
+        return DeviceArray.of_images(forward(x.volume, geometry, self.shape))
+
+    def spread(self, y: Any, geometry: ConeVec | None = None) -> Any:
+        """See `LinearSystem`; in memory of its own."""
+        geometry = self.geometry if geometry is None else geometry
+        found: Any = back(y.images, geometry, self.like)
+        return DeviceArray.of_volume(found)
+
+    def part(self, images: Any, views: slice | npt.NDArray[np.intp]) -> Any:
+        """See `LinearSystem`."""
+        return images if isinstance(views, slice) else images.images_of(views)
+
+    def volume(self, x: Any) -> Any:
+        """See `LinearSystem`; a `DeviceVolume` where the images were on the device."""
+        return x.volume.to("cpu") if self.returns else x.volume
+
+
+@dataclass(frozen=True, eq=False)
+class RegionSystem(LinearSystem):
+    """A fine region in coarse surroundings, solved together: x holds the voxels of both, flat.
+
+    The surroundings' grid is laid so that the region fills a whole number of its voxels, which are
+    no unknowns: every point belongs to one voxel of one grid, and rays have their exact lengths.
+
+    Attributes:
+        outer: the surroundings' grid.
+        outside: of its voxels (z, y, x), which are not in the region.
+    """
+
+    outer: Volume = field(kw_only=True)
+    outside: npt.NDArray[np.bool_] = field(kw_only=True)
+
+    @classmethod
+    def within(cls, inner: LinearSystem, about: Volume | Grid) -> RegionSystem:
+        """The system of a region, with surroundings out to `about` of voxels about as large as its.
+
+        Raises:
+            GeometryError: `about` does not reach beyond the region, or that is too thin for voxels
+                of nearly that size.
+        """
+        wanted, (low, high) = as_volume(about), inner.like.boxes[0]
+        parts = np.maximum(np.round((high - low) / wanted.voxel_xyz), 1.0)
+        edge = (high - low) / parts
+        beyond = np.stack([low - wanted.boxes[0, 0], wanted.boxes[0, 1] - high]) / edge
+        below, above = np.ceil(np.maximum(beyond - 1e-6, 0.0))
+        if not (below.any() or above.any()):
+            raise GeometryError(
+                f"surroundings {wanted!r} within the region {inner.like!r}; allowed: a grid that "
+                "reaches beyond it",
+                {"asked": list(wanted.shape), "allowed": "> region"},
+            )
+        counts = below + parts + above
+        most = MOST_FINER * (math.prod(wanted.shape) + math.prod(inner.like.shape))
+        if counts.prod() > most:
+            raise GeometryError(
+                f"{counts.prod():.3g} surrounding voxels, none larger than the region, "
+                f"{inner.like!r}; allowed: {most}, by a larger region or nearer surroundings",
+                {"asked": counts.tolist(), "allowed": most},
+            )
+        nx, ny, nz = (int(n) for n in counts)
+        outside = np.ones((nz, ny, nx), dtype=np.bool_)
+        cut = [slice(int(b), int(b + p)) for b, p in zip(below, parts, strict=True)]
+        outside[tuple(reversed(cut))] = False
+        x, y, z = (float(c) for c in (low + high + (above - below) * edge) / 2.0)
+        zeros = np.broadcast_to(np.zeros((), np.float32), outside.shape)
+        dx, dy, dz = (float(e) for e in edge)
+        given = {name: getattr(inner, name) for name in inner.__dataclass_fields__}
+        return cls(**given, outer=Volume(zeros, (dx, dy, dz), (x, y, z)), outside=outside)
+
+    def grids(self, x: Float32Array) -> tuple[Float32Array, Float32Array]:
+        """The region's voxels and the surroundings', (z, y, x) with z contiguous, in x's memory."""
+        (nz, ny, nx), (mz, my, mx) = self.like.shape, self.outer.shape
+        fine, coarse = np.split(x, [nz * ny * nx])
+        return (
+            fine.reshape(ny, nx, nz).transpose(2, 0, 1),
+            coarse.reshape(my, mx, mz).transpose(2, 0, 1),
+        )
+
+    def first(self, start: Volume | None) -> Float32Array:
+        """See `LinearSystem`; the surroundings begin with zeros."""
+        x = np.zeros(math.prod(self.like.shape) + self.outside.size, np.float32)
+        if start is not None:
+            self.grids(x)[0][...] = super().first(start)
+        return x
+
+    def project(self, x: Float32Array, geometry: ConeVec | None = None) -> Float32Array:
+        """See `LinearSystem`."""
+        fine, coarse = self.grids(x)
+        geometry = self.geometry if geometry is None else geometry
+        images = forward(replace(self.like, data=fine), geometry, self.shape)
+        coarse = np.where(self.outside, coarse, np.float32(0))
+        images += forward(replace(self.outer, data=coarse), geometry, self.shape)
+        return images
+
+    def spread(self, y: Float32Array, geometry: ConeVec | None = None) -> Float32Array:
+        """See `LinearSystem`."""
+        fine, coarse = self.grids(self.room)
+        geometry = self.geometry if geometry is None else geometry
+        back(y, geometry, self.like, fine)
+        back(y, geometry, self.outer, coarse)
+        coarse *= self.outside
+        return self.room
+
+    @cached_property
+    def room(self) -> Float32Array:
+        """Memory for the adjoint."""
+        return self.first(None)
+
+    def volume(self, x: Float32Array) -> Volume:
+        """The region's voxels."""
+        return replace(self.like, data=self.grids(x)[0])
+
+
+def solved(problem: LinearSystem, method: Callable[[LinearSystem], Found]) -> Found:
+    """By a method on the device, if images are there or it has room, or else on the processor.
+
+    With hardening or surroundings only projections are made on a device.
+    """
+    if problem.hardening is not None or isinstance(problem, RegionSystem):
+        return method(problem)
+    if gpu.is_there(problem.measured):
+        return method(DeviceProblem.of_host(problem))
+    voxels = 4 * int(np.prod(problem.like.shape))
+    need = STACKS * problem.measured.nbytes + VOLUMES * voxels
+    if gpu.availability().present and gpu.has_room(need):
+        with suppress(gpu.DeviceError):
+            return method(DeviceProblem.of_host(problem))
+    return method(problem)
+
+
+def ones(like: Any) -> Any:
+    """Ones of the form of an array, which may be on a device."""
+    return like * np.float32(0) + np.float32(1)
+
+
+def inverse(values: Float32Array) -> Float32Array:
+    """One over sums of weights, zero where (nearly) nothing is."""
+    found: Float32Array = ratio(ones(values), values)
+    return found
+
+
+@singledispatch
+def ratio(a: Any, b: Any) -> Any:
+    """a / b, zero where (nearly) nothing is in b."""
+    return np.divide(a, b, out=np.zeros_like(b), where=b > SMALLEST * float(b.max()))
+
+
+@ratio.register
+def _(a: DeviceArray, b: DeviceArray) -> DeviceArray:
+    return a.over(b, SMALLEST * b.max())
