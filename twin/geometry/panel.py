@@ -12,6 +12,7 @@ coefficient is about as large as the data show the others to be. It enters every
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -112,6 +113,14 @@ class Panel:
         out = places
         for _ in range(4):  # A distortion is smooth: each time, little is left of the error.
             out = places + self.shift(out)
+        for border in self.model.borders:  # What lies in a gap is between the lines beside it.
+            axis, first = border.axis, math.ceil(border.at)
+            sides = np.stack([places[:, :1] if axis == 0 else places[:1]] * 2)
+            sides[0, ..., axis], sides[1, ..., axis] = first - 1, first
+            low, high = (sides - self.shift(sides))[..., axis]
+            inside = (places[..., axis] > low) & (places[..., axis] < high)
+            part = (places[..., axis] - low) / np.maximum(high - low, 1e-9)
+            out[..., axis] = np.where(inside, first - 1 + part, out[..., axis])
         return out[..., 0].astype(np.float32), out[..., 1].astype(np.float32)
 
     def undistorted(self, image: Float32Array) -> Float32Array:
