@@ -1,6 +1,6 @@
 """Is anything that `align` tells far off? Random objects and scanners, with what spoils such scans.
 
-    python tests/studies/align_faults.py --count 200 [--seed 1] [--only cube,wires] [--column] [--json]
+    python tests/studies/align_faults.py [--count 200] [--seed 1] [--only cube] [--column] [--json]
 
 Every scan has an object drawn at random, a scanner that is not where it is said to be, and one or
 two of some fifty kinds of trouble. Every second one is asked for shifts of single frames too. A

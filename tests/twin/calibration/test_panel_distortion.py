@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 
@@ -122,6 +123,28 @@ def test_a_barrel_in_the_images_is_found_and_undone() -> None:
         left.append(math.sqrt(np.mean(off**2)))
     assert left[0] < 0.03
     assert left[1] > 3 * left[0]
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("width", [0.3, 0.9, 1.7])
+def test_a_gap_is_filled_from_the_lines_beside_it(axis: int, width: float) -> None:
+    """A ramp, of which the gap hides a part, is a ramp again, but where the kernel sees both."""
+    first = 40
+    panel = dataclasses.replace(
+        Panel.flat(SMALL), model=PanelModel(0.0, SMALL, (Border(axis, 39.5),))
+    )
+    shift = [0.0, 0.0]
+    shift[axis] = -width
+    panel = dataclasses.replace(panel, coefficients=(*panel.coefficients, *shift))
+    place = np.arange(SMALL[1 - axis], dtype=np.float32)
+    line = place + width * (place >= first)
+    image = np.broadcast_to(line if axis == 0 else line[:, None], SMALL).astype(np.float32)
+    straight = panel.undistorted(image)
+    whole = np.broadcast_to(place if axis == 0 else place[:, None], SMALL)
+    inner = np.abs(straight - whole)[5:-5, 5:-5]
+    assert inner.max() < 0.3 * width
+    hidden = straight[9, 36:45] if axis == 0 else straight[36:45, 9]
+    assert (np.diff(hidden) > 0).all()
 
 
 @pytest.mark.daily(2)

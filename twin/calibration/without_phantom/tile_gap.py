@@ -22,7 +22,7 @@ from scipy.ndimage import median_filter
 
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
-from flexdt.twin.geometry.panel import Border, Panel, PanelModel
+from flexdt.twin.geometry.panel import Border, Panel
 
 SIDE: Final = 4
 """Columns on each side of a border that are looked at."""
@@ -32,7 +32,7 @@ ROWS, FRAMES = 48, 96
 """Rows that a frame is averaged to, and frames that are looked at, where there are more."""
 EDGES: Final = 0.05
 """Part of all places that is compared, the one with most change: edges. Noise says nothing."""
-EVIDENCE, STANDS_OUT = 50.0, 3.0
+EVIDENCE, STANDS_OUT = 50.0, 2.5
 """Gain in log likelihood from which on there is a gap, and times the gain at any other border. Rows
 side by side are alike: 57 drawn scans without a gap had up to 32 where they stood out so far, and
 stood out up to 1.9 times where they had more; 25 with one of 0.5 to 2 px had 67 and 4.5 at least
@@ -44,16 +44,15 @@ class Gap(NamedTuple):
 
     column: int
     width: float
-    sigma: float = 0.5
-    """At first that of drawn gaps which are told by the columns beside them alone (0.4)."""
+    sigma: float
 
     def panel(self, shape: tuple[int, int], undone: Panel | None = None) -> Panel:
         """The panel of images (rows, cols) with this gap, beside what is undone in them already."""
-        one = undone or Panel(flat := PanelModel(0.0, shape), (0.0,) * len(flat.names))
+        one = undone or Panel.flat(shape)
         at = np.array([self.column - 0.5, (shape[0] - 1) / 2])
         border = Border(0, float((at + one.shift(at))[0]))
         model = replace(one.model, borders=(*one.model.borders, border))
-        return Panel(model, (*one.coefficients, -self.width, 0.0))
+        return replace(one, model=model, coefficients=(*one.coefficients, -self.width, 0.0))
 
 
 def averaged_rows(image: Float32Array) -> Float32Array:
@@ -94,7 +93,9 @@ def find_gap(frames: Sequence[Float32Array], closed: Sequence[float] = ()) -> Ga
     elsewhere = gain[:, np.abs(np.arange(gain.shape[1]) - best) > SIDE].max()
     if gain[:, best].max() < max(EVIDENCE, STANDS_OUT * elsewhere):
         return None
-    return Gap(best + SIDE, float(WIDTHS[gain[:, best].argmax()]))
+    width = float(WIDTHS[gain[:, best].argmax()])
+    # Sharper edges than the usual ones look like a wider gap: drawn ones are off by half of that.
+    return Gap(best + SIDE, width, 0.2 + 0.3 * width)
 
 
 def _differences(edges: FloatArray) -> PchipInterpolator:
