@@ -275,9 +275,7 @@ def scored(kind: str, seed: int, frames: int = 24) -> Scored:
     off = _errors(result, truth) if result.identifiable else {}
     where = max(off, key=lambda n: off[n], default="")
     named = any(re.match(name, one) for one in said) if name else True
-    return Scored(
-        kind, seed, result.identifiable, named, off.get(where, 0.0), where, said, off
-    )
+    return Scored(kind, seed, result.identifiable, named, off.get(where, 0.0), where, said, off)
 
 
 def _errors(result: Calibration, truth: Mapping[str, float]) -> dict[str, float]:

@@ -209,9 +209,8 @@ class _Level:
         begins, gap = math.inf, 0.0
         if self.border is not None:
             values, begins, gap = values[:-1], self.border - 0.5, float(values[-1])
-        beyond = np.where(at[0] > begins, gap, 0.0)
         c, r, w = mirror_map(self.view(values)) @ np.vstack(
-            [at[0] + beyond - middle[0], at[1] - middle[1], np.ones(at.shape[1])]
+            [at[0] + gap * (at[0] > begins) - middle[0], at[1] - middle[1], np.ones(at.shape[1])]
         )
         image = np.stack([c / w, r / w]) + middle
         far = image[0] - begins
