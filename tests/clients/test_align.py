@@ -390,12 +390,13 @@ def test_a_gap_stands_out_beside_a_dead_column(seed: int) -> None:
     true += rng.normal(0, 0.01, true.shape)
     true[..., 30] = 3.0
     frames = [averaged_rows(g) for g in apart(true, column, width).astype(np.float32)]
-    gap = find_gap(frames)
+    axis = scan(seed % 3)[0].axis()[0]
+    gap = find_gap(frames, axis)
     assert gap is not None
     assert gap.column == column
     assert abs(gap.width - width) < 2 * gap.sigma
-    assert find_gap([averaged_rows(g) for g in true.astype(np.float32)]) is None
-    assert find_gap(frames, [column - 0.5]) is None
+    assert find_gap([averaged_rows(g) for g in true.astype(np.float32)], axis) is None
+    assert find_gap(frames, axis, [column - 0.5]) is None
     undone = dataclasses.replace(Panel.flat(SHAPE), lag=0.02)
     panel = gap.panel(SHAPE, undone)
     assert panel.shift(np.array([119.0, 0.0]))[0] == pytest.approx(-gap.width)

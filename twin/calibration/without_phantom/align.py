@@ -352,7 +352,7 @@ def _align(
     gap = None
     if turn is not None:
         borders = panel.model.borders if panel else ()
-        gap = find_gap(turn.samples, [b.at for b in borders if b.axis == 0])
+        gap = find_gap(turn.samples, column, [b.at for b in borders if b.axis == 0])
         if gap is not None:
             start, scales = np.append(start, gap.width), np.append(scales, 1.0)
             known, instead = np.append(known, gap.sigma), f"{_apart(gap)}; "
