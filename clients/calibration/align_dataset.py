@@ -79,7 +79,7 @@ class Aligned:
         name = f"alignment {now:%Y-%m-%d %H:%M:%S}"
         note = f"without a phantom, {self.alignment.frames} frames of {self.dataset.name}"
         return NamedCorrection(
-            name, now.isoformat(timespec="seconds"), offsets, note, self.dataset.panel
+            name, now.isoformat(timespec="seconds"), offsets, note, self.alignment.panel
         )
 
 
@@ -103,6 +103,7 @@ def align_dataset(data: DataSet, per_frame: bool = False) -> Aligned:
         found = align_turn(
             frames, poses, data.present, data.shape, base,
             prior_widths(data.machine, data.profile), np.random.default_rng(0), per_frame,
+            data.panel,
         )  # fmt: skip
     document: dict[str, object] = {
         "identifiable": found.identifiable,
@@ -115,6 +116,8 @@ def align_dataset(data: DataSet, per_frame: bool = False) -> Aligned:
     }
     if found.offsets is not None:
         document["correction"] = found.offsets.to_edge()
+    if found.panel is not None:
+        document["panel"] = found.panel.to_json()
     if found.motion is not None:
         document["motion"] = [found.motion.to_dict()]
         document["datasets"] = [data.where]

@@ -194,7 +194,7 @@ class Outcome:
             now.isoformat(timespec="seconds"),
             result.fit.parameters,
             f"{self.phantom.name}, {len(result.scans)} scan(s), rms {rms:.4f} px",
-            result.fit.panel,
+            result.panel,
         )
 
 
@@ -392,8 +392,8 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
     }
     if result.identifiable:
         document["correction"] = fit.parameters.to_edge()
-        if fit.panel is not None:
-            document["panel"] = fit.panel.to_json()
+        if result.panel is not None:
+            document["panel"] = result.panel.to_json()
         document["limited"] = certificate.limited
         document["image_space"] = [
             {n: {"value": e.value, "sigma": e.sigma, "unit": e.unit} for n, e in some.items()}

@@ -292,7 +292,7 @@ class DataSet:
 
     @property
     def panel(self) -> Panel | None:
-        """The panel's distortion that the correction in force undoes in line integrals."""
+        """The panel's distortion and lag that the correction in force undoes in line integrals."""
         return None if self.correction is None else self.correction.panel
 
     def with_motion(self, motion: Motion) -> DataSet:
@@ -377,8 +377,8 @@ class DataSet:
         return LineIntegrals.of(self.dark, self.flat)
 
     def line_integrals(self, index: int | None = None) -> Float32Array:
-        """Projections as -log((p - d) / (f - d)), always finite; the panel's distortion is undone
-        where the correction in force has one.
+        """Projections as -log((p - d) / (f - d)), always finite; the panel's distortion and lag are
+        undone where the correction in force has some (lag where the frame before is there).
 
         Args:
             index: of one projection; None for all.
@@ -399,7 +399,13 @@ class DataSet:
         if index is None:
             return self.stack(range(len(self)))
         image = self.normalisation(self.counts(index))
-        return image if self.panel is None else self.panel.undistorted(image)
+        if self.panel is None:
+            return image
+        index = range(len(self))[index]
+        before = self.frames[max(index - 1, 0)]
+        if self.panel.lag and before.present and before.index == self.frames[index].index - 1:
+            image = self.panel.without_lag(image, self.normalisation(self.counts(index - 1)))
+        return self.panel.undistorted(image)
 
     def stack(self, indices: Sequence[int] | None = None) -> Float32Array:
         """Line integrals of several projections (default: all that are there), (n, rows, cols).

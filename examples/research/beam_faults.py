@@ -5,7 +5,8 @@ radiographs of balls in a body, with all seventeen offsets drawn from their prio
 from them. Light of three energies, a detector's blur, lag, distortion, tiles, dead pixels and
 scattered light are written out here, with the rays and planes of `prior_coverage`; nothing of
 flexdt is in the images. An offset, the axis's image or the magnification that is offered and more
-than four sigmas off is a confident wrong answer, and the command fails.
+than four sigmas off is a confident wrong answer, and the command fails. `--json` prints a line as
+soon as a scan is judged, one scan of every kind before the second of any, and the sums last.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import re
 import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Final
 
 import cv2
@@ -222,7 +223,10 @@ KINDS: Final[Mapping[str, tuple[Change, str]]] = {
 
 @dataclass(frozen=True)
 class Scored:
-    """What came of one scan: the largest error of what was offered [sigma], and what was said."""
+    """What came of one scan: the largest error of what was offered [sigma], and what was said.
+
+    `sigmas` are the errors of all that was offered, in standard deviations.
+    """
 
     kind: str
     seed: int
@@ -231,6 +235,7 @@ class Scored:
     worst: float
     where: str
     said: tuple[str, ...]
+    sigmas: Mapping[str, float] = field(default_factory=dict)
 
 
 def magnification(truth: Mapping[str, float]) -> float:
@@ -267,12 +272,14 @@ def scored(kind: str, seed: int, frames: int = 24) -> Scored:
     except TwinError as error:
         return Scored(kind, seed, False, False, 0.0, "", (f"refused: {error}",))
     said = tuple(f"{f.code}: {f.text}" for f in result.findings)
-    worst, where = _worst(result, truth) if result.identifiable else (0.0, "")
+    off = _errors(result, truth) if result.identifiable else {}
+    where = max(off, key=lambda n: off[n], default="")
     named = any(re.match(name, one) for one in said) if name else True
-    return Scored(kind, seed, result.identifiable, named, worst, where, said)
+    return Scored(kind, seed, result.identifiable, named, off.get(where, 0.0), where, said, off)
 
 
-def _worst(result: Calibration, truth: Mapping[str, float]) -> tuple[float, str]:
+def _errors(result: Calibration, truth: Mapping[str, float]) -> dict[str, float]:
+    """Of every value that is offered [sigma]."""
     fit = result.fit
     assert fit is not None
     true = {
@@ -281,11 +288,9 @@ def _worst(result: Calibration, truth: Mapping[str, float]) -> tuple[float, str]
         "magnification": magnification(truth),
     }
     found = {**fit.certificate.estimates, **image_quantities(fit)[0]}
-    off = {
+    return {
         n: abs(e.value - true[n]) / e.sigma for n, e in found.items() if e.sigma > 0 and n in true
     }
-    where = max(off, key=lambda n: off[n])
-    return off[where], where
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -300,13 +305,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     scans: list[Scored] = []
     if not args.json:
         print(f"{'kind':28}{'offered':>8}{'named':>7}{'worst':>7}  what was said")
-    for kind in args.kinds.split(","):
-        some = [scored(kind, args.seed + i) for i in range(args.each)]
-        scans += some
-        worst = max(some, key=lambda s: s.worst)
-        codes = Counter(line.partition(":")[0] for s in some for line in s.said)
-        said = ", ".join(f"{code} {n}" for code, n in codes.most_common())
-        if not args.json:
+    kinds = args.kinds.split(",")
+    runs = [(kind, args.seed + i) for i in range(args.each) for kind in kinds]
+    for kind, seed in runs if args.json else sorted(runs, key=lambda run: kinds.index(run[0])):
+        scans.append(scored(kind, seed))
+        some = [s for s in scans if s.kind == kind]
+        if args.json:
+            print(json.dumps(asdict(scans[-1])), flush=True)
+        elif len(some) == args.each:
+            worst = max(some, key=lambda s: s.worst)
+            codes = Counter(line.partition(":")[0] for s in some for line in s.said)
+            said = ", ".join(f"{code} {n}" for code, n in codes.most_common())
             print(f"{kind:28}{sum(s.offered for s in some):8}{sum(s.named for s in some):7}"
                   f"{worst.worst:7.1f}  {worst.where}; {said}", flush=True)  # fmt: skip
     wrong = [s for s in scans if s.worst > WRONG_SIGMAS]
@@ -316,9 +325,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         "scans": len(scans), "confidently wrong": len(wrong),
         "right scans": len(right), "of them refused": sum(not s.offered for s in right),
         "faults": len(faults), "of them named": sum(s.named for s in faults),
+        "values of right scans": len(off := [e for s in right for e in s.sigmas.values()]),
+        "of them within 1.96 sigma": sum(e <= 1.96 for e in off),
     }  # fmt: skip
     if args.json:
-        print(json.dumps({**summary, "each": [asdict(s) for s in scans]}))
+        print(json.dumps(summary))
     else:
         print(", ".join(f"{n}: {v}" for n, v in summary.items()))
     return 1 if wrong else 0

@@ -17,6 +17,10 @@ import pytest
 
 import flexdt as fx
 from flexdt.clients.cli.entry import run
+from flexdt.twin.calibration.without_phantom.tile_gap import averaged_rows, find_gap
+from flexdt.twin.geometry.offsets import NOMINAL
+from flexdt.twin.geometry.panel import Panel
+from flexdt.twin.scanner.state import NamedCorrection
 
 SHAPE, PITCH, SOD, SDD = (100, 120), 1.0, 600.0, 1059.0
 
@@ -349,25 +353,83 @@ def test_an_exact_copy_of_a_frame_is_left_out_by_name() -> None:
     assert np.abs(pulls(found, scanner)).max() < 4
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+def apart(true: np.ndarray, column: int, width: int) -> np.ndarray:
+    """Images whose right tile shows what lies `width` columns further to the right."""
+    there = np.arange(SHAPE[1])
+    return true[..., np.minimum(there + np.where(there >= column, width, 0), SHAPE[1] - 1)]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.slow
-def test_a_gap_between_tiles_is_named_and_in_the_sigma(seed: int) -> None:
-    """What the right tile shows is what lies a column and a half further to the right."""
+def test_a_gap_between_tiles_is_closed_whether_it_is_found_or_given(seed: int) -> None:
     scanner, lines = scan(seed)
-    true = np.array(lines, dtype=float)
-    column, width = 75, 1.5
-    beyond = np.clip(np.arange(column, SHAPE[1]) + width, 0, SHAPE[1] - 1)
-    low = np.minimum(beyond.astype(int), SHAPE[1] - 2)
-    part = beyond - low
-    seen = true.copy()
-    seen[..., column:] = (1 - part) * true[..., low] + part * true[..., low + 1]
-    found = data_set(seen, DEGREES, 1e4, np.random.default_rng(1)).align()
-    told = [*found.warnings, *found.document["refused"].values()]
-    assert f"from column {column} on" in " ".join(told)
-    if found.identifiable:
-        assert abs(pulls(found, scanner)[0]) < 2
-    whole = data_set(true, DEGREES, 1e4, np.random.default_rng(1)).align()
+    data = data_set(apart(np.array(lines), 75, 2), DEGREES, 1e4, np.random.default_rng(1))
+    found = data.align()
+    assert "from column 75 on" in " ".join(found.warnings)
+    assert np.abs(pulls(found, scanner)).max() < 4
+    panel = Panel.from_json(json.loads(json.dumps(found.document["panel"])))
+    assert panel.shift(np.array([[74.0, 9.0], [76.0, 9.0]]))[:, 0] == pytest.approx(
+        [0, -2.0], abs=0.1
+    )
+    assert found.correction.panel == panel
+    given = data.with_correction(dataclasses.replace(found.correction, parameters=NOMINAL)).align()
+    assert "between two tiles" not in " ".join(given.warnings)
+    assert given.document["panel"] == found.document["panel"]
+    assert np.abs(pulls(given, scanner)).max() < 4
+    whole = data_set(np.array(lines), DEGREES, 1e4, np.random.default_rng(1)).align()
     assert "between two tiles" not in " ".join(whole.warnings)
+    assert "panel" not in whole.document
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.daily(2)
+def test_a_gap_stands_out_beside_a_dead_column(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    column, width = int(rng.integers(45, 75)), 2
+    true = np.array(scan(seed % 3)[1])
+    true += rng.normal(0, 0.01, true.shape)
+    true[..., 30] = 3.0
+    frames = [averaged_rows(g) for g in apart(true, column, width).astype(np.float32)]
+    axis = scan(seed % 3)[0].axis()[0]
+    gap = find_gap(frames, axis)
+    assert gap is not None
+    assert gap.column == column
+    assert abs(gap.width - width) < 2 * gap.sigma
+    assert find_gap([averaged_rows(g) for g in true.astype(np.float32)], axis) is None
+    assert find_gap(frames, axis, [column - 0.5]) is None
+    undone = dataclasses.replace(Panel.flat(SHAPE), lag=0.02)
+    panel = gap.panel(SHAPE, undone)
+    assert panel.shift(np.array([119.0, 0.0]))[0] == pytest.approx(-gap.width)
+    assert panel.lag == undone.lag
+
+
+def test_lag_of_a_calibration_is_undone() -> None:
+    """Every frame shows a part of the light of the one before, as a panel with lag does."""
+    _, lines = scan(0)
+    true, lag = np.array(lines), 0.05
+    light = np.exp(-true)
+    light[1:] = (1 - lag) * light[1:] + lag * light[:-1].copy()
+    geometry = data_set(true, DEGREES, 1e4, np.random.default_rng(1)).geometry
+    data = fx.DataSet.from_arrays(-np.log(light), geometry)
+    panel = dataclasses.replace(Panel.flat(SHAPE), lag=lag)
+    assert Panel.from_json(json.loads(json.dumps(panel.to_json()))).lag == lag
+    undone = data.with_correction(NamedCorrection("a", "", NOMINAL, panel=panel))
+
+    def off(one: fx.DataSet, first: int = 0) -> float:
+        return float(np.sqrt(np.mean((one.stack()[2:] - true[first + 2 : first + len(one)]) ** 2)))
+
+    assert off(undone) < 0.1 * off(data)
+    assert off(undone[10:20], 10) < 0.1 * off(data)
+    assert np.array_equal(undone[::2].stack(), data[::2].stack())  # none after the one before
+    assert np.array_equal(undone.line_integrals(0), data.line_integrals(0))
+    assert np.array_equal(undone.line_integrals(-1), undone.line_integrals(len(data) - 1))
+    whole = fx.DataSet.from_arrays(true, geometry)
+    volume, lagging, mended = (
+        fx.reconstruct(one, shape=(16, 60, 60), voxel=0.8, errors=False).data
+        for one in (whole, data, undone)
+    )
+    left = [np.sqrt(np.mean((v - volume) ** 2)) for v in (lagging, mended)]
+    assert left[1] < 0.2 * left[0]
 
 
 def test_saturated_images_are_named() -> None:

@@ -84,7 +84,7 @@ from flexdt.twin.calibration.identify import (
 from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.geometry.motion import Motion, require_movable
 from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets
-from flexdt.twin.geometry.panel import PanelModel
+from flexdt.twin.geometry.panel import Panel, PanelModel
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection.analytic_solids import Scene
 
@@ -194,6 +194,14 @@ class Calibration:
     def motions(self) -> tuple[Motion, ...]:
         """The motion of each scan; empty if it was not asked for."""
         return () if self.motion is None else self.motion.motions
+
+    @property
+    def panel(self) -> Panel | None:
+        """Distortion and lag of the panel, where either was found."""
+        panel = None if self.fit is None else self.fit.panel
+        if not (seen := [lag.part for lag in self.lags if lag.seen]):
+            return panel
+        return replace(panel or Panel.flat(self.scans[0].frames.shape), lag=float(np.mean(seen)))
 
     @property
     def errors(self) -> tuple[Finding, ...]:

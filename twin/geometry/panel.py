@@ -1,5 +1,5 @@
 """Distortion of the panel's picture: a low polynomial in the plane of the panel, and gaps between
-its tiles.
+its tiles. And its lag: part of the light of the frame before.
 
 A place measured at m [px] belongs to the undistorted place m - d(m), d(m) = sum of coefficient
 times term. The terms are the polynomials of degree two and three in both directions, unequal pixel
@@ -12,6 +12,7 @@ coefficient is about as large as the data show the others to be. It enters every
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -27,6 +28,11 @@ POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 AFFINE = ("aspect", "skew")
 GAP_PX = 5.0
 """Standard deviation of a tile's shift, wide beside any: the data determine it."""
+
+MOST_LAG = 0.3
+"""Of a frame that the next one shows, at most: more is no lag but another fault."""
+LEAST_OF_LIGHT = 0.05
+"""Part of what a pixel shows that is left to it at least where lag is taken out of noise."""
 
 
 @dataclass(frozen=True)
@@ -88,15 +94,23 @@ class PanelModel:
 
 @dataclass(frozen=True)
 class Panel:
-    """A distortion.
+    """A distortion, and what the panel still shows of the image before.
 
     Attributes:
         model: its terms.
         coefficients: of them [px].
+        lag: part of the light of a frame that the next one shows; 0 where none was found.
     """
 
     model: PanelModel
     coefficients: tuple[float, ...]
+    lag: float = 0.0
+
+    @classmethod
+    def flat(cls, shape: tuple[int, int]) -> Panel:
+        """Without distortion, of images (rows, cols)."""
+        model = PanelModel(0.0, shape)
+        return cls(model, (0.0,) * len(model.names))
 
     def shift(self, places: FloatArray) -> FloatArray:
         """Measured minus undistorted places [px], (..., 2), at measured places."""
@@ -112,7 +126,22 @@ class Panel:
         out = places
         for _ in range(4):  # A distortion is smooth: each time, little is left of the error.
             out = places + self.shift(out)
+        for border in self.model.borders:  # What lies in a gap is between the lines beside it.
+            axis, first = border.axis, math.ceil(border.at)
+            sides = np.stack([places[:, :1] if axis == 0 else places[:1]] * 2)
+            sides[0, ..., axis], sides[1, ..., axis] = first - 1, first
+            low, high = (sides - self.shift(sides))[..., axis]
+            inside = (places[..., axis] > low) & (places[..., axis] < high)
+            part = (places[..., axis] - low) / np.maximum(high - low, 1e-9)
+            out[..., axis] = np.where(inside, first - 1 + part, out[..., axis])
         return out[..., 0].astype(np.float32), out[..., 1].astype(np.float32)
+
+    def without_lag(self, image: Float32Array, before: Float32Array) -> Float32Array:
+        """Line integrals (rows, cols) less what is of the frame that was taken before, as it shows
+        it itself: of a lag of 5 % some 0.2 % are left."""
+        share, shown = self.lag / (1.0 - self.lag), np.exp(-image)
+        light = (shown - share * np.exp(-before)) / (1.0 - share)
+        return np.asarray(-np.log(np.maximum(light, LEAST_OF_LIGHT * shown)), dtype=np.float32)
 
     def undistorted(self, image: Float32Array) -> Float32Array:
         """The image (rows, cols) that a panel without distortion would have taken.
@@ -122,6 +151,8 @@ class Panel:
         """
         import cv2
 
+        if not any(self.coefficients):
+            return image
         if image.shape != self.model.shape:
             raise TwinError.of_shape(
                 "an image", image.shape, self.model.shape, ": the panel's distortion is of those"
@@ -137,6 +168,7 @@ class Panel:
             "borders": [{"axis": ("column", "row")[b.axis], "from": b.at}
                         for b in self.model.borders],
             "coefficients": dict(zip(self.model.names, self.coefficients, strict=True)),
+            **({"lag": self.lag} if self.lag else {}),
         }  # fmt: skip
 
     @classmethod
@@ -154,7 +186,10 @@ class Panel:
             )
             model = PanelModel(0.0, (rows, cols), borders)
             found = document["coefficients"]
-            return cls(model, tuple(float(found[name]) for name in model.names))
+            lag = float(document.get("lag", 0.0))
+            if not 0.0 <= lag < MOST_LAG:
+                raise ValueError(f"lag {lag:g}; allowed: 0 to {MOST_LAG:g}")
+            return cls(model, tuple(float(found[name]) for name in model.names), lag)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise TwinError(
                 f"the panel's distortion cannot be read ({error}); allowed: the panel of a "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 
@@ -14,8 +15,9 @@ from flexdt.analysis import calibrate as calibrate_marks
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import detect_beads
+from flexdt.twin.calibration.detect.lag import Lag
 from flexdt.twin.calibration.frame_source import ArrayFrames
-from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate
+from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.panel import Border, Panel, PanelModel
@@ -122,6 +124,45 @@ def test_a_barrel_in_the_images_is_found_and_undone() -> None:
         left.append(math.sqrt(np.mean(off**2)))
     assert left[0] < 0.03
     assert left[1] > 3 * left[0]
+
+
+def test_lag_that_is_seen_is_of_the_panel() -> None:
+    poses = Poses.upright([0, 0, 0], [0, 600, 0], [0, 1059, 0], 0.15, np.zeros(1))
+    scans = tuple(Scan(ArrayFrames([np.zeros(SMALL, np.float32)], SMALL), poses) for _ in range(3))
+    model = BeadModel(np.zeros((1, 3)), np.ones(1))
+    found = Calibration(None, (), (), (), (), scans, model)
+    assert found.panel is None
+    lags = (Lag(0.03, 0.001), Lag(0.05, 0.001), Lag(0.2, 0.1))  # the last may be none
+    panel = dataclasses.replace(found, lags=lags).panel
+    assert panel == dataclasses.replace(Panel.flat(SMALL), lag=0.04)
+    assert Panel.from_json(panel.to_json()) == panel
+    image = np.zeros((3, 4), np.float32)  # of any shape: there is nothing to straighten
+    assert panel.undistorted(image) is image
+    for lag in (-0.1, 0.4, "much"):
+        with pytest.raises(TwinError, match=r"lag|much"):
+            Panel.from_json({**panel.to_json(), "lag": lag})
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("width", [0.3, 0.9, 1.7])
+def test_a_gap_is_filled_from_the_lines_beside_it(axis: int, width: float) -> None:
+    """A ramp, of which the gap hides a part, is a ramp again, but where the kernel sees both."""
+    first = 40
+    panel = dataclasses.replace(
+        Panel.flat(SMALL), model=PanelModel(0.0, SMALL, (Border(axis, 39.5),))
+    )
+    shift = [0.0, 0.0]
+    shift[axis] = -width
+    panel = dataclasses.replace(panel, coefficients=(*panel.coefficients, *shift))
+    place = np.arange(SMALL[1 - axis], dtype=np.float32)
+    line = place + width * (place >= first)
+    image = np.broadcast_to(line if axis == 0 else line[:, None], SMALL).astype(np.float32)
+    straight = panel.undistorted(image)
+    whole = np.broadcast_to(place if axis == 0 else place[:, None], SMALL)
+    inner = np.abs(straight - whole)[5:-5, 5:-5]
+    assert inner.max() < 0.3 * width
+    hidden = straight[9, 36:45] if axis == 0 else straight[36:45, 9]
+    assert (np.diff(hidden) > 0).all()
 
 
 @pytest.mark.daily(2)

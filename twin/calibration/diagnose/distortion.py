@@ -27,6 +27,8 @@ OUTLIER = 5.0
 """Residuals beyond so many robust standard deviations count as so many."""
 SAID_PX, GAP_SAID_PX = 0.015, 0.3
 """Root mean square of the residuals explained, and gap, from which a distortion is said."""
+EXPLAINED = 0.5
+"""Part of the residuals that a distortion may leave where something seems to move, too."""
 LOOSE_BEADS_MM = 0.3
 """Prior of bead positions with which they are compared with a distortion."""
 CHANCE = 1e-4
@@ -87,8 +89,9 @@ def better_panel(
             break
         best = better
     left = best.certificate
-    # What moves during a scan looks like a distortion in part, and stays in the residuals.
-    if best is fit or left.rms_px >= misfit_px or left.shared or left.drifts:
+    # What moves during a scan looks like a distortion in part, and most stays in the residuals.
+    moves = (left.shared or left.drifts) and left.rms_px > EXPLAINED * fit.certificate.rms_px
+    if best is fit or left.rms_px >= misfit_px or moves:
         return fit
     for rival in (loose, partial(refit, bead_tolerance_mm=LOOSE_BEADS_MM)):
         other = rival()

@@ -198,7 +198,8 @@ def judge_lag(lag: Lag) -> Finding:
         "lag",
         f"the camera still shows {100 * lag.part:.2g} % of the frame "
         "before: it was taken out of what was measured here; a volume is blurred by it along the "
-        "turn, less so with a pause before each image",
+        "turn, but with the correction reconstruct takes it out, of scans with as long exposures "
+        "and pauses",
     )
 
 

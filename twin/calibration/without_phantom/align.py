@@ -35,6 +35,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray, from_unity
 from flexdt.twin.geometry.motion import Motion
 from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.geometry.panel import Panel
 from flexdt.twin.geometry.poses import Poses
 
 # Shifts of single frames, by consistency of plane integrals.
@@ -235,6 +236,8 @@ class Alignment:
         warnings: what is doubtful about the scan.
         frames: number of those that were used.
         motion: shifts of single frames, as shifts of the sample; None: not asked for, or refused.
+        panel: the distortion that was undone, with a gap between two tiles that was found; None:
+            there is none.
     """
 
     offsets: Offsets | None
@@ -243,6 +246,7 @@ class Alignment:
     warnings: tuple[str, ...]
     frames: int
     motion: Motion | None = None
+    panel: Panel | None = None
 
     @property
     def identifiable(self) -> bool:
@@ -259,6 +263,7 @@ def align_turn(
     priors: Mapping[str, float],
     random: np.random.Generator,
     per_frame: bool = False,
+    panel: Panel | None = None,
 ) -> Alignment:
     """Estimate axis column, roll, yaw and the source's row from the frames of a turn.
 
@@ -272,12 +277,13 @@ def align_turn(
             count.
         random: for images of noise, which tell what noise does.
         per_frame: whether shifts of single frames are looked for.
+        panel: the distortion that is undone in the images.
 
     Returns:
         The alignment; what the scan cannot tell is in `refused`.
     """
     try:
-        return _align(image, poses, present, shape, base, priors, random, per_frame)
+        return _align(image, poses, present, shape, base, priors, random, per_frame, panel)
     except NotIdentifiableError as error:
         why = dict.fromkeys(
             ("axis_column_px", "det_roll", "det_yaw", "source_row_px"), error.message
@@ -288,7 +294,7 @@ def align_turn(
 def _align(
     image: Image, poses: Poses, present: tuple[int, ...], shape: tuple[int, int],
     base: Offsets, priors: Mapping[str, float], random: np.random.Generator,
-    per_frame: bool,
+    per_frame: bool, panel: Panel | None,
 ) -> Alignment:  # fmt: skip
     _refuse_if(len(present) == 0, "no frame is there")
     pose = _standing(poses, present)
@@ -345,9 +351,16 @@ def _align(
     )
     gap = None
     if turn is not None:
-        gap = find_gap(turn.samples)
-        instead = f"{_apart(gap)}; " if gap else ""
-    found = find_symmetry(turn, view, start, scales, known) if turn else rays.find(start)  # type: ignore[union-attr]
+        borders = panel.model.borders if panel else ()
+        gap = find_gap(turn.samples, column, [b.at for b in borders if b.axis == 0])
+        if gap is not None:
+            start, scales = np.append(start, gap.width), np.append(scales, 1.0)
+            known, instead = np.append(known, gap.sigma), f"{_apart(gap)}; "
+        border = gap.column if gap else None
+        found = find_symmetry(turn, view, start, scales, known, border)
+    else:
+        assert rays is not None
+        found = rays.find(start)
     _refuse_if(
         not found.converged,
         f"{instead}no plane of symmetry is found: too little structure for the noise, or too few "
@@ -360,6 +373,13 @@ def _align(
         "or the angles or the object change during the scan",
     )
     values, covariance = found.values.copy(), found.covariance.copy()
+    if gap is not None and turn is not None:  # what is read from here on has the gap closed
+        gap = gap._replace(width=float(values[-1]), sigma=float(np.sqrt(covariance[-1, -1])))
+        values, covariance, scales = values[:3], covariance[:3, :3], scales[:3]
+        own, apart = gap.panel(shape), image
+        image = lambda i: own.undistorted(apart(i))  # noqa: E731
+        turn = replace(turn, mean=own.undistorted(turn.mean.astype(np.float32)).astype(float))
+        panel = gap.panel(shape, panel)
     told, beside = found.images[1:3] < known[1:3] / 2, 0.0
     if rays is not None:  # what few rows say of the roll was up to six sigma off
         # It moves the axis in the panel's middle row, if rows beside that were read.
@@ -368,8 +388,7 @@ def _align(
         told[:], values[1], covariance[1], covariance[:, 1] = False, base.det_roll, 0.0, 0.0
         covariance[1, 1] = known[1] ** 2
     step = (0.0, 0.0) if turn is None or turn.step_px is None else turn.step_px[0]
-    apart = gap.width if gap else 0.0
-    covariance[0, 0] += (math.hypot(FLOOR_PX, step[0] / 2, beside, apart) * scales[0]) ** 2
+    covariance[0, 0] += (math.hypot(FLOOR_PX, step[0] / 2, beside) * scales[0]) ** 2
     covariance[1, 1] += math.radians(FLOOR_DEG) ** 2 + (step[0] / rows) ** 2
     slopes = _slopes(seen, values, scales)
     sigma = math.sqrt(slopes @ covariance @ slopes)
@@ -395,7 +414,7 @@ def _align(
     if turn is None:
         told_by = "a full turn of more rows tells it; the correction keeps what was in force"
         refused |= dict.fromkeys(("det_roll", "source_row_px", "motion"), told_by)
-        return Alignment(corrected, parameters, refused, (), len(present))
+        return Alignment(corrected, parameters, refused, (), len(present), None, panel)
     planes = _Planes(image, poses, turn, offsets, values, covariance, priors)
     try:
         corrected, parameters["source_row_px"] = planes.row(random)
@@ -412,7 +431,7 @@ def _align(
         except NotIdentifiableError as error:
             refused["motion"] = error.message
     warnings = _warnings(turn, gap, len(poses) - len(present))
-    return Alignment(corrected, parameters, refused, warnings, len(turn.used), motion)
+    return Alignment(corrected, parameters, refused, warnings, len(turn.used), motion, panel)
 
 
 def _rays(
@@ -587,16 +606,18 @@ def _refuse_if(wrong: bool, why: str) -> None:
 
 def _apart(gap: Gap) -> str:
     return (
-        f"from column {gap.column} on everything appears too near by up to {gap.width:.1f} px, as "
-        "behind a gap between two tiles of the panel (a calibration with a phantom measures it, "
-        "and its correction closes it)"
+        f"from column {gap.column} on everything appears nearer by {gap.width:.2f} +- "
+        f"{gap.sigma:.2g} px, as behind a gap between two tiles of the panel"
     )
 
 
 def _warnings(turn: Turn, gap: Gap | None, missing: int) -> tuple[str, ...]:
     out = []
     if gap is not None:
-        out.append(f"{_apart(gap)}; the sigma of the axis column contains it")
+        out.append(
+            f"{_apart(gap)}: it is closed in what is told here, its uncertainty is in the axis "
+            "column's sigma, and reconstruct closes it with the correction"
+        )
     if turn.repeated:
         out.append(f"frames {list(turn.repeated)} repeat the one before and are left out")
     if missing:

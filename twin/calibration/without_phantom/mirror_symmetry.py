@@ -115,8 +115,9 @@ def best_dip(cost: FloatArray, apart: float) -> tuple[int, float]:
 
 
 def find_symmetry(
-    turn: Turn, view: View, start: FloatArray, scales: FloatArray, priors: FloatArray
-) -> Symmetry:
+    turn: Turn, view: View, start: FloatArray, scales: FloatArray, priors: FloatArray,
+    border: int | None = None,
+) -> Symmetry:  # fmt: skip
     """The plane of symmetry, coarse to fine.
 
     Args:
@@ -125,6 +126,7 @@ def find_symmetry(
         start: of the parameters, (k,).
         scales: change of each parameter that moves the image's ends by about a pixel, (k,).
         priors: sigma of each parameter about its start, inf for none, (k,).
+        border: first column beyond a gap between two tiles, whose width is the last parameter [px].
 
     Returns:
         The estimate of the level that tells the first two parameters best.
@@ -133,8 +135,8 @@ def find_symmetry(
     values = start
     for level in LEVELS:
         smoothing = max(turn.mean.shape[1] / level, 1.0)
-        found.append(_Level(turn, view, scales, start, priors, smoothing).solve(values))
-        if not found[-1].converged:
+        found.append(_Level(turn, view, scales, start, priors, smoothing, border).solve(values))
+        if not found[-1].converged and border is None:
             break
         values = found[-1].values
     good = [f for f in found if f.converged]
@@ -146,9 +148,9 @@ class _Level:
 
     def __init__(
         self, turn: Turn, view: View, scales: FloatArray, mean: FloatArray, priors: FloatArray,
-        sigma: float,
+        sigma: float, border: int | None,
     ) -> None:  # fmt: skip
-        self.view, self.scales, self.sigma = view, scales, sigma
+        self.view, self.scales, self.sigma, self.border = view, scales, sigma, border
         self.start, self.priors = mean, priors
         rows, cols = self.shape = turn.mean.shape
         images = [gaussian_filter(i, sigma, mode="nearest") for i in (turn.mean, *turn.doubts)]
@@ -194,7 +196,8 @@ class _Level:
             longest = float(np.abs(step / self.scales).max())
             values = values + step * min(1.0, 4.0 * self.sigma / max(longest, 1e-30))
             sigmas = np.sqrt(np.abs(np.diag(covariance)))
-            done = bool((np.abs(step) <= 0.02 * sigmas + 1e-5 * self.scales).all())
+            near = 0.02 if self.border is None else 0.1
+            done = bool((np.abs(step) <= near * sigmas + 1e-5 * self.scales).all())
             found = Symmetry(values, covariance, np.sqrt(np.diag(raw)), pairs.asymmetry(), done)
             if done or not np.isfinite(values).all():
                 break
@@ -203,8 +206,16 @@ class _Level:
     def _mirrored(self, values: FloatArray, at: FloatArray) -> FloatArray:
         """Mirror images (2, k) of pixels (2, k)."""
         middle = (np.array(self.shape[::-1]) - 1)[:, None] / 2
-        c, r, w = mirror_map(self.view(values)) @ np.vstack([at - middle, np.ones(at.shape[1])])
-        return np.asarray(np.stack([c / w, r / w]) + middle)
+        begins, gap = math.inf, 0.0
+        if self.border is not None:
+            values, begins, gap = values[:-1], self.border - 0.5, float(values[-1])
+        c, r, w = mirror_map(self.view(values)) @ np.vstack(
+            [at[0] + gap * (at[0] > begins) - middle[0], at[1] - middle[1], np.ones(at.shape[1])]
+        )
+        image = np.stack([c / w, r / w]) + middle
+        far = image[0] - begins
+        image[0] -= np.where(far > gap, gap, np.maximum(far, 0.0))
+        return np.asarray(image)
 
     def _pairs(self, here: FloatArray) -> _MirrorPairs | None:
         """The pixels with a mirror image on the panel, each pair once; None if they are too few."""
@@ -213,6 +224,8 @@ class _Level:
         inside = (image[0] > room) & (image[0] < self.shape[1] - 1 - room)
         inside &= (image[1] > self.margin) & (image[1] < self.shape[0] - 1 - self.margin)
         inside &= self.at[0] < image[0]
+        for column in (self.at[0], image[0]) if self.border is not None else ():
+            inside &= np.abs(column - self.border + 0.5) > 1.0 + 2.5 * self.sigma
         if inside.sum() < max(100.0, OVERLAP / 4 * self.at.shape[1]):
             return None
         return _MirrorPairs(self, here, self.at[:, inside])
