@@ -11,6 +11,7 @@ import numpy as np
 
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.figures import require_plots
+from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection.volume import Volume
 from flexdt.twin.script import CheckReport, ScanPlan
@@ -19,6 +20,7 @@ SAMPLES = 2000
 """Moments at which motors are drawn."""
 KINDS = {"dark": "k", "flat": "C1", "projection": "C0", "preview": "C7"}
 CORNERS = ((-0.5, -0.5), (-0.5, 0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, -0.5))
+LAYERS = {"data": "attenuation", "sigma": "noise of attenuation", "bias_bound": "bound of its bias"}
 PANELS = 12
 """Panels that are drawn at most, evenly chosen."""
 
@@ -52,14 +54,18 @@ def plot_projection(data: DataSet, index: int, axes: Any = None) -> Any:
     return axes
 
 
-def plot_volume(volume: Volume, axes: Any = None) -> Any:
-    """The layer in the middle of a volume, from above."""
+def plot_volume(volume: Volume, axes: Any = None, what: str = "data") -> Any:
+    """The layer in the middle of a volume, or of its `sigma` or `bias_bound`, from above."""
+    values = getattr(volume, what, None) if what in LAYERS else None
+    if values is None:
+        allowed = [name for name in LAYERS if getattr(volume, name) is not None]
+        raise TwinError(f"what: {what!r} is not there; there is {', '.join(allowed)}")
     axes = _pyplot().figure().add_subplot() if axes is None else axes
     x, y, z = volume.centers()
     middle, half = len(z) // 2, volume.voxel_xyz[0] / 2
     ends = (x[0] - half, x[-1] + half, y[0] - half, y[-1] + half)
-    shown = axes.imshow(volume.data[middle], cmap="gray", origin="lower", extent=ends)
-    axes.figure.colorbar(shown, ax=axes, label="attenuation [1/mm]")
+    shown = axes.imshow(values[middle], cmap="gray", origin="lower", extent=ends)
+    axes.figure.colorbar(shown, ax=axes, label=f"{LAYERS[what]} [1/mm]")
     axes.set(xlabel="x [mm]", ylabel="y [mm]", title=f"z = {z[middle]:g} mm")
     return axes
 

@@ -68,8 +68,9 @@ Tell = Callable[[dict[str, Any]], None]
 class Held:
     """The volumes of the process by name, (z, y, x), and what it says of them.
 
-    `volume` is the one that was asked for, `truth` its sample's and `other` the one with the other
-    geometry, once they have been compared.
+    `volume` is the one that was asked for, `sigma` and `bias_bound` its noise and what else it may
+    be off by, `truth` its sample's and `other` the one with the other geometry, once they have been
+    compared.
     """
 
     tell: Tell
@@ -160,9 +161,12 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
     held.dataset, held.request = data, VolumeRequest(binning=max(1, round(data.shape[1] / side)))
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always")
-        volume = reconstruct_volume(data, held.request, progress=_share(held, "done"))
+        volume = reconstruct_volume(data, held.request, progress=_share(held, "done"), errors=True)
     held.hold(volume.data, volume)
+    found = {"sigma": volume.sigma, "bias_bound": volume.bias_bound}
+    held.volumes |= {name: some for name, some in found.items() if some is not None}
     held.keep(
+        volumes=list(held.volumes),
         done=1.0,
         views=len(data.present),
         of=len(data),
@@ -219,7 +223,7 @@ def compare(held: Held, now: NamedCorrection | None) -> None:
         rows[_named(None if data.correction is not None else now)] = figures(
             made.data, truth, voxel_mm
         )
-    held.keep(comparing=1.0, compared=rows)
+    held.keep(comparing=1.0, compared=rows, volumes=list(held.volumes))
 
 
 def surface(grown: Float32Array, voxel_mm: Any, center_mm: Any) -> dict[str, Any]:

@@ -131,10 +131,10 @@ class Live(Params):
 
 
 class Block(Live):
-    """Which of its volumes: the one that was asked for, its sample's truth, how far they are apart,
-    or the one with the other geometry."""
+    """Which of its volumes: the one that was asked for, its noise, a bound of its bias, its
+    sample's truth, how far they are apart, or the one with the other geometry."""
 
-    what: Literal["volume", "truth", "difference", "other"] = "volume"
+    what: Literal["volume", "sigma", "bias_bound", "truth", "difference", "other"] = "volume"
 
 
 class Voxel(Live):

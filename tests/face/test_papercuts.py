@@ -248,6 +248,8 @@ def test_a_volume_is_shown_and_handed_to_xarray() -> None:
     assert "2.5 x 2 x 1.5 mm" in html
     assert "0 to 59 / mm" in html
     pytest.importorskip("matplotlib").use("agg")
+    with pytest.raises(fx.TwinError, match="'sigma' is not there; there is data"):
+        volume.plot(what="sigma")
     axes = volume.plot()
     assert np.array_equal(axes.images[0].get_array(), volume.data[1])
     assert axes.get_title() == "z = -2 mm"

@@ -202,12 +202,22 @@ def test_a_past_scan_is_reconstructed_and_gone_through(
     page.mouse.up()
     x, y, z = page.evaluate(cross)
     assert (abs(x - nx / 4) < 2, y, abs(z - nz / 4) < 2) == (True, ny // 2, True)
-    page.locator("#volume-at", has_text=re.compile(r"mm  -?[\d.e-]{9,} per mm")).wait_for()
-    said = float(page.inner_text("#volume-at").split()[-3])
+    read = re.compile(r"mm  (-?[\d.e-]{9,}) per mm ± ([\d.e-]+), bias at most ([\d.e-]+)")
+    page.locator("#volume-at", has_text=read).wait_for()
     exact = page.evaluate(
         "at => flexdt.call('viewer.voxel', { ...flexdt.volume().of, at })", [x, y, z]
-    )["volume"]
-    assert said == pytest.approx(exact, rel=1e-6)
+    )
+    told = [float(word) for word in read.search(page.inner_text("#volume-at")).groups()]  # type: ignore[union-attr]
+    assert told[0] == pytest.approx(exact["volume"], rel=1e-6)
+    assert told[1:] == pytest.approx([exact["sigma"], exact["bias_bound"]], rel=0.06)
+    # Its errors are volumes, too, each with a window of its own.
+    block, highs = "flexdt.volume().three.block", set()
+    for what in ("sigma", "bias_bound", "volume"):
+        high = page.evaluate(f"{block}.high")
+        page.select_option("#volume-shown", what)
+        page.wait_for_function(f"high => {block}.high !== high", arg=high)
+        highs.add(page.evaluate(f"{block}.high"))
+    assert len(highs) == 3
     page.select_option("#volume-tool", "profile")
     page.mouse.down()
     page.mouse.move(box["x"] + box["width"] * 0.75, box["y"] + box["height"] * 0.5)

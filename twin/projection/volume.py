@@ -240,20 +240,24 @@ class Volume:
         there = replace(layout, flat=gpu.demand(layout.device_copy.uploaded))
         return DeviceVolume(there, self.shape, self.voxel_xyz, self.center_mm)
 
-    def plot(self, axes: Any = None) -> Any:
+    def plot(self, axes: Any = None, what: str = "data") -> Any:
         """Show the layer in the middle; needs matplotlib (the extra `plots`).
 
         Args:
             axes: matplotlib's axes to draw into; None makes a figure.
+            what: `data`, or what `reconstruct` found of its errors: `sigma` or `bias_bound`.
 
         Returns:
             The axes.
+
+        Raises:
+            TwinError: there is nothing of that name.
 
         Example:
             >>> Volume(np.zeros((6, 4, 4)), voxel_mm=0.5).plot().get_title()
             'z = 0.25 mm'
         """
-        return lazy_backend("plots").plot_volume(self, axes)
+        return lazy_backend("plots").plot_volume(self, axes, what)
 
     def to_xarray(self) -> Any:
         """The values as an xarray DataArray (z, y, x) with positions [mm], which needs xarray.

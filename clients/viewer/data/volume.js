@@ -7,7 +7,7 @@ import { extent, index, slices, valueOf } from "./slices.js";
 import { raycast } from "./raycast.js";
 import { shared } from "./shared.js";
 const KEY = "flexdt-volume", STARTING = "starting; dark, flat and a first image are needed", EXACT_MS = 60;
-const SHOWN = { volume: "volume", other: "the other geometry", truth: "truth of the sample", difference: "volume − truth" };
+const SHOWN = { volume: "volume", sigma: "noise (standard deviation)", bias_bound: "bound of the bias", other: "the other geometry", truth: "truth of the sample", difference: "volume − truth" };
 const size = $select("#volume-side"), note = $("#volume-note"), progress = $("#volume-progress"), shown = $select("#volume-shown");
 const chart = $canvas("#volume-histogram"), plot = $canvas("#volume-profile"), ends = [$input("#volume-low"), $input("#volume-high")], level = $input("#volume-level");
 size.addEventListener("change", choose);
@@ -52,7 +52,7 @@ function forget() {
     for (const id of [".slices", "#volume-tools", "#volume-large"])
         $(id).hidden = true;
     $("#volume-compared").textContent = "";
-    shown.replaceChildren(el("option", { value: "volume" }, SHOWN.volume));
+    offer(["volume"]);
     large(false);
 }
 function choose() { if (!size.value)
@@ -102,6 +102,8 @@ on("volume", (m) => {
     const facts = [`${m.views ?? "–"} of ${m.of ?? "–"} views`, `${m.size.join(" × ")} voxels of ${fixed(1000 * (m.voxel_mm ?? 0), 0)} µm`, m.geometry, m.uncovered && m.uncovered > 5e-4 ? `${fixed(100 * m.uncovered, 1)} % without data (grey)` : "",
         m.binning ? `flexdt reconstruct --binning ${m.binning}` : "", working ? `comparing: ${fixed(100 * (m.comparing ?? 0), 0)} %` : "", m.not_compared, ...(m.doubts ?? [])];
     setText(note, other + facts.filter(Boolean).join(" · "));
+    if (m.volumes)
+        offer(m.volumes, Object.keys(m.compared ?? {})[1]);
     if (m.views !== undefined && (!m.past || !blocks.size))
         void want();
     if (m.compared)
@@ -130,6 +132,8 @@ async function want() {
             block.signed = true;
             block.window = [-end, end];
         }
+        if (block)
+            block.own = block.signed || name === "sigma" || name === "bias_bound";
         if (block && past)
             blocks.set(name, block);
     }
@@ -143,8 +147,8 @@ function show(block) {
     const first = !three.block;
     for (const id of [".slices", "#volume-tools", "#volume-large"])
         $(id).hidden = false;
-    // The window is kept between volume, truth and the other geometry; while one grows it is chosen anew.
-    const same = kept && past && !block.signed;
+    // The window is kept between volume, truth and the other geometry; errors have their own; while one grows it is chosen anew.
+    const same = kept && past && !block.own;
     three.show(block, same ? kept ?? block.window : block.window);
     if (!tried) {
         tried = true;
@@ -154,10 +158,10 @@ function show(block) {
         else
             solid = made;
     }
-    if (!block.signed)
+    if (!block.own)
         solid?.show(block);
     put();
-    if (!same && !block.signed)
+    if (!same && !block.own)
         surface();
     if (first && reveal) {
         reveal = false;
@@ -170,7 +174,7 @@ const range = () => { const b = three.block; if (!b)
     return [0, 1]; const [l, h] = b.window, d = h - l; return [Math.max(b.low, l - 0.3 * d), Math.min(b.high, h + 1.5 * d)]; };
 const part = (v) => { const [l, h] = range(); return (1000 * (v - l)) / (h - l); }, value = (p) => { const [l, h] = range(); return l + (p * (h - l)) / 1000; };
 function put() { ends.forEach((end, k) => { end.value = String(part(three.window[k])); }); seen(); }
-function seen() { if (!three.block?.signed) {
+function seen() { if (!three.block?.own) {
     kept = three.window;
     solid?.window(kept);
 } drawHistogram(); drawProfile(); point(pointer); }
@@ -229,8 +233,10 @@ function point(place) {
     const at = place.map((v) => Math.floor((v + 0.5) * b.factor));
     due = window.setTimeout(async () => {
         const exact = await call("viewer.voxel", { ...of, at }).catch(() => null), v = exact?.[shown.value];
-        if (pointer === place && typeof v === "number")
-            say(`${v.toPrecision(8)} per mm`);
+        if (pointer !== place || typeof v !== "number")
+            return;
+        const { sigma, bias_bound: bias } = shown.value === "volume" ? exact ?? {} : {};
+        say(`${v.toPrecision(8)} per mm${sigma == null ? "" : ` ± ${sigma.toPrecision(2)}`}${bias == null ? "" : `, bias at most ${bias.toPrecision(2)}`}`);
     }, EXACT_MS);
 }
 // As measured with each geometry, beside the truth.
@@ -243,8 +249,14 @@ function compared(rows) {
     if ($("#volume-compared").childElementCount)
         return;
     $("#volume-compared").replaceChildren(table(rows));
-    const names = Object.keys(SHOWN).filter((name) => name !== "other" || Object.keys(rows).length > 1);
-    shown.replaceChildren(...names.map((name) => el("option", { value: name }, name === "other" ? Object.keys(rows)[1] : SHOWN[name])));
+}
+// The volumes that there are; the one that was chosen stays so.
+function offer(names, other = SHOWN.other) {
+    const chosen = shown.value, there = Object.keys(SHOWN).filter((name) => names.includes(name));
+    if (there.length === shown.options.length)
+        return;
+    shown.replaceChildren(...there.map((name) => el("option", { value: name }, name === "other" ? other : SHOWN[name])));
+    shown.value = names.includes(chosen) ? chosen : "volume";
 }
 clicks({ "volume-cancel": cancel, "volume-compare": compare, "volume-large": () => large(!document.body.classList.contains("whole")), "volume-share": () => { if (three.block && told)
         void shared(three, solid, told); } });

@@ -27,13 +27,14 @@ export interface Shown extends ImageHead {
 
 // A volume as a page has it: codes [z][y][x], 0 where no data cover, from 1 for `low` to 65535 for `high`; of cubes of `factor` voxels a side.
 export interface BlockHead { shape: Vector; factor: number; low: number; high: number; window: Pair }
-export interface Block extends BlockHead { codes: Uint16Array<ArrayBuffer>; voxel_mm: number; signed?: boolean }
+export interface Block extends BlockHead { codes: Uint16Array<ArrayBuffer>; voxel_mm: number; signed?: boolean; own?: boolean }
+export type Name = "volume" | "sigma" | "bias_bound" | "other" | "truth" | "difference";
 // As measured and as true [1/mm, part, mm], and the rms difference.
 export interface Figures { attenuation: Pair; void: Pair; x_mm: Pair; y_mm: Pair; z_mm: Pair; rms: number }
 export interface VolumeMessage {
   name: string; side: number; past: boolean; problem?: string; views?: number; of?: number; size?: Vector; voxel_mm?: number;
   // Of a finished one: how much of the work is done, and then what it was made of.
-  done?: number; binning?: number; geometry?: string; doubts?: string[]; uncovered?: number; sample?: string; started?: string; kV?: number | null;
+  done?: number; binning?: number; geometry?: string; doubts?: string[]; volumes?: Name[]; uncovered?: number; sample?: string; started?: string; kV?: number | null;
   comparing?: number; compared?: Record<string, Figures>; not_compared?: string;
 }
 interface Failure { code: number; message: string; data?: unknown }

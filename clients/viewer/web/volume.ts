@@ -2,15 +2,14 @@
 // scroll and in three dimensions, and beside the truth of its sample.
 import { $, $button, $canvas, $input, $select, bars, cleared, clicks, el, fixed, keep, setText, slid, words } from "./dom.js";
 import { call, on, store } from "./link.js";
-import type { Block, Figures, Live, Pair, Vector, VolumeMessage } from "./viewer.js";
+import type { Block, Figures, Live, Name, Pair, Vector, VolumeMessage } from "./viewer.js";
 import { folder } from "./data.js";
 import { extent, index, slices, valueOf } from "./slices.js";
 import { raycast } from "./raycast.js";
 import { shared } from "./shared.js";
 
 const KEY = "flexdt-volume", STARTING = "starting; dark, flat and a first image are needed", EXACT_MS = 60;
-const SHOWN: Record<string, string> = { volume: "volume", other: "the other geometry", truth: "truth of the sample", difference: "volume − truth" };
-type Name = "volume" | "other" | "truth" | "difference";
+const SHOWN: Record<Name, string> = { volume: "volume", sigma: "noise (standard deviation)", bias_bound: "bound of the bias", other: "the other geometry", truth: "truth of the sample", difference: "volume − truth" };
 const size = $select("#volume-side"), note = $("#volume-note"), progress = $<HTMLProgressElement>("#volume-progress"), shown = $select("#volume-shown");
 const chart = $canvas("#volume-histogram"), plot = $canvas("#volume-profile"), ends = [$input("#volume-low"), $input("#volume-high")] as const, level = $input("#volume-level");
 size.addEventListener("change", choose);
@@ -43,7 +42,7 @@ function forget() {
   blocks.clear(); three.show(null); kept = null;
   for (const id of [".slices", "#volume-tools", "#volume-large"]) $(id).hidden = true;
   $("#volume-compared").textContent = "";
-  shown.replaceChildren(el("option", { value: "volume" }, SHOWN.volume));
+  offer(["volume"]);
   large(false);
 }
 function choose() { if (!size.value) past = null; if (!past) keep(KEY, size.value); ask(); }
@@ -79,6 +78,7 @@ on("volume", (m) => {
   const facts = [`${m.views ?? "–"} of ${m.of ?? "–"} views`, `${m.size.join(" × ")} voxels of ${fixed(1000 * (m.voxel_mm ?? 0), 0)} µm`, m.geometry, m.uncovered && m.uncovered > 5e-4 ? `${fixed(100 * m.uncovered, 1)} % without data (grey)` : "",
     m.binning ? `flexdt reconstruct --binning ${m.binning}` : "", working ? `comparing: ${fixed(100 * (m.comparing ?? 0), 0)} %` : "", m.not_compared, ...(m.doubts ?? [])];
   setText(note, other + facts.filter(Boolean).join(" · "));
+  if (m.volumes) offer(m.volumes, Object.keys(m.compared ?? {})[1]);
   if (m.views !== undefined && (!m.past || !blocks.size)) void want();
   if (m.compared) compared(m.compared);
   $button("#volume-compare").disabled = !m.past || m.comparing !== undefined;
@@ -97,6 +97,7 @@ async function want() {
     if (head?.shape && raw && raw.byteLength === 2 * head.shape.reduce((a, n) => a * n) && told)
       block = { ...(head as Block), codes: new Uint16Array(raw), voxel_mm: (told.voxel_mm ?? 0) * (head.factor ?? 1) };
     if (block && name === "difference") { const end = Math.max(...(blocks.get("volume")?.window ?? [0, 1])) / 2; block.signed = true; block.window = [-end, end]; }
+    if (block) block.own = block.signed || name === "sigma" || name === "bias_bound";
     if (block && past) blocks.set(name, block);
   }
   wanting = false;
@@ -106,17 +107,17 @@ async function want() {
 function show(block: Block) {
   const first = !three.block;
   for (const id of [".slices", "#volume-tools", "#volume-large"]) $(id).hidden = false;
-  // The window is kept between volume, truth and the other geometry; while one grows it is chosen anew.
-  const same = kept && past && !block.signed;
+  // The window is kept between volume, truth and the other geometry; errors have their own; while one grows it is chosen anew.
+  const same = kept && past && !block.own;
   three.show(block, same ? kept ?? block.window : block.window);
   if (!tried) {
     tried = true;
     const made = raycast($canvas("#volume-ray"), Number(new URLSearchParams(location.search).get("rays")) || 0);
     if (typeof made === "string") $("#volume-ray").replaceWith(el("p", { class: "muted small-text" }, made)); else solid = made;
   }
-  if (!block.signed) solid?.show(block);
+  if (!block.own) solid?.show(block);
   put();
-  if (!same && !block.signed) surface();
+  if (!same && !block.own) surface();
   if (first && reveal) { reveal = false; $("#volume-card").scrollIntoView({ block: "start" }); }
 }
 shown.addEventListener("change", () => void want());
@@ -125,7 +126,7 @@ shown.addEventListener("change", () => void want());
 const range = (): Pair => { const b = three.block; if (!b) return [0, 1]; const [l, h] = b.window, d = h - l; return [Math.max(b.low, l - 0.3 * d), Math.min(b.high, h + 1.5 * d)]; };
 const part = (v: number) => { const [l, h] = range(); return (1000 * (v - l)) / (h - l); }, value = (p: number) => { const [l, h] = range(); return l + (p * (h - l)) / 1000; };
 function put() { ends.forEach((end, k) => { end.value = String(part(three.window[k])); }); seen(); }
-function seen() { if (!three.block?.signed) { kept = three.window; solid?.window(kept); } drawHistogram(); drawProfile(); point(pointer); }
+function seen() { if (!three.block?.own) { kept = three.window; solid?.window(kept); } drawHistogram(); drawProfile(); point(pointer); }
 function surface() { if (!three.block) return; level.value = String(part(three.block.window[1] / 2)); turned(); }
 function turned() { if (!solid) return; solid.level = value(level.valueAsNumber); solid.cut = Number($select("#volume-cut").value); solid.most = $select("#volume-way").value === "most"; solid.cross(three.cross); solid.draw(); drawHistogram(); }
 for (const end of ends) end.addEventListener("input", () => { const [l, h] = ends.map((e) => value(e.valueAsNumber)); three.look([l, Math.max(h, l + 1e-6)]); seen(); });
@@ -165,7 +166,9 @@ function point(place: Vector | null) {
   const at = place.map((v) => Math.floor((v + 0.5) * b.factor)) as Vector;
   due = window.setTimeout(async () => {
     const exact = await call("viewer.voxel", { ...of, at }).catch(() => null), v = exact?.[shown.value];
-    if (pointer === place && typeof v === "number") say(`${v.toPrecision(8)} per mm`);
+    if (pointer !== place || typeof v !== "number") return;
+    const { sigma, bias_bound: bias } = shown.value === "volume" ? exact ?? {} : {};
+    say(`${v.toPrecision(8)} per mm${sigma == null ? "" : ` ± ${sigma.toPrecision(2)}`}${bias == null ? "" : `, bias at most ${bias.toPrecision(2)}`}`);
   }, EXACT_MS);
 }
 
@@ -180,8 +183,13 @@ export function table(rows: Record<string, Figures>): HTMLElement {
 function compared(rows: Record<string, Figures>) {
   if ($("#volume-compared").childElementCount) return;
   $("#volume-compared").replaceChildren(table(rows));
-  const names = Object.keys(SHOWN).filter((name) => name !== "other" || Object.keys(rows).length > 1);
-  shown.replaceChildren(...names.map((name) => el("option", { value: name }, name === "other" ? Object.keys(rows)[1] : SHOWN[name])));
+}
+// The volumes that there are; the one that was chosen stays so.
+function offer(names: Name[], other = SHOWN.other) {
+  const chosen = shown.value, there = (Object.keys(SHOWN) as Name[]).filter((name) => names.includes(name));
+  if (there.length === shown.options.length) return;
+  shown.replaceChildren(...there.map((name) => el("option", { value: name }, name === "other" ? other : SHOWN[name])));
+  shown.value = names.includes(chosen as Name) ? chosen : "volume";
 }
 clicks({ "volume-cancel": cancel, "volume-compare": compare, "volume-large": () => large(!document.body.classList.contains("whole")), "volume-share": () => { if (three.block && told) void shared(three, solid, told); } });
 window.addEventListener("keydown", (e) => { if (e.key === "Escape" && document.body.classList.contains("whole")) { e.stopPropagation(); large(false); } }, true);

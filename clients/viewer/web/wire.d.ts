@@ -15,7 +15,7 @@ export type Block = {
   name?: string | null;
   side?: 128 | 192 | 256 | 512;
   past?: boolean;
-  what?: "volume" | "truth" | "difference" | "other";
+  what?: "volume" | "sigma" | "bias_bound" | "truth" | "difference" | "other";
 };
 export type CalibrationAlign = {
   name: string;
