@@ -163,10 +163,7 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
         warnings.simplefilter("always")
         volume = reconstruct_volume(data, held.request, progress=_share(held, "done"), errors=True)
     held.hold(volume.data, volume)
-    found = {"sigma": volume.sigma, "bias_bound": volume.bias_bound}
-    held.volumes |= {name: some for name, some in found.items() if some is not None}
     held.keep(
-        volumes=list(held.volumes),
         done=1.0,
         views=len(data.present),
         of=len(data),
@@ -176,6 +173,10 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
         uncovered=float(1.0 - np.isfinite(volume.data).mean()),
         **_facts(data),
     )
+    for name in ("sigma", "bias_bound"):  # the volume need not wait for its errors
+        if (found := getattr(volume, name)) is not None:
+            held.volumes[name] = found
+    held.keep(volumes=list(held.volumes))
 
 
 def _share(held: Held, name: str) -> Callable[[float, float], None]:

@@ -202,7 +202,7 @@ def test_a_past_scan_is_reconstructed_and_gone_through(
     page.mouse.up()
     x, y, z = page.evaluate(cross)
     assert (abs(x - nx / 4) < 2, y, abs(z - nz / 4) < 2) == (True, ny // 2, True)
-    read = re.compile(r"mm  (-?[\d.e-]{9,}) per mm ± ([\d.e-]+), bias at most ([\d.e-]+)")
+    read = re.compile(r"mm\s+(-?[\d.e-]{9,}) per mm ± ([\d.e-]+), bias at most ([\d.e-]+)")
     page.locator("#volume-at", has_text=read).wait_for()
     exact = page.evaluate(
         "at => flexdt.call('viewer.voxel', { ...flexdt.volume().of, at })", [x, y, z]
