@@ -296,7 +296,8 @@ def answer(held: Held, served: Served, asked: list[str]) -> None:
             served.answer(*block(held.volumes[name], most))
         case ["voxel", x, y, z]:
             at = int(x), int(y), int(z)
-            served.answer({name: exact(data, at) for name, data in held.volumes.items()})
+            there = held.volumes.copy()  # its errors may just be coming
+            served.answer({name: exact(data, at) for name, data in there.items()})
         case ["compare", now]:
             served.answer({})
             parameters = json.loads(now)

@@ -83,7 +83,9 @@ class SceneClients:
                 continue
             when, stand = self._shown.get(id, (built, plain))
             known = (stand,) if when == built else (stand, plain)
-            set_nodes(client, {n: s for n, s in nodes.items() if any(k.get(n) != s for k in known)})
+            changed = {n: s for n, s in nodes.items() if any(k.get(n) != s for k in known)}
+            if changed:
+                set_nodes(client, changed)
             self._shown[id] = built, nodes
 
     def page_of(self, client_id: int | None) -> str | None:

@@ -371,7 +371,7 @@ async def export(viewer: Viewer, page: Page, params: p.Export) -> object:
         seen = next(iter(viewer.clients.of(page.id, "free") or viewer.clients.of(page.id)), None)
         camera = FREE if seen is None else exports.standpoint(seen)
         make = partial(
-            exports.scene_file, viewer.viser, camera, lab.nodes(page.shown),
+            exports.scene_file, viewer.viser, camera, lab.nodes(page.shown, viewer.near),
             exports.title_of(viewer.state, "scene"),
             exports.beside(viewer.state, viewer.feeds["line_integral"].newest),
         )  # fmt: skip

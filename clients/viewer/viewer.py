@@ -87,6 +87,7 @@ class Viewer:
         looks: part of `machine` -> its own mesh.
 
     Attributes:
+        near: components near a contact, which all scenes highlight.
         failed: set when an essential task has failed; the process then ends.
     """
 
@@ -124,7 +125,7 @@ class Viewer:
         self._twin_time, self._told = 0.0, -1
         self._heard_at = time.monotonic()
         self._ranges_at, self._built = 0.0, 0
-        self._near: Sequence[str] = ()
+        self.near: Sequence[str] = ()
         self.link = KeptConnection(
             address,
             "flexdt viewer (scene)",
@@ -241,7 +242,7 @@ class Viewer:
             if lab is not None and world is not None:
                 self.show_layers()
                 for client, id in self.clients.with_names():
-                    named = lab.named(world, self.pages[id].shown if id in self.pages else Shown())
+                    named = lab.named(world, self._shown_by(id))
                     with contextlib.suppress(AssertionError, KeyError):  # it has just come or gone
                         await asyncio.to_thread(self.tags.draw, client, named)
 
@@ -250,8 +251,13 @@ class Viewer:
         if (lab := self.lab) is None:
             return
         for page in self.pages.values():
-            nodes = lab.nodes(page.shown, self._near)
+            nodes = lab.nodes(page.shown, self.near)
             self.clients.show(page.id, nodes, lab.plain, self._built)
+
+    def _shown_by(self, id: str) -> Shown:
+        """What a page shows, or the usual things where it has not said who it is."""
+        page = self.pages.get(id)
+        return Shown() if page is None else page.shown
 
     def _link_changed(self) -> None:
         self._heard_at = time.monotonic()
@@ -314,7 +320,7 @@ class Viewer:
                 feed.again()
         near = nearest(state.safety)
         lab.update(state, world)
-        self._near = near["pair"] if near["close"] else ()
+        self.near = near["pair"] if near["close"] else ()
         ranges = any("ranges" in page.shown for page in self.pages.values())
         if ranges and time.monotonic() - self._ranges_at > RANGES_S:
             self._ranges_at = time.monotonic()
@@ -403,8 +409,7 @@ class Viewer:
         camera = self.clients.cameras.get(asked.get("view", ""))
         if lab is None or world is None or camera is None:
             return None
-        page = self.pages.get(asked.get("page", ""))
-        shown = Shown() if page is None else page.shown
+        shown = self._shown_by(asked.get("page", ""))
         stamp = (self._pictured, id(self.look), shown, *world.view.rows.flat)
         return await self._stills.picture(camera, asked, stamp, lambda: lab.shapes(world, shown))
 

@@ -120,7 +120,8 @@ class Scenes:
         return self.server._websock_server._broadcast_buffer.message_counter
 
     def heard(self, client_id: int, said: int) -> bool:
-        """Whether a client was sent all of that: what is said to it alone may overtake the rest."""
+        """Whether a client has been sent all that had been said to everybody by then. What is said
+        to it alone has a queue of its own, and could overtake that."""
         at = self.server._websock_server._broadcast_buffer.generator_cursors.get(client_id, -1)
         return at >= said - 1
 

@@ -134,7 +134,7 @@ class Case:
 
 
 def cases(views: int) -> list[Case]:
-    """In the order of the list that the issue tracker had on 2026-11-23."""
+    """What was found, in that order; the last ones were refused."""
     turn = np.arange(views) * 360.0 / views
     ball = (
         Column((0.0, 0.0), (0.7 * FIELD, 0.7 * FIELD), 0.02),

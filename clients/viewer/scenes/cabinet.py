@@ -16,7 +16,7 @@ import trimesh
 from flexdt.clients.viewer.scenes import sample as s
 from flexdt.clients.viewer.scenes.sample import Paint, PaintedMesh
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.machine.description import Machine
+from flexdt.twin.machine.description import Component, Machine
 
 ROOM_MM: Final = (150.0, 150.0, 450.0)
 """Between the machine's largest part and the walls; above that part, what towers need and more."""
@@ -29,6 +29,11 @@ LAMP = {False: (92, 98, 106), True: (255, 243, 196)}
 """X-rays on or not -> colour of the lamp: no red, in which the page draws parts that touch."""
 
 
+def ground_of(machine: Machine) -> Component:
+    """The part on which the others stand."""
+    return max(machine.components, key=lambda part: part.size_mm[0] * part.size_mm[1])
+
+
 def cabinet(machine: Machine, floor_mm: float) -> tuple[list[PaintedMesh], FloatArray]:
     """The cabinet's pieces, and where its lamp is, (3,).
 
@@ -36,7 +41,7 @@ def cabinet(machine: Machine, floor_mm: float) -> tuple[list[PaintedMesh], Float
         machine: around the largest of whose parts it stands.
         floor_mm: height of the floor.
     """
-    ground = max(machine.components, key=lambda part: part.size_mm[0] * part.size_mm[1])
+    ground = ground_of(machine)
     towers = max(part.size_mm[2] for part in machine.components)
     half = np.array(ground.size_mm) / 2 + ROOM_MM
     low = np.array(ground.center_mm) - half

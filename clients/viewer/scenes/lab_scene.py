@@ -16,7 +16,7 @@ from flexdt.clients.viewer.scenes import parts, world
 from flexdt.clients.viewer.scenes import parts as bodies
 from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.beam_shade import BeamShade
-from flexdt.clients.viewer.scenes.cabinet import LAMP, cabinet
+from flexdt.clients.viewer.scenes.cabinet import LAMP, cabinet, ground_of
 from flexdt.clients.viewer.scenes.gizmos import Drag, Gizmos
 from flexdt.clients.viewer.scenes.labels import Name, names_of_image, names_of_parts
 from flexdt.clients.viewer.scenes.layers import Nodes, Shown
@@ -27,7 +27,7 @@ from flexdt.clients.viewer.scenes.world import SCREEN, PlanDrawing, World, motor
 from flexdt.protocol.state_model import State
 from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.machine.description import Component, Machine, Profile
+from flexdt.twin.machine.description import Machine, Profile
 
 FLOOR_MM = -405.0
 BEAM_ON = (255, 176, 32)
@@ -114,7 +114,7 @@ class LabScene:
             section_thickness=0.9, fade_distance=5.0, fade_strength=2.0,
             position=(0.0, 0.55, FLOOR_MM * MM),
         )  # fmt: skip
-        ground = _ground(self.machine)
+        ground = ground_of(self.machine)
         for part in self.machine.components:
             frame = scene.add_frame(f"/machine/{part.name}", show_axes=False)
             self._frames[part.name] = frame
@@ -384,14 +384,9 @@ def _clear(opacity: float, dense: bool) -> dict[str, Any]:
     return {"opacity": None if dense or opaque else opacity, "side": side}
 
 
-def _ground(machine: Machine) -> Component:
-    """The part on which the others stand."""
-    return max(machine.components, key=lambda part: part.size_mm[0] * part.size_mm[1])
-
-
 def _scale_mm(machine: Machine) -> FloatArray:
     """Where the scale begins: beside the part on which the others stand, on its top."""
-    ground = _ground(machine)
+    ground = ground_of(machine)
     (x, y, z), middle = ground.size_mm, np.array(ground.center_mm)
     return np.asarray(middle + [0.45 * x, -0.4 * y, z / 2 + 2.0])
 

@@ -28,7 +28,7 @@ export interface Shown extends ImageHead {
 // A volume as a page has it: codes [z][y][x], 0 where no data cover, from 1 for `low` to 65535 for `high`; of cubes of `factor` voxels a side.
 export interface BlockHead { shape: Vector; factor: number; low: number; high: number; window: Pair }
 export interface Block extends BlockHead { codes: Uint16Array<ArrayBuffer>; voxel_mm: number; signed?: boolean; own?: boolean }
-export type Name = "volume" | "sigma" | "bias_bound" | "other" | "truth" | "difference";
+export type Name = NonNullable<Requests["viewer.block"]["what"]>;
 // As measured and as true [1/mm, part, mm], and the rms difference.
 export interface Figures { attenuation: Pair; void: Pair; x_mm: Pair; y_mm: Pair; z_mm: Pair; rms: number }
 export interface VolumeMessage {

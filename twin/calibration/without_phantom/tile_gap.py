@@ -4,9 +4,9 @@ What lies in the gap is missing: beyond it everything appears nearer by its widt
 beside it differ as columns do that are further apart. How much columns differ with their distance
 is seen in the frames themselves, everywhere else. Where edges of the turning object pass a border,
 the differences of neighbouring columns about it are compared with what they would be with a gap of
-each width: the likelihood of normal differences, each row of each frame at its own scale. What also
-looks so is the outline of the object, where it turns back: it does on both sides of the axis, so
-what a border gains counts as far as its mirror image does not. What stays the same in all frames
+each width: the likelihood of normal differences, each row of each frame at its own scale. The
+outline of the object looks like a gap, too, where its edges turn back, but it does so on both sides
+of the axis: the gain at a border's mirror image is subtracted. What stays the same in all frames
 (rings, a wrong flat field) is left out, and so are borders near columns that show nothing.
 """
 
