@@ -32,7 +32,7 @@ def _detection() -> None:
     image, mask = np.zeros((9, 9), np.float32), np.zeros((9, 9), np.uint8)
     at, one, result = np.float64(4.0), np.ones(3), np.zeros(spot_kernels.RESULTS)
     spot_kernels.measure(image, at, at, at, 1.0, at, result)
-    spot_kernels.fit_ball(image, mask, at, at, at, one, at, 0.5, np.bool_(True), True, result)
+    spot_kernels.fit_ball(image, mask, at, at, at, one, at, 0.5, 0.0, np.bool_(True), True, result)
 
 
 def _fit() -> None:

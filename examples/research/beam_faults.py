@@ -326,7 +326,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "right scans": len(right), "of them refused": sum(not s.offered for s in right),
         "faults": len(faults), "of them named": sum(s.named for s in faults),
         "values of right scans": len(off := [e for s in right for e in s.sigmas.values()]),
-        "of them within 1.96 sigma": sum(e <= 1.96 for e in off),
+        "of them within 1.96 sigma": sum(bool(e <= 1.96) for e in off),
     }  # fmt: skip
     if args.json:
         print(json.dumps(summary))

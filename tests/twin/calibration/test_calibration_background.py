@@ -7,7 +7,7 @@ import pytest
 
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import bead_model
-from flexdt.twin.calibration.detect.background import survey
+from flexdt.twin.calibration.detect.background import evened, fading, survey
 from flexdt.twin.calibration.detect.detection import Detections, detect_beads
 from flexdt.twin.calibration.detect.refine import measure_beads
 from flexdt.twin.calibration.detect.windows import crop, lattice, plan_windows
@@ -35,6 +35,33 @@ def test_white_noise_and_planes_are_neither_foreign_nor_bent() -> None:
     found = survey(flat + ramp[None, None] - 0.5 * ramp[None, :, None], alone)
     assert not found.disturbed.any()
     assert found.bend is None
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_how_contrast_falls_is_read_from_beads_of_any_size(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    true, behind = rng.uniform(-1.2, -0.3), rng.uniform(0.5, 1.5, (24, 5))
+    size, noise = rng.uniform(0.5, 2.0, 5), 0.01 * rng.normal(size=behind.shape)
+    contrast = size * np.exp(true * behind + noise)
+    seen = rng.random(behind.shape) > 0.2
+    contrast[3, 2] *= 2.0  # one that is not that bead
+    brightness = 0.1 * rng.normal(size=(24, 1))
+    assert fading(contrast, behind + brightness, seen) == pytest.approx(true, abs=0.02)
+    alike = size * np.exp(noise)
+    assert abs(fading(alike, behind, seen)) < 0.01
+    assert fading(contrast, behind, seen & False) == 0.0
+    assert fading(contrast[:1], behind[:1], seen[:1]) == 0.0
+
+
+def test_a_bead_that_fades_across_its_shadow_is_evened() -> None:
+    i = np.arange(SIDE) - SIDE // 2
+    ball = 3.0 * np.sqrt(np.clip(1.0 - (i[None, :] ** 2 + i[:, None] ** 2) / 14.0**2, 0.0, None))
+    more = 0.01 * i[None, :] - 0.004 * i[:, None]
+    step = np.where(i[None, :] > 5, 0.3, 0.0) * np.ones((SIDE, 1))
+    for body, beyond in ((None, more), (step[None].astype(np.float32), more + step)):
+        seen = (0.7 + more + ball * np.exp(-0.8 * beyond))[None].astype(np.float32)
+        out = evened(seen, np.array([[0.7, 0.01, -0.004]]), body, -0.8)
+        assert np.abs(out[0] - (0.7 + more + ball)).max() < 1e-5
 
 
 def test_an_edge_beside_one_bead_is_found_in_that_window_alone() -> None:

@@ -91,6 +91,24 @@ def test_faults_of_beam_and_detector_mislead_nobody(capsys: pytest.CaptureFixtur
     assert "faults: 2, of them named: 2" in told, told
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [
+        ("scattered_light", 7000),  # was refused as beads 4 % larger
+        ("scattered_light", 7005),  # was offered with a magnification 6.4 sigmas off
+        ("spectrum_aluminium", 7001),
+    ],
+)
+@pytest.mark.campaign(2)
+def test_beads_that_fade_behind_a_body_mislead_nobody(kind: str, seed: int) -> None:
+    """Their centroids were off towards where the body is thinner."""
+    found = beam_faults.scored(kind, seed)
+    assert found.offered
+    assert found.worst < 3.5
+    assert not found.said
+
+
 @pytest.mark.parametrize(
     ("kind", "seed"),
     [

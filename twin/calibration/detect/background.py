@@ -4,6 +4,11 @@ Subtracting a plane fitted to the ring around a spot removes a straight gradient
 bad flat field, scatter) or an edge (something that is not in the model) shifts every centroid by
 less than the eye can see and by more than the reported uncertainty allows. Both show in the ring,
 averaged over blocks of pixels; pixels under the bead itself are not used.
+
+A gradient has a second effect that no plane removes. Scattered light and a beam of several energies
+make a bead fainter where more lies behind it, so the side of a spot behind which there is less
+counts for more, and all centroids are off in the direction in which the body becomes thinner.
+`fading` reads from the beads themselves how their contrast falls, and `evened` undoes it.
 """
 
 from __future__ import annotations
@@ -24,6 +29,11 @@ BENT = 40.0
 """Chi-square that the seven bent terms must explain in the median window (white noise: 6.3)."""
 LEAST_NOISE = 1e-3
 """Noise of line integrals that is assumed at least: no pixel counts a million photons."""
+OUTLIER = 4.5
+"""Contrasts that are off by so many times what half of them are (three standard deviations) are not
+those of that bead."""
+MEANS = 10
+"""Rounds in which the means of frames and beads are taken off in turns; few are missing."""
 FAR_OUT = 7.0
 """Standard deviations of a window's misfit above the median one from which it is disturbed."""
 
@@ -37,11 +47,14 @@ class Background:
             it cannot be judged.
         disturbed: (m,) the misfit is further from the others' than noise makes it.
         bend: (m, side, side) what to subtract besides a plane, or None where it is straight.
+        plane: (m, 3) line integral behind the middle of each window and its change by a pixel to
+            the right and down.
     """
 
     misfit: FloatArray
     disturbed: npt.NDArray[np.bool_]
     bend: Float32Array | None
+    plane: FloatArray
 
 
 def survey(flat: Float32Array, alone: Float32Array) -> Background:
@@ -58,7 +71,7 @@ def survey(flat: Float32Array, alone: Float32Array) -> Background:
     off[~valid] = 0.0
     shapes = _shapes((np.arange(count) + 0.5) * BLOCK + edge - 0.5, side)
     enough = valid.sum(axis=1) >= 24
-    straight, _ = _fitted(off, valid, shapes[:, :3], enough)
+    straight, plane = _fitted(off, valid, shapes[:, :3], enough)
     curved, coefficients = _fitted(off, valid, shapes, enough)
     variance = pixel_noise(flat, edge, count * BLOCK) ** 2 / BLOCK**2
     gain = (straight - curved) / np.maximum(variance, 1e-12)
@@ -73,7 +86,66 @@ def survey(flat: Float32Array, alone: Float32Array) -> Background:
         fine = _shapes(np.arange(side, dtype=np.float64), side)
         coefficients[:, :3] = 0.0
         bend = (coefficients @ fine.T).astype(np.float32).reshape(m, side, side)
-    return Background(ratio, enough & (ratio > limit), bend)
+    plane = plane / np.array([1.0, side / 2, side / 2])
+    return Background(ratio, enough & (ratio > limit), bend, plane)
+
+
+def fading(contrast: FloatArray, behind: FloatArray, seen: npt.NDArray[np.bool_]) -> float:
+    """How contrast changes with the line integral behind a bead, as a share of it.
+
+    Each bead is compared with itself in other frames, and each frame's mean is taken off, so beads
+    of several sizes and a beam that drifts say nothing. What noise may have made of it is taken off
+    (James and Stein), so that of no slope nothing is left.
+
+    Args:
+        contrast: of each bead in each frame, (n, k).
+        behind: line integrals behind their middles, (n, k).
+        seen: which of them are measured, (n, k).
+    """
+    logarithm = np.log(np.where(seen, contrast, 1.0))
+    use, slope, power, change = seen, 0.0, 0.0, behind
+    for _ in range(3):
+        change, more = (_against_own_means(a, use) for a in (logarithm, behind))
+        free, power = int(use.sum()) - sum(use.shape), float(np.square(more).sum())
+        if free < 1 or power <= 0.0:
+            return 0.0
+        slope = float((change * more).sum()) / power
+        left = np.abs(_against_own_means(logarithm - slope * behind, seen))
+        use = seen & (left <= OUTLIER * float(np.median(left[seen])))
+    variance = max(float(np.square(change).sum()) - slope**2 * power, 0.0) / free / power
+    return slope * max(1.0 - variance / max(slope**2, 1e-30), 0.0)
+
+
+def _against_own_means(values: FloatArray, seen: npt.NDArray[np.bool_]) -> FloatArray:
+    """Values (n, k) less what their frame and their bead have in common, 0 where not seen."""
+    out = np.where(seen, values, 0.0)
+    for _ in range(MEANS):
+        for axis in (0, 1):
+            count = np.maximum(seen.sum(axis=axis, keepdims=True), 1)
+            out = np.where(seen, out - out.sum(axis=axis, keepdims=True) / count, 0.0)
+    return np.asarray(out)
+
+
+def evened(
+    flat: Float32Array, plane: FloatArray, body: Float32Array | None, slope: float
+) -> Float32Array:
+    """Windows (m, side, side) with each bead as it would be were there as much behind all of it as
+    there is behind its middle.
+
+    Args:
+        flat: line integrals without the phantom's body.
+        plane: as `Background` has it.
+        body: line integrals of the body, or None.
+        slope: of the contrast, as `fading` has it.
+    """
+    at = (np.arange(flat.shape[1]) - (flat.shape[1] - 1) / 2).astype(np.float32)
+    value, right, down = plane.astype(np.float32).T[:, :, None, None]
+    more = right * at + down * at[:, None]
+    level = value + more
+    if body is not None:
+        middle = flat.shape[1] // 2
+        more = more + body - body[:, middle, middle][:, None, None]
+    return np.asarray(level + (flat - level) * np.exp(np.float32(-slope) * more))
 
 
 def _bends(

@@ -288,7 +288,18 @@ def _cut_beads(
         result = np.zeros(kernels.RESULTS)
         window, left, top = _window(image, x, y, 2.8 * radius + 8.0)
         kernels.fit_ball(
-            window, none, x - left, y - top, radius, round_, peak, BLUR_PX, False, False, result
+            window,
+            none,
+            x - left,
+            y - top,
+            radius,
+            round_,
+            peak,
+            BLUR_PX,
+            0.0,
+            False,
+            False,
+            result,
         )
         result[kernels.X] += left
         result[kernels.Y] += top

@@ -53,17 +53,18 @@ def centroids(
 def fits(
     patches: Patches,
     index: npt.NDArray[np.intp],
-    blur: float,
+    blur: tuple[float, float],
     free_radius: bool,
     masks: npt.NDArray[np.uint8],
 ) -> FloatArray:
-    """`fit_ball` in some windows; zeros elsewhere. masks: usable pixels of those windows."""
+    """`fit_ball` in some windows; zeros elsewhere. blur: with the veil; masks: usable pixels of
+    those windows."""
     results = np.zeros((len(patches.flat), kernels.RESULTS))
     whole = patches.windows.whole.ravel()
     for i, mask in zip(index, masks, strict=True):
         kernels.fit_ball(
             patches.flat[i], mask, *patches.offsets[i], patches.radii[i], patches.stretch[i],
-            patches.peaks[i], blur, whole[i], free_radius, results[i],
+            patches.peaks[i], *blur, whole[i], free_radius, results[i],
         )  # fmt: skip
     return results
 

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect import spot_kernels as kernels
-from flexdt.twin.calibration.detect.background import Background, survey
+from flexdt.twin.calibration.detect.background import Background, evened, fading, survey
 from flexdt.twin.calibration.detect.detection import BLUR_PX, MISFIT, covariances_of
 from flexdt.twin.calibration.detect.patches import (
     Patches,
@@ -207,6 +207,10 @@ def _shifted(shape: Shape, shift: tuple[float, float, float]) -> Shape:
 
 SAMPLE = 24
 """Spots from which blur and size are estimated, about."""
+BLURS = (0.12, 0.25, 0.45, 0.7, 1.1, 1.7, 2.5, 3.6)
+"""Blurs that are tried [px]."""
+VEILS = (0.0, 0.1, 0.2, 0.3, 0.45, 0.6)
+"""Veils that are tried."""
 CHECK_FINE = 3
 """Rays along a pixel's side where that estimate is checked on rendered beads."""
 BODY_BLUR_PX = 0.18
@@ -236,6 +240,7 @@ class Sharp:
 
     Attributes:
         blur, scale: blur and factor from expected to apparent radius with which a fit leaves least.
+        veil: part of the light about a bead that it does not take away, with which it leaves least.
         seen: they were seen, not assumed.
         true: the blur with which rendered beads look the same.
         size: likewise the factor on the beads' radii.
@@ -243,6 +248,7 @@ class Sharp:
 
     blur: float
     scale: float
+    veil: float
     seen: bool
     true: float
     size: float
@@ -281,36 +287,51 @@ def seen_sharpness(
 
 
 def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sharp:
-    """Blur and apparent size from some whole spots, by the fit that leaves least.
+    """Blur, veil and apparent size from some whole spots, by the fit that leaves least.
 
     A bead that is not as made shows here too; a spot cut by the edge has its centre where its
     radius puts it. Without whole spots: the assumed blur, and the expected size.
     """
     if len(sample) < 3:
-        return Sharp(blur, 1.0, False, blur, 1.0)
-    blurs = np.array([0.12, 0.25, 0.45, 0.7, 1.1, 1.7, 2.5, 3.6])
-    masks = usable(patches, sample)
-    misfit, scale = np.full(len(blurs), np.inf), np.ones(len(blurs))
-    for i, trial in enumerate(blurs):
-        results = fits(patches, sample, trial, True, masks)
+        return Sharp(blur, 1.0, 0.0, False, blur, 1.0)
+    masks, misfit = usable(patches, sample), np.full(len(VEILS), np.inf)
+    for i, trial in enumerate(VEILS):
+        misfit[i] = _sharpness(patches, sample, trial, masks)[0]
+        if i > 0 and misfit[i] > 1.5 * misfit[i - 1]:
+            break
+    if not np.isfinite(misfit).any():
+        return Sharp(blur, 1.0, 0.0, False, blur, 1.0)
+    veil = _lowest(np.array(VEILS), misfit)
+    _, best, apparent = _sharpness(patches, sample, veil, masks)
+    return Sharp(best, apparent, veil, True, best, apparent)
+
+
+def _sharpness(
+    patches: Patches, sample: npt.NDArray[np.intp], veil: float, masks: npt.NDArray[np.uint8]
+) -> tuple[float, float, float]:
+    """Least misfit with a veil, and the blur and apparent size that belong to it."""
+    misfit, scale = np.full(len(BLURS), np.inf), np.ones(len(BLURS))
+    for i, trial in enumerate(BLURS):
+        results = fits(patches, sample, (trial, veil), True, masks)
         good = sample[results[sample, kernels.OK] > 0]
         if len(good) >= 3:
             misfit[i] = float(np.median(results[good, kernels.NOISE]))
             scale[i] = float(np.median(results[good, kernels.RADIUS] / patches.radii[good]))
         if i > 0 and misfit[i] > 1.5 * misfit[i - 1]:
             break
+    best = _lowest(np.array(BLURS), misfit)
+    return float(misfit.min()), best, float(np.interp(best, BLURS, scale))
+
+
+def _lowest(tried: FloatArray, misfit: FloatArray) -> float:
+    """Where a misfit is least: a hyperbola about the right place, so its square is a parabola."""
     i = int(np.argmin(misfit))
-    if not np.isfinite(misfit[i]):
-        return Sharp(blur, 1.0, False, blur, 1.0)
-    best = float(blurs[i])
-    if 0 < i < len(blurs) - 1 and np.isfinite(misfit[i - 1 : i + 2]).all():
-        # Misfit is a hyperbola about the right blur, so its square is a parabola.
-        near = slice(i - 1, i + 2)
-        a, b, _ = np.polyfit(blurs[near], np.square(misfit[near]), 2)
+    near = slice(i - 1, i + 2)
+    if 0 < i < len(tried) - 1 and np.isfinite(misfit[near]).all():
+        a, b, _ = np.polyfit(tried[near], np.square(misfit[near]), 2)
         if a > 0:
-            best = float(np.clip(-b / (2.0 * a), blurs[i - 1], blurs[i + 1]))
-    apparent = float(np.interp(best, blurs, scale))
-    return Sharp(best, apparent, True, best, apparent)
+            return float(np.clip(-b / (2.0 * a), tried[i - 1], tried[i + 1]))
+    return float(tried[i])
 
 
 MISS_PX = 4.0
@@ -457,6 +478,7 @@ def _measured(
         behind = survey(patches.flat, alone)
         if behind.bend is not None:
             patches = replace(patches, flat=patches.flat - behind.bend)
+        patches = _evened(patches, behind, body)
     results = centroids(patches, patches.entire)
     patches = replace(patches, peaks=contrasts(results, patches), radii=patches.radii * sharp.scale)
     fitted = np.flatnonzero((windows.share > SHARE) & ~windows.whole)
@@ -471,7 +493,7 @@ def _measured(
     begun = fitted[results[fitted, kernels.OK] > 0]
     start[begun] = results[begun][:, [kernels.X, kernels.Y]]
     masks = usable(patches, fitted)
-    blur = sharp.blur
+    blur = sharp.blur, sharp.veil
     fitting = fits(replace(patches, offsets=start), fitted, blur, False, masks)
     taken = take(results, fitting, fitted, windows.whole.ravel())
     if alone is not None:
@@ -488,6 +510,20 @@ def _measured(
     if behind is not None:
         _discount(results, behind, patches.offsets)
     return _accept(results.reshape(n, k, -1), windows, patches.peaks.reshape(n, k), sharp)
+
+
+def _evened(patches: Patches, behind: Background, body: Float32Array | None) -> Patches:
+    """The windows with beads whose contrast is the same all over."""
+    found = centroids(patches, patches.entire)
+    seen = found[:, kernels.OK] > 0
+    level, thick = behind.plane[:, 0], body
+    if body is not None:
+        thick = np.asarray(body.reshape(-1, *patches.flat.shape[1:]))
+        level = level + thick[:, thick.shape[1] // 2, thick.shape[1] // 2]
+    shape = patches.windows.whole.shape
+    peaks = found[:, kernels.PEAK].reshape(shape)
+    slope = fading(peaks, level.reshape(shape), seen.reshape(shape))
+    return replace(patches, flat=evened(patches.flat, behind.plane, thick, slope))
 
 
 def _discount(results: FloatArray, behind: Background, expected: FloatArray) -> None:

@@ -360,10 +360,11 @@ def _likeness(image, x, y, radius, peak, cap, noise, plane, cx, cy):  # type: ig
 
 
 @linked
-def ball_table(radius, peak, blur, table, slope):  # type: ignore[no-untyped-def]
+def ball_table(radius, peak, blur, veil, table, slope):  # type: ignore[no-untyped-def]
     """Line integrals of a blurred ball along its radius in steps of 1/8 px, and their slope.
 
     The blur acts on intensities, before the logarithm, so a strong bead's spot looks smaller.
+    A veil is the part of the light about the ball that no ball takes away.
     """
     n = table.shape[0]
     half = math.ceil(3.0 * blur * 8.0)
@@ -376,6 +377,7 @@ def ball_table(radius, peak, blur, table, slope):  # type: ignore[no-untyped-def
     for k in range(n + half):
         d = k / (8.0 * radius)
         through[k] = math.exp(-peak * math.sqrt(1.0 - d * d)) if d < 1.0 else 1.0
+        through[k] = veil + (1.0 - veil) * through[k]
     for k in range(n):
         value = 0.0
         for i in range(-half, half + 1):
@@ -412,7 +414,7 @@ def _level(image, mask, masked, x, y, inner, outer):  # type: ignore[no-untyped-
 
 @serial
 def fit_ball(  # type: ignore[no-untyped-def]
-    image, mask, x0, y0, radius, stretch, peak, blur, sloped, free_radius, result
+    image, mask, x0, y0, radius, stretch, peak, blur, veil, sloped, free_radius, result
 ):
     """Fit a blurred ball to the usable part of a spot, weighted as photons count.
 
@@ -427,6 +429,8 @@ def fit_ball(  # type: ignore[no-untyped-def]
         stretch: (3,) direction of the major semi-axis (unit, column and row) and its ratio to the
             minor one.
         blur: standard deviation of the image's blur [px].
+        veil: part of the light about the spot that the ball does not take away however thick it
+            is: scattered light, or high energies.
         sloped: take the background's slope from the ring round the spot; else it is level.
         free_radius: estimate the radius too.
         result: filled as by `measure`; SCORE is the share of the spot used, NOISE the misfit as
@@ -441,10 +445,10 @@ def fit_ball(  # type: ignore[no-untyped-def]
     slope = np.empty(size)
     # Blur takes from the middle of a small ball, too: what is seen there is what it leaves.
     middle, through = int(1.6 * radius), peak
-    for _ in range(3):
-        ball_table(radius, through, blur, table, slope)
+    for _ in range(6):
+        ball_table(radius, through, blur, veil, table, slope)
         seen = table[middle] / math.sqrt(1.0 - (middle / (8.0 * radius)) ** 2)
-        through = min(through * peak / max(seen, 1e-9), 3.0 * peak)
+        through = min(through * peak / max(seen, 1e-9), 3.0 * peak / (1.0 - veil))
     masked = mask.shape[0] > 0
     base = _level(image, mask, masked, x0, y0, 1.12 * radius + 1.0, reach)
     plane = np.zeros(3)

@@ -38,12 +38,6 @@ SIZE = 0.04
 """Deviation of the spots' radii from the expected ones that betrays a wrong scale."""
 BLURRED = 0.6
 """By how much more they may deviate, by the square of the blur over the radius (measured)."""
-OPAQUE = 1.5
-"""Line integral through a ball from which what scatters into its shadow changes its size."""
-OR_OPAQUE = (
-    "; or the shadows of these nearly opaque balls are filled by scatter or by a wrong dark image: "
-    "take the dark image anew, or raise the voltage"
-)
 BODY = 0.5
 """Logarithm of the body's seen over its described attenuation from which that is said: beam
 hardening alone stays below."""
@@ -157,16 +151,15 @@ def judge_size(measured: Refined, radius_px: float) -> Finding | None:
             f"{radius_px:.1f} px wide: the beads' size is known to "
             f"{100 * (SIZE + BLURRED * blur**2):.0f} % only, and with it the phantom's scale",
         )
-    filled = measured.size > 1.0 and float(np.nanmedian(measured.contrast)) > OPAQUE
-    return _other_size(measured.size, OR_OPAQUE if filled else "")
+    return _other_size(measured.size)
 
 
-def _other_size(ratio: float, or_else: str = "") -> Finding:
+def _other_size(ratio: float) -> Finding:
     return error(
         "bead_size",
         f"the shadows are {100 * abs(ratio - 1):.0f} % {'larger' if ratio > 1 else 'smaller'} than "
         "those that the phantom's beads cast at the fitted geometry: beads of another size, or a "
-        f"phantom of another scale{or_else}",
+        "phantom of another scale",
     )
 
 
