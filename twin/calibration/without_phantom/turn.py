@@ -29,9 +29,9 @@ DARKEST: Final = 8.0
 """Line integral above which the noise is taken for that of this one."""
 MEDIAN_OF_CHI_SQUARE: Final = 0.4549
 """Of one degree of freedom."""
-ALIKE: Final = 0.3
-"""A frame is repeated where it differs from the one before by less than so much of what all but a
-tenth differ by, of what is usual there: the noise of two exposures remains (from drawn scans)."""
+WHITE: Final = 3.0
+"""Standard deviations of white noise's correlation up to which neighbouring pixels are not alike.
+From twice that on they are."""
 LOST: Final = 2.5
 """And above which one may be missing between them: with one missing it is about four."""
 STEPS: Final = 5.0
@@ -189,24 +189,38 @@ def _thumb(image: Float32Array) -> Float32Array:
 
 def _repeated(views: Float32Array, gaps: FloatArray) -> tuple[list[int], list[int]]:
     """Places of frames that show what the one before shows although the stage turned, and of those
-    that differ from it as if one were missing."""
+    that differ from it as if one were missing.
+
+    Two exposures of the same differ by noise alone, in which neighbouring pixels are not alike;
+    what a turn changes spreads over several.
+    """
     soft = gaussian_filter(views, (0, 2, 2))  # less noise: a copy may have been exposed anew
     rest = soft - np.roll(soft, 1, axis=0)
-    change = np.empty(len(views))
+    change, like = np.empty((2, len(views)))
     for i, (down, right) in enumerate(zip(*np.gradient(soft, axis=(1, 2)), strict=True)):
         # Frames that are shifted against each other change more than a turn makes them.
         slopes = np.stack([right.ravel(), down.ravel()], axis=1)
-        left = rest[i].ravel() - slopes @ np.linalg.lstsq(slopes, rest[i].ravel(), rcond=None)[0]
-        change[i] = np.square(left).mean(dtype=np.float64)
+        shifted = slopes @ np.linalg.lstsq(slopes, rest[i].ravel(), rcond=None)[0]
+        change[i] = np.square(rest[i].ravel() - shifted).mean(dtype=np.float64)
+        like[i] = _likeness(views[i] - views[i - 1] - shifted.reshape(soft[i].shape))
     # Usual for that part of the turn: a round body hardly changes where it turns back.
     usual = median_filter(change, 5, mode="wrap")
     turned = np.roll(gaps, 1) > 1e-6
     ratio = change / np.maximum(usual, 1e-30)
-    same = np.flatnonzero((ratio <= ALIKE * np.quantile(ratio, 0.1)) & turned)
+    limit = WHITE / math.sqrt(views[0].size)
+    white = (like <= limit) & (median_filter(like, 5, mode="wrap") > 2.0 * limit)
+    same = np.flatnonzero(white & (ratio <= np.quantile(ratio, 0.1)) & turned)
     if len(same) > len(views) // 4:
         return [], []
     jump = np.where(np.roll(gaps, 1) < 1.5 * np.median(gaps), ratio, 0.0)
     return same.tolist(), [int(jump.argmax())] if jump.max() > LOST else []
+
+
+def _likeness(image: FloatArray) -> float:
+    """Correlation of neighbouring pixels along rows or columns, whichever is larger; 0 of noise."""
+    own = image - image.mean()
+    along = [(own[1:] * own[:-1]).mean(), (own[:, 1:] * own[:, :-1]).mean()]
+    return float(max(along)) / max(float(np.square(own).mean()), 1e-30)
 
 
 def _step(
