@@ -57,7 +57,18 @@ from flexdt.twin.projection.kernels.fan_types import Box as VoxelBox
 from flexdt.twin.projection.mesh import TriangleMesh
 from flexdt.twin.projection.operators import box_of, voxel_rays
 from flexdt_extensions.bench import rtk_peer as rtk
-from flexdt_extensions.bench.benchmark import Document, line_of, load, machine, to_stderr
+from flexdt_extensions.bench.benchmark import (
+    Document,
+    Entry,
+    errors,
+    interleaved,
+    line_of,
+    load,
+    machine,
+    plain,
+    timed,
+    to_stderr,
+)
 from flexdt_extensions.bench.cases import (
     BINNED,
     C1_SHAPE,
@@ -69,7 +80,6 @@ from flexdt_extensions.bench.cases import (
     peer_cases,
     untuned_cases,
 )
-from flexdt_extensions.bench.measure import Entry, errors, interleaved, plain, timed
 from flexdt_extensions.bench.peers import absent
 
 ADJOINT = (

@@ -31,9 +31,8 @@ from flexdt_extensions.studies.algorithm_2 import (
     iterate,
     stacked,
 )
-from flexdt_extensions.studies.experiments import PIXEL_MM, SHAPE, unity_poses
+from flexdt_extensions.studies.experiments import PIXEL_MM, SHAPE, author, thesis, unity_poses
 from flexdt_extensions.studies.runs import Run, clean, fitted_run
-from flexdt_extensions.studies.thesis_tables import author, thesis
 
 STEPS: Final = np.array([STEP, STEP, STEP, SMALL_STEP, SMALL_STEP, SMALL_STEP])
 PHYSICAL: Final = np.array([1.0, 1.0, 1.0, 1.0, 1.0, -1.0])

@@ -29,10 +29,9 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.physics import EffectiveBeam
 from flexdt.twin.projection import Scene, Sphere, Volume, project_materials
 from flexdt.twin.reconstruction import fdk
-from flexdt_extensions.studies.experiments import SHAPE, unity_poses
+from flexdt_extensions.studies.experiments import SHAPE, thesis, unity_poses
 from flexdt_extensions.studies.rendered_runs import line_integrals, photons
 from flexdt_extensions.studies.runs import Run, fitted_run
-from flexdt_extensions.studies.thesis_tables import thesis
 
 FRAMES: Final = 120
 """Frames of a scan here (the thesis took 1434 and 360)."""

@@ -24,9 +24,8 @@ from flexdt.clients.cli.entry import run
 from flexdt.clients.failure import CommandError
 from flexdt.twin.physics.exposure import expose, ideal_response
 from flexdt.twin.projection import project_scene
-from flexdt_extensions.batch.batch_plan import Plan, parse_plan, read_plan
+from flexdt_extensions.batch.batch_plan import Plan, parse, parse_plan, read_plan
 from flexdt_extensions.batch.batch_run import figures, run_batch
-from flexdt_extensions.batch.draws import parse
 from flexdt_extensions.batch.work import draw_item, item_bytes, layout, run_item, seed_of
 from flexdt_extensions.executors import Slurm, job_script, read_slurm
 

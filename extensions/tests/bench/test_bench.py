@@ -17,6 +17,7 @@ from loaded_script import load
 from flexdt.clients.cli.entry import run as run_command
 from flexdt.twin.projection import forward, gpu
 from flexdt_extensions.bench import benchmark as run
+from flexdt_extensions.bench.benchmark import errors, exact_images, interleaved, sorted_crossings
 from flexdt_extensions.bench.cases import (
     Case,
     circle,
@@ -24,7 +25,6 @@ from flexdt_extensions.bench.cases import (
     peer_cases,
     untuned_cases,
 )
-from flexdt_extensions.bench.measure import errors, exact_images, interleaved, sorted_crossings
 from flexdt_extensions.bench.peers import Peer
 
 SHAPE = (30, 40)

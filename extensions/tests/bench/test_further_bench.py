@@ -11,8 +11,8 @@ import pytest
 
 from flexdt.twin.projection import project_mesh, project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
+from flexdt_extensions.bench.benchmark import errors, interleaved
 from flexdt_extensions.bench.cases import Case, circle, noise
-from flexdt_extensions.bench.measure import errors, interleaved
 
 SHAPE = (30, 40)
 
