@@ -26,8 +26,15 @@ from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import Volume, back, forward
-from flexdt_extensions.bench.benchmark import errors, exact_images, interleaved
-from flexdt_extensions.bench.cases import BINNED, C1_SHAPE, circle, noise
+from flexdt_extensions.bench.benchmark import (
+    BINNED,
+    C1_SHAPE,
+    circle,
+    errors,
+    exact_images,
+    interleaved,
+    noise,
+)
 
 SIZES = {"C1": (C1_SHAPE, 0.1), "512^3": ((512,) * 3, 0.1), "1024^3": ((1024,) * 3, 0.05)}
 COUNTS = (1, 36, 360)

@@ -10,16 +10,18 @@ height at which a block holds beads.
 from __future__ import annotations
 
 import html
+import io
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+import numpy.typing as npt
 
-from flexdt.clients.figures import page, require_plots, table
+from flexdt.clients.figures import COLOURS, DPI, blank, page, require_plots, svg, table
 from flexdt.extending import CommandError
 from flexdt.phantoms import Phantom, cuboid_with_beads, spiral_positions
 from flexdt.phantoms.bricks import Brickwork, lego_phantom
@@ -35,27 +37,14 @@ from flexdt_extensions.phantom_design.bead_search import (
     share_identified,
 )
 from flexdt_extensions.phantom_design.information_table import CRITERIA, Criterion, PlannedScans
-from flexdt_extensions.phantom_design.seats import grid_seats, seats_of, stack_phantom
+from flexdt_extensions.phantom_design.seats import grid_seats, seats_of, stack_phantom, tubes_at
 
 if TYPE_CHECKING:
     import trimesh
-
-    from flexdt.twin.machine.description import Machine, Profile
-import io
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
-
-import numpy.typing as npt
-
-from flexdt.clients.figures import COLOURS, DPI, blank, svg
-from flexdt_extensions.phantom_design.seats import tubes_at
-
-if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from flexdt.phantoms.bricks import Brickwork
-
+    from flexdt.twin.machine.description import Machine, Profile
 
 Tell = Callable[[str], None]
 GRID_STEP_MM = 4.0
@@ -294,7 +283,7 @@ def _phantom(body: BeadHolder, found: Design, request: DesignRequest) -> Phantom
     return replace(made, assumed=(f"body of {body.material}, beads of {request.bead_material}",))
 
 
-def _spiral(body: BeadHolder, request: DesignRequest) -> tuple[np.typing.NDArray[np.float64], str]:
+def _spiral(body: BeadHolder, request: DesignRequest) -> tuple[npt.NDArray[np.float64], str]:
     """The thesis's beads for the same body and number, to compare with."""
     if body.bricks == Brickwork() and request.beads == 5:
         return lego_phantom().beads, "lego (thesis 6.5.1)"

@@ -28,7 +28,6 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.physics import Chain, Detector, EffectiveBeam, effective_beam, weights_of
 from flexdt_extensions.executors import executor
 from flexdt_extensions.studies import experiment_4 as real
-from flexdt_extensions.studies import experiment_4_images as real_images
 from flexdt_extensions.studies.algorithm_2 import algorithm_2
 from flexdt_extensions.studies.experiments import (
     DAMPING,
@@ -251,7 +250,7 @@ def run_study(
             case "basin", _:
                 runs, more = _basin(spread, say, fidelity, seed)
             case "real", "images":
-                runs, more = real_images_runs(spread, say, seed, counts or real_images.COUNTS)
+                runs, more = real_images_runs(spread, say, seed, counts or real.COUNTS)
             case "real", _:
                 runs, more = _real(spread, say, fidelity, seed, counts)
             case _:
@@ -378,7 +377,7 @@ def real_images_task(task: tuple[str, BeadModel, int, int, Sequence[int]]) -> li
     """One scan: (name, beads as found, seed, frames, counts)."""
     name, found, seed, frames, counts = task
     phantom = load_phantom("lego")
-    return real_images.image_runs(
+    return real.image_runs(
         name, phantom.scene, bead_model(phantom), found, lego_beam(), seed, frames=frames,
         counts=counts,
     )  # fmt: skip
@@ -390,7 +389,7 @@ def real_images_runs(
     seed: int,
     counts: Sequence[int],
     scans: Sequence[str] | None = None,
-    frames: int = real_images.FRAMES,
+    frames: int = real.FRAMES,
 ) -> tuple[list[Run], Document]:
     """Experiment 4 on images: the first scan gives the beads, all are calibrated with them.
 
@@ -404,9 +403,9 @@ def real_images_runs(
     """
     phantom = load_phantom("lego")
     model = bead_model(phantom)
-    found, _ = real_images.first_scan("Scan1", phantom.scene, model, lego_beam(), seed, frames)
-    truth = real_images.hidden_phantom(phantom.scene, model, seed)[1]
+    found, _ = real.first_scan("Scan1", phantom.scene, model, lego_beam(), seed, frames)
+    truth = real.hidden_phantom(phantom.scene, model, seed)[1]
     names = real.scan_names() if scans is None else scans
     work = [(name, found, seed, frames, tuple(counts)) for name in names]
     runs = _collected(spread(real_images_task, work), names, say)
-    return runs, {"beads_off_truth_mm": real_images.off_truth(found, truth).tolist()}
+    return runs, {"beads_off_truth_mm": real.off_truth(found, truth).tolist()}

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 import flexdt as fx
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.failure import CommandError
 from flexdt.twin.physics.exposure import expose, ideal_response
 from flexdt.twin.projection import project_scene
@@ -588,7 +588,7 @@ def test_without_the_extra_one_line_says_what_to_install(
 ) -> None:
     code = (
         "import sys; sys.modules['zarr'] = None\n"
-        "from flexdt.clients.cli.entry import run\n"
+        "from flexdt.clients.cli.command_tree import run\n"
         f"sys.exit(run(['batch', {str(plan_file())!r}, '--out', {str(tmp_path / 'out')!r}]))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)

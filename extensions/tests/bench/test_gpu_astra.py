@@ -26,7 +26,7 @@ def circle(n: int, sod: float, sdd: float, pixel: float, roll: float = 0.0) -> f
 def test_probing_without_a_device_answers_and_touches_no_astra() -> None:
     code = (
         "import sys; from flexdt.twin.projection import gpu; "
-        "from flexdt_extensions.bench import gpu_astra; "
+        "from flexdt_extensions.bench import device_page; "
         "print(gpu.availability()); assert 'astra' not in sys.modules"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)

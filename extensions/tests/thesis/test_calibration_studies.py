@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexdt.clients.cli.entry import run as command
+from flexdt.clients.cli.command_tree import run as command
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import bead_model
 from flexdt.twin.errors import UnknownNameError
-from flexdt_extensions.studies.experiment_4_images import hidden_phantom, off_truth
+from flexdt_extensions.studies.experiment_4 import hidden_phantom, off_truth
 from flexdt_extensions.studies.experiments import (
     EXPERIMENTS,
     WorkUnit,

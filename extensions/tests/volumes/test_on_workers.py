@@ -16,7 +16,7 @@ import pytest
 import zarr
 
 import flexdt as fx
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.reconstruction.reconstruct import VolumeRequest as Request
 from flexdt.clients.reconstruction.reconstruct import reconstruct_dataset
