@@ -35,19 +35,11 @@ from flexdt.clients.client.twin_methods import FINAL_STATES
 from flexdt.clients.gateway.vocabulary import Refusal
 from flexdt.protocol.rpc_errors import RpcError
 from flexdt.protocol.state_model import AxisState, JobStatus, State
-from flexdt.runtime.files.dataset_folder import free_name, read_document, tiff_bytes
+from flexdt.runtime.files.dataset_folder import free_name, put_texts, read_document, tiff_bytes
 from flexdt.runtime.files.directory import Directory, open_data
-from flexdt.twin.dataset.dataset_errors import (
-    DOCUMENT,
-    SCAN_SETTINGS,
-    SCRIPT,
-    XRE_SETTINGS,
-    DatasetError,
-)
-from flexdt.twin.dataset.flexdt_json import DatasetDocument, FrameEntry
+from flexdt.twin.dataset.dataset_errors import SCRIPT, DatasetError
+from flexdt.twin.dataset.flexdt_json import FrameEntry
 from flexdt.twin.dataset.record import FrameBlock, FrameKind, ScanRecord
-from flexdt.twin.dataset.scan_settings_text import format_scan_settings
-from flexdt.twin.dataset.xre import format_xre
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine, Profile, builtin_machine, profile_of
@@ -205,11 +197,8 @@ class Recording:
         text = "\r\n".join([*self.transcript, ""])
         self._folder.put(SCRIPT, text.encode("utf-8", "surrogateescape"))
         record = self._record()
-        if record is None:
-            return
-        self._folder.put(SCAN_SETTINGS, format_scan_settings(record).encode("utf-8"))
-        self._folder.put(XRE_SETTINGS, format_xre(record).encode("utf-8"))
-        self._folder.put(DOCUMENT, DatasetDocument.of(record).to_json().encode("utf-8"))
+        if record is not None:
+            put_texts(self._folder, record)
 
     def _record(self) -> ScanRecord | None:
         if self._machine is None or self._profile is None:

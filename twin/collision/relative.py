@@ -10,11 +10,11 @@ A path is all motors over an interval of time, cut where any of them changes its
 Within a segment every motor has constant acceleration and does not reverse, so its displacement is
 one quadratic.
 
-`sweep` finds the first contact and the least clearance of one pair of bodies along their relative
-motion. It advances from certified gap to certified gap, so motion that counts as free keeps the
-margin everywhere, not only where it was evaluated: clearance >= margin along everything before the
-reported contact. A contact is reported where the certified gap is within `tolerance` of the margin.
-A pair that is as near as that when a motion begins keeps to its floor instead
+`sweep_pair` finds the first contact and the least clearance of one pair of bodies along their
+relative motion. It advances from certified gap to certified gap, so motion that counts as free
+keeps the margin everywhere, not only where it was evaluated: clearance >= margin along everything
+before the reported contact. A contact is reported where the certified gap is within `tolerance` of
+the margin. A pair that is as near as that when a motion begins keeps to its floor instead
 (`twin.scanner.safety.floor`), which depends on the gap alone, so that no number of motions wears it
 down.
 """
