@@ -47,9 +47,8 @@ from flexdt.clients import FINAL_STATES, CheckResult, JobStatus, RpcError
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import Machine, Profile, builtin_machine, profile_of
 from flexdt.twin.script import ScanRequest, compose_script, parse_script, plan_script
-from flexdt_extensions.bluesky.axes import LimitsExceeded
 from flexdt_extensions.bluesky.camera_device import Announcements, tiff_stream
-from flexdt_extensions.bluesky.lab_connection import LabConnection
+from flexdt_extensions.bluesky.lab_connection import LabConnection, LimitsExceeded
 
 
 @dataclass(frozen=True)
