@@ -31,7 +31,7 @@ from flexdt.twin.dataset import rebuild
 from flexdt.twin.dataset.xre import parse_xre
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine import description as d
-from flexdt.twin.machine.fitted_file import fitted_text
+from flexdt.twin.machine.machine_files import fitted_text
 from flexdt.twin.script.executed_log import Executed
 from flexdt.twin.script.grammar import own_name
 from flexdt.twin.script.parse import read_script

@@ -13,10 +13,10 @@ from typing import Final
 
 MOVED: Final = {
     "flexdt.clients.batch": "flexdt_extensions.batch",
-    "flexdt.clients.calibration.build_sheet": "flexdt_extensions.phantom_design.build_sheet",
+    "flexdt.clients.calibration.build_sheet": "flexdt_extensions.phantom_design.phantom_design",
     "flexdt.clients.calibration.phantom_design": "flexdt_extensions.phantom_design.phantom_design",
-    "flexdt.clients.reconstruction.on_workers": "flexdt_extensions.volumes.on_workers",
-    "flexdt.clients.reconstruction.zarr_volume": "flexdt_extensions.volumes.zarr_volume",
+    "flexdt.clients.reconstruction.on_workers": "flexdt_extensions.fdk_on_workers",
+    "flexdt.clients.reconstruction.zarr_volume": "flexdt_extensions.fdk_on_workers",
     "flexdt.clients.scenario": "flexdt_extensions.ctsimu.scenario",
     "flexdt.clients.studies": "flexdt_extensions.studies",
     "flexdt.server.files": "flexdt.runtime.files",
@@ -29,7 +29,7 @@ MOVED: Final = {
     "flexdt.twin.exchange.ctsimu": "flexdt_extensions.ctsimu.ctsimu_write",
     "flexdt.twin.exchange.ctsimu_read": "flexdt_extensions.ctsimu.ctsimu_read",
     "flexdt.twin.exchange.ctsimu_scan": "flexdt_extensions.ctsimu.ctsimu_scan",
-    "flexdt.twin.projection.gpu_astra": "flexdt_extensions.bench.gpu_astra",
+    "flexdt.twin.projection.gpu_astra": "flexdt_extensions.bench.device_page",
     "flexdt.twin.physics.apparatus": "flexdt.twin.physics.detector",
     "flexdt.twin.physics.panel": "flexdt.twin.physics.detector",
     "flexdt.clients.lab": "flexdt_extensions.bluesky",

@@ -14,6 +14,6 @@ __all__ = ["main"]
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of the command line; leaves with INTERFACE's exit code."""
-    from flexdt.clients.cli.entry import run
+    from flexdt.clients.cli.command_tree import run
 
     sys.exit(run(sys.argv[1:] if argv is None else list(argv)))

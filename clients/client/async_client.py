@@ -1,21 +1,244 @@
 """`AsyncTwinClient`: the twin server's methods as coroutines, any number of them at once.
 
 It has the methods, results and policy of `TwinClient`, which waits for it in another thread.
+
+Below is a client's connection policy: greet, reconnect with back-off, subscribe again. A call that
+only reads is repeated after a reconnect. One that acts is repeated only if it was never sent;
+otherwise the caller gets an error that says that its outcome is unknown. So no move is ever
+repeated silently.
 """
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import ssl as tls
-from typing import TypeVar
+from collections.abc import Iterator, Mapping
+from typing import Final, Protocol, TypeVar
 
 from flexdt.clients.client.events import AsyncSubscription
-from flexdt.clients.client.flows import Flow, adrive
-from flexdt.clients.client.policy import Core
+from flexdt.clients.client.flows import Ask, Flow, adrive
 from flexdt.clients.client.shared_methods import SharedMethods
-from flexdt.clients.client.transport import TcpTransport, Transport
+from flexdt.clients.client.transport import ConnectionLost, Link, TcpTransport, Transport
 from flexdt.clients.client.twin_methods import Kind, Topic
+from flexdt.protocol import METHODS, RpcError, hello_params, parse_result
 from flexdt.protocol.methods.session_messages import HelloResult
 from flexdt.twin.signatures import public
+
+FIRST_PAUSE_S: Final = 0.05
+LONGEST_PAUSE_S: Final = 1.0
+ATTEMPTS: Final = 3
+
+
+def back_off(first_s: float = FIRST_PAUSE_S) -> Iterator[float]:
+    """Pauses between attempts to connect [s]: each twice the one before, at most a second."""
+    pause = first_s
+    while True:
+        yield pause
+        pause = min(2 * pause, LONGEST_PAUSE_S)
+
+
+class Listener(Protocol):
+    """Receives the events of its topics."""
+
+    topics: tuple[str, ...]
+
+    def put(self, params: Mapping[str, object]) -> None:
+        """Take an event's params."""
+
+    def connection_lost(self) -> None:
+        """The connection has ended; the client may reconnect."""
+
+    def end(self) -> None:
+        """No more events will come."""
+
+
+class Core:
+    """A client's connection and what it keeps between calls.
+
+    Args:
+        transport: to the server.
+        name: of this program, for people who look at the server.
+        token: where the server requires one.
+        timeout_s: for an answer [s].
+        reconnect_s: how long to try after a connection has been lost [s].
+        wait_s: how long to try the first time, for a server that is just starting [s].
+
+    Attributes:
+        hello: the server's answer to the newest greeting; None before the first.
+        link: the newest connection, which may have ended.
+        closed: whether the client has been closed for good.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        *,
+        name: str,
+        token: str | None,
+        timeout_s: float,
+        reconnect_s: float,
+        wait_s: float,
+    ) -> None:
+        self.transport, self._name, self._token = transport, name, token
+        self.timeout_s, self.reconnect_s, self.wait_s = timeout_s, reconnect_s, wait_s
+        self.hello: HelloResult | None = None
+        self.link: Link | None = None
+        self.closed = False
+        self._listeners: dict[Listener, Mapping[str, object]] = {}
+        self._connecting = asyncio.Lock()
+
+    async def connected(self) -> Link:
+        """A link that is alive.
+
+        Raises:
+            ConnectionLost: no server answers, or the client is closed.
+            RpcError: the server refuses the client.
+        """
+        if not self.closed and self.link is not None and self.link.alive:
+            return self.link
+        async with self._connecting:
+            return await self._join()
+
+    async def call(self, asked: Ask) -> object:
+        """The result of a method, not yet decoded.
+
+        Raises:
+            RpcError: the server's answer is an error.
+            ConnectionLost: the server cannot be reached, or was lost during a call that acts.
+            TimeoutError: no answer in time.
+        """
+        patience = asked.patience_s
+        limit = self.timeout_s if patience is not None and patience < 0 else patience
+        for attempt in range(ATTEMPTS):
+            link = await self.connected()
+            try:
+                return await link.request(asked.method, asked.params, limit)
+            except ConnectionLost as lost:
+                if attempt == ATTEMPTS - 1 or self.closed:
+                    raise
+                if lost.sent and not METHODS[asked.method].safe:
+                    raise ConnectionLost(
+                        f"{lost} during {asked.method}: it is not known whether it was carried "
+                        "out; it was not repeated",
+                        sent=True,
+                    ) from lost
+        raise AssertionError("unreachable")
+
+    async def subscribe(self, listener: Listener, options: Mapping[str, object]) -> None:
+        """Send `listener` its topics' events, also after reconnects.
+
+        Raises:
+            ValueError: another listener follows one of the topics with other options; the server
+                keeps one set of options for each topic of a connection.
+        """
+        params = {
+            "topics": list(listener.topics),
+            **{k: v for k, v in options.items() if v is not None},
+        }
+        self.follow(listener, params)
+        try:
+            await self.call(Ask("state.subscribe", params))
+        except BaseException:
+            self._listeners.pop(listener, None)
+            raise
+
+    def follow(self, listener: Listener, params: Mapping[str, object]) -> None:
+        """Have `listener` subscribed with these params whenever a connection is made.
+
+        Raises:
+            ValueError: as `subscribe`.
+        """
+        for other, theirs in self._listeners.items():
+            for topic in set(listener.topics) & set(other.topics):
+                _require_same(topic, params, theirs)
+        self._listeners[listener] = params
+
+    async def unsubscribe(self, listener: Listener) -> None:
+        """Send it no more events; cancel topics without another listener at the server."""
+        self._listeners.pop(listener, None)
+        still = {topic for other in self._listeners for topic in other.topics}
+        gone = [topic for topic in listener.topics if topic not in still]
+        if gone and self.link is not None and self.link.alive:
+            # If this fails, the connection has ended and the subscriptions with it.
+            with contextlib.suppress(ConnectionLost, TimeoutError, RpcError):
+                await self.link.request("state.unsubscribe", {"topics": gone}, self.timeout_s)
+
+    async def close(self) -> None:
+        """End the connection and all subscriptions."""
+        self.closed = True
+        listeners = list(self._listeners)
+        self._listeners.clear()
+        for listener in listeners:
+            listener.end()
+        await self.disconnect()
+
+    async def disconnect(self) -> None:
+        """End the connection; another one may be made, with the same subscriptions."""
+        link, self.link = self.link, None
+        if link is not None:
+            await link.close()
+
+    def _deliver(self, params: Mapping[str, object]) -> None:
+        """Pass an event's params to its listeners."""
+        topic = params.get("topic")
+        for listener in list(self._listeners):
+            if topic in listener.topics:
+                listener.put(params)
+
+    def _ended(self) -> None:
+        """Tell the listeners that the connection has ended."""
+        for listener in list(self._listeners):
+            listener.connection_lost()
+
+    async def _join(self) -> Link:
+        """Connect, unless another call has done so meanwhile."""
+        clock = asyncio.get_running_loop().time
+        deadline = clock() + (self.wait_s if self.hello is None else self.reconnect_s)
+        pauses = back_off()
+        while True:
+            if self.closed:
+                raise ConnectionLost("the client is closed")
+            if self.link is not None and self.link.alive:
+                return self.link
+            try:
+                self.link = await self._greet()
+            except ConnectionLost:
+                pause = next(pauses)
+                if clock() + pause > deadline:
+                    raise
+                await asyncio.sleep(pause)
+
+    async def _greet(self) -> Link:
+        await self.transport.open()
+        link = Link(self.transport, self._deliver, self._ended)
+        try:
+            params = hello_params(self._name, self._token)
+            answer = await link.request("session.hello", params, self.timeout_s)
+            hello = parse_result(HelloResult, answer)
+            for wanted in list(self._listeners.values()):
+                await link.request("state.subscribe", wanted, self.timeout_s)
+            if self.closed:  # by another thread or task, meanwhile
+                raise ConnectionLost("the client is closed")
+        except BaseException as error:
+            await link.close()
+            if isinstance(error, ConnectionLost) and link.calls.reason is not None:
+                # The server said why it ends the connection: trying again is no help.
+                raise link.calls.reason from None
+            raise
+        self.hello = hello
+        return link
+
+
+def _require_same(topic: str, asked: Mapping[str, object], known: Mapping[str, object]) -> None:
+    view = ("projection_kind", "projection_binning") if topic == "projection" else ()
+    for name in ("max_rate_hz", *view):
+        if asked.get(name) != known.get(name):
+            raise ValueError(
+                f"{topic} with {name} {asked.get(name)}: this client follows it with "
+                f"{known.get(name)} already; use the same, or another client"
+            )
+
 
 _R = TypeVar("_R")
 

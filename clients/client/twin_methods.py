@@ -22,7 +22,7 @@ from flexdt.clients.client.flows import OWN_PATIENCE, Flow, Sleep, Tell, ask
 from flexdt.protocol import image as wire_image
 from flexdt.protocol import state_model as s
 from flexdt.protocol.methods import calibration_messages as corrections
-from flexdt.protocol.methods import dataset_messages as past_scans
+from flexdt.protocol.methods import calibration_messages as past_scans
 from flexdt.protocol.methods import document_messages as documents
 from flexdt.protocol.methods import image_messages as images
 from flexdt.protocol.methods import job_messages as scans

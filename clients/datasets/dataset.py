@@ -18,8 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.clients.datasets.data_set import DataSet
-from flexdt.clients.datasets.foreign_files import open_file
-from flexdt.clients.datasets.listed_images import NO_DARK, by_numbers, doubts, listed
+from flexdt.clients.datasets.foreign_files import NO_DARK, by_numbers, doubts, listed, open_file
 from flexdt.runtime.files.dataset_folder import (
     Folder,
     list_folder,

@@ -1,15 +1,18 @@
 """Scans in files of other programs: Nikon's .xtekct, Zeiss's .txrm and NXtomo.
 
-Nikon (as CIL's NikonDataReader 25.0 reads it, Apache-2.0; https://github.com/TomographicImaging/CIL):
-images are seen from behind the panel, column 0 at the right as seen from the source; the stage
-turns clockwise by `AngularStep` a view; images are counts under an open beam of `WhiteLevel`; the
-axis stands `ObjectOffsetX` to the left of the line from the source to the panel's middle.
+Nikon (as CIL's NikonDataReader 25.0 reads it, Apache-2.0;
+https://github.com/TomographicImaging/CIL): images are seen from behind the panel, column 0 at the
+right as seen from the source; the stage turns clockwise by `AngularStep` a view; images are counts
+under an open beam of `WhiteLevel`; the axis stands `ObjectOffsetX` to the left of the line from the
+source to the panel's middle.
 
 Zeiss (signs on which CIL's ZEISSDataReader 26.0, dxchange, xrmreader and mbirjax agree): row 0 is
 the lowest, column 0 the left one as seen from the source; the stage turns anticlockwise by `Angles`
 [deg] seen from above; `PixelSize` [um] is that of a pixel at the axis; shifts [pixels] take an
 image to higher columns and rows; counts are not divided by the reference, an image of the open
 beam, and nothing is left to subtract from either.
+
+Data sets of images that are named one by one are `DataSet`s like any other.
 """
 
 from __future__ import annotations
@@ -25,13 +28,69 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.clients.datasets.data_set import Arrays, DataSet
-from flexdt.clients.datasets.listed_images import by_numbers, listed
 from flexdt.clients.extras import package
-from flexdt.runtime.files.dataset_folder import list_folder, opened
-from flexdt.twin.dataset.dataset_errors import DatasetFormatError
+from flexdt.runtime.files.dataset_folder import Folder, list_folder, opened, read_image
+from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
+
+NO_DARK: Final = "no dark image"
+
+
+def by_numbers(name: str) -> list[tuple[int, str]]:
+    """Order of names in which 10 comes after 9."""
+    parts = re.split(r"(\d+)", name)
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
+
+
+def listed(
+    content: Folder,
+    geometry: ConeVec,
+    names: Sequence[str],
+    darks: Sequence[str],
+    flats: Sequence[str],
+    name: str = "",
+) -> DataSet:
+    """The data set of images named one by one, (rows, cols) as the first that is there.
+
+    Raises:
+        DatasetError: none is there, or the geometry has another number of views or another shape.
+    """
+    there = [n for n in names if n in content.names]
+    if not there:
+        raise DatasetMissingError(
+            f"{content.path}: no projections ({', '.join(names[:1]) or 'none is listed'} ...)",
+            {"path": str(content.path), "missing": list(names[:100])},
+        )
+    if len(names) != len(geometry):
+        raise DatasetFormatError(
+            f"{content.path}: {len(names)} projections and {len(geometry)} views; allowed: as many "
+            "of both",
+            {"path": str(content.path), "asked": len(geometry), "allowed": len(names)},
+        )
+    rows, cols = read_image(content.path / there[0]).shape
+    geometry = geometry.with_shape(geometry.of_shape((rows, cols)))
+    lost = content.lost(names)
+    return DataSet(
+        name or content.path.name,
+        content.frames(names, [(rows, cols)] * len(names)),
+        (rows, cols),
+        geometry,
+        None,
+        content.path,
+        content.paths(darks),
+        content.paths(flats),
+        complete=not lost,
+        reason=lost,
+        warnings=tuple(doubts(darks)),
+    )
+
+
+def doubts(darks: Sequence[str]) -> list[str]:
+    """What to say of a data set with these dark images."""
+    return [] if darks else [f"{NO_DARK} (di000000.tif): zero is taken"]
+
 
 NXTOMO: Final = (".nx", ".nxs", ".h5", ".hdf5")
 KINDS: Final = {3: "u1", 5: "<u2", 10: "<f4"}

@@ -14,8 +14,13 @@ from typing import Any, Final
 import numpy as np
 
 from flexdt.clients.client import twin_methods as m
-from flexdt.clients.gateway.connected_twin import POLL_S, Armed, CommandProgress, ConnectedTwin
-from flexdt.clients.gateway.recording import Image
+from flexdt.clients.gateway.connected_twin import (
+    POLL_S,
+    Armed,
+    CommandProgress,
+    ConnectedTwin,
+    Image,
+)
 from flexdt.clients.gateway.vocabulary import (
     AbortScript,
     Question,

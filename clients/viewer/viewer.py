@@ -36,8 +36,8 @@ from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.labels import NameTags
 from flexdt.clients.viewer.scenes.layers import Shown
 from flexdt.clients.viewer.scenes.sample import NOTHING, MeshCache, SampleLook
+from flexdt.clients.viewer.scenes.still import Stills
 from flexdt.clients.viewer.scenes.world import World, beads_on, world_of
-from flexdt.clients.viewer.stills import Stills
 from flexdt.clients.viewer.viser_gate import Scenes
 from flexdt.clients.viewer.volume_process import LiveReconstruction
 from flexdt.protocol import RpcError

@@ -57,19 +57,27 @@ from flexdt.twin.projection.kernels.fan_types import Box as VoxelBox
 from flexdt.twin.projection.mesh import TriangleMesh
 from flexdt.twin.projection.operators import box_of, voxel_rays
 from flexdt_extensions.bench import rtk_peer as rtk
-from flexdt_extensions.bench.benchmark import Document, line_of, load, machine, to_stderr
-from flexdt_extensions.bench.cases import (
+from flexdt_extensions.bench.benchmark import (
     BINNED,
     C1_SHAPE,
     FULL,
     NONE,
     TILT_DEG,
+    Document,
+    Entry,
     circle,
+    errors,
+    interleaved,
+    line_of,
+    load,
+    machine,
     noise,
     peer_cases,
+    plain,
+    timed,
+    to_stderr,
     untuned_cases,
 )
-from flexdt_extensions.bench.measure import Entry, errors, interleaved, plain, timed
 from flexdt_extensions.bench.peers import absent
 
 ADJOINT = (
@@ -199,7 +207,7 @@ def cold_start() -> list[Entry]:
     """
     code = (
         "import time; t = time.perf_counter(); "
-        "from flexdt_extensions.bench.cases import BINNED, circle; "
+        "from flexdt_extensions.bench.benchmark import BINNED, circle; "
         "from flexdt.twin.projection import Volume, forward; import numpy as np; "
         "v = Volume(np.ones((8, 8, 8), np.float32), 0.1); "
         "forward(v, circle(1, BINNED), BINNED); print(time.perf_counter() - t)"
@@ -237,7 +245,7 @@ def through_server() -> list[Entry]:
 
 
 async def _through(host: str, port: int) -> list[Entry]:
-    from flexdt.server.imaging.projector_client import ProjectorClient
+    from flexdt.server.imaging.projector_pool import ProjectorClient
 
     volume, view = noise(C1_SHAPE), circle(1, BINNED)
     out = np.empty((1, *BINNED), np.float32)

@@ -23,7 +23,7 @@ from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection.analytic_solids import Box, Scene, Solid, Sphere
-from flexdt_extensions.studies.experiment_4_images import moved_beads
+from flexdt_extensions.studies.experiment_4 import moved_beads
 from flexdt_extensions.studies.experiments import SHAPE
 from flexdt_extensions.studies.rendered_runs import Rendering
 

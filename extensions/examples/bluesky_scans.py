@@ -26,7 +26,7 @@ from ophyd_async.core import StaticPathProvider, UUIDFilenameProvider, init_devi
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.script import ScanRequest
 from flexdt_extensions.bluesky import FlyScan, LimitsExceeded, TwinLab
-from flexdt_extensions.bluesky.bluesky_plans import fly_scan
+from flexdt_extensions.bluesky.flyer import fly_scan
 
 SMALL = Roi(800, 620, 1199, 939)
 

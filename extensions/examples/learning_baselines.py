@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from flexdt_extensions.learning.policies import POLICIES, play
-from flexdt_extensions.learning.scanning import ScanEnv
+from flexdt_extensions.learning.scanning import POLICIES, ScanEnv, play
 
 COLOURS = {"random": "#5f6c7b", "equidistant": "#1b6ca8", "greedy": "#c8553d"}
 

@@ -7,6 +7,8 @@ node, and each worker has one thread.
 
 Items travel to the workers and their arrays travel back, so nodes need flexdt installed but no
 shared folder.
+
+The TOML files of batches and SLURM jobs are read here; errors name file, key path and value.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import logging
 import os
 import signal
 import threading
+import tomllib
 from collections.abc import Iterator, Mapping
 from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -24,11 +27,35 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 from annotated_types import Ge
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
-from flexdt.extending import CommandError, package
+from flexdt.extending import CommandError, message_of, package
 from flexdt.twin.errors import TwinError
-from flexdt_extensions.toml_files import problems_of, read_toml
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The content of a TOML file.
+
+    Raises:
+        CommandError: no TOML.
+        OSError: the file cannot be read.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise CommandError(f"{path}: no TOML: {error}") from None
+
+
+def problems_of(name: str, error: ValidationError) -> list[str]:
+    """What is wrong in a document, line by line, with key paths."""
+    lines = []
+    for e in error.errors(include_url=False, include_context=False):
+        path = ".".join(str(part) for part in e["loc"]) or "plan"
+        message = message_of(e)
+        shown = "" if isinstance(e["input"], dict | BaseModel) else f" (got {e['input']!r})"
+        lines.append(f"{name}: {path}: {message}{'' if 'got' in message else shown}")
+    return lines
+
 
 _NUMBERED: Final = ("NUMBA_NUM", "OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "VECLIB_MAXIMUM")
 SINGLE: Final[Mapping[str, str]] = {f"{name}_THREADS": "1" for name in _NUMBERED}

@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 from flexdt.clients import extras
-from flexdt.clients.cli.command_tree import GROUP, KNOWN
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import GROUP, KNOWN, run
 
 Run = Callable[..., tuple[int, str, str]]
 

@@ -16,9 +16,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from flexdt.testing.in_process import Deadlock as Deadlock
     from flexdt.testing.in_process import InProcessTwin as InProcessTwin
     from flexdt.testing.in_process import twin as twin
-    from flexdt.testing.virtual_time import Deadlock as Deadlock
 
 __all__ = ["Deadlock", "InProcessTwin", "twin"]
 

@@ -14,7 +14,6 @@ from pydantic.json_schema import models_json_schema
 
 from flexdt.protocol.method import PROTOCOL, AnyMethod, Method
 from flexdt.protocol.methods import calibration_messages as calibration
-from flexdt.protocol.methods import dataset_messages as datasets
 from flexdt.protocol.methods import document_messages as documents
 from flexdt.protocol.methods import image_messages as images
 from flexdt.protocol.methods import job_messages as jobs
@@ -23,7 +22,7 @@ from flexdt.protocol.methods import sample_messages as samples
 from flexdt.protocol.methods import session_messages as session
 from flexdt.protocol.rpc_errors import Code, method_not_found
 
-TOPICS: Final = (session, motion, samples, images, jobs, datasets, calibration, documents)
+TOPICS: Final = (session, motion, samples, images, jobs, calibration, documents)
 
 METHODS: Final[Mapping[str, AnyMethod]] = {
     found.name: found

@@ -32,6 +32,9 @@ from flexdt.twin.dataset.dataset_errors import (
     plain_name,
 )
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, parse_document
+from flexdt.twin.dataset.record import ScanRecord
+from flexdt.twin.dataset.scan_settings_text import format_scan_settings
+from flexdt.twin.dataset.xre import format_xre
 from flexdt.twin.geometry.conventions import Float32Array
 
 Shape = tuple[int, int]
@@ -211,6 +214,13 @@ def read_text(path: Path, most: int = MAX_TEXT_BYTES) -> str:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError:
         return raw.decode("cp1252", errors="replace")
+
+
+def put_texts(files: Directory, record: ScanRecord) -> None:
+    """Write what describes a data set: the scanner's two texts, then flexdt.json."""
+    files.put(SCAN_SETTINGS, format_scan_settings(record).encode("utf-8"))
+    files.put(XRE_SETTINGS, format_xre(record).encode("utf-8"))
+    files.put(DOCUMENT, DatasetDocument.of(record).to_json().encode("utf-8"))
 
 
 def read_document(folder: Directory) -> DatasetDocument:

@@ -59,7 +59,6 @@ from flexdt.protocol.rpc_errors import (
 from flexdt.runtime.access import ConnectionLimits, check_bind
 from flexdt.runtime.log import Sparing
 from flexdt.runtime.loop import ListeningServer, tune
-from flexdt.server.network.outbox import Outbox
 from flexdt.server.network.shell_parts import (
     FIRST,
     ORDINARY,
@@ -72,6 +71,7 @@ from flexdt.server.network.shell_parts import (
     LoopTurns,
     Observe,
     Open,
+    Outbox,
     Read,
     Room,
     Session,

@@ -5,7 +5,7 @@ out slice by slice, so the transport never buffers more than a slice.
 
 `ProjectorLink` is a client's end of one connection. Several requests may be open at once; results
 that come in parts are put together. When the connection ends, every open request fails with
-`LinkLost` and the link cannot be used again: `projector_client` makes a new one. A server that is
+`LinkLost` and the link cannot be used again: `ProjectorClient` makes a new one. A server that is
 silent while something is asked of it, also for its health, counts as gone.
 """
 

@@ -26,7 +26,7 @@ from flexdt.runtime.files.own_documents import (
     read_json,
     read_or_set_aside,
 )
-from flexdt.server.storage.scene import correction_fields, correction_of
+from flexdt.server.storage.memory import correction_fields, correction_of
 from flexdt.twin.errors import UnknownNameError
 from flexdt.twin.geometry.offsets import Offsets, require_plausible
 from flexdt.twin.scanner.state import NamedCorrection

@@ -18,13 +18,11 @@ import numpy as np
 import numpy.typing as npt
 import tifffile
 
-from flexdt.runtime.files.dataset_folder import read_document, tiff_bytes
+from flexdt.runtime.files.dataset_folder import put_texts, read_document, tiff_bytes
 from flexdt.runtime.files.directory import Directory, Write, free_bytes, write_some
 from flexdt.twin.dataset.dataset_errors import (
     DOCUMENT,
-    SCAN_SETTINGS,
     SCRIPT,
-    XRE_SETTINGS,
     DatasetError,
     DatasetExistsError,
     DatasetMissingError,
@@ -34,8 +32,6 @@ from flexdt.twin.dataset.dataset_errors import (
 )
 from flexdt.twin.dataset.flexdt_json import DatasetDocument
 from flexdt.twin.dataset.record import ScanRecord
-from flexdt.twin.dataset.scan_settings_text import format_scan_settings
-from flexdt.twin.dataset.xre import format_xre
 
 RESERVE_BYTES: Final = 16 << 20
 """Room asked for beside the images: texts, flexdt.json, the file system's own needs."""
@@ -84,7 +80,7 @@ class DatasetWriter:
             self._check_room()
             if script is not None:
                 self._files.put(SCRIPT, script)
-            self._write_texts()
+            put_texts(self._files, self.record)
         except BaseException:
             self._files.close()
             raise
@@ -221,13 +217,8 @@ class DatasetWriter:
         length = self.record.duration_s if duration_s is None else duration_s
         self._files.sync()  # no power cut leaves a complete data set without its images
         self.record = replace(self.record, complete=complete, reason=reason, duration_s=length)
-        self._write_texts()
+        put_texts(self._files, self.record)
         self._files.sync()
-
-    def _write_texts(self) -> None:
-        self._files.put(SCAN_SETTINGS, format_scan_settings(self.record).encode("utf-8"))
-        self._files.put(XRE_SETTINGS, format_xre(self.record).encode("utf-8"))
-        self._files.put(DOCUMENT, DatasetDocument.of(self.record).to_json().encode("utf-8"))
 
 
 def summary(names: Collection[str]) -> str:

@@ -8,6 +8,9 @@ scan are written as they change, at most a few times a second, and when the serv
 waits for no disk, but it is written at once, whatever was written a moment ago or failed. After a
 restart X-rays are off, motors are where they were last recorded, and interrupted scans are marked
 so and can be resumed. A damaged document is set aside, and the server starts without it.
+
+The scanner's part of it is `Scene` of `document_messages`, the document of scene.*; it is validated
+whole before any of it is applied.
 """
 
 from __future__ import annotations
@@ -17,25 +20,128 @@ import logging
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import asdict
 from datetime import UTC, datetime
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from annotated_types import Ge, Le
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from flexdt.protocol.fields import SpeedUp
-from flexdt.protocol.methods.document_messages import Scene
-from flexdt.protocol.rpc_errors import RpcError
+from flexdt.protocol.methods.document_messages import (
+    CameraPart,
+    CorrectionPart,
+    SamplePart,
+    Scene,
+    TubePart,
+)
+from flexdt.protocol.methods.document_messages import Placement as WirePlacement
+from flexdt.protocol.rpc_errors import RpcError, invalid_params
 from flexdt.protocol.state_model import JobPhase
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.own_documents import Changes, read_json, read_or_set_aside
 from flexdt.runtime.log import log
-from flexdt.server.storage.scene import apply_settings, require_fit, sample_of, save_scene
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetWriteError, plain_name
 from flexdt.twin.errors import TwinError
+from flexdt.twin.machine.camera import Roi
 from flexdt.twin.machine.description import Machine
+from flexdt.twin.machine.kinematics import resolve_targets
 from flexdt.twin.scanner.scanner import ScannerTwin
-from flexdt.twin.scanner.state import Sample
+from flexdt.twin.scanner.state import NamedCorrection, Sample, StagePlacement
+
+
+def save_scene(
+    scanner: ScannerTwin, now: float, *, name: str = "", saved: str = "", version: str = ""
+) -> Scene:
+    """The scanner as a document; a motor under way is saved where it is bound."""
+    return Scene(
+        schema=1,
+        flexdt=version,
+        name=name,
+        saved=saved,
+        machine=scanner.machine.name,
+        profile=scanner.profile.name,
+        positions=scanner.targets(now),
+        speeds={axis: pace[0] for axis, pace in scanner.paces.items()},
+        accelerations={axis: pace[1] for axis, pace in scanner.paces.items()},
+        tube=TubePart(kV=scanner.tube.kV, power_W=scanner.tube.power_W, on=scanner.tube.on),
+        camera=CameraPart(**scanner.camera.stated),
+        sample=SamplePart(
+            name=scanner.sample.name,
+            material=scanner.sample.material,
+            offset=WirePlacement(**asdict(scanner.sample.offset)),
+        ),
+        correction=None
+        if scanner.correction is None
+        else CorrectionPart(**correction_fields(scanner.correction)),
+    )
+
+
+def correction_fields(correction: NamedCorrection) -> dict[str, Any]:
+    """A correction as documents and the wire name its values, in mm and deg."""
+    return {
+        "name": correction.name,
+        "date": correction.date,
+        "parameters": correction.parameters.to_edge(),
+        "comment": correction.note,
+    }
+
+
+def correction_of(part: CorrectionPart) -> NamedCorrection:
+    """The correction of a document.
+
+    Raises:
+        UnknownNameError: a name that is not a parameter.
+    """
+    return NamedCorrection.from_edge(part.name, part.date, part.parameters, part.comment)
+
+
+def require_fit(scene: Scene, scanner: ScannerTwin) -> None:
+    """Check that a scene fits this scanner.
+
+    Raises:
+        RpcError: -32602, another machine's.
+        UnknownNameError, LimitError: an axis, position or setting this scanner does not have.
+        GeometryError: a correction that no scanner can have.
+    """
+    if scene.machine != scanner.machine.name:
+        raise invalid_params(
+            f"the scene is of machine {scene.machine!r}, this is {scanner.machine.name!r}",
+            [{"path": "machine", "message": "another machine", "asked": scene.machine}],
+            scanner.machine.name,
+        )
+    resolve_targets(scanner.machine, scene.positions, scene.positions)
+    trial = ScannerTwin(scanner.machine, scanner.profile)
+    apply_settings(scene, trial)
+    if scene.correction is not None:
+        trial.require_applicable(correction_of(scene.correction))
+
+
+def paces_of(scene: Scene, scanner: ScannerTwin) -> dict[str, tuple[float, float]]:
+    """Motor -> (speed, acceleration) with the scene's where it has them."""
+    return {
+        axis: (scene.speeds.get(axis, speed), scene.accelerations.get(axis, acceleration))
+        for axis, (speed, acceleration) in scanner.paces.items()
+    }
+
+
+def apply_settings(scene: Scene, scanner: ScannerTwin) -> None:
+    """Set tube, camera and paces as in the scene; X-rays are not switched."""
+    for axis, speed in scene.speeds.items():
+        scanner.set_axis(axis, speed=speed)
+    for axis, acceleration in scene.accelerations.items():
+        scanner.set_axis(axis, acceleration=acceleration)
+    scanner.set_tube(kV=scene.tube.kV, power_W=scene.tube.power_W)
+    camera = scene.camera.model_dump()
+    scanner.set_camera(**camera | {"roi": Roi(*scene.camera.roi)})
+
+
+def sample_of(scene: Scene) -> Sample:
+    """The scene's sample."""
+    return Sample(
+        scene.sample.name, StagePlacement(**scene.sample.offset.model_dump()), scene.sample.material
+    )
+
 
 FILE = "state.json"
 INTERVAL_S = 0.25

@@ -25,7 +25,7 @@ from flexdt.protocol import Codec, image
 from flexdt.protocol.connection import MAX_ANSWER, encoded
 from flexdt.protocol.fields import ImageValue, Params
 from flexdt.protocol.messages import Encoded
-from flexdt.protocol.methods import dataset_messages as p
+from flexdt.protocol.methods import calibration_messages as p
 from flexdt.protocol.methods.calibration_messages import CalibrationAlign, CalibrationFit
 from flexdt.protocol.rpc_errors import too_large
 from flexdt.runtime.files.dataset_folder import (

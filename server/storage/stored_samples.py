@@ -4,6 +4,11 @@ Uploads come in chunks, in order and bounded in size, and appear only when whole
 are stored under DATA/samples and survive a restart: the bytes in a file named after their content,
 and beside it a description, which is written last. Names become file names by percent encoding, so
 no name can leave that folder. An upload whose files are damaged is set aside.
+
+Uploads in progress are on disk without a name, and bounded in number and total size. A client may
+begin uploads and never finish them, so nothing of them is held in memory. When a bound is reached
+the oldest is dropped, and its sender's next chunk gets an error that says so. The files have no
+name, so a killed server leaves none behind.
 """
 
 from __future__ import annotations
@@ -12,13 +17,17 @@ import asyncio
 import fnmatch
 import hashlib
 import json
+import logging
 import math
 import threading
+from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
+from typing import Annotated, BinaryIO, Literal
 
 import numpy as np
+from pydantic import Field, StringConstraints
 
 from flexdt.phantoms import (
     Phantom,
@@ -30,9 +39,12 @@ from flexdt.phantoms import (
     voxel_phantom,
 )
 from flexdt.phantoms import material as material_of
+from flexdt.phantoms.files.mesh_files import default_unit
 from flexdt.phantoms.files.phantom_files import sent_scene
+from flexdt.protocol.fields import Payload
+from flexdt.protocol.methods.sample_messages import LengthUnit, SampleUpload
 from flexdt.protocol.rpc_errors import Code, RpcError, too_large
-from flexdt.runtime.files.directory import TEMPORARY, Directory
+from flexdt.runtime.files.directory import TEMPORARY, Directory, writing
 from flexdt.runtime.files.own_documents import (
     ASIDE,
     Changes,
@@ -42,10 +54,153 @@ from flexdt.runtime.files.own_documents import (
     read_or_set_aside,
     set_aside,
 )
+from flexdt.runtime.log import log
 from flexdt.runtime.worker import document
 from flexdt.runtime.workers import Worker
-from flexdt.server.storage.unfinished_uploads import Incoming, UploadHead
+from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.errors import LimitError, UnknownNameError
+
+MOST = 4
+"""Uploads under way at a time."""
+TOLD = 100
+"""Names of those that were dropped, kept for their senders."""
+
+
+class UploadHead(SampleUpload):
+    """What an upload is: every chunk repeats it, and it lies beside the bytes as a document.
+
+    Attributes:
+        unit: of mesh coordinates.
+        revision: names the content, in the document; those of older servers have none.
+    """
+
+    schema_version: Literal[1] = Field(default=1, alias="schema")
+    data: Payload = b""
+    unit: LengthUnit = "mm"
+    revision: Annotated[str, StringConstraints(pattern="^[0-9a-f]{16}$")] | None = None
+
+    @classmethod
+    def of(cls, chunk: SampleUpload) -> UploadHead:
+        """Of the upload to which a chunk belongs."""
+        given = chunk.model_dump(exclude={"start", "data"})
+        return cls.model_validate(given | {"unit": chunk.unit or default_unit(chunk.format)})
+
+
+@dataclass
+class _Open:
+    head: UploadHead
+    file: BinaryIO
+    received: int = 0
+
+
+class Incoming:
+    """All uploads under way; any thread may call.
+
+    Args:
+        folder: on whose disk they are; made with the first.
+        limit: bytes of all of them together; more than the largest upload.
+    """
+
+    def __init__(self, folder: Directory, limit: int) -> None:
+        self._folder, self._limit = folder, limit
+        self._open: dict[str, _Open] = {}
+        self._dropped: deque[str] = deque(maxlen=TOLD)
+        self._lock = threading.Lock()
+
+    def receive(self, head: UploadHead, start: int, data: bytes) -> int:
+        """Take a chunk; returns the bytes received so far.
+
+        A chunk that has come before is passed over, so a client may send it again; a chunk at 0
+        of another file under the same name begins anew.
+
+        Raises:
+            LimitError: a gap before this chunk, or the upload was dropped for newer ones.
+            DatasetWriteError: the disk does not take it; the upload is given up.
+        """
+        with self._lock:
+            known = self._open.get(head.name)
+            if start == 0 and (known is None or known.head != head or known.received >= head.total):
+                known = self._begin(head)
+            if known is None or known.head != head or start > known.received:
+                received = 0 if known is None or known.head != head else known.received
+                raise self._gap(head.name, start, received)
+            new = data[known.received - start :]
+            self._make_room(head.name, len(new))
+            try:
+                with self._writing():
+                    left = memoryview(new)
+                    while left:
+                        left = left[known.file.write(left) :]
+            except DatasetWriteError:
+                self._close(head.name)
+                raise
+            known.received += len(new)
+            return known.received
+
+    def take(self, name: str) -> tuple[UploadHead, bytes]:
+        """An upload of which all bytes have come; it is under way no more.
+
+        Raises:
+            LimitError: it is not whole, because another one was begun under its name.
+        """
+        with self._lock:
+            known = self._open.get(name)
+            if known is None or known.received < known.head.total:
+                raise self._gap(name, 0, 0 if known is None else known.received)
+            try:
+                with self._writing():
+                    known.file.seek(0)
+                    return known.head, known.file.read()
+            finally:
+                self._close(name)
+
+    def _begin(self, head: UploadHead) -> _Open:
+        self._close(head.name)
+        while len(self._open) >= MOST:
+            self._drop()
+        self._folder.make()
+        with self._writing():
+            file = self._folder.nameless()
+        self._open[head.name] = made = _Open(head, file)
+        if head.name in self._dropped:
+            self._dropped.remove(head.name)
+        return made
+
+    def _make_room(self, name: str, more: int) -> None:
+        while sum(o.received for o in self._open.values()) + more > self._limit:
+            if all(other == name for other in self._open):
+                break  # the largest upload alone always fits
+            self._drop(but=name)
+
+    def _drop(self, but: str | None = None) -> None:
+        oldest = next(name for name in self._open if name != but)
+        log("an unfinished upload was dropped for newer ones", logging.WARNING, name=oldest,
+            received=self._open[oldest].received)  # fmt: skip
+        self._close(oldest)
+        self._dropped.append(oldest)
+
+    def _close(self, name: str) -> None:
+        known = self._open.pop(name, None)
+        if known is not None:
+            known.file.close()
+
+    def _gap(self, name: str, start: int, received: int) -> LimitError:
+        why = ""
+        if name in self._dropped:
+            why = (
+                f" (it was dropped for newer ones: {MOST} uploads and {self._limit} bytes are kept "
+                "at a time)"
+            )
+        return LimitError(
+            f"upload {name!r}: the chunk begins at {start}, but {received} bytes have come; "
+            f"chunks come in order, from 0{why}",
+            {"asked": start, "allowed": received},
+        )
+
+    def _writing(self) -> AbstractContextManager[None]:
+        path = self._folder.path
+        return writing(path, f"the upload cannot be kept in {path}")
+
 
 # Parsing of uploaded meshes and scenes in a process of their own (`worker`).
 #

@@ -19,8 +19,7 @@ from flexdt.runtime.files.directory import free_bytes
 from flexdt.runtime.http_pages import Pages, watching_pages
 from flexdt.runtime.metrics import Figure, Requests, counter, gauge
 from flexdt.runtime.wire_errors import explain, is_user_error
-from flexdt.server.imaging.projector_client import ProjectorClient
-from flexdt.server.imaging.projector_pool import ProjectorPool
+from flexdt.server.imaging.projector_pool import ProjectorClient, ProjectorPool
 from flexdt.server.network.shell_parts import Peer
 from flexdt.server.network.tcp import TcpServer
 from flexdt.server.twin.core import TwinServer

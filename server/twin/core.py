@@ -49,9 +49,9 @@ from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.physics.radiograph import Radiograph
 from flexdt.twin.physics.scatter.simulation import Scatter
+from flexdt.twin.scanner.joining import StageChange
 from flexdt.twin.scanner.safety import Guard
 from flexdt.twin.scanner.scanner import ScannerTwin
-from flexdt.twin.scanner.stage_change import StageChange
 from flexdt.twin.scanner.state import NamedCorrection, Sample, ScannerState, TubeSettings
 from flexdt.twin.script import Exposure
 

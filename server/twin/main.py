@@ -46,8 +46,7 @@ async def run(options: TwinSettings) -> int:
 
     from flexdt.runtime.http_pages import served_pages
     from flexdt.runtime.metrics import Requests
-    from flexdt.server.imaging.projector_client import ProjectorClient
-    from flexdt.server.imaging.projector_pool import ProjectorPool
+    from flexdt.server.imaging.projector_pool import ProjectorClient, ProjectorPool
     from flexdt.server.imaging.truth import load_truth
     from flexdt.server.network.tcp import serve
     from flexdt.server.scans.jobs import fresh_seed

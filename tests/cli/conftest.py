@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.launch.processes import Servers
 
 Answer = tuple[int, str, str]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.launch.processes import Servers
 
 pytestmark = pytest.mark.slow

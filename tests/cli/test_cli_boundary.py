@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from flexdt.clients.cli import boundary, entry
+from flexdt.clients.cli import boundary, command_tree
 from flexdt.clients.cli.commands import process_commands as processes
 from flexdt.clients.failure import CommandError
 from flexdt.process_settings import words
@@ -81,7 +81,7 @@ def test_positions_of_script_errors_are_printed() -> None:
     ],
 )
 def test_usage_errors_leave_with_2(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert entry.run(argv) == 2
+    assert command_tree.run(argv) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
     assert "Traceback" not in captured.err
@@ -96,7 +96,7 @@ def test_unknown_error_is_one_line_not_a_traceback(
 
     monkeypatch.delenv("FLEXDT_TRACEBACK", raising=False)
     monkeypatch.setattr(processes, "become", broken)
-    assert entry.run(["projector"]) == 1
+    assert command_tree.run(["projector"]) == 1
     err = capsys.readouterr().err
     assert err.startswith("flexdt: internal error: RuntimeError: first\n")
     assert "Traceback" not in err
@@ -109,14 +109,14 @@ def test_ctrl_c_is_clean(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("flexdt.clients.cli.commands.process_commands.become", interrupted)
-    assert entry.run(["projector"]) == 130
+    assert command_tree.run(["projector"]) == 130
     assert capsys.readouterr().err == "flexdt: interrupted\n"
 
 
 def test_help_imports_nothing_heavy() -> None:
     program = (
         "import sys\n"
-        "from flexdt.clients.cli.entry import run\n"
+        "from flexdt.clients.cli.command_tree import run\n"
         "code = run(['--help'])\n"
         f"bad = [m for m in sys.modules for h in {HEAVY!r} if m == h or m.startswith(h + '.')]\n"
         "sys.exit(str(bad) if bad else code)\n"
@@ -195,7 +195,7 @@ def test_each_process_takes_its_port_by_the_name_that_up_has(
         given.extend(words(options))
 
     monkeypatch.setattr(processes, "become", become)
-    assert entry.run(argv) == 0
+    assert command_tree.run(argv) == 0
     assert word in " ".join(given)
 
 
@@ -238,7 +238,7 @@ def test_a_file_that_cannot_be_written_is_called_as_it_was_asked_for(
 def test_a_retired_command_says_in_one_line_what_to_do(
     name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert entry.run([name, "data", "copy.tar"]) == 2
+    assert command_tree.run([name, "data", "copy.tar"]) == 2
     said = capsys.readouterr()
     assert said.out == ""
     assert said.err.count("\n") == 1

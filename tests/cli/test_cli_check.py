@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 
 GOOD = "camera\tset exposure\t100\t\tACK\t\t\r\ntra_obj\tmove absolute\t10\t\tACK\t\t\r\n"
 BAD = (

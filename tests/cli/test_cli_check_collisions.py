@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 
 INTO_THE_SAMPLE = (
     "scanner\tpause\t0\t\tACK\t\t\r\n"

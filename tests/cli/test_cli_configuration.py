@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.cli.commands import process_commands
-from flexdt.clients.cli.entry import run
 from flexdt.clients.cli.settings_file import (
     TABLES,
     Configuration,

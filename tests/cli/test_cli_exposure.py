@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import tifffile
 
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.launch.processes import Servers
 
 Capture = pytest.CaptureFixture[str]

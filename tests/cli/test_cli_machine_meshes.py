@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from flexdt import machines
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.viewer.scenes.parts import own_looks, pieces_of
 from flexdt.phantoms.files import mesh_files
 from flexdt.twin.errors import MachineFileError

@@ -10,8 +10,8 @@ import pytest
 import typer
 
 from flexdt import machines
-from flexdt.clients.cli.entry import run
-from flexdt.twin.collision.home_check import check_home
+from flexdt.clients.cli.command_tree import run
+from flexdt.twin.collision.scene_search import check_home
 from flexdt.twin.errors import GeometryError, MachineFileError
 from flexdt.twin.machine.description import Profile, parse_machine
 from flexdt.twin.scanner.scanner import ScannerTwin

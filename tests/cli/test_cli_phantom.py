@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.phantoms import phantom_names
 from flexdt.phantoms.samples import as_phantom
 

@@ -17,7 +17,7 @@ import pytest
 import tifffile
 import trimesh
 
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.launch.processes import Servers
 from tests.support.phantom_texts import BEAD_FILE, SCENE_FILE
 

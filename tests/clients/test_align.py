@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import flexdt as fx
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.twin.calibration.without_phantom.tile_gap import averaged_rows, find_gap
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.geometry.panel import Panel

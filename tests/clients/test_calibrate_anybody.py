@@ -25,7 +25,7 @@ from flexdt.clients.calibration.markers import (
     markers_alone,
     read_markers,
 )
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration import Detections, detect_beads
 from flexdt.twin.calibration.frame_source import nothing

@@ -21,7 +21,7 @@ from flexdt.clients.calibration.calibrate import (
 )
 from flexdt.clients.calibration.calibration_report import write_report
 from flexdt.clients.calibration.compare import compare_folder, write_comparison, write_tracks
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.pipeline import CalibrationRequest

@@ -12,7 +12,7 @@ from prior_coverage import PIXEL, SDD, SOD, pixels
 from prior_coverage import SHAPE as STUDY_SHAPE
 
 import flexdt as fx
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.twin.geometry.motion import Motion
 from flexdt.twin.geometry.offsets import NAMES
 

@@ -14,8 +14,8 @@ from bead_scan import bead_scan
 from past_laboratory import Laboratory
 
 from flexdt import machines
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.cli.commands.scan_commands import read_log_file
-from flexdt.clients.cli.entry import run
 from flexdt.clients.commission import commission
 from flexdt.clients.following.traffic import Recorded, format_recorded
 from flexdt.twin.machine.description import builtin_machine, builtin_profile

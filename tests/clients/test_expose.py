@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import flexdt as fx
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.expose import exposure_of
 from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.physics.prediction import AIR, compton_share, mass_energy_transfer

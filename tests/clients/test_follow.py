@@ -18,7 +18,7 @@ import tifffile
 import zmq
 import zmq.asyncio
 
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.following.listening import endpoint
 from flexdt.clients.following.session import FollowSession, FramesBeside, executed_script
 from flexdt.clients.following.traffic import read_recording

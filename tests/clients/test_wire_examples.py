@@ -16,7 +16,7 @@ import pytest
 import tifffile
 
 from flexdt.clients import TwinClient
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.launch.processes import Servers
 from flexdt.clients.reconstruction.volume_files import read_volume
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.datasets.exchange import (
     ExchangeError,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.launch.processes import Servers
 from flexdt.clients.reconstruction.volume_files import read_volume
 from flexdt.phantoms import lego_phantom

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import tifffile
 
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.launch.processes import Servers
 
 pytestmark = pytest.mark.slow

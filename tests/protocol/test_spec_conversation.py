@@ -18,7 +18,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
 import flexdt
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.reconstruction.volume_files import read_volume
 from flexdt.phantoms import lego_phantom
 from flexdt.protocol.image import decode

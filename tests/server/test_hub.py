@@ -13,7 +13,7 @@ import pytest
 from flexdt.protocol import Codec, Connection, Message, Prepared, RpcError
 from flexdt.server.twin.core import ControlLease
 from flexdt.server.twin.hub import Hub, ImageWish
-from flexdt.testing.virtual_time import SimulatedLoop
+from flexdt.testing.in_process import SimulatedLoop
 
 
 class Ear:

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from lab import Refused, Wire, fly_script, projector, twin
 
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.client.async_client import AsyncTwinClient
 from flexdt.clients.client.client import TwinClient
 from flexdt.protocol import METHODS, Connection, Failure, RpcError

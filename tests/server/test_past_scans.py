@@ -21,7 +21,7 @@ from lab import Process, fly_script, twin
 from flexdt.clients.client.client import TwinClient
 from flexdt.protocol import Codec, RpcError
 from flexdt.protocol.fields import Params
-from flexdt.protocol.methods.dataset_messages import (
+from flexdt.protocol.methods.calibration_messages import (
     DatasetFrame,
     DatasetFrameResult,
     DatasetGet,

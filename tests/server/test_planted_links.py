@@ -26,8 +26,13 @@ from simulation import Simulation
 from whole_run import voxels
 
 from flexdt.protocol import Codec, RpcError
-from flexdt.protocol.methods.calibration_messages import CalibrationAlign, CalibrationFit
-from flexdt.protocol.methods.dataset_messages import DatasetFrame, DatasetGet, DatasetList
+from flexdt.protocol.methods.calibration_messages import (
+    CalibrationAlign,
+    CalibrationFit,
+    DatasetFrame,
+    DatasetGet,
+    DatasetList,
+)
 from flexdt.runtime.files import directory
 from flexdt.server.storage.past_scans import TwinContext, work
 from flexdt.twin.errors import TwinError

@@ -22,7 +22,7 @@ from lab import Process, Wire, digests, fly_script, projector, twin
 from flexdt.protocol import Code, RpcError
 from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.imaging.projector_pool import ProjectorPool
-from flexdt.testing.virtual_time import SimulatedLoop
+from flexdt.testing.in_process import SimulatedLoop
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 

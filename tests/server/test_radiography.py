@@ -32,7 +32,7 @@ from flexdt.server.scans.acquisition import Acquisition
 from flexdt.server.scans.scan_record import BEGINNING, ScanSource, StartConditions
 from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.setting_methods import set_tube
+from flexdt.server.twin.handlers.motion_methods import set_tube
 from flexdt.testing.in_process import DirectProjector
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import LimitError, MachineFileError

@@ -14,7 +14,7 @@ from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.scans import job
 from flexdt.server.scans.job import Retry, transient
 from flexdt.server.scans.runner import hopeless
-from flexdt.testing.virtual_time import SimulatedLoop
+from flexdt.testing.in_process import SimulatedLoop
 from flexdt.twin.dataset.dataset_errors import DiskFullError
 from flexdt.twin.errors import GeometryError, LimitError, TwinError
 

@@ -12,7 +12,7 @@ import pytest
 
 from flexdt.server.scans.runner import JobAborted, ScanRunner, rejoin
 from flexdt.server.scans.twin_clock import TwinClock
-from flexdt.testing.virtual_time import SimulatedLoop
+from flexdt.testing.in_process import SimulatedLoop
 from flexdt.twin.errors import CollisionError, LimitError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.physics.exposure import ExposureSettings, IdealResponse, expose, frame_rng

@@ -19,8 +19,7 @@ from flexdt.phantoms.samples import as_phantom
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.scans.stage import Stage
 from flexdt.server.storage import stored_samples as mesh_reading
-from flexdt.server.storage.stored_samples import SampleStore
-from flexdt.server.storage.unfinished_uploads import UploadHead
+from flexdt.server.storage.stored_samples import SampleStore, UploadHead
 from flexdt.twin.collision.convex_solids import Polytope
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile

@@ -26,7 +26,7 @@ def test_every_method_of_the_wire_has_a_handler() -> None:
         with pytest.raises(TypeError, match=r"not one handler for each method of the wire: \w+\."):
             handlers.table(*(other for other in TOPICS if other is not topic))
     with pytest.raises(TypeError, match=r"tube\.set"):
-        handlers.table(*TOPICS, handlers.setting_methods)
+        handlers.table(*TOPICS, handlers.motion_methods)
 
 
 def test_a_handler_of_an_unknown_method_is_an_error() -> None:

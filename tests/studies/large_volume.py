@@ -26,7 +26,7 @@ from lab import machine
 import flexdt as fx
 from flexdt.twin.reconstruction import fdk
 from flexdt.twin.reconstruction.fdk import filtered, ramp
-from flexdt_extensions.volumes import zarr_volume
+from flexdt_extensions.fdk_on_workers import create, put_whole, slabs
 
 
 def seconds(work: Callable[[], object], least_s: float = 0.0) -> float:
@@ -58,9 +58,9 @@ def rates(folder: Path) -> dict[str, float]:
     read_s = seconds(lambda: [data.line_integrals(i) for i in range(4)])
     slab = fx.Grid((64, 512, 512), 0.3)
     store = folder / "volume.zarr"
-    zarr_volume.create(store, slab)
+    create(store, slab)
     values = np.random.default_rng(2).random(slab.shape, dtype=np.float32)
-    write_s = seconds(lambda: zarr_volume.put_whole(store, slab, 0, values))
+    write_s = seconds(lambda: put_whole(store, slab, 0, values))
     return {
         "updates": views * side**3 / max(whole_s - filter_s, 1e-9),
         "filtered": images.size / filter_s,
@@ -93,20 +93,20 @@ def main() -> None:
           f"read and made line integrals, {found['written'] / 1e6:.0f} MB written a second"
     )  # fmt: skip
     grid = fx.Grid((o.side,) * 3, 1.0)
-    slabs = len(zarr_volume.slabs(grid))
+    count = len(slabs(grid))
     pixels, times = o.views * rows * cols, min(o.nodes * o.cores, here * 10**6) / here
     updates = o.views * float(o.side) ** 3
     # A slab needs the rows of its own shadow: its part of the panel, and a fifth more (assumed).
     need = {
-        "frames from the disk": slabs * 2 * pixels / (o.read * 1e9),
-        "line integrals": slabs * pixels / found["read"] / times,
-        "filter": pixels * min(slabs, 1 + 0.2 * slabs) / found["filtered"] / times,
+        "frames from the disk": count * 2 * pixels / (o.read * 1e9),
+        "line integrals": count * pixels / found["read"] / times,
+        "filter": pixels * min(count, 1 + 0.2 * count) / found["filtered"] / times,
         "backprojection": updates / (o.gpus * o.updates if o.gpus else found["updates"] * times),
         "compression": 4 * float(o.side) ** 3 / found["written"] / times,
         "volume to the disk": 4 * float(o.side) ** 3 / (o.write * 1e9),
     }
-    print(f"{o.side}^3 from {o.views} views of {rows} x {cols}: {slabs} slabs of "
-          f"{grid.bytes / slabs / 2**30:.2f} GiB, {slabs * 2 * pixels / 1e12:.1f} TB read, on "
+    print(f"{o.side}^3 from {o.views} views of {rows} x {cols}: {count} slabs of "
+          f"{grid.bytes / count / 2**30:.2f} GiB, {count * 2 * pixels / 1e12:.1f} TB read, on "
           f"{o.nodes} nodes of {o.cores} cores, {o.gpus} GPUs")  # fmt: skip
     for what, took in need.items():
         print(f"  {what:22} {took / 3600:8.2f} h")

@@ -18,7 +18,7 @@ import numba
 import numpy as np
 
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.projection import Volume, cpu, level_axis
+from flexdt.twin.projection import Volume, cpu, operators
 from flexdt.twin.projection.operators import box_of, voxel_rays
 
 WAYS = ("along z", "along x", "along y", "ray by ray")
@@ -65,13 +65,13 @@ def main() -> None:
     for _ in range(options.count):
         volume, geometry, shape = drawn(draw)
         rays = geometry.rays(shape) / volume.voxel_xyz[0]
-        chosen = int(level_axis.level_axes(rays, volume.shape, shape)[0])
+        chosen = int(operators.level_axes(rays, volume.shape, shape)[0])
         out = np.empty((1, *shape), np.float32)
         times = []
         for way in range(4):
-            order = level_axis.ORDERS[way % 3]
+            order = operators.ORDERS[way % 3]
             layout = volume.in_order(order).layout
-            views = voxel_rays(level_axis.in_order(geometry, order), layout, shape)
+            views = voxel_rays(operators.in_order(geometry, order), layout, shape)
             once = partial(cpu.project, box_of(layout), views, out, fans=way < 3)
             times.append(milliseconds(once))
         said = ", ".join(f"{w} {t:.2f}" for w, t in zip(WAYS, times, strict=True))

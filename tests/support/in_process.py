@@ -20,7 +20,7 @@ from flexdt.runtime.files.directory import open_data
 from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.twin.application import TwinSession
 from flexdt.server.twin.core import TwinServer
-from flexdt.testing.virtual_time import SimulatedLoop
+from flexdt.testing.in_process import SimulatedLoop
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.description import builtin_machine, builtin_profile

@@ -6,7 +6,7 @@ from typing import Self
 
 from flexdt.protocol import parse_result
 from flexdt.protocol.projector import VolumeList
-from flexdt.server.imaging.projector_client import ProjectorClient
+from flexdt.server.imaging.projector_pool import ProjectorClient
 
 
 class ProjectorUser(ProjectorClient):

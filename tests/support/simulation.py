@@ -39,7 +39,7 @@ from simulated_disk import Disk, Fault
 from flexdt.runtime.files.directory import open_data
 from flexdt.runtime.files.own_documents import lock_folder
 from flexdt.server.twin.core import TwinServer
-from flexdt.testing.virtual_time import SimulatedLoop
+from flexdt.testing.in_process import SimulatedLoop
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.scanner.state import Sample
 

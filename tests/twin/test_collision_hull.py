@@ -10,9 +10,9 @@ import pytest
 import trimesh
 from scipy.optimize import linprog, nnls
 
-from flexdt.twin.collision import outer_hull as hulls
+from flexdt.twin.collision import convex_solids as hulls
 from flexdt.twin.collision.collision_scene import build_scene
-from flexdt.twin.collision.outer_hull import outer_hull
+from flexdt.twin.collision.convex_solids import outer_hull
 from flexdt.twin.collision.scene_search import clearance
 from flexdt.twin.errors import MachineFileError, TwinError
 from flexdt.twin.machine.description import (

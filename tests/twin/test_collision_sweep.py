@@ -17,11 +17,25 @@ from scipy.spatial import ConvexHull
 from swept import sweep
 
 from flexdt.twin.collision.collision_scene import CollisionScene, build_scene, scene_of
-from flexdt.twin.collision.convex_solids import ConvexSolid, Polytope, UprightCylinder, box, hull
+from flexdt.twin.collision.convex_solids import (
+    ConvexSolid,
+    Polytope,
+    UprightCylinder,
+    box,
+    hull,
+    separation_of,
+)
 from flexdt.twin.collision.guard import SceneGuard, _Overlap
-from flexdt.twin.collision.nearest import separation_of
-from flexdt.twin.collision.paths import Path, path_of
-from flexdt.twin.collision.relative import Moment, RelativeMotion, _Bound
+from flexdt.twin.collision.relative import (
+    Limits,
+    Moment,
+    Path,
+    RelativeMotion,
+    _Bound,
+    path_of,
+    refine_pair,
+    sweep_pair,
+)
 from flexdt.twin.collision.scene_search import (
     SweepResult,
     clearance,
@@ -29,7 +43,6 @@ from flexdt.twin.collision.scene_search import (
     first_contact,
 )
 from flexdt.twin.collision.stages import Body
-from flexdt.twin.collision.sweep import Limits, refine_pair, sweep_pair
 from flexdt.twin.geometry.conventions import FloatArray, rotation_about
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.motion import profiles as motion

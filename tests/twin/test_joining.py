@@ -22,9 +22,9 @@ from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.motion import profiles as motion
 from flexdt.twin.motion.drives import Drive
 from flexdt.twin.motion.profiles import Piece, Trajectory
+from flexdt.twin.scanner.joining import StageChange
 from flexdt.twin.scanner.safety import Contact, Guard
 from flexdt.twin.scanner.scanner import ScannerTwin
-from flexdt.twin.scanner.stage_change import StageChange
 from flexdt.twin.scanner.state import NamedCorrection, Sample
 
 M = builtin_machine()

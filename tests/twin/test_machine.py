@@ -31,9 +31,8 @@ from flexdt.twin.machine.description import (
     default_profile,
     parse_machine,
 )
-from flexdt.twin.machine.kinematics import poses, resolve_targets
-from flexdt.twin.machine.new_file import Answers, new_machine_text
-from flexdt.twin.machine.places import places
+from flexdt.twin.machine.kinematics import places, poses, resolve_targets
+from flexdt.twin.machine.machine_files import Answers, new_machine_text
 
 X = {"lower": -5.0, "upper": 5.0, "home": 0.0, "speed": 1.0, "max_speed": 2.0, "acceleration": 1.0,
      "max_acceleration": 2.0}  # fmt: skip

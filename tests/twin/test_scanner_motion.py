@@ -17,8 +17,7 @@ from flexdt.twin.machine.description import (
     parse_machine,
     profile_of,
 )
-from flexdt.twin.motion.braking import braked_apart
-from flexdt.twin.motion.drives import home, plan_jog, plan_move
+from flexdt.twin.motion.drives import braked_apart, home, plan_jog, plan_move
 from flexdt.twin.motion.profiles import at_rest
 from flexdt.twin.scanner.scanner import ScannerTwin
 

@@ -22,14 +22,16 @@ from flexdt.clients.cli import main
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.viewer.live_volume import (
     MOST_POINTS,
+    TOP,
     Held,
+    block,
     compare,
+    exact,
     grow,
     points_of,
     reconstruct,
     surface,
 )
-from flexdt.clients.viewer.volume_block import TOP, block, exact
 from flexdt.clients.viewer.volume_process import LiveReconstruction, wish
 from flexdt.clients.viewer.volume_truth import figures, main_level, truth_of
 from flexdt.phantoms import load_phantom

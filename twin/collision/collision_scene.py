@@ -4,7 +4,7 @@ It is built from the machine's bodies and the sample's pieces (see `stages`) and
 Pairs that are fixed to each other or allowed to touch are left out. Pairs that cannot meet at any
 position within reach (travel limits and a little more) are kept apart from the rest when they
 belong to one stage or run at different levels, so that "least clearance" describes possible
-contacts and not the construction of the machine. `sweep` and `scene_search` add time.
+contacts and not the construction of the machine. `relative` and `scene_search` add time.
 """
 
 from __future__ import annotations
@@ -16,12 +16,9 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.collision.convex_solids import ConvexSolid
-from flexdt.twin.collision.nearest import separation_of
-from flexdt.twin.collision.paths import Path, path_of
-from flexdt.twin.collision.relative import Separate
+from flexdt.twin.collision.convex_solids import ConvexSolid, separation_of
+from flexdt.twin.collision.relative import Limits, Path, Separate, path_of
 from flexdt.twin.collision.stages import Body, sample_bodies, stage_bodies
-from flexdt.twin.collision.sweep import Limits
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import Machine, Profile

@@ -3,19 +3,31 @@
 Two kinds are enough: the hull of points, and the upright cylinder. Each has a support function (how
 far it reaches in a direction), which is all that a proof of separation needs: for any direction n
 the gap between two supports is a lower bound of the distance.
+
+`outer_hull` is a convex body of few corners around many points, for parts whose meshes have
+thousands. It is cut out of the points' box by planes on which the points' own hull lies, where it
+stands out most first; so it contains the hull, a pose that is free with it is free, and flat faces
+stay flat.
+
+The distance of two solids comes with a certificate; this is the one module that wraps python-fcl.
+fcl proposes the nearest points; the clearance that counts is then computed from the two solids'
+supports along that direction, a lower bound of the true distance whatever fcl said. So an error of
+the library can stop a motion too early but never call a touch free. fcl is imported when the first
+pair is made. Its continuous collision (which misses contacts) is not used.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.machine.description import Vector3
+from flexdt.twin.machine.description import MAX_POINTS, Vector3
 
 IntArray = npt.NDArray[np.int32]
 
@@ -154,3 +166,176 @@ def hull(points: npt.ArrayLike) -> Polytope:
     simplices[inward] = simplices[inward][:, ::-1]
     used, faces = np.unique(simplices, return_inverse=True)
     return Polytope(p[used], faces.reshape(-1, 3).astype(np.int32))
+
+
+MAX_PLANES: Final = 2000
+"""Of the points' hull that are looked at; any of them are right."""
+CLOSE_MM: Final = 0.01
+"""What stands out less is not cut off."""
+AT_ONCE: Final = 8
+"""Planes that cut corners off at a time."""
+LIFT: Final = 1e-9
+"""By what part of its size the body is larger, so that rounding leaves no point outside."""
+
+
+def outer_hull(points: npt.ArrayLike) -> Polytope:
+    """A convex body that contains points and has at most `MAX_POINTS` corners.
+
+    Args:
+        points: (k, 3) [mm].
+
+    Example:
+        >>> ball = np.random.default_rng(1).normal(size=(3000, 3))
+        >>> ball *= 50.0 / np.linalg.norm(ball, axis=1, keepdims=True)
+        >>> around = outer_hull(ball)
+        >>> len(around.vertices) <= 256, float(around.bounds()[1].max()) < 50.1
+        (True, True)
+    """
+    exact = hull(points)
+    if len(exact.vertices) <= MAX_POINTS:
+        return exact
+    planes = _planes(exact)
+    low, high = exact.bounds()
+    lift = LIFT * float((high - low).max())
+    inside = exact.vertices.mean(axis=0)
+    chosen = [np.concatenate([s * e, [-float((s * exact.vertices @ e).max()) - lift]])
+              for e in np.eye(3) for s in (-1.0, 1.0)]  # fmt: skip
+    corners = _corners(chosen, inside)
+    while True:
+        out = corners @ planes[:, :3].T + planes[:, 3]
+        far, taken = out.max(axis=1), list[int]()
+        while far.max() > CLOSE_MM and len(taken) < AT_ONCE:
+            taken.append(int(np.argmax(out[np.argmax(far)])))
+            far[out[:, taken[-1]] > 0.0] = 0.0  # what a plane cuts off needs no second one
+        chosen += list(planes[taken] - [0.0, 0.0, 0.0, lift])
+        cut = _corners(chosen, inside)
+        if not taken or len(cut) > MAX_POINTS:
+            return hull(corners)
+        corners = cut
+
+
+def _planes(solid: Polytope) -> FloatArray:
+    """Outward planes (m, 4) of its largest faces: n . x + d <= 0 inside."""
+    a, b, c = np.moveaxis(solid.vertices[solid.faces], 1, 0)
+    normals = np.cross(b - a, c - a)
+    areas = np.linalg.norm(normals, axis=1)
+    normals = normals[areas > 0.0] / areas[areas > 0.0, None]
+    heights = np.einsum("ij,ij->i", normals, a[areas > 0.0])
+    _, first, same = np.unique(
+        np.column_stack([normals, heights]).round(6), axis=0, return_index=True, return_inverse=True
+    )
+    large = np.argsort(np.bincount(same.ravel(), areas[areas > 0.0]))[-MAX_PLANES:]
+    normals = normals[first[large]]
+    reach = (normals @ solid.vertices.T).max(axis=1)  # a face's own height, but for rounding
+    return np.column_stack([normals, -reach])
+
+
+def _corners(planes: list[FloatArray], inside: FloatArray) -> FloatArray:
+    from scipy.spatial import HalfspaceIntersection
+
+    found = HalfspaceIntersection(np.array(planes), inside).intersections
+    _, first = np.unique(found.round(6), axis=0, return_index=True)
+    return np.asarray(found[first])
+
+
+Separation = tuple[float, FloatArray]
+"""Certified clearance [mm], 0 when they touch or overlap, and the unit direction from b to a."""
+
+_IDENTITY = np.eye(3)
+_ORIGIN = np.zeros(3)
+_NOWHERE: Separation = (0.0, np.array([0.0, 0.0, 1.0]))
+DOUBT = 1e-5
+"""A certificate this far below the distance [mm] is as good as exact."""
+ROUNDS = 40
+"""Most corners of the hull of all differences that the search for the nearest point takes up."""
+
+
+def separation_of(
+    a: ConvexSolid, b: ConvexSolid
+) -> Callable[[FloatArray, FloatArray | None, FloatArray | None], Separation]:
+    """A function that separates `a` from `b`.
+
+    Returns:
+        A function of the vector from b's origin to a's (3,) [mm] and of the orientations of a and
+        b (3, 3), None for a body that never turns.
+    """
+    import fcl
+
+    request = fcl.DistanceRequest(enable_nearest_points=True)
+    shape_a, shift_a = _as_fcl(a)
+    shape_b, shift_b = _as_fcl(b)
+    still_b = fcl.CollisionObject(shape_b, fcl.Transform(_IDENTITY, shift_b))
+
+    def separate(
+        offset: FloatArray, turn_a: FloatArray | None, turn_b: FloatArray | None
+    ) -> Separation:
+        # Nothing is shared that changes: several threads may ask at once.
+        ra, rb = (_IDENTITY if turn is None else turn for turn in (turn_a, turn_b))
+        object_a = fcl.CollisionObject(shape_a, fcl.Transform(ra, offset + ra @ shift_a))
+        object_b = still_b
+        if turn_b is not None:
+            object_b = fcl.CollisionObject(shape_b, fcl.Transform(rb, rb @ shift_b))
+        result = fcl.DistanceResult()
+        distance = fcl.distance(object_a, object_b, request, result)
+        if not distance > 0.0:
+            return _NOWHERE
+        on_a, on_b = result.nearest_points
+        apart = on_a - on_b
+        length = math.sqrt(apart @ apart)
+        if length == 0.0:
+            return _NOWHERE
+        normal = apart / length
+        # The empty slab across the normal: no two points are nearer than it is wide.
+        gap = float(normal @ offset - a.support(-normal @ ra) - b.support(normal @ rb))
+        if gap < distance - DOUBT:
+            gap, normal = _improved(a, b, (gap, normal), offset, ra, rb)
+        return (gap, normal) if gap > 0.0 else _NOWHERE
+
+    return separate
+
+
+def _improved(
+    a: ConvexSolid,
+    b: ConvexSolid,
+    found: Separation,
+    offset: FloatArray,
+    ra: FloatArray,
+    rb: FloatArray,
+) -> Separation:
+    """The certificate across the nearest point of the hull of all differences (Gilbert's search).
+
+    fcl is off by millimetres where two edges are parallel, as those of upright boxes are.
+    """
+    from scipy.optimize import nnls
+
+    normal, corners = found[1], []
+    for _ in range(ROUNDS):
+        corners.append(offset + ra @ a.farthest(-normal @ ra) - rb @ b.farthest(normal @ rb))
+        found = max(found, (float(normal @ corners[-1]), normal), key=lambda f: f[0])
+        # The hull's point nearest to the origin: least squares with weights that add up to one.
+        points = np.array(corners).T
+        system = np.vstack([points, np.full(len(corners), 100.0)])
+        try:
+            weights, _ = nnls(system, [0.0, 0.0, 0.0, 100.0])
+        except RuntimeError:  # not within its rounds: what was found so far is a certificate, too
+            break
+        nearest = points @ weights / weights.sum()
+        length = math.sqrt(nearest @ nearest)
+        if length - max(found[0], 0.0) < DOUBT:
+            break
+        normal = nearest / length
+    return found
+
+
+def _as_fcl(solid: ConvexSolid) -> tuple[Any, FloatArray]:
+    """fcl's shape and where its own centre lies in the solid's frame."""
+    import fcl
+
+    match solid:
+        case UprightCylinder(center, radius, height):
+            return fcl.Cylinder(radius, height), np.array(center)
+        case Polytope():
+            counts = np.full((len(solid.faces), 1), 3, dtype=np.int32)
+            faces = np.concatenate([counts, solid.faces], axis=1).ravel()
+            return fcl.Convex(np.array(solid.vertices), len(solid.faces), faces), _ORIGIN
+    raise TypeError(f"no collision shape for {type(solid).__name__}")

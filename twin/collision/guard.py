@@ -26,13 +26,10 @@ from functools import cached_property
 import numpy as np
 
 from flexdt.twin.collision.collision_scene import CollisionScene
-from flexdt.twin.collision.convex_solids import ConvexSolid, Polytope, UprightCylinder
-from flexdt.twin.collision.nearest import Separation
-from flexdt.twin.collision.paths import Path
-from flexdt.twin.collision.relative import START, Moment, RelativeMotion, Separate
+from flexdt.twin.collision.convex_solids import ConvexSolid, Polytope, Separation, UprightCylinder
+from flexdt.twin.collision.relative import START, Limits, Moment, Path, RelativeMotion, Separate
 from flexdt.twin.collision.scene_search import Pair, bodies_touching, first_contact
 from flexdt.twin.collision.stages import Body
-from flexdt.twin.collision.sweep import Limits
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.scanner.safety import ROUNDING_MM, Contact, floor

@@ -1,26 +1,164 @@
 """The motion of one body relative to another along a path, and how far it is proved safe.
 
-Conservative advancement in path length: from a certified gap d across the direction n, the gap at
-a later time is at least d + n . (displacement) - (what turning can bring nearer), a quadratic in
-each segment of the path. `next_at` finds the first time at which that bound has fallen to a level;
-no contact can occur before it, so none is ever stepped over. For pure translations the bound is
-exact along n, so that grazing costs one evaluation.
+Conservative advancement in path length: from a certified gap d across the direction n, the gap at a
+later time is at least d + n . (displacement) - (what turning can bring nearer), a quadratic in each
+segment of the path. `next_at` finds the first time at which that bound has fallen to a level; no
+contact can occur before it, so none is ever stepped over. For pure translations the bound is exact
+along n, so that grazing costs one evaluation.
+
+A path is all motors over an interval of time, cut where any of them changes its acceleration.
+Within a segment every motor has constant acceleration and does not reverse, so its displacement is
+one quadratic.
+
+`sweep_pair` finds the first contact and the least clearance of one pair of bodies along their
+relative motion. It advances from certified gap to certified gap, so motion that counts as free
+keeps the margin everywhere, not only where it was evaluated: clearance >= margin along everything
+before the reported contact. A contact is reported where the certified gap is within `tolerance` of
+the margin. A pair that is as near as that when a motion begins keeps to its floor instead
+(`twin.scanner.safety.floor`), which depends on the gap alone, so that no number of motions wears it
+down.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.collision.nearest import Separation
-from flexdt.twin.collision.paths import ROUNDING, Path, coarseness
+from flexdt.twin.collision.convex_solids import Separation
 from flexdt.twin.collision.stages import Body
 from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.motion.profiles import AxisPath
+from flexdt.twin.scanner.safety import ROUNDING_MM, floor
+
+CONTINUITY = 1e-6
+"""Largest jump of a motor between two pieces that counts as rounding [mm, deg]."""
+
+
+STEPS_OF_TIME = 8.0
+"""How many of the smallest steps of a time count as its rounding."""
+ROUNDING = 1e-9
+"""Shortest time that counts as a segment of its own where a motor turns round [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """Every motor over time.
+
+    Attributes:
+        axes: names of the motors, in the order of the columns.
+        times: (n + 1,) ends of the segments [s].
+        q: (n + 1, axes) positions there [mm, deg].
+        v: (n, axes) velocities at the start of each segment.
+        a: (n, axes) accelerations in each segment.
+    """
+
+    axes: tuple[str, ...]
+    times: FloatArray
+    q: FloatArray
+    v: FloatArray
+    a: FloatArray
+
+    def vectors(self, times: FloatArray) -> FloatArray:
+        """Positions at `times` (n,) within the path, (n, axes)."""
+        i = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.v) - 1)
+        dt = np.clip(times - self.times[i], 0.0, self.times[i + 1] - self.times[i])[:, None]
+        at = self.q[i] + dt * (self.v[i] + 0.5 * dt * self.a[i])
+        return np.where((times >= self.times[-1])[:, None], self.q[-1], at)
+
+    def positions(self, time: float) -> dict[str, float]:
+        """Motor -> position at `time` within the path [mm, deg]."""
+        return dict(zip(self.axes, self.vectors(np.array([time]))[0].tolist(), strict=True))
+
+    def after(self, time: float) -> Path:
+        """What is left of it from `time` on, which lies before its end."""
+        later = self.times > time
+        first = max(0, int(np.argmax(later)) - 1)
+        dt = time - self.times[first]
+        v = self.v[first:].copy()
+        v[0] = v[0] + dt * self.a[first]
+        q = np.concatenate([self.vectors(np.array([time])), self.q[first + 1 :]])
+        times = np.concatenate([[time], self.times[first + 1 :]])
+        return Path(self.axes, times, q, v, self.a[first:])
+
+    @property
+    def moving(self) -> npt.NDArray[np.bool_]:
+        """(axes,) whether each motor ever moves."""
+        moving: npt.NDArray[np.bool_] = np.abs(self.v).sum(axis=0) + np.abs(self.a).sum(axis=0) > 0
+        return moving
+
+
+def path_of(axes: Sequence[str], tables: Mapping[str, AxisPath], start: float, end: float) -> Path:
+    """The path of `axes` from `start` to `end` [s].
+
+    Raises:
+        KeyError: a motor has no table.
+        ValueError: a motor jumps; a sweep over it would prove nothing.
+    """
+    moving = [
+        (column, name, tables[name])
+        for column, name in enumerate(axes)
+        if not _stands(tables[name])
+    ]
+    cuts = [np.array([start, max(start, end)])]
+    for _, _, table in moving:
+        cuts += [table.times, _turning_times(table)]
+    times = np.unique(np.concatenate(cuts))
+    times = times[(times >= start) & (times <= end)]
+    if len(times) < 2:
+        times = np.array([start, start])
+    begin, length = times[:-1], np.diff(times)
+    q = np.tile([float(tables[name].x[0]) for name in axes], (len(times), 1))
+    v, a = np.zeros((2, len(begin), len(axes)))
+    for column, name, table in moving:
+        x0, v0, a0 = _state(table, begin)
+        arrives = x0 + length * (v0 + 0.5 * a0 * length)
+        # The times themselves are rounded, also those of a programme that is slowed: its places are
+        # off by what the motor goes before it is. A clock that is late has coarse ones.
+        rounding = coarseness(begin[1:]) * float(np.abs(table.v).max())
+        jumps = np.abs(arrives[:-1] - x0[1:]) > CONTINUITY + rounding
+        if jumps.any():
+            where = int(np.argmax(jumps))
+            raise ValueError(
+                f"{name} jumps from {arrives[where]:g} to {x0[where + 1]:g} at "
+                f"{times[where + 1]:g} s; a path must be continuous"
+            )
+        q[:-1, column], q[-1, column], v[:, column], a[:, column] = x0, arrives[-1], v0, a0
+    return Path(tuple(axes), times, q, v, a)
+
+
+def coarseness(times: FloatArray) -> FloatArray:
+    """How far times of that size may be off by rounding [s]."""
+    return STEPS_OF_TIME * np.asarray(np.spacing(np.abs(times)))
+
+
+def _stands(table: AxisPath) -> bool:
+    return not (table.v.any() or table.a.any() or (table.x != table.x[0]).any())
+
+
+def _state(table: AxisPath, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Position, velocity, acceleration in force from each of `times` (in order) on."""
+    i = table.times.searchsorted(times, side="right") - 1
+    before, i = i < 0, np.maximum(i, 0)  # there it stands
+    dt, v0, a0 = np.where(before, 0.0, (times - table.times[i], table.v[i], table.a[i]))
+    gained = a0 * dt
+    return table.x[i] + dt * (v0 + 0.5 * gained), v0 + gained, a0
+
+
+def _turning_times(table: AxisPath) -> FloatArray:
+    """When the motor turns round within a piece."""
+    turning = table.v * table.a < 0.0
+    if not turning.any():
+        return table.times[:0]
+    at = table.times[turning] - table.v[turning] / table.a[turning]
+    # A piece that brakes to rest turns round where it ends; rounding must not cut it there.
+    ends = np.append(table.times[1:], np.inf)[turning]
+    return np.asarray(at[at < ends - ROUNDING])
+
 
 Separate = Callable[[FloatArray, FloatArray | None, FloatArray | None], Separation]
 """The certified clearance of two solids: from b's origin to a's, orientations of a and b."""
@@ -268,3 +406,117 @@ class RelativeMotion:
 
     def _slide(self, normal: FloatArray) -> _Bound:
         return _Bound(self._velocity @ normal, self._acceleration @ normal)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What counts as a contact, and how well the least clearance is wanted [mm].
+
+    Attributes:
+        margin: clearance that is kept.
+        tolerance: a gap within this of the margin is a contact.
+        accuracy: absolute [mm] and relative error allowed in the least clearance (it is never
+            reported smaller than it is).
+    """
+
+    margin: float
+    tolerance: float
+    accuracy: tuple[float, float]
+
+    def slack(self, clearance: float) -> float:
+        """Error allowed in a least clearance of this size."""
+        return max(self.accuracy[0], self.accuracy[1] * clearance)
+
+
+@dataclass(frozen=True)
+class PairResult:
+    """What one pair's sweep found.
+
+    Attributes:
+        least: smallest clearance looked at before the contact, or at it [mm].
+        contact: where the margin is reached, or None.
+        last_free: a moment before it with a little more clearance; None if there is none.
+        looks: number of distance evaluations.
+    """
+
+    least: float
+    contact: Moment | None
+    last_free: Moment | None
+    looks: int
+
+
+def sweep_pair(
+    motion: RelativeMotion,
+    separate: Separate,
+    limits: Limits,
+    *,
+    start: Moment = START,
+    until: float = math.inf,
+) -> PairResult:
+    """Follow one pair until it touches, the motion ends, or `until` [s].
+
+    A pair that starts within the tolerance of the margin, or nearer, may move, but not below its
+    floor.
+
+    Args:
+        motion: of one body relative to the other.
+        separate: their certified clearance in a pose.
+        limits: margin, tolerance.
+        start: where to begin.
+        until: what happens after this time does not matter [s].
+    """
+    level, near = floor(math.inf, limits.margin), limits.margin + limits.tolerance
+    clear = near + limits.tolerance
+    at, before, looks, least = start, None, 0, math.inf
+    while True:
+        look = motion.look(at, separate)
+        looks += 1
+        least = min(least, look.gap)
+        if looks == 1 and 0.0 < look.gap <= near:
+            level = max(0.0, floor(look.gap, limits.margin))
+            near, clear = level + 0.5 * ROUNDING_MM, level + ROUNDING_MM
+        elif look.gap <= near:
+            if before is None:
+                return PairResult(look.gap, at, None, looks)
+            # The bound that led here holds as well as the look.
+            free = _last_free(motion, before, clear)
+            return PairResult(max(look.gap, level), at, free, looks)
+        before = look
+        following = motion.next_at(look, level)
+        if following is None or motion.time(following) > until:
+            break
+        at = following
+    # Free. Where it ends nearest is a good guess of the least clearance.
+    end = motion.nearest_end(before)
+    if motion.time(end) <= until:
+        least, looks = min(least, motion.look(end, separate).gap), looks + 1
+    return PairResult(least, None, None, looks)
+
+
+def refine_pair(
+    motion: RelativeMotion, separate: Separate, limits: Limits, best: float
+) -> tuple[float, int]:
+    """Least clearance of a pair that is known to be free, if it is below `best` [mm].
+
+    Returns:
+        A clearance that occurs, not more than `limits.slack` above the least (`best` if nothing
+        is below that), and the number of evaluations.
+    """
+    at: Moment | None = START
+    looks = 0
+    while at is not None:
+        look = motion.look(at, separate)
+        looks += 1
+        best = min(best, look.gap)
+        level = best - limits.slack(best)
+        if level <= 0.0:
+            break
+        at = motion.next_at(look, level)
+    return best, looks
+
+
+def _last_free(motion: RelativeMotion, before: Look, wanted: float) -> Moment:
+    """The last moment known to have clearance `wanted`, or the last one looked at."""
+    if before.gap <= wanted:
+        return before.at
+    return motion.next_at(before, wanted) or before.at

@@ -2,22 +2,32 @@
 
 Pairs are taken in the order in which their swept boxes could be near, so that most are decided
 without computing a distance.
+
+`check_home` says whether a machine file describes a machine that can stand at home and travel.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
-from flexdt.twin.collision.collision_scene import CollisionScene
-from flexdt.twin.collision.paths import Path
-from flexdt.twin.collision.relative import START, RelativeMotion
-from flexdt.twin.collision.sweep import PairResult, refine_pair, sweep_pair
+from flexdt.twin.collision.collision_scene import CollisionScene, build_scene
+from flexdt.twin.collision.relative import (
+    START,
+    PairResult,
+    Path,
+    RelativeMotion,
+    refine_pair,
+    sweep_pair,
+)
+from flexdt.twin.errors import MachineFileError
 from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.machine.kinematics import place
 from flexdt.twin.scanner.safety import Contact
 
 Pair = tuple[int, int]
@@ -203,3 +213,50 @@ def separation_at(scene: CollisionScene, pair: Pair, q: FloatArray) -> float:
     turn_a = a.rotation(float(q @ a.turns)) if a.spins else None
     turn_b = b.rotation(float(q @ b.turns)) if b.spins else None
     return scene.separation(pair)(offset, turn_a, turn_b)[0]
+
+
+def check_home(machine: Machine, profile: Profile, file: str) -> None:
+    """Check that the machine can stand at home: source, sample, panel in order, nothing touching.
+
+    No motor may take the rotation axis or the panel behind the source.
+
+    Args:
+        machine: read from `file`.
+        profile: its zero offsets.
+        file: for the error.
+
+    Raises:
+        MachineFileError: file, what is wrong, and where.
+    """
+    stage, panel = place(machine, "object_y"), place(machine, "detector_y")
+    sod, sdd = stage.home, panel.home
+    if not (math.isfinite(sod) and 0.0 < sod < sdd):
+        raise MachineFileError(
+            f"{file}: axes: at home SOD is {sod:g} mm and SDD {sdd:g} mm; allowed: 0 < SOD < SDD "
+            "(flexdt machine check prints what they are the sum of)",
+            {"file": file, "path": "axes", "sod": sod, "sdd": sdd},
+        )
+    for at, offset in ((stage, profile.c_obj), (panel, profile.c_det)):
+        least, most = at.least + offset, at.most + offset
+        if least <= 0.0:
+            raise MachineFileError(
+                f"{file}: axes: {at.name} goes from {least:g} to {most:g} mm over the travel "
+                f"({at.total}; zero offset {offset:g} mm); allowed: above 0 everywhere, in front "
+                "of the focal spot",
+                {"file": file, "path": "axes", "asked": [least, most], "allowed": "> 0"},
+            )
+    found = touching(build_scene(machine, profile), {})
+    if found:
+        raise MachineFileError(
+            f"{file}: axes: at home {_pairs(found)}; the safety margin is "
+            f"{machine.safety_margin_mm:g} mm (another home, other sizes or places; or say in "
+            "allowed_contacts that they are mounted on each other)",
+            {"file": file, "path": "axes", "pairs": [list(pair) for pair, _ in found]},
+        )
+
+
+def _pairs(found: Iterable[tuple[tuple[str, str], float]]) -> str:
+    return ", ".join(
+        f"{a} and {b} {f'are {gap:.3g} mm apart' if gap > 0.0 else 'touch'}"
+        for (a, b), gap in found
+    )

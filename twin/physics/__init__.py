@@ -10,7 +10,7 @@ from flexdt.twin.physics.chain import (
     spot_blur_px,
     weights_of,
 )
-from flexdt.twin.physics.detector import Detector, detector_of
+from flexdt.twin.physics.detector import Detector, deposited, detector_of
 from flexdt.twin.physics.effective import EffectiveBeam, effective_beam
 from flexdt.twin.physics.exposure import (
     Counts,
@@ -22,7 +22,6 @@ from flexdt.twin.physics.exposure import (
 )
 from flexdt.twin.physics.radiograph import check_rays, within_pixels
 from flexdt.twin.physics.scatter.simulation import Beam, ScanScatter, ScatterSettings, scan_scatter
-from flexdt.twin.physics.scintillator import deposited
 from flexdt.twin.physics.spectrum import (
     Filter,
     Spectrum,

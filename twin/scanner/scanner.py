@@ -25,8 +25,7 @@ from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses, resolve_targets, virtual_reading
 from flexdt.twin.motion import drives as plan
 from flexdt.twin.motion import profiles as motion
-from flexdt.twin.motion.braking import coasting
-from flexdt.twin.motion.drives import Drive
+from flexdt.twin.motion.drives import Drive, coasting
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.scanner.joining import (
     LEAST_STEP,
@@ -34,10 +33,10 @@ from flexdt.twin.scanner.joining import (
     JogMotion,
     Joined,
     Lookahead,
+    StageChange,
     StopMotion,
     UnsweptProgramme,
 )
-from flexdt.twin.scanner.readout import readout
 from flexdt.twin.scanner.safety import (
     ROUNDING_MM,
     Guard,
@@ -53,10 +52,10 @@ from flexdt.twin.scanner.settings import (
     CameraChange,
     changed_camera,
     changed_tube,
+    readout,
     require_applicable,
     switched,
 )
-from flexdt.twin.scanner.stage_change import StageChange
 from flexdt.twin.scanner.state import (
     AxisReading,
     NamedCorrection,

@@ -1,6 +1,7 @@
 """`flexdt machine` and `flexdt phantom`: machines and phantoms as data, new ones, fitted machines.
 
-A phantom file is JSON and may be named wherever `--phantom` is.
+A phantom file is JSON and may be named wherever `--phantom` is. `flexdt commission` makes a machine
+from a laboratory's past scans.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from flexdt.clients.cli.commands.scan_commands import read_log_file, tell
 from flexdt.clients.cli.console import note, table
 from flexdt.clients.cli.options import Answer, argument, option
 from flexdt.clients.cli.settings_file import MachineNewSettings, PhantomMakeSettings, chosen
+from flexdt.clients.failure import CommandError
 
 if TYPE_CHECKING:
     from flexdt.phantoms import Phantom
@@ -55,7 +57,7 @@ def show(name: NameOrFile) -> Answer:
 
 def check(name: NameOrFile) -> Answer:
     """Check a machine file: every value, its zero offsets, and whether it can stand at home."""
-    from flexdt.twin.collision.home_check import check_home
+    from flexdt.twin.collision.scene_search import check_home
 
     found = machines.machine(name)
     check_home(found, machines.profile(None, found, name), name)
@@ -83,10 +85,10 @@ def new(
     without: list[str] | None = option(None, "Leave out this axis.", metavar="AXIS"),
 ) -> Answer:
     """Write a short file for a machine of your own; asks for what is not said, on a terminal."""
-    from flexdt.twin.collision.home_check import check_home
+    from flexdt.twin.collision.scene_search import check_home
     from flexdt.twin.machine.description import builtin_machine, builtin_machines, parse_machine
-    from flexdt.twin.machine.new_file import Answers, new_machine_text
-    from flexdt.twin.machine.places import place
+    from flexdt.twin.machine.kinematics import place
+    from flexdt.twin.machine.machine_files import Answers, new_machine_text
 
     def asked(question: str, given: str | None, usual: str) -> str | None:
         if given is not None or not sys.stdin.isatty():
@@ -155,7 +157,7 @@ def fit(
 ) -> Answer:
     """Fit a machine to executed scripts: limits, rates and the times of its commands."""
     from flexdt.twin.machine.description import builtin_machine_text
-    from flexdt.twin.machine.fitted_file import fitted_text
+    from flexdt.twin.machine.machine_files import fitted_text
     from flexdt.twin.script.planning.log_fit import fit_machine, unlike
 
     machine = machines.machine(base)
@@ -194,7 +196,7 @@ def _axes(axes: dict[str, tuple[Axis, str]]) -> str:
 
 
 def _places(machine: Machine) -> str:
-    from flexdt.twin.machine.places import places
+    from flexdt.twin.machine.kinematics import places
 
     rows = [(p.name, p.total, f"{p.least:g}", f"{p.most:g}", f"{p.home:g}")
             for p in places(machine)]  # fmt: skip
@@ -288,3 +290,25 @@ def _summary(name: str, phantom: Phantom) -> dict[str, object]:
         "description": phantom.description,
         "assumed": list(phantom.assumed),
     }
+
+
+def commission(
+    folders: list[Path] = argument(..., "FOLDER...", "Past scans."),
+    traffic: Path | None = option(
+        None, "Read this recording of `flexdt follow --record` too.", metavar="FILE"
+    ),
+    out: Path = option(..., "Write machine, profile and report to this folder.", metavar="DIR"),
+) -> Answer:
+    """Fit a machine, its zero offsets and their drift to past scans, and say what disagrees."""
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise CommandError(f"{out} is there; allowed: a new or an empty folder")
+    from flexdt.clients.commission import commission as commissioned
+    from flexdt.clients.commission import write_commission
+    from flexdt.clients.figures import cell_text
+
+    found = commissioned(folders, traffic, read_log_file)
+    write_commission(found, out)
+    yield found.document(out)
+    for title, (head, rows) in found.tables(out).items():
+        yield f"{title}\n{table(([cell_text(x) for x in row] for row in rows), head)}\n"
+    yield f"{out}: machine.toml, profile.toml, commission.json and report.html written"

@@ -1,12 +1,15 @@
 """The scanner in viser: built once, then moved by every state; metres, one frame for each part.
 
 Only changes are sent. Setters may be called from any one thread at a time.
+
+The lab has plain lamps for every browser, and finer ones where a graphics processor draws. Without
+one, shadows and an environment take ten times as long as all the rest of a picture.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -16,11 +19,10 @@ from flexdt.clients.viewer.scenes import parts, world
 from flexdt.clients.viewer.scenes import parts as bodies
 from flexdt.clients.viewer.scenes import sample as solids
 from flexdt.clients.viewer.scenes.beam_shade import BeamShade
-from flexdt.clients.viewer.scenes.cabinet import LAMP, cabinet, ground_of
 from flexdt.clients.viewer.scenes.gizmos import Drag, Gizmos
 from flexdt.clients.viewer.scenes.labels import Name, names_of_image, names_of_parts
 from flexdt.clients.viewer.scenes.layers import Nodes, Shown
-from flexdt.clients.viewer.scenes.light import light_plainly
+from flexdt.clients.viewer.scenes.parts import LAMP, cabinet, ground_of
 from flexdt.clients.viewer.scenes.sample import MM, SampleLook
 from flexdt.clients.viewer.scenes.still import Shape, cone, cut, image_on, placed, shape_of
 from flexdt.clients.viewer.scenes.world import SCREEN, PlanDrawing, World, motors, quaternion
@@ -28,6 +30,33 @@ from flexdt.protocol.state_model import State
 from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine, Profile
+
+SKY: Final = "/lights/sky"
+GROUND: Final = (120, 116, 112)
+SKY_COLOR: Final = (236, 242, 255)
+KEY, KEY_AT = "/lights/key", (1.8, -2.2, 3.2)
+FILL_AT: Final = (-2.6, 1.4, 1.2)
+"""Where light comes from [m]."""
+
+
+def light_plainly(scene: viser.SceneApi) -> None:
+    """Lamps without shadows, for all clients."""
+    scene.configure_environment_map(None)
+    scene.add_light_hemisphere(SKY, sky_color=SKY_COLOR, ground_color=GROUND, intensity=1.35)
+    scene.add_light_directional(KEY, intensity=2.5, position=KEY_AT)
+    scene.add_light_directional("/lights/fill", intensity=0.8, position=FILL_AT)
+
+
+def light_finely(scene: viser.SceneApi) -> None:
+    """A room that shines in metal and lights from all around, and a lamp that casts shadows.
+
+    Args:
+        scene: of one client; its lamps take the place of those that all have.
+    """
+    scene.configure_environment_map("studio", environment_intensity=0.1)
+    scene.add_light_hemisphere(SKY, sky_color=SKY_COLOR, ground_color=GROUND, intensity=1.1)
+    scene.add_light_directional(KEY, intensity=1.9, position=KEY_AT, cast_shadow=True)
+
 
 FLOOR_MM = -405.0
 BEAM_ON = (255, 176, 32)

@@ -2,12 +2,16 @@
 
 Triangles are shaded flat and compete for pixels by their depth, in whole arrays: triangles of about
 one size are filled together. The live scene replaces it, so shadows and smooth surfaces can wait.
+
+`Stills` are those of a viewer's pages: computed one at a time, the newest kept.
 """
 
 from __future__ import annotations
 
+import asyncio
 import math
-from collections.abc import Iterable, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +21,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from flexdt.clients.viewer.scenes.sample import MM, PaintedMesh, Skin
-from flexdt.clients.viewer.scenes.standpoints import Standpoint
+from flexdt.clients.viewer.scenes.standpoints import Standpoint, roomy
 from flexdt.clients.viewer.scenes.world import World
 from flexdt.twin.geometry.conventions import FloatArray
 
@@ -213,3 +217,49 @@ def _filled(
             won = value >= depth[place]
             which[place[won]] = some[index[won]]
     return depth, which
+
+
+LEAST_PX, MOST_PX = 32, 1200
+MOST_BYTES = 60_000
+KEPT = 16
+
+
+class Stills:
+    """Pictures, each until the scene is another one."""
+
+    def __init__(self) -> None:
+        self._turn = asyncio.Lock()
+        self._kept: OrderedDict[object, bytes] = OrderedDict()
+
+    async def picture(
+        self,
+        camera: Standpoint,
+        asked: Mapping[str, str],
+        stamp: tuple[object, ...],
+        shapes: Callable[[], Sequence[Shape]],
+    ) -> bytes:
+        """A JPEG of at most MOST_BYTES.
+
+        Args:
+            camera: from where.
+            asked: `w` and `h` [px], and `dark` where it is "1": the page's query.
+            stamp: says whether the scene is still the same.
+            shapes: makes what is seen, in a thread.
+        """
+        width, height = (_side(asked.get(name, "")) for name in ("w", "h"))
+        dark = asked.get("dark") == "1"
+        key = camera, width, height, dark, *stamp
+        async with self._turn:
+            if key not in self._kept:
+                seen = roomy(camera, width / height)
+                self._kept[key] = await asyncio.to_thread(
+                    lambda: jpeg(drawn(shapes(), seen, (width, height), dark), MOST_BYTES)
+                )
+                while len(self._kept) > KEPT:
+                    self._kept.popitem(last=False)
+            return self._kept[key]
+
+
+def _side(text: str) -> int:
+    """Pixels of a query's words."""
+    return min(MOST_PX, max(LEAST_PX, int(text[:5]) if text.isdecimal() else 0))

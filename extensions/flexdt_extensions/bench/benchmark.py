@@ -1,21 +1,346 @@
-"""The benchmark from end to end: cases, peers, document."""
+"""The benchmark from end to end: cases, peers, times side by side, errors against exact lengths.
+
+Contestants run turn by turn, so that what disturbs one disturbs all; the minimum is what the
+machine can do, the median what one gets. `timed` and `plain` make entries of the benchmark's
+document.
+
+The cases are data: volumes, geometries, detectors. C1, C2 and C3 are the cases that peers were
+measured with; the others are what nobody tuned for. Volumes are filled with random numbers, so no
+empty space is there to be skipped (but for the ball).
+"""
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from flexdt.measuring import gpu, threads
-from flexdt.twin.projection import forward, warm_up
-from flexdt_extensions.bench.cases import Case, all_cases
-from flexdt_extensions.bench.measure import errors, exact_images, sorted_crossings, timed
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray, rotation_about, rotation_z
+from flexdt.twin.projection import Volume, forward, warm_up
 from flexdt_extensions.bench.peers import Peer, Runner, peers
+
+SOD, SDD = 600.0, 1059.0
+C1_SHAPE, C2_SHAPE = (498, 240, 160), (512, 512, 512)
+BINNED, FULL = (760, 956), (1944, 1536)
+PITCH = {BINNED: 0.1496, FULL: 0.0748}
+TILT_DEG = (0.4, 0.7, 0.3)
+"""Rotation in the detector's plane, and two out of it [deg]."""
+NONE = (0.0, 0.0, 0.0)
+LYING = (90.0, 0.0, 0.0)
+FAR = 100.0
+START = 0.3
+"""First angle [rad]: no axis of the volume is special."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One measurement: a volume, views of it, and whether peers take part.
+
+    Attributes:
+        name: as in the document.
+        volume: builds it.
+        geometry: all its views.
+        shape: detector (rows, cols).
+        peers: run the peers too.
+        what: one line for people.
+    """
+
+    name: str
+    volume: Callable[[], Volume]
+    geometry: ConeVec
+    shape: tuple[int, int]
+    peers: bool
+    what: str
+
+
+def circle(
+    views: int,
+    shape: tuple[int, int],
+    *,
+    sod: float = SOD,
+    sdd: float = SDD,
+    pitch: float | None = None,
+    tilt_deg: tuple[float, float, float] = NONE,
+    height: float = 0.0,
+    above_deg: float = 0.0,
+) -> ConeVec:
+    """Views on a full circle (object frame), the detector tilted about its normal, u and v; source
+    and detector turned together by `above_deg` about u, which brings the source above the object.
+    """
+    pixel = PITCH[shape] if pitch is None else pitch
+    u, v, beam = np.array([1.0, 0, 0]), np.array([0, 0, -1.0]), np.array([0, 1.0, 0])
+    for axis, angle in zip((beam, u, v), tilt_deg, strict=True):
+        turn = rotation_about(axis, math.radians(angle))
+        u, v = turn @ u, turn @ v
+    raise_ = rotation_about(np.array([1.0, 0, 0]), -math.radians(above_deg))
+    rows = []
+    for i in range(views):
+        r = rotation_z(START + 2 * math.pi * i / views) @ raise_
+        source = np.array([0, -sod, height])
+        centre = np.array([0, sdd - sod, -height * (sdd / sod - 1)])
+        rows.append(np.concatenate([r @ source, r @ centre, pixel * (r @ u), pixel * (r @ v)]))
+    return ConeVec(np.array(rows))
+
+
+def noise(shape: tuple[int, int, int], voxel: float | tuple[float, float, float] = 0.1) -> Volume:
+    """A volume of random numbers, the same every time."""
+    values: Float32Array = np.random.default_rng(0).random(shape, dtype=np.float32)
+    return Volume(values, voxel)
+
+
+def ball(side: int) -> Volume:
+    """A ball of a tenth of the volume's side in its middle, the rest empty."""
+    values = np.zeros((side,) * 3, np.float32)
+    n = side // 10
+    x = np.arange(-n, n + 1)
+    inside = (x[:, None, None] ** 2 + x[:, None] ** 2 + x**2) <= n * n
+    at = slice(side // 2 - n, side // 2 + n + 1)
+    values[at, at, at] = inside
+    return Volume(values, 0.1)
+
+
+def peer_cases() -> list[Case]:
+    """The cases of the targets."""
+    c1, c2 = partial(noise, C1_SHAPE), partial(noise, C2_SHAPE)
+    above = [
+        Case(f"above-{e}", c1, circle(8, BINNED, above_deg=e), BINNED, True,
+             f"C1, 8 views from {e} degrees above")
+        for e in (30, 45, 60, 75)
+    ]  # fmt: skip
+    row, small = (1, 956), (95, 120)
+    single = Case("row", c1, circle(8, row, pitch=0.1496), row, True, "C1, 8 views, one row")
+    tilted = circle(8, small, pitch=1.2, tilt_deg=TILT_DEG)
+    cube = partial(noise, (64, 64, 64), 0.8)
+    little = Case("small-tilt", cube, tilted, small, True, "64^3 voxels, 120 x 95 pixels, tilted")
+    return [
+        *(
+            Case(name, volume, circle(views, shape, tilt_deg=tilt), shape, True, what)
+            for name, volume, views, shape, tilt, what in (
+                ("C1", c1, 1, BINNED, NONE, "160 x 240 x 498 voxels, 956 x 760 pixels"),
+                ("C2", c2, 1, BINNED, NONE, "512^3 voxels, 956 x 760 pixels"),
+                ("C3", c1, 1, FULL, NONE, "C1's volume, 1536 x 1944 pixels"),
+                ("C1x36", c1, 36, BINNED, NONE, "C1, 36 views in one call"),
+                ("C2x10", c2, 10, BINNED, NONE, "C2, 10 views in one call"),
+                ("C1-tilt", c1, 1, BINNED, TILT_DEG, "C1, detector tilted"),
+                ("C2-tilt", c2, 1, BINNED, TILT_DEG, "C2, detector tilted"),
+                ("C3-tilt", c1, 1, FULL, TILT_DEG, "C3, detector tilted"),
+            )
+        ),
+        *above,
+        single,
+        little,
+    ]
+
+
+def untuned_cases() -> list[Case]:
+    """Cases nobody tuned for: exact, and without a cliff in speed."""
+    s, cube, strong = BINNED, (256, 256, 256), (45.0, 45.0, 45.0)
+    # 60 degrees across the detector's diagonal.
+    wide = 2 * math.tan(math.radians(30)) * 80.0 / math.hypot(*s)
+    cone: dict[str, Any] = {"sod": 40.0, "sdd": 80.0, "pitch": wide}
+    aslant = (LYING[0] + TILT_DEG[0], *TILT_DEG[1:])
+    near, small = {"sod": 19.2, "sdd": 60.0, "pitch": 0.08}, (95, 120)
+    # Nearly parallel rays pass no z level: what is left is walking through the voxel columns.
+    far = {"sod": FAR * SOD, "sdd": FAR * SDD}
+    rows: list[tuple[str, tuple[int, int, int], dict[str, Any], str]] = [
+        ("cone-60", cube, cone, "60 degree cone"),
+        ("cone-60-tilt", cube, cone | {"tilt_deg": TILT_DEG}, "and tilt"),
+        ("tilt-45", C1_SHAPE, {"tilt_deg": strong}, "three tilts of 45 degrees"),
+        ("roll-90", C1_SHAPE, {"tilt_deg": LYING}, "C1, detector on its side"),
+        ("roll-90-tilt", C1_SHAPE, {"tilt_deg": aslant}, "and tilted"),
+        ("near", cube, near, "source 1 mm off the box"),
+        ("flat", (4, 1024, 1024), {"height": 100.0}, "4 slices of 1024^2, from above"),
+        ("long", (2000, 32, 32), {}, "a rod 2000 voxels long"),
+        ("far", C1_SHAPE, far, "C1, 100 times as far"),
+    ]
+    c1, aniso = partial(noise, C1_SHAPE), partial(noise, C1_SHAPE, (0.1, 0.2, 0.05))
+    many = circle(1000, small, pitch=1.2)
+    return [
+        Case("ball", partial(ball, 512), circle(1, s), s, False, "a ball in empty 512^3"),
+        *(Case(name, partial(noise, shape), circle(1, s, **how), s, False, what)
+          for name, shape, how, what in rows),
+        Case("anisotropic", aniso, circle(1, s), s, False, "voxels 0.1 x 0.2 x 0.05 mm"),
+        Case("on-axis", c1, on_axis(s), s, False, "rays along a voxel axis, tilted"),
+        Case("C1x1000", c1, many, small, False, "1000 views of 120 x 95 pixels in one call"),
+    ]  # fmt: skip
+
+
+def all_cases() -> list[Case]:
+    """Every case that is a projection of voxels."""
+    return [*peer_cases(), *untuned_cases()]
+
+
+def on_axis(shape: tuple[int, int]) -> ConeVec:
+    """One tilted view whose central ray runs along y."""
+    view = circle(1, shape, tilt_deg=TILT_DEG)
+    back = rotation_z(-START)
+    return view.moved(back, (0.0, 0.0, 0.0))
+
+
+BUDGET_S = 6.0
+"""A contestant that has run this long runs no more rounds."""
+AT_LEAST, AT_MOST = 3, 15
+"""Rounds."""
+SHORT_S, MANY = 1.5, 150
+"""A contestant whose rounds took less than this in all runs up to so many: what else the machine
+does hides the best of a few short calls."""
+
+
+@dataclass(frozen=True)
+class CallTime:
+    """Seconds a call: the best, the median, and how many calls."""
+
+    best: float
+    median: float
+    calls: int
+
+
+def interleaved(
+    contestants: Mapping[str, Callable[[], object]],
+    *,
+    once: frozenset[str] = frozenset(),
+    budget_s: float = BUDGET_S,
+) -> dict[str, CallTime]:
+    """Time contestants turn by turn.
+
+    Args:
+        contestants: name to call; the first call of each is not counted (but for those in `once`,
+            which are called one time in all). A call that returns a float (seconds) has been timed
+            by itself, in its own process.
+        once: too slow for more.
+        budget_s: seconds a contestant may use before it drops out, after the least number.
+    """
+    times: dict[str, list[float]] = {name: [] for name in contestants}
+    for name, call in contestants.items():
+        if name not in once:
+            call()
+    wanting = set(contestants)
+    while wanting:
+        for name, call in contestants.items():
+            if name not in wanting:
+                continue
+            seen = times[name]
+            start = time.perf_counter()
+            answer = call()
+            taken = time.perf_counter() - start
+            seen.append(answer if isinstance(answer, float) else taken)
+            if name in once or _enough(len(seen), sum(seen), budget_s):
+                wanting.discard(name)
+    return {
+        name: CallTime(min(seen), float(np.median(seen)), len(seen)) for name, seen in times.items()
+    }
+
+
+def _enough(rounds: int, spent_s: float, budget_s: float) -> bool:
+    """Whether a contestant has run often enough."""
+    if rounds < AT_LEAST:
+        return False
+    most = MANY if spent_s < SHORT_S else AT_MOST
+    return spent_s > budget_s or rounds >= most
+
+
+def errors(images: Float32Array, exact: Float32Array | FloatArray) -> tuple[float, float]:
+    """(mean, worst) absolute difference, as a share of the exact images' maximum."""
+    top = float(exact.max())
+    difference = np.abs(images.astype(np.float64) - exact)
+    return float(difference.mean()) / top, float(difference.max()) / top
+
+
+def exact_images(volume: Volume, geometry: ConeVec, shape: tuple[int, int]) -> Float32Array:
+    """Every ray on its own in double precision (positions and sums), rounded once at the end."""
+    from flexdt.measuring import box_of, siddon_kernels, voxel_rays
+
+    out = np.zeros((len(geometry), *shape), np.float32)
+    views = voxel_rays(geometry, volume.layout, shape)
+    every = np.arange(len(geometry))
+    siddon_kernels.project_rays(box_of(volume.layout), views, every, out, 8)
+    return out
+
+
+def sorted_crossings(
+    volume: Volume, geometry: ConeVec, shape: tuple[int, int], pixels: FloatArray
+) -> FloatArray:
+    """The same integrals by another way: all crossings of a ray, sorted, in NumPy.
+
+    Args:
+        pixels: (k, 3) view, row, column.
+    """
+    data = volume.data
+    size, counts = np.array(volume.voxel_xyz), np.array(volume.shape[::-1])
+    low = np.array(volume.center_mm) - counts * size / 2
+    result = np.zeros(len(pixels))
+    for i, (view, r, c) in enumerate(pixels):
+        row = geometry.rows[int(view)]
+        start = row[0:3]
+        end = row[3:6] + (c - (shape[1] - 1) / 2) * row[6:9] + (r - (shape[0] - 1) / 2) * row[9:12]
+        d = end - start
+        t = [np.array([0.0, 1.0])]
+        for a in range(3):
+            if d[a] != 0:
+                t.append((low[a] + np.arange(counts[a] + 1) * size[a] - start[a]) / d[a])
+        cuts = np.sort(np.clip(np.concatenate(t), 0.0, 1.0))
+        middle = start + 0.5 * (cuts[1:] + cuts[:-1])[:, None] * d
+        index = np.floor((middle - low) / size).astype(np.int64)
+        inside = ((index >= 0) & (index < counts)).all(axis=1)
+        x, y, z = index[inside].T
+        lengths = np.diff(cuts)[inside] * np.linalg.norm(d)
+        result[i] = float(np.sum(lengths * data[z, y, x].astype(np.float64)))
+    return result
+
+
+Entry = dict[str, Any]
+
+
+def timed(
+    name: str,
+    views: int,
+    calls: dict[str, Callable[[], object]],
+    what: str,
+    once: frozenset[str] = frozenset(),
+) -> Entry:
+    """An entry for the call named flexdt beside those of the others."""
+    timing = interleaved(calls, once=once)
+    ours = timing.pop("flexdt")
+    entry = plain(name, ours.best * 1e3 / views, what)
+    entry["views"] = views
+    entry["median_ms_per_view"] = ours.median * 1e3 / views
+    for peer, seen in timing.items():
+        entry["peers"][peer] = {
+            "ms_per_view": seen.best * 1e3 / views,
+            "median_ms_per_view": seen.median * 1e3 / views,
+            "mean_error": None,
+        }
+        entry["ratio"][peer] = seen.best / ours.best
+        entry["median_ratio"][peer] = seen.median / ours.median
+    return entry
+
+
+def plain(name: str, ms: float, what: str) -> Entry:
+    """An entry of one time."""
+    return {
+        "name": name,
+        "what": what,
+        "views": 1,
+        "ms_per_view": ms,
+        "mean_error": None,
+        "worst_error": None,
+        "peers": {},
+        "ratio": {},
+        "median_ratio": {},
+        "threads": threads(),
+    }
+
 
 CHECKED = 300
 """Rays of each case that are checked by a second, independent exact method."""

@@ -10,20 +10,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from flexdt_extensions.bluesky.axes import LimitsExceeded as LimitsExceeded
-    from flexdt_extensions.bluesky.axes import TwinAxis as TwinAxis
     from flexdt_extensions.bluesky.camera_device import TwinCamera as TwinCamera
+    from flexdt_extensions.bluesky.devices import TwinAxis as TwinAxis
     from flexdt_extensions.bluesky.devices import TwinLab as TwinLab
     from flexdt_extensions.bluesky.devices import TwinTube as TwinTube
     from flexdt_extensions.bluesky.flyer import FlyScan as FlyScan
     from flexdt_extensions.bluesky.flyer import TwinFlyer as TwinFlyer
     from flexdt_extensions.bluesky.lab_connection import LabConnection as LabConnection
+    from flexdt_extensions.bluesky.lab_connection import LimitsExceeded as LimitsExceeded
 
 _HOMES = {
     "FlyScan": "flexdt_extensions.bluesky.flyer",
     "LabConnection": "flexdt_extensions.bluesky.lab_connection",
-    "LimitsExceeded": "flexdt_extensions.bluesky.axes",
-    "TwinAxis": "flexdt_extensions.bluesky.axes",
+    "LimitsExceeded": "flexdt_extensions.bluesky.lab_connection",
+    "TwinAxis": "flexdt_extensions.bluesky.devices",
     "TwinCamera": "flexdt_extensions.bluesky.camera_device",
     "TwinFlyer": "flexdt_extensions.bluesky.flyer",
     "TwinLab": "flexdt_extensions.bluesky.devices",

@@ -2,28 +2,185 @@
 
 Voltage, power and on or off of the X-ray tube are settable signals; `bps.mv(tube.kV, 90,
 tube.power_W, 20, tube.on, True)` waits until X-rays are stable.
+
+An axis is readable, movable, stoppable, and checked before anything moves. `check_value` judges a
+target by the machine's limits and by the twin's own plan of the path, so
+`bluesky.simulators.check_limits` and every `set` report what the scanner would reject. Positions
+have the script's sign, in mm and deg.
 """
 
 from __future__ import annotations
 
 import asyncio
 import ssl as tls
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
+from bluesky.protocols import Location
 from ophyd_async.core import (
     AsyncStageable,
     AsyncStatus,
     Device,
+    MovableLogic,
     PathProvider,
+    SignalR,
+    SignalRW,
+    StandardMovable,
     StandardReadable,
     StandardReadableFormat,
+    TimeoutCalculator,
+    WatchableAsyncStatus,
 )
 
-from flexdt.clients import Transport
+from flexdt.clients import AxisState, State, Transport
 from flexdt.twin.machine.description import Machine, builtin_machine
-from flexdt_extensions.bluesky.axes import TwinAxis
 from flexdt_extensions.bluesky.camera_device import TwinCamera
 from flexdt_extensions.bluesky.flyer import TwinFlyer
-from flexdt_extensions.bluesky.lab_connection import LabConnection, ReadBeforeDescribed, settable
+from flexdt_extensions.bluesky.lab_connection import (
+    LabConnection,
+    LimitsExceeded,
+    Put,
+    ReadBeforeDescribed,
+    TwinBackend,
+    settable,
+)
+
+ARRIVED = 1e-6
+"""Distance from the target at which an axis has arrived [mm, deg]."""
+
+
+@dataclass
+class AxisLogic(MovableLogic[float]):
+    """How an axis moves."""
+
+    link: LabConnection
+    axis: str
+    collisions: bool
+    stopped: bool = False
+    """Whether it was stopped since the last target was set."""
+
+    async def stop(self) -> None:
+        """Brake this axis; a motion that is still being checked does not begin."""
+        self.stopped = True
+        await self.link.client.jog(self.axis, 0.0)
+
+    async def check_move(self, new_position: float) -> None:
+        """Check a move from the current position to a target; nothing moves.
+
+        Raises:
+            LimitsExceeded: says which limit, or which two parts would touch.
+        """
+        state = await self.link.fresh()
+        axis = state.axes[self.axis]
+        low, high = axis.limits
+        if not low <= new_position <= high:
+            raise LimitsExceeded(
+                f"{self.axis} target {new_position:g} {axis.unit} is outside "
+                f"[{low:g}, {high:g}] {axis.unit}",
+                {"axis": self.axis, "asked": new_position, "allowed": [low, high]},
+            )
+        if not self.collisions or abs(new_position - axis.position) <= ARRIVED:
+            return
+        poses = [{self.axis: new_position}]
+        report = await self.link.client.check_trajectory(poses, flat=False)
+        if report.collisions:
+            first = report.collisions[0]
+            raise LimitsExceeded(
+                f"{self.axis} target {new_position:g} {axis.unit}: {' and '.join(first.pair)} "
+                "would touch on the way",
+                {"axis": self.axis, "asked": new_position, "pair": list(first.pair),
+                 "last_free": dict(first.last_free)},
+            )  # fmt: skip
+
+    async def move(self, new_position: float, timeout: TimeoutCalculator) -> None:
+        """Move there.
+
+        Raises:
+            RpcError: a limit, a collision, a running job, or another controller.
+            RuntimeError: another client stopped the axis on its way.
+        """
+        if self.stopped:
+            return
+        async with asyncio.timeout(timeout()):
+            await self.link.client.move({self.axis: new_position})
+            async for state in self.link.states():
+                axis = state.axes[self.axis]
+                if not axis.moving:
+                    self._arrived(axis, new_position, state)
+                    return
+
+    def _arrived(self, axis: AxisState, target: float, state: State) -> None:
+        if abs(axis.position - target) > ARRIVED:
+            why = " by the emergency stop" if state.safety.estop else ""
+            raise RuntimeError(
+                f"{self.axis} stopped{why} at {axis.position:g} {axis.unit}, "
+                f"on its way to {target:g}"
+            )
+
+
+class TwinAxis(ReadBeforeDescribed, StandardReadable, StandardMovable[float]):
+    """One motor or virtual axis.
+
+    Args:
+        link: to the twin.
+        axis: as the machine calls it, e.g. `rot_obj`.
+        unit: mm or deg.
+        name: of the device; a plan's data carry it.
+        collisions: whether `check_value` asks the twin about collisions too (some 50 ms each).
+    """
+
+    def __init__(
+        self,
+        link: LabConnection,
+        axis: str,
+        unit: str = "mm",
+        name: str = "",
+        *,
+        collisions: bool = True,
+    ) -> None:
+        self._link, self._axis, self._collisions = link, axis, collisions
+        client = link.client
+
+        def member(name: str, put: Put[float], units: str) -> SignalRW[float]:
+            return settable(link, f"axes.{axis}.{name}", float, put, units)
+
+        with self.add_children_as_readables(StandardReadableFormat.HINTED_SIGNAL):
+            position = TwinBackend(
+                link, f"axes.{axis}.position", float, units=unit,
+                limits=lambda state: state.axes[axis].limits,
+            )  # fmt: skip
+            self.readback = SignalR(position)
+        with self.add_children_as_readables(StandardReadableFormat.CONFIG_SIGNAL):
+            self.speed = member("speed", lambda v: client.set_axis(axis, speed=v), f"{unit}/s")
+            self.acceleration = member(
+                "acceleration", lambda v: client.set_axis(axis, acceleration=v), f"{unit}/s^2"
+            )
+        self.setpoint = member("target", lambda v: client.move({axis: v}), unit)
+        super().__init__(name=name)
+
+    def set(self, new_position: float, *more: Any, **options: Any) -> WatchableAsyncStatus[float]:
+        """Move there, unless `stop` comes first."""
+        self.movable_logic.stopped = False
+        return super().set(new_position, *more, **options)
+
+    async def locate(self) -> Location[float]:
+        """Target and position, from the newest state that is known.
+
+        Nothing is awaited while the twin's states arrive: Bluesky loses the answer to a message
+        that is interrupted, and its relative plans then take the axis to be at 0.
+        """
+        axis = (await self._link.known()).axes[self._axis]
+        at = axis.position
+        return Location(setpoint=at if axis.target is None else axis.target, readback=at)
+
+    @cached_property
+    def movable_logic(self) -> AxisLogic:
+        """How this axis moves."""
+        return AxisLogic(
+            setpoint=self.setpoint, readback=self.readback, link=self._link, axis=self._axis,
+            collisions=self._collisions,
+        )  # fmt: skip
 
 
 class TwinTube(ReadBeforeDescribed, StandardReadable):

@@ -32,6 +32,18 @@ PATIENCE_S = 0.1
 """How long to wait for an event before the state is requested."""
 
 
+class LimitsExceeded(ValueError):
+    """A target that the machine does not allow: beyond a limit, or in collision on the way.
+
+    Attributes:
+        data: what was asked and what is allowed.
+    """
+
+    def __init__(self, message: str, data: dict[str, object]) -> None:
+        super().__init__(message)
+        self.data = data
+
+
 class LabConnection:
     """The twin, as devices need it; used from the event loop that connects it (RunEngine's).
 

@@ -25,8 +25,9 @@ from flexdt_extensions.studies.experiments import (
     WorkUnit,
     placement_scenario,
     scenario,
+    thesis,
+    thesis_row,
 )
-from flexdt_extensions.studies.thesis_tables import thesis, thesis_row
 
 OURS = "ours"
 ALGORITHM_2 = "Algorithm 2"

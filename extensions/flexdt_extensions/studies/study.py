@@ -1,33 +1,185 @@
 """`flexdt study` without its command line: distributes the runs of an experiment over processes and
-collects their results in one document. The runs are `flexdt_extensions.studies`."""
+collects their results in one document. The runs are `flexdt_extensions.studies`.
+
+The experiment `basin` is here, too: how far off may the start be? It is success against the start's
+error in mm and degrees (RQ5). Gauss-Newton and Levenberg-Marquardt of Algorithm 2 and our fit are
+given the beads' identities; our identification is given spots without them.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from flexdt.clients.figures import require_plots
 from flexdt.phantoms import Phantom, cuboid_with_beads, load_phantom, loop_positions, material
-from flexdt.twin.calibration import SIX, BeadModel, bead_model
+from flexdt.twin.calibration import SIX, BeadModel, bead_model, build_problem, estimate_geometry
+from flexdt.twin.calibration.detect.detection import Detections
+from flexdt.twin.calibration.identify import identify
 from flexdt.twin.errors import TwinError, UnknownNameError
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.physics import Chain, Detector, EffectiveBeam, effective_beam, weights_of
 from flexdt_extensions.executors import executor
 from flexdt_extensions.studies import experiment_4 as real
-from flexdt_extensions.studies import experiment_4_images as real_images
-from flexdt_extensions.studies.basin import (
-    METHODS,
-    START_DEG,
-    START_MM,
-    Cell,
-    basin_runs,
-    cells,
-    success_grid,
+from flexdt_extensions.studies.algorithm_2 import algorithm_2
+from flexdt_extensions.studies.experiments import (
+    DAMPING,
+    EXPERIMENTS,
+    NOISE_PX,
+    SHAPE,
+    VARIANTS,
+    WorkUnit,
+    author,
+    scenario,
+    tasks,
 )
-from flexdt_extensions.studies.experiments import EXPERIMENTS, NOISE_PX, VARIANTS, WorkUnit, tasks
 from flexdt_extensions.studies.experiments import FIDELITIES as ALL_FIDELITIES
-from flexdt_extensions.studies.runs import Run, point_runs, summary
-from flexdt_extensions.studies.thesis_tables import author
+from flexdt_extensions.studies.runs import Run, errors_of, point_runs, summary
+
+START_MM: Final = (0.0, 5.0, 10.0, 20.0, 40.0, 80.0)
+START_DEG: Final = (0.0, 30.0, 60.0, 90.0, 120.0, 150.0, 180.0)
+FRAMES: Final = 36
+LIMIT: Final = 0.2
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One start error: draws of random directions."""
+
+    mm: float
+    deg: float
+    draws: int
+    phantom: str
+    seed: int
+    noise_px: float = NOISE_PX
+
+    @property
+    def name(self) -> str:
+        """For tables."""
+        return cell_name(self.mm, self.deg)
+
+
+def cell_name(mm: float, deg: float) -> str:
+    """What a start error is called in tables."""
+    return f"{mm:g} mm, {deg:g} deg"
+
+
+def cells(seed: int = 1, noise_px: float = NOISE_PX) -> list[Cell]:
+    """The grid of start errors."""
+    return [Cell(mm, deg, 10, "normal-5", seed, noise_px) for mm in START_MM for deg in START_DEG]
+
+
+def basin_runs(cell: Cell, model: BeadModel) -> list[Run]:
+    """All methods on all draws of a cell; the start is the truth plus the error."""
+    out = []
+    for draw in range(cell.draws):
+        rng = np.random.default_rng([cell.seed, int(cell.mm * 10), int(cell.deg), draw])
+        poses, truth = scenario(f"G{draw % 5}", FRAMES)
+        exact = poses.cone_vec(truth).project_points(model.beads, SHAPE)
+        tracks = exact + cell.noise_px * rng.normal(size=exact.shape)
+        way = rng.normal(size=3)
+        way *= cell.mm / np.linalg.norm(way)
+        turn = math.radians(cell.deg) * rng.choice([-1.0, 1.0])
+        start = replace(
+            truth, dO_x=truth.dO_x + way[0], dO_y=truth.dO_y + way[1], dO_z=truth.dO_z + way[2],
+            alpha=truth.alpha + turn,
+        )  # fmt: skip
+        for method in METHODS:
+            found, iterations = _solve(method, _Draw(tracks, model, poses, start, rng))
+            errors = {} if found is None else _six(found, truth)
+            out.append(
+                Run(
+                    method, cell.name, FRAMES, found is not None, errors, {}, iterations, math.nan,
+                    bool(errors) and float(np.mean(list(errors.values()))) < LIMIT,
+                )
+            )  # fmt: skip
+    return out
+
+
+def _six(found: Offsets, truth: Offsets) -> dict[str, float]:
+    edge = found.to_edge()
+    return errors_of({n: edge[n] for n in SIX}, truth)
+
+
+@dataclass(frozen=True, eq=False)
+class _Draw:
+    """What a method gets: measured points, beads, poses, where to start, and dice."""
+
+    tracks: FloatArray
+    model: BeadModel
+    poses: Poses
+    start: Offsets
+    rng: np.random.Generator
+
+
+_Found = tuple[Offsets | None, int]
+"""Geometry, if any, and iterations."""
+
+
+def _damped(lam: float) -> Callable[[_Draw], _Found]:
+    def solve(draw: _Draw) -> _Found:
+        problem = build_problem(
+            draw.tracks, draw.model, draw.poses, free=SIX, shape=SHAPE, start=draw.start
+        )
+        result = algorithm_2(problem, lam)
+        return result.parameters, result.iterations
+
+    return solve
+
+
+def _ours(draw: _Draw) -> _Found:
+    fit = estimate_geometry(
+        draw.tracks, draw.model, draw.poses, shape=SHAPE, noise_px=NOISE_PX, start=draw.start
+    )
+    return fit.parameters, fit.iterations
+
+
+def _nameless(draw: _Draw) -> _Found:
+    found = identify(_shadows(draw.tracks, draw.rng), draw.model, draw.poses, start=draw.start)
+    if found.ambiguous:
+        return None, 0
+    return _ours(replace(draw, tracks=found.tracks, start=found.parameters))
+
+
+_SOLVERS: Final[Mapping[str, Callable[[_Draw], _Found]]] = {
+    "GN": _damped(DAMPING["GN"]),
+    "LM_normal": _damped(DAMPING["LM_normal"]),
+    "ours": _ours,
+    "ours, identities unknown": _nameless,
+}
+METHODS: Final = tuple(_SOLVERS)
+
+
+def _solve(method: str, draw: _Draw) -> _Found:
+    try:
+        return _SOLVERS[method](draw)
+    except TwinError:
+        return None, 0
+
+
+def _shadows(tracks: FloatArray, rng: np.random.Generator) -> list[Detections]:
+    """Points in random order, as if detected."""
+    return [Detections.of_points(rng.permutation(f), NOISE_PX, 15.0, SHAPE) for f in tracks]
+
+
+def success_grid(runs: Sequence[Run], method: str) -> FloatArray:
+    """Share of successes, (mm, deg); nan where nothing was run."""
+    out = np.full((len(START_MM), len(START_DEG)), np.nan)
+    for i, mm in enumerate(START_MM):
+        for j, deg in enumerate(START_DEG):
+            name = cell_name(mm, deg)
+            some = [r.success for r in runs if r.setting == method and r.scenario == name]
+            if some:
+                out[i, j] = float(np.mean(some))
+    return out
+
 
 KILOVOLTS = 90.0
 LOOP_RADIUS_MM, LOOP_INSET_MM = 2.0, 3.0
@@ -98,7 +250,7 @@ def run_study(
             case "basin", _:
                 runs, more = _basin(spread, say, fidelity, seed)
             case "real", "images":
-                runs, more = real_images_runs(spread, say, seed, counts or real_images.COUNTS)
+                runs, more = real_images_runs(spread, say, seed, counts or real.COUNTS)
             case "real", _:
                 runs, more = _real(spread, say, fidelity, seed, counts)
             case _:
@@ -225,7 +377,7 @@ def real_images_task(task: tuple[str, BeadModel, int, int, Sequence[int]]) -> li
     """One scan: (name, beads as found, seed, frames, counts)."""
     name, found, seed, frames, counts = task
     phantom = load_phantom("lego")
-    return real_images.image_runs(
+    return real.image_runs(
         name, phantom.scene, bead_model(phantom), found, lego_beam(), seed, frames=frames,
         counts=counts,
     )  # fmt: skip
@@ -237,7 +389,7 @@ def real_images_runs(
     seed: int,
     counts: Sequence[int],
     scans: Sequence[str] | None = None,
-    frames: int = real_images.FRAMES,
+    frames: int = real.FRAMES,
 ) -> tuple[list[Run], Document]:
     """Experiment 4 on images: the first scan gives the beads, all are calibrated with them.
 
@@ -251,9 +403,9 @@ def real_images_runs(
     """
     phantom = load_phantom("lego")
     model = bead_model(phantom)
-    found, _ = real_images.first_scan("Scan1", phantom.scene, model, lego_beam(), seed, frames)
-    truth = real_images.hidden_phantom(phantom.scene, model, seed)[1]
+    found, _ = real.first_scan("Scan1", phantom.scene, model, lego_beam(), seed, frames)
+    truth = real.hidden_phantom(phantom.scene, model, seed)[1]
     names = real.scan_names() if scans is None else scans
     work = [(name, found, seed, frames, tuple(counts)) for name in names]
     runs = _collected(spread(real_images_task, work), names, say)
-    return runs, {"beads_off_truth_mm": real_images.off_truth(found, truth).tolist()}
+    return runs, {"beads_off_truth_mm": real.off_truth(found, truth).tolist()}

@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from flexdt.clients.figures import Series, cell_text, page, plot, table
+from flexdt.clients.figures import Series, axes_of, blank, cell_text, page, plot, svg, table
 from flexdt.extending import write_whole
 from flexdt.twin.geometry.offsets import UNITS
 from flexdt_extensions.studies.experiment_4 import ENOUGH
-from flexdt_extensions.studies.heat_map import heat_map
+from flexdt_extensions.studies.experiments import thesis
 from flexdt_extensions.studies.runs import Run, grid
-from flexdt_extensions.studies.thesis_tables import thesis
 
 SIGNED = {
     "beads": "table_A_1_signed_means",
@@ -224,3 +224,38 @@ def report(document: Mapping[str, Any], *charts: str) -> str:
 
 def _text(value: float | None) -> str:
     return "-" if value is None else f"{value:.2g}"
+
+
+def heat_map(
+    values: npt.ArrayLike,
+    rows: Sequence[str],
+    columns: Sequence[str],
+    *,
+    title: str,
+    x_label: str,
+    good_below: float | None = None,
+    good_from: float = 1.0,
+) -> str:
+    """A table of numbers, green where they are good and red where not.
+
+    Args:
+        values: (rows, columns); nan is white.
+        rows, columns: names.
+        title, x_label: texts.
+        good_below: smaller values are good, the more the smaller.
+        good_from: where no `good_below` is given: values from here on are good.
+    """
+    data = np.asarray(values, dtype=np.float64)
+    figure = blank(110 + 52 * len(columns), 80 + 24 * len(rows))
+    axes = axes_of(figure, title, x_label, "")
+    worse = np.where(data >= good_from, -0.5, 0.5)
+    if good_below is not None:
+        worse = np.log10(np.maximum(data, 1e-9) / good_below)
+    axes.imshow(
+        np.where(np.isfinite(data), worse, np.nan), "RdYlGn_r", aspect="auto", vmin=-2, vmax=2
+    )
+    axes.set_xticks(range(len(columns)), columns)
+    axes.set_yticks(range(len(rows)), rows)
+    for (i, j), value in np.ndenumerate(data):
+        axes.text(j, i, cell_text(float(value)), ha="center", va="center", size=9)
+    return svg(figure)

@@ -20,13 +20,12 @@ import numpy as np
 import pytest
 
 import flexdt as fx
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.failure import CommandError
 from flexdt.twin.physics.exposure import expose, ideal_response
 from flexdt.twin.projection import project_scene
-from flexdt_extensions.batch.batch_plan import Plan, parse_plan, read_plan
+from flexdt_extensions.batch.batch_plan import Plan, parse, parse_plan, read_plan
 from flexdt_extensions.batch.batch_run import figures, run_batch
-from flexdt_extensions.batch.draws import parse
 from flexdt_extensions.batch.work import draw_item, item_bytes, layout, run_item, seed_of
 from flexdt_extensions.executors import Slurm, job_script, read_slurm
 
@@ -589,7 +588,7 @@ def test_without_the_extra_one_line_says_what_to_install(
 ) -> None:
     code = (
         "import sys; sys.modules['zarr'] = None\n"
-        "from flexdt.clients.cli.entry import run\n"
+        "from flexdt.clients.cli.command_tree import run\n"
         f"sys.exit(run(['batch', {str(plan_file())!r}, '--out', {str(tmp_path / 'out')!r}]))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)

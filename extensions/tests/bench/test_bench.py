@@ -14,17 +14,20 @@ import pytest
 from device_simulator import run_simulated
 from loaded_script import load
 
-from flexdt.clients.cli.entry import run as run_command
+from flexdt.clients.cli.command_tree import run as run_command
 from flexdt.twin.projection import forward, gpu
 from flexdt_extensions.bench import benchmark as run
-from flexdt_extensions.bench.cases import (
+from flexdt_extensions.bench.benchmark import (
     Case,
     circle,
+    errors,
+    exact_images,
+    interleaved,
     noise,
     peer_cases,
+    sorted_crossings,
     untuned_cases,
 )
-from flexdt_extensions.bench.measure import errors, exact_images, interleaved, sorted_crossings
 from flexdt_extensions.bench.peers import Peer
 
 SHAPE = (30, 40)

@@ -13,7 +13,7 @@ from flexdt.twin.projection import Volume, forward, project_mesh, project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 from flexdt.twin.reconstruction import fdk
 from flexdt_extensions.bench import rtk_peer as rtk
-from flexdt_extensions.bench.cases import TILT_DEG, circle
+from flexdt_extensions.bench.benchmark import TILT_DEG, circle
 from flexdt_extensions.bench.peers import DiffDrr, absent, joseph
 
 SHAPE = (30, 40)

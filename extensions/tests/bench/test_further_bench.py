@@ -11,8 +11,7 @@ import pytest
 
 from flexdt.twin.projection import project_mesh, project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
-from flexdt_extensions.bench.cases import Case, circle, noise
-from flexdt_extensions.bench.measure import errors, interleaved
+from flexdt_extensions.bench.benchmark import Case, circle, errors, interleaved, noise
 
 SHAPE = (30, 40)
 

@@ -11,7 +11,7 @@ import pytest
 import flexdt as fx
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.projection import Volume, forward, gpu
-from flexdt_extensions.bench import gpu_astra
+from flexdt_extensions.bench import device_page
 
 FOUND = gpu.availability()
 needs_gpu = pytest.mark.skipif(not FOUND.present, reason=f"no CUDA device: {FOUND.reason}")
@@ -26,7 +26,7 @@ def circle(n: int, sod: float, sdd: float, pixel: float, roll: float = 0.0) -> f
 def test_probing_without_a_device_answers_and_touches_no_astra() -> None:
     code = (
         "import sys; from flexdt.twin.projection import gpu; "
-        "from flexdt_extensions.bench import gpu_astra; "
+        "from flexdt_extensions.bench import device_page; "
         "print(gpu.availability()); assert 'astra' not in sys.modules"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
@@ -37,12 +37,14 @@ def test_probing_without_a_device_answers_and_touches_no_astra() -> None:
 @pytest.mark.skipif(FOUND.present, reason="this machine has a device")
 def test_astra_is_refused_without_a_device() -> None:
     with pytest.raises(GeometryError, match="needs a GPU"):
-        gpu_astra.Resident(Volume(np.ones((3, 3, 3), np.float32), 1.0), circle(1, 9, 18, 1), (4, 4))
+        device_page.Resident(
+            Volume(np.ones((3, 3, 3), np.float32), 1.0), circle(1, 9, 18, 1), (4, 4)
+        )
 
 
 def test_astra_geometry_is_ours() -> None:
     volume = Volume(np.ones((2, 3, 4), np.float32), (1.0, 2.0, 3.0), (10.0, 20.0, 30.0))
-    space, panel = gpu_astra.geometries(volume, circle(3, 50, 100, 1), (5, 6))
+    space, panel = device_page.geometries(volume, circle(3, 50, 100, 1), (5, 6))
     assert (space["GridSliceCount"], space["GridRowCount"], space["GridColCount"]) == (2, 3, 4)
     window = space["option"]
     assert (window["WindowMinX"], window["WindowMaxX"]) == (8.0, 12.0)
@@ -64,7 +66,7 @@ def test_device_agrees_with_astra() -> None:
         assert np.abs(flipped - volume.data).max() > 1
     geometry = circle(5, 60.0, 106.0, 0.15, roll=1.1)
     ours = forward(volume, geometry, (150, 170))
-    theirs = gpu_astra.Resident(volume, geometry, (150, 170)).run().transpose(1, 0, 2)
+    theirs = device_page.Resident(volume, geometry, (150, 170)).run().transpose(1, 0, 2)
     # A smooth volume: interpolation and steps of voxels differ little (RTK's Joseph projector,
     # which interpolates as well, by 0.024 of the maximum and 0.00024 in the mean), mirrors do.
     assert np.abs(ours - theirs).max() < 0.03 * ours.max()

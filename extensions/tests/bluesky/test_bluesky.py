@@ -41,7 +41,7 @@ from flexdt.twin.machine.camera import Roi
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.script.compose import ScanRequest, compose_script
 from flexdt_extensions.bluesky import FlyScan, LimitsExceeded, TwinLab
-from flexdt_extensions.bluesky.bluesky_plans import fly_scan
+from flexdt_extensions.bluesky.flyer import fly_scan
 
 pytestmark = pytest.mark.timeout(300)
 

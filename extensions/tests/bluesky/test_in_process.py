@@ -21,7 +21,7 @@ from flexdt.testing.fixtures import flexdt_twin
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.script import ScanRequest
 from flexdt_extensions.bluesky import FlyScan, LimitsExceeded, TwinLab
-from flexdt_extensions.bluesky.bluesky_plans import fly_scan
+from flexdt_extensions.bluesky.flyer import fly_scan
 
 __all__ = ["flexdt_twin"]
 

@@ -15,7 +15,7 @@ import tifffile
 from required import required
 
 import flexdt as fx
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.attenuation.tables import tables
 from flexdt.twin.errors import TwinError

@@ -16,7 +16,7 @@ import pytest
 from compound_file import compound_file
 from scipy.io import savemat
 
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 
 Array = npt.NDArray[np.float64]
 POINTS = np.array([0.0, 0.0, 0.0]) + np.random.default_rng(4).uniform(-55.0, 55.0, (12, 3))

@@ -21,9 +21,8 @@ from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.projection import Volume, forward
 from flexdt_extensions.learning import ENVIRONMENTS
 from flexdt_extensions.learning.moved_scanner import Lab
-from flexdt_extensions.learning.policies import POLICIES, play
 from flexdt_extensions.learning.rewards import COARSE, SIDE_MM, QualityTask, column_lengths, noisy
-from flexdt_extensions.learning.scanning import ScanEnv
+from flexdt_extensions.learning.scanning import POLICIES, ScanEnv, play
 
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)

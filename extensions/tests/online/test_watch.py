@@ -18,7 +18,7 @@ from lab import Process
 
 import flexdt as fx
 from flexdt.clients import TwinClient
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.launch.processes import Servers
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt_extensions.watch import watch

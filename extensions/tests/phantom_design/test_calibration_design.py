@@ -13,10 +13,15 @@ from flexdt.phantoms.bricks import Brickwork
 from flexdt.twin.calibration import BeadModel, bead_model, identifiability
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.poses import Poses
-from flexdt_extensions.phantom_design.bead_search import design, forecast, turned_likeness
+from flexdt_extensions.phantom_design.bead_search import (
+    design,
+    forecast,
+    measured_spread,
+    share_identified,
+    turned_likeness,
+)
 from flexdt_extensions.phantom_design.information_table import PlannedScans
 from flexdt_extensions.phantom_design.seats import seats_of
-from flexdt_extensions.phantom_design.trials import measured_spread, share_identified
 
 SHAPE = (760, 956)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.phantoms.samples import as_phantom
 
 QUICK = ["--frames", "24", "--trials", "4"]

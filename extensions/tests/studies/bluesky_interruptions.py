@@ -42,7 +42,7 @@ from flexdt.clients.launch.processes import Servers
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.script.compose import ScanRequest
 from flexdt_extensions.bluesky import FlyScan, TwinLab
-from flexdt_extensions.bluesky.bluesky_plans import checkpoint_before_close, fly_scan
+from flexdt_extensions.bluesky.flyer import checkpoint_before_close, fly_scan
 
 START = {"tra_obj": 0.0, "mag_obj": 600.0, "rot_obj": 5.0, "mag_det": 1000.0}
 TURN = ScanRequest(

@@ -24,8 +24,8 @@ from flexdt_extensions.studies.experiment_4 import (
     scan_names,
     spots,
 )
+from flexdt_extensions.studies.experiments import author, thesis
 from flexdt_extensions.studies.study import authors, run_study
-from flexdt_extensions.studies.thesis_tables import author, thesis
 
 LEGO = bead_model(load_phantom("lego"))
 

@@ -8,19 +8,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexdt.clients.cli.entry import run as command
+from flexdt.clients.cli.command_tree import run as command
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import bead_model
 from flexdt.twin.errors import UnknownNameError
-from flexdt_extensions.studies.basin import METHODS, Cell
-from flexdt_extensions.studies.experiment_4_images import hidden_phantom, off_truth
+from flexdt_extensions.studies.experiment_4 import hidden_phantom, off_truth
 from flexdt_extensions.studies.experiments import (
     EXPERIMENTS,
     WorkUnit,
     placement_scenario,
     tasks,
 )
-from flexdt_extensions.studies.study import basin_task, real_images_runs, run_study, run_task
+from flexdt_extensions.studies.study import (
+    METHODS,
+    Cell,
+    basin_task,
+    real_images_runs,
+    run_study,
+    run_task,
+)
 
 
 def test_the_experiments_have_the_theses_numbers_of_runs() -> None:

@@ -14,11 +14,10 @@ from calibration_targets import TARGETS, collected, main, targets_table
 from spoilt_scans import Outcome
 
 from flexdt.clients import figures
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.twin.errors import TwinError, UnknownNameError
-from flexdt_extensions.studies.basin import METHODS, Cell, basin_runs
 from flexdt_extensions.studies.experiment_4 import scan_names
-from flexdt_extensions.studies.study import FIDELITIES, run_study
+from flexdt_extensions.studies.study import FIDELITIES, METHODS, Cell, basin_runs, run_study
 from flexdt_extensions.studies.study_report import open_directions, real_lines
 
 

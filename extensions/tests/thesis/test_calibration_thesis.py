@@ -8,7 +8,7 @@ from calibration_scenarios import SCENARIOS, SHAPE, exact_tracks, scenario, spir
 
 from flexdt.twin.calibration.fit.problem import SIX, build_problem
 from flexdt_extensions.studies.algorithm_2 import Stop, algorithm_2
-from flexdt_extensions.studies.thesis_tables import placements, thesis, thesis_row
+from flexdt_extensions.studies.experiments import placements, thesis, thesis_row
 
 
 @pytest.mark.parametrize("lam", [0.0, 1e-4, 1e-2, 1.0])

@@ -16,13 +16,12 @@ import pytest
 import zarr
 
 import flexdt as fx
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.reconstruction.reconstruct import VolumeRequest as Request
 from flexdt.clients.reconstruction.reconstruct import reconstruct_dataset
 from flexdt.twin.errors import LimitError, TwinError
-from flexdt_extensions.volumes import zarr_volume
-from flexdt_extensions.volumes.on_workers import as_made
+from flexdt_extensions.fdk_on_workers import as_made, levels, slabs
 
 STUDIES = Path(__file__).parents[3] / "tests" / "studies"
 
@@ -199,12 +198,12 @@ def test_slabs_of_large_volumes_stay_small() -> None:
     for _ in range(200):
         nz, ny, nx = (int(n) for n in np.exp(rng.uniform(0, np.log(6000), 3)))
         grid = fx.Grid((nz, ny, nx), 0.1)
-        made = zarr_volume.slabs(grid)
+        made = slabs(grid)
         assert [a for a, _ in made] == [0, *(b for _, b in made[:-1])]
         assert made[-1][1] == nz
         each = made[0][1]
         assert 4 * each * ny * nx <= max(128 << 20, 4 * nz * ny * nx // 256) or each == 1
-        for level, shape in enumerate(zarr_volume.levels(grid)):
+        for level, shape in enumerate(levels(grid)):
             assert shape == tuple(-(-n // 2**level) for n in (nz, ny, nx))
 
 
@@ -215,7 +214,7 @@ def test_what_workers_do_not_do(
     data = load_dataset(scan)
     with pytest.raises(LimitError, match=r"by fdk; not .* by sirt"):
         reconstruct_dataset(data, tmp_path / "v.zarr", Request("sirt"), workers=nullcontext(Here()))
-    monkeypatch.setattr("flexdt_extensions.volumes.on_workers.version", lambda name: next(old))
+    monkeypatch.setattr("flexdt_extensions.fdk_on_workers.version", lambda name: next(old))
     old = iter(["0.3", "0.2", "0.2", "0.2"])
     with pytest.raises(TwinError, match=r"a worker has flexdt 0\.2, this is 0\.3"):
         reconstruct_dataset(data, tmp_path / "v.zarr", REQUEST, workers=nullcontext(Here()))

@@ -14,7 +14,6 @@ from flexdt.server.twin.handlers import (
     motion_methods,
     sample_methods,
     session_methods,
-    setting_methods,
 )
 from flexdt.server.twin.handlers.handler import Handler
 
@@ -35,7 +34,7 @@ def table(*modules: ModuleType) -> Mapping[str, Handler]:
 
 
 HANDLERS = table(
-    session_methods, motion_methods, setting_methods, sample_methods, image_methods, job_methods,
+    session_methods, motion_methods, sample_methods, image_methods, job_methods,
     calibration_methods, document_methods,
 )  # fmt: skip
 """Method name -> what answers it."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from flexdt.protocol.fields import Empty, Params
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import calibration_messages as p
-from flexdt.protocol.methods.dataset_messages import DATASET_FRAME, DATASET_GET, DATASET_LIST
+from flexdt.protocol.methods.calibration_messages import DATASET_FRAME, DATASET_GET, DATASET_LIST
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import (
     Client,

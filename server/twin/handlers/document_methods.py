@@ -11,7 +11,7 @@ from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty
 from flexdt.protocol.methods import document_messages as p
 from flexdt.protocol.methods import openrpc_document
-from flexdt.server.storage.scene import require_fit, sample_of, save_scene
+from flexdt.server.storage.memory import require_fit, sample_of, save_scene
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, answers, change_stage, ensure_idle
 from flexdt.twin.errors import SafetyError

@@ -20,7 +20,7 @@ from flexdt.server.imaging.exposure_quality import predict as forecast
 from flexdt.server.storage.stored_samples import EMPTY
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, answers
-from flexdt.server.twin.handlers.setting_methods import camera_change
+from flexdt.server.twin.handlers.motion_methods import camera_change
 from flexdt.server.twin.hub import ImageWish
 from flexdt.server.twin.live import Shot, image_of
 from flexdt.twin.errors import LimitError

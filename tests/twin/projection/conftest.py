@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.projection import level_axis as walks
+from flexdt.twin.projection import operators as walks
 
 
 def _siddon(data, voxel, center, cone_vec, shape, pixels=None):

@@ -23,13 +23,14 @@ needs_gpu = pytest.mark.skipif(not FOUND.present, reason=f"no CUDA device: {FOUN
 SIMULATED = """
 import numpy as np
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.projection import Volume, back, cpu, forward, gpu, level_axis, room_like
+from flexdt.twin.projection import (Volume, back, cpu, forward, gpu, room_like)
+from flexdt.twin.projection import operators
 from flexdt.twin.projection.kernels import gpu_kernels
 from flexdt.twin.projection.operators import box_of, layout_data, voxel_rays
 from flexdt.twin.projection.volume import blank_layout
 
 assert gpu.availability().present, gpu.availability().reason
-level_axis.level_axes = lambda rays, *_: np.zeros(len(rays), int)
+operators.level_axes = lambda rays, *_: np.zeros(len(rays), int)
 gpu.CHUNK_BYTES = 1  # one view at a time
 gpu_kernels.BLOCK = (4, 2)
 gpu.VIEWS_A_THREAD = 0.0
@@ -79,14 +80,15 @@ def test_host_logic_and_kernels_in_the_simulator() -> None:
 DRAWN = """
 import numpy as np
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.projection import Volume, back, cpu, forward, gpu, level_axis
+from flexdt.twin.projection import (Volume, back, cpu, forward, gpu)
+from flexdt.twin.projection import operators
 from flexdt.twin.projection.operators import box_of, voxel_rays
 from flexdt.twin.projection.kernels import gpu_kernels
 from tests.twin.projection.conftest import _circle, _siddon
 
 gpu_kernels.BLOCK = (4, 2)  # a thread of the simulator costs more than what it computes
 gpu.VIEWS_A_THREAD = 0.0
-level_axis.level_axes = lambda rays, *_: np.zeros(len(rays), int)  # fans along z, as in scans
+operators.level_axes = lambda rays, *_: np.zeros(len(rays), int)  # fans along z, as in scans
 rng = np.random.default_rng(20261122)
 walked = []
 

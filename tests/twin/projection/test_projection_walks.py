@@ -9,7 +9,7 @@ import pytest
 
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Volume, back, forward, room_like
-from flexdt.twin.projection import level_axis as walks
+from flexdt.twin.projection import operators as walks
 
 SHAPE = (41, 37)
 

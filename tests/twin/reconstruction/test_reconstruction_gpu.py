@@ -89,7 +89,8 @@ for room in (None, 4 * (6 * 32 * 9 * 11 + 2 * 2 * 3)):  # for all, and for two l
 ITERATED = """
 import numpy as np
 from flexdt.twin.errors import GeometryError
-from flexdt.twin.projection import Volume, forward, gpu, level_axis
+from flexdt.twin.projection import (Volume, forward, gpu)
+from flexdt.twin.projection import operators
 from flexdt.twin.projection.volume import DeviceVolume
 from flexdt.twin.projection.device_arrays import DeviceArray
 from flexdt.twin.projection.kernels import gpu_array_kernels, gpu_kernels
@@ -97,7 +98,7 @@ from flexdt.twin.reconstruction import cgls, em, sart, sirt, tv
 from tests.twin.projection.conftest import _circle
 
 gpu_kernels.BLOCK, gpu_array_kernels.FOLDING, gpu.LINEAR = (4, 2), (1, 4), 16
-level_axis.level_axes = lambda rays, *_: np.zeros(len(rays), int)
+operators.level_axes = lambda rays, *_: np.zeros(len(rays), int)
 rng = np.random.default_rng(5)
 
 # Arithmetic, beside numpy's own.

@@ -21,7 +21,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from flexdt.clients.cli.entry import run
+from flexdt.clients.cli.command_tree import run
 from flexdt.twin.machine.description import (
     Machine,
     Timing,
