@@ -7,6 +7,8 @@ STAMP := $(VENV)/.installed
 COMPILED := $(VENV)/.compiled
 TEST_STAMP := $(VENV)/.installed-test
 TYPES := .typing/.linked
+LINTED := build/.linted
+TYPED := build/.typed
 WEB := clients/viewer/web
 WEB_STAMP := $(WEB)/node_modules/.installed
 
@@ -54,13 +56,23 @@ $(TYPES): $(STAMP) .ci/link_types.py $(wildcard flexdt/*.py)
 demo: $(STAMP)
 	$(BIN)/flexdt demo --no-viewer
 
-lint: install
+lint: $(LINTED)
+
+typecheck: $(TYPED)
+
+# What linters and types depend on: each stage of CI asks for both, and they run once.
+SOURCES := $(shell find . -name .venv -prune -o -name build -prune -o -name .typing -prune \
+  -o -name node_modules -prune -o -name '*.py' -print -o -name '*.pyi' -print) pyproject.toml
+
+$(LINTED): $(SOURCES) | install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	cd .typing && ../$(BIN)/lint-imports --config ../pyproject.toml
+	@mkdir -p $(@D) && touch $@
 
-typecheck: install $(TEST_STAMP)
+$(TYPED): $(SOURCES) | install $(TEST_STAMP)
 	$(BIN)/mypy -p flexdt -p flexdt_extensions
+	@mkdir -p $(@D) && touch $@
 
 # The kernels that most tests run: compiled once, not by all workers and by each server they start.
 kernels: $(TEST_STAMP) $(COMPILED)
@@ -89,7 +101,7 @@ studies: $(TEST_STAMP)
 
 # The page in a browser, which draws on all cores: nothing else runs beside it.
 page: $(TEST_STAMP)
-	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m 'browser and not night' \
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m 'browser and not night' tests/viewer \
 	  --junitxml=build/durations/page.xml
 
 # Every seed and every case: hours in all. Nothing waits for it.

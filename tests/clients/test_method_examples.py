@@ -27,6 +27,7 @@ def test_each_method_has_an_example() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("place", ["server", "process"])
+@pytest.mark.campaign(1)
 def test_the_examples_hold(place: str, request: pytest.FixtureRequest) -> None:
     """Of a server, and of a twin in this process."""
     finder, runner = doctest.DocTestFinder(recurse=False), doctest.DocTestRunner(verbose=False)

@@ -212,6 +212,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 def test_a_killed_writer_leaves_whole_files_and_can_be_resumed(
     tmp_path: Path, record: Make, images: Images
 ) -> None:

@@ -12,6 +12,7 @@ import pytest
 from flexdt.clients.cli.command_tree import run
 from flexdt.clients.launch.processes import Servers
 
+pytestmark = pytest.mark.slow
 TRUTH = {"dO_x": 0.61, "dO_y": -0.37, "dO_z": 1.4, "alpha": -2.3, "tau_x": 0.2, "tau_z": 0.3}
 Run = Callable[..., tuple[int, str, str]]
 

@@ -43,7 +43,7 @@ def run(name: str, *words: object) -> dict[str, Any]:
 def test_drawn_scans_are_right_or_said() -> None:
     study = EXAMPLES.parent / "tests" / "studies" / "silent_errors.py"
     done = subprocess.run(
-        [sys.executable, str(study), "--count", "60"],
+        [sys.executable, str(study), "--count", "30"],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout

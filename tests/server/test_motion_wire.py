@@ -27,6 +27,7 @@ def uploads(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("machine", MACHINES)
 @pytest.mark.parametrize("seed", range(2))
+@pytest.mark.campaign(3)
 def test_no_client_brings_anything_into_contact(
     machine: str, seed: int, uploads: Path, tmp_path: Path
 ) -> None:

@@ -152,7 +152,7 @@ def played(folder: Path, logic: Logic, episodes: int) -> Room:
         return room
 
 
-@pytest.mark.parametrize("episodes", [100, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("episodes", [100, pytest.param(1000, marks=pytest.mark.campaign)])
 @pytest.mark.slow
 def test_no_interleaving_releases_a_stop_that_was_not_seen(tmp_path: Path, episodes: int) -> None:
     room = played(tmp_path, page, episodes)

@@ -156,6 +156,7 @@ def machine(port: int) -> type[RuleBasedStateMachine]:
     return Clients
 
 
+@pytest.mark.slow
 def test_any_clients_in_any_order(server: Process) -> None:
     run_state_machine_as_test(  # type: ignore[no-untyped-call]
         machine(server.port),

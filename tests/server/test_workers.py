@@ -194,7 +194,7 @@ def test_work_on_a_busy_machine_has_the_time_that_it_has_alone() -> None:
             os.kill(pid, signal.SIGCONT)
             await asyncio.sleep(0.05)
 
-    some = matter(ScanSource(long_script(10_000)))
+    some = matter(ScanSource(long_script(4_000)))
 
     async def body(workers: Workers) -> None:
         await workers.ask(checking.in_pieces, light())

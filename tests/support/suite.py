@@ -70,6 +70,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Modules that may take longest begin first, then those with slow tests, then those with many:
     no worker is left with one at the end."""
     spread_out(items)
+    for item in items:
+        if item.get_closest_marker("browser") and item.path.parent.name != "viewer":
+            raise pytest.UsageError(f"{item.nodeid}: `make page` looks in tests/viewer alone")
     slow = {item.path for item in items if item.get_closest_marker("slow") is not None}
     count = Counter(item.path for item in items)
     allowed_s: dict[Path, float] = {}

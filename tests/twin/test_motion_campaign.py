@@ -221,7 +221,7 @@ class Use(RuleBasedStateMachine):
 
 
 Use.TestCase.settings = settings(max_examples=25, stateful_step_count=20, deadline=None)
-TestUse = Use.TestCase
+TestUse = pytest.mark.slow(Use.TestCase)
 
 
 def test_a_stop_in_step_with_a_weaker_motor_stays_within_the_travel() -> None:

@@ -60,6 +60,7 @@ def test_rtk_joseph_in_its_own_process() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 @needs("itk-rtk")
 def test_rtk_fdk_in_its_own_process() -> None:
     view = circle(60, SHAPE, pitch=1.6)

@@ -166,6 +166,7 @@ def test_a_gap_is_filled_from_the_lines_beside_it(axis: int, width: float) -> No
 
 
 @pytest.mark.daily(2)
+@pytest.mark.campaign(4)
 @pytest.mark.parametrize("seed", range(16))
 def test_a_gap_between_tiles_is_one_border_that_parts_the_same_marks(seed: int) -> None:
     """Marks with noise, those beyond a drawn column or row nearer by the gap. Beads keep their

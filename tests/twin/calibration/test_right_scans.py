@@ -133,7 +133,7 @@ def test_lag_is_taken_out_and_said(kind: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("kind", ["spectrum", "spectrum_aluminium"])
-@pytest.mark.daily(1)
+@pytest.mark.slow
 def test_a_camera_without_lag_is_not_said_to_have_it(kind: str) -> None:
     found = beam_faults.scored(kind, 1)
     assert found.offered

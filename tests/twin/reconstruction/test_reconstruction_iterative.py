@@ -89,7 +89,7 @@ def test_weights_solve_weighted_least_squares():
 
 
 @pytest.mark.parametrize("method", [sirt, sart])
-@pytest.mark.daily(1)
+@pytest.mark.slow
 def test_weighted_iterations_end_at_the_noise(images, method):
     rng = np.random.default_rng(5)
     variances = 10.0 ** rng.uniform(-5, -3, images.shape)
