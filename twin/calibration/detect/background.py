@@ -106,7 +106,8 @@ def fading(contrast: FloatArray, behind: FloatArray, seen: npt.NDArray[np.bool_]
     use, slope, power, change = seen, 0.0, 0.0, behind
     for _ in range(3):
         change, more = (_against_own_means(a, use) for a in (logarithm, behind))
-        free, power = int(use.sum()) - sum(use.shape), float(np.square(more).sum())
+        free = int(use.sum()) - int(use.any(axis=0).sum()) - int(use.any(axis=1).sum())
+        power = float(np.square(more).sum())
         if free < 1 or power <= 0.0:
             return 0.0
         slope = float((change * more).sum()) / power

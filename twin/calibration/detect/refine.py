@@ -345,6 +345,8 @@ FIT_BLUR_PX = 0.4
 """Least blur for that: an unblurred ball sampled at pixel centres misleads a fit by 0.015 px."""
 FEW_WINDOWS = 600
 """Up to so many windows the body is rendered with 3 x 3 rays a pixel, else 2 x 2."""
+FADING_FRAMES = 60
+"""Frames from which it is read how beads fade behind a body, at least if there are as many."""
 LARGEST_PX = 0.6
 """A larger systematic error of a rendered spot is not believed."""
 NEAR_PX = 0.15
@@ -513,16 +515,20 @@ def _measured(
 
 
 def _evened(patches: Patches, behind: Background, body: Float32Array | None) -> Patches:
-    """The windows with beads whose contrast is the same all over."""
-    found = centroids(patches, patches.entire)
+    """The windows with beads whose contrast is the same all over, as some frames show it."""
+    frames, beads = patches.windows.whole.shape
+    few = patches.entire[patches.entire // beads % max(1, frames // FADING_FRAMES) == 0]
+    found = centroids(patches, few)
     seen = found[:, kernels.OK] > 0
     level, thick = behind.plane[:, 0], body
     if body is not None:
         thick = np.asarray(body.reshape(-1, *patches.flat.shape[1:]))
         level = level + thick[:, thick.shape[1] // 2, thick.shape[1] // 2]
-    shape = patches.windows.whole.shape
+    shape = frames, beads
     peaks = found[:, kernels.PEAK].reshape(shape)
     slope = fading(peaks, level.reshape(shape), seen.reshape(shape))
+    if slope == 0.0:
+        return patches
     return replace(patches, flat=evened(patches.flat, behind.plane, thick, slope))
 
 
