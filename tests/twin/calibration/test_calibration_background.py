@@ -41,7 +41,7 @@ def test_white_noise_and_planes_are_neither_foreign_nor_bent() -> None:
 def test_how_contrast_falls_is_read_from_beads_of_any_size(seed: int) -> None:
     rng = np.random.default_rng(seed)
     true, behind = rng.uniform(-1.2, -0.3), rng.uniform(0.5, 1.5, (24, 5))
-    size, noise = rng.uniform(0.5, 2.0, 5), 0.01 * rng.normal(size=behind.shape)
+    size, noise = rng.uniform(0.3, 0.8, 5), 0.01 * rng.normal(size=behind.shape)
     contrast = size * np.exp(true * behind + noise)
     seen = rng.random(behind.shape) > 0.2
     contrast[3, 2] *= 2.0  # one that is not that bead
@@ -49,6 +49,10 @@ def test_how_contrast_falls_is_read_from_beads_of_any_size(seed: int) -> None:
     assert fading(contrast, behind + brightness, seen) == pytest.approx(true, abs=0.02)
     alike = size * np.exp(noise)
     assert abs(fading(alike, behind, seen)) < 0.01
+    for steep, most in ((-9.0, lambda c: -1.0 / c), (9.0, lambda c: np.expm1(c) / c)):
+        far = size * np.exp(steep * (behind - behind.mean()) + noise)
+        limit = most(float(np.median(far)))
+        assert fading(far, behind, seen | True) == pytest.approx(limit, rel=0.1)
     assert fading(contrast, behind, seen & False) == 0.0
     assert fading(contrast[:1], behind[:1], seen[:1]) == 0.0
 

@@ -95,7 +95,10 @@ def fading(contrast: FloatArray, behind: FloatArray, seen: npt.NDArray[np.bool_]
 
     Each bead is compared with itself in other frames, and each frame's mean is taken off, so beads
     of several sizes and a beam that drifts say nothing. What noise may have made of it is taken off
-    (James and Stein), so that of no slope nothing is left.
+    (James and Stein), so that of no slope nothing is left. Contrast C falls by at most as much as
+    what lies behind grows, if a ball lets nothing but scattered light through; where scattered
+    light is not even it grows with the line integral, by exp(C) - 1 times as much. What is beyond
+    these is an error of the level, which is in the contrast as well.
 
     Args:
         contrast: of each bead in each frame, (n, k).
@@ -114,7 +117,9 @@ def fading(contrast: FloatArray, behind: FloatArray, seen: npt.NDArray[np.bool_]
         left = np.abs(_against_own_means(logarithm - slope * behind, seen))
         use = seen & (left <= OUTLIER * float(np.median(left[seen])))
     variance = max(float(np.square(change).sum()) - slope**2 * power, 0.0) / free / power
-    return slope * max(1.0 - variance / max(slope**2, 1e-30), 0.0)
+    slope *= max(1.0 - variance / max(slope**2, 1e-30), 0.0)
+    usual = float(np.median(contrast[use]))
+    return min(max(slope, -1.0 / usual), math.expm1(usual) / usual)
 
 
 def _against_own_means(values: FloatArray, seen: npt.NDArray[np.bool_]) -> FloatArray:

@@ -294,33 +294,57 @@ def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sh
     """
     if len(sample) < 3:
         return Sharp(blur, 1.0, 0.0, False, blur, 1.0)
-    masks, misfit = usable(patches, sample), np.full(len(VEILS), np.inf)
-    for i, trial in enumerate(VEILS):
-        misfit[i] = _sharpness(patches, sample, trial, masks)[0]
-        if i > 0 and misfit[i] > 1.5 * misfit[i - 1]:
-            break
-    if not np.isfinite(misfit).any():
+    masks, blurs = usable(patches, sample), np.array(BLURS)
+    found = [_Blurs.tried(patches, sample, VEILS[0], masks, blurs)]
+    if not math.isfinite(found[0].least):
         return Sharp(blur, 1.0, 0.0, False, blur, 1.0)
-    veil = _lowest(np.array(VEILS), misfit)
-    _, best, apparent = _sharpness(patches, sample, veil, masks)
+    # A veil changes the blur that fits by little, so its neighbours are tried.
+    for trial in VEILS[1:]:
+        found.append(_Blurs.tried(patches, sample, trial, masks, found[-1].near(blurs)))
+        if not found[-1].least < found[-2].least:
+            break
+    misfit = np.array([one.least for one in found])
+    veil, last = _lowest(np.array(VEILS[: len(found)]), misfit), found[int(misfit.argmin())]
+    if veil > 0.0:
+        last = _Blurs.tried(patches, sample, veil, masks, last.near(blurs))
+    best = _lowest(last.blurs, last.misfit)
+    apparent = float(np.interp(best, last.blurs, last.scale))
     return Sharp(best, apparent, veil, True, best, apparent)
 
 
-def _sharpness(
-    patches: Patches, sample: npt.NDArray[np.intp], veil: float, masks: npt.NDArray[np.uint8]
-) -> tuple[float, float, float]:
-    """Least misfit with a veil, and the blur and apparent size that belong to it."""
-    misfit, scale = np.full(len(BLURS), np.inf), np.ones(len(BLURS))
-    for i, trial in enumerate(BLURS):
-        results = fits(patches, sample, (trial, veil), True, masks)
-        good = sample[results[sample, kernels.OK] > 0]
-        if len(good) >= 3:
-            misfit[i] = float(np.median(results[good, kernels.NOISE]))
-            scale[i] = float(np.median(results[good, kernels.RADIUS] / patches.radii[good]))
-        if i > 0 and misfit[i] > 1.5 * misfit[i - 1]:
-            break
-    best = _lowest(np.array(BLURS), misfit)
-    return float(misfit.min()), best, float(np.interp(best, BLURS, scale))
+@dataclass(frozen=True, eq=False)
+class _Blurs:
+    """Blurs that were tried with one veil, the misfits of the fits and the sizes they found."""
+
+    blurs: FloatArray
+    misfit: FloatArray
+    scale: FloatArray
+
+    @classmethod
+    def tried(
+        cls, patches: Patches, sample: npt.NDArray[np.intp], veil: float,
+        masks: npt.NDArray[np.uint8], blurs: FloatArray,
+    ) -> _Blurs:  # fmt: skip
+        """From the least on, until they leave much more than the one before."""
+        misfit, scale = np.full(len(blurs), np.inf), np.ones(len(blurs))
+        for i, trial in enumerate(blurs.tolist()):
+            results = fits(patches, sample, (trial, veil), True, masks)
+            good = sample[results[sample, kernels.OK] > 0]
+            if len(good) >= 3:
+                misfit[i] = float(np.median(results[good, kernels.NOISE]))
+                scale[i] = float(np.median(results[good, kernels.RADIUS] / patches.radii[good]))
+            if i > 0 and misfit[i] > 1.5 * misfit[i - 1]:
+                break
+        return cls(blurs, misfit, scale)
+
+    @property
+    def least(self) -> float:
+        return float(self.misfit.min())
+
+    def near(self, blurs: FloatArray) -> FloatArray:
+        """Those of `blurs` next to the one that leaves least."""
+        i = int(np.searchsorted(blurs, self.blurs[int(self.misfit.argmin())]))
+        return blurs[max(i - 1, 0) : i + 2]
 
 
 def _lowest(tried: FloatArray, misfit: FloatArray) -> float:

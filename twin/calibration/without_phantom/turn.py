@@ -199,7 +199,7 @@ def _repeated(views: Float32Array, gaps: FloatArray) -> tuple[list[int], list[in
     change, like = np.empty((2, len(views)))
     for i, (down, right) in enumerate(zip(*np.gradient(soft, axis=(1, 2)), strict=True)):
         # Frames that are shifted against each other change more than a turn makes them.
-        slopes = np.stack([right.ravel(), down.ravel()], axis=1)
+        slopes = np.stack([right.ravel(), down.ravel(), np.ones(right.size)], axis=1)
         shifted = slopes @ np.linalg.lstsq(slopes, rest[i].ravel(), rcond=None)[0]
         change[i] = np.square(rest[i].ravel() - shifted).mean(dtype=np.float64)
         like[i] = _likeness(views[i] - views[i - 1] - shifted.reshape(soft[i].shape))
