@@ -25,6 +25,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import maximum_filter1d, median_filter
 
 from flexdt.twin.dataset.normalise import binned_mean
+from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.panel import Border, Panel
 
@@ -71,6 +72,9 @@ def find_gap(
         frames: line integrals of `averaged_rows`, some of a turn.
         axis: column of the axis, to a pixel or two.
         closed: columns of borders beside which the images are filled in.
+
+    Raises:
+        NotIdentifiableError: two stand out.
     """
     stack = np.asarray(frames, dtype=np.float64)
     if stack.shape[2] < 8 * SIDE:
@@ -96,9 +100,18 @@ def find_gap(
     gain = gains.max(axis=0)
     gain = gain - np.where(known, 2.0 * maximum_filter1d(gain, 5)[np.where(known, mirror, 0)], 0.0)
     best = int(gain.argmax())
-    elsewhere = float(gain[np.abs(place - best) > SIDE].max())
-    if gain[best] < max(EVIDENCE, STANDS_OUT * elsewhere):
-        return None
+    others = np.where(np.abs(place - best) > SIDE, gain, 0.0)
+    second = int(others.argmax())
+    if gain[best] < max(EVIDENCE, STANDS_OUT * others[second]):
+        third = float(others[np.abs(place - second) > SIDE].max())
+        if others[second] < max(EVIDENCE, STANDS_OUT * third):
+            return None
+        both = sorted((best + SIDE, second + SIDE))
+        raise NotIdentifiableError(
+            f"from columns {both[0]} and {both[1]} on everything appears nearer, as behind two "
+            "gaps between tiles of the panel; one can be closed here, and a calibration's `panel` "
+            "closes others before",
+        )
     width = float(WIDTHS[gains[:, best].argmax()])
     # Sharper edges than the usual ones look like a wider gap: drawn ones are off by half of that.
     return Gap(best + SIDE, width, 0.2 + 0.3 * width)
