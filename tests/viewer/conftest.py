@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import KNOWN_HERE, seen, until
+from tests.viewer.looking import KNOWN_HERE, USUAL, seen, until
 
 CHROMIUM = "/usr/bin/chromium"
 FLAGS = [
@@ -70,7 +70,7 @@ class Lab:
     """Projector, twin and viewer; each may be ended and started again on its port."""
 
     def __init__(self, folder: Path, speed_up: str) -> None:
-        self.folder, self.log = folder, folder / "log"
+        self.folder, self.log, self.module = folder, folder / "log", ""
         self.data = folder / "data"
         self.projector = Process(
             "flexdt.server.projector.main", "--port", "0", "--threads", "1", log=self.log
@@ -233,7 +233,8 @@ def wait() -> Callable[..., Any]:
 @pytest.fixture(autouse=True)
 def at_peace(request: pytest.FixtureRequest) -> None:
     """Whatever the test before left behind, the servers run, no scan does, nothing moves, no key is
-    held, no note is left and no correction in force when a test begins; and the page knows it."""
+    held, no note is left and no correction in force when a test begins; and the page knows it. A
+    module begins with the usual camera."""
     if "lab" not in request.fixturenames:
         return
     lab: Lab = request.getfixturevalue("lab")
@@ -251,6 +252,7 @@ def at_peace(request: pytest.FixtureRequest) -> None:
         until(lambda: all(job.state not in BUSY for job in client.jobs().jobs), "scans end")
         state = client.state()
         usual = state.clock.speed_up == SPEED_UP and state.correction is None
+        usual = usual and lab.module == request.module.__name__
         holders = [None, *(page.evaluate("flexdt.store.session") for page in pages)]
         # A page that has just been closed may still hold control.
         if not usual or state.safety.state != "ok" or state.controller not in holders:
@@ -258,6 +260,9 @@ def at_peace(request: pytest.FixtureRequest) -> None:
             client.set_clock(SPEED_UP)
             until(lambda: at_rest(client), "the motors rest")
             client.reset()
+            if lab.module != request.module.__name__:
+                client.set_camera(**USUAL)
+                lab.module = request.module.__name__
             while client.state().correction is not None:
                 client.revert_calibration()
             client.control("release")

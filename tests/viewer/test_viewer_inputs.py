@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import USUAL, answered, point_at, released, seen
+from tests.viewer.looking import answered, point_at, released, seen
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]
@@ -53,15 +53,6 @@ def asked(page: Any) -> Iterator[Callable[[], list[str]]]:
     )
     yield lambda: list(page.evaluate("window.asked"))
     page.evaluate("window.unspy()")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def usual_camera(lab: Any) -> None:
-    """Whatever the module before has left in the twin that they share."""
-    with lab.client() as client:
-        client.control("force")
-        client.set_camera(**USUAL)
-        client.control("release")
 
 
 @pytest.fixture(autouse=True)
