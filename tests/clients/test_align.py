@@ -18,6 +18,7 @@ import pytest
 import flexdt as fx
 from flexdt.clients.cli.command_tree import run
 from flexdt.twin.calibration.without_phantom.tile_gap import averaged_rows, find_gap
+from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.geometry.panel import Panel
 from flexdt.twin.scanner.state import NamedCorrection
@@ -357,6 +358,25 @@ def apart(true: np.ndarray, column: int, width: int) -> np.ndarray:
     """Images whose right tile shows what lies `width` columns further to the right."""
     there = np.arange(SHAPE[1])
     return true[..., np.minimum(there + np.where(there >= column, width, 0), SHAPE[1] - 1)]
+
+
+@pytest.mark.slow
+def test_a_frame_that_is_exposed_again_is_left_out_though_the_beam_flickers() -> None:
+    scanner, lines = scan(0)
+    lines = np.array(lines)
+    lines[32] = lines[31]
+    lines += 0.01 * np.random.default_rng(2).normal(size=(len(lines), 1, 1))
+    found = data_set(lines, DEGREES, 1e4, np.random.default_rng(1)).align()
+    assert "[32] repeat" in " ".join(found.warnings)
+    assert np.abs(pulls(found, scanner)).max() < 4
+
+
+def test_two_gaps_are_refused_by_their_columns() -> None:
+    true = np.array(scan(0)[1])
+    true += np.random.default_rng(1).normal(0, 0.01, true.shape)
+    twice = apart(apart(true, 78, 2), 44, 2).astype(np.float32)
+    with pytest.raises(NotIdentifiableError, match="from columns 44 and 76 on"):
+        find_gap([averaged_rows(g) for g in twice], scan(0)[0].axis()[0])
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -106,7 +106,7 @@ def fading(contrast: FloatArray, behind: FloatArray, seen: npt.NDArray[np.bool_]
         seen: which of them are measured, (n, k).
     """
     logarithm = np.log(np.where(seen, contrast, 1.0))
-    use, slope, power, change = seen, 0.0, 0.0, behind
+    use = seen
     for _ in range(3):
         change, more = (_against_own_means(a, use) for a in (logarithm, behind))
         free = int(use.sum()) - int(use.any(axis=0).sum()) - int(use.any(axis=1).sum())

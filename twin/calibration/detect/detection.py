@@ -288,19 +288,9 @@ def _cut_beads(
         result = np.zeros(kernels.RESULTS)
         window, left, top = _window(image, x, y, 2.8 * radius + 8.0)
         kernels.fit_ball(
-            window,
-            none,
-            x - left,
-            y - top,
-            radius,
-            round_,
-            peak,
-            BLUR_PX,
-            0.0,
-            False,
-            False,
+            window, none, x - left, y - top, radius, round_, peak, BLUR_PX, 0.0, False, False,
             result,
-        )
+        )  # fmt: skip
         result[kernels.X] += left
         result[kernels.Y] += top
         good = result[kernels.OK] > 0 and result[kernels.NOISE] < MISFIT

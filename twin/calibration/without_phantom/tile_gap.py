@@ -109,8 +109,8 @@ def find_gap(
         both = sorted((best + SIDE, second + SIDE))
         raise NotIdentifiableError(
             f"from columns {both[0]} and {both[1]} on everything appears nearer, as behind two "
-            "gaps between tiles of the panel; one can be closed here, and a calibration's `panel` "
-            "closes others before",
+            "gaps between tiles of the panel, of which one can be found; calibrate with a phantom, "
+            "and give that correction"
         )
     width = float(WIDTHS[gains[:, best].argmax()])
     # Sharper edges than the usual ones look like a wider gap: drawn ones are off by half of that.

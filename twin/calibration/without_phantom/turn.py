@@ -33,7 +33,8 @@ WHITE: Final = 3.0
 """Standard deviations of white noise's correlation up to which neighbouring pixels are not alike.
 From twice that on they are."""
 LOST: Final = 2.5
-"""And above which one may be missing between them: with one missing it is about four."""
+"""A frame may be missing where two differ by more than so many times what is usual there: with one
+missing it is about four."""
 STEPS: Final = 5.0
 """A step between neighbours is one when it is so many times the usual spread (assumed)."""
 CLEAR: Final = 1.5
@@ -196,19 +197,21 @@ def _repeated(views: Float32Array, gaps: FloatArray) -> tuple[list[int], list[in
     """
     soft = gaussian_filter(views, (0, 2, 2))  # less noise: a copy may have been exposed anew
     rest = soft - np.roll(soft, 1, axis=0)
-    change, like = np.empty((2, len(views)))
+    change, correlation = np.empty((2, len(views)))
     for i, (down, right) in enumerate(zip(*np.gradient(soft, axis=(1, 2)), strict=True)):
         # Frames that are shifted against each other change more than a turn makes them.
         slopes = np.stack([right.ravel(), down.ravel(), np.ones(right.size)], axis=1)
         shifted = slopes @ np.linalg.lstsq(slopes, rest[i].ravel(), rcond=None)[0]
         change[i] = np.square(rest[i].ravel() - shifted).mean(dtype=np.float64)
-        like[i] = _likeness(views[i] - views[i - 1] - shifted.reshape(soft[i].shape))
+        own = views[i] - views[i - 1] - shifted.reshape(soft[i].shape)
+        correlation[i] = _neighbours_correlation(own)
     # Usual for that part of the turn: a round body hardly changes where it turns back.
     usual = median_filter(change, 5, mode="wrap")
     turned = np.roll(gaps, 1) > 1e-6
     ratio = change / np.maximum(usual, 1e-30)
     limit = WHITE / math.sqrt(views[0].size)
-    white = (like <= limit) & (median_filter(like, 5, mode="wrap") > 2.0 * limit)
+    white = correlation <= limit
+    white &= median_filter(correlation, 5, mode="wrap") > 2.0 * limit
     same = np.flatnonzero(white & (ratio <= np.quantile(ratio, 0.1)) & turned)
     if len(same) > len(views) // 4:
         return [], []
@@ -216,7 +219,7 @@ def _repeated(views: Float32Array, gaps: FloatArray) -> tuple[list[int], list[in
     return same.tolist(), [int(jump.argmax())] if jump.max() > LOST else []
 
 
-def _likeness(image: FloatArray) -> float:
+def _neighbours_correlation(image: FloatArray) -> float:
     """Correlation of neighbouring pixels along rows or columns, whichever is larger; 0 of noise."""
     own = image - image.mean()
     along = [(own[1:] * own[:-1]).mean(), (own[:, 1:] * own[:, :-1]).mean()]
