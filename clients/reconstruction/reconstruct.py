@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -39,23 +39,24 @@ from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.projection import Volume
 from flexdt.twin.reconstruction import (
     Grid,
+    Images,
     Polychromatic,
     Truncation,
     bias_of,
+    bias_warnings,
     cgls,
+    checked_fdk,
     em,
     fdk_parts,
     field_of_view,
     hardening,
     layer_warnings,
     lost_layers,
-    missing_wedge,
     ring_errors,
     sart,
     sirt,
     truncation_of,
     tv,
-    with_errors,
 )
 from flexdt.twin.reconstruction.scatter_correction import scatterer_of, subtracted
 
@@ -250,7 +251,8 @@ def reconstruct_dataset(
 
     Returns:
         JSON-able: file, slices, algorithm, shape (z, y, x), voxel_mm, center_mm, frames, missing,
-        correction (edge units), seconds.
+        correction (edge units), accuracy (see `Volume.accuracy`; None but for FDK), warnings,
+        seconds.
 
     Raises:
         UnknownNameError: no such algorithm, window or material.
@@ -278,6 +280,11 @@ def reconstruct_dataset(
         else:
             by_workers = extension("slabs", "a reconstruction by workers")
             doubts = by_workers(views, grid, wanted, out, pool, tell)
+    accuracy = None
+    if wanted.algorithm == "fdk":
+        bias = bias_of(views.view, views.cone_vec, views.shape, views.truncation())
+        accuracy = None if bias is None else bias.accuracy(grid)
+        doubts = [*bias_warnings(bias, grid), *doubts]
     doubts = [*views.doubts, *doubts]
     slices = write_slices(out, read_volume(out).data) if wanted.png else []
     in_force = dataset.correction
@@ -292,6 +299,7 @@ def reconstruct_dataset(
         "frames": len(views.indices),
         "missing": len(dataset.missing),
         "correction": None if used is None else used.to_edge(),
+        "accuracy": None if accuracy is None else asdict(accuracy),
         "warnings": doubts,
         "seconds": round(time.perf_counter() - begun, 3),
     }
@@ -322,11 +330,7 @@ def _here(
             )
             write(slab.data)
             lost += lost_layers(slab.data)
-    return [*_doubts(truncation), *layer_warnings(lost, grid.shape[0])]
-
-
-def _doubts(truncation: Truncation | None) -> list[str]:
-    return [truncation.doubt] if truncation is not None and truncation.doubt else []
+    return layer_warnings(lost, grid.shape[0])
 
 
 def reconstruct_volume(
@@ -338,27 +342,23 @@ def reconstruct_volume(
     errors: bool = False,
 ) -> Volume:
     """Reconstruct a data set in memory; arguments and errors as for `reconstruct_dataset`, and
-    `errors` as for `fdk_parts`.
+    `errors` as for `fdk`.
     """
     tell = progress or _untold
     wanted, views, grid = _task(dataset, request, parameters)
     _require("of memory", 3 * grid.bytes, memory_bytes(), grid)
     views = _corrected(views, wanted)
-    truncation = views.truncation() if wanted.algorithm == "fdk" else None
-    for doubt in (*views.doubts, *_doubts(truncation)):
+    for doubt in views.doubts:
         warnings.warn(doubt, stacklevel=2)
     if wanted.algorithm != "fdk":
         return _iterative(views, grid, wanted, tell)
-    volume = fdk_parts(
-        views.parts, views.cone_vec, views.shape, grid.blank(), wanted.window,
-        lambda done: tell(done, 1.0), truncation, errors=errors,
-    )  # fmt: skip
-    for doubt in layer_warnings(lost_layers(volume.data), grid.shape[0]):
+    images = Images(views.cone_vec, views.shape, views.view, views.parts)
+    volume, doubts = checked_fdk(
+        images, grid.blank(), wanted.window, lambda done: tell(done, 1.0), errors=errors
+    )
+    for doubt in doubts:
         warnings.warn(doubt, stacklevel=2)
-    if not errors:
-        return volume
-    bias = bias_of(views.view, views.cone_vec, views.shape, truncation)
-    return with_errors(volume, bias=bias)
+    return volume
 
 
 def _task(
@@ -377,10 +377,7 @@ def _task(
             {"asked": [name, *several], "allowed": ["sirt", "sart"]},
         )
     views = views_of(dataset, parameters, binning=wanted.binning, every=wanted.every)
-    doubts = image_doubts(dataset, needed=True)
-    if name == "fdk":  # iterative methods need no lines of all directions
-        doubts += missing_wedge(views.cone_vec)
-    views = replace(views, doubts=tuple(doubts))
+    views = replace(views, doubts=tuple(image_doubts(dataset, needed=True)))
     return wanted, views, grid_of(views, wanted)
 
 

@@ -366,7 +366,7 @@ def edges(plain: Hidden, rng: np.random.Generator) -> list[float]:
     near = np.abs(away) < 20
     widths = []
     for geometry in (data.geometry, aligned.geometry, true):
-        image = fx.fdk(data.line_integrals(), geometry, like).data[1]
+        image = fx.fdk(data.line_integrals(), geometry, like, errors=False).data[1]
         found, _ = curve_fit(
             lambda at, low, high, sigma, shift: low + (high - low) * ndtr((shift - at) / sigma),
             away[near], image[near], p0=(0.0, 0.02, 2.0, 0.0),

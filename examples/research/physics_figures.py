@@ -126,7 +126,7 @@ def ball(scan: ConeVec, iterations: int = 0) -> dict[str, object]:
         volume = sirt(data, scan, like, iterations=iterations,
                       watch=lambda s: residuals.append(s.residual)).data  # fmt: skip
     else:
-        volume = fdk(data, scan, like).data
+        volume = fdk(data, scan, like, errors=False).data
     at = (np.arange(80) - 39.5) * 0.4
     z, y, x = np.meshgrid(at, at, at, indexing="ij")
     distance = np.sqrt((x - 6) ** 2 + (y + 4) ** 2 + (z - 3) ** 2)

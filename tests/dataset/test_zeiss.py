@@ -121,7 +121,7 @@ def test_zeiss_scans_come_back_as_they_are(seed: int, kind: int, tmp_path: Path)
     assert [w.startswith(f"CenterShift of {center:.4g}"[:18]) for w in data.warnings] == [True]
     np.testing.assert_allclose(np.linalg.norm(data.geometry.source, axis=1), SOD, rtol=1e-6)
     np.testing.assert_allclose(np.abs(data.geometry.source_detector_distance), SDD, rtol=1e-6)
-    volume = data.reconstruct("fdk", voxel=0.2, shape=(40, 60, 60))
+    volume = data.reconstruct("fdk", voxel=0.2, shape=(40, 60, 60), errors=False)
     np.testing.assert_allclose(found(volume), 1.0, atol=0.04)
 
 
@@ -131,7 +131,7 @@ def test_zeiss_scans_come_back_as_they_are(seed: int, kind: int, tmp_path: Path)
 @pytest.mark.daily(1)
 def test_the_phantom_would_show_a_wrong_sign(wrong: str, tmp_path: Path) -> None:
     path, _ = balls(tmp_path / "scan.txrm", 0, wrong=wrong)
-    volume = fx.open(path).reconstruct("fdk", voxel=0.2, shape=(40, 60, 60))
+    volume = fx.open(path).reconstruct("fdk", voxel=0.2, shape=(40, 60, 60), errors=False)
     assert np.abs(found(volume) - 1.0).max() > 0.1
 
 
@@ -140,7 +140,7 @@ def test_align_finds_the_axis_of_a_panel_that_steps_about(tmp_path: Path) -> Non
     """With each view's shift, and a CenterShift that points the other way."""
     data = fx.open(balls(tmp_path / "scan.txrm", 0, wrong="CenterShift")[0])
     right = data.with_correction(data.align().correction)
-    volume = right.reconstruct("fdk", voxel=0.2, shape=(40, 60, 60))
+    volume = right.reconstruct("fdk", voxel=0.2, shape=(40, 60, 60), errors=False)
     np.testing.assert_allclose(found(volume), 1.0, atol=0.04)
 
 

@@ -20,6 +20,7 @@ import numpy.typing as npt
 from flexdt.twin.errors import GeometryError, NotBuiltError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray, as_numbers
 from flexdt.twin.lazy_backend import File, lazy_backend
+from flexdt.twin.projection.accuracy import Accuracy
 from flexdt.twin.signatures import public
 
 Vector3 = tuple[float, float, float]
@@ -323,6 +324,20 @@ class Volume:
         """
         bias: Any = getattr(self, "_bias", None)  # of `noise.with_errors`
         found: Float32Array | None = None if bias is None else bias.bound(self)
+        return found
+
+    @property
+    def accuracy(self) -> Accuracy | None:
+        """What the object's even places may be off by, in short (`reconstruct("fdk")`); None where
+        it was not found.
+
+        Example:
+            >>> volume = fx.reconstruct("my-scans/lego")  # doctest: +SKIP
+            >>> volume.accuracy  # doctest: +SKIP
+            Accuracy(half=0.006, most=0.021, cause='cone')
+        """
+        bias: Any = getattr(self, "_bias", None)  # of `noise.with_errors`
+        found: Accuracy | None = None if bias is None else bias.accuracy(self)
         return found
 
     @property

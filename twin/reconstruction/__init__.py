@@ -1,9 +1,11 @@
 """Volumes back from projections."""
 
+from flexdt.twin.projection.accuracy import Accuracy
 from flexdt.twin.projection.volume import Grid
 from flexdt.twin.reconstruction.bias_bound import Bias, bias_of
-from flexdt.twin.reconstruction.coverage import layer_warnings, lost_layers, missing_wedge
-from flexdt.twin.reconstruction.fdk import fdk, fdk_parts
+from flexdt.twin.reconstruction.checked_fdk import Images, bias_warnings, checked_fdk, fdk
+from flexdt.twin.reconstruction.coverage import layer_warnings, lost_layers
+from flexdt.twin.reconstruction.fdk import fdk_parts
 from flexdt.twin.reconstruction.iterative import cgls, em, sart, sirt
 from flexdt.twin.reconstruction.linear_system import Step
 from flexdt.twin.reconstruction.noise import with_errors
@@ -19,15 +21,19 @@ from flexdt.twin.reconstruction.truncation import Truncation, truncation_of
 from flexdt.twin.reconstruction.tv import Minimised, minimise_tv, tv
 
 __all__ = [
+    "Accuracy",
     "Bias",
     "Grid",
     "Hardening",
+    "Images",
     "Minimised",
     "Polychromatic",
     "Step",
     "Truncation",
     "bias_of",
+    "bias_warnings",
     "cgls",
+    "checked_fdk",
     "em",
     "fdk",
     "fdk_parts",
@@ -36,7 +42,6 @@ __all__ = [
     "layer_warnings",
     "lost_layers",
     "minimise_tv",
-    "missing_wedge",
     "ring_errors",
     "sart",
     "sirt",

@@ -11,10 +11,9 @@ from typing import Final
 
 import numpy as np
 
-from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume
-from flexdt.twin.reconstruction.trajectory import UNEVEN, Circle, circle_of
+from flexdt.twin.reconstruction.trajectory import Circle
 
 LEAST_SEEN: Final = 0.4
 """Part of the weight of all views that must see a voxel. At the panel's upper and lower edge it is
@@ -22,8 +21,6 @@ about half in a whole turn."""
 ALL_LINES: Final = 0.97
 """Part of the directions in which a voxel must be seen where the panel cuts the object off, less
 the arc that a view stands for."""
-WEDGE: Final = np.deg2rad(5.0)
-"""Smallest wedge that is warned of [rad]: a thirty-sixth of all directions."""
 MOST_VIEWS: Final = 360
 """Coverage is judged by so many of the views at most, evenly over the circle."""
 
@@ -79,24 +76,6 @@ def normalise_coverage(
 def first_and_steps(like: Volume) -> tuple[list[float], list[float]]:
     """Centre of the first voxel and steps (x, y, z) [mm]."""
     return [float(places[0]) for places in like.centers()], list(like.voxel_xyz)
-
-
-def missing_wedge(cone_vec: ConeVec) -> list[str]:
-    """A warning where neither views nor their opposites see lines of some directions.
-
-    Raises:
-        GeometryError: neither a circle nor a helix.
-    """
-    lines = np.unique((circle_of(cone_vec).angle % np.pi).round(9))
-    ahead = np.diff(lines, append=lines[0] + np.pi)
-    widest, usual = float(ahead.max()), float(np.median(ahead))
-    if widest <= max(UNEVEN * usual, WEDGE):
-        return []
-    return [
-        f"no view sees lines within a wedge of {np.rad2deg(widest):.3g} deg (the usual step is "
-        f"{np.rad2deg(usual):.3g} deg): expect streaks, and values some per cent off near edges "
-        "along it"
-    ]
 
 
 def lost_layers(data: Float32Array) -> int:

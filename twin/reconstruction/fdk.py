@@ -14,7 +14,6 @@ padded to twice their length, so that the convolution does not wrap.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -22,26 +21,13 @@ from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
 from flexdt.twin.errors import GeometryError, UnknownNameError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Grid, Volume, as_volume, gpu
 from flexdt.twin.projection.cpu import threads
-from flexdt.twin.projection.operators import (
-    as_cone_vec,
-    check_projections,
-    require_finite,
-    require_line_integrals,
-)
-from flexdt.twin.reconstruction.coverage import (
-    first_and_steps,
-    layer_warnings,
-    lost_layers,
-    missing_wedge,
-    normalise_coverage,
-)
+from flexdt.twin.reconstruction.coverage import first_and_steps, normalise_coverage
 from flexdt.twin.reconstruction.helix import Sharing
 from flexdt.twin.reconstruction.noise import NoiseMeter, with_errors
 from flexdt.twin.reconstruction.rectify import (
@@ -63,8 +49,7 @@ from flexdt.twin.reconstruction.trajectory import (
     narrow_overlap,
     redundancy,
 )
-from flexdt.twin.reconstruction.truncation import Truncation, truncation_of
-from flexdt.twin.signatures import public
+from flexdt.twin.reconstruction.truncation import Truncation
 
 MOST_COLUMNS = 65_535
 """Voxel columns along y that a device's grid can hold."""
@@ -349,79 +334,6 @@ Progress = Callable[[float], None]
 """Called with the fraction done, from 0 to 1."""
 
 
-@public
-def fdk(
-    projections: npt.ArrayLike,
-    cone_vec: ConeVec | npt.ArrayLike,
-    like: Volume | Grid,
-    *,
-    window: str = "ram-lak",
-    progress: Progress | None = None,
-) -> Volume:
-    """Reconstruct attenuation from line integrals of a circular or helical scan.
-
-    Args:
-        projections: (n, rows, cols) line integrals.
-        cone_vec: ConeVec or (n, 12) [mm].
-        like: the grid, or a volume on it, whose values are not used.
-        window: of the ramp filter: ram-lak, shepp-logan, cosine, hamming, hann.
-        progress: called with the fraction done.
-
-    Returns:
-        Volume [1/mm]; its data is a (nz, ny, nx) view with z contiguous. Voxels that too few views
-        see, above or below the panel, are NaN.
-
-    Raises:
-        GeometryError: no circle and no helix, too short a scan, too steep a helix, or shapes that
-            do not fit.
-        UnknownNameError: no such window.
-
-    Warns:
-        UserWarning: the panel cuts the object off, and its outline is not understood; layers of the
-            grid lie above or below what the panel sees; no lines of some directions were seen.
-
-    Examples:
-        A cube of 0.02 / mm, projected and reconstructed:
-
-        >>> from flexdt.twin.projection import forward
-        >>> cube = np.zeros((16, 16, 16), np.float32)
-        >>> cube[4:12, 4:12, 4:12] = 0.02
-        >>> volume = Volume(cube, 0.5)
-        >>> turn = np.linspace(0, 2 * np.pi, 90, endpoint=False)
-        >>> c, s, o = np.cos(turn), np.sin(turn), np.zeros(90)
-        >>> source, detector = np.stack([s, -c, o], 1) * 600, np.stack([-s, c, o], 1) * 400
-        >>> scan = ConeVec.from_vectors(source, detector, np.stack([c, s, o], 1), (0, 0, -1))
-        >>> found = fdk(forward(volume, scan, (24, 24)), scan, like=volume)
-        >>> bool(abs(found.data[8, 8, 8] - 0.02) < 0.002)
-        True
-    """
-    geometry = as_cone_vec(cone_vec)
-    values = np.asarray(projections)
-    require_line_integrals(values)
-    if values.ndim != 3:
-        values = check_projections(values, len(geometry))
-
-    chunk = max(CHUNK, 4 * PIXELS // max(values[0].size, 1)) if len(values) else CHUNK
-
-    def parts() -> Iterable[Float32Array]:
-        for start in range(0, len(values), chunk):
-            part = np.asarray(values[start : start + chunk], dtype=np.float32)
-            require_finite(part)
-            yield part
-
-    shape = (values.shape[1], values.shape[2])
-    truncation = None
-    if len(values) == len(geometry):
-        truncation = truncation_of(lambda view: values[view], geometry, shape)
-        if truncation is not None and truncation.doubt:
-            warnings.warn(truncation.doubt, stacklevel=3)
-    volume = fdk_parts(parts, geometry, shape, like, window, progress, truncation)
-    layers = layer_warnings(lost_layers(volume.data), len(volume.data))
-    for doubt in (*missing_wedge(geometry), *layers):
-        warnings.warn(doubt, stacklevel=3)
-    return volume
-
-
 def fdk_parts(
     parts: Callable[[], Iterable[Float32Array]],
     cone_vec: ConeVec,
@@ -435,7 +347,7 @@ def fdk_parts(
     outside: bool = False,
     errors: bool = False,
 ) -> Volume:
-    """As `fdk`, with the views coming in parts, in order.
+    """As `fdk`, with the views coming in parts, in order, and without warnings.
 
     Args:
         parts: gives float32 (k, rows, cols) arrays of line integrals, together one image a view;

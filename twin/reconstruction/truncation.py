@@ -6,7 +6,7 @@ path lengths. One shape for all views is what makes the continuations agree with
 materials in the object deviate from the prism and count less and less in a robust fit, which
 follows the quarter of the rays that fits best. Where even that quarter deviates by more than noise
 does, the outline is no ellipse, or too much else is in it: rows then fade out smoothly beyond the
-panel, and a warning says by how much densities may be off.
+panel, and `bias_bound` has what that may change.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SIGNIFICANT = 4.0
 """Standard deviations of noise beyond which a value at an edge counts as truncation: of thousands
 of bands, views and edges none is beyond by chance."""
 ACCURACY = 0.01
-"""Relative error of densities from which on a warning is given. The best quarter of the rays may
+"""Relative error of densities that is taken for none. The best quarter of the rays may
 deviate from the prism by half of it: what deviated by less was right within 1 %, and outlines that
 were up to 4 % off (an octagon of twice the field of view) deviate by 0.6 % and more. A tenth of it
 at the edges is nothing."""
@@ -90,7 +90,6 @@ class Truncation:
         prisms: one a band; None where rows are whole, or fade out.
         cut_off: (b,) whether the band's rows are continued.
         others: the best of the prisms that do not explain what was seen, where none does.
-        doubt: what to tell the user where densities may be off; else None.
         fade: length over which rows fade out that no prism explains, over that of a row.
         beyond: whether no prism stands for what a panel moved to one side misses.
     """
@@ -100,7 +99,6 @@ class Truncation:
     cut_off: npt.NDArray[np.bool_]
     others: tuple[Prism | None, ...] = ()
     fade: float = 0.5
-    doubt: str | None = None
     beyond: bool = False
 
     @property
@@ -215,11 +213,7 @@ def truncation_of(
     found = found or Truncation(np.zeros(1), (None,), np.zeros(1, dtype=bool))
     known = [p is not None for p in found.prisms] >= found.cut_off
     beyond = not (found.cut_off.any() and bool(np.all(known)))
-    return replace(
-        found, beyond=beyond, cut_off=found.cut_off & (not beyond),
-        doubt="the object reaches beyond the near edge of a panel moved to one side, and less than "
-        "a turn does not tell all of what is there: densities may be off by tens of per cent",
-    )  # fmt: skip
+    return replace(found, beyond=beyond, cut_off=found.cut_off & (not beyond))
 
 
 def _seen_beyond(images: Sequence[Float32Array], there: npt.NDArray[np.bool_]) -> bool:
@@ -258,7 +252,7 @@ def _fitted(
     seen = seen.astype(np.float64)
     prisms: list[Prism | None] = [None] * len(middles)
     others: list[Prism | None] = [None] * len(middles)
-    cut_off, off, known, why = np.zeros(len(middles), dtype=bool), 0.0, None, ""
+    cut_off, known = np.zeros(len(middles), dtype=bool), None
     # Bands above and below the object hold nothing that could be off.
     least = 0.1 * ACCURACY * float(np.abs(seen).mean())
     met = seen[seen > max(0.1 * float(seen.mean()), least)]
@@ -272,21 +266,9 @@ def _fitted(
         if not helix and not even:
             prisms[k], others[k] = _fit(source, rays, band, usual, known)
             known = prisms[k] or known
-        # What a row holds beyond its edges adds as much as this to what is between them, at most.
-        at_edges = float(np.abs(band[:, [0, -1]])[:, edges_that_count].sum(axis=1).mean())
-        if prisms[k] is None and at_edges / np.pi > off * usual:
-            off = at_edges / np.pi / usual
-            why = "its outline is unlike an ellipse, or much else is in it"
-            if helix or even:
-                why = f"{'a helix does' if helix else 'images without an edge do'} not tell how far"
     if not cut_off.any():
         return None
-    doubt = (
-        f"the object is wider than the panel, and {why}: densities may be off by up to "
-        f"{100.0 * off:.0f} per cent"
-    )
-    said = doubt if off > ACCURACY else None
-    return Truncation(middles, tuple(prisms), cut_off, tuple(others), doubt=said)
+    return Truncation(middles, tuple(prisms), cut_off, tuple(others))
 
 
 def _noise(lines: npt.NDArray[np.floating]) -> float:
@@ -308,7 +290,7 @@ def _cut_off(band: FloatArray, least: float, usual: float) -> npt.NDArray[np.boo
     noise = SIGNIFICANT * np.array([_noise(band[:, :5:2]), _noise(band[:, :-6:-2])])
     some = median_filter(ends, (min(5, len(band)), 1)) > np.maximum(least, noise)
     # In the mean the flat's drift and noise show, too, and the logarithm of noise: what counts is
-    # what would change densities by the accuracy (see `at_edges` above).
+    # what would change densities by the accuracy. Two edges add a pi-th of their sum, at most.
     mean = band.mean(axis=0)
     apart = np.std(np.diff(ends, axis=0), axis=0) / np.sqrt(2.0 * len(ends))
     apart = SIGNIFICANT * np.hypot(apart, _noise(mean))

@@ -87,6 +87,7 @@ def reconstruct(
     _check_together(given, out, [name for name in own if name in given] if preview else [])
     from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_dataset
     from flexdt.clients.reconstruction.reconstruct import preview as quick_look
+    from flexdt.twin.projection.accuracy import Accuracy
 
     voxels = None if shape is None else _shape(shape)
     scattering = None if scatter_correction is None else option_values.names(scatter_correction)
@@ -123,6 +124,8 @@ def reconstruct(
         f"{out}: {x} x {y} x {z} voxels of {document['voxel_mm']:g} mm from {document['frames']} "
         f"frames, {size(out.stat().st_size)}, {duration(document['seconds'])}"
     )
+    if document["accuracy"] is not None:
+        yield f"  {Accuracy(**document['accuracy'])}"
     yield from (f"  {file}" for file in document["slices"])
 
 

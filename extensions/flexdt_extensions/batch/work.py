@@ -307,7 +307,7 @@ def _projections(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, An
         z, y, x = want.shape
         like = Volume(np.zeros((z, y, x), np.float32), want.voxel_mm)
         geometry = cone if want.geometry == "true" else item.poses.cone_vec()
-        arrays["volumes"] = fdk(images, geometry, like, window=want.window).data
+        arrays["volumes"] = fdk(images, geometry, like, window=want.window, errors=False).data
     return arrays, {}
 
 

@@ -134,7 +134,7 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
         images, cone, like = self._images, self._cone, blank()
         match ALGORITHMS[algorithm]:
             case "fdk":
-                volume, work = fdk(images, cone, like, window=WINDOWS[strength]), 1.0
+                volume, work = fdk(images, cone, like, window=WINDOWS[strength], errors=False), 1.0
             case "sirt":
                 count = SIRT_ITERATIONS[strength]
                 volume = sirt(images, cone, like, iterations=count, nonnegative=nonnegative)

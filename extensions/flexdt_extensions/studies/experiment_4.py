@@ -385,7 +385,9 @@ def found_beads(images: Sequence[Float32Array], cone: ConeVec, model: BeadModel)
         side = 2 * int(np.ceil(1.8 * radius / VOXEL_MM)) + 1
         x0, y0, z0 = centre.tolist()
         grid = Volume(np.zeros((side, side, side), np.float32), VOXEL_MM, (x0, y0, z0))
-        data = np.asarray(fdk(stack, cone, grid, window="hann").data, dtype=np.float64)
+        data = np.asarray(
+            fdk(stack, cone, grid, window="hann", errors=False).data, dtype=np.float64
+        )
         weight = np.clip(data - 0.5 * float(np.quantile(data, 0.995)), 0.0, None)
         place = (np.arange(side) - (side - 1) / 2) * VOXEL_MM
         z, y, x = np.meshgrid(place, place, place, indexing="ij")

@@ -57,7 +57,7 @@ def errors(parts: list[tuple[np.ndarray, np.ndarray, float]], scan: ConeVec, z: 
         truth += mu * (((where / axes) ** 2).sum(-1) <= 1.0)
         grown, shrunk = axes + 2.5 * grid.voxel_mm, np.maximum(axes - 2.5 * grid.voxel_mm, 1e-3)
         even &= (((where / grown) ** 2).sum(-1) > 1) | (((where / shrunk) ** 2).sum(-1) < 1)
-    return ((fdk(images, scan, grid.blank()).data[0] - truth) / MU)[even]
+    return ((fdk(images, scan, grid.blank(), errors=False).data[0] - truth) / MU)[even]
 
 
 @pytest.mark.slow
@@ -163,7 +163,8 @@ def test_too_steep_a_helix_is_refused_with_what_is_allowed() -> None:
     assert most == pytest.approx(STEEPEST, rel=1e-3)
     assert error.value.data["allowed"] == pytest.approx(STEEPEST)  # type: ignore[index]
     fdk(images, helix(0.9999, 40), wide)
-    fdk(images, helix(1.08, 40), slim)  # which moves less on the panel
+    with pytest.warns(UserWarning, match="is not known"):  # the whole field cannot be had
+        fdk(images, helix(1.08, 40), slim)  # which moves less on the panel
     with pytest.raises(GeometryError, match="rises by"):
         fdk(images, helix(1.3, 40), slim)
     uneven = helix(0.5, 40).rows.copy()
@@ -178,7 +179,7 @@ def test_too_steep_a_helix_is_refused_with_what_is_allowed() -> None:
 def test_an_object_wider_than_the_panel_is_said() -> None:
     scan = helix(0.5, 40)
     body = Scene((Solid(Ellipsoid((0.0, 0.0, 0.0), (2 * FIELD, 2 * FIELD, 1e5)), "a", MU),))
-    with pytest.warns(UserWarning, match="helix does not tell"):
+    with pytest.warns(UserWarning, match="beyond the panel's sides"):
         fdk(project_scene(body, scan, SHAPE), scan, Grid((1, 8, 8), 4.0).blank())
 
 

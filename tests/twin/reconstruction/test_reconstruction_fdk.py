@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import sys
 import warnings
-from itertools import pairwise
+from functools import partial
+from itertools import pairwise, product
 from pathlib import Path
 
 import fan_beam
@@ -36,7 +36,6 @@ from flexdt.twin.reconstruction import (
     fdk,
     fdk_parts,
     field_of_view,
-    missing_wedge,
     truncation_of,
 )
 from flexdt.twin.reconstruction.fdk import WINDOWS, filtered, ramp
@@ -54,6 +53,9 @@ from flexdt.twin.reconstruction.trajectory import (
     redundancy,
 )
 from tests.twin.reconstruction.scans import CENTRE, MU, RADIUS, ball, circle, measure
+
+plain_fdk = partial(fdk, errors=False)
+"""Values alone."""
 
 SHAPE = (120, 130)
 LIKE = Grid((80, 80, 80), 0.4).blank()
@@ -81,7 +83,7 @@ NEAR = Grid((52, 52, 52), 0.4, CENTRE).blank()  # twice as wide as the ball
 )  # fmt: skip
 @pytest.mark.daily(5)
 def test_a_ball_comes_back(scan):
-    found, centre = measure(fdk(ball(scan, SHAPE), scan, NEAR))
+    found, centre = measure(plain_fdk(ball(scan, SHAPE), scan, NEAR))
     assert found == pytest.approx(1.0, abs=0.01)
     assert np.abs(centre).max() < 0.1
 
@@ -92,8 +94,8 @@ def test_a_ball_comes_back(scan):
 def test_views_may_come_in_any_order(scan):
     order = np.random.default_rng(3).permutation(len(scan))
     images = ball(scan, SHAPE)
-    in_turn = fdk(images, scan, LIKE).data
-    mixed = fdk(images[order], scan[order], LIKE).data
+    in_turn = plain_fdk(images, scan, LIKE).data
+    mixed = plain_fdk(images[order], scan[order], LIKE).data
     assert np.abs(mixed - in_turn).max() < 1e-5 * in_turn.max()
 
 
@@ -109,7 +111,7 @@ def rolled(scan: ConeVec, degrees: float) -> ConeVec:
 @pytest.mark.parametrize("degrees", [30.0, 60.0, 89.9, 90.0, 180.0, 269.95, 270.0])
 def test_a_panel_turned_any_way_gives_the_same_ball(degrees):
     scan = rolled(circle(240), degrees)
-    found, centre = measure(fdk(ball(scan, SHAPE), scan, NEAR))
+    found, centre = measure(plain_fdk(ball(scan, SHAPE), scan, NEAR))
     assert found == pytest.approx(1.0, abs=0.01)
     assert np.abs(centre).max() < 0.1
 
@@ -119,10 +121,10 @@ def test_a_panel_turned_any_way_gives_the_same_ball(degrees):
 def test_a_panel_on_its_side_loses_nothing(degrees):
     """Long and narrow: 60 x 130 pixels that lie as 130 x 60 on their side are the same image."""
     plain = circle(60, aside=8.0)
-    wanted = fdk(ball(plain, (60, 130)), plain, LIKE).data
+    wanted = plain_fdk(ball(plain, (60, 130)), plain, LIKE).data
     scan = rolled(plain, degrees)
     images = ball(scan, (130, 60))
-    np.testing.assert_allclose(fdk(images, scan, LIKE).data, wanted, atol=1e-4 * MU)
+    np.testing.assert_allclose(plain_fdk(images, scan, LIKE).data, wanted, atol=1e-4 * MU)
     assert field_of_view(scan, (130, 60)) == field_of_view(plain, (60, 130))
 
 
@@ -132,13 +134,13 @@ def test_a_panel_that_lies_flat_is_refused():
     rows[:, 9:12] = rows[:, 3:6] / 459.0 * 0.6  # columns run away from the axis,
     rows[:, 5] = -300.0  # below the source
     with pytest.raises(GeometryError, match="lies flat"):
-        fdk(np.zeros((60, *SHAPE), np.float32), ConeVec(rows), LIKE)
+        plain_fdk(np.zeros((60, *SHAPE), np.float32), ConeVec(rows), LIKE)
 
 
 def test_wrong_side_or_sense_would_be_seen():
     """The test above can fail: the mirrored turn puts the ball elsewhere."""
     scan = circle(120)
-    _, centre = measure(fdk(ball(scan, SHAPE), circle(120, sense=-1), LIKE))
+    _, centre = measure(plain_fdk(ball(scan, SHAPE), circle(120, sense=-1), LIKE))
     assert np.abs(centre).max() > 1.0
 
 
@@ -146,7 +148,7 @@ def test_parts_and_slabs_are_the_whole():
     scan = circle(90, tilt=0.01)
     data = ball(scan, SHAPE)
     grid = Grid((40, 30, 32), 0.7, (1.0, -2.0, 3.0))
-    whole = fdk(data, scan, grid.blank()).data
+    whole = plain_fdk(data, scan, grid.blank()).data
     pieces = []
     chunks = lambda: (data[i : i + 17] for i in range(0, 90, 17))  # noqa: E731
     for first, last in grid.slabs(grid.bytes // 3):
@@ -206,7 +208,7 @@ def test_what_some_views_see_above_or_below_the_panel_is_right_or_nan(span, many
         size = 1.6 * rng.uniform(0.8, 1.2)
         like = Grid((rows // 2 + 6, 25, 25), size).blank()
         with pytest.warns(UserWarning, match="layers of the grid lie"):
-            found = fdk(ellipses(parts, scan, (rows, 80)), scan, like).data
+            found = fdk(ellipses(parts, scan, (rows, 80)), scan, like, errors=False).data
         x, y, z = (places.ravel() for places in like.centers())
         at = np.stack(np.meshgrid(x, y, z, indexing="ij"), -1).transpose(2, 1, 0, 3)
         row = scan.project_points(at.reshape(-1, 3), (rows, 80))[..., 1]
@@ -230,34 +232,8 @@ def test_a_narrow_overlap_leaves_no_mark_on_the_axis():
         field = 300.0 * np.sin(max(reach(fan_angles(circle_of(scan), scan, 128))))
         parts = [(0.2 * field, -0.1 * field, 0.5 * field, 0.6 * field, 0.4, 0.02)]
         data = ellipses(parts, scan, (4, 128))
-        found = fdk(data, scan, Grid((1, 9, 9), 0.5).blank()).data[0]
+        found = plain_fdk(data, scan, Grid((1, 9, 9), 0.5).blank()).data[0]
         assert np.abs(found / 0.02 - 1.0).max() < 0.04  # -160 to 210 % unless sampled alike
-
-
-@pytest.mark.parametrize("kind", ["even", "half left out", "random", "arcs"])
-def test_a_wedge_of_directions_that_no_view_sees_is_said(kind):
-    """Drawn lists of views; the widest wedge is found here by trying directions."""
-    rng = np.random.default_rng(29)
-    for _ in range(12):
-        n = int(rng.integers(36, 200))
-        whole = np.arange(n) * 360.0 / n
-        degrees = {
-            "even": whole,
-            "half left out": np.delete(whole, rng.choice(n, n // 2, replace=False)),
-            "random": rng.uniform(0.0, 360.0, n),
-            "arcs": np.concatenate([whole[:8] * 72 / n + k for k in range(0, 360, 30)]),
-        }[kind]
-        scan = circle(len(degrees), angles=np.deg2rad(degrees), pixel=6.0)
-        tried = np.arange(0.0, 180.0, 0.05)
-        near = np.abs((tried[:, None] - degrees + 90.0) % 180.0 - 90.0).min(axis=1)
-        widest = 2.0 * near.max()
-        said = missing_wedge(scan)
-        if widest < 4.8:
-            assert not said
-        if kind in ("random", "arcs") and widest > max(5.2, 12.0 * 180.0 / n):
-            assert float(said[0].split()[8]) == pytest.approx(widest, abs=0.2)
-        if kind == "even":
-            assert not said
 
 
 @pytest.mark.parametrize(
@@ -273,7 +249,7 @@ def test_a_detector_moved_aside_brings_no_bias(shift, yaw):
     at = np.linspace(-radius, radius, 81)
     size = float(at[1] - at[0])
     data = ellipses(parts, scan, (4, 160))
-    found = fdk(data, scan, Grid((1, 81, 81), size).blank()).data[0]
+    found = plain_fdk(data, scan, Grid((1, 81, 81), size).blank()).data[0]
     truth, even = layer_of(parts, at)
     inside = even & (np.hypot(at[:, None], at) < 0.8 * radius)
     assert float((found - truth)[inside].mean()) / 0.02 == pytest.approx(0.0, abs=0.002)
@@ -294,7 +270,7 @@ def test_objects_wider_than_the_panel_come_out_even():
             place = field * rng.uniform(-0.6, 0.6, 2)
             parts.append((*place, *axes, 0.0, 0.02 * rng.uniform(-0.8, 2.0)))
         data = ellipses(parts, scan, (4, 80))
-        found = fdk(data, scan, Grid((1, 61, 61), float(at[1] - at[0])).blank()).data[0]
+        found = plain_fdk(data, scan, Grid((1, 61, 61), float(at[1] - at[0])).blank()).data[0]
         truth, even = layer_of(parts, at)
         assert float((found - truth)[even & middle].mean()) / 0.02 == pytest.approx(0.0, abs=0.03)
         lost, away = np.isnan(found), np.hypot(at[:, None], at) / field
@@ -322,14 +298,16 @@ def test_dense_things_do_not_pull_the_outline_unsaid(seed):
     at = np.linspace(-field, field, 61)
     parts = with_four_dense_things(seed, field)
     data = ellipses(parts, scan, (4, 80))
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        found = fdk(data, scan, Grid((1, 61, 61), float(at[1] - at[0])).blank()).data[0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        volume = fdk(data, scan, Grid((1, 61, 61), float(at[1] - at[0])).blank())
     truth, even = layer_of(parts, at)
-    middle = np.abs(np.hypot(at[:, None], at) / field - 0.5) < 0.1
-    off = abs(float((found - truth)[even & middle].mean())) / 0.02
-    assert off < 0.004 or any("wider than the panel" in str(one.message) for one in said)
-    assert said or seed not in (4, 11)
+    even &= np.abs(np.hypot(at[:, None], at) / field - 0.5) < 0.1
+    off = abs(float((volume.data[0] - truth)[even].mean())) / 0.02
+    assert volume.bias_bound is not None
+    assert volume.accuracy is not None
+    assert off < max(0.004, float(volume.bias_bound[0][even].mean()) / 0.02)
+    assert volume.accuracy.cause == "beyond" or seed not in (4, 11)
 
 
 def upright_prism(turns: np.ndarray, distances: np.ndarray) -> ConvexPolyhedron:
@@ -340,31 +318,33 @@ def upright_prism(turns: np.ndarray, distances: np.ndarray) -> ConvexPolyhedron:
     )
 
 
-@pytest.mark.daily(4)
-@pytest.mark.parametrize("corners", [3, 4, 6, 8])
-@pytest.mark.parametrize("seed", range(3))
-def test_what_is_off_by_more_than_a_per_cent_is_said(corners: int, seed: int) -> None:
-    """Drawn polygons wider than the panel, some with voids: a warning gives an upper bound."""
-    rng = np.random.default_rng([corners, seed])
-    scan = circle(60, pixel=1.6, sod=300.0, sdd=600.0)
-    field = 300.0 * np.sin(np.arctan2(64.0, 600.0))
-    turns = rng.uniform(0.0, 6.3) + 2 * np.pi * np.arange(corners) / corners
-    shape = upright_prism(turns, field * rng.uniform(1.0, 1.9, corners))
-    at = np.linspace(-field, field, 61)
-    x, y = np.meshgrid(at, at)
-    even = np.abs(np.hypot(x, y) / field - 0.5) < 0.1
-    solids = [Solid(shape, "a", 0.02)]
-    for _ in range(seed):
-        (px, py), radius = field * rng.uniform(-0.5, 0.5, 2), field * rng.uniform(0.1, 0.3)
-        solids.append(Solid(Cylinder((px, py, 0.0), radius, 400.0), "void", -0.02))
-        even &= np.hypot(x - px, y - py) > radius + 3.0
-    data = project_scene(Scene(tuple(solids)), scan, (2, 80))
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        found = fdk(data, scan, Grid((1, 61, 61), float(at[1] - at[0])).blank()).data[0] / 0.02
-    error = 100.0 * abs(float(found[even].mean()) - 1.0)
-    most = [re.search(r"wider than the panel.* up to (\d+) per cent", str(w.message)) for w in said]
-    assert error < max([1.0, *(float(one[1]) for one in most if one is not None)])
+@pytest.mark.slow
+def test_what_lies_beyond_the_panel_is_warned_of_and_in_the_bound() -> None:
+    """Drawn polygons wider than the panel, some with voids."""
+    within = []
+    for corners, seed in product([3, 4, 6, 8], range(3)):
+        rng = np.random.default_rng([corners, seed])
+        scan = circle(60, pixel=1.6, sod=300.0, sdd=600.0)
+        field = 300.0 * np.sin(np.arctan2(64.0, 600.0))
+        turns = rng.uniform(0.0, 6.3) + 2 * np.pi * np.arange(corners) / corners
+        shape = upright_prism(turns, field * rng.uniform(1.0, 1.9, corners))
+        at = np.linspace(-field, field, 61)
+        x, y = np.meshgrid(at, at)
+        even = np.abs(np.hypot(x, y) / field - 0.5) < 0.1
+        solids = [Solid(shape, "a", 0.02)]
+        for _ in range(seed):
+            (px, py), radius = field * rng.uniform(-0.5, 0.5, 2), field * rng.uniform(0.1, 0.3)
+            solids.append(Solid(Cylinder((px, py, 0.0), radius, 400.0), "void", -0.02))
+            even &= np.hypot(x - px, y - py) > radius + 3.0
+        data = project_scene(Scene(tuple(solids)), scan, (2, 80))
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            volume = fdk(data, scan, Grid((1, 61, 61), float(at[1] - at[0])).blank())
+        assert volume.bias_bound is not None
+        mean, bound = (each[0][even].mean() / 0.02 for each in (volume.data, volume.bias_bound))
+        within.append(abs(mean - 1.0) < bound)
+        assert abs(mean - 1.0) < 0.01 or said, (corners, seed)
+    assert sum(within) >= 11  # of 12: two ways to continue rows may agree, and be wrong
 
 
 def test_a_ball_wider_than_the_panel_comes_out_even():
@@ -449,7 +429,7 @@ def test_an_outline_that_is_not_understood_is_said():
     scan = circle(60, pixel=3.2, sod=300.0, sdd=600.0)
     arms = Box((0, -25, 0), (160.0, 30.0, 99.0)), Box((-25, 50, 0), (30.0, 120.0, 99.0))
     data = project_scene(Scene(tuple(Solid(arm, "a", 0.02) for arm in arms)), scan, (4, 40))
-    with pytest.warns(UserWarning, match="wider than the panel"):
+    with pytest.warns(UserWarning, match="beyond the panel's sides"):
         fdk(data, scan, Grid((1, 8, 8), 4.0).blank())
 
 
@@ -458,7 +438,7 @@ def test_half_a_dead_panel_ends_in_a_volume_and_a_warning():
     parts = with_four_dense_things(0, 300.0 * np.sin(np.arctan2(64.0, 600.0)))
     data = ellipses(parts, scan, (4, 80))
     data[:, :, 40:] = 0.0
-    with pytest.warns(UserWarning, match="wider than the panel"):
+    with pytest.warns(UserWarning, match="beyond the panel's sides"):
         found = fdk(data, scan, Grid((1, 8, 8), 4.0).blank())
     assert np.isfinite(found.data).all()
 
@@ -467,12 +447,12 @@ def test_a_row_of_detectors_is_a_panel():
     """A single row, and a single column, which no filter can do anything with."""
     scan, row = circle(120, pixel=1.0, sod=300.0, sdd=600.0), Cylinder((4, -3, 0), 9.0, 50.0)
     data = project_scene(Scene((Solid(row, "a", 0.02),)), scan, (1, 80))
-    found = fdk(data, scan, Grid((1, 61, 61), 0.5).blank()).data[0]
+    found = plain_fdk(data, scan, Grid((1, 61, 61), 0.5).blank()).data[0]
     x, y = np.meshgrid(*[np.linspace(-15.0, 15.0, 61)] * 2)
     inside = np.hypot(x - 4, y + 3) < 8.0
     assert float(found[inside].mean()) == pytest.approx(0.02, rel=0.01)
     with pytest.raises(GeometryError, match="2 or more"):
-        fdk(data[:, :, :1], scan, Grid((1, 8, 8), 4.0).blank())
+        plain_fdk(data[:, :, :1], scan, Grid((1, 8, 8), 4.0).blank())
 
 
 @pytest.mark.parametrize("columns", [40, 150])
@@ -497,26 +477,26 @@ def test_what_fdk_refuses():
     scan = circle(60)
     data = np.zeros((60, *SHAPE), np.float32)
     with pytest.raises(GeometryError, match="span 170"):
-        fdk(data, circle(60, 170.0, repeat=True), LIKE)
+        plain_fdk(data, circle(60, 170.0, repeat=True), LIKE)
     helix = scan.rows.copy()
     helix[:, [2, 5]] += np.linspace(-50, 50, 60)[:, None]
     with pytest.raises(GeometryError, match="rises by"):
-        fdk(data, helix, LIKE)
+        plain_fdk(data, helix, LIKE)
     helix[:, [2, 5]] **= 3
     with pytest.raises(GeometryError, match="horizontal circle"):
-        fdk(data, helix, LIKE)
+        plain_fdk(data, helix, LIKE)
     straight = np.repeat(scan.rows[:1], 60, axis=0)
     straight[:, [0, 3]] += np.linspace(-50, 50, 60)[:, None]
     with pytest.raises(GeometryError, match="line"):
-        fdk(data, straight, LIKE)
+        plain_fdk(data, straight, LIKE)
     with pytest.raises(GeometryError, match="axis"):
-        fdk(data, circle(60, aside=60.0), LIKE)
+        plain_fdk(data, circle(60, aside=60.0), LIKE)
     with pytest.raises(GeometryError, match="at least 3"):
-        fdk(data[:2], scan[:2], LIKE)
+        plain_fdk(data[:2], scan[:2], LIKE)
     with pytest.raises(GeometryError):
-        fdk(data[:59], scan, LIKE)
+        plain_fdk(data[:59], scan, LIKE)
     with pytest.raises(UnknownNameError, match="hann"):
-        fdk(data, scan, LIKE, window="boxcar")
+        plain_fdk(data, scan, LIKE, window="boxcar")
 
 
 def test_angles_stand_for_what_lies_between_them():
@@ -585,7 +565,7 @@ def test_what_the_views_cover_decides_and_not_their_order(seed: int) -> None:
     def found(degrees: np.ndarray) -> np.ndarray:
         scan = circle(len(degrees), pixel=0.8, sod=300.0, sdd=600.0, angles=np.deg2rad(degrees))
         like = Grid((1, 61, 61), float(at[1] - at[0])).blank()
-        return np.asarray(fdk(ellipses(parts, scan, (4, 160)), scan, like).data[0])
+        return np.asarray(plain_fdk(ellipses(parts, scan, (4, 160)), scan, like).data[0])
 
     def deviation(volume: np.ndarray) -> float:
         return float(np.sqrt(((volume - truth)[inside] ** 2).mean())) / 0.02
@@ -606,7 +586,7 @@ def test_lines_that_no_view_sees_are_an_error(seed: int) -> None:
     angles = angles[((angles - first) % 180.0 > 30.0)]
     scan = circle(len(angles), angles=np.deg2rad(np.roll(angles, 77 * seed)))
     with pytest.raises(GeometryError, match="do not see every line"):
-        fdk(ball(scan, SHAPE), scan, LIKE)
+        plain_fdk(ball(scan, SHAPE), scan, LIKE)
 
 
 def _ray(scan: ConeVec, view: int, col: int, cols: int) -> np.ndarray:
@@ -677,7 +657,7 @@ def test_edges_are_as_sharp_from_tilted_panels(seed):
     tilt, yaw = rng.uniform(0.01, 0.3) * rng.choice([-1, 1]), rng.uniform(-0.3, 0.3)
     like = Grid((44, 44, 44), 0.34, CENTRE).blank()
     level, tilted = (
-        edge_width(fdk(ball(scan, SHAPE), scan, like))
+        edge_width(plain_fdk(ball(scan, SHAPE), scan, like))
         for scan in (circle(120), circle(120, tilt=tilt, yaw=yaw))
     )
     assert tilted < 1.01 * level
@@ -712,7 +692,7 @@ def test_a_tilted_rotation_axis_costs_nothing(tilt):
     poses = Poses([0, -600, 0], [0, 0, 0], [0, 459, 0], [0.6, 0, 0], [0, 0, -0.6], angle)
     scan = poses.cone_vec(Offsets.from_edge(tilt))
     assert is_upright(scan) is (not tilt)
-    volume = fdk(ball(scan, SHAPE), scan, LIKE)
+    volume = plain_fdk(ball(scan, SHAPE), scan, LIKE)
     found, centre = measure(volume)
     assert found == pytest.approx(1.0, abs=0.002)
     assert np.abs(centre).max() < 0.03
@@ -736,7 +716,8 @@ rng, scan = np.random.default_rng(3), circle(12)
 like = Volume(rng.random((8, 8, 8), dtype=np.float32), 1.0)
 images = forward(like, scan, (16, 16))
 np.savez(sys.argv[1], forward=images, back=back(images, scan, like).data,
-         fdk=fdk(images, scan, like).data, sirt=sirt(images, scan, like, iterations=3).data)
+         fdk=fdk(images, scan, like, errors=False).data,
+         sirt=sirt(images, scan, like, iterations=3).data)
 """
     lesser = {"usual": {}, "plain": {"NUMBA_CPU_NAME": "x86-64", "NUMBA_CPU_FEATURES": ""}}
     if binding.get_host_cpu_features().get("avx2", False):
@@ -777,12 +758,12 @@ def test_a_panel_that_goes_sideways_between_the_views_is_refused(seed: int) -> N
 
     steady = scan(rng.uniform(-2.0, 2.0, 181))
     like = Volume(np.zeros((3, 30, 30), np.float32), 1.0)
-    made = fdk(project_scene(cylinder, steady, shape), steady, like)
+    made = plain_fdk(project_scene(cylinder, steady, shape), steady, like)
     assert made.data[1, 10:20, 10:20].mean() == pytest.approx(0.02, rel=0.01)
     aside = float(rng.uniform(8.0, 40.0))
     tiled = ConeVec(np.concatenate([scan(np.full(90, k * aside)).rows for k in (-0.5, 0.5)]))
     with pytest.raises(GeometryError, match="columns sideways between the views"):
-        fdk(np.zeros((180, *shape), np.float32), tiled, like)
+        plain_fdk(np.zeros((180, *shape), np.float32), tiled, like)
 
 
 @pytest.mark.parametrize(
@@ -794,7 +775,7 @@ def test_pitch_may_change_from_view_to_view(pitch: np.ndarray) -> None:
     rows[:, 6:] *= pitch[:, None]
     scan = ConeVec(rows)
     data = ellipses([(3.0, -2.0, 10.0, 8.0, 0.4, 0.02)], scan, (4, 130))
-    found = fdk(data, scan, Grid((1, 9, 9), 1.0, (3.0, -2.0, 0.0)).blank())
+    found = plain_fdk(data, scan, Grid((1, 9, 9), 1.0, (3.0, -2.0, 0.0)).blank())
     assert found.data.mean() == pytest.approx(0.02, rel=0.002)
 
 
@@ -823,7 +804,7 @@ def test_less_than_a_turn_does_not_tell_what_lies_beyond_a_near_edge(
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         made = fdk((0.02 * chords).astype(np.float32), ConeVec(rows), Grid((1, 9, 9), 1.0, middle))
-    assert any("less than a turn" in str(one.message) for one in found) == told
+    assert bool(found) == told
     assert told or made.data.mean() == pytest.approx(0.02, rel=0.005)
 
 
@@ -849,7 +830,7 @@ def test_a_small_ball_beyond_a_near_edge_counts_where_it_was_seen(
         inside = radius**2 - (missed**2).sum(axis=-1) / (ray**2).sum(axis=-1)
         view[:] = 2.0 * np.sqrt(np.maximum(inside, 0.0))
     like = Grid((1, 7, 7), 0.35, middle)
-    with pytest.warns(UserWarning, match="beyond the near edge .* less than a turn"):
+    with pytest.warns(UserWarning, match="directions that no view saw"):
         made = fdk((0.03 * chords).astype(np.float32), ConeVec(rows), like)
     assert made.data.mean() == pytest.approx(0.03, rel=0.01)
 
@@ -863,5 +844,4 @@ def test_images_without_an_edge_have_no_outline_to_fit(value: float, noise: floa
     images += noise * value * np.random.default_rng(1).normal(size=images.shape)
     found = truncation_of(lambda i: images[i], scan, (16, 48))
     assert (found is None) == (value == 0.0)
-    if found is not None:
-        assert "images without an edge" in str(found.doubt)
+    assert found is None or not any(found.prisms)

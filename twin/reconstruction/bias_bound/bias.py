@@ -21,7 +21,8 @@ import numpy.typing as npt
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
-from flexdt.twin.projection import Volume
+from flexdt.twin.projection import Grid, Volume
+from flexdt.twin.projection.accuracy import Accuracy
 from flexdt.twin.reconstruction.bias_bound.coarse_scan import CoarseScan
 from flexdt.twin.reconstruction.noise import interpolated
 from flexdt.twin.reconstruction.truncation import Truncation
@@ -37,6 +38,8 @@ SMOOTH: Final = 1.5
 would show as flaws of their own."""
 STEEP: Final = 0.05
 """Change between nodes, over the largest value, at an edge, where blur hides what a flaw does."""
+OBJECT: Final = 0.1
+"""Attenuation over the largest from which on a node is of the object."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,11 +48,14 @@ class Bias:
 
     Attributes:
         found: attenuation, smooth [1/mm].
+        even: weights of its nodes, little where values change fast and where some views do not see
+            them, (nz, ny, nx).
         causes: angles, aside, cone, rows, beyond or drift -> what it changes at most [1/mm], (nz,
             ny, nx).
     """
 
     found: Volume
+    even: FloatArray
     causes: dict[str, FloatArray]
 
     @cached_property
@@ -62,6 +68,25 @@ class Bias:
         """Bound at each voxel of a grid, NaN where it has no value, (nz, ny, nx) [1/mm]."""
         out = interpolated(self.found.like(self.total), grid)
         return np.where(np.isnan(grid.data), np.float32(np.nan), out)
+
+    def accuracy(self, grid: Grid | Volume) -> Accuracy | None:
+        """Of the object's even places in a grid; None where there is no object."""
+        size = np.array(grid.shape[::-1]) * grid.voxel_mm + self.found.voxel_xyz
+        near = [
+            np.abs(places - middle) <= 0.5 * side
+            for places, middle, side in zip(self.found.centers(), grid.center_mm, size, strict=True)
+        ]
+        inside = near[2][:, None, None] & near[1][:, None] & near[0]
+        value = np.abs(self.found.data)
+        inside &= value > OBJECT * value.max()
+        if (inside & (self.even > 0.5)).any():
+            inside &= self.even > 0.5
+        if not inside.any():
+            return None
+        off = {cause: flaw[inside] / value[inside] for cause, flaw in self.causes.items()}
+        half, most = np.percentile(self.total[inside] / value[inside], [50.0, 90.0])
+        worst = max(off, key=lambda cause: float(np.percentile(off[cause], 90.0)))
+        return Accuracy(float(half), float(most), worst)
 
 
 def bias_of(
@@ -95,10 +120,12 @@ def _bias_of(scan: CoarseScan) -> Bias:
     from scipy.ndimage import gaussian_filter
 
     data = scan.fdk(scan.images, scan.cone_vec, scan.truncation)
+    unseen = np.isnan(data) | scan.rim
+    data = np.nan_to_num(data)
     sharp = np.where(scan.rim, np.float32(0.0), data)
     smooth = (min(SMOOTH, (len(data) - 1) / 4), SMOOTH, SMOOTH)
     found = gaussian_filter(sharp, smooth, mode="nearest")
-    even = np.where(scan.rim, 0.0, _evenness(found)) + 1e-3  # a mean needs some weight
+    even = np.where(unseen, 0.0, _evenness(found)) + 1e-3  # a mean needs some weight
     causes: dict[str, FloatArray] = {}
     if scan.uneven:
         # Streaks come from edges, and do not cancel about a node.
@@ -114,12 +141,13 @@ def _bias_of(scan: CoarseScan) -> Bias:
         before = after
     truncation = scan.truncation
     if truncation is not None and truncation.cut_off.any():
-        other = scan.fdk(scan.images, scan.cone_vec, truncation.otherwise)
+        other = np.nan_to_num(scan.fdk(scan.images, scan.cone_vec, truncation.otherwise))
         share = TRUSTED if truncation.explained else SAFETY
         causes["beyond"] = share * _about(other - data, even)
     else:
-        causes["drift"] = _about(scan.fdk(_drift(scan.images), scan.cone_vec), even)
-    return Bias(scan.grid.like(found), causes)
+        drift = np.nan_to_num(scan.fdk(_drift(scan.images), scan.cone_vec))
+        causes["drift"] = _about(drift, even)
+    return Bias(scan.grid.like(found), even, causes)
 
 
 def _drift(images: Float32Array) -> Float32Array:

@@ -86,8 +86,12 @@ class CoarseScan:
         for k, view in enumerate(chosen.tolist()):
             full = np.asarray(image(view), np.float32)
             images[k] = binned_mean(full.T if flip else full, (down, across))
+        if circle.rise:  # the outermost half rows count, too, in how steep a helix may be
+            images = np.pad(images, ((0, 0), (1, 1), (0, 0)), "edge")
         if truncation is not None:
-            truncation = replace(truncation, rows=(truncation.rows + 0.5) / down - 0.5)
+            first = 1.0 if circle.rise else 0.0
+            rows_of_bands = (truncation.rows + 0.5) / down - 0.5 + first
+            truncation = replace(truncation, rows=rows_of_bands)
         scan = ConeVec.from_vectors(part.source, part.detector, part.u * across, part.v * down)
         return cls(images, scan, circle, circle.angle[chosen], truncation)
 
@@ -143,7 +147,7 @@ class CoarseScan:
     def fdk(
         self, images: Float32Array, cone_vec: ConeVec, truncation: Truncation | None = None
     ) -> Float32Array:
-        """The grid's values from some images."""
+        """The grid's values from some images, NaN where no data cover it."""
         from flexdt.twin.reconstruction.fdk import OnProcessor, fdk_parts
 
         shape = (images.shape[1], images.shape[2])
@@ -151,7 +155,7 @@ class CoarseScan:
             lambda: [images.copy()], cone_vec, shape, self.grid, truncation=truncation,
             target=OnProcessor(self.grid), outside=True,
         )  # fmt: skip
-        return np.nan_to_num(volume.data)
+        return volume.data
 
     def seen(self, thing: Float32Array, rung: Rung) -> Float32Array:
         """Values on the grid, (nz, ny, nx), projected and reconstructed."""
@@ -164,7 +168,8 @@ class CoarseScan:
         truncation = self.truncation
         if truncation is not None:
             truncation = truncation.nothing if rung.flaw and truncation.beyond else None
-        return self.fdk(0.5 * (rays[:, :, ::2] + rays[:, :, 1::2]), views, truncation)
+        images = 0.5 * (rays[:, :, ::2] + rays[:, :, 1::2])
+        return np.nan_to_num(self.fdk(images, views, truncation))
 
     def parallel(self, flaw: str, ends: tuple[float, float], *, even: bool = False) -> Rung:
         """Parallel views of a panel that sees some distances from the axis on its two sides [mm].

@@ -1,0 +1,146 @@
+"""FDK with all that is said of its volume: what lies beyond the panel, noise, bias and warnings."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.projection import Grid, Volume
+from flexdt.twin.projection.operators import (
+    as_cone_vec,
+    check_projections,
+    require_finite,
+    require_line_integrals,
+)
+from flexdt.twin.reconstruction.bias_bound import Bias, bias_of
+from flexdt.twin.reconstruction.coverage import layer_warnings, lost_layers
+from flexdt.twin.reconstruction.fdk import CHUNK, PIXELS, Progress, fdk_parts
+from flexdt.twin.reconstruction.noise import with_errors
+from flexdt.twin.reconstruction.truncation import truncation_of
+from flexdt.twin.signatures import public
+
+
+@dataclass(frozen=True)
+class Images:
+    """Line integrals of a scan.
+
+    Attributes:
+        cone_vec: of all views.
+        shape: (rows, cols).
+        view: gives an image by its number, (rows, cols).
+        parts: see `fdk_parts`.
+    """
+
+    cone_vec: ConeVec
+    shape: tuple[int, int]
+    view: Callable[[int], npt.NDArray[np.generic]]
+    parts: Callable[[], Iterable[Float32Array]]
+
+
+@public
+def fdk(
+    projections: npt.ArrayLike,
+    cone_vec: ConeVec | npt.ArrayLike,
+    like: Volume | Grid,
+    *,
+    window: str = "ram-lak",
+    progress: Progress | None = None,
+    errors: bool = True,
+) -> Volume:
+    """Reconstruct attenuation from line integrals of a circular or helical scan.
+
+    Args:
+        projections: (n, rows, cols) line integrals.
+        cone_vec: ConeVec or (n, 12) [mm].
+        like: the grid, or a volume on it, whose values are not used.
+        window: of the ramp filter: ram-lak, shepp-logan, cosine, hamming, hann.
+        progress: called with the fraction done.
+        errors: find `sigma`, `bias_bound` and `accuracy` of the volume, and warn.
+
+    Returns:
+        Volume [1/mm]; its data is a (nz, ny, nx) view with z contiguous. Voxels that too few views
+        see, above or below the panel, are NaN.
+
+    Raises:
+        GeometryError: no circle and no helix, too short a scan, too steep a helix, or shapes that
+            do not fit.
+        UnknownNameError: no such window.
+
+    Warns:
+        UserWarning: even places may be off by more than some per cent, and why; layers of the grid
+            lie above or below what the panel sees.
+
+    Examples:
+        A cube of 0.02 / mm, projected and reconstructed:
+
+        >>> from flexdt.twin.projection import forward
+        >>> cube = np.zeros((16, 16, 16), np.float32)
+        >>> cube[4:12, 4:12, 4:12] = 0.02
+        >>> volume = Volume(cube, 0.5)
+        >>> turn = np.linspace(0, 2 * np.pi, 90, endpoint=False)
+        >>> c, s, o = np.cos(turn), np.sin(turn), np.zeros(90)
+        >>> source, detector = np.stack([s, -c, o], 1) * 600, np.stack([-s, c, o], 1) * 400
+        >>> scan = ConeVec.from_vectors(source, detector, np.stack([c, s, o], 1), (0, 0, -1))
+        >>> found = fdk(forward(volume, scan, (24, 24)), scan, like=volume)
+        >>> bool(abs(found.data[8, 8, 8] - 0.02) < 0.002)
+        True
+    """
+    geometry = as_cone_vec(cone_vec)
+    values = np.asarray(projections)
+    require_line_integrals(values)
+    if values.ndim != 3 or len(values) != len(geometry):
+        values = check_projections(values, len(geometry))
+    chunk = max(CHUNK, 4 * PIXELS // max(values[0].size, 1)) if len(values) else CHUNK
+
+    def parts() -> Iterable[Float32Array]:
+        for start in range(0, len(values), chunk):
+            part = np.asarray(values[start : start + chunk], dtype=np.float32)
+            require_finite(part)
+            yield part
+
+    shape = values.shape[1], values.shape[2]
+    views = Images(geometry, shape, lambda number: values[number], parts)
+    volume, doubts = checked_fdk(views, like, window, progress, errors=errors)
+    for doubt in doubts:
+        warnings.warn(doubt, stacklevel=3)
+    return volume
+
+
+def checked_fdk(
+    images: Images,
+    like: Volume | Grid,
+    window: str = "ram-lak",
+    progress: Progress | None = None,
+    *,
+    errors: bool = True,
+) -> tuple[Volume, list[str]]:
+    """A volume of FDK, and what a user has to be warned of.
+
+    Args and raises as `fdk`.
+    """
+    shape = images.shape
+    truncation = truncation_of(images.view, images.cone_vec, shape)
+    volume = fdk_parts(
+        images.parts, images.cone_vec, shape, like, window, progress, truncation, errors=errors
+    )
+    said = layer_warnings(lost_layers(volume.data), len(volume.data))
+    if not errors:
+        return volume, said
+    bias = bias_of(images.view, images.cone_vec, shape, truncation)
+    return with_errors(volume, bias=bias), [*bias_warnings(bias, volume), *said]
+
+
+def bias_warnings(bias: Bias | None, like: Volume | Grid) -> list[str]:
+    """What a user has to be warned of where even places of a grid may be off."""
+    if bias is None:
+        return [
+            "what values may be off by is not known: the helix is too steep for a coarse copy of it"
+        ]
+    accuracy = bias.accuracy(like)
+    return [] if accuracy is None else accuracy.warnings
