@@ -272,21 +272,24 @@ def scored(kind: str, seed: int, frames: int = 24) -> Scored:
     except TwinError as error:
         return Scored(kind, seed, False, False, 0.0, "", (f"refused: {error}",))
     said = tuple(f"{f.code}: {f.text}" for f in result.findings)
-    off = _errors(result, truth) if result.identifiable else {}
+    off = _errors(result, truth, lab) if result.identifiable else {}
     where = max(off, key=lambda n: off[n], default="")
     named = any(re.match(name, one) for one in said) if name else True
     return Scored(kind, seed, result.identifiable, named, off.get(where, 0.0), where, said, off)
 
 
-def _errors(result: Calibration, truth: Mapping[str, float]) -> dict[str, float]:
-    """Of every value that is offered [sigma]."""
+def _errors(result: Calibration, truth: Mapping[str, float], lab: Laboratory) -> dict[str, float]:
+    """Of every value that is offered [sigma].
+
+    Where beads see one tile alone, no border is found, and the axis's column is that of its tile.
+    """
     fit = result.fit
     assert fit is not None
-    true = {
-        **truth,
-        **own.axis_in_image(truth),
-        "magnification": magnification(truth),
-    }
+    image = own.axis_in_image(truth)
+    if lab.shift is not None and fit.panel is None:
+        middle = own.SHAPE[0] // 2, round(image["axis_column"])
+        image["axis_column"] += float(lab.shift[1][middle])
+    true = {**truth, **image, "magnification": magnification(truth)}
     found = {**fit.certificate.estimates, **image_quantities(fit)[0]}
     return {
         n: abs(e.value - true[n]) / e.sigma for n, e in found.items() if e.sigma > 0 and n in true
