@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Final
 
 WARNED: Final = 0.05
-"""Relative bound that a warning tells of where a tenth of the even places are beyond it: what
-is called right within some per cent then has no warning."""
+"""Relative bound from which on a warning tells of it, where a tenth of the even places have more:
+the bound is two to four times the error, and few ask for densities within 2 %."""
 CAUSES: Final = {
     "angles": "directions that no view saw",
     "aside": "the few columns of the panel that see beyond the axis",

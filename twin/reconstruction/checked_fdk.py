@@ -140,7 +140,8 @@ def bias_warnings(bias: Bias | None, like: Volume | Grid) -> list[str]:
     """What a user has to be warned of where even places of a grid may be off."""
     if bias is None:
         return [
-            "what values may be off by is not known: the helix is too steep for a coarse copy of it"
+            "what values may be off by is not known: a coarse copy of the scan, by which it is "
+            "found, cannot be reconstructed"
         ]
     accuracy = bias.accuracy(like)
     return [] if accuracy is None else accuracy.warnings

@@ -37,9 +37,8 @@ SMOOTH: Final = 1.5
 """Standard deviation of what the coarse volume is smoothed with [nodes]: steps between its voxels
 would show as flaws of their own."""
 STEEP: Final = 0.05
-"""Change between nodes, over the largest value, at an edge, where blur hides what a flaw does."""
-OBJECT: Final = 0.1
-"""Attenuation over the largest from which on a node is of the object."""
+"""Change between nodes, over the largest value, at an edge, where blur hides what a flaw does.
+Nodes that attenuate less are not of the object."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +77,7 @@ class Bias:
         ]
         inside = near[2][:, None, None] & near[1][:, None] & near[0]
         value = np.abs(self.found.data)
-        inside &= value > OBJECT * value.max()
+        inside &= value > STEEP * value.max()
         if (inside & (self.even > 0.5)).any():
             inside &= self.even > 0.5
         if not inside.any():

@@ -181,6 +181,10 @@ class CoarseScan:
         """
         turn = np.linspace(0.0, 2.0 * np.pi, VIEWS, endpoint=False) if even else self.angles
         side, _, tall = self.grid.voxel_xyz
+        ends = (
+            max(ends[0], side),
+            max(ends[1], side),
+        )  # the axis falls on these coarser columns, too
         away = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(len(turn))])
         u = np.column_stack([-away[:, 1], away[:, 0], np.zeros(len(turn))])
         centre = np.append(self.circle.centre, self.grid.center_mm[2])
