@@ -101,7 +101,7 @@ studies: $(TEST_STAMP)
 
 # The page in a browser, which draws on all cores: nothing else runs beside it.
 page: $(TEST_STAMP)
-	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m 'browser and not night' tests/viewer \
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'browser and not night' tests/viewer \
 	  --junitxml=build/durations/page.xml
 
 # Every seed and every case: hours in all. Nothing waits for it.

@@ -11,7 +11,7 @@ the bound is two to four times the error, and few ask for densities within 2 %."
 CAUSES: Final = {
     "angles": "directions that no view saw",
     "aside": "the few columns of the panel that see beyond the axis",
-    "cone": "the angle of the cone",
+    "cone": "the angle of the cone, more so with few views",
     "rows": "what lies above or below the panel's rows",
     "beyond": "what lies beyond the panel's sides",
     "drift": "images that are not empty beside the object",
