@@ -49,7 +49,8 @@ def errors(views: int, noise: float, count: int) -> list[float]:
     )  # fmt: skip
     data = project_scene(SCENE, scan, scan.shape[1:])
     data += noise * np.random.default_rng(0).normal(size=data.shape).astype(np.float32)
-    volumes = [fdk(data, scan, grid), sirt(data, scan, grid, iterations=60, nonnegative=True)]
+    volumes = [fdk(data, scan, grid, errors=False)]
+    volumes += [sirt(data, scan, grid, iterations=60, nonnegative=True)]
     volumes += [tv(data, scan, grid, weight=w, iterations=200) for w in WEIGHTS]
     return [float(np.sqrt(np.mean((v.data - wanted) ** 2))) for v in volumes]
 

@@ -144,8 +144,9 @@ def reconstruct(
         tube: of the scan, for the two corrections; default: what the data set says.
         parameters: correction; default: the one in force during the scan, if any.
         progress: called with the fraction done.
-        errors: of FDK, find what may be off, `volume.bias_bound`, and the noise, `volume.sigma` (of
-            a circle on the processor, of five rows or more).
+        errors: of FDK, find what may be off, `volume.bias_bound` and `volume.accuracy`, and warn
+            of it; and find the noise, `volume.sigma` (of a circle on the processor, of five rows or
+            more).
 
     Returns:
         Volume of attenuation [1/mm].

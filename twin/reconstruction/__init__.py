@@ -3,7 +3,12 @@
 from flexdt.twin.projection.accuracy import Accuracy
 from flexdt.twin.projection.volume import Grid
 from flexdt.twin.reconstruction.bias_bound import Bias, bias_of
-from flexdt.twin.reconstruction.checked_fdk import Images, bias_warnings, checked_fdk, fdk
+from flexdt.twin.reconstruction.bias_bound.checked_fdk import (
+    Images,
+    bias_warnings,
+    checked_fdk,
+    fdk,
+)
 from flexdt.twin.reconstruction.coverage import layer_warnings, lost_layers
 from flexdt.twin.reconstruction.fdk import fdk_parts
 from flexdt.twin.reconstruction.iterative import cgls, em, sart, sirt

@@ -528,6 +528,9 @@ def _fdk(
             normalise_coverage(
                 meter.data, meter.grid, circle, table, rays, last - first, own, cut_off=cut_off
             )
+    else:
+        z = like.centers()[2]
+        data[:, :, (z < sharing.whole[0]) | (z > sharing.whole[1])] = np.nan
     volume = replace(like, data=data.transpose(2, 0, 1))
     return volume if meter is None else with_errors(volume, meter.found())
 

@@ -34,12 +34,14 @@ class Sharing:
         rows: of the panel.
         scale: (n,) distance from source to panel in pitches of rows.
         depth: (n, 2) least and largest of the grid's voxels, along the panel's normal [mm].
+        whole: lowest and highest layer whose voxels are seen from every side [mm].
     """
 
     circle: Circle
     rows: int
     scale: FloatArray
     depth: FloatArray
+    whole: tuple[float, float]
 
     @classmethod
     def of(cls, circle: Circle, cone_vec: ConeVec, shape: tuple[int, int], like: Volume) -> Sharing:
@@ -66,7 +68,12 @@ class Sharing:
                 "as this; the iterative methods (sirt, sart, cgls, em) take any trajectory",
                 {"asked": circle.rise, "allowed": most},
             )
-        return cls(circle, rows, scale, axis[:, None] + wide * np.array([-1.0, 1.0]))
+        # Of a direction just missed at an end, the first view is a whole rise further on.
+        lack = circle.rise - 0.5 * most
+        panel = cone_vec.detector[:, 2] - cone_vec.source[:, 2]
+        middle = cone_vec.source[:, 2] + panel * axis / distance
+        whole = float(middle.min()) + lack, float(middle.max()) - lack
+        return cls(circle, rows, scale, axis[:, None] + wide * np.array([-1.0, 1.0]), whole)
 
     def columns(self) -> FloatArray:
         """What the kernel needs to look a depth up, (n, 2): the first, and how many a mm."""

@@ -11,13 +11,15 @@ step much wider than the usual one is a gap, which the opposite views make up fo
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 FLATNESS = 0.03
 """Largest deviation of the sources from a horizontal circle, relative to its radius."""
@@ -112,6 +114,28 @@ def circle_of(cone_vec: ConeVec) -> Circle:
             {"asked": worst, "allowed": FLATNESS * radius},
         )
     return helix or _turn(azimuth % TURN, centre, radius)
+
+
+def distinct_angles(circle: Circle) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """First views of different angles, in the order of these, and which of them each view repeats;
+    neither depends on the order in which views are listed but in which of equals is the first.
+    """
+    angle = circle.angle.round(9)
+    angle = angle if circle.rise else angle % round(TURN, 9)
+    _, first, same = np.unique(angle, return_index=True, return_inverse=True)
+    return first, same
+
+
+def mean_image(
+    image: Callable[[int], npt.NDArray[np.generic]], views: npt.NDArray[np.intp]
+) -> Float32Array:
+    """The mean of some views' images: of those that repeat an angle, none counts by its place in
+    the list.
+    """
+    total = np.asarray(image(int(views[0])), np.float32)
+    for view in views[1:].tolist():
+        total = total + np.asarray(image(view), np.float32)
+    return np.asarray(total / len(views), np.float32)
 
 
 def _turn(azimuth: FloatArray, centre: FloatArray, radius: float) -> Circle:

@@ -20,7 +20,14 @@ import numpy.typing as npt
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.reconstruction.rectify import is_upright, on_its_side, rectified, swapped, upright
-from flexdt.twin.reconstruction.trajectory import circle_of, columns_beyond, fan_angles, reach
+from flexdt.twin.reconstruction.trajectory import (
+    circle_of,
+    columns_beyond,
+    distinct_angles,
+    fan_angles,
+    mean_image,
+    reach,
+)
 
 SAMPLES = 48
 """Views, and bins of columns, that the prism is fitted to, at most: 2304 rays for six numbers, in a
@@ -183,12 +190,11 @@ def truncation_of(
         For `fdk_parts`; None where the panel saw the whole object.
     """
     circle = circle_of(cone_vec)  # of all: fewer may seem to close a turn that is open
-    _, places = np.unique(circle.angle.round(9), return_index=True)
-    views = len(places)  # at different angles
+    places, same = distinct_angles(circle)
+    views = len(places)
     chosen = np.unique(np.linspace(0, views - 1, min(views, SAMPLES)).round().astype(np.intp))
-    chosen = places[chosen]
-    images = [np.asarray(image(i), dtype=np.float32) for i in chosen.tolist()]
-    cone_vec = cone_vec[chosen]
+    images = [mean_image(image, np.flatnonzero(same == i)) for i in chosen]
+    cone_vec = cone_vec[places[chosen]]
     if on_its_side(cone_vec):
         images, shape = [image.T for image in images], (shape[1], shape[0])
         cone_vec = swapped(cone_vec)

@@ -37,8 +37,8 @@ SMOOTH: Final = 1.5
 """Standard deviation of what the coarse volume is smoothed with [nodes]: steps between its voxels
 would show as flaws of their own."""
 STEEP: Final = 0.05
-"""Change between nodes, over the largest value, at an edge, where blur hides what a flaw does.
-Nodes that attenuate less are not of the object."""
+"""Change between nodes, over the object's attenuation, at an edge, where blur hides what a flaw
+does."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +49,14 @@ class Bias:
         found: attenuation, smooth [1/mm].
         even: weights of its nodes, little where values change fast and where some views do not see
             them, (nz, ny, nx).
+        inside: nodes of the object, (nz, ny, nx).
         causes: angles, aside, cone, rows, beyond or drift -> what it changes at most [1/mm], (nz,
             ny, nx).
     """
 
     found: Volume
     even: FloatArray
+    inside: npt.NDArray[np.bool_]
     causes: dict[str, FloatArray]
 
     @cached_property
@@ -66,7 +68,9 @@ class Bias:
     def bound(self, grid: Volume) -> Float32Array:
         """Bound at each voxel of a grid, NaN where it has no value, (nz, ny, nx) [1/mm]."""
         out = interpolated(self.found.like(self.total), grid)
-        return np.where(np.isnan(grid.data), np.float32(np.nan), out)
+        for layer, values in zip(out, grid.data, strict=True):
+            layer[np.isnan(values)] = np.nan
+        return out
 
     def accuracy(self, grid: Grid | Volume) -> Accuracy | None:
         """Of the object's even places in a grid; None where there is no object."""
@@ -75,9 +79,8 @@ class Bias:
             np.abs(places - middle) <= 0.5 * side
             for places, middle, side in zip(self.found.centers(), grid.center_mm, size, strict=True)
         ]
-        inside = near[2][:, None, None] & near[1][:, None] & near[0]
+        inside = near[2][:, None, None] & near[1][:, None] & near[0] & self.inside
         value = np.abs(self.found.data)
-        inside &= value > STEEP * value.max()
         if (inside & (self.even > 0.5)).any():
             inside &= self.even > 0.5
         if not inside.any():
@@ -108,9 +111,8 @@ def bias_of(
     Raises:
         GeometryError: neither a circle nor a helix.
     """
-    scan = CoarseScan.of(image, cone_vec, shape, truncation)
     try:
-        return _bias_of(scan)
+        return _bias_of(CoarseScan.of(image, cone_vec, shape, truncation))
     except GeometryError:
         return None
 
@@ -124,12 +126,15 @@ def _bias_of(scan: CoarseScan) -> Bias:
     sharp = np.where(scan.rim, np.float32(0.0), data)
     smooth = (min(SMOOTH, (len(data) - 1) / 4), SMOOTH, SMOOTH)
     found = gaussian_filter(sharp, smooth, mode="nearest")
-    even = np.where(unseen, 0.0, _evenness(found)) + 1e-3  # a mean needs some weight
+    typical = _typical(sharp)
+    even = np.where(unseen, 0.0, _evenness(found, STEEP * typical)) + 1e-3  # a mean needs weight
+    # Half of what is about them, and a quarter of what is usual: more than streaks in the air.
+    inside = (sharp > 0.5 * np.maximum(found, 0.5 * typical)) & ~unseen
     causes: dict[str, FloatArray] = {}
-    if scan.uneven:
+    if scan.sparse:
         # Streaks come from edges, and do not cancel about a node.
         wide = (max(scan.ends),) * 2
-        best, ours = (scan.seen(sharp, scan.parallel("", wide, even=e)) for e in (True, False))
+        best, ours = (scan.seen(sharp, scan.parallel("", wide, t)) for t in (None, scan.angles))
         causes["angles"] = _about(np.abs(ours - best), even)
     before = None
     for rung in scan.ladder():
@@ -146,7 +151,7 @@ def _bias_of(scan: CoarseScan) -> Bias:
     else:
         drift = np.nan_to_num(scan.fdk(_drift(scan.images), scan.cone_vec))
         causes["drift"] = _about(drift, even)
-    return Bias(scan.grid.like(found), even, causes)
+    return Bias(scan.grid.like(found), even, inside, causes)
 
 
 def _drift(images: Float32Array) -> Float32Array:
@@ -156,13 +161,21 @@ def _drift(images: Float32Array) -> Float32Array:
     return np.ascontiguousarray(np.broadcast_to(beside[:, :, None], images.shape))
 
 
-def _evenness(values: Float32Array) -> FloatArray:
-    """Weights of nodes, little where values change fast."""
+def _typical(values: Float32Array) -> float:
+    """Attenuation below which half of all that attenuates lies: of a body, not of a pin in it."""
+    ordered = np.sort(values[values > 0.0], axis=None)
+    if not ordered.size:
+        return 0.0
+    below = np.cumsum(ordered, dtype=np.float64)
+    return float(ordered[np.searchsorted(below, 0.5 * below[-1])])
+
+
+def _evenness(values: Float32Array, most: float) -> FloatArray:
+    """Weights of nodes, little where values change by more than `most`."""
     from scipy.ndimage import gaussian_gradient_magnitude
 
     steep = gaussian_gradient_magnitude(values.astype(np.float64), 0.5, mode="nearest")
-    most = STEEP * max(float(np.abs(values).max()), float(np.finfo(np.float32).tiny))
-    return np.asarray(np.exp(-np.square(steep / most)))
+    return np.asarray(np.exp(-np.square(steep / max(most, float(np.finfo(np.float32).tiny)))))
 
 
 def _about(values: Float32Array, weights: FloatArray) -> FloatArray:

@@ -15,7 +15,14 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume, forward
 from flexdt.twin.reconstruction.rectify import field_of_view, on_its_side, swapped, upright, window
-from flexdt.twin.reconstruction.trajectory import Circle, circle_of, fan_angles, reach
+from flexdt.twin.reconstruction.trajectory import (
+    Circle,
+    circle_of,
+    distinct_angles,
+    fan_angles,
+    mean_image,
+    reach,
+)
 from flexdt.twin.reconstruction.truncation import ACCURACY, Truncation
 
 NODES: Final = 40
@@ -74,17 +81,17 @@ class CoarseScan:
         flip = on_its_side(cone_vec)
         if flip:
             cone_vec, shape = swapped(cone_vec), (shape[1], shape[0])
-        _, places = np.unique(circle.angle.round(9), return_index=True)
-        chosen = places[:: -(-len(places) // VIEWS)]
+        at, same = distinct_angles(circle)
+        chosen = np.arange(0, len(at), -(-len(at) // VIEWS))
         low, high = reach(fan_angles(circle, upright(cone_vec), shape[1]))
         overlap = min(low, high) / (low + high) * shape[1]
         across = min(-(-shape[1] // NODES), max(1, int(overlap / FEWEST)))
         down = max(min(-(-shape[1] // NODES), shape[0] // 2), -(-shape[0] // NODES), 1)
         rows, cols = shape[0] // down, shape[1] // across
-        part = window(cone_vec[chosen], shape, (0, rows * down), (0, cols * across))
+        part = window(cone_vec[at[chosen]], shape, (0, rows * down), (0, cols * across))
         images = np.empty((len(chosen), rows, cols), np.float32)
-        for k, view in enumerate(chosen.tolist()):
-            full = np.asarray(image(view), np.float32)
+        for k, place in enumerate(chosen.tolist()):
+            full = mean_image(image, np.flatnonzero(same == place))
             images[k] = binned_mean(full.T if flip else full, (down, across))
         if circle.rise:  # the outermost half rows count, too, in how steep a helix may be
             images = np.pad(images, ((0, 0), (1, 1), (0, 0)), "edge")
@@ -93,7 +100,7 @@ class CoarseScan:
             rows_of_bands = (truncation.rows + 0.5) / down - 0.5 + first
             truncation = replace(truncation, rows=rows_of_bands)
         scan = ConeVec.from_vectors(part.source, part.detector, part.u * across, part.v * down)
-        return cls(images, scan, circle, circle.angle[chosen], truncation)
+        return cls(images, scan, circle, circle.angle[at[chosen]], truncation)
 
     @cached_property
     def level(self) -> ConeVec:
@@ -110,15 +117,20 @@ class CoarseScan:
     @cached_property
     def grid(self) -> Volume:
         """The field of view, in layers as high as rows; without values."""
-        view = field_of_view(self.cone_vec, self.images.shape[1:])
+        x, y = self.circle.centre.tolist()
+        scan, away = self.cone_vec, np.array([x, y, 0.0])
+        scan = ConeVec.from_vectors(scan.source - away, scan.detector - away, scan.u, scan.v)
+        view = field_of_view(scan, self.images.shape[1:])
         pitches = np.linalg.norm([self.cone_vec.u[0], self.cone_vec.v[0]], axis=1)
         tall = view.voxel_mm * float(pitches[1] / pitches[0])
-        wide = view.shape[1] * view.voxel_mm
+        layers, height = self.images.shape[1], view.shape[0] * view.voxel_mm
+        if self.circle.rise:  # far more than a panel's height, in layers as few as its rows
+            layers = min(max(layers, round(height / tall)), NODES)
+            tall = height / layers
+        wide = 2.0 * max(self.ends)
         across = round(wide / max(view.voxel_mm, wide / NODES))
-        x, y, z = view.center_mm
-        blank = np.zeros((self.images.shape[1], across, across), np.float32)
-        middle = (x, y, z * tall / view.voxel_mm)
-        return Volume(blank, (wide / across, wide / across, tall), middle)
+        blank = np.zeros((layers, across, across), np.float32)
+        return Volume(blank, (wide / across, wide / across, tall), (x, y, view.center_mm[2]))
 
     @cached_property
     def rim(self) -> npt.NDArray[np.bool_]:
@@ -138,11 +150,12 @@ class CoarseScan:
         return int(min(np.ceil(count * max(self.ends) / nearest), count))
 
     @cached_property
-    def uneven(self) -> bool:
-        """Whether the views of a circle leave directions out."""
+    def sparse(self) -> bool:
+        """Whether the views of a circle leave directions out, or are too few for these columns."""
         step = self.circle.step
         apart = float(np.ptp(step)) > float(np.median(step))
-        return not self.circle.rise and (apart or not self.circle.full)
+        few = len(self.angles) < 0.5 * np.pi * self.images.shape[2]
+        return not self.circle.rise and (apart or few or not self.circle.full)
 
     def fdk(
         self, images: Float32Array, cone_vec: ConeVec, truncation: Truncation | None = None
@@ -171,15 +184,18 @@ class CoarseScan:
         images = 0.5 * (rays[:, :, ::2] + rays[:, :, 1::2])
         return np.nan_to_num(self.fdk(images, views, truncation))
 
-    def parallel(self, flaw: str, ends: tuple[float, float], *, even: bool = False) -> Rung:
+    def parallel(
+        self, flaw: str, ends: tuple[float, float], turn: FloatArray | None = None
+    ) -> Rung:
         """Parallel views of a panel that sees some distances from the axis on its two sides [mm].
 
         Args:
             flaw: of the rung.
             ends: these distances.
-            even: from everywhere, instead of from the scan's angles.
+            turn: (n,) angles; None for everywhere [rad].
         """
-        turn = np.linspace(0.0, 2.0 * np.pi, VIEWS, endpoint=False) if even else self.angles
+        if turn is None:
+            turn = np.linspace(0.0, 2.0 * np.pi, VIEWS, endpoint=False)
         side, _, tall = self.grid.voxel_xyz
         ends = (
             max(ends[0], side),
@@ -200,14 +216,15 @@ class CoarseScan:
         """
         rows, cols = self.images.shape[1:]
         low, high = self.ends
-        rungs = [self.parallel("", (max(low, high),) * 2, even=bool(self.circle.rise))]
+        turn = None if self.circle.rise else self.angles
+        rungs = [self.parallel("", (max(low, high),) * 2, turn)]
         # Rays that climb less than a row across the object are a fan, whose flaw are its angles.
         climb = 0.5 * self.grid.size_mm[2] / self.circle.radius * 2.0 * max(low, high)
-        fan = self.uneven and climb < self.grid.voxel_xyz[2]
+        fan = self.sparse and climb < self.grid.voxel_xyz[2]
         cone = "angles" if fan else "cone"
         if not self.circle.rise:
             if abs(high - low) > (low + high) / cols:
-                rungs.append(self.parallel("aside", self.ends))
+                rungs.append(self.parallel("aside", self.ends, turn))
             if self.more:
                 reached = (-self.more, rows + self.more)
                 taller = window(self.level, (rows, cols), reached, (0, cols))
