@@ -115,3 +115,65 @@ def test_images_on_their_side_have_the_same_bound() -> None:
     assert upright is not None
     assert turned is not None
     np.testing.assert_allclose(upright.total, turned.total, rtol=1e-4, atol=1e-8)
+
+
+@pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (70.0, -40.0)])
+def test_a_scan_about_another_axis_has_the_same_accuracy(x: float, y: float) -> None:
+    scan = scan_of(TURN)
+    images = images_of(scan, (14.0, 10.0, 5.0))
+    rows = scan.rows + np.array([x, y, 0.0] * 2 + [0.0] * 6)
+    grid = Grid((20, 30, 30), 1.0)
+    here = fdk(images, scan, grid).accuracy
+    there = fdk(images, rows, Grid(grid.shape, 1.0, (x, y, 0.0))).accuracy
+    assert here is not None
+    assert there is not None
+    assert there.most == pytest.approx(here.most, rel=1e-3)
+    assert here.most < 0.05
+
+
+def test_of_two_turns_none_counts_by_its_place_in_the_list() -> None:
+    """The second turn's flat drifted: the one that was listed first was believed."""
+    scan = scan_of(np.concatenate([TURN, TURN]))
+    images = images_of(scan, (14.0, 10.0, 5.0))
+    images[len(TURN) :] += 0.2
+    turned = np.roll(np.arange(len(images)), len(TURN))
+    told = []
+    for order in (np.arange(len(images)), turned):
+        with pytest.warns(UserWarning, match="values may be off"):
+            volume = fdk(images[order], scan[order], Grid((3, 30, 30), 1.0))
+        assert volume.accuracy is not None
+        told.append((volume.data, volume.accuracy.most))
+    np.testing.assert_allclose(told[0][0], told[1][0], atol=1e-5)
+    assert told[0][1] == pytest.approx(told[1][1], rel=1e-4)
+
+
+def test_air_above_and_below_an_object_is_not_of_it() -> None:
+    """Its smoothed tails, a twentieth of the object, had relative bounds of 100 %."""
+    scan = scan_of(TURN)
+    images = images_of(scan, (14.0, 12.0, 3.5))
+    accuracy = fdk(images, scan, Grid((24, 30, 30), 1.0)).accuracy
+    assert accuracy is not None
+    assert accuracy.most < 0.05
+
+
+def test_few_views_of_one_row_are_warned_of() -> None:
+    scan = ConeVec.circular(
+        sod=200.0, sdd=400.0, angles=np.arange(16) * 22.5, shape=(1, 48), pixel=2.0
+    )
+    box = bias_bound.Solid("box", np.zeros(3), np.array([14.0, 10.0, 90.0]), 0.3, 0.02)
+    images = bias_bound.Scan("", scan, (1, 48), [box], 0.0, 0.0, 0).images()
+    with pytest.warns(UserWarning, match="directions that no view saw"):
+        fdk(images, scan, Grid((1, 30, 30), 1.0))
+
+
+def test_a_light_body_with_dense_pins_is_what_is_judged() -> None:
+    """A pin of forty times its attenuation made all of the body air."""
+    scan = scan_of(np.arange(30) * 12.0)
+    body = bias_bound.Solid("cylinder", np.zeros(3), np.array([16.0, 16.0, 9.0]), 0.0, 0.005)
+    pins = [
+        bias_bound.Solid("cylinder", np.array([x, 5.0, 0.0]), np.array([1.2, 1.2, 9.0]), 0.0, 0.2)
+        for x in (-8.0, 8.0)
+    ]
+    images = bias_bound.Scan("", scan, SHAPE, [body, *pins], 0.0, 0.0, 0).images()
+    with pytest.warns(UserWarning, match="values may be off"):
+        fdk(images, scan, Grid((3, 40, 40), 1.0))

@@ -13,7 +13,7 @@ from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Grid, project_scene
 from flexdt.twin.projection.analytic_solids import Ellipsoid, Scene, Solid
-from flexdt.twin.reconstruction import fdk, fdk_parts
+from flexdt.twin.reconstruction import fdk, fdk_parts, field_of_view
 from flexdt.twin.reconstruction.helix import Sharing
 from flexdt.twin.reconstruction.trajectory import circle_of
 
@@ -174,6 +174,22 @@ def test_too_steep_a_helix_is_refused_with_what_is_allowed() -> None:
     half = helix(0.9, 160, 1.0)[:100]
     with pytest.raises(GeometryError, match="a turn or more"):
         fdk(images[:100], ConeVec(half.rows * np.tile([1, 1, 4], 4)), wide)
+
+
+@pytest.mark.parametrize("part", [0.3, 0.6, 0.95])
+def test_layers_that_some_sides_do_not_see_are_nan_and_the_others_right(part: float) -> None:
+    """Of the whole field of view: at its ends up to 86 % was missing without a word."""
+    scan = helix(part, 90, 2.5)
+    solid = Solid(Ellipsoid((2.0, -3.0, 0.0), (0.6 * FIELD, 0.5 * FIELD, 1e5)), "a", MU)
+    whole = field_of_view(scan, SHAPE)
+    with pytest.warns(UserWarning, match="layers of the grid lie outside"):
+        volume = fdk(project_scene(Scene((solid,)), scan, SHAPE), scan, whole)
+    x, y, _ = volume.centers()
+    inside = np.hypot((x - 2.0) / 0.6, (y[:, None] + 3.0) / 0.5) < 0.8 * FIELD
+    layers = volume.data[:, inside].mean(axis=1) / MU
+    seen = np.isfinite(layers)
+    assert 0.2 < seen.mean() < 1.0
+    np.testing.assert_allclose(layers[seen], 1.0, atol=0.01)
 
 
 def test_an_object_wider_than_the_panel_is_said() -> None:
