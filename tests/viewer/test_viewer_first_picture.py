@@ -138,7 +138,7 @@ def test_the_viewer_paints_the_scene_until_the_live_one_is_there(
 ) -> None:
     page = open_page("iso", (1366, 768), notes_stay=False)
     box = page.locator(".view[data-view=iso]")
-    page.wait_for_function("document.querySelector('#still').complete")
+    page.wait_for_function("document.querySelector('#still').naturalWidth > 0")
     url = page.evaluate("document.querySelector('#still').src")
     raw = page.request.get(url).body()
     assert len(raw) <= 60_000
