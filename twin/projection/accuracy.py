@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-WARNED: Final = 0.05
-"""Relative bound from which on a warning tells of it, where a tenth of the even places have more:
-the bound is two to four times the error, and few ask for densities within 2 %."""
+WARNED: Final = 0.03
+"""Relative bound from which on a warning tells of it, where a tenth of the even places have more.
+The bound is two to four times what is off: about 1 %."""
 CAUSES: Final = {
     "angles": "directions that no view saw",
     "aside": "the few columns of the panel that see beyond the axis",

@@ -80,15 +80,15 @@ def fdk(
         A cube of 0.02 / mm, projected and reconstructed:
 
         >>> from flexdt.twin.projection import forward
-        >>> cube = np.zeros((16, 16, 16), np.float32)
-        >>> cube[4:12, 4:12, 4:12] = 0.02
+        >>> cube = np.zeros((24, 24, 24), np.float32)
+        >>> cube[6:18, 6:18, 6:18] = 0.02
         >>> volume = Volume(cube, 0.5)
         >>> turn = np.linspace(0, 2 * np.pi, 90, endpoint=False)
         >>> c, s, o = np.cos(turn), np.sin(turn), np.zeros(90)
         >>> source, detector = np.stack([s, -c, o], 1) * 600, np.stack([-s, c, o], 1) * 400
         >>> scan = ConeVec.from_vectors(source, detector, np.stack([c, s, o], 1), (0, 0, -1))
-        >>> found = fdk(forward(volume, scan, (24, 24)), scan, like=volume)
-        >>> bool(abs(found.data[8, 8, 8] - 0.02) < 0.002)
+        >>> found = fdk(forward(volume, scan, (36, 36)), scan, like=volume)
+        >>> bool(abs(found.data[12, 12, 12] - 0.02) < 0.002)
         True
     """
     geometry = as_cone_vec(cone_vec)
