@@ -29,7 +29,6 @@ def example() -> ModuleType:
     return module
 
 
-@pytest.mark.filterwarnings("ignore:values may be off")  # of 40 views, in place of 360
 @pytest.mark.parametrize("page", ["astra", "gvxr", "tigre", "cil"])
 def test_our_side_of_a_page_runs(
     page: str, example: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -187,7 +187,6 @@ def test_a_panel_of_one_row_reconstructs() -> None:
     assert volume.data[0, 12:18, 12:18].mean() == pytest.approx(0.0229, rel=0.05)
 
 
-@pytest.mark.filterwarnings("ignore:values may be off")  # of twelve views
 def test_a_data_set_reconstructs_in_memory(data: fx.DataSet) -> None:
     volume = data.reconstruct("fdk", voxel=0.8, shape=(11, 22, 22))
     x, y, z = volume.centers()

@@ -561,7 +561,6 @@ def test_slurm_where_there_is_none_is_said(
     assert "no sbatch here" in capsys.readouterr().err
 
 
-@pytest.mark.filterwarnings("ignore:values may be off")  # some spheres leave it
 @pytest.mark.parametrize("name", ["spheres", "panel", "calibrations", "radiographs"])
 def test_the_examples_run(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     import zarr

@@ -160,7 +160,6 @@ def figures(capsys: pytest.CaptureFixture[str]) -> dict[str, bool]:
     return {f["what"]: f["agrees"] for case in document["cases"] for f in case["figures"]}
 
 
-@pytest.mark.filterwarnings("ignore:values may be off")  # a flat field
 def test_right_data_agree(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     needles(tmp_path, 340.0)
     helsinki(tmp_path)
@@ -174,7 +173,6 @@ def test_right_data_agree(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert all(found.values()), found
 
 
-@pytest.mark.filterwarnings("ignore:values may be off")  # a flat field
 @pytest.mark.parametrize(
     ("make", "missed"),
     [

@@ -64,7 +64,6 @@ def test_the_cause_that_contributes_most(
 
 
 @pytest.mark.parametrize("drift", [0.0, 0.1])
-@pytest.mark.filterwarnings("ignore:values may be off")
 @pytest.mark.daily(1)
 def test_a_flat_that_drifted_is_in_the_bound(drift: float) -> None:
     scan = scan_of(TURN)
