@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -168,6 +169,7 @@ class ScanFrames:
             chosen = self.indices[first : first + PART]
             yield np.stack([self.image(i) for i in chosen])
 
+    @cached_property
     def truncation(self) -> Truncation | None:
         """What of the object lies beyond the panel's edges, for FDK."""
         return truncation_of(self.view, self.cone_vec, self.shape)
@@ -282,7 +284,7 @@ def reconstruct_dataset(
             doubts = by_workers(views, grid, wanted, out, pool, tell)
     accuracy = None
     if wanted.algorithm == "fdk":
-        bias = bias_of(views.view, views.cone_vec, views.shape, views.truncation())
+        bias = bias_of(views.view, views.cone_vec, views.shape, views.truncation)
         accuracy = None if bias is None else bias.accuracy(grid)
         doubts = [*bias_warnings(bias, grid), *doubts]
     doubts = [*views.doubts, *doubts]
@@ -317,7 +319,7 @@ def _here(
         if request.algorithm != "fdk":
             write(_iterative(views, grid, request, tell).data)
             return []
-        slabs, truncation = grid.slabs(SLAB_BYTES), views.truncation()
+        slabs, truncation = grid.slabs(SLAB_BYTES), views.truncation
         lost = 0
         for k, (first, last) in enumerate(slabs):
 

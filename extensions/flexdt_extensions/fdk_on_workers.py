@@ -270,7 +270,7 @@ def fdk_on_workers(
     )  # fmt: skip
     # Workers compute for themselves what this process has computed of the data set.
     sent = replace(views, dataset=replace(data))
-    truncation = views.truncation()
+    truncation = views.truncation
     work = SlabWork(sent.parts, views.cone_vec, views.shape, grid, request.window, truncation)
     home, made_by = folder_of(out, identity)
     store = home / STORE

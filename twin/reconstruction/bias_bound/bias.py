@@ -129,7 +129,7 @@ def _bias_of(scan: CoarseScan) -> Bias:
     typical = _typical(sharp)
     even = np.where(unseen, 0.0, _evenness(found, STEEP * typical)) + 1e-3  # a mean needs weight
     # Half of what is about them, and a quarter of what is usual: more than streaks in the air.
-    inside = (sharp > 0.5 * np.maximum(found, 0.5 * typical)) & ~unseen
+    inside = (sharp > 0.5 * found) & (np.minimum(sharp, found) > 0.25 * typical) & ~unseen
     causes: dict[str, FloatArray] = {}
     if scan.sparse:
         # Streaks come from edges, and do not cancel about a node.
