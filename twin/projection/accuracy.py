@@ -16,6 +16,10 @@ CAUSES: Final = {
     "beyond": "what lies beyond the panel's sides",
     "drift": "images that are not empty beside the object",
 }
+UNSEEN: Final = (
+    "; this holds if the object goes on beyond the panel's sides as it is within them: a denser "
+    "shell out there makes every value too low, and no image shows it"
+)
 
 
 @dataclass(frozen=True)
@@ -26,18 +30,20 @@ class Accuracy:
         half: of the attenuation there, in half of them at most.
         most: in nine of ten at most.
         cause: what contributes most to the others: angles, aside, cone, rows, beyond or drift.
+        cut_off: the object goes on beyond the panel's sides, where its outline is a guess.
     """
 
     half: float
     most: float
     cause: str
+    cut_off: bool = False
 
     def __str__(self) -> str:
         half, most = (f"{min(100.0 * part, 99.0):.2g} %" for part in (self.half, self.most))
         return (
             f"half of the object's even places are right within {half} and nine of ten within "
             f"{most}, beside the noise; what contributes most: {CAUSES[self.cause]}"
-        )
+        ) + UNSEEN * self.cut_off
 
     @property
     def warnings(self) -> list[str]:

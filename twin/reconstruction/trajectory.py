@@ -140,7 +140,8 @@ def mean_image(
 
 def _turn(azimuth: FloatArray, centre: FloatArray, radius: float) -> Circle:
     """A circle with its sources at angles from 0 to 2 pi."""
-    at, same = np.unique(azimuth.round(9) % TURN, return_inverse=True)
+    # A little below zero is zero, as in `distinct_angles`, and not a whole turn.
+    at, same = np.unique(azimuth.round(9) % round(TURN, 9), return_inverse=True)
     # From each place to the next one; views at one place share what it stands for.
     ahead = np.diff(at, append=at[0] + TURN)
     # The widest may be the gap of a short scan, so that it does not say what is usual. A step of

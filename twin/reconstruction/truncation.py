@@ -127,8 +127,12 @@ class Truncation:
         if self.explained:
             return replace(self, prisms=(None,) * len(self.prisms))
         pairs = zip(self.prisms, self.others or self.prisms, strict=True)
-        prisms = tuple(prism or other for prism, other in pairs)
-        return replace(self, prisms=prisms, fade=2.0 * self.fade)
+        return replace(self.later, prisms=tuple(prism or other for prism, other in pairs))
+
+    @property
+    def later(self) -> Truncation:
+        """What no prism explains at the edges fades out later."""
+        return replace(self, fade=2.0 * self.fade)
 
     def columns(self, cone_vec: ConeVec, cols: int) -> tuple[int, int]:
         """Columns before the first and after the last into which the object's shadow reaches."""
@@ -287,18 +291,18 @@ def _noise(lines: npt.NDArray[np.floating]) -> float:
 def _cut_off(band: FloatArray, least: float, usual: float) -> npt.NDArray[np.bool_]:
     """Whether the object goes on beyond the edges (2,), in some neighbouring views or in all.
 
-    The middle one of five views counts, and the mean of all, in which less noise hides it. Noise is
-    that of every other bin near the edge: detectors blur it over some columns.
+    The middle one of three views counts, and the mean of all, in which less noise hides it. Noise
+    is that of every other bin near the edge: detectors blur it over some columns.
     """
     from scipy.ndimage import median_filter
 
     ends = band[:, [0, -1]]
     noise = SIGNIFICANT * np.array([_noise(band[:, :5:2]), _noise(band[:, :-6:-2])])
-    some = median_filter(ends, (min(5, len(band)), 1)) > np.maximum(least, noise)
+    some = median_filter(ends, (min(3, len(band)), 1)) > np.maximum(least, noise)
     # In the mean the flat's drift and noise show, too, and the logarithm of noise: what counts is
     # what would change densities by the accuracy. Two edges add a pi-th of their sum, at most.
     mean = band.mean(axis=0)
-    apart = np.std(np.diff(ends, axis=0), axis=0) / np.sqrt(2.0 * len(ends))
+    apart = np.array([_noise(end) for end in ends.T]) / np.sqrt(len(ends))
     apart = SIGNIFICANT * np.hypot(apart, _noise(mean))
     every = mean[[0, -1]] > np.maximum(0.5 * np.pi * ACCURACY * usual, apart)
     return np.asarray(some.any(axis=0) | every)

@@ -176,3 +176,34 @@ def test_a_light_body_with_dense_pins_is_what_is_judged() -> None:
     images = bias_bound.Scan("", scan, SHAPE, [body, *pins], 0.0, 0.0, 0).images()
     with pytest.warns(UserWarning, match="values may be off"):
         fdk(images, scan, Grid((3, 40, 40), 1.0))
+
+
+def turned(*solids: bias_bound.Solid) -> tuple[ConeVec, Float32Array]:
+    """A scan of 240 views, and its images."""
+    scan = scan_of(np.arange(240) * 1.5)
+    return scan, bias_bound.Scan("", scan, SHAPE, list(solids), 0.0, 0.0, 0).images()
+
+
+def upright(radius: float, mu: float, x: float = 0.0) -> bias_bound.Solid:
+    half = np.array([radius, radius, 90.0])
+    return bias_bound.Solid("cylinder", np.array([x, 0.0, 0.0]), half, 0.0, mu)
+
+
+def test_a_rod_that_shades_the_edges_in_few_views_is_cut_off() -> None:
+    """Of the 48 views that are looked at it shades two, far from each other."""
+    scan, images = turned(upright(17.0, 0.02), upright(4.0, 0.4, 60.0))
+    assert 0 < (images[::5, 12, 0] > 0.0).sum() <= 2
+    with pytest.warns(UserWarning, match="beyond the panel's sides"):
+        volume = fdk(images, scan, Grid((3, 30, 30), 1.0))
+    assert 0.03 < volume.data[1, 10:20, 10:20].mean() / 0.02 - 1.0 < 0.1  # 7.7 % if nothing is done
+
+
+def test_what_no_image_shows_is_said_with_the_figures() -> None:
+    """A shell beyond the panel looks much like a wider body, whose values are right."""
+    scan, images = turned(upright(32.0, 0.02))
+    accuracy = fdk(images, scan, Grid((3, 30, 30), 1.0)).accuracy
+    assert accuracy is not None
+    assert accuracy.most < 0.03
+    assert "denser shell out there makes every value too low" in str(accuracy)
+    scan, images = turned(upright(17.0, 0.02))
+    assert "shell" not in str(fdk(images, scan, Grid((3, 30, 30), 1.0)).accuracy)

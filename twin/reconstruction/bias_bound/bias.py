@@ -88,7 +88,7 @@ class Bias:
         off = {cause: flaw[inside] / value[inside] for cause, flaw in self.causes.items()}
         half, most = np.percentile(self.total[inside] / value[inside], [50.0, 90.0])
         worst = max(off, key=lambda cause: float(np.percentile(off[cause], 90.0)))
-        return Accuracy(float(half), float(most), worst)
+        return Accuracy(float(half), float(most), worst, "beyond" in off)
 
 
 def bias_of(
@@ -135,7 +135,7 @@ def _bias_of(scan: CoarseScan) -> Bias:
         # Streaks come from edges, and do not cancel about a node.
         wide = (max(scan.ends),) * 2
         best, ours = (scan.seen(sharp, scan.parallel("", wide, t)) for t in (None, scan.angles))
-        causes["angles"] = _about(np.abs(ours - best), even)
+        causes["angles"] = SAFETY * _about(np.abs(ours - best), even)
     before = None
     for rung in scan.ladder():
         after = scan.seen(found, rung)
@@ -145,9 +145,13 @@ def _bias_of(scan: CoarseScan) -> Bias:
         before = after
     truncation = scan.truncation
     if truncation is not None and truncation.cut_off.any():
-        other = np.nan_to_num(scan.fdk(scan.images, scan.cone_vec, truncation.otherwise))
-        share = TRUSTED if truncation.explained else SAFETY
-        causes["beyond"] = share * _about(other - data, even)
+        ways = [(truncation.otherwise, SAFETY)]
+        if truncation.explained:  # but what the prisms leave at the edges is as unknown as ever
+            ways = [(truncation.otherwise, TRUSTED), (truncation.later, SAFETY)]
+        causes["beyond"] = np.zeros(data.shape)
+        for way, share in ways:
+            other = np.nan_to_num(scan.fdk(scan.images, scan.cone_vec, way))
+            causes["beyond"] = causes["beyond"] + share * _about(other - data, even)
     else:
         drift = np.nan_to_num(scan.fdk(_drift(scan.images), scan.cone_vec))
         causes["drift"] = _about(drift, even)

@@ -197,10 +197,8 @@ class CoarseScan:
         if turn is None:
             turn = np.linspace(0.0, 2.0 * np.pi, VIEWS, endpoint=False)
         side, _, tall = self.grid.voxel_xyz
-        ends = (
-            max(ends[0], side),
-            max(ends[1], side),
-        )  # the axis falls on these coarser columns, too
+        # The axis falls on these coarser columns, too.
+        ends = max(ends[0], side), max(ends[1], side)
         away = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(len(turn))])
         u = np.column_stack([-away[:, 1], away[:, 0], np.zeros(len(turn))])
         centre = np.append(self.circle.centre, self.grid.center_mm[2])
