@@ -13,7 +13,6 @@ asked first.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from functools import partial
@@ -54,30 +53,30 @@ Document = dict[str, Any]
 
 def on_the_clock(work: Callable[[], object], rounds: int = ROUNDS) -> float:
     """Best of a few calls [ms], the device's work included; the first is not counted."""
-    from numba import cuda
-
-    best = math.inf
-    for i in range(rounds + 1):
-        start = time.perf_counter()
-        work()
-        cuda.synchronize()
-        best = min(best, (time.perf_counter() - start) * 1e3) if i else best
-    return best
+    return _best(work, rounds, lambda start, end: (end[0] - start[0]) * 1e3)
 
 
 def by_events(work: Callable[[], object]) -> float:
     """Best of a few launches [ms], by the device's events; the first is not counted."""
+    return _best(work, ROUNDS, lambda start, end: float(start[1].elapsed_time(end[1])))
+
+
+def _best(work: Callable[[], object], rounds: int, apart: Callable[[Any, Any], float]) -> float:
+    """Least of what lies between (clock, event) before and after each call but the first."""
     from numba import cuda
 
-    best = math.inf
-    for i in range(ROUNDS + 1):
-        start, end = cuda.event(), cuda.event()
-        start.record()
+    def now() -> tuple[float, Any]:
+        event = cuda.event()
+        event.record()
+        event.synchronize()
+        return time.perf_counter(), event
+
+    def once() -> float:
+        start = now()
         work()
-        end.record()
-        end.synchronize()
-        best = min(best, start.elapsed_time(end)) if i else best
-    return best
+        return apart(start, now())
+
+    return min([once() for _ in range(rounds + 1)][1:])
 
 
 def run_device_bench(tell: Callable[[str], None]) -> Document:

@@ -144,13 +144,8 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         self._sectors[round(self.lab.position("rot_obj") / 10.0) % SECTORS] = 1.0
         self._taken += 1
         self._over = done = self._taken >= self.frames
-        return (
-            self._observe(),
-            self._gain * worth - cost,
-            False,
-            done,
-            self._info(worth, taken.seconds),
-        )
+        info = self._info(worth, taken.seconds)
+        return self._observe(), self._gain * worth - cost, False, done, info
 
     def new_lab(self) -> Lab:
         """A scanner as it stands at the start of an episode."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -215,49 +214,13 @@ def exposures(
                 yield photons(np.float32(camera.counts) * image, rng)
 
 
-FEW = 100.0
-"""Expected photons below which a Gaussian is no longer a good Poisson."""
-
-
 def photons(expected: Float32Array, rng: np.random.Generator) -> npt.NDArray[np.uint16]:
-    """Poisson counts, (rows, cols); Gaussian where many photons are expected, which is faster."""
-    noise = rng.standard_normal(expected.shape, dtype=np.float32)
-    noise *= np.sqrt(expected)
-    noise += expected
-    few = np.flatnonzero(expected < FEW)
-    noise.reshape(-1)[few] = rng.poisson(expected.reshape(-1)[few])
-    return np.rint(np.clip(noise, 0.0, 65535.0)).astype(np.uint16)
+    """Poisson counts, (rows, cols)."""
+    return np.asarray(np.minimum(rng.poisson(expected), 65535), np.uint16)
 
 
-@dataclass(frozen=True, eq=False)
-class _Key:
-    """Arguments that follow from the others, so that a cache need not compare them."""
-
-    values: tuple[BeadModel, Scene, list[Poses], Offsets]
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Key)
-
-    def __hash__(self) -> int:
-        return 0
-
-
-@lru_cache(maxsize=1)
-def _rendered(
-    phantom: str,
-    placements: str | bool,
-    scenario: str,
-    frames: int,
-    camera: Rendering,
-    seed: int,
-    rest: _Key,
-) -> tuple[RenderedFrames, ...]:
-    """The radiographs of a task; tasks that differ in the solver alone share them."""
-    model, scene, everything, truth = rest.values
-    key = [seed, *phantom.encode(), *str(placements).encode(), *scenario.encode()]
-    return tuple(
-        render(scene, model, poses, truth, camera, [*key, g]) for g, poses in enumerate(everything)
-    )
+_made: dict[tuple[object, ...], tuple[RenderedFrames, ...]] = {}
+"""The radiographs of the last task; tasks that differ in the solver alone share them."""
 
 
 def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
@@ -269,8 +232,15 @@ def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
     camera = CLEAN if task.fidelity == "clean" else Rendering()
     most = max(task.counts)
     everything, truth = geometry_of(task, most)
-    made = _rendered(task.phantom, task.experiment == "detector" and task.setting, task.scenario,
-                     most, camera, task.seed, _Key((model, scene, everything, truth)))  # fmt: skip
+    placements = task.experiment == "detector" and task.setting
+    key = task.phantom, placements, task.scenario, task.variant, most, camera, task.seed
+    if key not in _made:
+        _made.clear()
+        seed = [task.seed, *f"{task.phantom}{placements}{task.scenario}".encode()]
+        _made[key] = tuple(
+            render(scene, model, poses, truth, camera, [*seed, g])
+            for g, poses in enumerate(everything)
+        )
     out = []
     for n in task.counts:
         if most % n:
@@ -278,7 +248,7 @@ def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
         chosen = list(range(0, most, most // n))
         scans = [
             Scan(frames.take(chosen), poses[np.array(chosen)], f"placement {g + 1}")
-            for g, (frames, poses) in enumerate(zip(made, everything, strict=True))
+            for g, (frames, poses) in enumerate(zip(_made[key], everything, strict=True))
         ]
         result = calibrate(
             scans, model, CalibrationRequest(free=task.free, priors=exact(task.free)), scene=scene

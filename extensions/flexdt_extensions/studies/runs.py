@@ -6,6 +6,7 @@ Errors are absolute throughout, because signed ones cancel in a mean.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -84,23 +85,14 @@ class Run:
 
     def to_dict(self) -> dict[str, object]:
         """JSON-able form; nan becomes null."""
-        return {k: _cleaned(v) for k, v in (asdict(self) | {"mae": self.mae}).items()}
+        text = json.dumps(asdict(self) | {"mae": self.mae})
+        whole: dict[str, object] = json.loads(text, parse_constant=lambda _: None)
+        return whole
 
 
 def clean(value: float) -> float | None:
     """A finite float, or None."""
     return float(value) if math.isfinite(value) else None
-
-
-def _cleaned(value: object) -> object:
-    match value:
-        case float():
-            return clean(value)
-        case dict():
-            return {k: _cleaned(v) for k, v in value.items()}
-        case tuple():
-            return list(value)
-    return value
 
 
 def point_runs(task: WorkUnit, model: BeadModel) -> list[Run]:

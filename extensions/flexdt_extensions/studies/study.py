@@ -63,12 +63,7 @@ class Cell:
     @property
     def name(self) -> str:
         """For tables."""
-        return cell_name(self.mm, self.deg)
-
-
-def cell_name(mm: float, deg: float) -> str:
-    """What a start error is called in tables."""
-    return f"{mm:g} mm, {deg:g} deg"
+        return f"{self.mm:g} mm, {self.deg:g} deg"
 
 
 def cells(seed: int = 1, noise_px: float = NOISE_PX) -> list[Cell]:
@@ -93,7 +88,8 @@ def basin_runs(cell: Cell, model: BeadModel) -> list[Run]:
         )  # fmt: skip
         for method in METHODS:
             found, iterations = _solve(method, _Draw(tracks, model, poses, start, rng))
-            errors = {} if found is None else _six(found, truth)
+            edge = {} if found is None else found.to_edge()
+            errors = errors_of({n: edge[n] for n in SIX if edge}, truth)
             out.append(
                 Run(
                     method, cell.name, FRAMES, found is not None, errors, {}, iterations, math.nan,
@@ -101,11 +97,6 @@ def basin_runs(cell: Cell, model: BeadModel) -> list[Run]:
                 )
             )  # fmt: skip
     return out
-
-
-def _six(found: Offsets, truth: Offsets) -> dict[str, float]:
-    edge = found.to_edge()
-    return errors_of({n: edge[n] for n in SIX}, truth)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +133,11 @@ def _ours(draw: _Draw) -> _Found:
 
 
 def _nameless(draw: _Draw) -> _Found:
-    found = identify(_shadows(draw.tracks, draw.rng), draw.model, draw.poses, start=draw.start)
+    # Points in random order, as if detected.
+    seen = [
+        Detections.of_points(draw.rng.permutation(f), NOISE_PX, 15.0, SHAPE) for f in draw.tracks
+    ]
+    found = identify(seen, draw.model, draw.poses, start=draw.start)
     if found.ambiguous:
         return None, 0
     return _ours(replace(draw, tracks=found.tracks, start=found.parameters))
@@ -162,23 +157,6 @@ def _solve(method: str, draw: _Draw) -> _Found:
         return _SOLVERS[method](draw)
     except TwinError:
         return None, 0
-
-
-def _shadows(tracks: FloatArray, rng: np.random.Generator) -> list[Detections]:
-    """Points in random order, as if detected."""
-    return [Detections.of_points(rng.permutation(f), NOISE_PX, 15.0, SHAPE) for f in tracks]
-
-
-def success_grid(runs: Sequence[Run], method: str) -> FloatArray:
-    """Share of successes, (mm, deg); nan where nothing was run."""
-    out = np.full((len(START_MM), len(START_DEG)), np.nan)
-    for i, mm in enumerate(START_MM):
-        for j, deg in enumerate(START_DEG):
-            name = cell_name(mm, deg)
-            some = [r.success for r in runs if r.setting == method and r.scenario == name]
-            if some:
-                out[i, j] = float(np.mean(some))
-    return out
 
 
 KILOVOLTS = 90.0
@@ -310,7 +288,10 @@ def _basin(spread: Map, say: Tell, fidelity: str, seed: int) -> tuple[list[Run],
     """Success against the start's error, for Algorithm 2, our fit, and unknown identities."""
     work = cells(seed=seed, noise_px=0.0 if fidelity == "points" else NOISE_PX)
     runs = _collected(spread(basin_task, work), [cell.name for cell in work], say)
-    shares = {method: success_grid(runs, method).tolist() for method in METHODS}
+    shares = {}
+    for method in METHODS:
+        good = [run.success for run in runs if run.setting == method]  # by cells, then draws
+        shares[method] = np.reshape(good, (len(START_MM), len(START_DEG), -1)).mean(axis=2).tolist()
     return runs, {
         "start_mm": list(START_MM), "start_deg": list(START_DEG), "success_share": shares
     }  # fmt: skip

@@ -1,10 +1,8 @@
-"""Files of a study: summary.json, a table in CSV, heat maps in SVG, and one HTML page with all."""
+"""Files of a study: summary.json, heat maps in SVG, and one HTML page with all."""
 
 from __future__ import annotations
 
-import csv
 import html
-import io
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -18,15 +16,7 @@ from flexdt.clients.figures import Series, axes_of, blank, cell_text, page, plot
 from flexdt.extending import write_whole
 from flexdt.twin.geometry.offsets import UNITS
 from flexdt_extensions.studies.experiment_4 import ENOUGH
-from flexdt_extensions.studies.experiments import thesis
 from flexdt_extensions.studies.runs import Run, grid
-
-SIGNED = {
-    "beads": "table_A_1_signed_means",
-    "phantoms": "table_A_2_signed_means",
-    "damping": "table_A_3_signed_means",
-}
-"""The thesis's per-parameter means; they are signed, so that errors cancel in them."""
 
 
 def write_study(out: Path, document: Mapping[str, Any], runs: Sequence[Run]) -> None:
@@ -39,7 +29,6 @@ def write_study(out: Path, document: Mapping[str, Any], runs: Sequence[Run]) -> 
     """
     out.mkdir(parents=True, exist_ok=True)
     write_whole(out / "summary.json", json.dumps(document, indent=1) + "\n")
-    write_whole(out / "rows.csv", rows_csv(document["rows"]))
     if "success_share" in document:
         parts = _basin_charts(document)
     elif "curves" in document:
@@ -164,21 +153,6 @@ def _mean(values: Sequence[float]) -> float:
     return float(np.mean(values)) if values else float("nan")
 
 
-def rows_csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The rows as CSV."""
-    keys = ["setting", "runs", "success", "unidentifiable", "mae", "mae_max", "iterations",
-            "cost_reduction_pct", "thesis_mae", "thesis_cost_reduction_pct",
-            "thesis_iterations"]  # fmt: skip
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*keys, "method", "other_method", "other_mae", "other_iterations"])
-    for row in rows:
-        beside = row["beside"]
-        others = [row["method"], *(beside.get(k) for k in ("method", "mae", "iterations"))]
-        writer.writerow([*(row.get(k) for k in keys), *others])
-    return text.getvalue()
-
-
 def report(document: Mapping[str, Any], *charts: str) -> str:
     """One HTML page."""
     rows = [
@@ -206,24 +180,10 @@ def report(document: Mapping[str, Any], *charts: str) -> str:
         table(head, rows),
         *(f"<figure>{chart}</figure>" for chart in charts),
     ]
-    signed = thesis().get(SIGNED.get(str(document["experiment"]), ""), None)
-    if signed is not None:
-        names = list(next(iter(signed.values())))
-        ours = {r["setting"]: r["mean_absolute"] for r in document["rows"]}
-        rows = [
-            [s, *(f"{_text(ours.get(s, {}).get(n))} ({values[n]:g})" for n in names)]
-            for s, values in signed.items()
-        ]
-        body.append("<h2>By parameter: our mean absolute error (thesis: signed mean)</h2>")
-        body.append(table(["setting", *names], rows))
     body.append(f"<p>{document['thesis_source']}.</p>")
     assumed = [f"{k}: {v}" for k, v in document["assumed"].items() if v is not None]
     body.append(f"<p>Assumed: {html.escape('; '.join(assumed))}.</p>")
     return page(f"flexdt study {document['experiment']}", body)
-
-
-def _text(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2g}"
 
 
 def heat_map(
