@@ -221,6 +221,9 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always")
         volume = reconstruct_volume(data, held.request, progress=_share(held, "done"), errors=True)
+    said, accuracy = [str(doubt.message) for doubt in doubts], volume.accuracy
+    if accuracy is not None and not accuracy.warnings:  # which say it, too
+        said.append(str(accuracy))
     held.hold(volume.data, volume)
     held.keep(
         done=1.0,
@@ -228,7 +231,7 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
         of=len(data),
         binning=held.request.binning,
         geometry=_named(data.correction),
-        doubts=[str(doubt.message) for doubt in doubts],
+        doubts=said,
         uncovered=float(1.0 - np.isfinite(volume.data).mean()),
         **_facts(data),
     )
