@@ -286,7 +286,7 @@ def reconstruct_dataset(
     if wanted.algorithm == "fdk":
         bias = bias_of(views.view, views.cone_vec, views.shape, views.truncation)
         accuracy = None if bias is None else bias.accuracy(grid)
-        doubts = [*bias_warnings(bias, grid), *doubts]
+        doubts = [*bias_warnings(bias, accuracy), *doubts]
     doubts = [*views.doubts, *doubts]
     slices = write_slices(out, read_volume(out).data) if wanted.png else []
     in_force = dataset.correction

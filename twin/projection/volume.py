@@ -334,7 +334,7 @@ class Volume:
         Example:
             >>> volume = fx.reconstruct("my-scans/lego")  # doctest: +SKIP
             >>> volume.accuracy  # doctest: +SKIP
-            Accuracy(half=0.006, most=0.021, cause='cone')
+            Accuracy(half=0.006, most=0.021, cause='cone', cut_off=False)
         """
         bias: Any = getattr(self, "_bias", None)  # of `noise.with_errors`
         found: Accuracy | None = None if bias is None else bias.accuracy(self)

@@ -120,10 +120,14 @@ def distinct_angles(circle: Circle) -> tuple[npt.NDArray[np.intp], npt.NDArray[n
     """First views of different angles, in the order of these, and which of them each view repeats;
     neither depends on the order in which views are listed but in which of equals is the first.
     """
-    angle = circle.angle.round(9)
-    angle = angle if circle.rise else angle % round(TURN, 9)
+    angle = circle.angle.round(9) if circle.rise else _on_circle(circle.angle)
     _, first, same = np.unique(angle, return_index=True, return_inverse=True)
     return first, same
+
+
+def _on_circle(angle: FloatArray) -> FloatArray:
+    """Angles so rounded that those of one place are equal: a little below zero is zero."""
+    return np.asarray(angle.round(9) % round(TURN, 9))
 
 
 def mean_image(
@@ -140,8 +144,7 @@ def mean_image(
 
 def _turn(azimuth: FloatArray, centre: FloatArray, radius: float) -> Circle:
     """A circle with its sources at angles from 0 to 2 pi."""
-    # A little below zero is zero, as in `distinct_angles`, and not a whole turn.
-    at, same = np.unique(azimuth.round(9) % round(TURN, 9), return_inverse=True)
+    at, same = np.unique(_on_circle(azimuth), return_inverse=True)
     # From each place to the next one; views at one place share what it stands for.
     ahead = np.diff(at, append=at[0] + TURN)
     # The widest may be the gap of a short scan, so that it does not say what is usual. A step of

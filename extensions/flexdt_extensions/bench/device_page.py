@@ -68,7 +68,7 @@ def _best(work: Callable[[], object], rounds: int, apart: Callable[[Any, Any], f
     def now() -> tuple[float, Any]:
         event = cuda.event()
         event.record()
-        event.synchronize()
+        cuda.synchronize()
         return time.perf_counter(), event
 
     def once() -> float:

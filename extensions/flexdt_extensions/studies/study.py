@@ -88,8 +88,8 @@ def basin_runs(cell: Cell, model: BeadModel) -> list[Run]:
         )  # fmt: skip
         for method in METHODS:
             found, iterations = _solve(method, _Draw(tracks, model, poses, start, rng))
-            edge = {} if found is None else found.to_edge()
-            errors = errors_of({n: edge[n] for n in SIX if edge}, truth)
+            values = {} if found is None else found.to_edge()
+            errors = errors_of({n: v for n, v in values.items() if n in SIX}, truth)
             out.append(
                 Run(
                     method, cell.name, FRAMES, found is not None, errors, {}, iterations, math.nan,

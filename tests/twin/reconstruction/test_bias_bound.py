@@ -199,7 +199,13 @@ def test_a_rod_that_shades_the_edges_in_few_views_is_cut_off() -> None:
 
 
 def test_what_no_image_shows_is_said_with_the_figures() -> None:
-    """A shell beyond the panel looks much like a wider body, whose values are right."""
+    """A shell beyond the panel looks much like a wider body, whose values are right: a thick one of
+    three times the attenuation makes all values a quarter too low."""
+    shell = [upright(31.0, 0.06), upright(25.0, -0.04)]
+    scan, images = turned(*shell)
+    with pytest.warns(UserWarning, match="denser shell out there makes every value too low"):
+        volume = fdk(images, scan, Grid((3, 30, 30), 1.0))
+    assert volume.data[1, 10:20, 10:20].mean() / 0.02 == pytest.approx(0.73, abs=0.02)
     scan, images = turned(upright(32.0, 0.02))
     accuracy = fdk(images, scan, Grid((3, 30, 30), 1.0)).accuracy
     assert accuracy is not None

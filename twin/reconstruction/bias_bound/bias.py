@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -131,30 +132,28 @@ def _bias_of(scan: CoarseScan) -> Bias:
     # Half of what is about them, and a quarter of what is usual: more than streaks in the air.
     inside = (sharp > 0.5 * found) & (np.minimum(sharp, found) > 0.25 * typical) & ~unseen
     causes: dict[str, FloatArray] = {}
+
+    def add(cause: str, share: float, change: Float32Array) -> None:
+        causes[cause] = causes.get(cause, 0.0) + share * _about(change, even)
+
     if scan.sparse:
         # Streaks come from edges, and do not cancel about a node.
         wide = (max(scan.ends),) * 2
         best, ours = (scan.seen(sharp, scan.parallel("", wide, t)) for t in (None, scan.angles))
-        causes["angles"] = SAFETY * _about(np.abs(ours - best), even)
-    before = None
-    for rung in scan.ladder():
-        after = scan.seen(found, rung)
-        if before is not None:
-            more = SAFETY * _about(after - before, even)
-            causes[rung.flaw] = causes.get(rung.flaw, 0.0) + more
-        before = after
+        add("angles", SAFETY, np.abs(ours - best))
+    rungs = [(rung.flaw, scan.seen(found, rung)) for rung in scan.ladder()]
+    for (_, before), (flaw, after) in pairwise(rungs):
+        add(flaw, SAFETY, after - before)
     truncation = scan.truncation
     if truncation is not None and truncation.cut_off.any():
         ways = [(truncation.otherwise, SAFETY)]
         if truncation.explained:  # but what the prisms leave at the edges is as unknown as ever
             ways = [(truncation.otherwise, TRUSTED), (truncation.later, SAFETY)]
-        causes["beyond"] = np.zeros(data.shape)
         for way, share in ways:
             other = np.nan_to_num(scan.fdk(scan.images, scan.cone_vec, way))
-            causes["beyond"] = causes["beyond"] + share * _about(other - data, even)
+            add("beyond", share, other - data)
     else:
-        drift = np.nan_to_num(scan.fdk(_drift(scan.images), scan.cone_vec))
-        causes["drift"] = _about(drift, even)
+        add("drift", 1.0, np.nan_to_num(scan.fdk(_drift(scan.images), scan.cone_vec)))
     return Bias(scan.grid.like(found), even, inside, causes)
 
 

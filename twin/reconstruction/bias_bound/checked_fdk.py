@@ -12,6 +12,7 @@ import numpy.typing as npt
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import Grid, Volume
+from flexdt.twin.projection.accuracy import Accuracy
 from flexdt.twin.projection.operators import (
     as_cone_vec,
     check_projections,
@@ -133,15 +134,20 @@ def checked_fdk(
     if not errors:
         return volume, said
     bias = bias_of(images.view, images.cone_vec, shape, truncation)
-    return with_errors(volume, bias=bias), [*bias_warnings(bias, volume), *said]
+    volume = with_errors(volume, bias=bias)
+    return volume, [*bias_warnings(bias, volume.accuracy), *said]
 
 
-def bias_warnings(bias: Bias | None, like: Volume | Grid) -> list[str]:
-    """What a user has to be warned of where even places of a grid may be off."""
+def bias_warnings(bias: Bias | None, accuracy: Accuracy | None) -> list[str]:
+    """What a user has to be warned of: even places that may be off, or that nobody knows.
+
+    Args:
+        bias: of the scan.
+        accuracy: of it in the volume's grid.
+    """
     if bias is None:
         return [
             "what values may be off by is not known: a coarse copy of the scan, by which it is "
             "found, cannot be reconstructed"
         ]
-    accuracy = bias.accuracy(like)
     return [] if accuracy is None else accuracy.warnings
