@@ -279,6 +279,7 @@ def test_links_for_type_checkers_follow_new_and_removed_modules(tmp_path: Path) 
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_a_users_type_checker_sees_the_types(tmp_path: Path) -> None:
     """What `make install` does for type checkers, in an environment of its own."""
     python = environment_with(tmp_path / "venv")

@@ -160,6 +160,7 @@ def aligned(k: int, photons: float, column: float, roll: float) -> tuple[object,
 
 @pytest.mark.daily(1)
 @pytest.mark.parametrize("k", range(3))
+@pytest.mark.campaign
 def test_column_and_roll_are_where_they_are(k: int) -> None:
     found, scanner = aligned(k, 1e4, 0.04, 0.06)
     assert np.abs(pulls(found, scanner)).max() < 4
@@ -257,6 +258,7 @@ def test_shifts_of_single_frames_are_found_with_their_sigmas(size: float, photon
 @pytest.mark.daily(1)
 @pytest.mark.parametrize("k", range(2))
 @pytest.mark.parametrize("spoilt", ["ramp", "missing frames", "missed step"])
+@pytest.mark.campaign(2)
 def test_a_ramp_of_the_flat_field_and_missing_frames_do_not_mislead(spoilt: str, k: int) -> None:
     scanner, lines = scan(k)
     frames = {
@@ -381,6 +383,7 @@ def test_two_gaps_are_refused_by_their_columns() -> None:
 
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.slow
+@pytest.mark.campaign(1)
 def test_a_gap_between_tiles_is_closed_whether_it_is_found_or_given(seed: int) -> None:
     scanner, lines = scan(seed)
     data = data_set(apart(np.array(lines), 75, 2), DEGREES, 1e4, np.random.default_rng(1))

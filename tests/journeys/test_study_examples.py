@@ -40,6 +40,7 @@ def run(name: str, *words: object) -> dict[str, Any]:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_drawn_scans_are_right_or_said() -> None:
     study = EXAMPLES.parent / "tests" / "studies" / "silent_errors.py"
     done = subprocess.run(

@@ -54,6 +54,7 @@ def test_new_clients_are_answered_beside_a_flood_of_connections() -> None:
     run("floods.py", "--connections", "40")  # it fails without an answer, or with a long log
 
 
+@pytest.mark.campaign
 def test_many_clients_keep_their_order() -> None:
     out = run("load.py", "--clients", "30", "--seconds", "2")
     assert out.count("0 out of order, 0 cut off") == 2
@@ -65,5 +66,6 @@ def test_an_estop_is_answered_beside_every_load() -> None:
     assert "0 beyond their limits; 0 unhandled exceptions" in out
 
 
+@pytest.mark.campaign
 def test_a_few_simulated_hours() -> None:
     assert "0 unhandled exceptions" in run("soak.py", "--hours", "1", "--uses", "9")

@@ -8,10 +8,10 @@ Strings that stand alone as a statement count as documentation.
 
 from __future__ import annotations
 
+import argparse
 import ast
 import io
 import re
-import sys
 import tokenize
 from collections import Counter
 from collections.abc import Sequence
@@ -69,7 +69,12 @@ def by_folder(root: Path, folders: Sequence[str] = FOLDERS) -> dict[str, tuple[i
 
 
 def main() -> None:
-    root = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).resolve().parents[2]
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    here = Path(__file__).resolve().parents[2]
+    parser.add_argument("root", nargs="?", type=Path, default=here, help="another clone")
+    root = parser.parse_args().root
     for what, folders in (("core", FOLDERS), ("extensions", EXTENSIONS)):
         table = by_folder(root, folders)
         for name, (modules, lines) in table.items():

@@ -155,6 +155,7 @@ def test_what_once_had_another_name_beside_or_instead(kind: str, seed: int) -> N
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_a_large_motion_that_may_be_followed_is() -> None:
     """A screw of 1.3 mm was called a drift and refused although it was to be followed."""
     scan = drawn("screw", 303)

@@ -110,6 +110,7 @@ def test_a_parameter_that_is_not_asked_for_is_not_taken_to_be_exact(
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_a_cause_that_looks_like_another_is_named_beside_it() -> None:
     """A panel aside looks as one turned about the vertical: the one whose prior is narrower was
     believed, and dO_x was 46 of its sigmas off."""

@@ -40,6 +40,7 @@ def test_a_drift_that_breaks_off_is_no_turn_of_the_table() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_a_runout_is_found_in_radiographs() -> None:
     found = study.one(3, "runout", images=True)
     assert found["before_px"] > 0.05

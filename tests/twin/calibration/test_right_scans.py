@@ -100,7 +100,7 @@ def test_faults_of_beam_and_detector_mislead_nobody(capsys: pytest.CaptureFixtur
         ("spectrum_aluminium", 7001),
     ],
 )
-@pytest.mark.campaign(2)
+@pytest.mark.campaign(1)
 def test_beads_that_fade_behind_a_body_mislead_nobody(kind: str, seed: int) -> None:
     """Their centroids were off towards where the body is thinner."""
     found = beam_faults.scored(kind, seed)
@@ -134,6 +134,7 @@ def test_lag_is_taken_out_and_said(kind: str, seed: int) -> None:
 
 @pytest.mark.parametrize("kind", ["spectrum", "spectrum_aluminium"])
 @pytest.mark.slow
+@pytest.mark.campaign(1)
 def test_a_camera_without_lag_is_not_said_to_have_it(kind: str) -> None:
     found = beam_faults.scored(kind, 1)
     assert found.offered

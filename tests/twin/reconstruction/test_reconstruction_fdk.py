@@ -703,6 +703,7 @@ def test_a_tilted_rotation_axis_costs_nothing(tilt):
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_lesser_processors_give_the_same_numbers(tmp_path):
     """AVX2 alone, and none of it: projection, adjoint, FDK and SIRT. A kernel's branch that is
     never taken is compiled all the same, and ended the process."""

@@ -67,6 +67,7 @@ def test_cgls_solves_least_squares():
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_weights_solve_weighted_least_squares():
     """Beside the explicit matrix, with and without ordered subsets."""
     rng = np.random.default_rng(4)

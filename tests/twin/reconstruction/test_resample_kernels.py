@@ -99,6 +99,7 @@ def ways() -> list[int]:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_every_way_is_numpys_and_the_others(ways: list[int], tmp_path: Path) -> None:
     given = draw(3)
     wanted = given["acc"].astype(np.float64)
