@@ -25,7 +25,7 @@ if _typing.TYPE_CHECKING:
     from flexdt.clients.datasets.dataset import load_dataset
     from flexdt.clients.datasets.dataset import read_tiffs as read_tiffs
     from flexdt.clients.expose import expose as expose
-    from flexdt.clients.launch.local_twin import LocalTwin as LocalTwin
+    from flexdt.clients.launch.processes import LocalTwin as LocalTwin
     from flexdt.clients.simulate import simulate as simulate
     from flexdt.projecting import project as project
     from flexdt.scripts import plan as plan
@@ -64,7 +64,7 @@ _HOMES: _typing.Final = {
     "DataSet": "flexdt.clients.datasets.data_set",
     "Detector": "flexdt.twin.physics.detector",
     "Grid": "flexdt.twin.projection.volume",
-    "LocalTwin": "flexdt.clients.launch.local_twin",
+    "LocalTwin": "flexdt.clients.launch.processes",
     "NotBuiltError": "flexdt.twin.errors",
     "Operator": "flexdt.twin.projection.linear_operator",
     "Rigid": "flexdt.twin.geometry.rigid",

@@ -7,14 +7,22 @@ With a folder of frames, the last real one is written beside the twin's radiogra
 machine: its positions and camera when the frame appeared, the profile's offsets and the phantom on
 the stage. Their distance comes from the peak of their cross-correlation, whitened (phase
 correlation; Kuglin and Hines 1975).
+
+Raw messages of a scanner with the times of day at which they came: written and read.
+
+One message after the other, each behind its time: `[hh:mm:ss.ffffff LATE] MESSAGE`, where LATE is
+how many seconds earlier it may have come. Messages are kept byte for byte and may hold line ends;
+that the link came up or was lost is a message that begins with `--`. The form is that of the public
+`monitor_zmq.py`, whose times are whole seconds without LATE: they may be anywhere in their second.
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
+import re
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -25,7 +33,6 @@ import cv2
 import numpy as np
 
 from flexdt.clients.datasets.pictures import png
-from flexdt.clients.following import traffic as r
 from flexdt.clients.gateway.vocabulary import Question, Refusal, read_command
 from flexdt.clients.whole_files import write_whole
 from flexdt.phantoms import Phantom
@@ -234,7 +241,7 @@ class FollowSession:
     def link(self, connected: bool, why: str) -> None:
         """The connection has come up or gone down."""
         now = self.clock()
-        self._keep(r.UP if connected else r.LINK + why.encode(), now, 0.0)
+        self._keep(UP if connected else LINK + why.encode(), now, 0.0)
         self._take(self.follower.linked(self.mirror, connected, now, why))
 
     def tick(self, now: float) -> None:
@@ -243,11 +250,11 @@ class FollowSession:
 
     def time_of_day(self, at: float) -> str:
         """hh:mm:ss.mmm of a time of the clock."""
-        return r.time_of_day(at - self._midnight)
+        return time_of_day(at - self._midnight)
 
     def _keep(self, data: bytes, at: float, late_s: float) -> None:
         if self.record is not None:
-            self.record.write(r.format_recorded(r.Recorded(at - self._midnight, late_s, data)))
+            self.record.write(format_recorded(Recorded(at - self._midnight, late_s, data)))
             self.record.flush()
 
     def _take(self, mirror: Mirror) -> None:
@@ -273,20 +280,20 @@ class FollowSession:
         """Hear a recording as if it came now; the clock is the recording's.
 
         Args:
-            recording: see `flexdt.clients.following.traffic`.
+            recording: see `flexdt.clients.following.session`.
             ahead: whether what is under way, and the rest of the script, are checked as well.
         """
         now = self._midnight = 0.0
         self.clock = lambda: now
-        for message in r.read_recording(recording):
+        for message in read_recording(recording):
             now = now or message.at_s
             while now + TICK_S < message.at_s:
                 idle = not self.mirror.waiting and self.mirror.due_s is None
                 now = message.at_s if idle else now + TICK_S
                 self.tick(now)
             now = max(now, message.at_s)
-            if message.data.startswith(r.LINK):
-                self.link(message.data == r.UP, message.data.removeprefix(r.LINK).decode())
+            if message.data.startswith(LINK):
+                self.link(message.data == UP, message.data.removeprefix(LINK).decode())
             else:
                 self.message(message.data, message.at_s, message.late_s)
             if ahead and self._is_new():
@@ -330,3 +337,61 @@ def executed_script(recording: bytes, machine: Machine) -> bytes:
     follower = Follower(machine, Profile(name=ZERO, machine=machine.name, source="no offsets"))
     FollowSession(follower, executed=lines.append).replay(recording, ahead=False)
     return b"".join(lines)
+
+
+STAMP: Final = re.compile(rb"^\[(\d\d):(\d\d):(\d\d(?:\.\d+)?)(?: (\d+\.\d+))?\] ", re.MULTILINE)
+LINK: Final = b"-- "
+UP: Final = b"-- connected"
+DAY_S: Final = 86400.0
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """One message.
+
+    Attributes:
+        at_s: when it was read, since the midnight before the first [s].
+        late_s: by how much earlier it may have come [s].
+        data: as it came.
+    """
+
+    at_s: float
+    late_s: float
+    data: bytes
+
+
+def time_of_day(seconds: float, digits: int = 3) -> str:
+    """hh:mm:ss.mmm of a time since a midnight.
+
+    Example:
+        >>> time_of_day(86400.0 + 3723.5)
+        '01:02:03.500'
+    """
+    unit = 10**digits
+    whole, part = divmod(round(seconds * unit) % round(DAY_S * unit), unit)
+    hour, minute = divmod(whole // 60, 60)
+    return f"{hour:02d}:{minute:02d}:{whole % 60:02d}.{part:0{digits}d}"
+
+
+def format_recorded(message: Recorded) -> bytes:
+    """A message as a recording holds it."""
+    head = f"[{time_of_day(message.at_s, 6)} {message.late_s:.6f}] "
+    return head.encode() + message.data + b"\n"
+
+
+def read_recording(data: bytes) -> Iterator[Recorded]:
+    """The messages of a recording; times go on after midnight.
+
+    Example:
+        >>> recording = b"[23:59:59] {}\\n[00:00:01.5 0.002] {}\\n"
+        >>> [(m.at_s, m.late_s) for m in read_recording(recording)]
+        [(86400.0, 1.0), (86401.5, 0.002)]
+    """
+    stamps, last = list(STAMP.finditer(data)), 0.0
+    for stamp, end in zip(stamps, [*(s.start() for s in stamps[1:]), len(data)], strict=True):
+        hour, minute, second = (float(x) for x in stamp.groups()[:3])
+        late = float(stamp[4] or (0.0 if b"." in stamp[3] else 1.0))
+        at = 3600.0 * hour + 60.0 * minute + second + (0.0 if b"." in stamp[3] else 1.0)
+        at += DAY_S * round((last - at) / DAY_S)
+        last = at
+        yield Recorded(at, late, data[stamp.end() : end].removesuffix(b"\n"))

@@ -1,4 +1,4 @@
-"""The image feed: radiographs from the twin to the panel in the scene and to the pages.
+"""What comes to the pages beside states: images from the twin, and volumes of `live_volume`.
 
 There is one feed for each kind of image; it subscribes only while a page shows that kind. During
 motion pages get the mean over 2 x 2 pixels, and the full image at rest. Pixels are processed in a
@@ -6,6 +6,8 @@ thread, and only the newest image is kept.
 
 For the scene line integrals and counts become 8-bit grey by window and level. A page applies its
 own window: it gets 16-bit integers with a scale, deflated, or, while things move, a JPEG.
+
+The process of `live_volume` is one at a time; pages ask it for what they draw.
 """
 
 from __future__ import annotations
@@ -13,10 +15,15 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import os
 import struct
+import sys
 import zlib
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -26,6 +33,7 @@ from flexdt.clients.client.events import Event, Projection
 from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress
 from flexdt.clients.viewer.page import watched
 from flexdt.runtime.log import log
+from flexdt.runtime.workers import ENVIRONMENT
 from flexdt.twin.geometry.conventions import Float32Array
 
 MAGIC = b"FXI2"
@@ -254,3 +262,119 @@ def radiograph(params: Mapping[str, object]) -> ShownImage:
     time = event.time if shot.time is None else shot.time
     flags = None if shot.flags is None else shot.flags.model_dump()
     return ShownImage(shot.image, shot.kind, shot.cone_vec, time, event.seq, flags)
+
+
+PROGRAM: Final = "flexdt.clients.viewer.live_volume"
+LINE_BYTES: Final = 4 << 20
+SINGLE: Final = {name: ones for name, ones in ENVIRONMENT.items() if not name.startswith("NUMBA")}
+"""The process itself says how many threads its kernels have."""
+Answer = tuple[dict[str, Any], bytes]
+Wish = tuple[str, ...]
+"""What the process reads first."""
+
+
+def wish(folder: Path, side: int, past: bool) -> Wish:
+    """The volume of a data set, with so many voxels a side; the whole one of a past scan."""
+    return str(folder.absolute()), str(side), *(["past"] if past else [])
+
+
+class LiveReconstruction:
+    """The one process of a viewer, for the data set that was asked for last.
+
+    Args:
+        tell: gets its lines.
+    """
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self._tell, self.newest = tell, ""
+        self._asked: Wish = ()
+        self._task: asyncio.Task[None] | None = None
+        self._ending: asyncio.Task[None] | None = None
+        self._spare: asyncio.Task[asyncio.subprocess.Process] | None = None
+        self._writer: asyncio.StreamWriter | None = None
+        self._wanted: deque[asyncio.Future[Answer]] = deque()
+
+    def warm(self) -> None:
+        """Have a process ready that has loaded what it needs: that takes longer than a slice."""
+        if self._spare is None and self._task is None:
+            self._spare = asyncio.create_task(_started())
+
+    def grow(self, folder: Path, side: int, past: bool = False) -> None:
+        """Grow the volume of a data set, unless that is being done; the last line comes again."""
+        asked = wish(folder, side, past)
+        if asked == self._asked:
+            if self.newest:
+                self._tell(self.newest)
+            return
+        self.stop()
+        self._asked = asked
+        self._task = watched(self._follow(*asked), "a live reconstruction")
+
+    def stop(self) -> None:
+        """End what is under way."""
+        if self._task is not None:
+            self._task.cancel()
+            self._ending = self._task
+        self._task, self._asked, self.newest = None, (), ""
+        self._hang_up()
+
+    async def close(self) -> None:
+        """End all there is."""
+        self.stop()
+        if self._ending is not None:
+            await asyncio.wait([self._ending])
+        if self._spare is not None:
+            process = await self._spare
+            process.kill()
+            await process.wait()
+
+    def _hang_up(self) -> None:
+        """Nobody answers any more who has been asked for a slice."""
+        self._writer = None
+        while self._wanted:
+            self._wanted.popleft().cancel()
+
+    async def ask(self, asked: Wish, *words: str) -> Answer | None:
+        """What the process answers, and bytes behind it; None while there is none, or once it
+        has another volume than the one `asked` for."""
+        if self._writer is None or asked != self._asked:
+            return None
+        wanted: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+        self._wanted.append(wanted)
+        self._writer.write("\t".join(words).encode() + b"\n")
+        with suppress(asyncio.CancelledError):  # somebody has asked for another volume
+            return await wanted
+        return None
+
+    async def _follow(self, *asked: str) -> None:
+        spare, self._spare = self._spare, None
+        process = await (spare or _started())
+        assert process.stdout is not None
+        assert process.stdin is not None
+        self._writer = process.stdin
+        self._writer.write("\t".join(asked).encode() + b"\n")
+        try:
+            async for line in process.stdout:
+                kind, _, content = line.decode().partition("\t")
+                if kind == "answer":
+                    size, _, told = content.partition("\t")
+                    answer = json.loads(told), await process.stdout.readexactly(int(size))
+                    if not (wanted := self._wanted.popleft()).done():
+                        wanted.set_result(answer)
+                else:
+                    self.newest = line.decode()
+                    self._tell(self.newest)
+            self._hang_up()
+            await process.wait()  # to kill what has just ended would take its code from the loop
+        finally:
+            if process.returncode is None:
+                process.kill()
+            await process.wait()
+
+
+async def _started() -> asyncio.subprocess.Process:
+    return await asyncio.create_subprocess_exec(
+        sys.executable, "-P", "-m", PROGRAM,
+        stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.DEVNULL, env={**os.environ, **SINGLE}, limit=LINE_BYTES,
+    )  # fmt: skip

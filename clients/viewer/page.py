@@ -28,7 +28,7 @@ from websockets.exceptions import ConnectionClosed
 
 from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress, Unsendable
 from flexdt.clients.client.transport import ConnectionLost
-from flexdt.clients.viewer.scenes.layers import Shown
+from flexdt.clients.viewer.scenes.world import Shown
 from flexdt.protocol import METHODS, Code, RpcError, parse_params
 from flexdt.protocol.rpc_errors import busy, clip, internal, link_down
 from flexdt.runtime.log import log, traced

@@ -25,14 +25,12 @@ from flexdt.clients.client.flows import Ask
 from flexdt.clients.viewer import exports
 from flexdt.clients.viewer import page_params as p
 from flexdt.clients.viewer import scrubbed_plan as plans
-from flexdt.clients.viewer.feed import ShownImage, packed
+from flexdt.clients.viewer.feed import ShownImage, packed, wish
 from flexdt.clients.viewer.front import Download
 from flexdt.clients.viewer.page import Page, without_bytes
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
-from flexdt.clients.viewer.scenes.standpoints import FREE
-from flexdt.clients.viewer.scenes.world import motors
+from flexdt.clients.viewer.scenes.world import FREE, motors
 from flexdt.clients.viewer.viewer import PageMethod, Viewer
-from flexdt.clients.viewer.volume_process import wish
 from flexdt.protocol import Code, Method, RpcError, parse_params
 from flexdt.protocol import image as wire_image
 from flexdt.protocol.fields import Nothing, Params

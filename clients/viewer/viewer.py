@@ -25,21 +25,26 @@ from websockets.asyncio.server import ServerConnection
 from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress
 from flexdt.clients.client.transport import ConnectionLost
 from flexdt.clients.viewer import scrubbed_plan as plans
-from flexdt.clients.viewer.feed import ImageFeed, ShownImage, grey, packed, window_of
+from flexdt.clients.viewer.feed import (
+    ImageFeed,
+    LiveReconstruction,
+    ShownImage,
+    grey,
+    packed,
+    window_of,
+)
 from flexdt.clients.viewer.front import Download, Front
 from flexdt.clients.viewer.live_volume import points_of
 from flexdt.clients.viewer.page import TRY_AGAIN, Page, watched, without_bytes
 from flexdt.clients.viewer.page_cameras import SceneClients
-from flexdt.clients.viewer.scenes import sample as shapes
-from flexdt.clients.viewer.scenes import standpoints as views
+from flexdt.clients.viewer.scenes import painted_meshes as shapes
+from flexdt.clients.viewer.scenes import world as views
+from flexdt.clients.viewer.scenes.drawing_aids import NameTags
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
-from flexdt.clients.viewer.scenes.labels import NameTags
-from flexdt.clients.viewer.scenes.layers import Shown
-from flexdt.clients.viewer.scenes.sample import NOTHING, MeshCache, SampleLook
+from flexdt.clients.viewer.scenes.painted_meshes import NOTHING, MeshCache, SampleLook
 from flexdt.clients.viewer.scenes.still import Stills
-from flexdt.clients.viewer.scenes.world import World, beads_on, world_of
+from flexdt.clients.viewer.scenes.world import Shown, World, beads_on, world_of
 from flexdt.clients.viewer.viser_gate import Scenes
-from flexdt.clients.viewer.volume_process import LiveReconstruction
 from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SafetyState, SampleState, State
 from flexdt.runtime.access import ViewerLimits

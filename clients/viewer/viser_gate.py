@@ -42,8 +42,7 @@ from viser._messages import (
 from websockets.asyncio.client import ClientConnection, unix_connect
 from websockets.typing import Subprotocol
 
-from flexdt.clients.viewer.scenes.layers import Nodes
-from flexdt.clients.viewer.scenes.standpoints import Standpoint
+from flexdt.clients.viewer.scenes.world import Nodes, Standpoint
 from flexdt.protocol.fields import Params
 from flexdt.runtime.log import log
 

@@ -10,7 +10,7 @@ import trimesh
 
 from flexdt import machines
 from flexdt.clients.cli.command_tree import run
-from flexdt.clients.viewer.scenes.parts import own_looks, pieces_of
+from flexdt.clients.viewer.scenes.painted_meshes import own_looks, pieces_of
 from flexdt.phantoms.files import mesh_files
 from flexdt.twin.errors import MachineFileError
 

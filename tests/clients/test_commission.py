@@ -17,7 +17,7 @@ from flexdt import machines
 from flexdt.clients.cli.command_tree import run
 from flexdt.clients.cli.commands.scan_commands import read_log_file
 from flexdt.clients.commission import commission
-from flexdt.clients.following.traffic import Recorded, format_recorded
+from flexdt.clients.following.session import Recorded, format_recorded
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.script.executed_log import read_log
 

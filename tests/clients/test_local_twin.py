@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import flexdt as fx
-from flexdt.clients.launch import local_twin
+from flexdt.clients.launch import processes as local_twin
 
 
 def gone(address: tuple[str, int]) -> bool:

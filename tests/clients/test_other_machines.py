@@ -15,7 +15,7 @@ from bead_scan import bead_scan_on
 
 from flexdt.clients.calibration.calibrate import calibrate_datasets
 from flexdt.clients.datasets.dataset import load_dataset
-from flexdt.clients.launch.local_twin import LocalTwin
+from flexdt.clients.launch.processes import LocalTwin
 from flexdt.clients.reconstruction.reconstruct import (
     VolumeRequest,
     reconstruct_dataset,

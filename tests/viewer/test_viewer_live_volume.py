@@ -20,6 +20,7 @@ import tifffile
 
 from flexdt.clients.cli import main
 from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.clients.viewer.feed import LiveReconstruction, wish
 from flexdt.clients.viewer.live_volume import (
     MOST_POINTS,
     TOP,
@@ -27,13 +28,14 @@ from flexdt.clients.viewer.live_volume import (
     block,
     compare,
     exact,
+    figures,
     grow,
+    main_level,
     points_of,
     reconstruct,
     surface,
+    truth_of,
 )
-from flexdt.clients.viewer.volume_process import LiveReconstruction, wish
-from flexdt.clients.viewer.volume_truth import figures, main_level, truth_of
 from flexdt.phantoms import load_phantom
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.storage.dataset_writer import DatasetWriter

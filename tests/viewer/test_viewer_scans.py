@@ -18,7 +18,7 @@ from PIL import Image
 
 from flexdt.clients.client.client import TwinClient
 from flexdt.clients.datasets.dataset import load_dataset
-from flexdt.clients.viewer.scenes.standpoints import FREE
+from flexdt.clients.viewer.scenes.world import FREE
 from tests.viewer.looking import begun, changed, drawn, film, picture, point_at, seen
 
 pytestmark = pytest.mark.browser

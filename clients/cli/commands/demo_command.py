@@ -29,12 +29,12 @@ from flexdt.clients.cli.console import duration, note, say, size, table
 from flexdt.clients.cli.options import Answer, option
 from flexdt.clients.failure import CommandError
 from flexdt.clients.launch import random_truth as hidden
-from flexdt.clients.launch.processes import Servers
 
 if TYPE_CHECKING:
     from flexdt.clients.calibration.calibrate import Outcome
     from flexdt.clients.client.client import TwinClient
     from flexdt.clients.datasets.data_set import DataSet
+    from flexdt.clients.launch.processes import Servers
 
 
 def demo(
@@ -92,6 +92,7 @@ def run_demo(
     Raises:
         CommandError: a stage did not do what it should; the line says which and what.
     """
+    from flexdt.clients.launch.processes import Servers
     from flexdt.runtime import compile_ahead
 
     out.mkdir(parents=True, exist_ok=True)

@@ -41,8 +41,7 @@ def follow(
     Nothing is ever sent to the scanner. Ends with Ctrl-C or after --for. Exit code 4 if there was
     no connection.
     """
-    from flexdt.clients.following.session import FollowSession, FramesBeside
-    from flexdt.clients.following.traffic import STAMP
+    from flexdt.clients.following.session import STAMP, FollowSession, FramesBeside
 
     if (address is None) == (replay is None):
         raise CommandError("give either ADDRESS or --replay FILE", USAGE)

@@ -15,17 +15,21 @@ import numpy as np
 import numpy.typing as npt
 import viser
 
-from flexdt.clients.viewer.scenes import parts, world
-from flexdt.clients.viewer.scenes import parts as bodies
-from flexdt.clients.viewer.scenes import sample as solids
-from flexdt.clients.viewer.scenes.beam_shade import BeamShade
-from flexdt.clients.viewer.scenes.gizmos import Drag, Gizmos
-from flexdt.clients.viewer.scenes.labels import Name, names_of_image, names_of_parts
-from flexdt.clients.viewer.scenes.layers import Nodes, Shown
-from flexdt.clients.viewer.scenes.parts import LAMP, cabinet, ground_of
-from flexdt.clients.viewer.scenes.sample import MM, SampleLook
+from flexdt.clients.viewer.scenes import painted_meshes as solids
+from flexdt.clients.viewer.scenes.drawing_aids import (
+    HOME,
+    SCREEN,
+    BeamShade,
+    Drag,
+    Gizmos,
+    Name,
+    PlanDrawing,
+    names_of_image,
+    names_of_parts,
+)
+from flexdt.clients.viewer.scenes.painted_meshes import LAMP, SampleLook, cabinet, ground_of
 from flexdt.clients.viewer.scenes.still import Shape, cone, cut, image_on, placed, shape_of
-from flexdt.clients.viewer.scenes.world import SCREEN, PlanDrawing, World, motors, quaternion
+from flexdt.clients.viewer.scenes.world import MM, Nodes, Shown, World, motors, quaternion
 from flexdt.protocol.state_model import State
 from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.geometry.conventions import FloatArray
@@ -82,7 +86,7 @@ class LabScene:
         server: to draw in.
         machine, profile: what to draw.
         drag: called when a stage is dragged.
-        looks: part -> its own mesh (`parts.own_looks`).
+        looks: part -> its own mesh (`own_looks`).
     """
 
     def __init__(
@@ -148,7 +152,7 @@ class LabScene:
             frame = scene.add_frame(f"/machine/{part.name}", show_axes=False)
             self._frames[part.name] = frame
             own = self._own.get(part.name)
-            pieces = parts.pieces_of(part)
+            pieces = solids.pieces_of(part)
             self._solids[part.name] = cut(pieces)
             self._looks.append(scene.add_glb(
                 f"/machine/{part.name}/look", own or solids.glb(pieces),
@@ -168,7 +172,7 @@ class LabScene:
         self._frames["sample"] = scene.add_frame("/sample", show_axes=False)
         self._frames["object"] = scene.add_frame("/object", show_axes=False)
         self._stand_frame = scene.add_frame(STAND, show_axes=False)
-        self._paths = scene.add_frame(world.HOME, show_axes=False)
+        self._paths = scene.add_frame(HOME, show_axes=False)
         self._beam = scene.add_frame("/beam", show_axes=False)
         blank = np.zeros((8, 8, 3), dtype=np.uint8)
         self._image = scene.add_image(
@@ -196,10 +200,10 @@ class LabScene:
     def _build_bodies(self) -> None:
         margin = self.machine.safety_margin_mm
         for name, body in self._bodies.items():
-            hull = bodies.bare(body.solid)
+            hull = solids.bare(body.solid)
             self._hulls[name] = self._hull(f"/machine/{name}/body", hull, RED, 0.35)
             if margin > 0.0:
-                shell = bodies.grown(hull, margin)
+                shell = solids.grown(hull, margin)
                 self._margins[name] = self._hull(f"/machine/{name}/margin", shell, AMBER, 0.25)
 
     def _build_labels(self) -> None:

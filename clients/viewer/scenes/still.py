@@ -20,9 +20,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from flexdt.clients.viewer.scenes.sample import MM, PaintedMesh, Skin
-from flexdt.clients.viewer.scenes.standpoints import Standpoint, roomy
-from flexdt.clients.viewer.scenes.world import World
+from flexdt.clients.viewer.scenes.painted_meshes import PaintedMesh, Skin
+from flexdt.clients.viewer.scenes.world import MM, Standpoint, World, roomy
 from flexdt.twin.geometry.conventions import FloatArray
 
 NEAR_M = 0.02

@@ -1,28 +1,32 @@
-"""From the twin's state to positions in the world frame: what the scene draws, in mm.
+"""From the twin's state to positions in the world frame, and to cameras; in mm.
 
 Positions come from motors and calibration profile as in `kinematics`, and the correction in force
 is added as in `poses`, so the drawing shows the public geometry that `geometry.get` states. The
 hidden misalignment is unknown here.
 
-A scrubbed plan is a blue ghost of the machine and the focal spot's path, drawn for the viser
-clients of one page alone.
+What a page shows of it is each person's own choice (`Shown`).
+
+The views: where each camera stands and, for the beam's eye, how the page crops it.
+
+The overview holds focal spot, sample and image whatever their distances, and the sample's own view
+the ball around it, both as large as the picture allows (`fitted`).
+
+The beam's eye stands in the focal spot and looks along the detector's normal, so the panel is an
+undistorted rectangle. Where the piercing point is off its centre the picture is rendered larger and
+cropped by the page, since a browser's camera is symmetric. Units: m for viser, ratios for the page.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import numpy as np
-import viser
 from scipy.spatial.transform import Rotation
 
-from flexdt.clients.viewer.scenes import parts as bodies
-from flexdt.clients.viewer.scenes import sample as solids
-from flexdt.clients.viewer.scenes.sample import MM
 from flexdt.protocol.state_model import CameraState, State
-from flexdt.twin.collision.collision_scene import CollisionScene
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import (
     FloatArray,
@@ -37,6 +41,45 @@ from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.scanner.state import StagePlacement
+
+MM = 0.001
+"""Scene units (m) per mm: viser's renderer clips at 1 cm and 1 km."""
+LAYERS: Final[Mapping[str, bool]] = {
+    "beam": True, "axis": True, "panel": True, "ranges": False, "bodies": False, "margin": False,
+    "sample": True, "machine": True, "orbit": True, "gizmos": False, "labels": False,
+    "names": True, "cabinet": True,
+}  # fmt: skip
+"""Layer -> whether it is shown until somebody chooses."""
+
+Nodes = Mapping[str, Mapping[str, Any]]
+"""Name of a node -> its properties; `visible` is one of them."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """The layers that are shown, and the opacity of the sample (0, 1]."""
+
+    layers: frozenset[str] = frozenset(name for name, on in LAYERS.items() if on)
+    opacity: float = 0.5
+
+    def __contains__(self, layer: str) -> bool:
+        return layer in self.layers
+
+    def changed(self, opacity: float | None = None, **layers: bool | None) -> Shown:
+        """The same, but for what is given.
+
+        >>> sorted(Shown(frozenset(["beam", "axis"])).changed(axis=False, names=True).layers)
+        ['beam', 'names']
+        """
+        on = {name for name, wanted in layers.items() if wanted}
+        off = {name for name, wanted in layers.items() if wanted is False}
+        opaque = self.opacity if opacity is None else opacity
+        return replace(self, layers=self.layers - off | on, opacity=opaque)
+
+    @property
+    def told(self) -> dict[str, object]:
+        """For the page."""
+        return {"shown": {name: name in self for name in LAYERS}, "opacity": self.opacity}
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,83 +241,121 @@ def beads_on(
     return [[float(c), float(r)] for c, r in pixels[inside]]
 
 
-SCREEN: Any = {"thickness_units": "screen"}
-"""Lines have a width in pixels."""
-GHOST = (60, 130, 255)
-PATH = (90, 120, 255)
-HOME = "/object/plan"
-"""The node that holds the paths in all scenes: one switch for all of them."""
-ORBIT = f"{HOME}/orbit"
-RAY, RAY_COLOR = "/ray", (255, 60, 160)
+Vector = tuple[float, float, float]
+WIDEST = 3.0
+"""The beam's eye is rendered at most this many times as wide or high as the panel; beyond, the
+camera looks at the panel's centre instead and the frame is no longer exact."""
 
 
-class PlanDrawing:
-    """Ghosts and paths in clients' own scenes.
+@dataclass(frozen=True)
+class Standpoint:
+    """A camera: metres, and its vertical opening angle [rad]."""
+
+    position: Vector
+    look_at: Vector
+    up: Vector
+    fov: float
+
+
+WIDE = 1.35
+"""Aspect (width over height) for which cameras are made; narrower pictures open wider (`roomy`)."""
+ROOM = 0.86
+"""Part of the picture, in width and height, that what is fitted takes."""
+TUBE_MM = 60.0
+"""Of the tube behind its focal spot that the overview shows."""
+ISO_WAY, ISO_FOV = (-0.5, 0.75, -0.42), math.radians(38.0)
+SAMPLE_WAY, SAMPLE_FOV = (-0.62, 0.68, -0.39), math.radians(30.0)
+SIDE = Standpoint((3.15, 0.52, 0.1), (0.0, 0.52, 0.1), (0.0, 0.0, 1.0), math.radians(30.0))
+FREE = Standpoint((-0.95, 0.1, 0.52), (0.0, 0.72, 0.0), (0.0, 0.0, 1.0), math.radians(45.0))
+FIXED = {"side": SIDE, "free": FREE}
+"""View -> camera, for those that do not depend on the machine's pose."""
+
+
+def presets(world: World, radius_mm: float) -> dict[str, Standpoint]:
+    """View -> the camera that it opens with, for all but the beam's eye.
 
     Args:
-        machine: whose parts.
-        collision: its collision bodies.
+        world: the machine's pose.
+        radius_mm: of the ball around the sample.
     """
-
-    def __init__(self, machine: Machine, collision: CollisionScene) -> None:
-        self._collision = collision
-        moving = {part.name for part in machine.components if machine.chain(part)}
-        self._moving = [body for body in collision.bodies if body.name in moving]
-
-    def ghost(self, clients: Sequence[viser.ClientHandle], positions: Mapping[str, float]) -> None:
-        """Show some clients where the moving parts would be for motor positions [mm, deg]."""
-        q = self._collision.vector(positions)
-        for client in clients:
-            with client.atomic():
-                if client.scene.get_handle_by_name("/ghost") is None:
-                    client.scene.add_frame("/ghost", show_axes=False)
-                for body in self._moving:
-                    name = f"/ghost/{body.name}"
-                    turn = quaternion(body.rotation(float(q @ body.turns)))
-                    at = tuple(((body.origin + q @ body.slides) * MM).tolist())
-                    handle = client.scene.get_handle_by_name(name)
-                    if handle is None:
-                        vertices, faces = solids.plain(bodies.bare(body.solid))
-                        client.scene.add_mesh_simple(
-                            name, vertices, faces, color=GHOST, opacity=0.28,
-                            side="double", cast_shadow=False, receive_shadow=False,
-                            wxyz=turn, position=at,
-                        )  # fmt: skip
-                    else:
-                        handle.wxyz, handle.position = turn, at
-
-    def unghost(self, clients: Iterable[viser.ClientHandle]) -> None:
-        """Show them no longer."""
-        _remove(clients, "/ghost")
-
-    def orbit(self, clients: Sequence[viser.ClientHandle], points: FloatArray | None) -> None:
-        """Show some clients the focal spot's path as the sample sees it; None: no longer.
-
-        Args:
-            clients: that see it.
-            points: (n, 3) [mm], object frame.
-        """
-        steps = None if points is None else np.stack([points[:-1], points[1:]], axis=1)
-        _draw_lines(clients, ORBIT, steps, PATH, 1.5)
-
-    def ray(self, clients: Sequence[viser.ClientHandle], ends: FloatArray | None) -> None:
-        """Show some clients a ray, (2, 3) [mm, world]; None: no longer."""
-        _draw_lines(clients, RAY, None if ends is None else ends[None], RAY_COLOR, 3.0)
+    middle = world.sample.shift
+    ball = middle + max(radius_mm, 5.0) * np.concatenate([np.eye(3), -np.eye(3)])
+    tube = world.source + TUBE_MM * np.outer((0.0, 1.0), (0.0, -1.0, 0.0))
+    whole = np.concatenate([tube, ball, world.corners])
+    iso = fitted(whole * MM, ISO_WAY, ISO_FOV, middle * MM)
+    return {**FIXED, "iso": iso, "sample": fitted(ball * MM, SAMPLE_WAY, SAMPLE_FOV, middle * MM)}
 
 
-def _draw_lines(
-    clients: Sequence[viser.ClientHandle], name: str, lines: FloatArray | None,
-    color: tuple[int, int, int], px: float,
-) -> None:  # fmt: skip
-    """Lines (n, 2, 3) [mm] in place of those that clients had under this name; None for none."""
-    _remove(clients, name)
-    if lines is not None and len(lines):
-        for client in clients:
-            client.scene.add_line_segments(name, lines * MM, color, thickness=px, **SCREEN)
+def fitted(points: FloatArray, way: Vector, fov: float, around: FloatArray) -> Standpoint:
+    """The nearest camera that looks along `way` and holds all points; up is +z.
+
+    Args:
+        points: (n, 3) [m].
+        way: direction of the look.
+        fov: vertical opening of a picture that is `WIDE` [rad].
+        around: (3,) [m], what turns of the camera keep at their distance.
+    """
+    ahead = np.asarray(way) / np.linalg.norm(way)
+    right = np.cross(ahead, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(right, ahead), ahead])
+    seen = points @ axes.T
+    eye, back = np.zeros(3), []
+    for k, aspect in ((0, WIDE), (1, 1.0)):
+        slope = ROOM * aspect * math.tan(0.5 * fov)
+        # On the left each point wants x - eye >= -slope * (depth - eye's depth); right likewise.
+        left = (seen[:, k] + slope * seen[:, 2]).min()
+        right_of = (seen[:, k] - slope * seen[:, 2]).max()
+        back.append((left - right_of) / (2.0 * slope))
+        eye[k] = 0.5 * (left + right_of)
+    eye[2] = min(back)
+    position = eye @ axes
+    target = position + ahead * ((around - position) @ ahead)
+    return Standpoint(_vector(position), _vector(target), (0.0, 0.0, 1.0), fov)
 
 
-def _remove(clients: Iterable[viser.ClientHandle], name: str) -> None:
-    for client in clients:
-        handle = client.scene.get_handle_by_name(name)
-        if handle is not None:
-            handle.remove()
+def roomy(camera: Standpoint, aspect: float) -> Standpoint:
+    """The camera with as wide an opening in a narrow picture as in one that is `WIDE`."""
+    wider = max(1.0, WIDE / max(aspect, 0.3))
+    return replace(camera, fov=2.0 * math.atan(wider * math.tan(0.5 * camera.fov)))
+
+
+def beam_view(world: World) -> tuple[Standpoint, dict[str, object]]:
+    """The beam's eye of a geometry, and how a page crops it to show the image and nothing else.
+
+    Lengths for the page are in units of the image's width: the picture is `width` x `height`, and
+    the image, 1 x `aspect`, has its top left corner `left`, `top` inside it; the sample stands
+    `sample_height_mm` above the focal spot. Where not `exact` the eye looks at the panel's middle.
+    """
+    rows, cols = world.shape
+    pu, pv = float(np.linalg.norm(world.u)), float(np.linalg.norm(world.v))
+    column, row = world.piercing_px.tolist()
+    width, height = cols * pu, rows * pv
+    left, top = (column + 0.5) * pu, (row + 0.5) * pv
+    half_w, half_h = max(left, width - left), max(top, height - top)
+    exact = 2.0 * half_w <= WIDEST * width and 2.0 * half_h <= WIDEST * height
+    if exact:
+        target, far = world.foot, world.distance
+    else:
+        left, top, half_w, half_h = 0.5 * width, 0.5 * height, 0.5 * width, 0.5 * height
+        target, far = world.detector, float(np.linalg.norm(world.detector - world.source))
+    up = tuple((-world.v / pv).tolist())
+    eye = Standpoint(_m(world.source), _m(target), up, 2.0 * math.atan2(half_h, far))
+    return eye, {
+        "width": 2.0 * half_w / width,
+        "height": 2.0 * half_h / width,
+        "left": (half_w - left) / width,
+        "top": (half_h - top) / width,
+        "aspect": height / width,
+        "exact": exact,
+        "sample_height_mm": float(world.axis[2] - world.source[2]),
+    }
+
+
+def _m(point: FloatArray) -> Vector:
+    return _vector(point * MM)
+
+
+def _vector(point: FloatArray) -> Vector:
+    x, y, z = point.tolist()
+    return (x, y, z)
