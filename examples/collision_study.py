@@ -27,12 +27,17 @@ from scipy.spatial.transform import Rotation
 
 from flexdt.phantoms import load_phantom
 from flexdt.twin.collision.collision_scene import CollisionScene, build_scene, scene_of
-from flexdt.twin.collision.convex_solids import ConvexSolid, Polytope, UprightCylinder, box, hull
-from flexdt.twin.collision.guard import SceneGuard
+from flexdt.twin.collision.convex_solids import (
+    ConvexSolid,
+    Polytope,
+    UprightCylinder,
+    box,
+    convex_pieces,
+    hull,
+)
+from flexdt.twin.collision.guard import PathSearch, SceneGuard, SweepResult
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.collision.relative import Limits
-from flexdt.twin.collision.sample_hull import convex_pieces
-from flexdt.twin.collision.scene_search import PathSearch, SweepResult
 from flexdt.twin.collision.stages import Body
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.motion import profiles as motion

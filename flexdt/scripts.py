@@ -9,8 +9,8 @@ from flexdt.machines import machine as find_machine
 from flexdt.machines import profile as find_profile
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.samples import as_phantom
+from flexdt.twin.collision.convex_solids import convex_pieces
 from flexdt.twin.collision.plan_report import collision_check
-from flexdt.twin.collision.sample_hull import convex_pieces
 from flexdt.twin.lazy_backend import File
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.script import (

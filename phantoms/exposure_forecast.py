@@ -33,7 +33,7 @@ from flexdt.twin.physics.radiograph import radiographs
 from flexdt.twin.physics.spectrum import Filter, tube_of, voltages
 from flexdt.twin.projection import project_body
 from flexdt.twin.projection.analytic_solids import Vector
-from flexdt.twin.scanner.settings import CameraChange, changed_camera
+from flexdt.twin.scanner.state import CameraChange, changed_camera
 from flexdt.twin.script.compose import Kind, ScanRequest, compose_script
 from flexdt.twin.script.planning.plan import ScanPlan, StartState
 from flexdt.twin.script.planning.planner import plan_script

@@ -43,7 +43,7 @@ from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.physics.spectrum import tube_of, tube_spectrum
-from flexdt.twin.scanner.settings import readout_of
+from flexdt.twin.scanner.state import readout_of
 from flexdt.twin.script.compose import ScanRequest, compose_script
 
 APART: Final = 0.01

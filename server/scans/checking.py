@@ -31,7 +31,7 @@ from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.script import ScanPlan, ScriptProblem, StartState, plan_poses
-from flexdt.twin.script.lexer import LIGHT_BYTES, is_light
+from flexdt.twin.script.parse import LIGHT_BYTES, is_light
 from flexdt.twin.script.planning.dry_run import (
     CheckReport,
     Clearance,

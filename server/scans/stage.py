@@ -15,9 +15,8 @@ from flexdt.phantoms import Phantom
 from flexdt.protocol.rpc_errors import too_large
 from flexdt.server.storage.stored_samples import ReceivedSample, SampleStore
 from flexdt.twin.collision.collision_scene import CollisionScene, build_scene
-from flexdt.twin.collision.convex_solids import Polytope
+from flexdt.twin.collision.convex_solids import Polytope, convex_pieces
 from flexdt.twin.collision.guard import SceneGuard
-from flexdt.twin.collision.sample_hull import convex_pieces
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.scanner.safety import Guard

@@ -479,7 +479,7 @@ def _mean(path: Path, key: tuple[object, ...]) -> float:
 def _clearances(scan: _Scan, at: tuple[int, ...]) -> tuple[list[float | None], str]:
     from flexdt.twin.collision.collision_scene import build_scene
     from flexdt.twin.collision.convex_solids import UprightCylinder
-    from flexdt.twin.collision.scene_search import clearance
+    from flexdt.twin.collision.guard import clearance
 
     document = scan.document
     assert document is not None

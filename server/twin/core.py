@@ -42,8 +42,7 @@ from flexdt.server.twin import wire_values as views
 from flexdt.server.twin.hub import Hub
 from flexdt.server.twin.live import LiveView, Shot, StateFeed
 from flexdt.server.twin.obstacle_move import ObstacleMoves
-from flexdt.twin.collision.guard import SceneGuard
-from flexdt.twin.collision.scene_search import NearestPair, clearance
+from flexdt.twin.collision.guard import NearestPair, SceneGuard, clearance
 from flexdt.twin.errors import GeometryError, SafetyError
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.description import Machine, Profile

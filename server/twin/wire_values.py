@@ -7,7 +7,7 @@ import math
 from flexdt.protocol import state_model as w
 from flexdt.server.scans.twin_clock import TwinClock
 from flexdt.server.storage.memory import correction_fields
-from flexdt.twin.collision.scene_search import NearestPair
+from flexdt.twin.collision.guard import NearestPair
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine

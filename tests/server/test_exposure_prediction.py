@@ -18,7 +18,7 @@ from flexdt.protocol.methods.image_messages import ExposurePrediction
 from flexdt.server.imaging.exposure_quality import BEST, predict
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.camera import Roi
-from flexdt.twin.scanner.settings import changed_camera
+from flexdt.twin.scanner.state import changed_camera
 from flexdt.twin.script.compose import ScanRequest, compose_script
 
 ROD = {"kind": "cylinder", "center": [0, 0, 0], "radius": 12.0, "height": 60, "material": "pmma"}

@@ -38,7 +38,7 @@ from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.script.planning.dry_run import check_plan, check_script
 from flexdt.twin.script.planning.plan import StartState
-from flexdt.twin.script.posed_scan import plan_poses
+from flexdt.twin.script.planning.planner import plan_poses
 
 M = builtin_machine("flexray")
 P = builtin_profile(M.default_profile)

@@ -13,7 +13,7 @@ from flexdt.phantoms.exposure_forecast import expose
 from flexdt.twin.errors import LimitError, MachineFileError
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.machine.description import Machine, builtin_machine, parse_machine, profile_of
-from flexdt.twin.scanner.settings import changed_camera
+from flexdt.twin.scanner.state import changed_camera
 from flexdt.twin.script import ScanRequest, compose_script, plan_script
 
 SMALL = Roi(900, 700, 963, 763)

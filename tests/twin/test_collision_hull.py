@@ -13,7 +13,7 @@ from scipy.optimize import linprog, nnls
 from flexdt.twin.collision import convex_solids as hulls
 from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.collision.convex_solids import outer_hull
-from flexdt.twin.collision.scene_search import clearance
+from flexdt.twin.collision.guard import clearance
 from flexdt.twin.errors import MachineFileError, TwinError
 from flexdt.twin.machine.description import (
     MAX_POINTS,

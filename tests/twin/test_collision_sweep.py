@@ -25,7 +25,14 @@ from flexdt.twin.collision.convex_solids import (
     hull,
     separation_of,
 )
-from flexdt.twin.collision.guard import SceneGuard, _Overlap
+from flexdt.twin.collision.guard import (
+    SceneGuard,
+    SweepResult,
+    _Overlap,
+    clearance,
+    clearance_trace,
+    first_contact,
+)
 from flexdt.twin.collision.relative import (
     Limits,
     Moment,
@@ -35,12 +42,6 @@ from flexdt.twin.collision.relative import (
     path_of,
     refine_pair,
     sweep_pair,
-)
-from flexdt.twin.collision.scene_search import (
-    SweepResult,
-    clearance,
-    clearance_trace,
-    first_contact,
 )
 from flexdt.twin.collision.stages import Body
 from flexdt.twin.geometry.conventions import FloatArray, rotation_about

@@ -14,8 +14,7 @@ from flexdt.twin.machine.camera import Roi
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.scanner.scanner import ScannerTwin
-from flexdt.twin.scanner.settings import readout
-from flexdt.twin.scanner.state import NamedCorrection, Sample, StagePlacement
+from flexdt.twin.scanner.state import NamedCorrection, Sample, StagePlacement, readout
 
 M = builtin_machine()
 

@@ -4,7 +4,7 @@ It is built from the machine's bodies and the sample's pieces (see `stages`) and
 Pairs that are fixed to each other or allowed to touch are left out. Pairs that cannot meet at any
 position within reach (travel limits and a little more) are kept apart from the rest when they
 belong to one stage or run at different levels, so that "least clearance" describes possible
-contacts and not the construction of the machine. `relative` and `scene_search` add time.
+contacts and not the construction of the machine. `relative` and `guard` add time.
 """
 
 from __future__ import annotations
@@ -173,7 +173,7 @@ def build_scene(
     Args:
         machine: its components, limits, margin.
         profile: zero offsets, so that bodies sit where the X-ray geometry is.
-        sample: convex pieces in the object's frame (see `sample_hull.convex_pieces`).
+        sample: convex pieces in the object's frame (see `convex_solids.convex_pieces`).
         parameters: the correction in force; bodies sit where it says they are.
         margin_mm: clearance to keep; default: the machine's.
     """

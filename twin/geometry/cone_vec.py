@@ -9,6 +9,7 @@ error. Files, other programs' objects and figures are handled by `flexdt.geometr
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,14 +19,22 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.errors import GeometryError
-from flexdt.twin.geometry.conventions import FloatArray, as_numbers
-from flexdt.twin.geometry.trajectories import FULL_TURN, Bench, stage_angles
+from flexdt.twin.geometry.conventions import (
+    COLUMN_DIRECTION,
+    ROW_DIRECTION,
+    UP,
+    FloatArray,
+    as_numbers,
+    rotation_z,
+    turn_detector,
+)
 from flexdt.twin.lazy_backend import File, lazy_backend
 from flexdt.twin.signatures import public
 
 ROW_LENGTH = 12
 DEGENERATE = 1e-12
 """Sine of an angle below which two directions count as one."""
+FULL_TURN = 360.0
 SPELT_OUT = 2
 """Views up to which a printed geometry shows every number."""
 Shape2 = tuple[int, int]
@@ -130,8 +139,10 @@ class ConeVec:
             >>> scan.detector.tolist()
             [[2.0, 459.0, -1.0]]
         """
-        bench = Bench(sod, sdd, pixel, offset, tilts, height)
-        return cls(bench.rows(stage_angles(angles)), shape)
+        return cls.helical(
+            sod=sod, sdd=sdd, angles=angles, rise=0.0, shape=shape, pixel=pixel, offset=offset,
+            tilts=tilts, height=height,
+        )  # fmt: skip
 
     @classmethod
     def helical(
@@ -168,13 +179,32 @@ class ConeVec:
             [-4.0, 4.0]
         """
         if not np.isfinite(rise) or not (np.isfinite(turns) and turns > 0):
-            raise GeometryError(
-                f"rise {rise:g} mm a turn, {turns:g} turns; allowed: finite, and more than 0 turns",
-                {"asked": [rise, turns], "allowed": "finite, turns > 0"},
+            asked, allowed = (
+                f"rise {rise:g} mm a turn, {turns:g} turns",
+                "finite, more than 0 turns",
             )
-        found = stage_angles(angles, turns)
-        up = rise * (found - (found[0] + found[-1]) / 2) / FULL_TURN
-        return cls(Bench(sod, sdd, pixel, offset, tilts, height).rows(found, up), shape)
+            raise GeometryError.instead(asked, [rise, turns], allowed)
+        given = _stage_angles(angles, turns)
+        rises = rise * (given - (given[0] + given[-1]) / 2) / FULL_TURN
+        pitch = _numbers("pixel", pixel, 2, "mm", repeated=True)
+        columns, down = _numbers("offset", offset, 2, "mm")
+        roll, tilt, yaw = (math.radians(a) for a in _numbers("tilts", tilts, 3, "deg"))
+        places = {"sod": sod, "sdd": sdd, "height": height}
+        sod, sdd, height = (_numbers(name, value, 1, "mm")[0] for name, value in places.items())
+        if not 0.0 < sod <= sdd:
+            asked = f"sod {sod:g} mm and sdd {sdd:g} mm"
+            raise GeometryError.instead(asked, [sod, sdd], "0 < sod <= sdd")
+        if min(pitch) <= 0.0:
+            asked = f"pixel {pitch[0]:g} x {pitch[1]:g} mm"
+            raise GeometryError.instead(asked, list(pitch), "more than 0")
+        right, below = np.array(COLUMN_DIRECTION), np.array(ROW_DIRECTION)
+        # At stage angle 0; the object turns clockwise, so these turn the other way in its frame.
+        source = np.array([0.0, -sod, height])
+        centre = np.array([0.0, sdd - sod, height]) + columns * right + down * below
+        u, v = turn_detector(right * pitch[0], below * pitch[1], yaw, tilt, roll)
+        turn, up = rotation_z(np.radians(given)), np.multiply.outer(rises, np.array(UP))
+        parts = turn @ source + up, turn @ centre + up, turn @ u, turn @ v
+        return cls(np.concatenate(parts, axis=1), shape)
 
     @classmethod
     def from_astra(cls, geometry: Any, shape: Shape2 | None = None) -> ConeVec:
@@ -665,6 +695,39 @@ def check_shape(shape: Shape2) -> Shape2:
             {"asked": repr(shape), "allowed": ["rows", "cols"]},
         )
     return rows, cols
+
+
+def _stage_angles(angles: int | npt.ArrayLike, turns: float = 1.0) -> FloatArray:
+    """Stage angles [deg]: given ones, or a number of them from 0 on, evenly over whole turns.
+
+    Raises:
+        GeometryError: no views, or an angle that is not finite.
+    """
+    found: FloatArray = np.asarray(angles, dtype=np.float64)
+    if isinstance(angles, int | np.integer):
+        found = np.linspace(0.0, FULL_TURN * turns, max(int(angles), 0), endpoint=False)
+    if found.ndim != 1 or len(found) == 0 or not np.isfinite(found).all():
+        shown = angles if np.ndim(angles) == 0 else f"an array of shape {found.shape}"
+        raise GeometryError(
+            f"angles: {shown}; allowed: a number of views from 1, or finite angles (n,) [deg]",
+            {"asked": repr(angles)[:100], "allowed": "views, or (n,) deg"},
+        )
+    return found
+
+
+def _numbers(
+    name: str, value: object, count: int, unit: str, *, repeated: bool = False
+) -> tuple[float, ...]:
+    array = np.asarray(value, dtype=np.float64)
+    if array.ndim == 0 and (repeated or count == 1):
+        array = np.full(count, array)
+    if array.shape != (count,) or not np.isfinite(array).all():
+        wanted = "one finite number" if count == 1 else f"{count} finite numbers"
+        raise GeometryError(
+            f"{name} is {value!r}; allowed: {wanted} [{unit}]",
+            {"asked": repr(value)[:100], "allowed": wanted},
+        )
+    return tuple(array.tolist())
 
 
 def _formats() -> Any:

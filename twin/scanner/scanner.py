@@ -48,22 +48,20 @@ from flexdt.twin.scanner.safety import (
     released,
     require_ready,
 )
-from flexdt.twin.scanner.settings import (
-    CameraChange,
-    changed_camera,
-    changed_tube,
-    readout,
-    require_applicable,
-    switched,
-)
 from flexdt.twin.scanner.state import (
     AxisReading,
+    CameraChange,
     NamedCorrection,
     Readout,
     Safety,
     Sample,
     ScannerState,
     TubeSettings,
+    changed_camera,
+    changed_tube,
+    readout,
+    require_applicable,
+    switched,
 )
 
 

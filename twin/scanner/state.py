@@ -1,22 +1,32 @@
-"""The values that describe a scanner at one moment: plain, frozen, comparable.
+"""The values that describe a scanner at one moment: plain, frozen, comparable; and their changes.
 
 They describe tube, sample, safety state and the whole scanner. `scanner.ScannerTwin`, the one
-mutable object, returns them. A hidden misalignment is never part of them.
+mutable object, returns them. A hidden misalignment is never part of them. Settings of tube and
+camera change by pure functions, old value and request to new value, which raise without a change.
+
+`readout` is derived geometry: distances, magnification, voxel size, field of view, piercing point.
+Everything is computed from nominal poses and an optional correction. Voxel size is pixel * SOD /
+SDD (the thesis's formula has the ratio upside down).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from typing import Literal
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal, TypedDict
 
-from flexdt.twin.errors import LimitError
-from flexdt.twin.geometry.cone_vec import ConeVec
+import numpy as np
+
+from flexdt.twin.errors import GeometryError, LimitError
+from flexdt.twin.geometry.cone_vec import ConeVec, check_cone_vec
 from flexdt.twin.geometry.conventions import FloatArray, rotation_x, rotation_y, rotation_z
-from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets, require_plausible
 from flexdt.twin.geometry.panel import Panel
-from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.machine.camera import CameraSettings, PixelGrid, Roi, check_roi
+from flexdt.twin.machine.description import DetectorSpec, Machine, Profile, TubeSpec
+from flexdt.twin.machine.kinematics import motor_poses
 
 SafetyName = Literal["ready", "blocked", "estopped"]
 
@@ -202,3 +212,174 @@ class ScannerState:
     safety: Safety
     correction: NamedCorrection | None
     moving: bool
+
+
+def readout(
+    poses: Poses, camera: CameraSettings, sensor: PixelGrid, parameters: Offsets = NOMINAL
+) -> Readout | None:
+    """Derived quantities of the first of `poses`.
+
+    Args:
+        poses: nominal poses, world frame.
+        camera: decides the image's shape.
+        sensor: decides the pixel pitch.
+        parameters: the correction in force.
+
+    Returns:
+        The readout, or None where there is none: the axis or the detector is not in front of
+        the focal spot.
+    """
+    cone = poses[:1].cone_vec(parameters)
+    # The axis in the object's frame: through tau, whose direction tau_y does not matter here.
+    tau = np.array([parameters.tau_x, parameters.tau_z, 0.0]) - poses.mount[0]
+    return readout_of(cone, camera.shape, camera.pixels_mm(sensor), tau)
+
+
+def readout_of(
+    cone: ConeVec, shape: tuple[int, int], pixels_mm: tuple[float, float], axis: FloatArray
+) -> Readout | None:
+    """Derived quantities of the first view of a geometry, or None as `readout` has it.
+
+    Args:
+        cone: in the object's frame.
+        shape: of the image, (rows, cols).
+        pixels_mm: pitch along columns and along rows.
+        axis: a point (3,) of the rotation axis, which is parallel to z [mm].
+    """
+    rows, cols = shape
+    pixel, row_pixel = pixels_mm
+    sdd = float(cone.source_detector_distance[0])
+    sod = float((axis - cone.source[0]) @ cone.normal[0])
+    if sod <= 0.0 or sdd <= 0.0:
+        return None
+    column, row = cone.piercing_points((rows, cols))[0]
+    on_axis = [axis[0], axis[1], cone.source[0, 2]]
+    axis_column = cone.project_points(on_axis, (rows, cols))[0, 0, 0]
+    scale = sod / sdd
+    up, down = (x * row_pixel / sdd for x in (row + 0.5, rows - 0.5 - row))
+    return Readout(
+        SOD_mm=sod,
+        SDD_mm=sdd,
+        magnification=sdd / sod,
+        voxel_size_mm=pixel * scale,
+        field_of_view_mm=(cols * pixel * scale, rows * row_pixel * scale),
+        piercing_point_px=(float(column), float(row)),
+        cone_angle_deg=math.degrees(math.atan(up) + math.atan(down)),
+        axis_column_px=float(axis_column),
+    )
+
+
+class CameraChange(TypedDict, total=False):
+    """Settings of the camera to change; those left out, or None, stay."""
+
+    exposure_ms: float | None
+    mode: str | None
+    roi: Roi | None
+    averages: int | None
+    frames: int | None
+
+
+def switched(
+    machine: Machine, tube: TubeSettings, on: bool, now: float | None, *, warm: bool
+) -> TubeSettings:
+    """The tube's state after it is switched on or off.
+
+    Args:
+        machine: says how long the high voltage takes, and a warm-up after a long rest.
+        tube: before; switching on what is on changes nothing.
+        on: which.
+        now: time of the command [s]; None: the X-rays are ready already.
+        warm: no warm-up, however long the rest was.
+    """
+    if now is None:
+        return replace(tube, on=on, ready_at=-math.inf)
+    if on == tube.on:
+        return tube
+    if not on:
+        return replace(tube, on=False, since=now)
+    timing, spec = machine.timing, machine.tube
+    rested = now - tube.since > spec.cold_after_s
+    takes = timing.xrayon_s + timing.xray_ready_s
+    if rested and not warm:
+        takes += spec.warm_up_s
+    return replace(tube, on=True, since=now, ready_at=now + takes)
+
+
+def changed_tube(
+    spec: TubeSpec, tube: TubeSettings, kV: float | None, power_W: float | None
+) -> TubeSettings:
+    """The tube with another voltage [kV] or power [W]; None stays.
+
+    Raises:
+        LimitError: outside the tube's range; the message names the setting.
+    """
+    new = replace(
+        tube,
+        kV=tube.kV if kV is None else kV,
+        power_W=tube.power_W if power_W is None else power_W,
+    )
+    _require_within("tube", "kV", new.kV, spec.min_kV, spec.max_kV)
+    _require_within("tube", "power_W", new.power_W, 0.0, spec.max_W)
+    return new
+
+
+def changed_camera(
+    spec: DetectorSpec, camera: CameraSettings, change: CameraChange
+) -> CameraSettings:
+    """The camera with other settings.
+
+    Raises:
+        LimitError: outside what the detector allows; the message names the setting.
+    """
+    stated: dict[str, Any] = {name: x for name, x in change.items() if x is not None}
+    new = replace(camera, **stated)
+    spec.check_mode(new.mode)
+    check_roi(new.roi, spec.pixels, new.binning)
+    least, most = spec.min_exposure_ms, spec.max_exposure_ms
+    _require_within("camera", "exposure_ms", new.exposure_ms, least, most)
+    _require_within("camera", "averages", new.averages, 1, 10_000)
+    _require_within("camera", "frames", new.frames, 1, 1_000_000)
+    return new
+
+
+def _require_within(device: str, name: str, value: float, lower: float, upper: float) -> None:
+    if not lower <= value <= upper:
+        raise LimitError(
+            f"{device} {name} {value:g} is outside [{lower:g}, {upper:g}]",
+            {"setting": name, "asked": value, "allowed": [lower, upper]},
+        )
+
+
+def require_applicable(
+    machine: Machine, profile: Profile, camera: CameraSettings, correction: NamedCorrection | None
+) -> None:
+    """Check that a correction leaves a geometry that a scanner can have, anywhere in the travel.
+
+    Raises:
+        GeometryError: it does not; the message names the offset or the check.
+    """
+    offsets = NOMINAL if correction is None else correction.parameters
+    travels = (a.upper - a.lower for a in machine.axes.values() if a.unit == "mm")
+    require_plausible(offsets, max(travels, default=math.inf))
+    sensor = machine.detector.pixels
+    nearest = motor_poses(machine, profile, camera, _nearest(machine))
+    cone = check_cone_vec(nearest.cone_vec(offsets), camera.pixels_mm(sensor))
+    if readout(nearest, camera, sensor, offsets) is None:
+        what = "the machine file's travel" if correction is None else "the correction"
+        raise GeometryError(
+            f"{what} puts the rotation axis behind the source somewhere",
+            {"check": "sod", "source": cone.source[0].tolist(), "allowed": "SOD > 0"},
+        )
+
+
+def _nearest(machine: Machine) -> dict[str, float]:
+    """Motor positions at which sample and detector are as near to the source as they get."""
+    along = {
+        name: machine.geometry.get("object_y", {}).get(name, 0.0)
+        + machine.geometry.get("detector_y", {}).get(name, 0.0)
+        for name in machine.axes
+    }
+    return {
+        name: a.lower if along[name] > 0 else a.upper if along[name] < 0 else a.home
+        for name, a in machine.axes.items()
+    }

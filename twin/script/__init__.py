@@ -12,8 +12,7 @@ from flexdt.twin.script.planning.dry_run import (
 )
 from flexdt.twin.script.planning.dry_run_report import html_report
 from flexdt.twin.script.planning.plan import Exposure, PlanStep, SampleSize, ScanPlan, StartState
-from flexdt.twin.script.planning.planner import plan_script
-from flexdt.twin.script.posed_scan import plan_poses
+from flexdt.twin.script.planning.planner import plan_poses, plan_script
 from flexdt.twin.script.problems import ScriptError, ScriptProblem
 
 __all__ = [

@@ -28,9 +28,8 @@ from flexdt.twin.geometry.conventions import (
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Axis, Machine, Profile, check_target
 from flexdt.twin.machine.kinematics import motor_poses
-from flexdt.twin.scanner.settings import CameraChange, changed_camera, changed_tube
-from flexdt.twin.scanner.state import TubeSettings
-from flexdt.twin.script.planning.smooth_scan import MARGIN_IMAGES, run_up
+from flexdt.twin.scanner.state import CameraChange, TubeSettings, changed_camera, changed_tube
+from flexdt.twin.script.planning.planned_images import MARGIN_IMAGES, run_up
 
 Kind = Literal["fly", "step", "tiled", "helical", "calibration"]
 

@@ -15,8 +15,7 @@ from typing import Final
 from flexdt.twin.script import commands as c
 from flexdt.twin.script import grammar
 from flexdt.twin.script.grammar import ArgumentError, shorten
-from flexdt.twin.script.lexer import LOG_STAMP, rows
-from flexdt.twin.script.parse import read_row
+from flexdt.twin.script.parse import LOG_STAMP, read_row, rows
 from flexdt.twin.script.problems import ScriptProblem, in_order
 
 _WAIT = re.compile(rb"\t(?:ACK|no[ ]wait|POS|RCV)(?=\t)", re.IGNORECASE)

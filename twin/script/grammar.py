@@ -19,7 +19,6 @@ from flexdt.twin.machine.camera import Roi
 from flexdt.twin.motion.profiles import LEAST_RATE
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.commands import ImageKind
-from flexdt.twin.script.lexer import encode
 
 MAX_FRAMES: Final = 1_000_000
 MAX_AVERAGES: Final = 100_000
@@ -55,6 +54,14 @@ class Spec:
     read: Read
     arguments: int
     free: bool = False
+
+
+def encode(text: str) -> bytes:
+    """The bytes that `decode` was given."""
+    try:
+        return text.encode("utf-8", "surrogateescape")
+    except UnicodeEncodeError:  # a str with lone surrogates that never came from bytes
+        return text.encode("utf-8", "replace")
 
 
 def number(text: str, what: str, index: int = 0) -> float:

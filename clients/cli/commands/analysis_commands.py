@@ -57,7 +57,7 @@ def show(name: NameOrFile) -> Answer:
 
 def check(name: NameOrFile) -> Answer:
     """Check a machine file: every value, its zero offsets, and whether it can stand at home."""
-    from flexdt.twin.collision.scene_search import check_home
+    from flexdt.twin.collision.guard import check_home
 
     found = machines.machine(name)
     check_home(found, machines.profile(None, found, name), name)
@@ -85,7 +85,7 @@ def new(
     without: list[str] | None = option(None, "Leave out this axis.", metavar="AXIS"),
 ) -> Answer:
     """Write a short file for a machine of your own; asks for what is not said, on a terminal."""
-    from flexdt.twin.collision.scene_search import check_home
+    from flexdt.twin.collision.guard import check_home
     from flexdt.twin.machine.description import builtin_machine, builtin_machines, parse_machine
     from flexdt.twin.machine.kinematics import place
     from flexdt.twin.machine.machine_files import Answers, new_machine_text

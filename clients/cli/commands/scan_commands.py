@@ -100,7 +100,7 @@ def compare(script: Path, log: Path, machine: str | None, html: Path | None) -> 
         CommandError: the log is not of this script; the message names the first line that differs.
     """
     from flexdt.twin.script import parse_script
-    from flexdt.twin.script.lexer import is_log
+    from flexdt.twin.script.parse import is_log
     from flexdt.twin.script.planning.dry_run_report import against_html, against_summary
     from flexdt.twin.script.planning.log_fit import LogComparison, first_difference
 
@@ -130,7 +130,7 @@ def read_log_file(log: Path, machine: Machine) -> tuple[Executed, ...]:
     """
     from flexdt.clients.following.session import STAMP
     from flexdt.twin.script.executed_log import COLUMNS, read_log
-    from flexdt.twin.script.lexer import is_log
+    from flexdt.twin.script.parse import is_log
 
     data = log.read_bytes()
     if STAMP.match(data):

@@ -26,7 +26,7 @@ from flexdt.server.twin.live import Shot, image_of
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import Roi
-from flexdt.twin.scanner.settings import changed_camera, changed_tube, switched
+from flexdt.twin.scanner.state import changed_camera, changed_tube, switched
 
 
 @answers(p.PROJECTION_GET)

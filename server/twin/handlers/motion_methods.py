@@ -16,7 +16,7 @@ from flexdt.server.twin.obstacle_move import finished
 from flexdt.twin.errors import SafetyError
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.scanner.scanner import ScannerTwin
-from flexdt.twin.scanner.settings import CameraChange
+from flexdt.twin.scanner.state import CameraChange
 
 
 @answers(p.AXES_MOVE)

@@ -17,8 +17,8 @@ from flexdt.twin.script import (
     parse_script,
     read_script,
 )
-from flexdt.twin.script.grammar import FIXED, vocabulary
-from flexdt.twin.script.lexer import decode, encode
+from flexdt.twin.script.grammar import FIXED, encode, vocabulary
+from flexdt.twin.script.parse import decode
 
 FLEXRAY = builtin_machine("flexray")
 PROFILE = builtin_profile(FLEXRAY.default_profile)

@@ -16,8 +16,7 @@ from typing import Any, Final
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import Machine, unknown_axis
 from flexdt.twin.motion.profiles import Trajectory
-from flexdt.twin.scanner.settings import CameraChange, changed_camera, changed_tube
-from flexdt.twin.scanner.state import TubeSettings
+from flexdt.twin.scanner.state import CameraChange, TubeSettings, changed_camera, changed_tube
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.grammar import describe, is_reserved, own_name
 from flexdt.twin.script.planning import planned_scanner as planned
