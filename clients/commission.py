@@ -34,8 +34,8 @@ from flexdt.twin.machine import description as d
 from flexdt.twin.machine.machine_files import fitted_text
 from flexdt.twin.script.executed_log import Executed
 from flexdt.twin.script.grammar import own_name
+from flexdt.twin.script.log_fit import Fit, fit_machine
 from flexdt.twin.script.parse import read_script
-from flexdt.twin.script.planning.log_fit import Fit, fit_machine
 
 MOST_NEXT: Final = 3
 """Scans that are proposed; a list of all nobody follows."""

@@ -20,8 +20,8 @@ from flexdt.twin.script import (
     Script,
     plan_script,
 )
-from flexdt.twin.script.planning.dry_run import CollisionCheck, check_plan
-from flexdt.twin.script.planning.plan import StartState
+from flexdt.twin.script.dry_run import CollisionCheck, check_plan
+from flexdt.twin.script.plan import StartState
 from flexdt.twin.signatures import public
 
 

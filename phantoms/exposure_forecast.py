@@ -35,8 +35,8 @@ from flexdt.twin.projection import project_body
 from flexdt.twin.projection.analytic_solids import Vector
 from flexdt.twin.scanner.state import CameraChange, changed_camera
 from flexdt.twin.script.compose import Kind, ScanRequest, compose_script
-from flexdt.twin.script.planning.plan import ScanPlan, StartState
-from flexdt.twin.script.planning.planner import plan_script
+from flexdt.twin.script.plan import ScanPlan, StartState
+from flexdt.twin.script.planner import plan_script
 from flexdt.twin.script.problems import ScriptProblem
 from flexdt.twin.signatures import public
 

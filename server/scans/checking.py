@@ -31,15 +31,15 @@ from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.script import ScanPlan, ScriptProblem, StartState, plan_poses
-from flexdt.twin.script.parse import LIGHT_BYTES, is_light
-from flexdt.twin.script.planning.dry_run import (
+from flexdt.twin.script.dry_run import (
     CheckReport,
     Clearance,
     CollisionCheck,
     check_plan,
     check_script,
 )
-from flexdt.twin.script.planning.plan import SampleSize
+from flexdt.twin.script.parse import LIGHT_BYTES, is_light
+from flexdt.twin.script.plan import SampleSize
 
 AT_ONCE: Final = 2
 """Checks in worker processes at a time; others wait."""

@@ -21,7 +21,7 @@ from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.scanner.safety import Guard
 from flexdt.twin.scanner.state import Sample, StagePlacement
-from flexdt.twin.script.planning.plan import SampleSize
+from flexdt.twin.script.plan import SampleSize
 
 KEPT = 8
 MAX_BYTES: Final = 64 << 20

@@ -31,7 +31,7 @@ from typing import Any
 
 from flexdt.twin.machine.description import Machine, Timing, builtin_machine
 from flexdt.twin.script.executed_log import Executed, read_log
-from flexdt.twin.script.planning.log_fit import LogComparison, fit_machine
+from flexdt.twin.script.log_fit import LogComparison, fit_machine
 
 FAMILIES = ("lognormal", "bimodal", "drifting")
 DAILY = "daily"

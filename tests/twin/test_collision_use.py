@@ -25,8 +25,8 @@ from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import parse_script, plan_script
 from flexdt.twin.script.commands import MoveAbsolute
-from flexdt.twin.script.planning.dry_run import check_script
-from flexdt.twin.script.planning.plan import SampleSize
+from flexdt.twin.script.dry_run import check_script
+from flexdt.twin.script.plan import SampleSize
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)

@@ -1,6 +1,6 @@
 """Collisions and clearances of a whole plan, for the dry-run report.
 
-A `CollisionCheck` for `flexdt.twin.script.planning.dry_run` reports every contact of the plan with
+A `CollisionCheck` for `flexdt.twin.script.dry_run` reports every contact of the plan with
 the line that moves, its time, the pair and the last free position, the least clearance, and a trace
 for a plot. After a contact the check continues with the plan as written, so that one mistake does
 not hide the next.
@@ -21,8 +21,8 @@ from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.scanner.safety import Contact
 from flexdt.twin.script.commands import MoveAbsolute
-from flexdt.twin.script.planning.dry_run import Clearance, Collision, CollisionCheck
-from flexdt.twin.script.planning.plan import SampleSize, ScanPlan
+from flexdt.twin.script.dry_run import Clearance, Collision, CollisionCheck
+from flexdt.twin.script.plan import SampleSize, ScanPlan
 
 MAX_CONTACTS = 20
 """Contacts of one pair that are listed; a scan that hits every turn needs no more to be wrong."""

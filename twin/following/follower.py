@@ -22,13 +22,13 @@ from typing import Final
 from flexdt.twin.following.mirror import MOST_WAITING, Alarm, Heard, Mirror, Waiting
 from flexdt.twin.machine.description import Machine, Profile, unknown_axis
 from flexdt.twin.script import commands as c
+from flexdt.twin.script.dry_run import CollisionCheck, check_plan
 from flexdt.twin.script.executed_log import MotorReply, log_line, motor_reply
 from flexdt.twin.script.grammar import FIXED, ArgumentError, describe, find, number
-from flexdt.twin.script.planning.dry_run import CollisionCheck, check_plan
-from flexdt.twin.script.planning.plan import PlanStep, Range, SampleSize, step_range, total_range
-from flexdt.twin.script.planning.planner import plan_script, simulated
-from flexdt.twin.script.planning.simulated_script import Simulation
+from flexdt.twin.script.plan import PlanStep, Range, SampleSize, step_range, total_range
+from flexdt.twin.script.planner import plan_script, simulated
 from flexdt.twin.script.problems import Severity
+from flexdt.twin.script.simulated_script import Simulation
 
 NEAR_LIMIT: Final = 0.5
 """Distance of a target from a limit that is worth telling [mm or deg]."""

@@ -1,7 +1,7 @@
 """The commands of an Acquila script as frozen values, one type for each.
 
 A command holds its arguments and its place in the text; it does not depend on a machine. Units are
-the script's: mm, deg, ms, kV, W. `parse` reads commands, `planning` simulates them.
+the script's: mm, deg, ms, kV, W. `parse` reads commands, `simulated_script` simulates them.
 """
 
 from __future__ import annotations

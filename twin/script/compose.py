@@ -29,7 +29,7 @@ from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Axis, Machine, Profile, check_target
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.scanner.state import CameraChange, TubeSettings, changed_camera, changed_tube
-from flexdt.twin.script.planning.planned_images import MARGIN_IMAGES, run_up
+from flexdt.twin.script.planned_images import MARGIN_IMAGES, run_up
 
 Kind = Literal["fly", "step", "tiled", "helical", "calibration"]
 

@@ -158,7 +158,7 @@ def fit(
     """Fit a machine to executed scripts: limits, rates and the times of its commands."""
     from flexdt.twin.machine.description import builtin_machine_text
     from flexdt.twin.machine.machine_files import fitted_text
-    from flexdt.twin.script.planning.log_fit import fit_machine, unlike
+    from flexdt.twin.script.log_fit import fit_machine, unlike
 
     machine = machines.machine(base)
     text = Path(base).read_text("utf-8") if machines.is_file(base) else builtin_machine_text(base)

@@ -100,9 +100,9 @@ def compare(script: Path, log: Path, machine: str | None, html: Path | None) -> 
         CommandError: the log is not of this script; the message names the first line that differs.
     """
     from flexdt.twin.script import parse_script
+    from flexdt.twin.script.dry_run_report import against_html, against_summary
+    from flexdt.twin.script.log_fit import LogComparison, first_difference
     from flexdt.twin.script.parse import is_log
-    from flexdt.twin.script.planning.dry_run_report import against_html, against_summary
-    from flexdt.twin.script.planning.log_fit import LogComparison, first_difference
 
     known = machines.machine(machine)
     lines = read_log_file(log, known)
@@ -160,8 +160,8 @@ def tell(problems: Sequence[ScriptProblem], file: str) -> None:
 
 def show(report: CheckReport, file: str) -> Answer:
     """The plan and the figures of a check."""
-    from flexdt.twin.script.planning.dry_run_report import between, summary
-    from flexdt.twin.script.planning.plan import step_range
+    from flexdt.twin.script.dry_run_report import between, summary
+    from flexdt.twin.script.plan import step_range
 
     timing = report.plan.machine.timing
     steps = [

@@ -21,7 +21,7 @@ from flexdt.twin.following.mirror import Alarm, Mirror
 from flexdt.twin.machine.description import Machine, builtin_machine, builtin_profile, profile_of
 from flexdt.twin.script import parse_script
 from flexdt.twin.script.executed_log import read_log
-from flexdt.twin.script.planning.log_fit import fit_machine
+from flexdt.twin.script.log_fit import fit_machine
 from tests.support.scanner_traffic import Motor, event, replay
 
 LOGS = Path(__file__).parents[2] / "data" / "logs"

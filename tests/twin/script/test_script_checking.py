@@ -26,7 +26,7 @@ from flexdt.twin.script import (
     html_report,
     plan_poses,
 )
-from flexdt.twin.script.planning.dry_run_report import clearance_plot, summary
+from flexdt.twin.script.dry_run_report import clearance_plot, summary
 from tests.twin.script.conftest import Planner, blob, tabbed
 
 LINES = [

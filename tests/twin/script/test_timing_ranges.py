@@ -13,8 +13,8 @@ import pytest
 import timing_ranges
 
 from flexdt.twin.machine.description import Spread, Timing
-from flexdt.twin.script.planning.log_fit import LogRow
-from flexdt.twin.script.planning.plan import total_range
+from flexdt.twin.script.log_fit import LogRow
+from flexdt.twin.script.plan import total_range
 
 
 @pytest.mark.slow

@@ -33,10 +33,10 @@ from flexdt.twin.script import commands as c
 from flexdt.twin.script.commands import ImageKind
 from flexdt.twin.script.compose import REFERENCES, beside_beam
 from flexdt.twin.script.parse import Source, parse_script
-from flexdt.twin.script.planning.plan import SampleSize, ScanPlan, StartState
-from flexdt.twin.script.planning.planned_scanner import Motors, clamp
-from flexdt.twin.script.planning.simulated_script import Simulation
+from flexdt.twin.script.plan import SampleSize, ScanPlan, StartState
+from flexdt.twin.script.planned_scanner import Motors, clamp
 from flexdt.twin.script.problems import ScriptProblem, in_order
+from flexdt.twin.script.simulated_script import Simulation
 
 
 def plan_script(

@@ -11,9 +11,9 @@ import html
 import math
 from collections.abc import Iterable, Sequence
 
-from flexdt.twin.script.planning.dry_run import HOME_ASSUMED, CheckReport, Optics, Trace
-from flexdt.twin.script.planning.log_fit import LogComparison
-from flexdt.twin.script.planning.plan import PlanStep, Range, step_range, total_range
+from flexdt.twin.script.dry_run import HOME_ASSUMED, CheckReport, Optics, Trace
+from flexdt.twin.script.log_fit import LogComparison
+from flexdt.twin.script.plan import PlanStep, Range, step_range, total_range
 from flexdt.twin.script.problems import ScriptProblem
 
 Facts = Sequence[tuple[str, str]]

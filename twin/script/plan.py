@@ -34,7 +34,7 @@ from flexdt.twin.script.problems import ScriptProblem, WithProblems
 from flexdt.twin.values import Array, ArrayValue, JsonValue
 
 if TYPE_CHECKING:
-    from flexdt.twin.script.planning.dry_run import CheckReport
+    from flexdt.twin.script.dry_run import CheckReport
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.parse import Source, content, read_script
-from flexdt.twin.script.planning.plan import (
+from flexdt.twin.script.plan import (
     Range,
     SampleSize,
     ScanPlan,
@@ -24,7 +24,7 @@ from flexdt.twin.script.planning.plan import (
     step_range,
     total_range,
 )
-from flexdt.twin.script.planning.planner import View, plan_script, views
+from flexdt.twin.script.planner import View, plan_script, views
 from flexdt.twin.script.problems import ScriptProblem, WithProblems, in_order
 
 Trace = tuple[tuple[float, float], ...]
