@@ -20,8 +20,7 @@ from flexdt.protocol.state_model import AxisState, JobStatus, State
 from flexdt.twin.script import commands as c
 from flexdt.twin.script import grammar
 from flexdt.twin.script.grammar import ArgumentError
-from flexdt.twin.script.lexer import CodeLine, rows
-from flexdt.twin.script.parse import read_script
+from flexdt.twin.script.parse import CodeLine, read_script, rows
 
 MAX_SHOWN: Final = 60
 
