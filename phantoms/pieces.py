@@ -21,7 +21,7 @@ from flexdt.phantoms.checked_reading import PACK, Lengths, Number, PhantomError,
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection import TriangleMesh
 from flexdt.twin.projection import analytic_solids as analytic
-from flexdt.twin.projection.convex import as_convex
+from flexdt.twin.projection.analytic_solids import as_convex
 from flexdt.twin.values import ArrayValue
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ import trimesh
 from flexdt.phantoms.checked_reading import PhantomError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection import analytic_solids as analytic
-from flexdt.twin.projection.convex import polyhedron_corners
+from flexdt.twin.projection.analytic_solids import polyhedron_corners
 
 if TYPE_CHECKING:
     from flexdt.phantoms.phantom import Phantom

@@ -18,8 +18,7 @@ from flexdt.phantoms.checked_reading import PhantomError
 from flexdt.phantoms.pieces import Surface, Voxels, bounds
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection import Volume
-from flexdt.twin.projection.analytic_solids import Scene, Shape, Vector
-from flexdt.twin.projection.convex import as_convex
+from flexdt.twin.projection.analytic_solids import Scene, Shape, Vector, as_convex
 
 MAX_VOXELS: Final = 1 << 30
 MAX_LEAKS: Final = 1e-3

@@ -50,11 +50,11 @@ from flexdt.twin.projection import (
     room_like,
     warm_up,
 )
+from flexdt.twin.projection.analytic import TriangleMesh
 from flexdt.twin.projection.analytic_solids import Box, Scene, Solid, Sphere
 from flexdt.twin.projection.cpu import threads
 from flexdt.twin.projection.kernels import fan_kernels
 from flexdt.twin.projection.kernels.fan_types import Box as VoxelBox
-from flexdt.twin.projection.mesh import TriangleMesh
 from flexdt.twin.projection.operators import box_of, voxel_rays
 from flexdt_extensions.bench import rtk_peer as rtk
 from flexdt_extensions.bench.benchmark import (

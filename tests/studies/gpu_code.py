@@ -115,7 +115,6 @@ def all_kernels() -> dict[str, tuple[Any, tuple[Any, ...]]]:
     """Every kernel with the types of its arguments."""
     from numba import boolean, float32, float64, int64, types
 
-    arrays = load_kernels("projection/kernels/gpu_array_kernels.py")
     project = load_kernels("projection/kernels/gpu_kernels.py")
     fdk = load_kernels("reconstruction/gpu_fdk_kernels.py")
     tv = load_kernels("reconstruction/gpu_tv_kernels.py")
@@ -144,7 +143,7 @@ def all_kernels() -> dict[str, tuple[Any, tuple[Any, ...]]]:
             (float32[::1], int64, int64, table, float64[::1], float64[::1], images),
         ),
         "combine": (
-            arrays.combine,
+            project.combine,
             (int64, float32[::1], float32[::1], float32, boolean, float32[::1]),
         ),
         "lengths": (tv.lengths, (flat, counts, int64, edges, flat)),
@@ -153,7 +152,7 @@ def all_kernels() -> dict[str, tuple[Any, tuple[Any, ...]]]:
             (flat, flat, float32, counts, int64, edges, float32, flat, flat),
         ),
         "dual_step": (tv.dual_step, (flat, flat, flat, float32, float32, counts, int64, edges)),
-        "fold": (arrays.fold, (int64, float32[::1], float32[::1], float64[::1])),
+        "fold": (project.fold, (int64, float32[::1], float32[::1], float64[::1])),
     }
 
 

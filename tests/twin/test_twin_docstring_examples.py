@@ -9,8 +9,8 @@ import pytest
 
 MODULES = (
     "flexdt.twin.projection.analytic",
-    "flexdt.twin.projection.geometry_gradient",
-    "flexdt.twin.projection.mesh",
+    "flexdt.twin.projection.operators",
+    "flexdt.twin.projection.analytic",
     "flexdt.twin.projection.operators",
     "flexdt.twin.projection.volume",
     "flexdt.twin.reconstruction.bias_bound.checked_fdk",

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
-from flexdt.twin.projection.convex import corner_shadows
+from flexdt.twin.projection.analytic_solids import corner_shadows
 from flexdt.twin.projection.fan_plan import IntArray, exchanged, lying, plan_fans, plan_turns
 from flexdt.twin.projection.kernels.fan_types import Box
 from flexdt.twin.projection.volume import LANES

@@ -143,7 +143,7 @@ def _combined(
     def launch() -> DeviceArray:
         from numba import cuda
 
-        from flexdt.twin.projection.kernels import gpu_array_kernels as kernels
+        from flexdt.twin.projection.kernels import gpu_kernels as kernels
 
         made = out
         if made is None:
@@ -164,7 +164,7 @@ def _folded(name: str, a: DeviceArray, b: DeviceArray) -> FloatArray:
     def launch() -> FloatArray:
         from numba import cuda
 
-        from flexdt.twin.projection.kernels import gpu_array_kernels as kernels
+        from flexdt.twin.projection.kernels import gpu_kernels as kernels
 
         parts = cuda.device_array(kernels.FOLDING[0] * kernels.FOLDING[1], np.float64)
         kernels.fold[kernels.FOLDING](getattr(kernels, name), a.flat, b.flat, parts)

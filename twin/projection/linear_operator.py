@@ -1,9 +1,10 @@
 """The projector of one scan and one grid as a linear operator, for algorithms written as algebra.
 
 `A @ x` is `forward`, `A.T @ y` is `back`, and one is the exact transpose of the other: what least
-squares, proximal methods and automatic differentiation need. SciPy, PyTorch, ODL and CIL get
-operators of their own kind; each of these libraries is imported by the method that is named after
-it, and by nothing else.
+squares, proximal methods and automatic differentiation need. Arrays of other libraries come in by
+DLPack, and go out as arrays of the same library. SciPy, PyTorch, ODL and CIL get operators of their
+own kind; each of these libraries is imported by the method that is named after it, and by nothing
+else.
 """
 
 from __future__ import annotations
@@ -19,19 +20,65 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.errors import GeometryError, LimitError, TwinError
+from flexdt.twin.errors import GeometryError, LimitError, NotBuiltError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import gpu
-from flexdt.twin.projection.arrays import on_host
 from flexdt.twin.projection.device_arrays import DeviceArray
-from flexdt.twin.projection.geometry_gradient import geometry_change, geometry_gradient
-from flexdt.twin.projection.operators import Shape2, as_cone_vec, back, forward
+from flexdt.twin.projection.operators import (
+    Shape2,
+    as_cone_vec,
+    back,
+    forward,
+    geometry_change,
+    geometry_gradient,
+)
 from flexdt.twin.projection.volume import DeviceVolume, Grid, Volume, as_volume, room_like
 from flexdt.twin.signatures import public
 
 if TYPE_CHECKING:
-    from flexdt.twin.projection.frameworks.for_torch import TorchOperator
+    from flexdt.twin.projection.for_torch import TorchOperator
+
+HOST = 1
+"""DLPack's number for the processor's memory."""
+
+
+def on_host(
+    function: Callable[[npt.NDArray[Any]], Float32Array],
+) -> Callable[[Any], Any]:
+    """A function of a numpy array for arrays of any library.
+
+    Anything that numpy itself can read gives a numpy array. Of other arrays the memory is shared by
+    DLPack, and the result is handed to `from_dlpack` of the array's own library.
+
+    Raises:
+        NotBuiltError: the array is in the memory of a device.
+    """
+
+    def wrapped(x: Any) -> Any:
+        if isinstance(x, np.ndarray) or not hasattr(x, "__dlpack__"):
+            return function(np.asarray(x))
+        check_host(x.__dlpack_device__()[0] == HOST, type(x).__name__)
+        return _library(x).from_dlpack(function(np.from_dlpack(x)))
+
+    return wrapped
+
+
+def check_host(there: bool, what: str) -> None:
+    """Raise NotBuiltError unless the array is in the processor's memory."""
+    if not there:
+        raise NotBuiltError(
+            f"{what} is in the memory of a device; allowed: arrays in the processor's memory",
+            {"asked": "device", "allowed": "cpu"},
+        )
+
+
+def _library(x: Any) -> Any:
+    """The module with the functions for an array, as the array API standard has it."""
+    if hasattr(x, "__array_namespace__"):
+        return x.__array_namespace__()
+    return sys.modules[type(x).__module__.partition(".")[0]]
+
 
 SMALLEST_TOLERANCE = 1e-5
 """Of a norm: images and voxels are single precision."""
@@ -182,7 +229,7 @@ class Operator:
     def gradient(self, x: Volume | npt.ArrayLike, weights: npt.ArrayLike) -> FloatArray:
         """Derivative of sum(weights * (A @ x)) with respect to the geometry, (n, 12) [1/mm].
 
-        See `flexdt.twin.projection.geometry_gradient`.
+        See `flexdt.twin.projection.operators`.
 
         Example:
             >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
@@ -224,7 +271,7 @@ class Operator:
     def torch(self) -> TorchOperator:
         """The same for PyTorch tensors, with gradients with respect to voxels and geometry.
 
-        Needs the extra `torch`. See `flexdt.twin.projection.frameworks.for_torch.TorchOperator`.
+        Needs the extra `torch`. See `flexdt.twin.projection.for_torch.TorchOperator`.
 
         Raises:
             TwinError: PyTorch is not installed.
@@ -234,7 +281,7 @@ class Operator:
 
     @cached_property
     def _torch(self) -> TorchOperator:
-        from flexdt.twin.projection.frameworks.for_torch import TorchOperator
+        from flexdt.twin.projection.for_torch import TorchOperator
 
         return TorchOperator(self.geometry, self.like, self.detector_shape)
 
@@ -248,7 +295,7 @@ class Operator:
             TwinError: ODL is not installed.
         """
         _require("odl", "pip install 'flexdt[odl]'")
-        from flexdt.twin.projection.frameworks.for_odl import odl_operator
+        from flexdt.twin.projection.for_odl_and_cil import odl_operator
 
         return odl_operator(self._forward, self._back, self.like, self.image_shape)
 
@@ -262,7 +309,7 @@ class Operator:
             TwinError: CIL is not installed.
         """
         _require("cil", "conda install -c ccpi cil")
-        from flexdt.twin.projection.frameworks.for_cil import cil_operator
+        from flexdt.twin.projection.for_odl_and_cil import cil_operator
 
         return cil_operator(self._forward, self._back, self.like, self.geometry, self.image_shape)
 

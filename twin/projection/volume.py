@@ -1,4 +1,5 @@
-"""A voxel volume as a frozen value, and the memory layout that the kernels read.
+"""A voxel volume as a frozen value, the memory layout that the kernels read, and how far the values
+of a reconstructed one may be off, in short.
 
 Voxels are stored data[z, y, x], float32. The kernels want z contiguous, know which voxels are
 empty, and never look outside the occupied box; that layout is derived once per volume, on first
@@ -12,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
 from itertools import pairwise
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -20,8 +21,53 @@ import numpy.typing as npt
 from flexdt.twin.errors import GeometryError, NotBuiltError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray, as_numbers
 from flexdt.twin.lazy_backend import File, lazy_backend
-from flexdt.twin.projection.accuracy import Accuracy
 from flexdt.twin.signatures import public
+
+WARNED: Final = 0.03
+"""Relative bound from which on a warning tells of it, where a tenth of the even places have more.
+The bound is two to four times what is off: about 1 %."""
+CAUSES: Final = {
+    "angles": "directions that no view saw",
+    "aside": "the few columns of the panel that see beyond the axis",
+    "cone": "the angle of the cone, more so with few views",
+    "rows": "what lies above or below the panel's rows",
+    "beyond": "what lies beyond the panel's sides",
+    "drift": "images that are not empty beside the object",
+}
+UNSEEN: Final = (
+    "; this holds if the object goes on beyond the panel's sides as it is within them: a denser "
+    "shell out there makes every value too low, and no image shows it"
+)
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """What the even places of an object may be off by, beside the noise.
+
+    Attributes:
+        half: of the attenuation there, in half of them at most.
+        most: in nine of ten at most.
+        cause: what contributes most to the others: angles, aside, cone, rows, beyond or drift.
+        cut_off: the object goes on beyond the panel's sides, where its outline is a guess.
+    """
+
+    half: float
+    most: float
+    cause: str
+    cut_off: bool = False
+
+    def __str__(self) -> str:
+        half, most = (f"{min(100.0 * part, 99.0):.2g} %" for part in (self.half, self.most))
+        return (
+            f"half of the object's even places are right within {half} and nine of ten within "
+            f"{most}, beside the noise; what contributes most: {CAUSES[self.cause]}"
+        ) + UNSEEN * self.cut_off
+
+    @property
+    def warnings(self) -> list[str]:
+        """A warning where a tenth of the places may be off by more than some per cent."""
+        return [f"values may be off: {self}"] * (self.most > WARNED)
+
 
 Vector3 = tuple[float, float, float]
 IntArray = npt.NDArray[np.int32]

@@ -1,7 +1,6 @@
 """Volumes back from projections."""
 
-from flexdt.twin.projection.accuracy import Accuracy
-from flexdt.twin.projection.volume import Grid
+from flexdt.twin.projection.volume import Accuracy, Grid
 from flexdt.twin.reconstruction.bias_bound import Bias, bias_of
 from flexdt.twin.reconstruction.bias_bound.checked_fdk import (
     Images,

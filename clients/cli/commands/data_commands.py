@@ -87,7 +87,7 @@ def reconstruct(
     _check_together(given, out, [name for name in own if name in given] if preview else [])
     from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_dataset
     from flexdt.clients.reconstruction.reconstruct import preview as quick_look
-    from flexdt.twin.projection.accuracy import Accuracy
+    from flexdt.twin.projection.volume import Accuracy
 
     voxels = None if shape is None else _shape(shape)
     scattering = None if scatter_correction is None else option_values.names(scatter_correction)

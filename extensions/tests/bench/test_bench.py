@@ -285,11 +285,11 @@ from pathlib import Path
 from flexdt.clients.cli import main
 from flexdt_extensions.bench import device_page
 from flexdt.twin.projection import gpu
-from flexdt.twin.projection.kernels import gpu_array_kernels, gpu_kernels
+from flexdt.twin.projection.kernels import gpu_kernels
 from flexdt.twin.reconstruction import gpu_fdk_kernels
 
 gpu_kernels.BLOCK = gpu_fdk_kernels.BLOCK = gpu_fdk_kernels.PLANE = (4, 2)
-gpu_array_kernels.FOLDING = (1, 4)
+gpu_kernels.FOLDING = (1, 4)
 gpu.LINEAR, gpu.VIEWS_A_THREAD, device_page.ROUNDS = 64, 0.0, 1
 device_page.BESIDE_S = 0.0
 sizes = ((4, 3, 3), 12.0), ((3, 4, 3), 12.0), ((3, 3, 3), 9.0)

@@ -154,7 +154,7 @@ import numpy as np, torch
 from numba import cuda
 from numba.cuda.simulator.cudadrv.devicearray import FakeCUDAArray
 from flexdt.twin.projection import Grid, Operator, gpu
-from flexdt.twin.projection.frameworks import for_torch
+from flexdt.twin.projection import for_torch
 from flexdt.twin.projection.kernels import gpu_kernels
 from tests.twin.projection.conftest import _circle
 

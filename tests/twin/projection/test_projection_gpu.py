@@ -452,7 +452,7 @@ from numba.cuda.simulator.cudadrv.devicearray import FakeCUDAArray
 from numba.cuda.simulator.kernel import FakeCUDAKernel
 from flexdt.twin.errors import TwinError
 from flexdt.twin.projection import Volume, back, forward, gpu
-from flexdt.twin.projection.kernels import gpu_array_kernels, gpu_kernels
+from flexdt.twin.projection.kernels import gpu_kernels
 from flexdt.twin.reconstruction import Grid, cgls, fdk, gpu_fdk_kernels
 from tests.twin.projection.conftest import _circle
 
@@ -463,7 +463,7 @@ class Keep(logging.Handler):
 logging.getLogger("flexdt").addHandler(Keep())
 gpu.VIEWS_A_THREAD, gpu.LINEAR = 0.0, 16
 gpu_kernels.BLOCK = gpu_fdk_kernels.BLOCK = gpu_fdk_kernels.PLANE = (4, 2)
-gpu_array_kernels.FOLDING = (1, 4)
+gpu_kernels.FOLDING = (1, 4)
 scan, shape = _circle(3, 60.0, 100.0, 1.2, start=0.3), (3, 4)
 data = np.random.default_rng(0).random((2, 3, 4), dtype=np.float32)
 

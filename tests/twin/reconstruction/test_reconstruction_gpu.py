@@ -93,11 +93,11 @@ from flexdt.twin.projection import (Volume, forward, gpu)
 from flexdt.twin.projection import operators
 from flexdt.twin.projection.volume import DeviceVolume
 from flexdt.twin.projection.device_arrays import DeviceArray
-from flexdt.twin.projection.kernels import gpu_array_kernels, gpu_kernels
+from flexdt.twin.projection.kernels import gpu_kernels
 from flexdt.twin.reconstruction import cgls, em, sart, sirt, tv
 from tests.twin.projection.conftest import _circle
 
-gpu_kernels.BLOCK, gpu_array_kernels.FOLDING, gpu.LINEAR = (4, 2), (1, 4), 16
+gpu_kernels.BLOCK, gpu_kernels.FOLDING, gpu.LINEAR = (4, 2), (1, 4), 16
 operators.level_axes = lambda rays, *_: np.zeros(len(rays), int)
 rng = np.random.default_rng(5)
 
@@ -155,11 +155,11 @@ for method, options in (
     assert np.allclose(residuals, residuals[1], rtol=1e-5) and (residuals > 0).all()
 
 # A device that fails in an iteration: the processor's own numbers, and one line of the log.
-real = gpu_array_kernels.fold
+real = gpu_kernels.fold
 class Broken:
     def __getitem__(self, _):
         raise RuntimeError("lost")
-gpu_array_kernels.fold = Broken()
+gpu_kernels.fold = Broken()
 assert np.array_equal(cgls(images, scan, volume, iterations=2).data,
                       cgls(images, scan, volume, iterations=2).data)
 assert not gpu.availability().present and "lost" in gpu.availability().reason

@@ -1,7 +1,15 @@
-"""Exact chords through convex solids, one detector row at a time, in double precision.
+"""Exact chords through convex solids, and path lengths through closed triangle meshes. Double
+precision.
 
-A row's rays are cut by one surface after the other (loops a compiler can vectorise), only over the
-columns that a solid's shadow can reach. Quadrics and slabs come from `convex`.
+*Solids*, one detector row at a time: a row's rays are cut by one surface after the other (loops a
+compiler can vectorise), only over the columns that a solid's shadow can reach. Quadrics and slabs
+come from `analytic_solids`.
+
+*Meshes*, triangle by triangle instead of ray by ray: the signed distances at which a ray leaves (+)
+and enters (-) the solid add up to its path length, so each triangle is drawn once onto the pixels
+it covers. Whether a ray passes left or right of an edge is computed from the edge alone, the same
+way for both its triangles: no ray slips through between them or is counted twice. `analytic` has
+checked that the mesh is closed.
 """
 
 from __future__ import annotations
@@ -11,7 +19,7 @@ import math
 import numpy as np
 from numba import prange
 
-from flexdt.twin.projection.kernels.compiling import kernel, parallel
+from flexdt.twin.projection.kernels.compiling import fetch_next, kernel, maker, parallel
 
 TINY = 1e-300
 BAND = 16
@@ -88,7 +96,7 @@ def project_convex(quadric, slabs, slab_range, shadow, rays, weight, channel, ou
     """Fill out (channels, n, rows, cols) with weighted chord lengths.
 
     rays (n, 12) [mm]: source, first pixel centre minus source, u, v; shadow (n, k, 4) from
-    `convex.shadows`; weight, channel (k,) of each solid.
+    `analytic_solids.shadows`; weight, channel (k,) of each solid.
     """
     channels, n, rows, cols = out.shape
     bands = (rows + BAND - 1) // BAND
@@ -136,3 +144,160 @@ def project_convex(quadric, slabs, slab_range, shadow, rays, weight, channel, ou
                     step = b[0] * e[0] + b[1] * e[1] + b[2] * e[2]
                     cut_by_slab(t0, t1, at, b[3], b[4], rate, step, c0)
                 add_chords(out[channel[s], view, r, c0:c1], t0, t1, weight[s], d, e, c0)
+
+
+MESH_BAND = 64
+"""The same of meshes."""
+
+
+@kernel
+def edge_form(p, i, j, g, form):
+    """form[0:3]: affine function a + b c + e r of the pixel, positive where the ray passes to the
+    left of the edge from the lower to the higher vertex number; p (k, 3) seen from the source.
+    """
+    a, b = (i, j) if i < j else (j, i)
+    # p_a x (p_b - p_a): the difference of far vertices would lose the digits that matter.
+    ex, ey, ez = p[b, 0] - p[a, 0], p[b, 1] - p[a, 1], p[b, 2] - p[a, 2]
+    x = p[a, 1] * ez - p[a, 2] * ey
+    y = p[a, 2] * ex - p[a, 0] * ez
+    z = p[a, 0] * ey - p[a, 1] * ex
+    # The ray to pixel (c, r) is g[3:6] + c g[6:9] + r g[9:12]: its product with p_a x (p_b - p_a)
+    # is affine in c and r, so that three numbers say for every pixel on which side it passes.
+    for k in range(3):
+        at = 3 + 3 * k
+        form[k] = g[at] * x + g[at + 1] * y + g[at + 2] * z
+
+
+@kernel
+def draw_row(line, forms, flips, plane, r, c0, c1):
+    """Add the signed distances of one triangle to a row of pixels, in lengths of their rays."""
+    a0, b0 = forms[0, 0] + forms[0, 2] * r, forms[0, 1]
+    a1, b1 = forms[1, 0] + forms[1, 2] * r, forms[1, 1]
+    a2, b2 = forms[2, 0] + forms[2, 2] * r, forms[2, 1]
+    n0, n1 = plane[0] + plane[2] * r, plane[1]
+    reach = plane[3]
+    f0, f1, f2 = flips[0], flips[1], flips[2]
+    # `!=` undoes the order of the vertices: an edge that the triangle runs through from the higher
+    # number to the lower has the triangle on its other side. Left of all three edges the ray leaves
+    # the solid there (+), right of all three it enters (-).
+    for c in range(c0, c1):
+        left0 = (a0 + b0 * c >= 0.0) != f0
+        left1 = (a1 + b1 * c >= 0.0) != f1
+        left2 = (a2 + b2 * c >= 0.0) != f2
+        if left0 == left1 and left1 == left2:
+            speed = n0 + n1 * c
+            # In lengths of the ray, from the source (0) to the pixel (1): what lies behind either
+            # counts as there, so that a solid that is cut by the panel is cut off at it.
+            t = reach / speed if speed != 0.0 else 0.0
+            t = min(max(t, 0.0), 1.0)
+            line[c] += t if left0 else -t
+
+
+@kernel
+def draw_triangle(sums, p, pixels, face, g, row0, row1, cols, forms, flips, plane):
+    """Draw one triangle onto rows row0 to row1 - 1. pixels (k, 3): column, row and whether the
+    vertex lies in front of the source.
+    """
+    i, j, k = face[0], face[1], face[2]
+    front = pixels[i, 2] + pixels[j, 2] + pixels[k, 2]
+    if front == 0.0:
+        return
+    # A triangle that reaches behind the source has no bounding box of pixels: every pixel is tried.
+    first, last, c0, c1 = row0, row1, 0, cols
+    if front == 3.0:
+        low = min(pixels[i, 1], min(pixels[j, 1], pixels[k, 1]))
+        high = max(pixels[i, 1], max(pixels[j, 1], pixels[k, 1]))
+        if high < row0 - 1 or low > row1:
+            return
+        left = min(pixels[i, 0], min(pixels[j, 0], pixels[k, 0]))
+        right = max(pixels[i, 0], max(pixels[j, 0], pixels[k, 0]))
+        if right < -1 or left > cols:
+            return
+        # Each pixel is tested, so the margin changes nothing; one left out would be a hole.
+        first = max(row0, math.ceil(low - 1e-6))
+        last = min(row1, math.floor(high + 1e-6) + 1)
+        c0 = max(0, math.ceil(left - 1e-6))
+        c1 = min(cols, math.floor(right + 1e-6) + 1)
+    if last <= first or c1 <= c0:
+        return
+    edge_form(p, i, j, g, forms[0])
+    edge_form(p, j, k, g, forms[1])
+    edge_form(p, k, i, g, forms[2])
+    flips[0], flips[1], flips[2] = i > j, j > k, k > i
+    # The plane of the triangle: a ray d meets it at t = (p_i . n) / (d . n), and d . n is affine in
+    # the pixel as the edges are.
+    ax, ay, az = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
+    bx, by, bz = p[k, 0] - p[i, 0], p[k, 1] - p[i, 1], p[k, 2] - p[i, 2]
+    nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    for q in range(3):
+        at = 3 + 3 * q
+        plane[q] = g[at] * nx + g[at + 1] * ny + g[at + 2] * nz
+    plane[3] = p[i, 0] * nx + p[i, 1] * ny + p[i, 2] * nz
+    for r in range(first, last):
+        draw_row(sums[r - row0], forms, flips, plane, r, c0, c1)
+
+
+@kernel
+def locate(vertices, g, inverse, p, pixels):
+    """Vertices seen from the source, and their pixel coordinates."""
+    for i in range(len(vertices)):
+        x = vertices[i, 0] - g[0]
+        y = vertices[i, 1] - g[1]
+        z = vertices[i, 2] - g[2]
+        p[i, 0], p[i, 1], p[i, 2] = x, y, z
+        depth = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2] * z
+        if depth > 1e-9:
+            pixels[i, 0] = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2] * z) / depth
+            pixels[i, 1] = (inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2] * z) / depth
+            pixels[i, 2] = 1.0
+        else:
+            pixels[i, 2] = 0.0
+
+
+@maker
+def make_band(vertices, cols):
+    """A worker's arrays: sums, vertices, pixels, edge forms, flips, plane."""
+    return (
+        np.empty((MESH_BAND, cols)),
+        np.empty((vertices, 3)),
+        np.empty((vertices, 3)),
+        np.empty((3, 3)),
+        np.empty(3, np.bool_),
+        np.empty(4),
+    )
+
+
+@parallel
+def project_triangles(vertices, faces, rays, inverses, workers, out):
+    """Fill out (n, rows, cols) with path lengths [mm].
+
+    rays (n, 12) [mm]: source, first pixel minus source, u, v; inverses (n, 3, 3): of the matrix
+    with columns u, v, first pixel minus source.
+    """
+    n, rows, cols = out.shape
+    bands = (rows + MESH_BAND - 1) // MESH_BAND
+    counter = np.zeros(1, np.int64)
+    for _ in prange(workers):
+        sums, p, pixels, forms, flips, plane = make_band(len(vertices), cols)
+        seen = -1
+        job = fetch_next(counter)
+        while job < n * bands:
+            view = job // bands
+            row0 = job % bands * MESH_BAND
+            row1 = min(rows, row0 + MESH_BAND)
+            g = rays[view]
+            if view != seen:
+                locate(vertices, g, inverses[view], p, pixels)
+                seen = view
+            sums[:] = 0.0
+            for f in range(len(faces)):
+                draw_triangle(sums, p, pixels, faces[f], g, row0, row1, cols, forms, flips, plane)
+            for r in range(row0, row1):
+                for c in range(cols):
+                    total = sums[r - row0, c]
+                    dx = g[3] + c * g[6] + r * g[9]
+                    dy = g[4] + c * g[7] + r * g[10]
+                    dz = g[5] + c * g[8] + r * g[11]
+                    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+                    out[view, r, c] = np.float32(total * length)
+            job = fetch_next(counter)

@@ -1,7 +1,21 @@
-"""Exact Siddon along single rays, for any geometry: the path that is always right.
+"""Exact Siddon along single rays, for any geometry: the path that is always right; and how its line
+integrals change with the geometry.
 
 Each ray walks from voxel to voxel (Amanatides and Woo 1987), positions and sum in double
-precision, between the focal spot and the pixel centre. Coordinates are in voxel units of the box.
+precision, between the focal spot and the pixel centre. Coordinates are in voxel units of the box,
+derivatives in 1/mm.
+
+A ray from s to e has the integral p = L sum_i mu_i (t[i+1] - t[i]): L its length, mu_i the value of
+the i-th voxel it meets, t the parameters of s + t (e - s) at which it goes from one voxel to the
+next. Each t[k] belongs to a plane across one axis a, t = (plane - s_a) / (e_a - s_a), so that it
+depends on s and e along that axis alone:
+
+    dt / ds_a = (t - 1) / (e_a - s_a),    dt / de_a = -t / (e_a - s_a).
+
+In p, t[k] has the factor L J with the jump J = mu before the plane - mu behind it (outside the box
+mu is 0). So two sums for each axis, of J and of J t, are all that a walk along the ray has to
+gather. Where a ray runs through an edge of the grid, or within one of its planes, p has a kink and
+no derivative; the walk then gives that of one side.
 """
 
 from __future__ import annotations
@@ -165,3 +179,198 @@ def spread_rays(box, views, chosen, values, slices, marks):
                 for r in range(rows):
                     if values[view, r, c] != np.float32(0):
                         walk_ray(piece, g, r, c, values[view, r, c], True)
+
+
+@inline
+def faces(s, d, n):
+    """t at which the ray s + t d comes into [0, n] and leaves it; never, if d is 0."""
+    if d > 0.0:
+        return -s / d, (n - s) / d
+    if d < 0.0:
+        return (n - s) / d, -s / d
+    return -math.inf, math.inf
+
+
+@kernel
+def walk_jumps(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz):
+    """Walks like `walk_ray` and gathers what the derivatives need.
+
+    Returns:
+        sum of values times ray parameter; then sum of J and sum of J t over the planes across x,
+        y and z.
+    """
+    jx = jy = jz = mx = my = mz = total = 0.0
+    enter, leave = clip_to_box(nx, ny, nz, sx, sy, sz, dx, dy, dz)
+    if leave <= enter:
+        return total, jx, mx, jy, my, jz, mz
+    ix, left_x, next_x, every_x, hop_x = first_step(sx, dx, nx, enter, step_x)
+    iy, left_y, next_y, every_y, hop_y = first_step(sy, dy, ny, enter, step_y)
+    iz, left_z, next_z, every_z, hop_z = first_step(sz, dz, nz, enter, 1)
+    # p runs through memory with the ray; `value` is that of the voxel it is in.
+    p = base + ix * step_x + iy * step_y + iz
+    value = np.float64(flat[p])
+    near_x, far_x = faces(sx, dx, nx)
+    near_y, far_y = faces(sy, dy, ny)
+    near_z, far_z = faces(sz, dz, nz)
+    # Into the box through the face that is reached last: a jump from 0. A ray that begins inside
+    # (enter = 0, whatever the geometry) meets no face there.
+    if enter > 0.0:
+        if near_x >= near_y and near_x >= near_z:
+            jx, mx = -value, -value * enter
+        elif near_y >= near_z:
+            jy, my = -value, -value * enter
+        else:
+            jz, mz = -value, -value * enter
+    t = enter
+    while True:
+        # The nearest of the three next planes ends the piece in this voxel. Its axis gets the jump;
+        # at an edge, where two are equally near, the first one does (see above: a kink).
+        upto = min(next_x, min(next_y, next_z))
+        if upto >= leave:
+            break
+        total += (upto - t) * value
+        t = upto
+        if next_x == upto:
+            left_x -= 1
+            if left_x == 0:
+                break
+            next_x += every_x
+            p += hop_x
+            jump = value - flat[p]
+            jx += jump
+            mx += jump * t
+        elif next_y == upto:
+            left_y -= 1
+            if left_y == 0:
+                break
+            next_y += every_y
+            p += hop_y
+            jump = value - flat[p]
+            jy += jump
+            my += jump * t
+        else:
+            left_z -= 1
+            if left_z == 0:
+                break
+            next_z += every_z
+            p += hop_z
+            jump = value - flat[p]
+            jz += jump
+            mz += jump * t
+        value -= jump  # jump = before - behind, so that this is the voxel behind the plane
+    total += (leave - t) * value
+    # Out through the face that is reached first, a jump to 0; none if the ray ends inside.
+    if leave < 1.0:
+        if far_x <= far_y and far_x <= far_z:
+            jx += value
+            mx += value * leave
+        elif far_y <= far_z:
+            jy += value
+            my += value * leave
+        else:
+            jz += value
+            mz += value * leave
+    return total, jx, mx, jy, my, jz, mz
+
+
+@inline
+def ends(total, length, d, jumps, moments):
+    """Derivatives of the line integral with respect to one coordinate of source and of pixel.
+
+    total: sum of values times ray parameter, so that the integral is total * length; d: what the
+    ray covers along this axis [mm]; jumps, moments: sums of J and of J t over its planes.
+    """
+    stretch = total * d / length  # the ray grows longer
+    if d == 0.0:
+        return -stretch, stretch
+    return length * (moments - jumps) / d - stretch, stretch - length * moments / d
+
+
+@kernel
+def ray_derivatives(box, g, r, c):
+    """Derivatives [1/mm] of the integral of the ray to pixel (r, c) with respect to the source
+    (x, y, z) and to the pixel's centre (x, y, z).
+    """
+    dx, dy, dz, length = ray_of(box, g, r, c)
+    total, jx, mx, jy, my, jz, mz = walk_jumps(
+        box.flat, box.base, box.hop_x, box.hop_y, box.nx, box.ny, box.nz,
+        g[0], g[1], g[2], dx, dy, dz,
+    )  # fmt: skip
+    sx, ex = ends(total, length, dx * box.size_x, jx, mx)
+    sy, ey = ends(total, length, dy * box.size_y, jy, my)
+    sz, ez = ends(total, length, dz * box.size_z, jz, mz)
+    return sx, sy, sz, ex, ey, ez
+
+
+@parallel
+def gather(box, views, weights, tile, parts):
+    """Sum over the pixels of weight times derivative, with respect to the twelve numbers of a view.
+
+    A pixel's centre is D + (c - (cols - 1) / 2) u + (r - (rows - 1) / 2) v, so that what it gets
+    goes to D, u and v with these factors. Each job, `tile` columns of one view, adds into a row of
+    its own of parts (n * tiles, 12): no two write to the same place, and the sums do not depend on
+    the number of threads.
+
+    Args:
+        box: the volume.
+        views: (n, 12) source, first pixel minus source, u, v in voxel units of the box.
+        weights: float32 (n, rows, cols).
+        tile: columns a job.
+        parts: float64 zeros; row view * tiles + k belongs to the k-th tile of a view.
+    """
+    _, rows, cols = weights.shape
+    tiles = (cols + tile - 1) // tile
+    for job in prange(len(parts)):
+        view = job // tiles
+        first = job % tiles * tile
+        part = parts[job]
+        for c in range(first, min(cols, first + tile)):
+            across = c - (cols - 1) / 2
+            # Sums of one column: of a source's derivatives, of a pixel's, and of these times the
+            # row, which is what v gets. `across` is the same all along, so that u needs no sums.
+            s0 = s1 = s2 = e0 = e1 = e2 = d0 = d1 = d2 = 0.0
+            for r in range(rows):
+                w = np.float64(weights[view, r, c])
+                if w != 0.0:
+                    down = r - (rows - 1) / 2
+                    sx, sy, sz, ex, ey, ez = ray_derivatives(box, views[view], r, c)
+                    s0, s1, s2 = s0 + w * sx, s1 + w * sy, s2 + w * sz
+                    e0, e1, e2 = e0 + w * ex, e1 + w * ey, e2 + w * ez
+                    d0, d1, d2 = d0 + w * down * ex, d1 + w * down * ey, d2 + w * down * ez
+            part[0] += s0
+            part[1] += s1
+            part[2] += s2
+            part[3] += e0
+            part[4] += e1
+            part[5] += e2
+            part[6] += across * e0
+            part[7] += across * e1
+            part[8] += across * e2
+            part[9] += d0
+            part[10] += d1
+            part[11] += d2
+
+
+@parallel
+def follow(box, views, change, tile, out):
+    """The transpose of `gather`: what a change (n, 12) [mm] of the views does to each pixel.
+
+    Fills out (n, rows, cols); each job, `tile` columns of one view, has pixels of its own.
+    """
+    n, rows, cols = out.shape
+    tiles = (cols + tile - 1) // tile
+    for job in prange(n * tiles):
+        view = job // tiles
+        first = job % tiles * tile
+        m = change[view]
+        for c in range(first, min(cols, first + tile)):
+            across = c - (cols - 1) / 2
+            for r in range(rows):
+                down = r - (rows - 1) / 2
+                sx, sy, sz, ex, ey, ez = ray_derivatives(box, views[view], r, c)
+                out[view, r, c] = np.float32(
+                    sx * m[0] + sy * m[1] + sz * m[2]
+                    + ex * (m[3] + across * m[6] + down * m[9])
+                    + ey * (m[4] + across * m[7] + down * m[10])
+                    + ez * (m[5] + across * m[8] + down * m[11])
+                )  # fmt: skip

@@ -12,13 +12,13 @@ import numpy.typing as npt
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import Grid, Volume
-from flexdt.twin.projection.accuracy import Accuracy
 from flexdt.twin.projection.operators import (
     as_cone_vec,
     check_projections,
     require_finite,
     require_line_integrals,
 )
+from flexdt.twin.projection.volume import Accuracy
 from flexdt.twin.reconstruction.bias_bound import Bias, bias_of
 from flexdt.twin.reconstruction.coverage import layer_warnings, lost_layers
 from flexdt.twin.reconstruction.fdk import CHUNK, PIXELS, Progress, fdk_parts

@@ -18,9 +18,8 @@ import torch
 from flexdt.twin.errors import GeometryError, NotBuiltError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import gpu
-from flexdt.twin.projection.arrays import check_host
-from flexdt.twin.projection.geometry_gradient import geometry_gradient
-from flexdt.twin.projection.operators import Shape2, back, forward
+from flexdt.twin.projection.linear_operator import check_host
+from flexdt.twin.projection.operators import Shape2, back, forward, geometry_gradient
 from flexdt.twin.projection.volume import DeviceVolume, Volume
 
 

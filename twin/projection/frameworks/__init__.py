@@ -1,1 +1,0 @@
-"""Projector and adjoint as operators of other libraries, one module for each library."""
