@@ -40,7 +40,7 @@ if _typing.TYPE_CHECKING:
     from flexdt.twin.projection.operators import forward as forward
     from flexdt.twin.projection.volume import Grid as Grid
     from flexdt.twin.projection.volume import Volume as Volume
-    from flexdt.twin.reconstruction.bias_bound.checked_fdk import fdk as fdk
+    from flexdt.twin.reconstruction.checked_fdk import fdk as fdk
     from flexdt.twin.reconstruction.iterative import cgls as cgls
     from flexdt.twin.reconstruction.iterative import sirt as sirt
     from flexdt.twin.reconstruction.tv import tv as tv
@@ -77,7 +77,7 @@ _HOMES: _typing.Final = {
     "calibrate": "flexdt.analysis",
     "cgls": "flexdt.twin.reconstruction.iterative",
     "expose": "flexdt.clients.expose",
-    "fdk": "flexdt.twin.reconstruction.bias_bound.checked_fdk",
+    "fdk": "flexdt.twin.reconstruction.checked_fdk",
     "forward": "flexdt.twin.projection.operators",
     "machine": "flexdt.checked_machine",
     "open": "flexdt.clients.datasets.dataset:load_dataset",

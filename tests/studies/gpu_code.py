@@ -116,8 +116,7 @@ def all_kernels() -> dict[str, tuple[Any, tuple[Any, ...]]]:
     from numba import boolean, float32, float64, int64, types
 
     project = load_kernels("projection/kernels/gpu_kernels.py")
-    fdk = load_kernels("reconstruction/gpu_fdk_kernels.py")
-    tv = load_kernels("reconstruction/gpu_tv_kernels.py")
+    fdk = load_kernels("reconstruction/gpu_reconstruction_kernels.py")
     table, images, flat2 = float64[:, ::1], float32[:, :, ::1], float32[:, ::1]
     flat, counts, edges = float32[::1], types.UniTuple(int64, 3), types.UniTuple(float32, 3)
 
@@ -146,12 +145,12 @@ def all_kernels() -> dict[str, tuple[Any, tuple[Any, ...]]]:
             project.combine,
             (int64, float32[::1], float32[::1], float32, boolean, float32[::1]),
         ),
-        "lengths": (tv.lengths, (flat, counts, int64, edges, flat)),
+        "lengths": (fdk.lengths, (flat, counts, int64, edges, flat)),
         "primal_step": (
-            tv.primal_step,
+            fdk.primal_step,
             (flat, flat, float32, counts, int64, edges, float32, flat, flat),
         ),
-        "dual_step": (tv.dual_step, (flat, flat, flat, float32, float32, counts, int64, edges)),
+        "dual_step": (fdk.dual_step, (flat, flat, flat, float32, float32, counts, int64, edges)),
         "fold": (project.fold, (int64, float32[::1], float32[::1], float64[::1])),
     }
 

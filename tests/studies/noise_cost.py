@@ -16,7 +16,7 @@ import numpy as np
 
 import flexdt as fx
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.reconstruction.bias_bound.checked_fdk import Images, checked_fdk
+from flexdt.twin.reconstruction.checked_fdk import Images, checked_fdk
 
 CASES = (
     (360, (128, 128), 1.17, fx.Grid((96, 96, 96), 0.6)),

@@ -13,7 +13,7 @@ MODULES = (
     "flexdt.twin.projection.analytic",
     "flexdt.twin.projection.operators",
     "flexdt.twin.projection.volume",
-    "flexdt.twin.reconstruction.bias_bound.checked_fdk",
+    "flexdt.twin.reconstruction.checked_fdk",
     "flexdt.twin.reconstruction.iterative",
     "flexdt.twin.reconstruction.rectify",
 )

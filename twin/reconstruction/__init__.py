@@ -1,8 +1,8 @@
 """Volumes back from projections."""
 
 from flexdt.twin.projection.volume import Accuracy, Grid
-from flexdt.twin.reconstruction.bias_bound import Bias, bias_of
-from flexdt.twin.reconstruction.bias_bound.checked_fdk import (
+from flexdt.twin.reconstruction.bias import Bias, bias_of
+from flexdt.twin.reconstruction.checked_fdk import (
     Images,
     bias_warnings,
     checked_fdk,

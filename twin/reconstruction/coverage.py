@@ -1,19 +1,28 @@
-"""Which voxels the views of a circle cover, and what becomes of the others.
+"""Which voxels the views of a scan cover, what becomes of the others, and how views share voxels.
 
-A voxel near the upper or lower end of the field of view lies above or below the panel in the views
-whose source is near. The other views still see lines of every direction through it, so what they
-gave is scaled. A voxel of which the data say too little is NaN.
+A voxel near the upper or lower end of a circle's field of view lies above or below the panel in the
+views whose source is near. The other views still see lines of every direction through it, so what
+they gave is scaled. A voxel of which the data say too little is NaN.
+
+A voxel of a helix is seen from the same side once a turn, higher or lower on the panel. Each such
+view counts by its row, most in the middle of the panel and least at its upper and lower edge, and
+all together once: the aperture weights of weighted FDK (Stierstorfer et al., Phys. Med. Biol. 49
+(2004) 2209), for views a whole turn apart, so that no rays are resampled. Every voxel must be seen
+in every direction, which limits the rise in a turn.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
+from flexdt.twin.errors import GeometryError
+from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume
-from flexdt.twin.reconstruction.trajectory import Circle
+from flexdt.twin.reconstruction.trajectory import Circle, fan_angles, reach
 
 LEAST_SEEN: Final = 0.4
 """Part of the weight of all views that must see a voxel. At the panel's upper and lower edge it is
@@ -91,3 +100,89 @@ def layer_warnings(lost: int, layers: int) -> list[str]:
         f"{lost} of {layers} layers of the grid lie outside what the panel sees; their voxels are "
         "NaN"
     ]
+
+
+DEPTHS = 64
+"""Depths at which shares are tabulated."""
+ENDS = 0.2
+"""Angle over which views count less and less towards the ends of the helix [rad]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sharing:
+    """Shares of the views of a helix in the voxels that they see.
+
+    Attributes:
+        circle: the helix.
+        rows: of the panel.
+        scale: (n,) distance from source to panel in pitches of rows.
+        depth: (n, 2) least and largest of the grid's voxels, along the panel's normal [mm].
+        whole: lowest and highest layer whose voxels are seen from every side [mm].
+    """
+
+    circle: Circle
+    rows: int
+    scale: FloatArray
+    depth: FloatArray
+    whole: tuple[float, float]
+
+    @classmethod
+    def of(cls, circle: Circle, cone_vec: ConeVec, shape: tuple[int, int], like: Volume) -> Sharing:
+        """Of upright panels of `shape` (rows, cols), for a grid.
+
+        Raises:
+            GeometryError: some voxel is not seen from every side.
+        """
+        rows, cols = shape
+        away = cone_vec.normal * np.sign(cone_vec.source_detector_distance)[:, None]
+        distance = np.abs(cone_vec.source_detector_distance)
+        scale = distance / np.linalg.norm(cone_vec.v, axis=1)
+        half = np.array(like.size_mm[:2]) / 2
+        corner = np.hypot(*(np.abs(np.array(like.center_mm[:2]) - circle.centre) + half))
+        seen = circle.radius * np.sin(max(reach(fan_angles(circle, cone_vec, cols))))
+        wide = min(float(corner), float(seen))
+        axis = ((circle.centre - cone_vec.source[:, :2]) * away[:, :2]).sum(axis=1)
+        # The voxels nearest to the source move farthest on the panel.
+        most = float(((rows - 1) * (axis - wide) / scale).min())
+        if circle.rise > most:
+            raise GeometryError(
+                f"the helix rises by {circle.rise:.4g} mm a turn; FDK needs every voxel in "
+                f"every direction: at most {most:.4g} mm a turn for this panel and a grid as wide "
+                "as this; the iterative methods (sirt, sart, cgls, em) take any trajectory",
+                {"asked": circle.rise, "allowed": most},
+            )
+        # Of a direction just missed at an end, the first view is a whole rise further on.
+        lack = circle.rise - 0.5 * most
+        panel = cone_vec.detector[:, 2] - cone_vec.source[:, 2]
+        middle = cone_vec.source[:, 2] + panel * axis / distance
+        whole = float(middle.min()) + lack, float(middle.max()) - lack
+        return cls(circle, rows, scale, axis[:, None] + wide * np.array([-1.0, 1.0]), whole)
+
+    def columns(self) -> FloatArray:
+        """What the kernel needs to look a depth up, (n, 2): the first, and how many a mm."""
+        first, last = self.depth.T
+        return np.column_stack([first, (DEPTHS - 1) / (last - first)])
+
+    def table(self, views: slice, rows: tuple[int, int]) -> Float32Array:
+        """Shares of rows first <= r < last at each depth, (n, DEPTHS, rows)."""
+        first, last = self.depth[views].T[..., None]
+        depth = first + (last - first) * np.linspace(0.0, 1.0, DEPTHS)
+        turn = self.circle.rise * self.scale[views, None] / depth  # rows that a voxel sinks
+        span = float(self.circle.step.sum())
+        since = (self.circle.angle + 0.5 * self.circle.step)[views]
+        until = span - since
+        inside = np.arange(*rows).clip(0, self.rows - 1)  # rows off the panel repeat its edge
+        row = (inside - (self.rows - 1) / 2).astype(np.float32)
+        most = int(min(span / (2 * np.pi), self.rows / np.abs(turn).min())) + 1
+        own = total = np.zeros((len(since), DEPTHS, len(row)), np.float32)
+        for k in range(-most, most + 1):
+            end = np.minimum(since + 2 * np.pi * k, until - 2 * np.pi * k)
+            if (end <= 0.0).all():
+                continue
+            off = np.abs(row + (k * turn)[..., None].astype(np.float32)) / np.float32(self.rows / 2)
+            part = np.maximum(np.float32(1.0) - off, 0)
+            part *= part * (3 - 2 * part)
+            part *= np.clip(end / ENDS, 0.0, 1.0)[:, None, None].astype(np.float32)
+            total = total + part
+            own = part if k == 0 else own
+        return np.asarray(own / total)

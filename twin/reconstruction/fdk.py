@@ -27,8 +27,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Grid, Volume, as_volume, gpu
 from flexdt.twin.projection.cpu import threads
-from flexdt.twin.reconstruction.coverage import first_and_steps, normalise_coverage
-from flexdt.twin.reconstruction.helix import Sharing
+from flexdt.twin.reconstruction.coverage import Sharing, first_and_steps, normalise_coverage
 from flexdt.twin.reconstruction.noise import NoiseMeter, with_errors
 from flexdt.twin.reconstruction.rectify import (
     FINER,
@@ -211,7 +210,7 @@ class OnDevice:
         """Weigh, filter and add images that are on a device."""
         from numba import cuda
 
-        from flexdt.twin.reconstruction import gpu_fdk_kernels as kernels
+        from flexdt.twin.reconstruction import gpu_reconstruction_kernels as kernels
 
         n, wide, cols, rows = views.sizes
         (ny, nx, _), nz, stream = self._shape, part.high - part.low, part.stream

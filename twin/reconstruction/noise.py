@@ -21,7 +21,7 @@ from flexdt.twin.projection.volume import Volume
 from flexdt.twin.reconstruction.trajectory import Circle
 
 if TYPE_CHECKING:
-    from flexdt.twin.reconstruction.bias_bound import Bias
+    from flexdt.twin.reconstruction.bias import Bias
     from flexdt.twin.reconstruction.fdk import Views
 
 NODES: Final = 32

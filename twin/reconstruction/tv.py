@@ -380,9 +380,9 @@ class DeviceRegular:
 
     def _run(self, name: str, *arguments: Any) -> None:
         def launch() -> None:
-            from flexdt.twin.reconstruction import gpu_tv_kernels
+            from flexdt.twin.reconstruction import gpu_reconstruction_kernels as kernels
 
             blocks = -(-self.allowed.flat.size // gpu.LINEAR)
-            getattr(gpu_tv_kernels, name)[blocks, gpu.LINEAR](*arguments)
+            getattr(kernels, name)[blocks, gpu.LINEAR](*arguments)
 
         gpu.demand(launch)

@@ -340,7 +340,7 @@ from numba import cuda
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Volume, back, forward, gpu, room_like
 from flexdt.twin.projection.kernels import gpu_kernels
-from flexdt.twin.reconstruction import Grid, fdk, gpu_fdk_kernels
+from flexdt.twin.reconstruction import Grid, fdk, gpu_reconstruction_kernels
 from tests.twin.reconstruction.scans import ball, circle
 
 said = []
@@ -349,7 +349,7 @@ class Keep(logging.Handler):
         said.append(record.getMessage())
 logging.getLogger("flexdt").addHandler(Keep())
 gpu.VIEWS_A_THREAD = 0.0
-gpu_kernels.BLOCK = gpu_fdk_kernels.BLOCK = (4, 2)
+gpu_kernels.BLOCK = gpu_reconstruction_kernels.BLOCK = (4, 2)
 
 def again(present):
     said.clear(); gpu._failed.clear(); gpu._probed.cache_clear()
@@ -372,7 +372,7 @@ volume = Volume(np.random.default_rng(0).random((2, 3, 4), dtype=np.float32), 4.
 shape = (2, 4)
 NAMES = ("project_slabs", "spread_slabs", "project_rays", "spread_rays")
 right = {name: getattr(gpu_kernels, name) for name in NAMES}
-right_fdk = gpu_fdk_kernels.backproject
+right_fdk = gpu_reconstruction_kernels.backproject
 
 def put(change=lambda kernel: kernel):
     for name in NAMES:
@@ -411,13 +411,13 @@ assert "instead of" in gpu.availability().reason
 for number in (5, 7):
     for place in ("projection", "reconstruction"):
         put()
-        gpu_fdk_kernels.backproject = right_fdk
+        gpu_reconstruction_kernels.backproject = right_fdk
         again(True)
         if place == "projection":
             put(failing(number - 4, RuntimeError("device lost")))
         else:
             broken = failing(number - 4, RuntimeError("device lost"))
-            gpu_fdk_kernels.backproject = broken(right_fdk)
+            gpu_reconstruction_kernels.backproject = broken(right_fdk)
         found = everything()
         for a, b in zip(found, exact, strict=True):
             worst = np.abs(a - b).max() / np.abs(b).max()
@@ -429,7 +429,7 @@ for number in (5, 7):
             assert all(np.array_equal(a, b) for a, b in zip(everything(), exact, strict=True))
 
 # Without memory for one call, the device may have it for the next.
-gpu_fdk_kernels.backproject = right_fdk
+gpu_reconstruction_kernels.backproject = right_fdk
 put()
 again(True)
 full = RuntimeError("[2] Call to cuMemAlloc results in CUDA_ERROR_OUT_OF_MEMORY")
@@ -453,7 +453,7 @@ from numba.cuda.simulator.kernel import FakeCUDAKernel
 from flexdt.twin.errors import TwinError
 from flexdt.twin.projection import Volume, back, forward, gpu
 from flexdt.twin.projection.kernels import gpu_kernels
-from flexdt.twin.reconstruction import Grid, cgls, fdk, gpu_fdk_kernels
+from flexdt.twin.reconstruction import Grid, cgls, fdk, gpu_reconstruction_kernels
 from tests.twin.projection.conftest import _circle
 
 said = []
@@ -462,7 +462,7 @@ class Keep(logging.Handler):
         said.append(record.getMessage())
 logging.getLogger("flexdt").addHandler(Keep())
 gpu.VIEWS_A_THREAD, gpu.LINEAR = 0.0, 16
-gpu_kernels.BLOCK = gpu_fdk_kernels.BLOCK = gpu_fdk_kernels.PLANE = (4, 2)
+gpu_kernels.BLOCK = gpu_reconstruction_kernels.BLOCK = gpu_reconstruction_kernels.PLANE = (4, 2)
 gpu_kernels.FOLDING = (1, 4)
 scan, shape = _circle(3, 60.0, 100.0, 1.2, start=0.3), (3, 4)
 data = np.random.default_rng(0).random((2, 3, 4), dtype=np.float32)

@@ -67,11 +67,11 @@ for case in range(4):
 TWO_DEVICES = """
 import numpy as np
 from flexdt.twin.projection import gpu
-from flexdt.twin.reconstruction import Grid, fdk, gpu_fdk_kernels
+from flexdt.twin.reconstruction import Grid, fdk, gpu_reconstruction_kernels
 from tests.support.device_simulator import two_devices
 from tests.twin.reconstruction.scans import ball, circle
 
-gpu_fdk_kernels.BLOCK = gpu_fdk_kernels.PLANE = (4, 2)
+gpu_reconstruction_kernels.BLOCK = gpu_reconstruction_kernels.PLANE = (4, 2)
 assert gpu.availability().present
 launches, gpu.LINEAR, gpu.VIEWS_A_DEVICE, shape = two_devices(), 16, 2, (9, 11)
 scan, like = circle(5, 360.0, pixel=6.0, aside=10.0), Grid((7, 2, 3), 2.0, (0.4, -0.3, 0.7))

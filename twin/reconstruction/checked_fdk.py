@@ -19,7 +19,7 @@ from flexdt.twin.projection.operators import (
     require_line_integrals,
 )
 from flexdt.twin.projection.volume import Accuracy
-from flexdt.twin.reconstruction.bias_bound import Bias, bias_of
+from flexdt.twin.reconstruction.bias import Bias, bias_of
 from flexdt.twin.reconstruction.coverage import layer_warnings, lost_layers
 from flexdt.twin.reconstruction.fdk import CHUNK, PIXELS, Progress, fdk_parts
 from flexdt.twin.reconstruction.noise import with_errors

@@ -24,7 +24,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.projection.volume import Accuracy
-from flexdt.twin.reconstruction.bias_bound.coarse_scan import CoarseScan
+from flexdt.twin.reconstruction.coarse_scan import CoarseScan
 from flexdt.twin.reconstruction.noise import interpolated
 from flexdt.twin.reconstruction.truncation import Truncation
 
