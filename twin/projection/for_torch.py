@@ -18,7 +18,6 @@ import torch
 from flexdt.twin.errors import GeometryError, NotBuiltError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import gpu
-from flexdt.twin.projection.linear_operator import check_host
 from flexdt.twin.projection.operators import Shape2, back, forward, geometry_gradient
 from flexdt.twin.projection.volume import DeviceVolume, Volume
 
@@ -143,7 +142,7 @@ def _tensor(values: Any) -> Any:
         values = values if values.flags.writeable else values.copy()  # no tensor is read-only
     tensor = values if isinstance(values, torch.Tensor) else torch.from_dlpack(values)
     usable = _is_there(tensor) and gpu.availability().present
-    check_host(usable or tensor.device.type == "cpu", f"the tensor on {tensor.device}")
+    gpu.check_host(usable or tensor.device.type == "cpu", f"the tensor on {tensor.device}")
     return tensor
 
 

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.errors import GeometryError, TwinError
+from flexdt.twin.errors import GeometryError, NotBuiltError, TwinError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.fan_plan import exchanged, lying
 from flexdt.twin.projection.kernels.fan_types import Box
@@ -231,6 +231,15 @@ def zeros(count: int, kind: Any = np.float32) -> Any:
 def is_there(x: object) -> bool:
     """Whether an array is on a CUDA device, of whatever library."""
     return hasattr(x, "copy_to_host") or hasattr(x, "__cuda_array_interface__")
+
+
+def check_host(there: bool, what: str) -> None:
+    """Raise NotBuiltError unless an array is in the processor's memory."""
+    if not there:
+        raise NotBuiltError(
+            f"{what} is in the memory of a device; allowed: arrays in the processor's memory",
+            {"asked": "device", "allowed": "cpu"},
+        )
 
 
 def taken(x: Any) -> Any:

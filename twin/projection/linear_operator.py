@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.errors import GeometryError, LimitError, NotBuiltError, TwinError
+from flexdt.twin.errors import GeometryError, LimitError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import gpu
@@ -58,19 +58,10 @@ def on_host(
     def wrapped(x: Any) -> Any:
         if isinstance(x, np.ndarray) or not hasattr(x, "__dlpack__"):
             return function(np.asarray(x))
-        check_host(x.__dlpack_device__()[0] == HOST, type(x).__name__)
+        gpu.check_host(x.__dlpack_device__()[0] == HOST, type(x).__name__)
         return _library(x).from_dlpack(function(np.from_dlpack(x)))
 
     return wrapped
-
-
-def check_host(there: bool, what: str) -> None:
-    """Raise NotBuiltError unless the array is in the processor's memory."""
-    if not there:
-        raise NotBuiltError(
-            f"{what} is in the memory of a device; allowed: arrays in the processor's memory",
-            {"asked": "device", "allowed": "cpu"},
-        )
 
 
 def _library(x: Any) -> Any:
