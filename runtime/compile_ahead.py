@@ -43,11 +43,11 @@ def _fit() -> None:
     radii.flags.writeable = False  # as a phantom's
     data = fit_kernels.Data(
         np.zeros((0, 18)), ints[:0], 1.0, radii, views, np.zeros((0, 1, 2)), np.zeros((0, 1, 3)),
-        ints, sets.astype(np.int64), -1,
+        ints, sets.astype(np.int64), -1, np.zeros((0, 1, 2, 0)),
     )  # fmt: skip
     fit_kernels.evaluate(
-        data, sets, np.zeros((1, 3)), np.zeros((0, 1), np.bool_), math.inf, 0, np.zeros((0, 1, 2)),
-        views, views, np.zeros((1, 1)), floats,
+        data, sets, np.zeros((1, 3)), floats[:0], np.zeros((0, 1), np.bool_), math.inf, 0,
+        np.zeros((0, 1, 2)), views, views, np.zeros((1, 1)), floats,
     )  # fmt: skip
 
 

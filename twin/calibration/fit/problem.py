@@ -239,7 +239,7 @@ class FitProblem:
         return kernels.Data(
             self.geometry, self.group, self.reading.pivot, self.model.bead_radius_mm, self.bias,
             self.measured, self.whiten, self.layout.active, self.layout.colmap,
-            self.layout.bead_column,
+            self.layout.bead_column, self.panel_terms,
         )  # fmt: skip
 
     def spread(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -256,10 +256,6 @@ class FitProblem:
             return np.zeros((*self.measured.shape, 0))
         return self.panel.terms(self.measured + self.origin[:, None, :])
 
-    def distortion(self, x: FloatArray) -> FloatArray:
-        """By how much the panel shifts each position (n, k, 2) [px]."""
-        return np.asarray(self.panel_terms @ np.asarray(x)[self.layout.panel_column :])
-
     def parameters(self, x: FloatArray) -> tuple[Offsets, ...]:
         """The geometry of each group for column values `x`, in the reading corrections use."""
         params, _ = self.spread(x)
@@ -273,7 +269,7 @@ class FitProblem:
         Lengths are -1 where a position is not used.
         """
         predicted, norms, _ = self._evaluate(x, self.seen if use is None else use, 0)
-        return predicted + self.distortion(x) + self.origin[:, None, :], norms
+        return predicted + self.origin[:, None, :], norms
 
     def whitened(self, x: FloatArray) -> FloatArray:
         """Whitened residuals (n, k, 2), measured minus predicted, in the order of `jacobian`."""
@@ -301,8 +297,9 @@ class FitProblem:
     ) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """The cost of column values, and what `fit_kernels.evaluate` writes: predicted, norms, jac,
         hess, grad; arguments as there."""
-        params, beads = self.spread(np.asarray(x, dtype=np.float64))
-        size = len(self.layout.names)
+        x = np.asarray(x, dtype=np.float64)
+        params, beads = self.spread(x)
+        size = len(x)
         written = (
             np.zeros((*use.shape, 2)),
             np.zeros(use.shape),
@@ -310,44 +307,9 @@ class FitProblem:
             np.zeros((size, size)),
             np.zeros(size),
         )
-        if self.panel is None:
-            cost = kernels.evaluate(self.data, params, beads, use, huber, want, *written)
-            return float(cost), *written
-        return self._evaluate_with_panel(x, params, beads, use, want, huber, written)
-
-    def _evaluate_with_panel(
-        self,
-        x: FloatArray,
-        params: FloatArray,
-        beads: FloatArray,
-        use: npt.NDArray[np.bool_],
-        want: int,
-        huber: float,
-        written: tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray],
-    ) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """`evaluate` of the positions that a panel without distortion would have."""
-        predicted, norms, jac, hess, grad = written
-        if want:
-            jac = np.zeros((2 * use.size, len(x)))
-        data = self.data._replace(measured=self.measured - self.distortion(x))
-        rows = kernels.evaluate(
-            data, params, beads, use, huber, 2 * min(want, 1), predicted, norms, jac, hess, grad
-        )
-        if want:
-            w, terms = self.whiten, np.where(use[..., None, None], self.panel_terms, 0.0)
-            across = w[..., :1] * terms[..., 0, :] + w[..., 1:2] * terms[..., 1, :]
-            jac[:, self.layout.panel_column :] = np.stack(
-                [across, w[..., 2:] * terms[..., 1, :]], axis=2
-            ).reshape(len(jac), -1)
-        if want == 1:
-            off = predicted + self.distortion(x) - self.measured
-            left = np.stack([w[..., 0] * off[..., 0] + w[..., 1] * off[..., 1],
-                             w[..., 2] * off[..., 1]], axis=-1)  # fmt: skip
-            weight = np.where(norms > huber, huber / np.maximum(norms, 1e-300), 1.0)
-            weighed = jac * np.repeat(weight.ravel(), 2)[:, None]
-            grad[:] = weighed.T @ np.where(use[..., None], left, 0.0).ravel()
-            hess[:] = np.triu(weighed.T @ jac)
-        return float(rows), predicted, norms, jac, hess, grad
+        panel = np.array(x[self.layout.panel_column :])
+        cost = kernels.evaluate(self.data, params, beads, panel, use, huber, want, *written)
+        return float(cost), *written
 
     @property
     def pixels(self) -> FloatArray:
