@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from flexdt.twin.calibration.fit.image_quantities import axis_in_image
+from flexdt.twin.calibration.fit.fit import axis_in_image
 from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.without_phantom.align import Alignment
 from flexdt.twin.dataset import rebuild, scan_settings

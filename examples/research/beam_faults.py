@@ -28,7 +28,7 @@ import prior_coverage as own
 from scipy import ndimage
 
 from flexdt.twin.calibration.bead_model import BeadModel
-from flexdt.twin.calibration.fit.image_quantities import image_quantities
+from flexdt.twin.calibration.fit.fit import image_quantities
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
 from flexdt.twin.errors import TwinError

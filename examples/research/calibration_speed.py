@@ -18,7 +18,7 @@ from pathlib import Path
 
 from flexdt.clients.calibration.calibrate import DatasetFrames, calibrate_datasets, find_phantom
 from flexdt.clients.datasets.dataset import load_dataset
-from flexdt.twin.calibration.fit.solver import solve
+from flexdt.twin.calibration.fit.fit import solve
 from flexdt.twin.calibration.pipeline import Scan, calibrate
 from flexdt.twin.errors import TwinError
 

@@ -24,8 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.diagnose.fixed_parameters import doubtful, judge_priors, loosened
-from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
-from flexdt.twin.calibration.fit.image_quantities import image_quantities
+from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry, image_quantities
 from flexdt.twin.calibration.fit.priors import ASSUMED, exact
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate

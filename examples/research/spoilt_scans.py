@@ -15,7 +15,7 @@ import numpy as np
 from ways_of_spoiling import FRAMES, KINDS, Rng, Spoilt
 
 from flexdt.twin.calibration.bead_model import BeadModel
-from flexdt.twin.calibration.fit.image_quantities import axis_in_image, image_quantities
+from flexdt.twin.calibration.fit.fit import axis_in_image, image_quantities
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import Calibration, Scan, calibrate
 from flexdt.twin.geometry.offsets import Offsets

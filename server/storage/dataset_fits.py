@@ -29,7 +29,7 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
         TwinError: there is no such data set or phantom, or nothing can be fitted.
     """
     # Here: the server's own process fits nothing, and these load what fits.
-    from flexdt.twin.calibration.fit.covariance_steps import covariance_by_step
+    from flexdt.twin.calibration.fit.fit import covariance_by_step
     from flexdt.twin.calibration.unknown_markers import UNKNOWN
 
     phantom: Any = asked.phantom
@@ -59,7 +59,9 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
             for n, matrix in covariance_by_step(fitted, asked.steps)
         ]
     if asked.tracks:
-        told["tracks"] = import_module("flexdt.clients.calibration.compare").tracks_document(found)
+        told["tracks"] = import_module(
+            "flexdt.clients.calibration.calibration_report"
+        ).tracks_document(found)
     return p.CalibrationFitResult.model_validate(from_root(told, root.path))
 
 

@@ -19,8 +19,12 @@ from flexdt.clients.calibration.calibrate import (
     find_phantom,
     inside_95,
 )
-from flexdt.clients.calibration.calibration_report import write_report
-from flexdt.clients.calibration.compare import compare_folder, write_comparison, write_tracks
+from flexdt.clients.calibration.calibration_report import (
+    compare_folder,
+    write_comparison,
+    write_report,
+    write_tracks,
+)
 from flexdt.clients.cli.command_tree import run
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.phantoms import load_phantom

@@ -10,7 +10,7 @@ import pytest
 from typer.main import get_command
 
 import flexdt as fx
-from flexdt.clients.calibration.verdict import NEXT, digits, ranges, rounded_up
+from flexdt.clients.calibration.calibrate import NEXT, digits, ranges, rounded_up
 from flexdt.clients.cli.command_tree import build
 from flexdt.clients.cli.commands.calibrate_commands import show
 

@@ -19,7 +19,7 @@ from flexdt.phantoms import load_phantom
 from flexdt.protocol import Codec, RpcError
 from flexdt.protocol.methods.calibration_messages import CalibrationFit
 from flexdt.server.storage.past_scans import PastScans
-from flexdt.twin.calibration.fit.covariance_steps import covariance_by_step
+from flexdt.twin.calibration.fit.fit import covariance_by_step
 from flexdt.twin.machine.description import profile_of
 
 pytestmark = pytest.mark.slow

@@ -4,7 +4,9 @@ from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_mode
 from flexdt.twin.calibration.detect.detection import Detections, SpotFinder, detect_beads
 from flexdt.twin.calibration.fit.certificate import Certificate, Estimate
 from flexdt.twin.calibration.fit.fit import (
+    LEAST_SQUARES,
     FitResult,
+    Solver,
     estimate_geometry,
     fit_geometry,
     require_identifiable,
@@ -18,7 +20,6 @@ from flexdt.twin.calibration.fit.problem import (
     build_problem,
     edge_factor,
 )
-from flexdt.twin.calibration.fit.solver import LEAST_SQUARES, Solver
 from flexdt.twin.calibration.fit.weak_directions import Direction, tolerance_of
 from flexdt.twin.calibration.identify import Identification, Search, identify_beads, overlapping
 

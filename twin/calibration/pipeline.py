@@ -16,8 +16,8 @@ from functools import partial
 import numpy as np
 
 from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model, spot_radii
+from flexdt.twin.calibration.detect.background import Lag, lag_of, without_lag
 from flexdt.twin.calibration.detect.detection import SpotFinder
-from flexdt.twin.calibration.detect.lag import Lag, lag_of, without_lag
 from flexdt.twin.calibration.detect.refine import FEW_WINDOWS, Refined, contrast_of, measure_beads
 from flexdt.twin.calibration.detect.windows import mended, plan_windows
 from flexdt.twin.calibration.diagnose.data import (
@@ -50,7 +50,7 @@ from flexdt.twin.calibration.diagnose.fixed_parameters import (
 )
 from flexdt.twin.calibration.diagnose.moving import OF_MOTION
 from flexdt.twin.calibration.fit.certificate import widened
-from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry, with_start
+from flexdt.twin.calibration.fit.fit import FitResult, Solver, estimate_geometry, with_start
 from flexdt.twin.calibration.fit.fitted_motion import (
     MotionFit,
     aware,
@@ -66,7 +66,6 @@ from flexdt.twin.calibration.fit.problem import (
     require_tolerance,
     to_printed_reading,
 )
-from flexdt.twin.calibration.fit.solver import Solver
 from flexdt.twin.calibration.fit.weak_directions import BOUND
 from flexdt.twin.calibration.frame_source import (
     FrameSpots,

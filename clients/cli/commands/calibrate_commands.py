@@ -108,7 +108,7 @@ def calibrate(
     if report is not None:
         write_report(outcome, report)
     if tracks is not None:
-        from flexdt.clients.calibration.compare import write_tracks
+        from flexdt.clients.calibration.calibration_report import write_tracks
 
         write_tracks(outcome, tracks)
     yield document
@@ -263,7 +263,7 @@ def compare(
     The twin is posed from the data set's texts; residuals and difference images are given before
     and after the correction that calibration finds. Exit code 1 above the tolerance.
     """
-    from flexdt.clients.calibration.compare import compare_folder, write_comparison
+    from flexdt.clients.calibration.calibration_report import compare_folder, write_comparison
     from flexdt.clients.figures import require_plots
 
     if out is not None:
@@ -332,7 +332,7 @@ def show(document: Mapping[str, Any]) -> Iterator[str]:
         yield "(name): not asked for; of images: the part of sigma that is the images' noise"
     rms, seconds = _number(document["rms_px"], 4), _number(document["seconds"], 2)
     yield f"{seen}, {len(document['outliers'])} of these left out, rms {rms} px, {seconds} s"
-    from flexdt.clients.calibration.verdict import ranges
+    from flexdt.clients.calibration.calibrate import ranges
 
     frames: dict[int, list[int]] = {}
     for one in document["outliers"]:
@@ -387,7 +387,7 @@ def write_json(path: Path, document: Mapping[str, object]) -> None:
 
 def _rounded(estimate: Mapping[str, Any], *names: str) -> Iterator[str]:
     """Numbers of an estimate, to the digits that its sigma leaves."""
-    from flexdt.clients.calibration.verdict import digits
+    from flexdt.clients.calibration.calibrate import digits
 
     return (digits(estimate[name], estimate["sigma"]) for name in names)
 

@@ -12,7 +12,7 @@ from prior_coverage import NOISE_PX, PIXEL, SDD, SHAPE, SOD, drawn, pixels, scan
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration import estimate_geometry, identifiability
 from flexdt.twin.calibration.diagnose.fixed_parameters import judge_priors, loosened
-from flexdt.twin.calibration.fit.image_quantities import image_quantities
+from flexdt.twin.calibration.fit.fit import image_quantities
 from flexdt.twin.calibration.fit.priors import ASSUMED, exact, prior_widths
 from flexdt.twin.calibration.pipeline import CalibrationRequest
 from flexdt.twin.errors import TwinError, UnknownNameError

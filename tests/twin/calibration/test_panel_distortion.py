@@ -14,8 +14,8 @@ from prior_coverage import PIXEL, SDD, SHAPE, pixels, radiographs
 from flexdt.analysis import calibrate as calibrate_marks
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.detect.background import Lag
 from flexdt.twin.calibration.detect.detection import detect_beads
-from flexdt.twin.calibration.detect.lag import Lag
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
 from flexdt.twin.errors import TwinError

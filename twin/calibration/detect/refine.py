@@ -12,192 +12,145 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect import spot_kernels as kernels
-from flexdt.twin.calibration.detect.background import Background, evened, fading, survey
-from flexdt.twin.calibration.detect.detection import BLUR_PX, MISFIT, covariances_of
-from flexdt.twin.calibration.detect.patches import (
-    Patches,
-    centroids,
-    contrasts,
-    fits,
-    ring_noise,
-    take,
-    usable,
+from flexdt.twin.calibration.detect.background import (
+    NO_BODY,
+    Background,
+    SeenBody,
+    evened,
+    fading,
+    see_body,
+    survey,
 )
+from flexdt.twin.calibration.detect.detection import BLUR_PX, CAP, MISFIT, covariances_of
 from flexdt.twin.calibration.detect.windows import (
     Windows,
     blurred_windows,
     edged,
+    free_of_others,
     render_windows,
     without_beads,
 )
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
-from flexdt.twin.projection.analytic_solids import ConvexPolyhedron, Scene, Shape, Solid, Sphere
+from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 
-# The phantom's body as the images have it: how much it attenuates, and where it stands.
-#
-# A body is printed or glued together, and its description says neither its attenuation in this beam
-# nor to a hundredth of a millimetre where it stands round the beads. Both are estimated from the
-# surroundings of some beads, by least squares with rendered bodies, before the body is subtracted.
-
-SAMPLE = 24
-"""Windows that are looked at."""
-LEAST = 0.3
-"""Attenuation of a seen body over the described one below which the body is not this one: one that
-is absent, turned or elsewhere has 0.01 to 0.03, one of half the attenuation 0.5."""
-PRIOR_MM = 0.5
-"""How far a body may stand from its description; holds a direction that no edge shows."""
-FAR_MM = 2.0
-"""A body found further away than that is another body."""
-ROUNDS = 4
-STILL_MM = 0.01
-"""A step of the shift after which no further one is taken; what it leaves is of second order."""
+# Windows in the form that the compiled kernels take, and the kernels applied to all of them.
 
 
-@dataclass(frozen=True)
-class SeenBody:
-    """A body as the images have it.
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """Windows as the kernels want them, (m = n k, ...): what is expected where.
 
     Attributes:
-        factor: attenuation over the described one; 0 where the images do not show the body, nan
-            where none is described.
-        shift_mm: where it stands from where it is described, in the phantom's frame.
+        flat: (m, side, side) line integrals minus the body.
+        offsets: (m, 2) expected place in the window.
+        radii, stretch, peaks: (m,), (m, 3), (m,) expected spots.
+        windows: where they were cut.
+        entire: indices of whole, lone spots.
     """
 
-    factor: float
-    shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def scene(self, described: Scene) -> Scene:
-        """The body's solids as they are seen."""
-        return Scene(
-            tuple(
-                Solid(_shifted(s.shape, self.shift_mm), s.material, self.factor * s.mu_per_mm)
-                for s in described.solids
-            )
-        )
+    flat: Float32Array
+    offsets: FloatArray
+    radii: FloatArray
+    stretch: FloatArray
+    peaks: FloatArray
+    windows: Windows
+    entire: npt.NDArray[np.intp]
 
 
-NO_BODY = SeenBody(math.nan)
-"""None is described."""
+def centroids(
+    patches: Patches, index: npt.NDArray[np.intp], least: FloatArray | None = None
+) -> FloatArray:
+    """`measure` in some windows; zeros elsewhere. least: (m,) noise to weigh pixels for."""
+    results = np.zeros((len(patches.flat), kernels.RESULTS))
+    least = np.zeros(len(results)) if least is None else least
+    for i in index:
+        x, y = patches.offsets[i]
+        kernels.measure(patches.flat[i], x, y, patches.radii[i], CAP, least[i], results[i])
+    return results
 
 
-def see_body(
-    images: npt.NDArray[np.float32],
-    described: Scene,
-    cone: ConeVec,
-    model: BeadModel,
-    windows: Windows,
-    blur: float = 0.0,
-) -> SeenBody:
-    """Find the body in the rings round the beads.
+def fits(
+    patches: Patches,
+    index: npt.NDArray[np.intp],
+    blur: tuple[float, float],
+    free_radius: bool,
+    masks: npt.NDArray[np.uint8],
+) -> FloatArray:
+    """`fit_ball` in some windows; zeros elsewhere. blur: with the veil; masks: usable pixels of
+    those windows."""
+    results = np.zeros((len(patches.flat), kernels.RESULTS))
+    whole = patches.windows.whole.ravel()
+    for i, mask in zip(index, masks, strict=True):
+        kernels.fit_ball(
+            patches.flat[i], mask, *patches.offsets[i], patches.radii[i], patches.stretch[i],
+            patches.peaks[i], *blur, whole[i], free_radius, results[i],
+        )  # fmt: skip
+    return results
 
-    A body that is moved a little moves in each window as its bead would: the slope of the rendered
-    body along rows and columns, times that shift of the bead, is what the images have more.
 
-    Args:
-        images: (n, k, side, side) line integrals.
-        described: the body's solids.
-        cone: geometry of the n frames.
-        model: the k beads.
-        windows: where the images were cut out.
-        blur: of the images [px].
+def ring_noise(results: FloatArray, entire: npt.NDArray[np.intp]) -> float:
+    """Typical noise of the line integrals round whole spots; 0 without any."""
+    good = results[entire, kernels.OK] > 0
+    return float(np.median(results[entire[good], kernels.NOISE])) if good.any() else 0.0
+
+
+def take(
+    results: FloatArray,
+    fits: FloatArray,
+    fitted: npt.NDArray[np.intp],
+    whole: npt.NDArray[np.bool_],
+) -> npt.NDArray[np.intp]:
+    """Put fits into `results`: all of the partial spots', the good ones of the whole.
 
     Returns:
-        The body; the described one if no ring has anything of it.
+        Those that were put, in the order of `fitted`.
     """
-    frames, beads = np.nonzero(~windows.crowded)
-    some = np.linspace(0, len(frames) - 1, min(SAMPLE, len(frames))).astype(np.intp)
-    frames, beads = frames[some], beads[some]
-    if len(frames) == 0:
-        return SeenBody(1.0)
-    few, near = windows.pick(frames, beads), cone[frames]
-    ring = _rings(few) & np.isfinite(images[frames, beads])
-    seen = _levelled(images[frames, beads], ring)
-    dof = np.maximum(ring.sum(axis=(1, 2)), 1)
-    along = _shift_of_beads(near, model, beads, windows.shape)
-    body, shift = SeenBody(1.0), np.zeros(3)
-    for turn in range(ROUNDS):
-        moved = SeenBody(1.0, body.shift_mm).scene(described)
-        image = render_windows(moved, near, few)
-        image = (blurred_windows(image, blur) if blur > 0 else image)[:, 0]
-        here = _levelled(np.asarray(image), ring)
-        if turn == 0:
-            power, push = np.einsum("mp,mp->m", here, here), np.einsum("mp,mp->m", here, seen)
-            telling = power > 1e-6 * dof
-            if not telling.any():
-                return SeenBody(1.0)
-            # One foreign object in a ring must not decide, so the median over the windows is taken.
-            factor = _middle(push[telling] / power[telling], power[telling])
-            if factor < LEAST:
-                return SeenBody(0.0)
-        down, right = (np.asarray(slope) for slope in np.gradient(image, axis=(1, 2)))
-        slopes = -np.stack([_levelled(right, ring), _levelled(down, ring)], axis=-1)
-        design = np.concatenate([here[..., None], slopes @ along], axis=2)
-        rest = ((seen - factor * here) ** 2).sum(axis=1) / dof
-        typical = max(float(np.median(rest)), 1e-8)
-        weight = np.minimum(1.0, 2.0 * typical / np.maximum(rest, 1e-12))
-        normal = np.einsum("m,mpi,mpj->ij", weight, design, design)
-        hold = typical / (factor * PRIOR_MM) ** 2 + 1e-12
-        normal[1:, 1:] += hold * np.eye(3)
-        pull = np.einsum("m,mpi,mp->i", weight, design, seen)
-        pull[1:] -= hold * factor * shift
-        found = np.linalg.solve(normal, pull)
-        factor, step = float(found[0]), found[1:] / float(found[0])
-        shift = shift + step
-        if factor < LEAST or float(np.linalg.norm(shift)) > FAR_MM:
-            return SeenBody(0.0)
-        body = SeenBody(factor, (float(shift[0]), float(shift[1]), float(shift[2])))
-        if float(np.linalg.norm(step)) < STILL_MM:
-            break
-    return body
+    good = (fits[fitted, kernels.OK] > 0) & (fits[fitted, kernels.NOISE] < MISFIT)
+    part = fitted[~whole[fitted]]
+    results[part] = fits[part]
+    # Radius, peak and likeness stay those of the centroid: they judge the spot.
+    lone = fitted[whole[fitted] & good]
+    for place in (
+        kernels.X, kernels.Y, kernels.VAR_X, kernels.COV_XY, kernels.VAR_Y, kernels.BIAS
+    ):  # fmt: skip
+        results[lone, place] = fits[lone, place]
+    return np.asarray(fitted[~whole[fitted] | good])
 
 
-def _shift_of_beads(
-    cone: ConeVec, model: BeadModel, beads: npt.NDArray[np.intp], shape: tuple[int, int]
-) -> FloatArray:
-    """How the spot of a bead moves with the bead: (m, 2, 3) pixels (column, row) a millimetre."""
-    one = np.arange(len(beads))
-    there = cone.project_points(model.beads, shape)[one, beads]
-    moved = [cone.project_points(model.beads + e, shape)[one, beads] for e in np.eye(3)]
-    return np.stack([each - there for each in moved], axis=-1)
+def contrasts(results: FloatArray, patches: Patches) -> FloatArray:
+    """Contrast of each bead, (m,): the median over its whole spots, else as expected, scaled as
+    the others' are."""
+    shape = patches.windows.whole.shape
+    seen = np.where(results[:, kernels.OK] > 0, results[:, kernels.PEAK], np.nan).reshape(shape)
+    given = patches.peaks.reshape(shape)[0]
+    out = np.full(len(given), np.nan)
+    for bead in range(len(out)):
+        values = seen[:, bead][np.isfinite(seen[:, bead])]
+        if len(values) >= 3:
+            out[bead] = np.median(values)
+    known = np.isfinite(out)
+    ratio = float(np.median(out[known] / given[known])) if known.any() else 1.0
+    out[~known] = given[~known] * ratio
+    return np.broadcast_to(out, shape).ravel().copy()
 
 
-def _rings(windows: Windows) -> npt.NDArray[np.bool_]:
-    """Pixels round the beads that no bead touches, (m, side, side)."""
-    i = np.arange(windows.side)
-    x, y = np.moveaxis((windows.predicted - windows.corner)[:, 0], -1, 0)[..., None, None]
-    d2 = (i[None, None, :] - x) ** 2 + (i[None, :, None] - y) ** 2
-    radii = windows.radii[:, 0, None, None]
-    return np.asarray((d2 > (1.15 * radii + 2.0) ** 2) & (d2 < (1.6 * radii + 4.0) ** 2))
-
-
-def _levelled(values: npt.NDArray[Any], ring: npt.NDArray[np.bool_]) -> FloatArray:
-    """The values in each ring less their mean, 0 elsewhere, (m, side * side)."""
-    inside = np.where(ring, values, 0.0).astype(np.float64)
-    mean = inside.sum(axis=(1, 2)) / np.maximum(ring.sum(axis=(1, 2)), 1)
-    return np.asarray(np.where(ring, inside - mean[:, None, None], 0.0).reshape(len(ring), -1))
-
-
-def _middle(values: FloatArray, weights: FloatArray) -> float:
-    """Weighted median."""
-    order = np.argsort(values)
-    heap = np.cumsum(weights[order])
-    return float(values[order][int(np.searchsorted(heap, 0.5 * heap[-1]))])
-
-
-def _shifted(shape: Shape, shift: tuple[float, float, float]) -> Shape:
-    if isinstance(shape, ConvexPolyhedron):
-        offsets = np.asarray(shape.offsets) + np.asarray(shape.normals) @ np.asarray(shift)
-        return replace(shape, offsets=tuple(offsets.tolist()))
-    x, y, z = (math.fsum(pair) for pair in zip(shape.center, shift, strict=True))
-    return replace(shape, center=(x, y, z))
+def usable(patches: Patches, index: npt.NDArray[np.intp]) -> npt.NDArray[np.uint8]:
+    """Usable pixels of some windows: inside the image and free of other beads' spots."""
+    masks = np.isfinite(patches.flat[index]).astype(np.uint8)
+    windows = patches.windows
+    k = windows.corner.shape[1]
+    for i, position in enumerate(index.tolist()):
+        frame, bead = divmod(position, k)
+        if windows.crowded[frame, bead]:
+            masks[i] &= free_of_others(windows, frame, bead)
+    return masks
 
 
 # Blur of the images and apparent size of the beads, estimated from the spots themselves.

@@ -16,13 +16,14 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel
-from flexdt.twin.calibration.detect.background import pixel_noise
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.analytic import project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 
 Part = tuple[slice, slice]
+LEAST_NOISE = 1e-3
+"""Noise of line integrals that is assumed at least: no pixel counts a million photons."""
 LEAST_SEEN = 4
 """Frames in which a pixel must be seen before it can be called dead."""
 STILL = 0.1
@@ -349,3 +350,16 @@ def free_of_others(windows: Windows, frame: int, bead: int) -> npt.NDArray[np.ui
         reach = windows.radii[frame, other] * windows.stretch[frame, other, 2] + 3.0
         free[(columns - cx) ** 2 + (rows - cy) ** 2 < reach * reach] = 0
     return free
+
+
+def pixel_noise(flat: Float32Array, edge: int, width: int) -> FloatArray:
+    """Noise of each window's pixels from neighbours in a few rows at its top and bottom, (m,)."""
+    rows = [edge, edge + 3, edge + 6, edge + width - 7, edge + width - 4, edge + width - 1]
+    strips = flat[:, rows, edge : edge + width]
+    steps = np.abs(np.diff(strips, axis=2)).reshape(len(flat), -1)
+    good = np.isfinite(steps).all(axis=1)
+    out = np.zeros(len(flat))
+    if good.any():
+        out[good] = np.median(steps[good], axis=1) / (0.6745 * math.sqrt(2.0))
+        out[~good] = np.median(out[good])
+    return np.asarray(np.maximum(out, LEAST_NOISE))

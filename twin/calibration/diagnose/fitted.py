@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtri
 
-from flexdt.twin.calibration.detect.lag import Lag
+from flexdt.twin.calibration.detect.background import Lag
 from flexdt.twin.calibration.detect.refine import Refined
 from flexdt.twin.calibration.diagnose.distortion import better_panel, distorted
 from flexdt.twin.calibration.diagnose.finding import Finding, Severity, error, warning

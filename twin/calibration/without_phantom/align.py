@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from flexdt.twin.calibration.fit.image_quantities import axis_in_image
+from flexdt.twin.calibration.fit.fit import axis_in_image
 from flexdt.twin.calibration.without_phantom.mirror_symmetry import (
     REACH,
     find_symmetry,
