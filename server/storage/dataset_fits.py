@@ -59,9 +59,8 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
             for n, matrix in covariance_by_step(fitted, asked.steps)
         ]
     if asked.tracks:
-        told["tracks"] = import_module(
-            "flexdt.clients.calibration.calibration_report"
-        ).tracks_document(found)
+        report = import_module("flexdt.clients.calibration.calibration_report")
+        told["tracks"] = report.tracks_document(found)
     return p.CalibrationFitResult.model_validate(from_root(told, root.path))
 
 
