@@ -30,11 +30,14 @@ from flexdt.protocol.rpc_errors import RpcError
 MAX_UNKNOWN = 50
 """An object with this many members more than it has fields is rejected without a closer look."""
 
+_MODEL = ConfigDict(frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True)
+"""Of all models; the text below a field is its description in the OpenRPC document."""
+
 
 class Params(BaseModel):
     """Parameters of a method: frozen, strict, no unknown members, finite numbers only."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(**_MODEL, extra="forbid")
 
     @model_validator(mode="before")
     @classmethod
@@ -59,7 +62,7 @@ def few(most: int) -> BeforeValidator:
 class Result(BaseModel):
     """A result: frozen, finite numbers only; unknown members are kept (the protocol may grow)."""
 
-    model_config = ConfigDict(frozen=True, extra="allow", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(**_MODEL, extra="allow")
 
 
 class Empty(Params):
@@ -231,5 +234,6 @@ class ImageValue(Result):
     """An array: little-endian, C order."""
 
     dtype: Literal["uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"]
-    shape: list[int] = Field(description="sizes, slowest first: (rows, columns) for an image")
+    shape: list[int]
+    """sizes, slowest first: (rows, columns) for an image"""
     data: Payload

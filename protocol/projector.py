@@ -157,12 +157,12 @@ class VolumePut(f.Params):
     """
 
     name: f.VolumeName
-    scene: dict[str, Any] | None = Field(
-        default=None, description="{solids: [{shape: {kind, ...}, material, mu_per_mm}]}"
-    )
+    scene: dict[str, Any] | None = None
+    """{solids: [{shape: {kind, ...}, material, mu_per_mm}]}"""
     grid: VoxelGrid | None = None
     mesh: MeshSize | None = None
-    start: Bytes = Field(default=0, description="position of this chunk [bytes]")
+    start: Bytes = 0
+    """position of this chunk [bytes]"""
     data: Buffer | None = None
 
     @model_validator(mode="after")
@@ -186,10 +186,8 @@ class Project(f.Params):
     volume: f.VolumeName
     cone_vec: ConeVecs
     detector: Detector
-    key: Annotated[f.ShortText, MaxLen(300)] | None = Field(
-        default=None,
-        description="interactive: a newer request with this key replaces one that waits",
-    )
+    key: Annotated[f.ShortText, MaxLen(300)] | None = None
+    """interactive: a newer request with this key replaces one that waits"""
 
 
 class Backproject(f.Params):
@@ -212,8 +210,10 @@ class VolumeInfo(f.Result):
 
     name: str
     kind: Literal["voxels", "mesh", "scene"]
-    bytes: int = Field(description="memory it takes")
-    shape: list[int] | None = Field(default=None, description="(z, y, x)")
+    bytes: int
+    """memory it takes"""
+    shape: list[int] | None = None
+    """(z, y, x)"""
     voxel_mm: f.Triple | None = None
     center_mm: f.Triple | None = None
     solids: int | None = None
@@ -261,14 +261,17 @@ class Cancelled(f.Result):
 class Health(f.Result):
     """How the server is."""
 
-    instance: str = Field(description="changes when the server restarts")
+    instance: str
+    """changes when the server restarts"""
     version: str
     backend: str
     threads: int
     uptime_s: float
     clients: int
-    waiting: int = Field(description="requests in the queue")
-    views: int = Field(description="projected so far")
+    waiting: int
+    """requests in the queue"""
+    views: int
+    """projected so far"""
     superseded: int
     volumes: int
     memory_used: int

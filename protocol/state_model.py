@@ -18,12 +18,16 @@ class AxisState(Result):
     position: float
     target: float
     velocity: float
-    limits: Pair = Field(description="lowest and highest position")
+    limits: Pair
+    """lowest and highest position"""
     moving: bool
     unit: Literal["mm", "deg"] = "mm"
-    speed: float | None = Field(default=None, description="cruise speed in force [unit/s]")
-    acceleration: float | None = Field(default=None, description="acceleration in force [unit/s2]")
-    virtual: bool = Field(default=False, description="moves several motors, has none of its own")
+    speed: float | None = None
+    """cruise speed in force [unit/s]"""
+    acceleration: float | None = None
+    """acceleration in force [unit/s2]"""
+    virtual: bool = False
+    """moves several motors, has none of its own"""
 
 
 class TubeState(Result):
@@ -32,12 +36,10 @@ class TubeState(Result):
     on: bool
     kV: float
     power_W: float
-    ready: bool = Field(
-        default=True, description="X-rays are on and stable; before that images stay dark"
-    )
-    ready_in_s: float | None = Field(
-        default=None, description="seconds until X-rays are ready; null while they are off [s]"
-    )
+    ready: bool = True
+    """X-rays are on and stable; before that images stay dark"""
+    ready_in_s: float | None = None
+    """seconds until X-rays are ready; null while they are off [s]"""
 
 
 class CameraState(Result):
@@ -48,8 +50,10 @@ class CameraState(Result):
     roi: Roi
     averages: int = 1
     frames: int = 1
-    shape: Shape2 = Field(description="(rows, columns) of an image")
-    pixel_mm: float = Field(description="pitch of an image pixel")
+    shape: Shape2
+    """(rows, columns) of an image"""
+    pixel_mm: float
+    """pitch of an image pixel"""
 
 
 class SamplePlacement(Result):
@@ -71,62 +75,70 @@ class SampleState(Result):
     offset: SamplePlacement = Field(default_factory=SamplePlacement)
     size_mm: Triple | None = None
     description: str = ""
-    revision: str | None = Field(
-        default=None, description="of an upload: another one whenever its content changes"
-    )
+    revision: str | None = None
+    """of an upload: another one whenever its content changes"""
 
 
 class GeometryState(Result):
     """What follows from the positions: nominal plus the correction in force."""
 
-    SOD_mm: float = Field(description="source to rotation axis")
-    SDD_mm: float = Field(description="source to detector")
+    SOD_mm: float
+    """source to rotation axis"""
+    SDD_mm: float
+    """source to detector"""
     magnification: float
-    voxel_size_mm: float = Field(description="pixel pitch over magnification")
-    piercing_point_px: Pair = Field(description="(column, row) of the normal from the source")
-    field_of_view_mm: Pair = Field(description="(width, height) at the rotation axis")
-    cone_angle_deg: float | None = Field(default=None, description="full vertical opening angle")
-    axis_column_px: float | None = Field(
-        default=None, description="column of the projected rotation axis"
-    )
+    voxel_size_mm: float
+    """pixel pitch over magnification"""
+    piercing_point_px: Pair
+    """(column, row) of the normal from the source"""
+    field_of_view_mm: Pair
+    """(width, height) at the rotation axis"""
+    cone_angle_deg: float | None = None
+    """full vertical opening angle"""
+    axis_column_px: float | None = None
+    """column of the projected rotation axis"""
 
 
 class SafetyState(Result):
     """Whether the machine may move, and how close things are."""
 
-    state: str = Field(description="ok, estop, aborted, ...")
+    state: str
+    """ok, estop, aborted, ..."""
     estop: bool
     message: str = ""
-    stop: int = Field(default=0, description="number of the latest E-stop or block")
-    stopped_by: str | None = Field(
-        default=None, description="connection that pressed the E-stop in force, as in controller"
-    )
+    stop: int = 0
+    """number of the latest E-stop or block"""
+    stopped_by: str | None = None
+    """connection that pressed the E-stop in force, as in controller"""
     blocked_attempts: int = 0
-    clearance_mm: float | None = Field(default=None, description="smallest distance of two parts")
-    pair: list[str] | None = Field(default=None, description="the two parts that are closest")
-    warnings: list[str] = Field(
-        default_factory=list, description="parts that are within the safety margin now"
-    )
+    clearance_mm: float | None = None
+    """smallest distance of two parts"""
+    pair: list[str] | None = None
+    """the two parts that are closest"""
+    warnings: list[str] = Field(default_factory=list)
+    """parts that are within the safety margin now"""
 
 
 class Correction(Result):
     """A dated, named, immutable calibration; values in mm and deg."""
 
     name: str
-    date: str = Field(description="ISO 8601")
+    date: str
+    """ISO 8601"""
     parameters: dict[str, float]
     comment: str = ""
-    source: str | None = Field(default=None, description="data sets or method it came from")
+    source: str | None = None
+    """data sets or method it came from"""
 
 
 class ClockState(Result):
     """The twin's clock."""
 
     time_s: float
-    speed_up: SpeedUp = Field(description="asked for: twin seconds per real second, or max")
-    real_time_factor: float | None = Field(
-        default=None, description="achieved, over the last seconds"
-    )
+    speed_up: SpeedUp
+    """asked for: twin seconds per real second, or max"""
+    real_time_factor: float | None = None
+    """achieved, over the last seconds"""
 
 
 JobPhase = Literal["queued", "running", "paused", "done", "failed", "aborted", "incomplete"]
@@ -138,53 +150,51 @@ class JobStatus(Result):
     job: str
     state: JobPhase
     name: str = ""
-    dataset: str | None = Field(default=None, description="folder of the data set")
+    dataset: str | None = None
+    """folder of the data set"""
     frames_done: int = 0
     frames_total: int = 0
     elapsed_s: NonNegative = 0.0
     remaining_s: NonNegative | None = None
-    time: float = Field(default=0.0, description="the twin's clock")
+    time: float = 0.0
+    """the twin's clock"""
     speed_up: SpeedUp = 1.0
     real_time_factor: float | None = None
-    error: dict[str, object] | None = Field(
-        default=None, description="{code, message, data} when failed"
-    )
-    retry_s: float | None = Field(
-        default=None, description="paused by what may mend by itself: real seconds to the next try"
-    )
+    error: dict[str, object] | None = None
+    """{code, message, data} when failed"""
+    retry_s: float | None = None
+    """paused by what may mend by itself: real seconds to the next try"""
     warnings: list[str] = Field(default_factory=list)
-    step: int | None = Field(default=None, description="index of the current step")
-    line: int | None = Field(default=None, description="line of the script being run")
-    what: str = Field(default="", description="what is being done now, for people")
+    step: int | None = None
+    """index of the current step"""
+    line: int | None = None
+    """line of the script being run"""
+    what: str = ""
+    """what is being done now, for people"""
 
 
 class ImageFlags(Result):
     """What is wrong with an image at first sight, judged as though X-rays were on."""
 
-    time: float | None = Field(default=None, description="of the pose, on the twin's clock [s]")
-    saturated: float = Field(ge=0, le=1, description="part of the pixels at full scale")
-    starved: float = Field(
-        ge=0, le=1, description="part of the pixels with hardly a count above dark"
-    )
-    truncated: list[Literal["left", "right", "top", "bottom"]] = Field(
-        description="edges of the image at which the sample is cut off"
-    )
-    good_counts: Pair | None = Field(
-        default=None,
-        description="a pixel with fewer counts than the first is starved, from the second on "
-        "saturated",
-    )
-    good_lines: Pair | None = Field(
-        default=None,
-        description="the same of line integrals: saturated below the first, starved above the "
-        "second",
-    )
+    time: float | None = None
+    """of the pose, on the twin's clock [s]"""
+    saturated: float = Field(ge=0, le=1)
+    """part of the pixels at full scale"""
+    starved: float = Field(ge=0, le=1)
+    """part of the pixels with hardly a count above dark"""
+    truncated: list[Literal["left", "right", "top", "bottom"]]
+    """edges of the image at which the sample is cut off"""
+    good_counts: Pair | None = None
+    """a pixel with fewer counts than the first is starved, from the second on saturated"""
+    good_lines: Pair | None = None
+    """the same of line integrals: saturated below the first, starved above the second"""
 
 
 class State(Result):
     """Everything, as one snapshot."""
 
-    time: float = Field(description="the twin's clock [s]")
+    time: float
+    """the twin's clock [s]"""
     axes: dict[str, AxisState]
     tube: TubeState
     camera: CameraState
@@ -194,35 +204,32 @@ class State(Result):
     job: JobStatus | None = None
     correction: Correction | None = None
     clock: ClockState
-    controller: str | None = Field(
-        default=None, description="who may move; None: nobody holds control"
-    )
-    image: ImageFlags | None = Field(
-        default=None, description="the image made last, by anyone's request or by a scan"
-    )
+    controller: str | None = None
+    """who may move; None: nobody holds control"""
+    image: ImageFlags | None = None
+    """the image made last, by anyone's request or by a scan"""
 
 
 class Stopping(Result):
     """How the motors come to rest after a stop."""
 
-    path: Literal["along", "apart", "coasting"] = Field(
-        description="along the path they were on together; apart, each by itself, on a path that "
-        "was swept; coasting, without power (E-stop of category 0), on a path nothing keeps free"
-    )
-    duration_s: NonNegative = Field(description="until all rest, on the twin's clock")
-    distances: dict[str, NonNegative] = Field(
-        description="motor -> how far it still travels [mm or deg]"
-    )
-    would_hit: list[str] | None = Field(
-        default=None, description="the two parts that coasting brings together"
-    )
+    path: Literal["along", "apart", "coasting"]
+    """along the path they were on together; apart, each by itself, on a path that was swept;
+    coasting, without power (E-stop of category 0), on a path nothing keeps free"""
+    duration_s: NonNegative
+    """until all rest, on the twin's clock"""
+    distances: dict[str, NonNegative]
+    """motor -> how far it still travels [mm or deg]"""
+    would_hit: list[str] | None = None
+    """the two parts that coasting brings together"""
     would_hit_in_s: NonNegative | None = None
 
 
 class Stopped(State):
     """The state, and how the motors come to rest."""
 
-    stopping: Stopping | None = Field(default=None, description="of this server's motors")
+    stopping: Stopping | None = None
+    """of this server's motors"""
 
 
 class LogEntry(Result):

@@ -60,6 +60,9 @@ def openrpc_document(
         ref_template="#/components/schemas/{model}",
     )
     schemas = definitions.get("$defs", {})
+    for field in (f for schema in schemas.values() for f in schema.get("properties", {}).values()):
+        if "description" in field:  # a docstring, which may have several lines
+            field["description"] = " ".join(field["description"].split())
     return {
         "openrpc": "1.3.2",
         "info": {

@@ -19,39 +19,39 @@ DataSetName = Annotated[ShortText, Len(1, 255)]
 class DatasetList(Params):
     """Which data sets of the data directory to list."""
 
-    search: Annotated[ShortText, MaxLen(200)] = Field(
-        default="",
-        description="words; each occurs in name, sample, operator, date, state or a setting",
-    )
-    start: Annotated[int, Ge(0), Le(1_000_000)] = Field(default=0, description="left out before")
-    count: Annotated[int, Ge(1), Le(200)] = Field(default=50, description="listed at most")
-    thumbnail: Annotated[int, Ge(0), Le(256)] = Field(
-        default=0, description="longer side of a small image of each [pixels]; 0 for none"
-    )
+    search: Annotated[ShortText, MaxLen(200)] = ""
+    """words; each occurs in name, sample, operator, date, state or a setting"""
+    start: Annotated[int, Ge(0), Le(1_000_000)] = 0
+    """left out before"""
+    count: Annotated[int, Ge(1), Le(200)] = 50
+    """listed at most"""
+    thumbnail: Annotated[int, Ge(0), Le(256)] = 0
+    """longer side of a small image of each [pixels]; 0 for none"""
 
 
 class DatasetGet(Params):
     """A data set, and what to say of it."""
 
-    name: DataSetName = Field(description="of its folder")
-    points: Annotated[int, Ge(2), Le(2000)] = Field(
-        default=400, description="images at most, evenly chosen, of which poses and times are told"
-    )
-    measure: bool = Field(default=False, description="tell their mean counts and clearances, too")
-    script: bool = Field(default=False, description="tell its script, too")
+    name: DataSetName
+    """of its folder"""
+    points: Annotated[int, Ge(2), Le(2000)] = 400
+    """images at most, evenly chosen, of which poses and times are told"""
+    measure: bool = False
+    """tell their mean counts and clearances, too"""
+    script: bool = False
+    """tell its script, too"""
 
 
 class DatasetFrame(Params):
     """An image of a data set."""
 
-    name: DataSetName = Field(description="of its folder")
-    index: Annotated[int, Ge(0), Le(10_000_000)] = Field(
-        description="of the image, in the order taken: dark and flat images count"
-    )
+    name: DataSetName
+    """of its folder"""
+    index: Annotated[int, Ge(0), Le(10_000_000)]
+    """of the image, in the order taken: dark and flat images count"""
     kind: Literal["line_integral", "counts"] = "counts"
-    binning: Annotated[int, Ge(1), Le(64)] = Field(
-        default=1, description="mean over so many pixels a side"
-    )
+    binning: Annotated[int, Ge(1), Le(64)] = 1
+    """mean over so many pixels a side"""
 
 
 ImageKind = Literal["dark", "flat", "projection"]
@@ -60,14 +60,20 @@ ImageKind = Literal["dark", "flat", "projection"]
 class DatasetInfo(Result):
     """A data set in a few words; what is not known of it is null."""
 
-    name: str = Field(description="of its folder")
-    modified: float = Field(description="when its folder last changed [s since 1970]")
+    name: str
+    """of its folder"""
+    modified: float
+    """when its folder last changed [s since 1970]"""
     started: str | None = None
-    duration_s: float | None = Field(default=None, description="of the twin's clock")
+    duration_s: float | None = None
+    """of the twin's clock"""
     state: Literal["complete", "incomplete", "running", "unknown"] = "unknown"
-    reason: str = Field(default="", description="why it is incomplete")
-    projections: int = Field(default=0, description="that it has, or should have")
-    present: int = Field(default=0, description="projections that are there")
+    reason: str = ""
+    """why it is incomplete"""
+    projections: int = 0
+    """that it has, or should have"""
+    present: int = 0
+    """projections that are there"""
     machine: str | None = None
     sample: str = ""
     operator: str = ""
@@ -76,44 +82,47 @@ class DatasetInfo(Result):
     exposure_ms: float | None = None
     mode: str | None = None
     shape: Shape2 | None = None
-    problem: str = Field(default="", description="why the rest is not known")
-    thumbnail: ImageValue | None = Field(
-        default=None, description="uint8, its projection in the middle, windowed"
-    )
+    problem: str = ""
+    """why the rest is not known"""
+    thumbnail: ImageValue | None = None
+    """uint8, its projection in the middle, windowed"""
 
 
 class DatasetListResult(Result):
     """Data sets, the newest first."""
 
     datasets: list[DatasetInfo]
-    total: int = Field(description="data sets that the search finds")
-    unread: int = Field(default=0, description="of those, not read yet for lack of time: ask again")
-    left_out: int = Field(
-        default=0, description="older folders, and folders whose names no data set may have"
-    )
+    total: int
+    """data sets that the search finds"""
+    unread: int = 0
+    """of those, not read yet for lack of time: ask again"""
+    left_out: int = 0
+    """older folders, and folders whose names no data set may have"""
 
 
 class DatasetResult(Result):
     """A data set over time: lists have one entry for each image of `indices`."""
 
     info: DatasetInfo
-    images: int = Field(description="that it has, or should have, of all kinds")
-    indices: list[int] = Field(description="of the images chosen, in the order taken")
+    images: int
+    """that it has, or should have, of all kinds"""
+    indices: list[int]
+    """of the images chosen, in the order taken"""
     files: list[str]
     kinds: list[ImageKind]
     present: list[bool]
-    times_s: list[float] | None = Field(description="on the scan's clock")
-    positions: dict[str, list[float | None]] = Field(
-        description="motor -> [mm, deg], script's sign; null where it is not known"
-    )
-    same_machine: bool = Field(description="whether this twin has the same axes, parts and zeros")
-    counts: list[float | None] | None = Field(
-        default=None, description="mean of each image; null where it cannot be read"
-    )
-    clearance_mm: list[float | None] | None = Field(
-        default=None, description="of the nearest parts that may not touch"
-    )
-    clearance_of: str = Field(default="", description="what the clearances are of")
+    times_s: list[float] | None
+    """on the scan's clock"""
+    positions: dict[str, list[float | None]]
+    """motor -> [mm, deg], script's sign; null where it is not known"""
+    same_machine: bool
+    """whether this twin has the same axes, parts and zeros"""
+    counts: list[float | None] | None = None
+    """mean of each image; null where it cannot be read"""
+    clearance_mm: list[float | None] | None = None
+    """of the nearest parts that may not touch"""
+    clearance_of: str = ""
+    """what the clearances are of"""
     script: str | None = None
 
 
@@ -124,16 +133,18 @@ class DatasetFrameResult(ImageValue):
     index: int
     file: str
     image: ImageKind
-    projection: int | None = Field(
-        default=None, description="its number among the projections, as calibration.fit counts them"
-    )
+    projection: int | None = None
+    """its number among the projections, as calibration.fit counts them"""
     kind: Literal["line_integral", "counts"]
     time_s: float | None = None
     exposure_ms: float | None = None
     positions: dict[str, float] | None = None
-    cone_vec: list[float] | None = Field(default=None, description="nominal, without a correction")
-    tube: dict[str, JsonValue] | None = Field(default=None, description="for projection.get")
-    camera: dict[str, JsonValue] | None = Field(default=None, description="for projection.get")
+    cone_vec: list[float] | None = None
+    """nominal, without a correction"""
+    tube: dict[str, JsonValue] | None = None
+    """for projection.get"""
+    camera: dict[str, JsonValue] | None = None
+    """for projection.get"""
 
 
 DATASET_LIST = read("dataset.list", DatasetList, DatasetListResult, "data sets, the newest first")
@@ -148,9 +159,8 @@ Parameters = Annotated[list[f.AxisName], MaxLen(17)]
 class CalibrationApply(f.Params):
     """A correction to put in force; it replaces the last."""
 
-    parameters: Annotated[dict[f.AxisName, f.Deviation], MaxLen(64), f.few(64)] = Field(
-        description="name -> value [mm or deg], true minus nominal"
-    )
+    parameters: Annotated[dict[f.AxisName, f.Deviation], MaxLen(64), f.few(64)]
+    """name -> value [mm or deg], true minus nominal"""
     name: f.Name | None = None
     comment: f.Comment = ""
     source: f.ShortText | None = None
@@ -165,56 +175,51 @@ class CalibrationGet(f.Params):
 class Mark(f.Params):
     """Where a bead was seen in a projection; pixel (0, 0) is the middle of the upper left one."""
 
-    frame: Annotated[int, Ge(0), Le(10_000_000)] = Field(description="projection, counted from 0")
-    marker: f.AxisName = Field(
-        description="number of the bead in its phantom, counted from 0; any name of an unknown one"
-    )
+    frame: Annotated[int, Ge(0), Le(10_000_000)]
+    """projection, counted from 0"""
+    marker: f.AxisName
+    """number of the bead in its phantom, counted from 0; any name of an unknown one"""
     column: f.Place
     row: f.Place
-    sigma: Annotated[float, Ge(1e-3), Le(1e4)] | None = Field(
-        default=None, description="standard deviation of each [px]; 0.5 if left out"
-    )
+    sigma: Annotated[float, Ge(1e-3), Le(1e4)] | None = None
+    """standard deviation of each [px]; 0.5 if left out"""
 
 
 class CalibrationFit(f.Params):
     """Data sets of a bead phantom, and what to estimate from them."""
 
-    datasets: Annotated[list[DataSetName], Len(1, 8)] = Field(description="of their folders")
-    phantom: f.Name = Field(
-        description="one that ships, a TOML or JSON file among the data sets, or unknown: markers "
-        "of which nobody knows where they are, in one data set"
-    )
-    free: Annotated[Parameters, MinLen(1)] | None = Field(
-        default=None,
-        description="what is estimated; default: dO_x, dO_y, dO_z, alpha, tau_*, of unknown "
-        "markers dO_x",
-    )
+    datasets: Annotated[list[DataSetName], Len(1, 8)]
+    """of their folders"""
+    phantom: f.Name
+    """one that ships, a TOML or JSON file among the data sets, or unknown: markers of which nobody
+    knows where they are, in one data set"""
+    free: Annotated[Parameters, MinLen(1)] | None = None
+    """what is estimated; default: dO_x, dO_y, dO_z, alpha, tau_*, of unknown markers dO_x"""
     priors: Annotated[dict[f.AxisName, f.NonNegative], MaxLen(17), f.few(17)] = Field(
-        default_factory=dict, description="name -> standard deviation [mm or deg]; 0: exactly known"
+        default_factory=dict
     )
-    per_frame: Parameters = Field(
-        default_factory=list, description="what may also move during the scan"
-    )
-    steps: Annotated[int, Ge(0), Le(50)] = Field(
-        default=0, description="covariances after so many parts of the frames are told"
-    )
-    residuals: bool = Field(default=False, description="tell those of every bead in every frame")
-    tracks: bool = Field(
-        default=False, description="tell where beads are, and were put before and after"
-    )
-    markers: Annotated[list[Mark], Len(1, 10_000)] | None = Field(
-        default=None, description="where beads were seen in the one data set; default: found there"
-    )
-    scale: Annotated[f.ShortText, MaxLen(300)] | None = Field(
-        default=None, description="distance of two unknown markers [mm]: A-B=MM or A-B=MM+-SIGMA"
-    )
+    """name -> standard deviation [mm or deg]; 0: exactly known"""
+    per_frame: Parameters = Field(default_factory=list)
+    """what may also move during the scan"""
+    steps: Annotated[int, Ge(0), Le(50)] = 0
+    """covariances after so many parts of the frames are told"""
+    residuals: bool = False
+    """tell those of every bead in every frame"""
+    tracks: bool = False
+    """tell where beads are, and were put before and after"""
+    markers: Annotated[list[Mark], Len(1, 10_000)] | None = None
+    """where beads were seen in the one data set; default: found there"""
+    scale: Annotated[f.ShortText, MaxLen(300)] | None = None
+    """distance of two unknown markers [mm]: A-B=MM or A-B=MM+-SIGMA"""
 
 
 class CalibrationAlign(f.Params):
     """A scan of anything over a full turn."""
 
-    name: DataSetName = Field(description="of its folder")
-    per_frame: bool = Field(default=False, description="look for shifts of single frames too")
+    name: DataSetName
+    """of its folder"""
+    per_frame: bool = False
+    """look for shifts of single frames too"""
 
 
 class CorrectionResult(f.Result):
@@ -239,9 +244,8 @@ class CalibrationStep(f.Result):
     """What the first frames of a fit would know by themselves."""
 
     frames: int
-    covariance: list[list[float]] | None = Field(
-        description="[mm, deg], in the order of `parameters`; None: not all are determined"
-    )
+    covariance: list[list[float]] | None
+    """[mm, deg], in the order of `parameters`; None: not all are determined"""
 
 
 class CalibrationProblem(f.Result):
@@ -257,17 +261,16 @@ class CalibrationFitResult(f.Result):
 
     identifiable: bool
     parameters: dict[str, Estimated]
-    correction: dict[str, float] | None = Field(default=None, description="for calibration.apply")
+    correction: dict[str, float] | None = None
+    """for calibration.apply"""
     covariance: list[list[float | None]] = Field(default_factory=list)
     rms_px: float | None
     rms_per_bead_px: list[float | None] = Field(default_factory=list)
-    residuals_px: list[list[f.Pair | None]] | None = Field(
-        default=None, description="of each frame and bead: measured minus predicted column and row"
-    )
+    residuals_px: list[list[f.Pair | None]] | None = None
+    """of each frame and bead: measured minus predicted column and row"""
     steps: list[CalibrationStep] = Field(default_factory=list)
-    tracks: dict[str, JsonValue] | None = Field(
-        default=None, description="as `flexdt calibrate --tracks` writes them"
-    )
+    tracks: dict[str, JsonValue] | None = None
+    """as `flexdt calibrate --tracks` writes them"""
     problems: list[CalibrationProblem]
 
 
@@ -276,12 +279,13 @@ class CalibrationAlignResult(f.Result):
 
     identifiable: bool
     parameters: dict[str, Estimated]
-    refused: dict[str, str] = Field(description="what such a scan cannot tell, and why")
+    refused: dict[str, str]
+    """what such a scan cannot tell, and why"""
     warnings: list[str]
-    correction: dict[str, float] | None = Field(default=None, description="for calibration.apply")
-    motion: list[dict[str, JsonValue]] | None = Field(
-        default=None, description="shifts of single frames, as `flexdt align --json` tells them"
-    )
+    correction: dict[str, float] | None = None
+    """for calibration.apply"""
+    motion: list[dict[str, JsonValue]] | None = None
+    """shifts of single frames, as `flexdt align --json` tells them"""
 
 
 class CorrectionListResult(f.Result):

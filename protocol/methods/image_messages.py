@@ -24,48 +24,48 @@ class ProjectionGet(f.Params):
     """
 
     kind: Literal["line_integral", "counts"] = "line_integral"
-    binning: Annotated[int, Ge(1), Le(32)] = Field(
-        default=1, description="mean over so many pixels a side, beyond the camera's mode"
-    )
-    marks: bool = Field(
-        default=False, description="say which pixels are saturated, starved or cut off as well"
-    )
-    positions: f.Targets | None = Field(
-        default=None,
-        description="motor -> [mm, deg] there, beyond its travel too; others stand as they do",
-    )
-    tube: TubeSet | None = Field(default=None, description="as though set so")
-    camera: CameraSet | None = Field(default=None, description="as though set so")
+    binning: Annotated[int, Ge(1), Le(32)] = 1
+    """mean over so many pixels a side, beyond the camera's mode"""
+    marks: bool = False
+    """say which pixels are saturated, starved or cut off as well"""
+    positions: f.Targets | None = None
+    """motor -> [mm, deg] there, beyond its travel too; others stand as they do"""
+    tube: TubeSet | None = None
+    """as though set so"""
+    camera: CameraSet | None = None
+    """as though set so"""
 
 
 class RayGet(f.Params):
     """A pixel of the image of this moment."""
 
-    pixel: f.PixelAsked = Field(
-        description="(column, row); (0, 0) is the centre of the top left one"
-    )
+    pixel: f.PixelAsked
+    """(column, row); (0, 0) is the centre of the top left one"""
 
 
 class ExposurePredict(f.Params):
     """A scan to predict; what is left out is as it is now."""
 
-    sample: f.Name | None = Field(default=None, description="default: the one on the stage")
+    sample: f.Name | None = None
+    """default: the one on the stage"""
     kV: f.Voltage | None = None
     power_W: f.Power | None = None
-    filter: LayerText = Field(default="", description="MATERIAL:MM beside the machine's own")
+    filter: LayerText = ""
+    """MATERIAL:MM beside the machine's own"""
     exposure_ms: f.Exposure | None = None
     averages: Averages | None = None
     mode: f.ShortText | None = None
     roi: f.RoiAsked | None = None
-    frames: Frames = Field(default=361, description="of the scan, or of each of its turns")
-    kind: Literal["fly", "step", "tiled", "helical", "calibration"] | None = Field(
-        default=None, description="of a script, of which time and bytes are then; default: images"
-    )
-    sod_mm: f.Distance | None = Field(default=None, description="default: as it stands")
-    sdd_mm: f.Distance | None = Field(default=None, description="default: as it stands")
-    detail: LayerText = Field(
-        default="void:0.5", description="MATERIAL:MM or void:MM on the darkest ray, to be seen"
-    )
+    frames: Frames = 361
+    """of the scan, or of each of its turns"""
+    kind: Literal["fly", "step", "tiled", "helical", "calibration"] | None = None
+    """of a script, of which time and bytes are then; default: images"""
+    sod_mm: f.Distance | None = None
+    """default: as it stands"""
+    sdd_mm: f.Distance | None = None
+    """default: as it stands"""
+    detail: LayerText = "void:0.5"
+    """MATERIAL:MM or void:MM on the darkest ray, to be seen"""
 
 
 class Projection(f.ImageValue):
@@ -73,30 +73,33 @@ class Projection(f.ImageValue):
 
     cone_vec: list[float] = Field(min_length=12, max_length=12)
     kind: Literal["line_integral", "counts"] = "line_integral"
-    time: float | None = Field(default=None, description="of the pose, on the twin's clock [s]")
+    time: float | None = None
+    """of the pose, on the twin's clock [s]"""
     flags: ImageFlags | None = None
-    marks: f.ImageValue | None = Field(
-        default=None,
-        description="uint8, as large as the image, where asked for: sum of 1 saturated, 2 starved, "
-        "4 sample cut off at this pixel of the edge; judged as though X-rays were on",
-    )
+    marks: f.ImageValue | None = None
+    """uint8, as large as the image, where asked for: sum of 1 saturated, 2 starved, 4 sample cut
+    off at this pixel of the edge; judged as though X-rays were on"""
 
 
 class RayResult(f.Result):
     """What the ray of a pixel goes through, in the geometry of geometry.get."""
 
-    paths_mm: dict[str, float] = Field(description="material -> path through it")
+    paths_mm: dict[str, float]
+    """material -> path through it"""
 
 
 class TransmissionShares(f.Result):
     """How much of the open beam the pixels see, in a few views of a turn."""
 
     least: float
-    p1: float = Field(description="1 % of the pixels see less")
+    p1: float
+    """1 % of the pixels see less"""
     p5: float
     median: float
-    edges: list[float] = Field(description="of the bins; the last one has no upper edge")
-    shares: list[float] = Field(description="of the pixels in each bin")
+    edges: list[float]
+    """of the bins; the last one has no upper edge"""
+    shares: list[float]
+    """of the pixels in each bin"""
 
 
 class PredictedSetting(f.Result):
@@ -106,8 +109,10 @@ class PredictedSetting(f.Result):
     filter: str
     exposure_ms: float
     averages: int
-    cnr: float = Field(description="contrast of the detail to the noise of a pixel of one image")
-    kerma_mGy: float = Field(description="air kerma of the scan on the axis, without a sample")
+    cnr: float
+    """contrast of the detail to the noise of a pixel of one image"""
+    kerma_mGy: float
+    """air kerma of the scan on the axis, without a sample"""
 
 
 class ExposurePrediction(f.Result):
@@ -115,15 +120,21 @@ class ExposurePrediction(f.Result):
 
     sample: str
     transmission: TransmissionShares
-    saturated: float = Field(ge=0, le=1, description="part of the pixels")
-    starved: float = Field(ge=0, le=1, description="part of the pixels")
+    saturated: float = Field(ge=0, le=1)
+    """part of the pixels"""
+    starved: float = Field(ge=0, le=1)
+    """part of the pixels"""
     detail: str
     asked: PredictedSetting
-    best: list[PredictedSetting] = Field(description="of the same power and time, the best first")
+    best: list[PredictedSetting]
+    """of the same power and time, the best first"""
     frames: int
-    seconds: float = Field(description="that the frames take at least; of a kind, all of the scan")
-    bytes: int = Field(description="of the frames; of a kind, with dark and flat images")
-    assumed: list[str] = Field(description="what is not known of the sample")
+    seconds: float
+    """that the frames take at least; of a kind, all of the scan"""
+    bytes: int
+    """of the frames; of a kind, with dark and flat images"""
+    assumed: list[str]
+    """what is not known of the sample"""
 
 
 PREDICTION_LIMITS: Final[Mapping[str, float]] = {"seconds": 60, "memory_bytes": 4 << 30}

@@ -33,12 +33,10 @@ class ScriptInput(f.Params):
 
     text: ScriptText | None = None
     data_base64: ScriptText | None = None
-    name: f.Name | None = Field(
-        default=None, description="name of the data set; made up if left out"
-    )
-    speed_up: f.SpeedUp | None = Field(
-        default=None, description="for this job; the clock's if left out"
-    )
+    name: f.Name | None = None
+    """name of the data set; made up if left out"""
+    speed_up: f.SpeedUp | None = None
+    """for this job; the clock's if left out"""
     motion_samples: Moments = 1
     seed: Seed = None
 
@@ -52,15 +50,12 @@ class ScriptInput(f.Params):
 class TrajectoryInput(f.Params):
     """Poses to go through, one image each (thesis 4.6.2)."""
 
-    poses: Annotated[list[f.Targets], FailFast(), MinLen(1), MaxLen(200_000)] = Field(
-        description="each: axis -> value [mm or deg]; axes left out stay"
-    )
+    poses: Annotated[list[f.Targets], FailFast(), MinLen(1), MaxLen(200_000)]
+    """each: axis -> value [mm or deg]; axes left out stay"""
     exposure_ms: f.Exposure | None = None
-    flat: bool | f.Targets = Field(
-        default=True,
-        description="the flat image: at a place beside the beam that the server finds (true), at "
-        "this pose, or not at all (false)",
-    )
+    flat: bool | f.Targets = True
+    """the flat image: at a place beside the beam that the server finds (true), at this pose, or not
+    at all (false)"""
     name: f.Name | None = None
     speed_up: f.SpeedUp | None = None
     motion_samples: Moments = 1
@@ -119,7 +114,8 @@ class CheckResult(f.Result):
     frames: int
     bytes: int
     collisions: list[CheckCollision] = Field(default_factory=list)
-    min_clearance_mm: float | None = Field(None, description="of parts in relative motion")
+    min_clearance_mm: float | None = None
+    """of parts in relative motion"""
 
 
 class SubmitResult(f.Result):

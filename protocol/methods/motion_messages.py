@@ -17,53 +17,55 @@ from flexdt.protocol.state_model import CameraState, ClockState, State, Stopped,
 class Move(f.Params):
     """Targets of one or several axes, which start together."""
 
-    targets: f.Targets = Field(description="axis -> position [mm or deg], in the script's sign")
-    relative: bool = Field(default=False, description="targets are displacements")
-    wait: bool = Field(default=False, description="answer when the motion has ended")
-    plan: bool = Field(default=False, description="go around obstacles, as a series of free moves")
-    shortest: bool = Field(
-        default=False, description="rot_obj by the shortest way, not accumulated"
-    )
+    targets: f.Targets
+    """axis -> position [mm or deg], in the script's sign"""
+    relative: bool = False
+    """targets are displacements"""
+    wait: bool = False
+    """answer when the motion has ended"""
+    plan: bool = False
+    """go around obstacles, as a series of free moves"""
+    shortest: bool = False
+    """rot_obj by the shortest way, not accumulated"""
 
 
 class Jog(f.Params):
     """Move at a velocity until the lease runs out or is renewed."""
 
     axis: f.AxisName
-    velocity: f.Velocity = Field(description="[mm/s or deg/s], signed; 0 stops")
-    lease_s: Annotated[float, Ge(1e-6), Le(10)] = Field(
-        default=0.5, description="of the twin's clock"
-    )
+    velocity: f.Velocity
+    """[mm/s or deg/s], signed; 0 stops"""
+    lease_s: Annotated[float, Ge(1e-6), Le(10)] = 0.5
+    """of the twin's clock"""
 
 
 class AxisSet(f.Params):
     """Speed and acceleration of later moves."""
 
     axis: f.AxisName
-    speed: f.Pace | None = Field(default=None, description="[mm/s or deg/s]")
-    acceleration: f.Pace | None = Field(default=None, description="[mm/s2 or deg/s2]")
+    speed: f.Pace | None = None
+    """[mm/s or deg/s]"""
+    acceleration: f.Pace | None = None
+    """[mm/s2 or deg/s2]"""
 
 
 class Reset(f.Params):
     """Leave the emergency stop, or blocked."""
 
-    stop: Annotated[int, Ge(0), Le(2**53)] | None = Field(
-        default=None, description="release this stop (safety.stop) alone; null: any"
-    )
+    stop: Annotated[int, Ge(0), Le(2**53)] | None = None
+    """release this stop (safety.stop) alone; null: any"""
 
 
 class MoveResult(f.Result):
     """What the motion will take."""
 
-    duration_s: f.NonNegative = Field(description="of the twin's clock")
+    duration_s: f.NonNegative
+    """of the twin's clock"""
     warnings: list[str] = Field(default_factory=list)
-    moves: list[dict[str, float]] | None = Field(
-        default=None, description="with plan: the moves in order, axis -> target"
-    )
-    arrived: bool | None = Field(
-        default=None,
-        description="with wait: whether the motors rest at their targets; false after a stop",
-    )
+    moves: list[dict[str, float]] | None = None
+    """with plan: the moves in order, axis -> target"""
+    arrived: bool | None = None
+    """with wait: whether the motors rest at their targets; false after a stop"""
 
 
 class AxisSetResult(f.Result):
@@ -101,9 +103,8 @@ class CameraSet(Params):
 
     exposure_ms: Exposure | None = None
     mode: ShortText | None = None
-    roi: RoiAsked | None = Field(
-        default=None, description="left, top, right, bottom; inclusive, unbinned"
-    )
+    roi: RoiAsked | None = None
+    """left, top, right, bottom; inclusive, unbinned"""
     averages: Averages | None = None
     frames: Frames | None = None
 

@@ -25,7 +25,8 @@ class SampleSet(f.Params):
     """Which sample stands on the stage: a shipped phantom's name, or an uploaded file's."""
 
     name: f.Name | None = None
-    file: f.Name | None = Field(default=None, description="name under which it was uploaded")
+    file: f.Name | None = None
+    """name under which it was uploaded"""
     material: f.Material | None = None
     offset: Placement | None = None
 
@@ -39,10 +40,10 @@ class SampleSet(f.Params):
 class SampleMesh(f.Params):
     """A part of the shape of the sample on the stage."""
 
-    start: Bytes = Field(default=0, description="first byte")
-    count: Annotated[int, Ge(1), Le(MESH_CHUNK)] = Field(
-        default=1 << 20, description="bytes at most"
-    )
+    start: Bytes = 0
+    """first byte"""
+    count: Annotated[int, Ge(1), Le(MESH_CHUNK)] = 1 << 20
+    """bytes at most"""
 
 
 class SampleUpload(f.Params):
@@ -50,19 +51,21 @@ class SampleUpload(f.Params):
 
     name: f.Name
     kind: Literal["mesh", "voxels", "scene"] = "mesh"
-    format: Literal["stl", "obj", "ply", "glb", "off", "raw", "json", "toml"] = Field(
-        description="raw: float32 little-endian voxels [z, y, x] of attenuation [1/mm]; json, "
-        "toml: the text of a phantom or scene file"
-    )
-    total: Annotated[Bytes, Gt(0)] = Field(description="size of the whole [bytes]")
-    start: Bytes = Field(default=0, description="position of this chunk [bytes]")
+    format: Literal["stl", "obj", "ply", "glb", "off", "raw", "json", "toml"]
+    """raw: float32 little-endian voxels [z, y, x] of attenuation [1/mm]; json, toml: the text of a
+    phantom or scene file"""
+    total: Annotated[Bytes, Gt(0)]
+    """size of the whole [bytes]"""
+    start: Bytes = 0
+    """position of this chunk [bytes]"""
     data: f.Payload
-    unit: LengthUnit | None = Field(
-        default=None, description="of mesh coordinates; left out: m for glb, mm for the others"
-    )
+    unit: LengthUnit | None = None
+    """of mesh coordinates; left out: m for glb, mm for the others"""
     material: f.Material | None = None
-    shape: f.VoxelShape | None = Field(default=None, description="(z, y, x) of voxels")
-    voxel_mm: f.VoxelPitch | None = Field(default=None, description="(x, y, z)")
+    shape: f.VoxelShape | None = None
+    """(z, y, x) of voxels"""
+    voxel_mm: f.VoxelPitch | None = None
+    """(x, y, z)"""
 
     @model_validator(mode="after")
     def _fits(self) -> SampleUpload:
@@ -108,7 +111,8 @@ class UploadResult(f.Result):
     """How much of an upload has come."""
 
     name: str
-    received: int = Field(description="bytes so far")
+    received: int
+    """bytes so far"""
     complete: bool
     sample: SampleInfo | None = None
     warnings: list[str] = Field(default_factory=list)
@@ -120,8 +124,10 @@ class SampleMeshResult(f.Result):
     name: str
     revision: str | None = None
     format: Literal["stl"] = "stl"
-    total: int = Field(description="size of the whole [bytes]")
-    start: int = Field(description="position of this part [bytes]")
+    total: int
+    """size of the whole [bytes]"""
+    start: int
+    """position of this part [bytes]"""
     data: f.Payload
 
 

@@ -40,7 +40,8 @@ class Hello(Params):
     """Who the client is; the token where the server wants one."""
 
     protocol: Version = Field(description='the protocol the client speaks, e.g. "1.0"')
-    client: ShortText = Field(description="name of the program, for people")
+    client: ShortText
+    """name of the program, for people"""
     token: Annotated[str, MaxLen(4096)] | None = None
 
 
@@ -54,13 +55,11 @@ class Subscribe(Params):
     """Which events to send."""
 
     topics: Annotated[list[TopicName], Len(1, 16)]
-    max_rate_hz: Annotated[float, Ge(1e-3), Le(1000)] | None = Field(
-        default=None, description="at most so many events a second and topic; the newest value wins"
-    )
+    max_rate_hz: Annotated[float, Ge(1e-3), Le(1000)] | None = None
+    """at most so many events a second and topic; the newest value wins"""
     projection_kind: Literal["line_integral", "counts"] = "line_integral"
-    projection_binning: Annotated[int, Ge(1), Le(32)] = Field(
-        default=1, description="mean over so many pixels a side, for the topic projection"
-    )
+    projection_binning: Annotated[int, Ge(1), Le(32)] = 1
+    """mean over so many pixels a side, for the topic projection"""
 
 
 class Unsubscribe(Params):
@@ -73,28 +72,29 @@ class HelloResult(Result):
     """Who the server is."""
 
     protocol: str
-    server: str = Field(description="name and version")
+    server: str
+    """name and version"""
     machine: str
     profile: str | None = None
-    session: str | None = Field(
-        default=None, description="this connection's name, as in `controller`"
-    )
-    physics: str | None = Field(
-        default=None, description="how images are made: ideal, mono or poly"
-    )
+    session: str | None = None
+    """this connection's name, as in `controller`"""
+    physics: str | None = None
+    """how images are made: ideal, mono or poly"""
 
 
 class ControlResult(Result):
     """Who may move now."""
 
     controller: str | None
-    yours: bool = Field(default=False, description="whether that is this connection")
+    yours: bool = False
+    """whether that is this connection"""
 
 
 class Pong(Result):
     """The server is alive."""
 
-    time: float = Field(description="the twin's clock [s]")
+    time: float
+    """the twin's clock [s]"""
 
 
 SESSION_HELLO = read("session.hello", Hello, HelloResult, "introduce the client; bring the token")
