@@ -38,7 +38,6 @@ from flexdt.protocol import (
     Response,
     RpcError,
 )
-from flexdt.protocol.connection import Raw
 from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Id, Single, to_plain
 from flexdt.protocol.rpc_errors import internal, not_authorised
@@ -242,7 +241,7 @@ class Frozen:
         return message
 
 
-Read = Callable[[Raw, Connection], Awaitable[Frozen | tuple[Frozen, ...]]]
+Read = Callable[[bytes, Connection], Awaitable[Frozen | tuple[Frozen, ...]]]
 """Reads a large message of a connection apart from the loop: one message, or those of a batch.
 
 Raises `RpcError` where that takes too much.

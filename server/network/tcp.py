@@ -43,7 +43,7 @@ from flexdt.protocol import (
     parse_params,
     require_compatible,
 )
-from flexdt.protocol.connection import MAX_ANSWER, Raw
+from flexdt.protocol.connection import MAX_ANSWER
 from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Id, Single
 from flexdt.protocol.methods.session_messages import Hello
@@ -426,11 +426,11 @@ class _Link(asyncio.Protocol):
         except ProtocolError as error:
             self.out.reply(Failure(None, parse_error(str(error))))
 
-    async def _decoded(self, raw: Raw) -> Message | Frozen | tuple[Frozen, ...]:
+    async def _decoded(self, raw: bytes) -> Message | Frozen | tuple[Frozen, ...]:
         read = self.server.read
-        if not self.let_in and (isinstance(raw, tuple) or len(raw) > LARGE):
+        if not self.let_in and len(raw) > LARGE:
             return Malformed(not_authorised())
-        if read is None or (isinstance(raw, bytes) and len(raw) <= LARGE):
+        if read is None or len(raw) <= LARGE:
             return self.wire.decode(raw)
         try:
             return await read(raw, self.wire)

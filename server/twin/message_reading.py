@@ -20,7 +20,6 @@ from flexdt.protocol import (
     RpcError,
     find,
 )
-from flexdt.protocol.connection import Raw
 from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Single
 from flexdt.protocol.method import parse_params
@@ -42,14 +41,13 @@ class Reader:
     def __init__(self) -> None:
         self._workers = Workers(1, MEMORY_BYTES, SECONDS)
 
-    async def __call__(self, raw: Raw, wire: Connection) -> Frozen | tuple[Frozen, ...]:
+    async def __call__(self, raw: bytes, wire: Connection) -> Frozen | tuple[Frozen, ...]:
         """The message of `raw`, or those of a batch.
 
         Raises:
             RpcError: -32008, it cannot be read within the limits.
         """
-        pieces = (raw,) if isinstance(raw, bytes) else raw
-        kind, *items = await self._workers.ask(work, wire.codec, wire.max_batch, raw=pieces)
+        kind, *items = await self._workers.ask(work, wire.codec, wire.max_batch, raw=(raw,))
         pairs = zip(items[::2], items[1::2], strict=True)
         frozen = tuple(Frozen(item, method.decode()) for method, item in pairs)
         return frozen if kind == b"batch" else frozen[0]
@@ -59,9 +57,9 @@ class Reader:
         self._workers.close()
 
 
-def work(codec: Codec | None, most: int, *pieces: bytes) -> list[bytes]:
+def work(codec: Codec | None, most: int, raw: bytes) -> list[bytes]:
     """In the worker: the items of a message, of a batch of at most so many: method, pickle."""
-    message = Connection(codec, max_batch=most).decode(pieces)
+    message = Connection(codec, max_batch=most).decode(raw)
     batch = isinstance(message, Batch)
     items = message.items if isinstance(message, Batch) else (message,)
     parts = [b"batch" if batch else b"single"]

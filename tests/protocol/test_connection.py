@@ -331,7 +331,7 @@ class Queue:
 
     def __init__(self, codec: Codec) -> None:
         self.json, self.whole, self.judged = codec is Codec.JSON, list[bytes](), 0
-        self.rest, self.large = b"", False
+        self.rest = b""
 
     def end(self) -> int:
         """Bytes of the message that `rest` begins with, framing included; 0: not all have come."""
@@ -342,10 +342,12 @@ class Queue:
 
     def feed(self, data: bytes) -> None:
         self.rest += data
-        while not self.large and (size := self.end()):
+        while size := self.end():
             self.whole.append(self.rest[:size])
             self.rest = self.rest[size:]
-        self.large = self.large or len(self.rest) > PIECE
+
+    def urgent(self, message: bytes) -> bool:
+        return b"stop" in message and len(self.body(message)) <= PIECE
 
     def body(self, message: bytes) -> bytes:
         return message[:-1] if self.json else message[4:]
@@ -356,23 +358,18 @@ class Queue:
             self.judged = max(0, self.judged - 1)
             if body.strip() or not self.json:
                 return body
-        if not (self.large and self.end()):
-            return None
-        body = self.body(self.rest[: self.end()])
-        self.rest, self.large = self.rest[self.end() :], False
-        self.feed(b"")
-        return body
+        return None
 
     def overtake(self, most: int, shown: list[bytes]) -> list[bytes]:
         out, seen = [], 0
-        if not any(b"stop" in m for m in self.whole[self.judged :]):
+        if not any(map(self.urgent, self.whole[self.judged :])):
             self.judged = len(self.whole)
         while self.judged < len(self.whole) and seen < most:
             message = self.whole[self.judged]
-            seen += b"stop" in message
-            if b"stop" in message:
+            seen += self.urgent(message)
+            if self.urgent(message):
                 shown.append(self.body(message))
-            if b"stop now" in message:
+            if self.urgent(message) and b"stop now" in message:
                 out.append(self.body(self.whole.pop(self.judged)))
             else:
                 self.judged += 1
@@ -389,7 +386,7 @@ def test_messages_come_out_whole_once_and_urgent_ones_first(codec: Codec, seed: 
         if rng.random() < 0.15:
             body += b"." * (PIECE - rng.randrange(-3, 12))
         stream += body + b"\n" if queue.json else len(body).to_bytes(4, "big") + body
-    while stream or queue.whole or queue.large:
+    while stream or queue.whole:
         if rng.random() < 0.5:
             size = rng.choice(
                 [rng.randrange(1, 9), rng.randrange(1, 90), PIECE - 2, PIECE, 200_000]
@@ -400,7 +397,7 @@ def test_messages_come_out_whole_once_and_urgent_ones_first(codec: Codec, seed: 
         elif rng.random() < 0.5:
             raw = wire.next_raw()
             assert not isinstance(raw, Malformed)
-            assert (b"".join(raw) if isinstance(raw, tuple) else raw) == queue.next()
+            assert raw == queue.next()
         else:
             shown: list[list[bytes]] = [[], []]
 
@@ -412,12 +409,10 @@ def test_messages_come_out_whole_once_and_urgent_ones_first(codec: Codec, seed: 
             got = wire.overtake([b"halt", b"stop"], wanted, most)
             assert got == queue.overtake(most, shown[1])
             assert shown[0] == shown[1]
-        ended = queue.large and queue.end() > 0
-        assert wire.whole is (len(queue.whole) > 0 or ended)
-        assert wire.waiting == len(queue.whole) + ended
+        assert wire.whole is (len(queue.whole) > 0)
+        assert wire.waiting == len(queue.whole)
         assert wire.unjudged is (queue.judged < len(queue.whole))
-        assert wire.holds(b"stop") is any(b"stop" in m for m in queue.whole[queue.judged :])
-        assert wire.mid_message is (not ended if queue.large else len(queue.rest) > 0)
-        if not queue.large:
-            assert wire.pending == sum(map(len, queue.whole)) + len(queue.rest)
+        assert wire.holds(b"stop") is any(map(queue.urgent, queue.whole[queue.judged :]))
+        assert wire.mid_message is (len(queue.rest) > 0)
+        assert wire.pending == sum(map(len, queue.whole)) + len(queue.rest)
     assert wire.next_raw() is None
