@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from flexdt.clients.client.async_client import AsyncTwinClient as AsyncTwinClient
+    from flexdt.clients.client.client import AsyncTwinClient as AsyncTwinClient
     from flexdt.clients.client.client import TwinClient as TwinClient
     from flexdt.clients.client.events import Projection as Projection
     from flexdt.clients.client.transport import ConnectionLost as ConnectionLost
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from flexdt.protocol.state_model import State as State
 
 _HOMES = {
-    "AsyncTwinClient": "flexdt.clients.client.async_client",
+    "AsyncTwinClient": "flexdt.clients.client.client",
     "Projection": "flexdt.clients.client.events",
     "TwinClient": "flexdt.clients.client.client",
     "ConnectionLost": "flexdt.clients.client.transport",

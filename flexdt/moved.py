@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import Final
 
 MOVED: Final = {
+    "flexdt.clients.client.async_client": "flexdt.clients.client.client",
     "flexdt.clients.batch": "flexdt_extensions.batch",
     "flexdt.clients.calibration.build_sheet": "flexdt_extensions.phantom_design.phantom_design",
     "flexdt.clients.calibration.phantom_design": "flexdt_extensions.phantom_design.phantom_design",

@@ -2,16 +2,19 @@
 
 from flexdt.protocol.codec import Codec
 from flexdt.protocol.connection import MAX_FRAME, Connection, Prepared
-from flexdt.protocol.correlation import Answered, Correlation, Role, hello_params
 from flexdt.protocol.messages import (
+    Answered,
     Batch,
+    Correlation,
     Failure,
     Malformed,
     Message,
     Notification,
     Request,
     Response,
+    Role,
     event,
+    hello_params,
 )
 from flexdt.protocol.method import (
     PROTOCOL,

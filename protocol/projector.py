@@ -20,7 +20,7 @@ from flexdt.protocol import fields as f
 from flexdt.protocol import image
 from flexdt.protocol.method import AnyMethod, Method, read
 from flexdt.protocol.methods.document_messages import Discovery
-from flexdt.protocol.methods.sample_messages import Bytes
+from flexdt.protocol.methods.scanner_messages import Bytes
 from flexdt.protocol.methods.session_messages import Hello, HelloResult
 from flexdt.protocol.rpc_errors import RpcError
 

@@ -1,31 +1,448 @@
-"""`TwinClient`: the twin server's methods as blocking, typed Python calls.
+"""`TwinClient` and `AsyncTwinClient`: the twin server's methods, blocking and as coroutines.
 
-It waits for what an `AsyncTwinClient` does on an event loop in a thread of its own, one for all
-clients of the process. So it works in scripts, in threads and in a notebook whose own event loop is
-running.
+`Core` is a client's connection policy: greet, reconnect with back-off, subscribe again. A call that
+only reads is repeated after a reconnect. One that acts is repeated only if it was never sent;
+otherwise the caller gets an error that says that its outcome is unknown. So no move is ever
+repeated silently.
+
+`TwinClient` waits for what an `AsyncTwinClient` does on an event loop in a thread of its own, one
+for all clients of the process. So it works in scripts, in threads and in a notebook whose own event
+loop is running.
 """
 
 from __future__ import annotations
 
 import asyncio
 import atexit
+import contextlib
 import functools
+import inspect
 import os
 import ssl as tls
 import threading
-from collections.abc import Coroutine
-from typing import Any, TypeVar
+from collections.abc import Callable, Coroutine, Iterator, Mapping
+from typing import Any, Final, Generic, ParamSpec, Protocol, TypeVar, overload
 
-from flexdt.clients.client.async_client import AsyncTwinClient
-from flexdt.clients.client.events import Subscription
-from flexdt.clients.client.flows import Effect, Flow, Tell, drive, perform
-from flexdt.clients.client.shared_methods import SharedMethods
-from flexdt.clients.client.transport import Transport
+from flexdt.clients.client import twin_methods as m
+from flexdt.clients.client.events import AsyncSubscription, Subscription
+from flexdt.clients.client.flows import Ask, Effect, Flow, Tell, adrive, drive, perform
+from flexdt.clients.client.transport import ConnectionLost, Link, TcpTransport, Transport
 from flexdt.clients.client.twin_methods import Kind, Topic
+from flexdt.protocol import METHODS, RpcError, hello_params, parse_result
 from flexdt.protocol.methods.session_messages import HelloResult
 from flexdt.twin.signatures import public
 
+FIRST_PAUSE_S: Final = 0.05
+LONGEST_PAUSE_S: Final = 1.0
+ATTEMPTS: Final = 3
+
+_P = ParamSpec("_P")
 _R = TypeVar("_R")
+
+
+def back_off(first_s: float = FIRST_PAUSE_S) -> Iterator[float]:
+    """Pauses between attempts to connect [s]: each twice the one before, at most a second."""
+    pause = first_s
+    while True:
+        yield pause
+        pause = min(2 * pause, LONGEST_PAUSE_S)
+
+
+class Listener(Protocol):
+    """Receives the events of its topics."""
+
+    topics: tuple[str, ...]
+
+    def put(self, params: Mapping[str, object]) -> None:
+        """Take an event's params."""
+
+    def connection_lost(self) -> None:
+        """The connection has ended; the client may reconnect."""
+
+    def end(self) -> None:
+        """No more events will come."""
+
+
+class Core:
+    """A client's connection and what it keeps between calls.
+
+    Args:
+        transport: to the server.
+        name: of this program, for people who look at the server.
+        token: where the server requires one.
+        timeout_s: for an answer [s].
+        reconnect_s: how long to try after a connection has been lost [s].
+        wait_s: how long to try the first time, for a server that is just starting [s].
+
+    Attributes:
+        hello: the server's answer to the newest greeting; None before the first.
+        link: the newest connection, which may have ended.
+        closed: whether the client has been closed for good.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        *,
+        name: str,
+        token: str | None,
+        timeout_s: float,
+        reconnect_s: float,
+        wait_s: float,
+    ) -> None:
+        self.transport, self._name, self._token = transport, name, token
+        self.timeout_s, self.reconnect_s, self.wait_s = timeout_s, reconnect_s, wait_s
+        self.hello: HelloResult | None = None
+        self.link: Link | None = None
+        self.closed = False
+        self._listeners: dict[Listener, Mapping[str, object]] = {}
+        self._connecting = asyncio.Lock()
+
+    async def connected(self) -> Link:
+        """A link that is alive.
+
+        Raises:
+            ConnectionLost: no server answers, or the client is closed.
+            RpcError: the server refuses the client.
+        """
+        if not self.closed and self.link is not None and self.link.alive:
+            return self.link
+        async with self._connecting:
+            return await self._join()
+
+    async def call(self, asked: Ask) -> object:
+        """The result of a method, not yet decoded.
+
+        Raises:
+            RpcError: the server's answer is an error.
+            ConnectionLost: the server cannot be reached, or was lost during a call that acts.
+            TimeoutError: no answer in time.
+        """
+        patience = asked.patience_s
+        limit = self.timeout_s if patience is not None and patience < 0 else patience
+        for attempt in range(ATTEMPTS):
+            link = await self.connected()
+            try:
+                return await link.request(asked.method, asked.params, limit)
+            except ConnectionLost as lost:
+                if attempt == ATTEMPTS - 1 or self.closed:
+                    raise
+                if lost.sent and not METHODS[asked.method].safe:
+                    raise ConnectionLost(
+                        f"{lost} during {asked.method}: it is not known whether it was carried "
+                        "out; it was not repeated",
+                        sent=True,
+                    ) from lost
+        raise AssertionError("unreachable")
+
+    async def subscribe(self, listener: Listener, options: Mapping[str, object]) -> None:
+        """Send `listener` its topics' events, also after reconnects.
+
+        Raises:
+            ValueError: another listener follows one of the topics with other options; the server
+                keeps one set of options for each topic of a connection.
+        """
+        params = {
+            "topics": list(listener.topics),
+            **{k: v for k, v in options.items() if v is not None},
+        }
+        self.follow(listener, params)
+        try:
+            await self.call(Ask("state.subscribe", params))
+        except BaseException:
+            self._listeners.pop(listener, None)
+            raise
+
+    def follow(self, listener: Listener, params: Mapping[str, object]) -> None:
+        """Have `listener` subscribed with these params whenever a connection is made.
+
+        Raises:
+            ValueError: as `subscribe`.
+        """
+        for other, theirs in self._listeners.items():
+            for topic in set(listener.topics) & set(other.topics):
+                _require_same(topic, params, theirs)
+        self._listeners[listener] = params
+
+    async def unsubscribe(self, listener: Listener) -> None:
+        """Send it no more events; cancel topics without another listener at the server."""
+        self._listeners.pop(listener, None)
+        still = {topic for other in self._listeners for topic in other.topics}
+        gone = [topic for topic in listener.topics if topic not in still]
+        if gone and self.link is not None and self.link.alive:
+            # If this fails, the connection has ended and the subscriptions with it.
+            with contextlib.suppress(ConnectionLost, TimeoutError, RpcError):
+                await self.link.request("state.unsubscribe", {"topics": gone}, self.timeout_s)
+
+    async def close(self) -> None:
+        """End the connection and all subscriptions."""
+        self.closed = True
+        listeners = list(self._listeners)
+        self._listeners.clear()
+        for listener in listeners:
+            listener.end()
+        await self.disconnect()
+
+    async def disconnect(self) -> None:
+        """End the connection; another one may be made, with the same subscriptions."""
+        link, self.link = self.link, None
+        if link is not None:
+            await link.close()
+
+    def _deliver(self, params: Mapping[str, object]) -> None:
+        """Pass an event's params to its listeners."""
+        topic = params.get("topic")
+        for listener in list(self._listeners):
+            if topic in listener.topics:
+                listener.put(params)
+
+    def _ended(self) -> None:
+        """Tell the listeners that the connection has ended."""
+        for listener in list(self._listeners):
+            listener.connection_lost()
+
+    async def _join(self) -> Link:
+        """Connect, unless another call has done so meanwhile."""
+        clock = asyncio.get_running_loop().time
+        deadline = clock() + (self.wait_s if self.hello is None else self.reconnect_s)
+        pauses = back_off()
+        while True:
+            if self.closed:
+                raise ConnectionLost("the client is closed")
+            if self.link is not None and self.link.alive:
+                return self.link
+            try:
+                self.link = await self._greet()
+            except ConnectionLost:
+                pause = next(pauses)
+                if clock() + pause > deadline:
+                    raise
+                await asyncio.sleep(pause)
+
+    async def _greet(self) -> Link:
+        await self.transport.open()
+        link = Link(self.transport, self._deliver, self._ended)
+        try:
+            params = hello_params(self._name, self._token)
+            answer = await link.request("session.hello", params, self.timeout_s)
+            hello = parse_result(HelloResult, answer)
+            for wanted in list(self._listeners.values()):
+                await link.request("state.subscribe", wanted, self.timeout_s)
+            if self.closed:  # by another thread or task, meanwhile
+                raise ConnectionLost("the client is closed")
+        except BaseException as error:
+            await link.close()
+            if isinstance(error, ConnectionLost) and link.calls.reason is not None:
+                # The server said why it ends the connection: trying again is no help.
+                raise link.calls.reason from None
+            raise
+        self.hello = hello
+        return link
+
+
+def _require_same(topic: str, asked: Mapping[str, object], known: Mapping[str, object]) -> None:
+    view = ("projection_kind", "projection_binning") if topic == "projection" else ()
+    for name in ("max_rate_hz", *view):
+        if asked.get(name) != known.get(name):
+            raise ValueError(
+                f"{topic} with {name} {asked.get(name)}: this client follows it with "
+                f"{known.get(name)} already; use the same, or another client"
+            )
+
+
+class ClientMethod(Generic[_P, _R]):
+    """A method made of a function that makes a flow, with its signature and docstring.
+
+    It runs the flow by its client's `run`: so it blocks on a `TwinClient`, and is a coroutine on an
+    `AsyncTwinClient`.
+    """
+
+    def __init__(self, make: Callable[_P, Flow[_R]]) -> None:
+        @functools.wraps(make)
+        def blocking(self: TwinClient, /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
+            return self.run(make(*args, **kwargs))
+
+        @functools.wraps(make)
+        async def awaited(self: AsyncTwinClient, /, *args: _P.args, **kwargs: _P.kwargs) -> _R:
+            return await self.run(make(*args, **kwargs))
+
+        self._methods: dict[bool, Any] = {False: blocking, True: awaited}
+        # What help() and notebooks show: with self, without Flow.
+        made = inspect.signature(make)
+        own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
+        returns = str(made.return_annotation).removeprefix("Flow[").removesuffix("]")
+        parameters = [own, *made.parameters.values()]
+        for method in self._methods.values():
+            method.__signature__ = made.replace(parameters=parameters, return_annotation=returns)
+
+    @overload
+    def __get__(self, client: TwinClient, kind: type[TwinClient]) -> Callable[_P, _R]: ...
+    @overload
+    def __get__(
+        self, client: AsyncTwinClient, kind: type[AsyncTwinClient]
+    ) -> Callable[_P, Coroutine[Any, Any, _R]]: ...
+    def __get__(self, client: TwinClient | AsyncTwinClient | None, kind: type[Any]) -> Any:
+        return self._methods[inspect.iscoroutinefunction(kind.run)].__get__(client, kind)
+
+
+class SharedMethods:
+    """The methods of the wire; how they wait is the client's. Written by `make web`."""
+
+    control = ClientMethod(m.control)
+    ping = ClientMethod(m.ping)
+    discover = ClientMethod(m.discover)
+    state = ClientMethod(m.state)
+    move = ClientMethod(m.move)
+    jog = ClientMethod(m.jog)
+    set_axis = ClientMethod(m.set_axis)
+    stop = ClientMethod(m.stop)
+    estop = ClientMethod(m.estop)
+    reset = ClientMethod(m.reset)
+    set_clock = ClientMethod(m.set_clock)
+    set_tube = ClientMethod(m.set_tube)
+    set_camera = ClientMethod(m.set_camera)
+    samples = ClientMethod(m.samples)
+    set_sample = ClientMethod(m.set_sample)
+    sample_mesh = ClientMethod(m.sample_mesh)
+    upload_mesh = ClientMethod(m.upload_mesh)
+    upload_scene = ClientMethod(m.upload_scene)
+    upload_voxels = ClientMethod(m.upload_voxels)
+    projection = ClientMethod(m.projection)
+    ray = ClientMethod(m.ray)
+    geometry = ClientMethod(m.geometry)
+    predict_exposure = ClientMethod(m.predict_exposure)
+    check_script = ClientMethod(m.check_script)
+    submit_script = ClientMethod(m.submit_script)
+    check_trajectory = ClientMethod(m.check_trajectory)
+    submit_trajectory = ClientMethod(m.submit_trajectory)
+    jobs = ClientMethod(m.jobs)
+    job_status = ClientMethod(m.job_status)
+    pause_job = ClientMethod(m.pause_job)
+    resume_job = ClientMethod(m.resume_job)
+    step_job = ClientMethod(m.step_job)
+    abort_job = ClientMethod(m.abort_job)
+    wait_job = ClientMethod(m.wait_job)
+    datasets = ClientMethod(m.datasets)
+    dataset = ClientMethod(m.dataset)
+    dataset_frame = ClientMethod(m.dataset_frame)
+    apply_calibration = ClientMethod(m.apply_calibration)
+    calibration = ClientMethod(m.calibration)
+    calibrations = ClientMethod(m.calibrations)
+    revert_calibration = ClientMethod(m.revert_calibration)
+    fit_calibration = ClientMethod(m.fit_calibration)
+    align_dataset = ClientMethod(m.align_dataset)
+    save_scene = ClientMethod(m.save_scene)
+    load_scene = ClientMethod(m.load_scene)
+
+
+class AsyncTwinClient(SharedMethods):
+    """A connection to a twin server; an async context manager.
+
+    It connects on entering, or with the first call. Errors are `TwinClient`'s. A call that is
+    cancelled may still be carried out by the server (use `stop` to end a motion).
+
+    Args:
+        host, port: of the server.
+        token: where the server requires one.
+        transport: replaces TCP (for tests); host, port and ssl are not used then.
+        name: of this program, for people who look at the server.
+        timeout_s: for an answer [s]; calls that wait for a motion or a job have none.
+        reconnect_s: how long to try after the connection was lost [s].
+        wait_s: how long to try the first time [s].
+        ssl: TLS context; None for plain TCP.
+
+    Attributes:
+        core: the connection, by the policy.
+
+    Example:
+        >>> async def turn() -> None:  # doctest: +SKIP
+        ...     async with AsyncTwinClient("127.0.0.1", 55000) as twin:
+        ...         await twin.move({"rot_obj": 90.0}, wait=True)
+    """
+
+    @public
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        port: int = 55000,
+        token: str | None = None,
+        transport: Transport | None = None,
+        *,
+        name: str = "flexdt.clients",
+        timeout_s: float = 30.0,
+        reconnect_s: float = 10.0,
+        wait_s: float = 0.0,
+        ssl: tls.SSLContext | None = None,
+    ) -> None:
+        self.core = Core(
+            TcpTransport(host, port, ssl=ssl) if transport is None else transport,
+            name=name, token=token, timeout_s=timeout_s, reconnect_s=reconnect_s, wait_s=wait_s,
+        )  # fmt: skip
+
+    async def connect(self) -> AsyncTwinClient:
+        """Connect now; returns the client.
+
+        Raises:
+            ConnectionLost: no server answers.
+            RpcError: the server refuses the client (-32004), or is another version.
+        """
+        await self.core.connected()
+        return self
+
+    async def __aenter__(self) -> AsyncTwinClient:
+        return await self.connect()
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """End the connection; this releases control."""
+        await self.core.close()
+
+    @property
+    def server(self) -> HelloResult:
+        """The server's answer to the hello of the newest connection.
+
+        Raises:
+            RuntimeError: there has been no connection yet.
+        """
+        if self.core.hello is None:
+            raise RuntimeError("not connected yet: await connect(), or use `async with`")
+        return self.core.hello
+
+    async def run(self, flow: Flow[_R]) -> _R:
+        """Run a flow of `twin_methods`, or your own made of them."""
+        return await adrive(flow, self.core.call)
+
+    def subscribe(
+        self,
+        *topics: Topic,
+        max_rate_hz: float | None = None,
+        projection_kind: Kind | None = None,
+        projection_binning: int | None = None,
+        max_queue: int = 256,
+    ) -> AsyncSubscription:
+        """Events of `topics` (default: state), for `async with` and `async for`.
+
+        Args:
+            topics: state, projection, job, log.
+            max_rate_hz: most events per second for each topic.
+            projection_kind, projection_binning: for the topic projection.
+            max_queue: events kept until they are read; the oldest are dropped first.
+
+        Raises:
+            ValueError: this client already follows one of the topics with other options.
+        """
+        core = self.core
+        options = {
+            "max_rate_hz": max_rate_hz,
+            "projection_kind": projection_kind,
+            "projection_binning": projection_binning,
+        }
+        return AsyncSubscription(
+            topics or ("state",), max_queue,
+            lambda made: core.subscribe(made, options), core.connected, core.unsubscribe,
+        )  # fmt: skip
 
 
 @functools.cache

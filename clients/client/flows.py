@@ -13,6 +13,7 @@ from typing import Any, Final, TypeAlias, TypeVar
 
 from flexdt.protocol import Method, parse_result
 from flexdt.protocol.fields import Params, Result
+from flexdt.protocol.methods import scanner_messages as scanner
 
 _R = TypeVar("_R")
 _M = TypeVar("_M", bound=Result)
@@ -71,6 +72,20 @@ def ask(
     given = {k: v for k, v in params.items() if v is not None}
     answer = yield Ask(method.name, given, None if "seconds" in method.limits else patience_s)
     return parse_result(method.result, answer)
+
+
+def sample_shape() -> Flow[scanner.SampleMeshResult]:
+    """The mesh of the sample on the stage, with the name and the revision that it is of."""
+    while True:
+        content, first = b"", None
+        while first is None or len(content) < first.total:
+            part = yield from ask(scanner.SAMPLE_MESH, start=len(content))
+            first = part if first is None else first
+            if (part.name, part.revision, part.total) != (first.name, first.revision, first.total):
+                break  # another sample is on the stage by now: start again
+            content += part.data
+        else:
+            return first.model_copy(update={"data": content})
 
 
 def drive(flow: Flow[_R], perform: Callable[[Effect], object]) -> _R:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final, cast
 
-from flexdt.clients.client.async_client import AsyncTwinClient, back_off
+from flexdt.clients.client.client import AsyncTwinClient, back_off
 from flexdt.clients.client.transport import ConnectionLost
 from flexdt.protocol import Code, RpcError
 from flexdt.protocol.methods.session_messages import HelloResult

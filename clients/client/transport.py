@@ -1,7 +1,7 @@
 """How a client's messages reach a server: over TCP, or in tests straight into a function.
 
 A transport opens a connection, sends single messages and receives messages; the client above it
-does not know which transport it has; retries belong to `async_client`. `Link` gives requests their
+does not know which transport it has; retries belong to `client`. `Link` gives requests their
 ids and is one connection's life in an event loop: one task reads, any number of tasks send
 requests.
 """

@@ -1,13 +1,14 @@
 """The server's methods as flows, once for both clients.
 
 One function per method of the wire, with the protocol's own models as results and NumPy arrays as
-images. `client` and `async_client` decide how to wait for an answer. In the examples `twin` is a
+images. The clients of `client` decide how to wait for an answer. In the examples `twin` is a
 `TwinClient`; with `AsyncTwinClient` the same calls are awaited.
 """
 
 from __future__ import annotations
 
 import base64
+import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,18 +17,15 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.clients.client import uploads
 from flexdt.clients.client.events import Projection
-from flexdt.clients.client.flows import OWN_PATIENCE, Flow, Sleep, Tell, ask
+from flexdt.clients.client.flows import OWN_PATIENCE, Flow, Sleep, Tell, ask, sample_shape
 from flexdt.protocol import image as wire_image
 from flexdt.protocol import state_model as s
 from flexdt.protocol.methods import calibration_messages as corrections
-from flexdt.protocol.methods import calibration_messages as past_scans
 from flexdt.protocol.methods import document_messages as documents
 from flexdt.protocol.methods import image_messages as images
 from flexdt.protocol.methods import job_messages as scans
-from flexdt.protocol.methods import motion_messages as motion
-from flexdt.protocol.methods import sample_messages as stage
+from flexdt.protocol.methods import scanner_messages as scanner
 from flexdt.protocol.methods import session_messages as session
 
 if TYPE_CHECKING:
@@ -38,6 +36,10 @@ Kind = Literal["line_integral", "counts"]
 SpeedUp = float | Literal["max"]
 Positions = Mapping[str, float]
 
+CHUNK: Final = 4 * 2**20
+"""Bytes in one message of an upload: below a frame, also as base64."""
+SCENE_FORMATS: Final = ("toml", "json")
+MESH_FORMATS: Final = ("stl", "obj", "ply", "glb", "off")
 FINAL_STATES: Final = ("done", "failed", "aborted", "incomplete")
 """States in which a job has ended."""
 
@@ -92,7 +94,7 @@ def move(
     wait: bool = False,
     plan: bool = False,
     shortest: bool = False,
-) -> Flow[motion.MoveResult]:
+) -> Flow[scanner.MoveResult]:
     """Move axes [mm, deg, script's sign]; they start together.
 
     Args:
@@ -111,31 +113,31 @@ def move(
         30.0
     """
     return ask(
-        motion.AXES_MOVE, None if wait else OWN_PATIENCE, targets=dict(targets),
+        scanner.AXES_MOVE, None if wait else OWN_PATIENCE, targets=dict(targets),
         relative=relative, wait=wait, plan=plan, shortest=shortest,
     )  # fmt: skip
 
 
-def jog(axis: str, velocity: float, lease_s: float = 0.5) -> Flow[motion.MoveResult]:
+def jog(axis: str, velocity: float, lease_s: float = 0.5) -> Flow[scanner.MoveResult]:
     """Move at `velocity` [mm/s, deg/s] until the lease [s] runs out or is renewed.
 
     Example:
         >>> twin.jog("rot_obj", 5.0, lease_s=0.2).warnings
         []
     """
-    return ask(motion.AXES_JOG, axis=axis, velocity=velocity, lease_s=lease_s)
+    return ask(scanner.AXES_JOG, axis=axis, velocity=velocity, lease_s=lease_s)
 
 
 def set_axis(
     axis: str, *, speed: float | None = None, acceleration: float | None = None
-) -> Flow[motion.AxisSetResult]:
+) -> Flow[scanner.AxisSetResult]:
     """Set speed [unit/s] and acceleration [unit/s2] of later moves.
 
     Example:
         >>> twin.set_axis("rot_obj", speed=10.0).speed
         10.0
     """
-    return ask(motion.AXES_SET, axis=axis, speed=speed, acceleration=acceleration)
+    return ask(scanner.AXES_SET, axis=axis, speed=speed, acceleration=acceleration)
 
 
 def stop() -> Flow[s.Stopped]:
@@ -145,7 +147,7 @@ def stop() -> Flow[s.Stopped]:
         >>> twin.stop().safety.estop
         False
     """
-    return ask(motion.AXES_STOP)
+    return ask(scanner.AXES_STOP)
 
 
 def estop() -> Flow[s.Stopped]:
@@ -155,7 +157,7 @@ def estop() -> Flow[s.Stopped]:
         >>> twin.estop().safety.estop, twin.reset().safety.estop
         (True, False)
     """
-    return ask(motion.SAFETY_ESTOP)
+    return ask(scanner.SAFETY_ESTOP)
 
 
 def reset(stop: int | None = None) -> Flow[s.State]:
@@ -171,7 +173,7 @@ def reset(stop: int | None = None) -> Flow[s.State]:
         >>> twin.reset().safety.state
         'ok'
     """
-    return ask(motion.SAFETY_RESET, stop=stop)
+    return ask(scanner.SAFETY_RESET, stop=stop)
 
 
 # -- settings ----------------------------------------------------------------------------
@@ -184,7 +186,7 @@ def set_clock(speed_up: SpeedUp) -> Flow[s.ClockState]:
         >>> twin.set_clock("max").speed_up
         'max'
     """
-    return ask(motion.CLOCK_SET, speed_up=speed_up)
+    return ask(scanner.CLOCK_SET, speed_up=speed_up)
 
 
 def set_tube(
@@ -197,7 +199,7 @@ def set_tube(
         >>> tube.kV, tube.power_W
         (80.0, 20.0)
     """
-    return ask(motion.TUBE_SET, kV=kV, power_W=power_W, on=on)
+    return ask(scanner.TUBE_SET, kV=kV, power_W=power_W, on=on)
 
 
 def set_camera(
@@ -215,7 +217,7 @@ def set_camera(
         200.0
     """
     return ask(
-        motion.CAMERA_SET, exposure_ms=exposure_ms, mode=mode,
+        scanner.CAMERA_SET, exposure_ms=exposure_ms, mode=mode,
         roi=None if roi is None else list(roi), averages=averages, frames=frames,
     )  # fmt: skip
 
@@ -223,14 +225,14 @@ def set_camera(
 # -- samples -----------------------------------------------------------------------------
 
 
-def samples() -> Flow[stage.SampleListResult]:
+def samples() -> Flow[scanner.SampleListResult]:
     """All samples that may be set, and the materials of meshes.
 
     Example:
         >>> "lego" in [sample.name for sample in twin.samples().samples]
         True
     """
-    return ask(stage.SAMPLE_LIST)
+    return ask(scanner.SAMPLE_LIST)
 
 
 def set_sample(
@@ -239,7 +241,7 @@ def set_sample(
     file: str | None = None,
     material: str | None = None,
     offset: Mapping[str, float] | None = None,
-) -> Flow[stage.SampleResult]:
+) -> Flow[scanner.SampleResult]:
     """Put a phantom (`name`) or an upload (`file`) on the stage.
 
     Args:
@@ -253,7 +255,7 @@ def set_sample(
         'lego'
     """
     place = None if offset is None else dict(offset)
-    return ask(stage.SAMPLE_SET, name=name, file=file, material=material, offset=place)
+    return ask(scanner.SAMPLE_SET, name=name, file=file, material=material, offset=place)
 
 
 def sample_mesh() -> Flow[bytes]:
@@ -268,7 +270,7 @@ def sample_mesh() -> Flow[bytes]:
         >>> len(twin.sample_mesh()) > 84  # the header and a triangle of an STL file
         True
     """
-    return (yield from uploads.sample_shape()).data
+    return (yield from sample_shape()).data
 
 
 def upload_mesh(
@@ -279,7 +281,7 @@ def upload_mesh(
     unit: Literal["um", "mm", "cm", "m", "inch"] | None = None,
     material: str | None = None,
     progress: Callable[[int, int], object] | None = None,
-) -> Flow[stage.UploadResult]:
+) -> Flow[scanner.UploadResult]:
     """Upload a mesh in chunks; afterwards `set_sample(file=name)` puts it on the stage.
 
     Args:
@@ -300,7 +302,20 @@ def upload_mesh(
         >>> twin.upload_mesh(cube, "cube", format="stl").complete
         True
     """
-    return _upload(uploads.mesh(source, name, format, unit, material), progress)
+    if isinstance(source, bytes):
+        data = source
+    else:
+        path = Path(source)
+        data = path.read_bytes()
+        name = path.stem if name is None else name
+        format = path.suffix.lower().lstrip(".") if format is None else format
+    if name is None or format not in MESH_FORMATS:
+        raise ValueError(
+            f"a mesh needs a name and a format of {', '.join(MESH_FORMATS)}; "
+            f"got name {name!r}, format {format!r}"
+        )
+    head = {"name": name, "kind": "mesh", "format": format, "unit": unit, "material": material}
+    return _upload(head, data, progress)
 
 
 def upload_scene(
@@ -308,7 +323,7 @@ def upload_scene(
     name: str | None = None,
     *,
     progress: Callable[[int, int], object] | None = None,
-) -> Flow[stage.UploadResult]:
+) -> Flow[scanner.UploadResult]:
     """Upload a phantom in chunks; afterwards `set_sample(file=name)` puts it on the stage.
 
     Args:
@@ -324,7 +339,15 @@ def upload_scene(
         >>> twin.upload_scene(load_phantom("normal-3"), "three").complete
         True
     """
-    return _upload(uploads.scene(source, name), progress)
+    from flexdt.phantoms import Phantom
+    from flexdt.phantoms.files.phantom_files import read_phantom_file
+
+    # A scene file is read here, as the meshes that it names lie beside it; what is sent is whole.
+    phantom = source if isinstance(source, Phantom) else read_phantom_file(Path(source))
+    if name is None:
+        name = source.name if isinstance(source, Phantom) else Path(source).stem
+    head = {"name": name, "kind": "scene", "format": "json"}
+    return _upload(head, json.dumps(phantom.to_dict()).encode(), progress)
 
 
 def upload_voxels(
@@ -334,7 +357,7 @@ def upload_voxels(
     *,
     material: str | None = None,
     progress: Callable[[int, int], object] | None = None,
-) -> Flow[stage.UploadResult]:
+) -> Flow[scanner.UploadResult]:
     """Upload voxels in chunks.
 
     Args:
@@ -351,18 +374,26 @@ def upload_voxels(
         >>> twin.upload_voxels(np.full((4, 4, 4), 0.02), 0.5, "block").complete
         True
     """
-    return _upload(uploads.voxels(data, voxel_mm, name, material), progress)
+    size = (voxel_mm,) * 3 if isinstance(voxel_mm, (int, float)) else voxel_mm
+    raw = np.ascontiguousarray(data, dtype="<f4")
+    head = {
+        "name": name, "kind": "voxels", "format": "raw", "material": material,
+        "shape": list(raw.shape), "voxel_mm": [float(v) for v in size],
+    }  # fmt: skip
+    return _upload(head, raw.tobytes(), progress)
 
 
 def _upload(
-    upload: uploads.Upload, progress: Callable[[int, int], object] | None
-) -> Flow[stage.UploadResult]:
-    done = None
-    for chunk in upload.chunks():
-        done = yield from ask(stage.SAMPLE_UPLOAD, **chunk)
+    head: Mapping[str, object], data: bytes, progress: Callable[[int, int], object] | None
+) -> Flow[scanner.UploadResult]:
+    total, done = len(data), None
+    for start in range(0, total, CHUNK):
+        part = data[start : start + CHUNK]
+        done = yield from ask(scanner.SAMPLE_UPLOAD, **head, total=total, start=start, data=part)
         if progress is not None:
-            yield Tell(progress, (done.received, len(upload.data)))
-    assert done is not None
+            yield Tell(progress, (done.received, total))
+    if done is None:
+        raise ValueError(f"nothing to upload as {head['name']!r}: the data are empty")
     return done
 
 
@@ -701,7 +732,7 @@ def wait_job(
 
 def datasets(
     search: str = "", *, start: int = 0, count: int = 50
-) -> Flow[past_scans.DatasetListResult]:
+) -> Flow[corrections.DatasetListResult]:
     """Data sets of the data directory, the newest first.
 
     Args:
@@ -716,12 +747,12 @@ def datasets(
         >>> [found.name for found in twin.datasets("listed").datasets]
         ['listed']
     """
-    return ask(past_scans.DATASET_LIST, search=search, start=start, count=count)
+    return ask(corrections.DATASET_LIST, search=search, start=start, count=count)
 
 
 def dataset(
     name: str, points: int = 400, *, measure: bool = False, script: bool = False
-) -> Flow[past_scans.DatasetResult]:
+) -> Flow[corrections.DatasetResult]:
     """A data set: its settings, and poses and times of at most `points` of its images.
 
     Args:
@@ -741,12 +772,12 @@ def dataset(
         >>> twin.dataset("looked-at").positions["rot_obj"]
         [0.0, 0.0, 0.0, 90.0]
     """
-    return ask(past_scans.DATASET_GET, name=name, points=points, measure=measure, script=script)
+    return ask(corrections.DATASET_GET, name=name, points=points, measure=measure, script=script)
 
 
 def dataset_frame(
     name: str, index: int, kind: Kind = "counts", binning: int = 1
-) -> Flow[tuple[npt.NDArray[np.generic], past_scans.DatasetFrameResult]]:
+) -> Flow[tuple[npt.NDArray[np.generic], corrections.DatasetFrameResult]]:
     """An image of a data set.
 
     Args:
@@ -771,7 +802,7 @@ def dataset_frame(
         (True, 'dark')
     """
     told = yield from ask(
-        past_scans.DATASET_FRAME, name=name, index=index, kind=kind, binning=binning
+        corrections.DATASET_FRAME, name=name, index=index, kind=kind, binning=binning
     )
     return wire_image.from_bytes(told.data, told.dtype, told.shape), told
 

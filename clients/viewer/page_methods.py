@@ -20,7 +20,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from flexdt.clients.client.async_client import AsyncTwinClient
+from flexdt.clients.client.client import AsyncTwinClient
 from flexdt.clients.client.flows import Ask
 from flexdt.clients.viewer import exports
 from flexdt.clients.viewer import page_params as p

@@ -17,12 +17,11 @@ from flexdt.protocol.methods import calibration_messages as calibration
 from flexdt.protocol.methods import document_messages as documents
 from flexdt.protocol.methods import image_messages as images
 from flexdt.protocol.methods import job_messages as jobs
-from flexdt.protocol.methods import motion_messages as motion
-from flexdt.protocol.methods import sample_messages as samples
+from flexdt.protocol.methods import scanner_messages as scanner
 from flexdt.protocol.methods import session_messages as session
 from flexdt.protocol.rpc_errors import Code, method_not_found
 
-TOPICS: Final = (session, motion, samples, images, jobs, calibration, documents)
+TOPICS: Final = (session, scanner, images, jobs, calibration, documents)
 
 METHODS: Final[Mapping[str, AnyMethod]] = {
     found.name: found

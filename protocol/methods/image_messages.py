@@ -11,7 +11,7 @@ from pydantic import Field
 from flexdt.protocol import fields as f
 from flexdt.protocol.method import read
 from flexdt.protocol.methods.document_messages import Averages, Frames
-from flexdt.protocol.methods.motion_messages import CameraSet, TubeSet
+from flexdt.protocol.methods.scanner_messages import CameraSet, TubeSet
 from flexdt.protocol.state_model import GeometryResult, ImageFlags
 
 LayerText = Annotated[f.ShortText, MaxLen(100)]

@@ -30,7 +30,7 @@ from flexdt.protocol import (
     find,
     parse_params,
 )
-from flexdt.protocol import msgpack_frames as frames
+from flexdt.protocol import connection as frames
 from flexdt.protocol.messages import Id
 from flexdt.protocol.projector import PROJECTOR_METHODS
 from flexdt.protocol.rpc_errors import (

@@ -37,8 +37,8 @@ from flexdt.protocol import (
     image,
     parse_result,
 )
-from flexdt.protocol import msgpack_frames as frames
-from flexdt.protocol.msgpack_frames import pack
+from flexdt.protocol import connection as frames
+from flexdt.protocol.connection import pack
 from flexdt.protocol.projector import Array
 from flexdt.protocol.rpc_errors import parse_error, too_large
 from flexdt.runtime.log import current, log

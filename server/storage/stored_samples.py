@@ -42,7 +42,7 @@ from flexdt.phantoms import material as material_of
 from flexdt.phantoms.files.mesh_files import default_unit
 from flexdt.phantoms.files.phantom_files import sent_scene
 from flexdt.protocol.fields import Payload
-from flexdt.protocol.methods.sample_messages import LengthUnit, SampleUpload
+from flexdt.protocol.methods.scanner_messages import LengthUnit, SampleUpload
 from flexdt.protocol.rpc_errors import Code, RpcError, too_large
 from flexdt.runtime.files.directory import TEMPORARY, Directory, writing
 from flexdt.runtime.files.own_documents import (

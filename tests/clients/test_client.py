@@ -33,7 +33,7 @@ from flexdt.protocol import (
     parse_params,
 )
 from flexdt.protocol.fields import Empty, Params
-from flexdt.protocol.methods.sample_messages import SampleUpload
+from flexdt.protocol.methods.scanner_messages import SampleUpload
 from flexdt.protocol.methods.session_messages import Hello
 from flexdt.protocol.rpc_errors import parse_error
 from flexdt.server.network.shell_parts import Peer

@@ -8,9 +8,9 @@ from __future__ import annotations
 import inspect
 from pathlib import Path
 
-from flexdt.clients.client import shared_methods, twin_methods
+from flexdt.clients.client import client, twin_methods
 
-FILE = Path(shared_methods.__file__)
+FILE = Path(client.__file__)
 HEAD = (
     '    """The methods of the wire; how they wait is the client\'s. Written by `make web`."""\n\n'
 )
@@ -25,9 +25,18 @@ def lines() -> str:
     return "".join(f"    {f.__name__} = ClientMethod(m.{f.__name__})\n" for f in own)
 
 
+def parts() -> tuple[str, str, str]:
+    """The text before the list, the list, and the text after it."""
+    before, head, rest = FILE.read_text("utf-8").partition(HEAD)
+    own, end, after = rest.partition("\n\n\n")
+    return before + head, own + "\n", end[1:] + after
+
+
 def test_the_list_of_methods_is_current() -> None:
-    assert FILE.read_text("utf-8").split(HEAD)[1] == lines(), "run `make web`, or this file"
+    _, now, _ = parts()
+    assert now == lines(), "run `make web`, or this file"
 
 
 if __name__ == "__main__":
-    FILE.write_text(FILE.read_text("utf-8").split(HEAD)[0] + HEAD + lines(), "utf-8")
+    before, _, after = parts()
+    FILE.write_text(before + lines() + after, "utf-8")

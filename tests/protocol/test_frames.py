@@ -18,7 +18,7 @@ from flexdt.protocol import (
     RpcError,
     image,
 )
-from flexdt.protocol.msgpack_frames import SMALL, pack, unpack
+from flexdt.protocol.connection import SMALL, pack, unpack
 
 
 def whole(message: Message) -> bytes:

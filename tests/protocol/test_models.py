@@ -28,8 +28,7 @@ from flexdt.protocol import (
 from flexdt.protocol.fields import require_extent
 from flexdt.protocol.method import compatible
 from flexdt.protocol.methods import openrpc_document
-from flexdt.protocol.methods.motion_messages import MoveResult
-from flexdt.protocol.methods.sample_messages import SampleUpload
+from flexdt.protocol.methods.scanner_messages import MoveResult, SampleUpload
 from flexdt.protocol.projector import PROJECTOR_METHODS
 from flexdt.protocol.rpc_errors import Code, clip, internal, invalid_params
 

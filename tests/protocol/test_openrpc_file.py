@@ -13,7 +13,7 @@ from typing import get_args
 from flexdt.protocol import METHODS
 from flexdt.protocol.methods import openrpc_document
 from flexdt.protocol.methods.image_messages import ProjectionGet
-from flexdt.protocol.methods.sample_messages import SampleUpload
+from flexdt.protocol.methods.scanner_messages import SampleUpload
 from flexdt.protocol.state_model import JobPhase
 
 PROTOCOL = Path(__file__).parents[2] / "protocol"

@@ -15,8 +15,7 @@ import pytest
 from lab import Refused, Wire, fly_script, projector, twin
 
 from flexdt.clients.cli.command_tree import run
-from flexdt.clients.client.async_client import AsyncTwinClient
-from flexdt.clients.client.client import TwinClient
+from flexdt.clients.client.client import AsyncTwinClient, TwinClient
 from flexdt.protocol import METHODS, Connection, Failure, RpcError
 from flexdt.protocol.method import compatible
 from flexdt.runtime.access import (

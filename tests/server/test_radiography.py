@@ -21,7 +21,7 @@ from flexdt.phantoms.channels import chain_through, channels, scatter_object
 from flexdt.phantoms.materials import stated_keV
 from flexdt.protocol import Codec
 from flexdt.protocol.messages import Encoded
-from flexdt.protocol.methods.motion_messages import TubeSet
+from flexdt.protocol.methods.scanner_messages import TubeSet
 from flexdt.protocol.rpc_errors import Code, RpcError
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.imaging.exposure_quality import CUT_OFF, SATURATED, STARVED, flags_of, marks_of

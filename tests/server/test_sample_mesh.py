@@ -13,7 +13,7 @@ import trimesh
 from lab import Process, Wire, twin
 
 from flexdt.clients.client.client import TwinClient
-from flexdt.clients.client.uploads import MESH_FORMATS
+from flexdt.clients.client.twin_methods import MESH_FORMATS
 from flexdt.phantoms import load_phantom
 from flexdt.protocol import RpcError
 from flexdt.server.scans.stage import Shapes

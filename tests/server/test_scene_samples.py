@@ -12,7 +12,8 @@ import pytest
 import trimesh
 from stored_upload import completed
 
-from flexdt.clients.client.uploads import scene as to_upload
+from flexdt.clients.client.flows import Ask
+from flexdt.clients.client.twin_methods import upload_scene
 from flexdt.phantoms import Phantom, PhantomError, Surface, bead_phantom, load_phantom
 from flexdt.phantoms.files import phantom_files
 from flexdt.phantoms.samples import as_phantom
@@ -59,9 +60,12 @@ def test_a_scene_with_a_mesh_is_sent_whole(tmp_path: Path) -> None:
     trimesh.creation.box(extents=(2, 3, 4)).export(tmp_path / "handle.stl")
     file = tmp_path / "assembly.toml"
     file.write_text(SCENE_FILE)
-    upload = to_upload(file, None)
-    assert upload.head == {"name": "assembly", "kind": "scene", "format": "json"}
-    found = phantom_files.sent_scene(upload.data, name="assembly")
+    asked = next(upload_scene(file))
+    assert isinstance(asked, Ask)
+    data, head = asked.params["data"], {"name": "assembly", "kind": "scene", "format": "json"}
+    assert isinstance(data, bytes)
+    assert head.items() <= asked.params.items()
+    found = phantom_files.sent_scene(data, name="assembly")
     assert found.scene == as_phantom(file).scene
     with pytest.raises(PhantomError, match="has no folder"):
         sent(SCENE_FILE)

@@ -18,7 +18,7 @@ import numpy as np
 
 from flexdt.clients.client.transport import Link, TcpTransport
 from flexdt.protocol import Response, image
-from flexdt.protocol import msgpack_frames as frames
+from flexdt.protocol import connection as frames
 from flexdt.protocol.projector import PROJECTOR_METHODS
 from flexdt.runtime.access import ConnectionLimits
 from flexdt.server.network import tcp

@@ -261,7 +261,7 @@ def sample(
     material: str | None = option(None, "Fill a mesh with this material; default: abs."),
 ) -> Answer:
     """Put a sample on the stage, or list what there is."""
-    from flexdt.clients.client.uploads import MESH_FORMATS, SCENE_FORMATS
+    from flexdt.clients.client.twin_methods import MESH_FORMATS, SCENE_FORMATS
 
     file = None if name is None else Path(name)
     kind = "" if file is None else file.suffix.lower().lstrip(".")

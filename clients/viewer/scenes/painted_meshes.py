@@ -38,8 +38,7 @@ import numpy.typing as npt
 import trimesh
 from trimesh.visual.material import PBRMaterial
 
-from flexdt.clients.client.flows import adrive
-from flexdt.clients.client.uploads import sample_shape
+from flexdt.clients.client.flows import adrive, sample_shape
 from flexdt.clients.viewer.scenes.world import MM
 from flexdt.phantoms import Phantom, load_phantom, mesh_phantom
 from flexdt.phantoms.files.mesh_files import read_part

@@ -21,7 +21,7 @@ from event_model import DataKey, Dtype, Limits
 from ophyd_async.core import AsyncConfigurable, NotConnectedError, SignalBackend, SignalRW
 
 from flexdt.clients import ConnectionLost, RpcError, State, Transport
-from flexdt.clients.client.async_client import AsyncTwinClient
+from flexdt.clients.client.client import AsyncTwinClient
 
 Watcher = Callable[[State], None]
 

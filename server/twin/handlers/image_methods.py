@@ -13,7 +13,7 @@ from flexdt.protocol.connection import MAX_ANSWER, encoded
 from flexdt.protocol.fields import Empty, ImageValue
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import image_messages as p
-from flexdt.protocol.methods.motion_messages import CameraSet, TubeSet
+from flexdt.protocol.methods.scanner_messages import CameraSet, TubeSet
 from flexdt.protocol.rpc_errors import invalid_params, too_large
 from flexdt.server.imaging.exposure_quality import marks_of
 from flexdt.server.imaging.exposure_quality import predict as forecast

@@ -8,7 +8,7 @@ from dataclasses import replace
 from flexdt.phantoms import Phantom, load_phantom, materials, phantom_names
 from flexdt.protocol.fields import Empty
 from flexdt.protocol.messages import Encoded
-from flexdt.protocol.methods import sample_messages as p
+from flexdt.protocol.methods import scanner_messages as p
 from flexdt.server.storage.stored_samples import EMPTY, UploadHead
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import (
