@@ -25,13 +25,12 @@ from flexdt.clients.cli.commands import process_commands as processes
 from flexdt.clients.cli.commands import scan_commands as scans
 from flexdt.clients.cli.commands import scanner_commands as scanner
 from flexdt.clients.cli.commands.analysis_commands import commission
-from flexdt.clients.cli.commands.demo_command import demo
 from flexdt.clients.cli.commands.follow_command import follow
 from flexdt.clients.cli.console import hush, note, printable
 from flexdt.clients.cli.options import Json, Server, TokenFile, argument, completed, option
 
 COMMANDS: Final[Mapping[str, Callable[..., object]]] = {
-    "demo": demo,
+    "demo": processes.demo,
     "up": processes.up,
     "twin": processes.twin,
     "projector": processes.projector,

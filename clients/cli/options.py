@@ -1,27 +1,35 @@
-"""How commands declare their options, the options that several share, and the twin's connection.
+"""How commands declare their options, the options that several share, their values, and the twin's
+connection.
 
 `--json`, `--server` and `--token-file` are options of `flexdt` itself, which commands get as
 arguments: what yields answers `--json`, and a parameter `twin: Twin` connects to the server.
+
+Words of the command line that do not hold (AXIS=VALUE, HOST:PORT, lists) become usage errors (exit
+code 2) that quote the word and state what is allowed. The twin, not this module, knows the names of
+the axes.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from flexdt.clients.cli import option_values
 from flexdt.clients.cli.console import emit, say
 from flexdt.clients.cli.settings_file import configuration
 from flexdt.clients.failure import CommandError
-from flexdt.process_settings import has_parameters
+from flexdt.process_settings import LOOPBACK, address, has_parameters
 
 if TYPE_CHECKING:
     from flexdt.clients.client.client import TwinClient
+
+DEFAULT_SERVER = "127.0.0.1:55000"
+DEFAULT_PORT = 55000
 
 Answer = Iterator[object]
 """What most commands yield: texts, which are lines for people, and one thing that is no text, which
@@ -55,7 +63,7 @@ Server = Annotated[
     str | None,
     typer.Option(
         metavar="HOST:PORT",
-        help=f"Talk to the twin there; default: {option_values.DEFAULT_SERVER}, or configured.",
+        help=f"Talk to the twin there; default: {DEFAULT_SERVER}, or configured.",
     ),
 ]
 TokenFile = Annotated[
@@ -100,7 +108,7 @@ def connect(server: str | None = None, token_file: str | None = None) -> TwinCli
     What is None is taken from the user's configuration, see `configuration`.
 
     Args:
-        server: HOST:PORT, see `option_values.server`; 127.0.0.1:55000 if nothing says otherwise.
+        server: HOST:PORT, see `server_address`; 127.0.0.1:55000 if nothing says otherwise.
         token_file: file whose first line is the session's token; shows none by default.
 
     Raises:
@@ -110,7 +118,7 @@ def connect(server: str | None = None, token_file: str | None = None) -> TwinCli
         OSError: nothing answers.
     """
     own = configuration()
-    host, port = option_values.server(server or own.server or option_values.DEFAULT_SERVER)
+    host, port = server_address(server or own.server or DEFAULT_SERVER)
     shown = token_file or own.token_file
     from flexdt.clients.client.client import TwinClient
     from flexdt.runtime.access import AccessError, client_tls, read_token
@@ -165,3 +173,130 @@ Texts = Annotated[
     bool, typer.Option("--texts", help="Take the geometry from the scanner's two texts alone.")
 ]
 Push = Annotated[bool, typer.Option("--push", help="Put the correction in force on the twin.")]
+
+
+def number(word: str, what: str) -> float:
+    """A finite number, negative ones and exponents included.
+
+    Raises:
+        typer.BadParameter: not a finite number.
+    """
+    try:
+        value = float(word)
+    except ValueError:
+        raise typer.BadParameter(f"{what}: {word!r} is not a number") from None
+    if not math.isfinite(value):
+        raise typer.BadParameter(f"{what}: {word!r} is not finite")
+    return value
+
+
+def assignments(words: Iterable[str]) -> dict[str, float]:
+    """AXIS=VALUE words to axis -> value, in order.
+
+    Raises:
+        typer.BadParameter: a word of another form, or an axis given twice.
+    """
+    out: dict[str, float] = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        name = name.strip()
+        if not equals or not name or not value.strip():
+            raise typer.BadParameter(f"{word!r} is not of the form AXIS=VALUE, e.g. tra_obj=-12.5")
+        if name in out:
+            raise typer.BadParameter(f"{name} is given twice")
+        out[name] = number(value, f"the value of {name}")
+    return out
+
+
+def span(word: str, what: str) -> tuple[float, float]:
+    """LOWER:UPPER, or one number for both.
+
+    Raises:
+        typer.BadParameter: neither, or the lower is above the upper.
+    """
+    ends = [number(part, what) for part in word.split(":")]
+    if len(ends) > 2 or ends[0] > ends[-1]:
+        raise typer.BadParameter(f"{what}: {word!r} is not of the form VALUE or LOWER:UPPER")
+    return ends[0], ends[-1]
+
+
+def server_address(word: str) -> tuple[str, int]:
+    """HOST:PORT, HOST, :PORT or [IPV6]:PORT to (host, port); the default port is 55000.
+
+    Raises:
+        typer.BadParameter: no such form, or a port outside 1 to 65535.
+    """
+    text = word.strip()
+    if text.count(":") > 1 and "[" not in text:  # an IPv6 address by itself
+        text = f"[{text}]"
+    if ":" not in text.rpartition("]")[2]:
+        text += f":{DEFAULT_PORT}"
+    found = address(f"{LOOPBACK}{text}" if text.startswith(":") else text)
+    return found.host, found.port
+
+
+def numbers(
+    word: str, what: str, form: str, *counts: int, by: str = ",", whole: bool = False
+) -> list[float]:
+    """A list of finite numbers.
+
+    Args:
+        word: from the command line.
+        what: is listed, for errors.
+        form: of the list with an example, for errors: `X,Y,Z, e.g. 0,0,-5.5`.
+        counts: how many there may be.
+        by: what separates them.
+        whole: they are whole and above 0.
+
+    Raises:
+        typer.BadParameter: another count, or a part that is no such number.
+    """
+    parts = [part.strip() for part in word.lower().split(by)]
+    if len(parts) not in counts or (whole and not all(p.isdecimal() and int(p) for p in parts)):
+        raise typer.BadParameter(f"{what} {word!r} is not {form}")
+    return [number(part, what) for part in parts]
+
+
+def triple(word: str, what: str, form: str) -> tuple[float, float, float]:
+    """Three of `numbers`."""
+    x, y, z = numbers(word, what, form, 3)
+    return x, y, z
+
+
+def position(word: str) -> tuple[float, float]:
+    """SOD[:LATERAL] to (SOD, lateral) [mm]; lateral is 0 if left out.
+
+    Raises:
+        typer.BadParameter: not numbers.
+    """
+    sod, _, lateral = word.partition(":")
+    return (
+        number(sod, "the SOD of --position"),
+        number(lateral, "the lateral of --position") if lateral else 0.0,
+    )
+
+
+def names(word: str) -> tuple[str, ...]:
+    """A comma-separated list of names, blanks dropped."""
+    return tuple(part.strip() for part in word.split(",") if part.strip())
+
+
+def require_ending(file: Path, *allowed: str) -> None:
+    """Check a file's ending.
+
+    Raises:
+        typer.BadParameter: another one.
+    """
+    if file.suffix.lower() not in allowed:
+        raise typer.BadParameter(f"{file.name}: the ending must be {' or '.join(allowed)}")
+
+
+def require_folder(*files: Path | None) -> None:
+    """Check that files can be written where they are to be.
+
+    Raises:
+        CommandError: a folder does not exist.
+    """
+    for file in files:
+        if file is not None and not file.absolute().parent.is_dir():
+            raise CommandError(f"{file}: the folder does not exist")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import typer
 
 from flexdt import machines
-from flexdt.clients.cli import option_values
+from flexdt.clients.cli import options
 from flexdt.clients.cli.commands.scan_commands import read_log_file, tell
 from flexdt.clients.cli.console import note, table
 from flexdt.clients.cli.options import Answer, argument, option
@@ -109,7 +109,7 @@ def new(
     sod = asked("SOD, mm: one if fixed, or least:greatest", sod, usual[0])
     sdd = asked("SDD, mm: one if fixed, or least:greatest", sdd, usual[1])
     kv = asked("Tube, kV: at most, or least:most", kv, f"{like.tube.min_kV:g}:{like.tube.max_kV:g}")
-    volts = None if kv is None else option_values.span(kv, "--kv")
+    volts = None if kv is None else options.span(kv, "--kv")
     pixels = None if size is None else _pair(size, "--detector", whole=True)
     lines = [word.partition("=") for word in limit or []]
     answers = Answers(
@@ -120,12 +120,12 @@ def new(
         rows=None if pixels is None else int(pixels[1]),
         pitch_mm=None if pitch is None else _pair(pitch, "--pitch"),
         bits=bits,
-        sod_mm=None if sod is None else option_values.span(sod, "--sod"),
-        sdd_mm=None if sdd is None else option_values.span(sdd, "--sdd"),
+        sod_mm=None if sod is None else options.span(sod, "--sod"),
+        sdd_mm=None if sdd is None else options.span(sdd, "--sdd"),
         min_kV=volts[0] if volts is not None and ":" in str(kv) else None,
         max_kV=None if volts is None else volts[1],
-        max_W=None if power is None else option_values.number(f"{power}", "--power"),
-        limits={axis: option_values.span(ends, f"--limit {axis}") for axis, _, ends in lines},
+        max_W=None if power is None else options.number(f"{power}", "--power"),
+        limits={axis: options.span(ends, f"--limit {axis}") for axis, _, ends in lines},
         without=tuple(without or ()),
     )
     text = new_machine_text(answers)
@@ -142,7 +142,7 @@ def new(
 
 def _pair(word: str, what: str, *, whole: bool = False) -> tuple[float, float]:
     form = "of the form NUMBERxNUMBER"
-    found = option_values.numbers(word, f"{what}:", form, 1, 2, by="x", whole=whole)
+    found = options.numbers(word, f"{what}:", form, 1, 2, by="x", whole=whole)
     return found[0], found[-1]
 
 
@@ -255,7 +255,7 @@ def make(
     """Write a new phantom: a bead cuboid of your own size, or a mesh."""
     if sum(given is not None for given in (like, size, mesh)) != 1:
         raise typer.BadParameter("give one of --like NAME, --size W,B,H or --mesh FILE")
-    option_values.require_folder(file, stl)
+    options.require_folder(file, stl)
     from flexdt.phantoms import bead_phantom, mesh_phantom
 
     if mesh is not None:
@@ -278,7 +278,7 @@ def make(
 
 
 def _size(text: str) -> tuple[float, float, float]:
-    return option_values.triple(text, "size", "W,B,H, e.g. 20,40,60")
+    return options.triple(text, "size", "W,B,H, e.g. 20,40,60")
 
 
 def _summary(name: str, phantom: Phantom) -> dict[str, object]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
-from flexdt.clients.cli import option_values, options
+from flexdt.clients.cli import options
 from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
 from flexdt.clients.cli.commands.data_commands import said
 from flexdt.clients.cli.console import as_json, note, table, warn
@@ -85,7 +85,7 @@ def calibrate(
     data cannot determine what was asked for; then nothing is pushed.
     """
     if report is not None:
-        option_values.require_ending(report, ".html", ".json")
+        options.require_ending(report, ".html", ".json")
     from flexdt.clients.calibration.calibrate import calibrate_datasets
     from flexdt.clients.calibration.calibration_report import write_report
     from flexdt.clients.calibration.markers import Scale
@@ -134,22 +134,22 @@ def _request(
     from flexdt.twin.geometry.offsets import Offsets
 
     usual = ("dO_x",) if phantom == UNKNOWN else SIX
-    asked = usual if free is None else option_values.names(free)
+    asked = usual if free is None else options.names(free)
     return CalibrationRequest(
         free=asked,
-        per_scan=option_values.names(per_scan),
+        per_scan=options.names(per_scan),
         reading={"axis": Reading.AXIS_AT_O_PLUS_TAU, "mount": Reading.MOUNT_SHIFT}[reading],
         bead_tolerance_mm=bead_tolerance,
         priors=exact(asked) if prior == ["none"] else _assigned(prior),
         bound=chosen(CalibrateSettings).bound,
         start=Offsets.from_edge(_assigned(start)),
-        per_frame=option_values.names(per_frame),
+        per_frame=options.names(per_frame),
     )
 
 
 def _assigned(given: list[str] | None) -> dict[str, float]:
     """P=VALUE,... of an option that may be given several times."""
-    return option_values.assignments(word for one in given or () for word in one.split(","))
+    return options.assignments(word for one in given or () for word in one.split(","))
 
 
 def _named(phantom: str | None) -> str:
@@ -218,7 +218,7 @@ def align(
     correction.
     """
     if out is not None:
-        option_values.require_ending(out, ".json")
+        options.require_ending(out, ".json")
     from flexdt.clients.calibration.align_dataset import align_dataset
 
     if push:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 
 from flexdt import machines, process_settings
-from flexdt.clients.cli import option_values, options
+from flexdt.clients.cli import options
 from flexdt.clients.cli.boundary import (
     INTERRUPTED,
     INVALID,
@@ -356,7 +356,7 @@ def _own(kind: Kind, **given: Any) -> dict[str, Any]:
         from flexdt.twin.script.compose import ScanPosition
 
         own["placements"] = tuple(
-            ScanPosition(*option_values.position(word)) for word in own.pop("position")
+            ScanPosition(*options.position(word)) for word in own.pop("position")
         )
     if "rise" in own:
         own["rise_mm"] = own.pop("rise")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import typer
 
 from flexdt import process_settings
-from flexdt.clients.cli import option_values, options
+from flexdt.clients.cli import options
 from flexdt.clients.cli.boundary import REFUSED
 from flexdt.clients.cli.console import duration, note, table, warn
 from flexdt.clients.cli.options import Answer, Twin, argument, option
@@ -143,7 +143,7 @@ def move(
     no_wait: bool = option(False, "Return without waiting for the arrival.", "--no-wait"),
 ) -> Answer:
     """Move axes; several start together."""
-    wanted = option_values.assignments(targets)
+    wanted = options.assignments(targets)
     with twin() as client:
         try:
             done = client.move(
@@ -169,8 +169,8 @@ def jog(
     ),
 ) -> Answer:
     """Move an axis at a velocity until Ctrl-C, or for a time."""
-    speed = option_values.number(velocity, "the velocity")
-    lasting = math.inf if seconds is None else option_values.number(seconds, "--for")
+    speed = options.number(velocity, "the velocity")
+    lasting = math.inf if seconds is None else options.number(seconds, "--for")
     if lasting <= 0:
         raise typer.BadParameter(f"--for {seconds}: the seconds must be more than 0")
     with twin() as client:
@@ -303,8 +303,8 @@ def snap(
     dense parts dark, and shows line integrals unless said, so X-rays may be off. It shows in colour
     what would be wrong with the exposure: saturated red, starved blue, cut-off edges yellow.
     """
-    option_values.require_ending(file, ".tiff", ".tif", ".png")
-    option_values.require_folder(file)
+    options.require_ending(file, ".tiff", ".tif", ".png")
+    options.require_folder(file)
     with twin() as client:
         wanted = kind or ("line_integral" if file.suffix.lower() == ".png" else "counts")
         tube = client.state().tube
