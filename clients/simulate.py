@@ -1,4 +1,4 @@
-"""`flexdt.simulate`: a sample and a geometry in, a data set in memory out.
+"""`flexdt.simulate`: a sample and a geometry in, a data set in memory out; `flexdt.project`.
 
 The images come from the chain that the twin itself uses (`flexdt.twin.physics`): exact paths
 through each material, spectrum, panel, noise. Only the geometry is given instead of following from
@@ -11,7 +11,7 @@ import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,13 @@ from flexdt.clients.expose import image_doubts
 from flexdt.clients.extras import extension
 from flexdt.machines import machine as machine_of
 from flexdt.phantoms import Phantom
-from flexdt.phantoms.channels import Channel, chain_through, channels, scatter_object
+from flexdt.phantoms.channels import (
+    Channel,
+    chain_through,
+    channels,
+    line_integrals,
+    scatter_object,
+)
 from flexdt.phantoms.samples import as_phantom
 from flexdt.twin.errors import GeometryError, LimitError, require_within
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -51,7 +57,7 @@ from flexdt.twin.physics.scatter.simulation import (
 )
 from flexdt.twin.physics.spectrum import tube_of
 from flexdt.twin.physics.tube import Tube
-from flexdt.twin.projection import project_body
+from flexdt.twin.projection import Volume, forward, project_body
 from flexdt.twin.projection.analytic_solids import Vector
 from flexdt.twin.projection.operators import as_cone_vec
 from flexdt.twin.signatures import public
@@ -147,6 +153,53 @@ class Truth:
     def line_integrals(self) -> Float32Array:
         """-log of the noise-free signal over the open beam's, float32 (n, rows, cols)."""
         return np.stack([image.integrals for image in self.radiographs()])
+
+
+@public
+def project(
+    sample: object,
+    geometry: ConeVec | npt.ArrayLike,
+    *,
+    shape: tuple[int, int] | None = None,
+    material: str | Mapping[int, str] | None = None,
+    voxel_mm: float | Vector | None = None,
+) -> Float32Array:
+    """Line integrals of attenuation, without tube, noise and detector; see `flexdt.simulate`.
+
+    Solids and meshes are exact path lengths times their attenuation at its effective energy, voxels
+    exact lengths through each voxel (Siddon). Bodies of one mesh that overlap count once.
+
+    Args:
+        sample: a Volume, a phantom or its name, a file, a mesh, an array with `voxel_mm`, or a list
+            of them, which add up.
+        geometry: of the views, in the sample's frame.
+        shape: detector (rows, cols), where the geometry does not say.
+        material: of a mesh or an array; {1: "pmma", 2: "steel"} for an array of labels.
+        voxel_mm: edge of an array's voxels [mm].
+
+    Returns:
+        float32 (n, rows, cols), dimensionless.
+
+    Warns:
+        UserWarning: a geometry that fits no scan of the sample: the source inside it, ...
+
+    Raises:
+        TwinError: a sample or a geometry that does not hold; says what is allowed.
+
+    Example:
+        >>> import numpy as np
+        >>> scan = ConeVec.circular(sod=600, sdd=1000, angles=4, shape=(5, 5), pixel=2)
+        >>> images = project(Volume(np.full((8, 8, 8), 0.02), 1.0), scan)
+        >>> images.shape, round(float(images[0, 2, 2]), 3)
+        ((4, 5, 5), 0.16)
+    """
+    cone = as_cone_vec(geometry)
+    size = cone.of_shape(shape)
+    plain = isinstance(sample, Volume) and material is None
+    body: Any = sample if plain else as_phantom(sample, material=material, voxel_mm=voxel_mm)
+    for doubt in geometry_doubts(cone, size, body.boxes):
+        warnings.warn(doubt, stacklevel=3)
+    return (forward if plain else line_integrals)(body, cone, size)
 
 
 @public

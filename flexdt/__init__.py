@@ -18,7 +18,6 @@ if _typing.TYPE_CHECKING:
     from flexdt.analysis import align as align
     from flexdt.analysis import calibrate as calibrate
     from flexdt.analysis import reconstruct as reconstruct
-    from flexdt.checked_machine import machine as machine
     from flexdt.clients import AsyncTwinClient as AsyncTwinClient
     from flexdt.clients import TwinClient as TwinClient
     from flexdt.clients.datasets.data_set import DataSet as DataSet
@@ -26,8 +25,9 @@ if _typing.TYPE_CHECKING:
     from flexdt.clients.datasets.dataset import read_tiffs as read_tiffs
     from flexdt.clients.expose import expose as expose
     from flexdt.clients.launch.processes import LocalTwin as LocalTwin
+    from flexdt.clients.simulate import project as project
     from flexdt.clients.simulate import simulate as simulate
-    from flexdt.projecting import project as project
+    from flexdt.scripts import machine as machine
     from flexdt.scripts import plan as plan
     from flexdt.twin.errors import NotBuiltError as NotBuiltError
     from flexdt.twin.errors import TwinError as TwinError
@@ -79,11 +79,11 @@ _HOMES: _typing.Final = {
     "expose": "flexdt.clients.expose",
     "fdk": "flexdt.twin.reconstruction.checked_fdk",
     "forward": "flexdt.twin.projection.operators",
-    "machine": "flexdt.checked_machine",
+    "machine": "flexdt.scripts",
     "open": "flexdt.clients.datasets.dataset:load_dataset",
     "phantoms": "flexdt.phantoms:",
     "plan": "flexdt.scripts",
-    "project": "flexdt.projecting",
+    "project": "flexdt.clients.simulate",
     "read_tiffs": "flexdt.clients.datasets.dataset",
     "reconstruct": "flexdt.analysis",
     "simulate": "flexdt.clients.simulate",

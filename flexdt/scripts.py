@@ -1,4 +1,5 @@
-"""Scan scripts as plans: the public function `flexdt.plan`, and what plans do beyond the core."""
+"""Machines and scan scripts as plans: the public functions `flexdt.machine` and `flexdt.plan`, and
+what plans do beyond the core."""
 
 from __future__ import annotations
 
@@ -23,6 +24,8 @@ from flexdt.twin.script import (
 from flexdt.twin.script.dry_run import CollisionCheck, check_plan
 from flexdt.twin.script.plan import StartState
 from flexdt.twin.signatures import public
+
+machine = public(find_machine)
 
 
 @public

@@ -16,11 +16,10 @@ import pytest
 import trimesh
 
 from flexdt.clients.datasets.dataset import load_dataset
-from flexdt.clients.simulate import simulate
+from flexdt.clients.simulate import project, simulate
 from flexdt.phantoms import Phantom, load_phantom, material
 from flexdt.phantoms.channels import channels, scatter_object
 from flexdt.phantoms.samples import as_phantom
-from flexdt.projecting import project
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.radiography import Radiography
