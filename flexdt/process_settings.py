@@ -369,6 +369,13 @@ def parameters(settings: type[Settings]) -> dict[str, inspect.Parameter]:
     return found
 
 
+def described(thing: object) -> tuple[str, dict[str, str]]:
+    """A docstring without its list of arguments or attributes, and what the list says of each."""
+    text, *lists = re.split(r"\n\n(?:Args|Attributes):\n", inspect.getdoc(thing) or "")
+    items = re.findall(r"^    (\w+): (.*(?:\n {5,}.*)*)", "\n".join(lists), re.MULTILINE)
+    return text, {name: " ".join(about.split()) for name, about in items}
+
+
 def has_parameters(command: Callable[..., Any], shown: Iterable[inspect.Parameter]) -> None:
     """Have typer see these parameters as those of a command, by name alone."""
     named = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in shown]

@@ -23,7 +23,7 @@ import typer
 from flexdt.clients.cli.console import emit, say
 from flexdt.clients.cli.settings_file import configuration
 from flexdt.clients.failure import CommandError
-from flexdt.process_settings import LOOPBACK, address, has_parameters
+from flexdt.process_settings import LOOPBACK, address, described, has_parameters
 
 if TYPE_CHECKING:
     from flexdt.clients.client.client import TwinClient
@@ -36,17 +36,19 @@ Answer = Iterator[object]
 is the document of `--json`."""
 
 
-def option(default: object, help: str = "", *flags: str, **details: Any) -> Any:
+def option(default: object, *words: str, **details: Any) -> Any:
     """The default of a command's parameter that the command line offers as an option.
 
     Args:
         default: where the option is left out; `...` for one that must be given.
-        help: one line.
-        flags: as typed. They follow from the parameter's name, but a switch that is only ever on
-            has to name its flag, or typer adds one that switches it off.
+        words: flags as typed, and one line of help. Flags follow from the parameter's name, but a
+            switch that is only ever on has to name its flag, or typer adds one that switches it
+            off. The help is that of the command's docstring (`Args:`) if it is not given here.
         details: of `typer.Option`, such as metavar, min and max.
     """
-    return typer.Option(default, *flags, help=help or None, **details)
+    flags = [word for word in words if word.startswith("-")]
+    help = next((word for word in words if not word.startswith("-")), None)
+    return typer.Option(default, *flags, help=help, **details)
 
 
 def argument(default: object, metavar: str, help: str = "") -> Any:
@@ -80,6 +82,11 @@ def completed(command: Callable[..., Any]) -> tuple[Callable[..., None], tuple[s
     if not yields and "context" in own:  # it passes its words on
         return command, ()
 
+    about, helps = described(command)
+    for name, parameter in own.items():
+        if getattr(parameter.default, "help", "") is None:
+            parameter.default.help = helps.get(name)
+
     @wraps(command)
     def complete(context: typer.Context, **given: Any) -> None:
         root = context.find_root().params
@@ -96,6 +103,7 @@ def completed(command: Callable[..., Any]) -> tuple[Callable[..., None], tuple[s
             elif root["json"] and not isinstance(part, str):
                 emit(part)
 
+    complete.__doc__ = about
     context = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
     has_parameters(complete, [context, *(p for name, p in own.items() if name not in GIVEN)])
     heeds = ("--json",) if yields or "json" in own else ()

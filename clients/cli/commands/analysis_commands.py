@@ -69,22 +69,35 @@ def check(name: NameOrFile) -> Answer:
 
 
 def new(
-    name: str = argument(..., "NAME", "One word."),
-    out: Path = option(..., "Write the machine to this file.", metavar="FILE"),
-    base: str | None = option(None, "Begin with this machine, the most similar.", metavar="NAME"),
-    detector: str | None = option(
-        None, "Set the detector's unbinned columns and rows.", metavar="COLUMNSxROWS"
-    ),
-    pitch: str | None = option(None, "Set the pitch of columns, and of rows.", metavar="MM[xMM]"),
-    bits: int | None = option(None, "Set the bits of a pixel."),
-    sod: str | None = option(None, "Set source to axis, or least:most.", metavar="MM or MM:MM"),
-    sdd: str | None = option(None, "Set source to panel, or least:most.", metavar="MM or MM:MM"),
-    kv: str | None = option(None, "Set the largest voltage, or least:most.", metavar="KV or KV:KV"),
-    power: float | None = option(None, "Set the largest power.", metavar="W"),
-    limit: list[str] | None = option(None, "Set an axis's travel so.", metavar="AXIS=LOWER:UPPER"),
-    without: list[str] | None = option(None, "Leave out this axis.", metavar="AXIS"),
+    name: str = argument(..., "NAME"),
+    out: Path = option(..., metavar="FILE"),
+    base: str | None = option(None, metavar="NAME"),
+    detector: str | None = option(None, metavar="COLUMNSxROWS"),
+    pitch: str | None = option(None, metavar="MM[xMM]"),
+    bits: int | None = option(None),
+    sod: str | None = option(None, metavar="MM or MM:MM"),
+    sdd: str | None = option(None, metavar="MM or MM:MM"),
+    kv: str | None = option(None, metavar="KV or KV:KV"),
+    power: float | None = option(None, metavar="W"),
+    limit: list[str] | None = option(None, metavar="AXIS=LOWER:UPPER"),
+    without: list[str] | None = option(None, metavar="AXIS"),
 ) -> Answer:
-    """Write a short file for a machine of your own; asks for what is not said, on a terminal."""
+    """Write a short file for a machine of your own; asks for what is not said, on a terminal.
+
+    Args:
+        name: One word.
+        out: Write the machine to this file.
+        base: Begin with this machine, the most similar.
+        detector: Set the detector's unbinned columns and rows.
+        pitch: Set the pitch of columns, and of rows.
+        bits: Set the bits of a pixel.
+        sod: Set source to axis, or least:most.
+        sdd: Set source to panel, or least:most.
+        kv: Set the largest voltage, or least:most.
+        power: Set the largest power.
+        limit: Set an axis's travel so.
+        without: Leave out this axis.
+    """
     from flexdt.twin.collision.guard import check_home
     from flexdt.twin.machine.description import builtin_machine, builtin_machines, parse_machine
     from flexdt.twin.machine.kinematics import place
@@ -147,15 +160,17 @@ def _pair(word: str, what: str, *, whole: bool = False) -> tuple[float, float]:
 
 
 def fit(
-    logs: list[Path] = argument(..., "LOG...", "Logs, or recordings of follow; oldest first."),
-    out: Path = option(..., "Write the machine to this file.", metavar="FILE"),
-    base: str = option(
-        machines.DEFAULT_MACHINE,
-        "Take what the logs do not tell from this machine.",
-        metavar="FILE or NAME",
-    ),
+    logs: list[Path] = argument(..., "LOG..."),
+    out: Path = option(..., metavar="FILE"),
+    base: str = option(machines.DEFAULT_MACHINE, metavar="FILE or NAME"),
 ) -> Answer:
-    """Fit a machine to executed scripts: limits, rates and the times of its commands."""
+    """Fit a machine to executed scripts: limits, rates and the times of its commands.
+
+    Args:
+        logs: Logs, or recordings of follow; oldest first.
+        out: Write the machine to this file.
+        base: Take what the logs do not tell from this machine.
+    """
     from flexdt.twin.machine.description import builtin_machine_text
     from flexdt.twin.machine.machine_files import fitted_text
     from flexdt.twin.script.log_fit import fit_machine, unlike
@@ -242,17 +257,29 @@ def list_phantoms() -> Answer:
 
 
 def make(
-    file: Path = argument(..., "FILE.json", "Where to write it."),
-    like: str | None = option(None, "Begin with this cuboid of `phantom list`.", metavar="NAME"),
-    size: str | None = option(None, "Set width, breadth and height [mm].", metavar="W,B,H"),
-    beads: int = option(5, "Put so many beads on a spiral.", metavar="K"),
-    radius: float = option(2.0, "Set the beads' radius.", metavar="MM"),
-    body: str = option("abs", "Make the body of this material.", metavar="MATERIAL"),
-    mesh: Path | None = option(None, "Fill this mesh: STL, OBJ, PLY, GLB or OFF.", metavar="FILE"),
-    unit: str | None = option(None, "Read the mesh in this unit; default: mm, for GLB m."),
-    stl: Path | None = option(None, "Write its surfaces, too, to print it.", metavar="FILE.stl"),
+    file: Path = argument(..., "FILE.json"),
+    like: str | None = option(None, metavar="NAME"),
+    size: str | None = option(None, metavar="W,B,H"),
+    beads: int = option(5, metavar="K"),
+    radius: float = option(2.0, metavar="MM"),
+    body: str = option("abs", metavar="MATERIAL"),
+    mesh: Path | None = option(None, metavar="FILE"),
+    unit: str | None = option(None),
+    stl: Path | None = option(None, metavar="FILE.stl"),
 ) -> Answer:
-    """Write a new phantom: a bead cuboid of your own size, or a mesh."""
+    """Write a new phantom: a bead cuboid of your own size, or a mesh.
+
+    Args:
+        file: Where to write it.
+        like: Begin with this cuboid of `phantom list`.
+        size: Set width, breadth and height [mm].
+        beads: Put so many beads on a spiral.
+        radius: Set the beads' radius.
+        body: Make the body of this material.
+        mesh: Fill this mesh: STL, OBJ, PLY, GLB or OFF.
+        unit: Read the mesh in this unit; default: mm, for GLB m.
+        stl: Write its surfaces, too, to print it.
+    """
     if sum(given is not None for given in (like, size, mesh)) != 1:
         raise typer.BadParameter("give one of --like NAME, --size W,B,H or --mesh FILE")
     options.require_folder(file, stl)
@@ -293,13 +320,17 @@ def _summary(name: str, phantom: Phantom) -> dict[str, object]:
 
 
 def commission(
-    folders: list[Path] = argument(..., "FOLDER...", "Past scans."),
-    traffic: Path | None = option(
-        None, "Read this recording of `flexdt follow --record` too.", metavar="FILE"
-    ),
-    out: Path = option(..., "Write machine, profile and report to this folder.", metavar="DIR"),
+    folders: list[Path] = argument(..., "FOLDER..."),
+    traffic: Path | None = option(None, metavar="FILE"),
+    out: Path = option(..., metavar="DIR"),
 ) -> Answer:
-    """Fit a machine, its zero offsets and their drift to past scans, and say what disagrees."""
+    """Fit a machine, its zero offsets and their drift to past scans, and say what disagrees.
+
+    Args:
+        folders: Past scans.
+        traffic: Read this recording of `flexdt follow --record` too.
+        out: Write machine, profile and report to this folder.
+    """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise CommandError(f"{out} is there; allowed: a new or an empty folder")
     from flexdt.clients.commission import commission as commissioned

@@ -35,47 +35,23 @@ ReadingName = Literal["axis", "mount"]
 def calibrate(
     twin: Twin,
     datasets: list[Path] | None = argument(None, "[DATASET...]"),
-    phantom: str | None = option(
-        None,
-        "Use this phantom's beads; unknown: markers anywhere.",
-        metavar="NAME, FILE or unknown",
-    ),
+    phantom: str | None = option(None, metavar="NAME, FILE or unknown"),
     free: options.Free = None,
-    per_scan: str = option("", "Give these parameters a value in each scan.", metavar="P,P,..."),
-    per_frame: str = option("", "Let these parameters move during the scan.", metavar="P,P,..."),
-    reading: ReadingName = option(
-        "axis", "Read eq. 5.4 as the axis at O + tau, or as R (b - tau) + O."
-    ),
-    report: Path | None = option(
-        None, "Write the report to FILE (HTML or JSON).", metavar="FILE.{html,json}"
-    ),
-    tracks: Path | None = option(
-        None, "Write the beads of every frame, seen, before and after.", metavar="FILE.json"
-    ),
-    geometry: list[Path] | None = option(
-        None, "Start from this geometry; once for each data set, in order.", metavar="FILE"
-    ),
-    bead_tolerance: float | None = option(
-        None, "Estimate the beads' places, too, known to this tolerance.", metavar="MM"
-    ),
-    prior: list[str] | None = option(
-        None,
-        "Know offsets so well, not as the machine says; none: all exactly.",
-        metavar="P=SIGMA,...",
-    ),
-    frames: Path | None = option(None, "Read any scanner's TIFFs, with --geometry.", metavar="DIR"),
-    shape: str | None = option(
-        None, "Take this detector shape where FILE does not say it.", metavar="ROWS,COLS"
-    ),
-    pixel: str | None = option(
-        None, "Take this pixel pitch where FILE does not say it (RTK).", metavar="MM or U,V"
-    ),
-    markers: Path | None = option(
-        None, "Read where markers were seen, in pixels (CSV or npy).", metavar="FILE"
-    ),
-    scale: str | None = option(None, "Set the distance of two unknown markers.", metavar="A-B=MM"),
-    radius: float | None = option(None, "Look for bead spots of this radius.", metavar="PX"),
-    start: list[str] | None = option(None, "Begin at these offsets (mm, deg).", metavar="P=V,..."),
+    per_scan: str = option("", metavar="P,P,..."),
+    per_frame: str = option("", metavar="P,P,..."),
+    reading: ReadingName = option("axis"),
+    report: Path | None = option(None, metavar="FILE.{html,json}"),
+    tracks: Path | None = option(None, metavar="FILE.json"),
+    geometry: list[Path] | None = option(None, metavar="FILE"),
+    bead_tolerance: float | None = option(None, metavar="MM"),
+    prior: list[str] | None = option(None, metavar="P=SIGMA,..."),
+    frames: Path | None = option(None, metavar="DIR"),
+    shape: str | None = option(None, metavar="ROWS,COLS"),
+    pixel: str | None = option(None, metavar="MM or U,V"),
+    markers: Path | None = option(None, metavar="FILE"),
+    scale: str | None = option(None, metavar="A-B=MM"),
+    radius: float | None = option(None, metavar="PX"),
+    start: list[str] | None = option(None, metavar="P=V,..."),
     push: options.Push = False,
 ) -> Answer:
     """Calibrate the geometry from scans of a bead phantom or of unknown markers.
@@ -83,6 +59,24 @@ def calibrate(
     A data set may be a folder of TIFFs with the two settings texts alone; --frames and --geometry
     are for those of any other scanner, --markers for what was marked by hand. Exit code 5 when the
     data cannot determine what was asked for; then nothing is pushed.
+
+    Args:
+        phantom: Use this phantom's beads; unknown: markers anywhere.
+        per_scan: Give these parameters a value in each scan.
+        per_frame: Let these parameters move during the scan.
+        reading: Read eq. 5.4 as the axis at O + tau, or as R (b - tau) + O.
+        report: Write the report to FILE (HTML or JSON).
+        tracks: Write the beads of every frame, seen, before and after.
+        geometry: Start from this geometry; once for each data set, in order.
+        bead_tolerance: Estimate the beads' places, too, known to this tolerance.
+        prior: Know offsets so well, not as the machine says; none: all exactly.
+        frames: Read any scanner's TIFFs, with --geometry.
+        shape: Take this detector shape where FILE does not say it.
+        pixel: Take this pixel pitch where FILE does not say it (RTK).
+        markers: Read where markers were seen, in pixels (CSV or npy).
+        scale: Set the distance of two unknown markers.
+        radius: Look for bead spots of this radius.
+        start: Begin at these offsets (mm, deg).
     """
     if report is not None:
         options.require_ending(report, ".html", ".json")
@@ -204,10 +198,8 @@ def _opened(folders: list[Path], geometries: list[Path] | None) -> list[DataSet]
 def align(
     twin: Twin,
     dataset: Path = argument(..., "DATASET"),
-    out: Path | None = option(
-        None, "Write the report, for flexdt reconstruct --correction.", metavar="FILE.json"
-    ),
-    per_frame: bool = option(False, "Find shifts of single frames (jitter) too."),
+    out: Path | None = option(None, metavar="FILE.json"),
+    per_frame: bool = option(False),
     push: options.Push = False,
     geometry: options.Geometry = None,
 ) -> Answer:
@@ -216,6 +208,10 @@ def align(
     Axis column and, if the object tells them, roll and yaw of the panel and row of the plane in
     which the source turns. Exit code 5 when the scan cannot tell the column; then there is no
     correction.
+
+    Args:
+        out: Write the report, for flexdt reconstruct --correction.
+        per_frame: Find shifts of single frames (jitter) too.
     """
     if out is not None:
         options.require_ending(out, ".json")
@@ -248,20 +244,19 @@ def align(
 
 def compare(
     dataset: Path = argument(..., "DATASET"),
-    phantom: str | None = option(
-        None, "Compare with this phantom, the one that was scanned.", metavar="NAME or FILE"
-    ),
-    tolerance: float = option(
-        0.5, "Exit with 1 where the beads' rms is above this.", metavar="PX", min=0.0
-    ),
-    out: Path | None = option(
-        None, "Write a report and difference images to this folder.", metavar="DIR"
-    ),
+    phantom: str | None = option(None, metavar="NAME or FILE"),
+    tolerance: float = option(0.5, metavar="PX", min=0.0),
+    out: Path | None = option(None, metavar="DIR"),
 ) -> Answer:
     """Lay virtual projections beside a data set's radiographs.
 
     The twin is posed from the data set's texts; residuals and difference images are given before
     and after the correction that calibration finds. Exit code 1 above the tolerance.
+
+    Args:
+        phantom: Compare with this phantom, the one that was scanned.
+        tolerance: Exit with 1 where the beads' rms is above this.
+        out: Write a report and difference images to this folder.
     """
     from flexdt.clients.calibration.calibration_report import compare_folder, write_comparison
     from flexdt.clients.figures import require_plots

@@ -33,48 +33,49 @@ Algorithm = Literal["fdk", "sirt", "sart", "cgls", "em", "tv"]
 def reconstruct(
     twin: Twin,
     dataset: Path = argument(..., "DATASET"),
-    out: Path = option(
-        ..., "Write the volume: .tif, .nrrd, .mha, .nii.gz, .h5 or .zarr.", metavar="FILE"
-    ),
-    algorithm: Algorithm | None = option(None, "Use this algorithm; default: fdk."),
-    voxel: float | None = option(
-        None, "Set the voxels' edge; default: a pixel's size at the axis.", metavar="MM"
-    ),
-    shape: str | None = option(
-        None, "Set the number of voxels; default: the field of view.", metavar="Z,Y,X"
-    ),
-    binning: int | None = option(None, "Average so many pixels a side first.", min=1),
-    every: int | None = option(None, "Use every n-th frame.", min=1),
-    iterations: int | None = option(None, "Iterate so often; default: the algorithm's.", min=1),
-    weight: float | None = option(None, "Weigh the total variation of tv by this.", min=0.0),
-    correction: str | None = option(
-        None,
-        "Apply a report's correction, or the twin's; default: the scan's.",
-        metavar="FILE, twin or none",
-    ),
-    center: str | None = option(None, "Put the volume's centre there [mm].", metavar="X,Y,Z"),
+    out: Path = option(..., metavar="FILE"),
+    algorithm: Algorithm | None = option(None),
+    voxel: float | None = option(None, metavar="MM"),
+    shape: str | None = option(None, metavar="Z,Y,X"),
+    binning: int | None = option(None, min=1),
+    every: int | None = option(None, min=1),
+    iterations: int | None = option(None, min=1),
+    weight: float | None = option(None, min=0.0),
+    correction: str | None = option(None, metavar="FILE, twin or none"),
+    center: str | None = option(None, metavar="X,Y,Z"),
     texts: options.Texts = False,
-    rings: bool = option(False, "Correct the images for rings.", "--rings"),
-    material: str | None = option(
-        None,
-        "Correct beam hardening of this material; sirt, sart: of several.",
-        metavar="MATERIALS",
-    ),
-    scatter_correction: str | None = option(
-        None,
-        "Subtract the scatter of an object of these, e.g. pmma,aluminium.",
-        metavar="MATERIALS",
-    ),
-    kv: float | None = option(None, "Take this tube voltage; default: the data set's."),
-    png: bool = option(False, "Write three slices beside the volume.", "--png"),
-    preview: bool = option(False, "Make a quick, coarse FDK volume, and PNG slices.", "--preview"),
+    rings: bool = option(False, "--rings"),
+    material: str | None = option(None, metavar="MATERIALS"),
+    scatter_correction: str | None = option(None, metavar="MATERIALS"),
+    kv: float | None = option(None),
+    png: bool = option(False, "--png"),
+    preview: bool = option(False, "--preview"),
     geometry: options.Geometry = None,
     scheduler: options.Scheduler = None,
-    slurm: Path | None = option(None, "Submit workers to SLURM as this file says.", metavar="FILE"),
+    slurm: Path | None = option(None, metavar="FILE"),
 ) -> Answer:
     """Reconstruct a volume from a data set.
 
     Layers go from the lowest up, rows along +y, columns along +x; values are attenuation in 1/mm.
+
+    Args:
+        out: Write the volume: .tif, .nrrd, .mha, .nii.gz, .h5 or .zarr.
+        algorithm: Use this algorithm; default: fdk.
+        voxel: Set the voxels' edge; default: a pixel's size at the axis.
+        shape: Set the number of voxels; default: the field of view.
+        binning: Average so many pixels a side first.
+        every: Use every n-th frame.
+        iterations: Iterate so often; default: the algorithm's.
+        weight: Weigh the total variation of tv by this.
+        correction: Apply a report's correction, or the twin's; default: the scan's.
+        center: Put the volume's centre there [mm].
+        rings: Correct the images for rings.
+        material: Correct beam hardening of this material; sirt, sart: of several.
+        scatter_correction: Subtract the scatter of an object of these, e.g. pmma,aluminium.
+        kv: Take this tube voltage; default: the data set's.
+        png: Write three slices beside the volume.
+        preview: Make a quick, coarse FDK volume, and PNG slices.
+        slurm: Submit workers to SLURM as this file says.
     """
     own = {
         "algorithm": None if algorithm == "fdk" else algorithm, "voxel": voxel, "shape": shape,
@@ -281,25 +282,25 @@ Rows = Literal["down", "up"]
 
 def export(
     dataset: Path = argument(..., "DATASET"),
-    format: Exported = option(..., "Write this program's format."),
-    out: Path = option(..., "Write the geometry to this file.", metavar="FILE"),
-    corrected: bool = option(
-        True, "Apply the correction in force, or leave it out.", "--corrected/--nominal"
-    ),
-    correction: Path | None = option(
-        None, "Apply the correction of this calibration report instead.", metavar="FILE"
-    ),
-    unknown: Path | None = option(
-        None,
-        "State, for CTSimU, what reconstruction does not know (TOML).",
-        metavar="FILE",
-    ),
-    rows: Rows = option("down", "Count rows down or up; up: for images turned upside down."),
+    format: Exported = option(...),
+    out: Path = option(..., metavar="FILE"),
+    corrected: bool = option(True, "--corrected/--nominal"),
+    correction: Path | None = option(None, metavar="FILE"),
+    unknown: Path | None = option(None, metavar="FILE"),
+    rows: Rows = option("down"),
     texts: options.Texts = False,
 ) -> Answer:
     """Write a data set's geometry in another program's format; nxtomo holds its images, too.
 
     What the format cannot carry is an error, and nothing is written: docs/exchange.md.
+
+    Args:
+        format: Write this program's format.
+        out: Write the geometry to this file.
+        corrected: Apply the correction in force, or leave it out.
+        correction: Apply the correction of this calibration report instead.
+        unknown: State, for CTSimU, what reconstruction does not know (TOML).
+        rows: Count rows down or up; up: for images turned upside down.
     """
     if correction is not None and not corrected:
         raise typer.BadParameter("--correction and --nominal exclude each other")
@@ -331,26 +332,28 @@ def export(
 
 def import_(
     file: Path = argument(..., "FILE"),
-    format: Format = option(..., "Read this program's format."),
-    out: Path = option(..., "Write the geometry to this file.", metavar="FILE.{json,npy}"),
-    like: Path | None = option(
-        None, "Take what FILE does not say from this data set.", metavar="DATASET"
-    ),
-    shape: str | None = option(
-        None, "Set the detector's shape where FILE does not say it.", metavar="ROWS,COLS"
-    ),
-    pixel: str | None = option(
-        None, "Set the pixel pitch where FILE does not say it (RTK).", metavar="MM or U,V"
-    ),
-    views: int | None = option(None, "Set the number of projections (flexDATA).", min=1),
-    rows: Rows = option("down", "Count rows down or up; up: v is negated."),
-    real: bool = option(
-        False, "Take, of a CTSimU file, what is so, or what reconstruction knows.", "--real/--known"
-    ),
+    format: Format = option(...),
+    out: Path = option(..., metavar="FILE.{json,npy}"),
+    like: Path | None = option(None, metavar="DATASET"),
+    shape: str | None = option(None, metavar="ROWS,COLS"),
+    pixel: str | None = option(None, metavar="MM or U,V"),
+    views: int | None = option(None, min=1),
+    rows: Rows = option("down"),
+    real: bool = option(False, "--real/--known"),
 ) -> Answer:
     """Read a geometry in another program's format and write it as a geometry file.
 
     `flexdt reconstruct` and `calibrate` take it with --geometry, Python with `load_geometry`.
+
+    Args:
+        format: Read this program's format.
+        out: Write the geometry to this file.
+        like: Take what FILE does not say from this data set.
+        shape: Set the detector's shape where FILE does not say it.
+        pixel: Set the pixel pitch where FILE does not say it (RTK).
+        views: Set the number of projections (flexDATA).
+        rows: Count rows down or up; up: v is negated.
+        real: Take, of a CTSimU file, what is so, or what reconstruction knows.
     """
     given = said(like, shape, pixel, views)
     from dataclasses import replace

@@ -24,22 +24,32 @@ STATUS_S = 5.0
 
 
 def follow(
-    address: str | None = argument(None, "ADDRESS", "tcp://HOST[:PORT] of its outgoing events."),
+    address: str | None = argument(None, "ADDRESS"),
     machine: options.MachineName = None,
     profile: options.ProfileName = None,
-    script: Path | None = option(None, "Predict this script, which will run.", metavar="FILE"),
-    sample: str | None = option(None, "Put this phantom on the stage.", metavar="NAME or FILE"),
-    record: Path | None = option(None, "Append the raw messages to this file.", metavar="FILE"),
-    replay: Path | None = option(None, "Hear this recording instead of a scanner.", metavar="FILE"),
-    frames: Path | None = option(None, "Compare images that appear here.", metavar="DIR"),
-    out: Path = option(Path(), "Write beside.png and beside.json of --frames here.", metavar="DIR"),
-    seconds: float | None = option(None, "End after this time.", "--for", metavar="S", min=0.0),
+    script: Path | None = option(None, metavar="FILE"),
+    sample: str | None = option(None, metavar="NAME or FILE"),
+    record: Path | None = option(None, metavar="FILE"),
+    replay: Path | None = option(None, metavar="FILE"),
+    frames: Path | None = option(None, metavar="DIR"),
+    out: Path = option(Path(), metavar="DIR"),
+    seconds: float | None = option(None, "--for", metavar="S", min=0.0),
     json: bool = False,
 ) -> Answer:
     """Follow a real scanner: hear its messages, compare, and say what leaves the prediction.
 
     Nothing is ever sent to the scanner. Ends with Ctrl-C or after --for. Exit code 4 if there was
     no connection.
+
+    Args:
+        address: tcp://HOST[:PORT] of its outgoing events.
+        script: Predict this script, which will run.
+        sample: Put this phantom on the stage.
+        record: Append the raw messages to this file.
+        replay: Hear this recording instead of a scanner.
+        frames: Compare images that appear here.
+        out: Write beside.png and beside.json of --frames here.
+        seconds: End after this time.
     """
     from flexdt.clients.following.session import STAMP, FollowSession, FramesBeside
 

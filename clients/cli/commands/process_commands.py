@@ -164,9 +164,9 @@ Tell = Callable[[str], None]
 
 
 def demo(
-    out: Path = option(Path("flexdt-demo"), "Write everything to this folder.", metavar="DIR"),
-    no_viewer: bool = option(False, "Exit when the work is done, without a viewer.", "--no-viewer"),
-    truth: Path | None = option(None, "Hide this misalignment, not a random one.", metavar="FILE"),
+    out: Path = option(Path("flexdt-demo"), metavar="DIR"),
+    no_viewer: bool = option(False, "--no-viewer"),
+    truth: Path | None = option(None, metavar="FILE"),
     json: bool = False,
 ) -> Answer:
     """Do the main job: script, scan, data set, calibration.
@@ -174,6 +174,11 @@ def demo(
     Starts the servers on free ports, scans the LEGO bead phantom with the example script,
     accelerated, calibrates from the data set, and says what was done, where the files are and how
     the result compares with the hidden truth. With the viewer it stays up until Ctrl-C.
+
+    Args:
+        out: Write everything to this folder.
+        no_viewer: Exit when the work is done, without a viewer.
+        truth: Hide this misalignment, not a random one.
     """
 
     def stay(url: str) -> None:

@@ -41,25 +41,24 @@ if TYPE_CHECKING:
 
 ScriptFile = Annotated[Path, typer.Argument(metavar="SCRIPT", help="Acquila scan script.")]
 
-USUAL = "Set this distance; default: 600 and 1059, or the machine's."
-
 
 def check(
     script: ScriptFile,
     machine: options.MachineName = None,
     profile: options.ProfileName = None,
-    sample: str | None = option(
-        None, "Check truncation, collisions and exposure of this sample.", metavar="NAME or FILE"
-    ),
-    html: Path | None = option(None, "Write the report to this file as one page.", metavar="FILE"),
-    against: Path | None = option(
-        None, "Compare with the log of this script, line by line.", metavar="LOG"
-    ),
+    sample: str | None = option(None, metavar="NAME or FILE"),
+    html: Path | None = option(None, metavar="FILE"),
+    against: Path | None = option(None, metavar="LOG"),
     json: bool = False,
 ) -> Answer:
     """Parse, plan and check a script, without a server.
 
     Exit code 0 with warnings alone, 1 for an invalid script, 3 for a collision or limit.
+
+    Args:
+        sample: Check truncation, collisions and exposure of this sample.
+        html: Write the report to this file as one page.
+        against: Compare with the log of this script, line by line.
     """
     if against is not None:
         yield from compare(script, against, machine, html)
@@ -179,19 +178,20 @@ def show(report: CheckReport, file: str) -> Answer:
 def run(
     twin: Twin,
     script: ScriptFile,
-    out: str | None = option(None, "Give the data set this name.", metavar="NAME"),
-    sample: str | None = option(None, "Put this sample on the stage first.", metavar="NAME"),
-    speed_up: Any = option(
-        None,
-        "Let the twin's time run X times as fast as yours.",
-        metavar="X or max",
-        parser=process_settings.speed_up,
-    ),
-    detach: bool = option(False, "Return once the script is submitted.", "--detach"),
+    out: str | None = option(None, metavar="NAME"),
+    sample: str | None = option(None, metavar="NAME"),
+    speed_up: Any = option(None, metavar="X or max", parser=process_settings.speed_up),
+    detach: bool = option(False, "--detach"),
 ) -> Answer:
     """Run a script on the twin and wait for the data set.
 
     Ctrl-C leaves the scan running; `flexdt job` steers it.
+
+    Args:
+        out: Give the data set this name.
+        sample: Put this sample on the stage first.
+        speed_up: Let the twin's time run X times as fast as yours.
+        detach: Return once the script is submitted.
     """
     from flexdt.protocol.rpc_errors import RpcError
 
@@ -273,33 +273,42 @@ Kind = Literal["fly", "step", "tiled", "helical", "calibration"]
 
 
 def new(
-    kind: Kind = option(..., "Write a script of this kind."),
-    file: Path | None = option(
-        None, "Write to this file; default: standard output.", "--out", metavar="FILE"
-    ),
-    sod: float | None = option(None, USUAL, metavar="MM"),
-    sdd: float | None = option(None, USUAL, metavar="MM"),
-    frames: int = option(361, "Take so many images in a turn, or in all."),
-    exposure: float | None = option(
-        None,
-        "Expose each image so long; default: 100, or as near as the camera gets.",
-        metavar="MS",
-    ),
-    averages: int = option(1, "Average so many read-outs in an image."),
-    position: list[str] | None = option(
-        None, "Put a calibration scan there; once for each scan.", metavar="SOD[:LATERAL]"
-    ),
-    tiles: int | None = option(None, "Put so many tiles side by side; default: 2."),
-    turns: float | None = option(None, "Make so many turns of a helix; default: 3."),
-    rise: float | None = option(None, "Let a helix rise by so much; default: 20.", metavar="MM"),
-    kv: float | None = option(None, "Set the tube's voltage.", metavar="KV"),
-    power: float | None = option(None, "Set the tube's power.", metavar="W"),
-    mode: str | None = option(None, "Set the camera's mode.", metavar="NAME"),
+    kind: Kind = option(...),
+    file: Path | None = option(None, "--out", metavar="FILE"),
+    sod: float | None = option(None, metavar="MM"),
+    sdd: float | None = option(None, metavar="MM"),
+    frames: int = option(361),
+    exposure: float | None = option(None, metavar="MS"),
+    averages: int = option(1),
+    position: list[str] | None = option(None, metavar="SOD[:LATERAL]"),
+    tiles: int | None = option(None),
+    turns: float | None = option(None),
+    rise: float | None = option(None, metavar="MM"),
+    kv: float | None = option(None, metavar="KV"),
+    power: float | None = option(None, metavar="W"),
+    mode: str | None = option(None, metavar="NAME"),
     roi: options.Roi = None,
     machine: options.MachineName = None,
     profile: options.ProfileName = None,
 ) -> Answer:
-    """Write a valid scan script; one that `flexdt check` would reject is not written."""
+    """Write a valid scan script; one that `flexdt check` would reject is not written.
+
+    Args:
+        kind: Write a script of this kind.
+        file: Write to this file; default: standard output.
+        sod: Set this distance; default: 600 and 1059, or the machine's.
+        sdd: Set this distance; default: 600 and 1059, or the machine's.
+        frames: Take so many images in a turn, or in all.
+        exposure: Expose each image so long; default: 100, or as near as the camera gets.
+        averages: Average so many read-outs in an image.
+        position: Put a calibration scan there; once for each scan.
+        tiles: Put so many tiles side by side; default: 2.
+        turns: Make so many turns of a helix; default: 3.
+        rise: Let a helix rise by so much; default: 20.
+        kv: Set the tube's voltage.
+        power: Set the tube's power.
+        mode: Set the camera's mode.
+    """
     from flexdt.scripts import collisions
     from flexdt.twin.machine.camera import Roi
     from flexdt.twin.script import check_script
@@ -432,27 +441,39 @@ BEST = 5
 
 
 def expose(
-    dataset: Path | None = argument(None, "[DATASET]", "Measure a scan's radiographs instead."),
-    sample: str = option("lego", "Predict the scan of this sample.", metavar="NAME or FILE"),
-    material: str | None = option(None, "Fill a mesh file with this material.", metavar="M"),
-    kV: list[float] | None = option(
-        None, "Try this voltage; repeat it for more, and the best is chosen.", "--kV", "--kv"
-    ),
-    power: float | None = option(None, "Set the tube's power.", metavar="W"),
-    filter: str = option("", "Put this filter beside the machine's own.", metavar="MATERIAL:MM"),
-    exposure: float | None = option(None, "Expose each image so long.", metavar="MS"),
-    averages: int = option(1, "Average so many read-outs in an image."),
-    mode: str | None = option(None, "Set the camera's mode.", metavar="NAME"),
+    dataset: Path | None = argument(None, "[DATASET]"),
+    sample: str = option("lego", metavar="NAME or FILE"),
+    material: str | None = option(None, metavar="M"),
+    kV: list[float] | None = option(None, "--kV", "--kv"),
+    power: float | None = option(None, metavar="W"),
+    filter: str = option("", metavar="MATERIAL:MM"),
+    exposure: float | None = option(None, metavar="MS"),
+    averages: int = option(1),
+    mode: str | None = option(None, metavar="NAME"),
     roi: options.Roi = None,
-    frames: int = option(361, "Take so many images of the scan."),
-    sod: float = option(600.0, "Set the distance from source to axis.", metavar="MM"),
-    sdd: float = option(1059.0, "Set the distance from source to panel.", metavar="MM"),
-    detail: str = option(
-        "void:0.5", "See this detail; void:MM for less of the sample.", metavar="MATERIAL:MM"
-    ),
+    frames: int = option(361),
+    sod: float = option(600.0, metavar="MM"),
+    sdd: float = option(1059.0, metavar="MM"),
+    detail: str = option("void:0.5", metavar="MATERIAL:MM"),
     machine: options.MachineName = None,
 ) -> Answer:
-    """Predict transmission, contrast to noise, dose and the best voltage and filter."""
+    """Predict transmission, contrast to noise, dose and the best voltage and filter.
+
+    Args:
+        dataset: Measure a scan's radiographs instead.
+        sample: Predict the scan of this sample.
+        material: Fill a mesh file with this material.
+        kV: Try this voltage; repeat it for more, and the best is chosen.
+        power: Set the tube's power.
+        filter: Put this filter beside the machine's own.
+        exposure: Expose each image so long.
+        averages: Average so many read-outs in an image.
+        mode: Set the camera's mode.
+        frames: Take so many images of the scan.
+        sod: Set the distance from source to axis.
+        sdd: Set the distance from source to panel.
+        detail: See this detail; void:MM for less of the sample.
+    """
     from flexdt.clients import expose as of
     from flexdt.clients.datasets.dataset import load_dataset
     from flexdt.twin.machine.camera import Roi

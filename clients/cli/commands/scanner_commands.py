@@ -76,11 +76,17 @@ def _facts(state: State) -> list[tuple[str, str]]:
 
 def tube(
     twin: Twin,
-    kV: float | None = option(None, "Set the tube's voltage.", "--kv"),
-    power_W: float | None = option(None, "Set the tube's power.", "--power", metavar="W"),
-    on: bool | None = option(None, "Switch X-rays on or off.", "--on/--off"),
+    kV: float | None = option(None, "--kv"),
+    power_W: float | None = option(None, "--power", metavar="W"),
+    on: bool | None = option(None, "--on/--off"),
 ) -> Answer:
-    """Set the X-ray tube, or show it; what is left out stays."""
+    """Set the X-ray tube, or show it; what is left out stays.
+
+    Args:
+        kV: Set the tube's voltage.
+        power_W: Set the tube's power.
+        on: Switch X-rays on or off.
+    """
     with twin() as client:
         if kV is None and power_W is None and on is None:
             t = client.state().tube
@@ -99,12 +105,18 @@ def xrays(tube: TubeState) -> str:
 
 def camera(
     twin: Twin,
-    exposure_ms: float | None = option(None, "Set the exposure time.", "--exposure", metavar="MS"),
-    mode: str | None = option(None, "Set the mode: HWaSWbHigh or HWaSWbLow."),
+    exposure_ms: float | None = option(None, "--exposure", metavar="MS"),
+    mode: str | None = option(None),
     roi: options.Roi = None,
-    averages: int | None = option(None, "Average so many read-outs in an image."),
+    averages: int | None = option(None),
 ) -> Answer:
-    """Set the camera, or show it; what is left out stays."""
+    """Set the camera, or show it; what is left out stays.
+
+    Args:
+        exposure_ms: Set the exposure time.
+        mode: Set the mode: HWaSWbHigh or HWaSWbLow.
+        averages: Average so many read-outs in an image.
+    """
     with twin() as client:
         if exposure_ms is None and mode is None and roi is None and averages is None:
             c = client.state().camera
@@ -136,13 +148,21 @@ JOG_POLL_S = 0.002
 
 def move(
     twin: Twin,
-    targets: list[str] = argument(..., "AXIS=VALUE...", "mm or deg, script's sign."),
-    relative: bool = option(False, "Move by these values instead of to them.", "--relative"),
-    plan: bool = option(False, "Plan a path around obstacles.", "--plan"),
-    shortest: bool = option(False, "Turn rot_obj by the shortest way.", "--shortest"),
-    no_wait: bool = option(False, "Return without waiting for the arrival.", "--no-wait"),
+    targets: list[str] = argument(..., "AXIS=VALUE..."),
+    relative: bool = option(False, "--relative"),
+    plan: bool = option(False, "--plan"),
+    shortest: bool = option(False, "--shortest"),
+    no_wait: bool = option(False, "--no-wait"),
 ) -> Answer:
-    """Move axes; several start together."""
+    """Move axes; several start together.
+
+    Args:
+        targets: mm or deg, script's sign.
+        relative: Move by these values instead of to them.
+        plan: Plan a path around obstacles.
+        shortest: Turn rot_obj by the shortest way.
+        no_wait: Return without waiting for the arrival.
+    """
     wanted = options.assignments(targets)
     with twin() as client:
         try:
@@ -163,12 +183,15 @@ def move(
 def jog(
     twin: Twin,
     axis: str = argument(..., "AXIS"),
-    velocity: str = argument(..., "VELOCITY", "mm/s or deg/s, signed."),
-    seconds: str | None = option(
-        None, "Stop after so many seconds of the twin's clock.", "--for", metavar="SECONDS"
-    ),
+    velocity: str = argument(..., "VELOCITY"),
+    seconds: str | None = option(None, "--for", metavar="SECONDS"),
 ) -> Answer:
-    """Move an axis at a velocity until Ctrl-C, or for a time."""
+    """Move an axis at a velocity until Ctrl-C, or for a time.
+
+    Args:
+        velocity: mm/s or deg/s, signed.
+        seconds: Stop after so many seconds of the twin's clock.
+    """
     speed = options.number(velocity, "the velocity")
     lasting = math.inf if seconds is None else options.number(seconds, "--for")
     if lasting <= 0:
@@ -250,17 +273,17 @@ def reset(twin: Twin) -> Answer:
 
 def sample(
     twin: Twin,
-    name: str | None = argument(
-        None,
-        "NAME or FILE",
-        "A mesh, phantom or scene file is sent first. Lists what there is if left out.",
-    ),
-    unit: Literal["um", "mm", "cm", "m", "inch"] | None = option(
-        None, "Read a mesh in this unit; default: mm, for GLB m."
-    ),
-    material: str | None = option(None, "Fill a mesh with this material; default: abs."),
+    name: str | None = argument(None, "NAME or FILE"),
+    unit: Literal["um", "mm", "cm", "m", "inch"] | None = option(None),
+    material: str | None = option(None),
 ) -> Answer:
-    """Put a sample on the stage, or list what there is."""
+    """Put a sample on the stage, or list what there is.
+
+    Args:
+        name: A mesh, phantom or scene file is sent first. Lists what there is if left out.
+        unit: Read a mesh in this unit; default: mm, for GLB m.
+        material: Fill a mesh with this material; default: abs.
+    """
     from flexdt.clients.client.twin_methods import MESH_FORMATS, SCENE_FORMATS
 
     file = None if name is None else Path(name)
@@ -291,17 +314,20 @@ def sample(
 def snap(
     twin: Twin,
     file: Path = argument(..., "FILE.{tif,png}"),
-    kind: Literal["counts", "line_integral"] | None = option(
-        None, "Write this kind; default: counts in a TIFF, integrals in a PNG."
-    ),
-    binning: int = option(1, "Average so many pixels a side.", min=1, max=32),
-    marks: bool = option(True, "Colour saturated, starved and cut-off pixels of a PNG."),
+    kind: Literal["counts", "line_integral"] | None = option(None),
+    binning: int = option(1, min=1, max=32),
+    marks: bool = option(True),
 ) -> Answer:
     """Take a projection at the current pose.
 
     A TIFF holds the values as they come: uint16 counts unless said. A PNG is windowed to 8 bit,
     dense parts dark, and shows line integrals unless said, so X-rays may be off. It shows in colour
     what would be wrong with the exposure: saturated red, starved blue, cut-off edges yellow.
+
+    Args:
+        kind: Write this kind; default: counts in a TIFF, integrals in a PNG.
+        binning: Average so many pixels a side.
+        marks: Colour saturated, starved and cut-off pixels of a PNG.
     """
     options.require_ending(file, ".tiff", ".tif", ".png")
     options.require_folder(file)
