@@ -115,47 +115,23 @@ def scatter_method(text: str) -> str:
     return text
 
 
-def option(default: object, help: str, *flags: str, public: bool = True, **details: Any) -> Any:
-    """A field of settings that is an option.
+def option(default: object, *flags: str, public: bool = True, **details: Any) -> Any:
+    """A field of settings that is an option; its help is what the class's docstring says of it.
 
     Args:
         default: where the option is left out.
-        help: one line.
         flags: as typed; they follow from the field's name.
         public: whether `flexdt up` lists it in its help.
         details: of `typer.Option`, such as metavar, min, max and parser.
     """
-    return field(default=default, metadata={"public": public, "flags": flags,
-                                            "details": {"help": help, **details}})  # fmt: skip
+    return field(default=default, metadata={"public": public, "flags": flags, "details": details})
 
 
 def tcp_port(
-    default: int | None, help: str, *flags: str, most: int = LARGEST_PORT, public: bool = True
+    default: int | None, *flags: str, most: int = LARGEST_PORT, public: bool = True
 ) -> Any:
     """A field for a TCP port."""
-    return option(default, help, *flags, public=public, min=0, max=most)
-
-
-def some_file(help: str, *, public: bool = True) -> Any:
-    """A field for a file that may be left out."""
-    return option(None, help, public=public, metavar="FILE")
-
-
-def further_projectors() -> Any:
-    """A field for projectors beside the first."""
-    return option(
-        None,
-        "Deal the views among these projectors, too.",
-        public=False,
-        metavar="HOST:PORT,...",
-        parser=several,
-    )
-
-
-def where_the_twin_is() -> Any:
-    """A field for the twin's address."""
-    twin = Address(LOOPBACK, 55000)
-    return option(twin, "Connect to the twin there.", metavar="HOST:PORT", parser=address)
+    return option(default, *flags, public=public, min=0, max=most)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,108 +147,109 @@ class Settings:
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessSettings(Settings):
-    """What every process has."""
+    """What every process has.
 
-    host: str = option(LOOPBACK, "Listen on this address.", public=False)
-    port: int = tcp_port(0, "Listen on this port; 0 is any free one.")
+    Attributes:
+        host: Listen on this address.
+        port: Listen on this port; 0 is any free one.
+    """
+
+    host: str = option(LOOPBACK, public=False)
+    port: int = tcp_port(0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ServerSettings(ProcessSettings):
-    """What twin, projector and viewer share."""
+    """What twin, projector and viewer share.
 
-    token_file: Path | None = some_file("Require the token in this file of every client.")
-    tls_cert: Path | None = some_file("Speak TLS with this certificate.", public=False)
-    tls_key: Path | None = some_file(
-        "Use the private key of the certificate in this file.", public=False
-    )
-    limit: tuple[str, ...] = option(
-        (), "Set a limit of docs/twin-server.md; may be repeated.", public=False,
-        metavar="NAME=VALUE",
-    )  # fmt: skip
-    http_port: int | None = tcp_port(
-        None, "Serve the pages /healthz and /metrics on this port.", public=False
-    )
-    http_host: str = option(
-        LOOPBACK, "Serve these pages on this address; beyond the loopback they need the token.",
-        public=False,
-    )  # fmt: skip
-    log_level: LogLevel = option(
-        "info", "Log from this level on; debug logs every request.", public=False
-    )
+    Attributes:
+        token_file: Require the token in this file of every client.
+        tls_cert: Speak TLS with this certificate.
+        tls_key: Use the private key of the certificate in this file.
+        limit: Set a limit of docs/twin-server.md; may be repeated.
+        http_port: Serve the pages /healthz and /metrics on this port.
+        http_host: Serve these pages on this address; beyond the loopback they need the token.
+        log_level: Log from this level on; debug logs every request.
+    """
+
+    token_file: Path | None = option(None, metavar="FILE")
+    tls_cert: Path | None = option(None, public=False, metavar="FILE")
+    tls_key: Path | None = option(None, public=False, metavar="FILE")
+    limit: tuple[str, ...] = option((), public=False, metavar="NAME=VALUE")
+    http_port: int | None = tcp_port(None, public=False)
+    http_host: str = option(LOOPBACK, public=False)
+    log_level: LogLevel = option("info", public=False)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProjectorSettings(ServerSettings):
-    """`flexdt projector`."""
+    """`flexdt projector`.
+
+    Attributes:
+        port: Listen on this port; 0 is any free one.
+        threads: Compute with so many threads; default: all cores.
+        memory_limit: Hold volumes of at most this size, e.g. 4GiB; default: half of the memory.
+    """
 
     command = "projector"
-    port: int = tcp_port(
-        55001, "Listen on this port; 0 is any free one.", "--port", "--projector-port"
-    )
-    threads: int | None = option(None, "Compute with so many threads; default: all cores.", min=1)
-    memory_limit: int | None = option(
-        None,
-        "Hold volumes of at most this size, e.g. 4GiB; default: half of the memory.",
-        metavar="SIZE",
-        parser=memory_size,
-    )
+    port: int = tcp_port(55001, "--port", "--projector-port")
+    threads: int | None = option(None, min=1)
+    memory_limit: int | None = option(None, metavar="SIZE", parser=memory_size)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScannerSettings(ServerSettings):
-    """What `flexdt twin` and `flexdt up` share; None leaves the choice to the twin."""
+    """What `flexdt twin` and `flexdt up` share; None leaves the choice to the twin.
 
-    port: int = tcp_port(55000, "Listen on this port as the twin; 0 is any free one.")
-    data: Path | None = option(
-        None,
-        "Write all to this data directory; default: data, or configured.",
-        metavar="DIR",
-    )
-    machine: str | None = option(
-        None, "Simulate this machine: a shipped name or a TOML file.", metavar="FILE or NAME"
-    )
-    profile: str | None = option(
-        None, "Use the zero offsets of this calibration profile.", metavar="NAME"
-    )
-    truth: Path | None = some_file("Hide this misalignment in the images (TOML).")
-    sample: str | None = option(
-        None, "Put this sample on the stage at the start, or 'empty'.", metavar="NAME"
-    )
-    speed_up: Any = option(
-        1.0, "Let the twin's time run X times as fast as yours.", metavar="X or max",
-        parser=speed_up,
-    )  # fmt: skip
-    physics: Physics = option("ideal", "Make images this way (docs/physics.md).")
-    scatter: Scatter = option(
-        "off", "Simulate scattered radiation, with physics mono and poly.", metavar="off or mc",
-        parser=scatter_method,
-    )  # fmt: skip
-    fresh: bool = option(False, "Start anew instead of where the last twin left off.", public=False)
+    Attributes:
+        port: Listen on this port as the twin; 0 is any free one.
+        data: Write all to this data directory; default: data, or configured.
+        machine: Simulate this machine: a shipped name or a TOML file.
+        profile: Use the zero offsets of this calibration profile.
+        truth: Hide this misalignment in the images (TOML).
+        sample: Put this sample on the stage at the start, or 'empty'.
+        speed_up: Let the twin's time run X times as fast as yours.
+        physics: Make images this way (docs/physics.md).
+        scatter: Simulate scattered radiation, with physics mono and poly.
+        fresh: Start anew instead of where the last twin left off.
+    """
+
+    port: int = tcp_port(55000)
+    data: Path | None = option(None, metavar="DIR")
+    machine: str | None = option(None, metavar="FILE or NAME")
+    profile: str | None = option(None, metavar="NAME")
+    truth: Path | None = option(None, metavar="FILE")
+    sample: str | None = option(None, metavar="NAME")
+    speed_up: Any = option(1.0, metavar="X or max", parser=speed_up)
+    physics: Physics = option("ideal")
+    scatter: Scatter = option("off", metavar="off or mc", parser=scatter_method)
+    fresh: bool = option(False, public=False)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TwinSettings(ScannerSettings):
-    """`flexdt twin`."""
+    """`flexdt twin`.
+
+    Attributes:
+        data: Write everything to this directory.
+        machine: Simulate this machine: a shipped name or a TOML file.
+        projector: Connect to the projector that listens there; default: 127.0.0.1:55001.
+        projector_port: Connect to the projector on this port of 127.0.0.1 instead.
+        projectors: Deal the views among these projectors, too.
+        projector_token_file: Show this file's token to the projectors.
+        projector_tls_ca: Speak TLS with the projectors and trust this certificate.
+        no_noise: Make images of expected counts, without noise.
+    """
 
     command = "twin"
-    data: Path = option(Path("data"), "Write everything to this directory.", metavar="DIR")
-    machine: str = option(
-        "flexray", "Simulate this machine: a shipped name or a TOML file.", metavar="FILE or NAME"
-    )
-    projector: Address | None = option(
-        None, "Connect to the projector that listens there; default: 127.0.0.1:55001.",
-        metavar="HOST:PORT", parser=address,
-    )  # fmt: skip
-    projector_port: int | None = tcp_port(
-        None, "Connect to the projector on this port of 127.0.0.1 instead."
-    )
-    projectors: str | None = further_projectors()
-    projector_token_file: Path | None = some_file("Show this file's token to the projectors.")
-    projector_tls_ca: Path | None = some_file(
-        "Speak TLS with the projectors and trust this certificate."
-    )
-    no_noise: bool = option(False, "Make images of expected counts, without noise.", public=False)
+    data: Path = option(Path("data"), metavar="DIR")
+    machine: str = option("flexray", metavar="FILE or NAME")
+    projector: Address | None = option(None, metavar="HOST:PORT", parser=address)
+    projector_port: int | None = tcp_port(None)
+    projectors: str | None = option(None, public=False, metavar="HOST:PORT,...", parser=several)
+    projector_token_file: Path | None = option(None, metavar="FILE")
+    projector_tls_ca: Path | None = option(None, metavar="FILE")
+    no_noise: bool = option(False, public=False)
 
     @property
     def places(self) -> tuple[Address, ...]:
@@ -285,70 +262,81 @@ class TwinSettings(ScannerSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class TwinClientSettings(ProcessSettings):
-    """What viewer and gateway share: where the twin is and what they know of it."""
+    """What viewer and gateway share: where the twin is and what they know of it.
 
-    data: Path | None = option(None, "Read the twin's data directory here.", metavar="DIR")
-    machine: Path | None = option(
-        None, "Read the twin's machine from this file, where it is one.", metavar="FILE or NAME"
-    )
-    profile: Path | None = option(
-        None, "Read the twin's profile from this file, where it is one.", metavar="NAME"
-    )
-    token_file: Path | None = some_file("Show this file's token to the twin.")
-    twin_cert: Path | None = some_file("Speak TLS with the twin and trust this certificate.")
+    Attributes:
+        data: Read the twin's data directory here.
+        machine: Read the twin's machine from this file, where it is one.
+        profile: Read the twin's profile from this file, where it is one.
+        token_file: Show this file's token to the twin.
+        twin_cert: Speak TLS with the twin and trust this certificate.
+    """
+
+    data: Path | None = option(None, metavar="DIR")
+    machine: Path | None = option(None, metavar="FILE or NAME")
+    profile: Path | None = option(None, metavar="NAME")
+    token_file: Path | None = option(None, metavar="FILE")
+    twin_cert: Path | None = option(None, metavar="FILE")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewerSettings(TwinClientSettings, ServerSettings):
-    """`flexdt viewer`."""
+    """`flexdt viewer`.
+
+    Attributes:
+        port: Listen on this port; 0: any free one.
+        twin: Connect to the twin there.
+        token_file: Show this file's token to the twin; browsers must show it here.
+    """
 
     command = "viewer"
-    port: int = tcp_port(8080, "Listen on this port; 0: any free one.", "--port", "--viewer-port")
-    twin: Address = where_the_twin_is()
-    token_file: Path | None = some_file(
-        "Show this file's token to the twin; browsers must show it here."
-    )
+    port: int = tcp_port(8080, "--port", "--viewer-port")
+    twin: Address = option(Address(LOOPBACK, 55000), metavar="HOST:PORT", parser=address)
+    token_file: Path | None = option(None, metavar="FILE")
 
 
 @dataclass(frozen=True, kw_only=True)
 class GatewaySettings(TwinClientSettings):
-    """`flexdt gateway`."""
+    """`flexdt gateway`.
+
+    Attributes:
+        host: Listen on this address of the loopback; use a tunnel beyond.
+        port: Publish events on this port; 0 is any free one.
+        inbound_port: Take events on this port; default: the next.
+        server: Connect to the twin there.
+        data: Save images in this directory.
+    """
 
     command = "gateway"
-    host: str = option(
-        LOOPBACK,
-        "Listen on this address of the loopback; use a tunnel beyond.",
-        "--bind",
-        "--host",
-        metavar="HOST",
-    )
-    port: int = tcp_port(50000, "Publish events on this port; 0 is any free one.")
-    inbound_port: int | None = tcp_port(None, "Take events on this port; default: the next.")
-    server: Address = where_the_twin_is()
-    data: Path = option(Path("data"), "Save images in this directory.", metavar="DIR")
+    host: str = option(LOOPBACK, "--bind", "--host", metavar="HOST")
+    port: int = tcp_port(50000)
+    inbound_port: int | None = tcp_port(None)
+    server: Address = option(Address(LOOPBACK, 55000), metavar="HOST:PORT", parser=address)
+    data: Path = option(Path("data"), metavar="DIR")
 
 
 @dataclass(frozen=True, kw_only=True)
 class UpSettings(ScannerSettings):
-    """`flexdt up`: those of the twin, and what the other processes need."""
+    """`flexdt up`: those of the twin, and what the other processes need.
+
+    Attributes:
+        projector_port: Give the projector this port; 0 is any free one.
+        projector_memory: Let the projector hold volumes of this size, e.g. 4GiB.
+        projectors: Deal the views among these projectors, too.
+        projector_token_file: Show this file's token to the projectors.
+        viewer_port: Give the viewer this port; 0 is any free one.
+        no_viewer: Start no viewer.
+        gateway_port: Serve Acquila's interface on this port and the next (see gateway).
+    """
 
     command = "up"
-    projector_port: int = tcp_port(55001, "Give the projector this port; 0 is any free one.")
-    projector_memory: str | None = option(
-        None, "Let the projector hold volumes of this size, e.g. 4GiB.", public=False,
-        metavar="SIZE",
-    )  # fmt: skip
-    projectors: str | None = further_projectors()
-    projector_token_file: Path | None = some_file(
-        "Show this file's token to the projectors.", public=False
-    )
-    viewer_port: int = tcp_port(8080, "Give the viewer this port; 0 is any free one.")
-    no_viewer: bool = option(False, "Start no viewer.")
-    gateway_port: int | None = tcp_port(
-        None,
-        "Serve Acquila's interface on this port and the next (see gateway).",
-        most=LARGEST_PORT - 1,
-    )
+    projector_port: int = tcp_port(55001)
+    projector_memory: str | None = option(None, public=False, metavar="SIZE")
+    projectors: str | None = option(None, public=False, metavar="HOST:PORT,...", parser=several)
+    projector_token_file: Path | None = option(None, public=False, metavar="FILE")
+    viewer_port: int = tcp_port(8080)
+    no_viewer: bool = option(False)
+    gateway_port: int | None = tcp_port(None, most=LARGEST_PORT - 1)
 
 
 S = TypeVar("S", bound=Settings)
@@ -357,14 +345,16 @@ S = TypeVar("S", bound=Settings)
 def parameters(settings: type[Settings]) -> dict[str, inspect.Parameter]:
     """A table's keys as options: parameters of a function that typer reads."""
     hints, found = get_type_hints(settings), {}
+    helps = {n: h for kind in settings.__mro__[::-1] for n, h in described(kind)[1].items()}
     for f in fields(settings):
         flags = f.metadata["flags"] or (f"--{f.name.replace('_', '-')}",)
         default = str(f.default) if isinstance(f.default, Address) else f.default
         kind: Any = list[str] if isinstance(default, tuple) else hints[f.name]
+        details = {"help": helps[f.name], **f.metadata["details"]}
         found[f.name] = inspect.Parameter(
             f.name, inspect.Parameter.KEYWORD_ONLY,
             default=[*default] if isinstance(default, tuple) else default,
-            annotation=Annotated[kind, typer.Option(*flags, **f.metadata["details"])],
+            annotation=Annotated[kind, typer.Option(*flags, **details)],
         )  # fmt: skip
     return found
 

@@ -21,44 +21,25 @@ from flexdt.clients.cli.boundary import DONE, INTERRUPTED, USAGE, describe
 from flexdt.clients.cli.commands import analysis_commands as analysis
 from flexdt.clients.cli.commands import calibrate_commands as geometry
 from flexdt.clients.cli.commands import data_commands as data
+from flexdt.clients.cli.commands import follow_command as following
 from flexdt.clients.cli.commands import process_commands as processes
 from flexdt.clients.cli.commands import scan_commands as scans
 from flexdt.clients.cli.commands import scanner_commands as scanner
-from flexdt.clients.cli.commands.analysis_commands import commission
-from flexdt.clients.cli.commands.follow_command import follow
 from flexdt.clients.cli.console import hush, note, printable
 from flexdt.clients.cli.options import Json, Server, TokenFile, argument, completed, option
 
 COMMANDS: Final[Mapping[str, Callable[..., object]]] = {
-    "demo": processes.demo,
-    "up": processes.up,
-    "twin": processes.twin,
-    "projector": processes.projector,
-    "viewer": processes.viewer,
-    "gateway": processes.gateway,
-    "check": scans.check,
-    "run": scans.run,
-    "state": scanner.state,
-    "tube": scanner.tube,
-    "camera": scanner.camera,
-    "clock": scanner.clock,
-    "move": scanner.move,
-    "jog": scanner.jog,
-    "stop": scanner.stop,
-    "estop": scanner.estop,
-    "reset": scanner.reset,
-    "sample": scanner.sample,
-    "snap": scanner.snap,
-    "calibrate": geometry.calibrate,
-    "align": geometry.align,
-    "compare": geometry.compare,
-    "expose": scans.expose,
-    "reconstruct": data.reconstruct,
-    "export": data.export,
-    "import": data.import_,
-    "follow": follow,
-    "commission": commission,
-    "doctor": processes.doctor,
+    name.strip("_"): getattr(module, name)
+    for module, names in (
+        (processes, "demo up twin projector viewer gateway doctor"),
+        (scans, "check run expose"),
+        (scanner, "state tube camera clock move jog stop estop reset sample snap"),
+        (geometry, "calibrate align compare"),
+        (data, "reconstruct export import_"),
+        (following, "follow"),
+        (analysis, "commission"),
+    )
+    for name in names.split()
 }
 """Name -> what it runs."""
 GROUPS: Final[Mapping[str, tuple[str, Mapping[str, Callable[..., object]]]]] = {
@@ -66,10 +47,7 @@ GROUPS: Final[Mapping[str, tuple[str, Mapping[str, Callable[..., object]]]]] = {
     "job": ("Jobs: scripts and trajectories being run.", scans.JOB_COMMANDS),
     "phantom": (
         "Phantoms: objects to scan.",
-        {
-            "list": analysis.list_phantoms,
-            "make": analysis.make,
-        },
+        {"list": analysis.list_phantoms, "make": analysis.make},
     ),
     "machine": (
         "Machines as data, and from their logs.",

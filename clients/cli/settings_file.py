@@ -46,44 +46,62 @@ PATHS: Final = ("token_file", "tls_ca", "data")
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateSettings(Settings):
-    """`flexdt calibrate`."""
+    """`flexdt calibrate`.
+
+    Attributes:
+        bound: Refuse a sigma above this (mm, deg).
+    """
 
     command = "calibrate"
-    bound: float = option(5.0, "Refuse a sigma above this (mm, deg).")
+    bound: float = option(5.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MachineNewSettings(Settings):
-    """`flexdt machine new`."""
+    """`flexdt machine new`.
+
+    Attributes:
+        scanner: Name the scanner so in data sets.
+    """
 
     command = "machine new"
-    scanner: str | None = option(None, "Name the scanner so in data sets.")
+    scanner: str | None = option(None)
 
 
 @dataclass(frozen=True, kw_only=True)
 class PhantomMakeSettings(Settings):
-    """`flexdt phantom make`."""
+    """`flexdt phantom make`.
+
+    Attributes:
+        bead: Make the beads of this material.
+    """
 
     command = "phantom make"
-    bead: str = option("steel", "Make the beads of this material.")
+    bead: str = option("steel")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructSettings(Settings):
-    """`flexdt reconstruct`."""
+    """`flexdt reconstruct`.
+
+    Attributes:
+        window: Filter FDK with this window.
+    """
 
     command = "reconstruct"
-    window: Literal["ram-lak", "shepp-logan", "cosine", "hamming", "hann"] = option(
-        "ram-lak", "Filter FDK with this window."
-    )
+    window: Literal["ram-lak", "shepp-logan", "cosine", "hamming", "hann"] = option("ram-lak")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScriptNewSettings(Settings):
-    """`flexdt script new`."""
+    """`flexdt script new`.
+
+    Attributes:
+        height: Set the height of source and detector centre [mm].
+    """
 
     command = "script new"
-    height: float | None = option(None, "Set the height of source and detector centre [mm].")
+    height: float | None = option(None)
 
 
 @dataclass(frozen=True, kw_only=True)

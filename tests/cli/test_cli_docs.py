@@ -6,7 +6,6 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from typer.main import get_command
 
 from flexdt.clients.cli.command_tree import SECTIONS, build
 from flexdt.clients.cli.settings_file import TABLES
+from flexdt.process_settings import parameters
 
 MOST_OPTIONS = 216
 THEIRS = ("flexdt study", "flexdt batch", "flexdt bench", "flexdt phantom design")
@@ -131,5 +131,6 @@ def test_every_option_has_a_sentence_of_help() -> None:
     ]
     assert not wrong
     for kind in TABLES.values():
-        for field in fields(kind):
-            assert re.fullmatch(r"[A-Z]\S*( \S+){2,}\.", field.metadata["details"]["help"]), field
+        for name, parameter in parameters(kind).items():
+            [option] = parameter.annotation.__metadata__
+            assert re.fullmatch(r"[A-Z]\S*( \S+){2,}\.", option.help), name
