@@ -3,7 +3,7 @@
 A command is an event whose `reply type` is empty (some programs write SEND or SENT). Whoever
 executes it answers with events that bear the same UUID: RCV at once, FDB while it lasts, then one
 ACK or ERR. The interface's description asks replies for the command's tick count too, but programs
-renew it or leave it out. `Exchange` keeps that order for one command; time is an argument.
+renew it or leave it out. Time is an argument.
 """
 
 from __future__ import annotations
@@ -156,27 +156,16 @@ def format_event(event: AcquilaEvent) -> str:
 
 
 class Exchange:
-    """The replies to one command, in the order the interface demands.
+    """The replies to one command: `received` first, `feedback` while it lasts, then one end.
 
     Args:
         command: what was asked; its UUID is already given.
         comp_type: of the component, for the replies.
         now: real time [s].
-
-    Raises:
-        AcquilaError: `command` is a reply itself.
     """
 
     def __init__(self, command: AcquilaEvent, comp_type: ComponentType, now: float) -> None:
-        if not command.is_command:
-            raise AcquilaError(f"{command.reply_type.value} is a reply and no command")
-        self.command, self._type = command, comp_type
-        self._last, self._received, self._ended = now, False, False
-
-    @property
-    def ended(self) -> bool:
-        """Whether ACK or ERR has gone out."""
-        return self._ended
+        self.command, self._type, self._last = command, comp_type, now
 
     @property
     def next_feedback(self) -> float:
@@ -185,35 +174,21 @@ class Exchange:
 
     def received(self, now: float) -> AcquilaEvent:
         """RCV; the first event of every exchange."""
-        self._require(not self._received, "RCV goes out once")
-        self._received, self._last = True, now
-        return self._answer(ReplyType.RCV, "")
+        self._last = now
+        return self.command.answer(ReplyType.RCV, "", self._type)
 
     def feedback(self, text: str, now: float) -> AcquilaEvent:
         """FDB, due or not."""
-        self._require(self._received and not self._ended, "FDB stands between RCV and the end")
         self._last = now
-        return self._answer(ReplyType.FDB, text)
+        return self.command.answer(ReplyType.FDB, text, self._type)
 
     def done(self, reply: str = "") -> AcquilaEvent:
         """ACK, the end."""
-        return self._end(ReplyType.ACK, reply)
+        return self.command.answer(ReplyType.ACK, reply, self._type)
 
     def failed(self, message: str) -> AcquilaEvent:
         """ERR, the end."""
-        return self._end(ReplyType.ERR, message)
-
-    def _end(self, kind: ReplyType, reply: str) -> AcquilaEvent:
-        self._require(self._received and not self._ended, f"{kind.value} ends a command once")
-        self._ended = True
-        return self._answer(kind, reply)
-
-    def _answer(self, kind: ReplyType, reply: str) -> AcquilaEvent:
-        return self.command.answer(kind, reply, self._type)
-
-    def _require(self, holds: bool, rule: str) -> None:
-        if not holds:
-            raise AcquilaError(f"{self.command.component} {self.command.command}: {rule}")
+        return self.command.answer(ReplyType.ERR, message, self._type)
 
 
 def _attribute(name: str) -> str:

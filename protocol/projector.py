@@ -13,7 +13,7 @@ from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from annotated_types import Ge, Le, Len, MaxLen
-from pydantic import BeforeValidator, Field, InstanceOf, model_validator
+from pydantic import BeforeValidator, Field, InstanceOf, TypeAdapter, model_validator
 from pydantic.json_schema import WithJsonSchema
 
 from flexdt.protocol import fields as f
@@ -71,29 +71,15 @@ def _buffer(value: object) -> object:
         raise ValueError(error.message) from None
 
 
+Coordinate = Annotated[float, Ge(-MAX_MM), Le(MAX_MM)]
+_ROW = Annotated[list[Coordinate], Len(12, 12)]
+_ROWS_SCHEMA: Final = TypeAdapter(Annotated[list[_ROW], Len(1, MAX_VIEWS)]).json_schema()
 _IMAGE_SCHEMA: Final = {"type": "object", "required": ["dtype", "shape", "data"]}
 
 ConeVecs = Annotated[
     InstanceOf[np.ndarray],
     BeforeValidator(_rows),
-    WithJsonSchema(
-        {
-            "anyOf": [
-                {
-                    "type": "array",
-                    "minItems": 1,
-                    "maxItems": MAX_VIEWS,
-                    "items": {
-                        "type": "array",
-                        "minItems": 12,
-                        "maxItems": 12,
-                        "items": {"type": "number", "minimum": -MAX_MM, "maximum": MAX_MM},
-                    },
-                },
-                _IMAGE_SCHEMA,
-            ]
-        }
-    ),
+    WithJsonSchema({"anyOf": [_ROWS_SCHEMA, _IMAGE_SCHEMA]}),
 ]
 """(n, 12) float64 [mm], object frame."""
 
@@ -110,7 +96,6 @@ Buffer = Annotated[
 Detector = Annotated[tuple[f.Side, f.Side], Field(strict=False)]
 """(rows, columns)."""
 
-Coordinate = Annotated[float, Ge(-MAX_MM), Le(MAX_MM)]
 Place = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
 """(x, y, z) [mm]."""
 
