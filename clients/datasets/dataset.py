@@ -37,8 +37,7 @@ from flexdt.twin.dataset.dataset_errors import (
 )
 from flexdt.twin.dataset.flexdt_json import parse_document
 from flexdt.twin.dataset.rebuild import rebuild
-from flexdt.twin.dataset.scan_settings import ScanSettings
-from flexdt.twin.dataset.scan_settings_text import parse_scan_settings
+from flexdt.twin.dataset.scan_settings import ScanSettings, parse_scan_settings
 from flexdt.twin.dataset.xre import parse_xre
 from flexdt.twin.errors import TwinError
 from flexdt.twin.exchange.number_tables import read_geometry_text

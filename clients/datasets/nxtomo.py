@@ -27,8 +27,12 @@ from flexdt.twin.dataset.dataset_errors import (
 )
 from flexdt.twin.dataset.flexdt_json import CorrectionEntry
 from flexdt.twin.dataset.rebuild import MATCH_MM
-from flexdt.twin.dataset.scan_settings import ScanSettings, figures_of, poses_of
-from flexdt.twin.dataset.scan_settings_text import format_scan_settings
+from flexdt.twin.dataset.scan_settings import (
+    ScanSettings,
+    figures_of,
+    format_scan_settings,
+    poses_of,
+)
 from flexdt.twin.dataset.xre import format_settings
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.exchange.geometry import ScanGeometry

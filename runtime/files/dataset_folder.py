@@ -31,9 +31,8 @@ from flexdt.twin.dataset.dataset_errors import (
     DatasetMissingError,
     plain_name,
 )
-from flexdt.twin.dataset.flexdt_json import DatasetDocument, parse_document
-from flexdt.twin.dataset.record import ScanRecord
-from flexdt.twin.dataset.scan_settings_text import format_scan_settings
+from flexdt.twin.dataset.flexdt_json import DatasetDocument, ScanRecord, parse_document
+from flexdt.twin.dataset.scan_settings import format_scan_settings
 from flexdt.twin.dataset.xre import format_xre
 from flexdt.twin.geometry.conventions import Float32Array
 

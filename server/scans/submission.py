@@ -40,7 +40,7 @@ from flexdt.twin.dataset.dataset_errors import (
     DiskFullError,
     plain_name,
 )
-from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
+from flexdt.twin.dataset.flexdt_json import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.geometry.cone_vec import check_cone_vec
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import Sample

@@ -30,8 +30,7 @@ from flexdt.twin.dataset.dataset_errors import (
     DiskFullError,
     plain_name,
 )
-from flexdt.twin.dataset.flexdt_json import DatasetDocument
-from flexdt.twin.dataset.record import ScanRecord
+from flexdt.twin.dataset.flexdt_json import DatasetDocument, ScanRecord
 
 RESERVE_BYTES: Final = 16 << 20
 """Room asked for beside the images: texts, flexdt.json, the file system's own needs."""

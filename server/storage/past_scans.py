@@ -49,9 +49,8 @@ from flexdt.twin.dataset.dataset_errors import (
     DatasetNameError,
     plain_name,
 )
-from flexdt.twin.dataset.flexdt_json import DatasetDocument, FrameEntry, parse_document
+from flexdt.twin.dataset.flexdt_json import DatasetDocument, FrameEntry, FrameKind, parse_document
 from flexdt.twin.dataset.normalise import LineIntegrals, binned_mean
-from flexdt.twin.dataset.record import FrameKind
 from flexdt.twin.errors import LimitError, TwinError
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.description import Machine, Profile

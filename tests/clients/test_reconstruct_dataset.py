@@ -32,7 +32,7 @@ from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.testing.in_process import DirectProjector
 from flexdt.twin.attenuation.substances import Substance
-from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
+from flexdt.twin.dataset.flexdt_json import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.errors import GeometryError, LimitError, TwinError, UnknownNameError
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import builtin_machine, builtin_profile

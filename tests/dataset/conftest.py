@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from flexdt.twin.dataset.record import FrameBlock, NoiseRecord, SampleRecord, ScanRecord
+from flexdt.twin.dataset.flexdt_json import FrameBlock, NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import builtin_machine, builtin_profile

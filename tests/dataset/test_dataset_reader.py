@@ -19,9 +19,14 @@ from hypothesis import strategies as st
 
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetFormatError, DatasetMissingError
-from flexdt.twin.dataset.flexdt_json import DatasetDocument, parse_document
+from flexdt.twin.dataset.flexdt_json import (
+    DatasetDocument,
+    NoiseRecord,
+    SampleRecord,
+    ScanRecord,
+    parse_document,
+)
 from flexdt.twin.dataset.normalise import LineIntegrals, binned_mean
-from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import builtin_profile, builtin_profiles
 

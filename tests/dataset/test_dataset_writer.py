@@ -35,8 +35,7 @@ from flexdt.twin.dataset.dataset_errors import (
     DiskFullError,
     plain_name,
 )
-from flexdt.twin.dataset.flexdt_json import parse_document
-from flexdt.twin.dataset.record import NoiseRecord, ScanRecord
+from flexdt.twin.dataset.flexdt_json import NoiseRecord, ScanRecord, parse_document
 
 Image = npt.NDArray[np.uint16]
 Make = Callable[..., ScanRecord]

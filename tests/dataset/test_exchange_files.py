@@ -24,7 +24,7 @@ from flexdt.clients.datasets.exchange import (
     save_geometry,
     with_geometry,
 )
-from flexdt.twin.dataset.record import FrameBlock, ScanRecord
+from flexdt.twin.dataset.flexdt_json import FrameBlock, ScanRecord
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.projection import Volume
 

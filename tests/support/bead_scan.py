@@ -15,7 +15,7 @@ from flexdt.server.scans.acquisition import Acquisition
 from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.testing.in_process import DirectProjector
-from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
+from flexdt.twin.dataset.flexdt_json import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import Machine, builtin_machine, profile_of
 from flexdt.twin.scanner.state import Sample

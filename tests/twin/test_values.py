@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from flexdt.twin.dataset.flexdt_json import DatasetDocument, parse_document
-from flexdt.twin.dataset.record import ScanRecord
+from flexdt.twin.dataset.flexdt_json import DatasetDocument, ScanRecord, parse_document
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.poses import Poses

@@ -39,8 +39,7 @@ from flexdt.clients.viewer.live_volume import (
 from flexdt.phantoms import load_phantom
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.storage.dataset_writer import DatasetWriter
-from flexdt.twin.dataset.flexdt_json import parse_document
-from flexdt.twin.dataset.record import NoiseRecord, SampleRecord, ScanRecord
+from flexdt.twin.dataset.flexdt_json import NoiseRecord, SampleRecord, ScanRecord, parse_document
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.projection import Volume

@@ -91,39 +91,44 @@ def rebuild(
         DatasetFormatError: neither machine and motors nor the figures suffice.
     """
     angles = np.radians(angles_deg(settings, count, file))
-    settings, moved = physical(settings, file)
+    settings, notes = physical(settings, file)
     machine = machines[0] if len(machines) == 1 else named_machine(settings, machines)
-    figures = settings.figures
+    figures, place = settings.figures, dict[str, float]()
+    positions: dict[str, FloatArray] = {}
+    height = "the sample's reference height is taken to be the focal spot's"
     if machine is None:
-        who = settings.scanner_name or "(unnamed)"
-        why = "; ".join((*moved, f"scanner {who!r} is not known"))
-        return _figures_alone(figures, shape, angles, why, file)
-    if not set(settings.motors) & set(machine.axes):
-        why = "; ".join((*moved, "the texts state no motor positions"))
-        return _figures_alone(figures, shape, angles, why, file)
-    positions, notes = _positions(settings, machine, np.degrees(angles))
-    notes += moved
-    camera = _camera(settings, shape, file, machine.detector.camera.modes)
-    found = None if camera is None else _profile(machine, profiles, camera, positions, figures)
-    if found is not None and camera is not None:
-        profile, why = found
-        notes.append(f"profile {profile.name}{why}")
-        nominal = motor_poses(machine, profile, camera, positions)
-        return Rebuilt(nominal, machine, profile, positions, tuple(notes))
-    nothing = Profile(name=ZERO, machine=machine.name, source="no offsets")
-    offsets = _default(machine, profiles) or nothing
-    heights = motor_poses(machine, offsets, machine.detector.camera, positions)
-    why = "no ROI and mode" if camera is None else "no profile reproduces the printed figures"
-    note = f"{why}, so these are the geometry; heights come from the motors and {offsets.name}"
-    place = {
-        "source_x": float(heights.source[0, 0]),
-        "source_z": float(heights.source[0, 2]),
-        "axis_z": float(heights.axis[0, 2]),
-    }
-    built = _required(figures, why, file)
-    return Rebuilt(
-        poses_of(built, shape, angles, **place), machine, None, positions, (*notes, note)
-    )
+        why = f"scanner {settings.scanner_name or '(unnamed)'!r} is not known"
+    elif not set(settings.motors) & set(machine.axes):
+        machine, why = None, "the texts state no motor positions"
+    else:
+        positions, assumed = _positions(settings, machine, np.degrees(angles))
+        notes = [*assumed, *notes]
+        camera = _camera(settings, shape, file, machine.detector.camera.modes)
+        found = None if camera is None else _profile(machine, profiles, camera, positions, figures)
+        if found is not None and camera is not None:
+            profile, why = found
+            notes.append(f"profile {profile.name}{why}")
+            nominal = motor_poses(machine, profile, camera, positions)
+            return Rebuilt(nominal, machine, profile, positions, tuple(notes))
+        nothing = Profile(name=ZERO, machine=machine.name, source="no offsets")
+        offsets = _default(machine, profiles) or nothing
+        heights = motor_poses(machine, offsets, machine.detector.camera, positions)
+        why = "no ROI and mode" if camera is None else "no profile reproduces the printed figures"
+        height = f"heights come from the motors and {offsets.name}"
+        place = {
+            "source_x": float(heights.source[0, 0]),
+            "source_z": float(heights.source[0, 2]),
+            "axis_z": float(heights.axis[0, 2]),
+        }
+    if figures is None:
+        raise DatasetFormatError(
+            f"{file}: {why}, and not all of SOD, SDD, COR, VC, HC and `Binned pixel size` are "
+            "there, so the geometry is unknown; give the machine and a profile",
+            {"path": file, "reason": why},
+        )
+    notes.append(f"{why}, so the printed figures are the geometry; {height}")
+    poses = poses_of(figures, shape, angles, **place)
+    return Rebuilt(poses, machine, None, positions, tuple(notes))
 
 
 def physical(settings: ScanSettings, file: str) -> tuple[ScanSettings, list[str]]:
@@ -222,52 +227,26 @@ def _camera(
     """Camera settings that give images of `shape`; None if the texts do not state them."""
     if settings.roi is None or settings.mode is None:
         return None
-    roi = settings.roi
     try:
-        camera = CameraSettings(settings.mode, roi, modes=modes)
+        camera = CameraSettings(settings.mode, settings.roi, modes=modes)
         stated = camera.shape
     except TwinError:
         return None
     if stated != shape:
         raise DatasetFormatError(
-            f"{file}: ROI {roi} in mode {settings.mode} gives images of {stated[1]} x {stated[0]} "
-            f"pixels, but the images have {shape[1]} x {shape[0]}",
+            f"{file}: ROI {settings.roi} in mode {settings.mode} gives images of {stated[1]} x "
+            f"{stated[0]} pixels, but the images have {shape[1]} x {shape[0]}",
             {"path": file, "asked": list(shape), "allowed": list(stated)},
         )
     return camera
 
 
 def _agree(ours: Figures, printed: Figures) -> bool:
-    lengths = (ours.sod_mm - printed.sod_mm, ours.sdd_mm - printed.sdd_mm)
-    pixels = (
-        ours.hc_px - printed.hc_px, ours.vc_px - printed.vc_px, ours.cor_px - printed.cor_px
-    )  # fmt: skip
-    return (
-        max(map(abs, lengths)) < MATCH_MM
-        and max(map(abs, pixels)) < MATCH_PX
-        and abs(ours.pixel_mm - printed.pixel_mm) < 1e-5
+    slack = {"sod_mm": MATCH_MM, "sdd_mm": MATCH_MM, "pixel_mm": 1e-5}
+    return all(
+        abs(value - getattr(printed, name)) < slack.get(name, MATCH_PX)
+        for name, value in vars(ours).items()
     )
-
-
-def _figures_alone(
-    figures: Figures | None, shape: tuple[int, int], angles: FloatArray, why: str, file: str
-) -> Rebuilt:
-    note = (
-        f"{why}: the printed figures are the geometry, and the sample's reference height is taken "
-        "to be the focal spot's"
-    )
-    built = poses_of(_required(figures, why, file), shape, angles)
-    return Rebuilt(built, None, None, {}, (note,))
-
-
-def _required(figures: Figures | None, why: str, file: str) -> Figures:
-    if figures is None:
-        raise DatasetFormatError(
-            f"{file}: {why}, and not all of SOD, SDD, COR, VC, HC and `Binned pixel size` are "
-            "there, so the geometry is unknown; give the machine and a profile",
-            {"path": file, "reason": why},
-        )
-    return figures
 
 
 def _default(machine: Machine, profiles: Sequence[Profile]) -> Profile | None:

@@ -8,7 +8,7 @@ hold. Unknown keys are kept without interpretation.
 from __future__ import annotations
 
 import re
-import tomllib
+import string
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -18,22 +18,113 @@ from typing import Any, Final
 import numpy as np
 
 from flexdt.twin.dataset.dataset_errors import XRE_SETTINGS, DatasetFormatError
-from flexdt.twin.dataset.record import ScanRecord
-from flexdt.twin.dataset.scan_settings import ENTRIES, MotorLine, ScanSettings, settings_of
-from flexdt.twin.dataset.scan_settings_text import EOL, clean, parse_number, parse_roi
+from flexdt.twin.dataset.flexdt_json import ScanRecord
+from flexdt.twin.dataset.scan_settings import (
+    ENTRIES,
+    EOL,
+    MotorLine,
+    ScanSettings,
+    clean,
+    parse_number,
+    parse_roi,
+    settings_of,
+)
 from flexdt.twin.geometry.conventions import BEAM, RIGHT, UP, FloatArray, stage_rotation
-from flexdt.twin.geometry.poses import Poses
 
-# The content of `data settings XRE.txt`, section by section, in the scanner's order.
-#
-# Values of the maker's reconstruction and of hardware the twin does not model are written as zero
-# or empty, so that readers find every key.
-#
+Value = str | bool | int | float
+Sections = Mapping[str, Mapping[str, Value]]
+
+
+def format_xre(record: ScanRecord) -> str:
+    """The text of `data settings XRE.txt` (CRLF) for a scan: `data/texts/xre.txt`, filled in.
+
+    Values of the maker's reconstruction and of hardware the twin does not model are zero or empty
+    there, so that readers find every key.
+    """
+    s, camera = settings_of(record), record.camera
+    rotation = next(iter(record.machine.geometry.get("angle", {"rot_obj": 1.0})))
+    motors: dict[str, Value] = {name: line.value for name, line in s.motors.items()}
+    # Both are written also where there are none.
+    absent = {name: motors.get(name, 0.0) for name in ("mag_tube", "tra_tube")}
+    moved = {name: value for name, value in motors.items() if name != rotation} | absent
+    flat = next((b for b in record.blocks if b.kind == "flat"), None)
+    if flat is not None and record.flat_axis in motors:  # where it took the sample for the flats
+        sign = record.machine.axes[record.flat_axis].settings_sign
+        moved |= {
+            "Flat field axis": record.flat_axis,
+            "Flat Field position": sign * float(flat.positions[record.flat_axis][0]),
+            "Scan position": motors[record.flat_axis],
+        }
+    images, seconds = record.count("projection"), int(record.duration_s)
+    turn = abs((s.last_angle_deg or 0.0) - (s.start_angle_deg or 0.0))
+    values = {
+        "scan_type": f"{'smooth' if record.smooth else 'step'} take and save",
+        "rotation_mode": "Smooth" if record.smooth else "Step",
+        "rotation": rotation,
+        "turning": s.motors[rotation],
+        "start": _utc(record.started),
+        "stop": _utc(record.stopped),
+        "duration": f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}",
+        "error": "No error" if record.complete else record.reason or "not finished",
+        "binning": float(camera.binning),
+        "roi": ";".join(map(str, camera.roi.edges)),
+        "bottom": camera.shape[0] - 1.0,
+        "right": camera.shape[1] - 1.0,
+        "voxel_mm": (s.voxel_um or 0.0) / 1000.0,
+        "last": max(images - 1, 0),
+        "per_turn": round((images - 1) * 360.0 / turn) + 1 if images > 1 and turn > 0 else images,
+        "sections": record.sections(),
+        "darks": record.count("dark"),
+        "flats": record.count("flat"),
+        "motors": motors,
+        "moved": moved,
+        "places": points_of_interest(record),
+    }
+    template = resources.files("flexdt.twin") / "data" / "texts" / "xre.txt"
+    lines = template.read_text(encoding="utf-8").splitlines(keepends=False)
+    return EOL.join(_Filled().format(line, record=record, s=s, **values) for line in lines) + EOL
+
+
+class _Filled(string.Formatter):
+    """Values as this file writes them; mappings are lines."""
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        """A value, by its type."""
+        if format_spec:
+            return format(value, format_spec)
+        return _lines(value) if isinstance(value, Mapping) else _written(value)
+
+
+def format_settings(settings: ScanSettings) -> str:
+    """The text of `data settings XRE.txt` as far as `XreSettings.settings` would read it."""
+    sections: dict[str, dict[str, Value]] = {}
+    for field, entry in ENTRIES.items():
+        value = getattr(settings, field)
+        if entry.xre is not None and value is not None:
+            section, key = entry.xre
+            sections.setdefault(section, {})[key] = value
+    return format_sections(sections)
+
+
+def format_sections(sections: Sections) -> str:
+    """Sections as text: quoted texts, TRUE and FALSE, `%d` and `%f` numbers."""
+    blocks = [f"[{clean(name)}]{EOL}{_lines(entries)}" for name, entries in sections.items()]
+    return (EOL + EOL).join(block.strip() for block in blocks) + EOL
+
+
+def _lines(entries: Mapping[str, Value]) -> str:
+    return EOL.join(f"{key} = {_written(value)}" for key, value in entries.items())
+
+
+def _utc(moment: datetime) -> str:
+    utc = moment if moment.tzinfo is None else moment.astimezone(UTC)
+    return f"{utc:%Y-%m-%d %H:%M:%S}.{utc.microsecond:06d}0 UTC"
+
+
 # `[POIs]` are places in the scanner's world, as it prints them. That world has x across, y along
 # the beam and z up, with the origin at the focal spot's foot: the same directions as here. A
 # detector's entry is its top left corner with pixels per mm along rows and columns. Hardware that
 # the twin does not model has no entry.
-
 _NOWHERE: Final = (0.0, 0.0, 0.0)
 _TALL_MM: Final = 2000.0
 """Height of the sample where the scanner was told none."""
@@ -44,7 +135,9 @@ def points_of_interest(record: ScanRecord) -> Mapping[str, str]:
     pose = record.settings_pose()
     source, axis = pose.source[0], pose.axis[0]
     rows, cols = record.camera.shape
-    corner, right, down = _panel(pose, rows, cols)
+    u, v = pose.u[0], pose.v[0]
+    corner = pose.detector[0] - u * cols / 2.0 - v * rows / 2.0
+    right, down = u / float(u @ u), v / float(v @ v)  # pixels per mm along rows and columns
     at_source_height = np.array([axis[0], axis[1], source[2]])
     towards_source = np.cross(down, right)
     towards_source /= float(np.linalg.norm(towards_source))
@@ -73,13 +166,6 @@ def points_of_interest(record: ScanRecord) -> Mapping[str, str]:
     }
 
 
-def _panel(pose: Poses, rows: int, cols: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Top left corner [mm] and directions of columns and rows [pixels per mm] of the image."""
-    u, v = pose.u[0], pose.v[0]
-    corner = pose.detector[0] - u * cols / 2.0 - v * rows / 2.0
-    return corner, u / float(u @ u), v / float(v @ v)
-
-
 def _entry(
     place: Sequence[float] | FloatArray,
     x: Sequence[float] | FloatArray,
@@ -104,174 +190,9 @@ def _word(name: str) -> str:
 
 
 def _triple(vector: Sequence[float] | FloatArray) -> str:
-    return "[" + ";".join(_short(float(v)) for v in vector) + "]"
-
-
-def _short(value: float) -> str:
     """Four decimals at most, without trailing zeros and minus zero."""
-    text = f"{value:.4f}".rstrip("0").rstrip(".")
-    return "0" if text in ("-0", "") else text
-
-
-Value = str | bool | int | float
-Sections = Mapping[str, Mapping[str, Value]]
-
-
-def stated_sections(settings: ScanSettings) -> dict[str, dict[str, Value]]:
-    """Section -> key -> value, as far as `scan settings.txt` says it."""
-    sections: dict[str, dict[str, Value]] = {}
-    for field, entry in ENTRIES.items():
-        value = getattr(settings, field)
-        if entry.xre is not None and value is not None:
-            section, key = entry.xre
-            sections.setdefault(section, {})[key] = value
-    return sections
-
-
-def sections_of(record: ScanRecord) -> dict[str, dict[str, Value]]:
-    """All sections of a scan, in the scanner's order."""
-    s = settings_of(record)
-    template = resources.files("flexdt.twin") / "data" / "texts" / "xre.toml"
-    sections: dict[str, dict[str, Value]] = tomllib.loads(template.read_text(encoding="utf-8"))
-    motors = {name: line.value for name, line in s.motors.items()}
-    rotation = next(iter(record.machine.geometry.get("angle", {"rot_obj": 1.0})))
-    stated = stated_sections(s)
-    del stated["Acquisition settings"]["Flat field axis"]  # `_flat_field` puts it in its place
-    further: dict[str, dict[str, Value]] = {
-        "Scantype": {"name": "smooth take and save" if record.smooth else "step take and save"},
-        "Sample info": {"Project": record.sample.project, "Height (mm)": record.sample.height_mm},
-        "Scan info": _scan(record),
-        "Tube settings": _tube(record, s),
-        "Camera settings": _camera(record),
-        "Acquisition settings": _acquisition(record, s, rotation),
-        "Data set settings": _data_set(record),
-        "CT-parameters IN": _ct_parameters(record, s, stated["CT-parameters IN"]),
-    }
-    for name, entries in further.items():
-        sections[name] |= stated.get(name, {}) | entries
-    moved = {name: value for name, value in motors.items() if name != rotation}
-    last = sections.pop("Acquisition settings, last part") | {
-        "rotation speed": s.motors[rotation].speed or 0.0,
-        "rotation acc": s.motors[rotation].acceleration or 0.0,
-    }
-    sections["Acquisition settings"] |= {
-        **moved,
-        # Both are written also where there are none.
-        **{absent: motors.get(absent, 0.0) for absent in ("mag_tube", "tra_tube")},
-        **_flat_field(record, s),
-        **last,
-    }
-    return sections | {"motor positions": dict(motors), "POIs": dict(points_of_interest(record))}
-
-
-def _scan(record: ScanRecord) -> dict[str, Value]:
-    return {
-        "Start": _utc(record.started),
-        "Stop": _utc(record.stopped),
-        "Duration": _duration(record.duration_s),
-        "Succeeded": record.complete,
-        "Error": "No error" if record.complete else record.reason or "not finished",
-    }
-
-
-def _tube(record: ScanRecord, s: ScanSettings) -> dict[str, Value]:
-    current = s.target_current_uA or 0.0
-    return {
-        "Focus mode": s.focus_mode or "",
-        "Output mode": s.output_mode or "",
-        "Filament status": s.filament_status or "",
-        **dict.fromkeys(("Current set value", "Current actual value"), current),
-        **dict.fromkeys(("Target current set value", "Target current actual value"), current),
-        "kV actual value": record.kV,
-        "Target power actual value": record.power_W,
-    }
-
-
-def _camera(record: ScanRecord) -> dict[str, Value]:
-    rows, cols = record.camera.shape
-    return {
-        "Nr. of averages": record.camera.averages,
-        "Nr. of frames": record.count("projection"),
-        "Binning value": float(record.camera.binning),
-        "ROI": ";".join(map(str, record.camera.roi.edges)),
-        "Columns": cols,
-        "Rows": rows,
-    }
-
-
-def _acquisition(record: ScanRecord, s: ScanSettings, rotation: str) -> dict[str, Value]:
-    n = record.count("projection")
-    start, last = s.start_angle_deg or 0.0, s.last_angle_deg or 0.0
-    turn = abs(last - start)
-    return {
-        "Rotation mode": "Smooth" if record.smooth else "Step",
-        "CTaxis": rotation,
-        "projs_per_360": round((n - 1) * 360.0 / turn) + 1 if n > 1 and turn > 0 else n,
-        "CT start angle": start,
-        "CT stop angle": last,
-        "nr of sections": record.sections(),
-        "tube kV": record.kV,
-        "tube power": record.power_W,
-        "Focus Mode": s.focus_mode or "",
-        "Exposure time (ms)": record.camera.exposure_ms,
-        "nr of averages": record.camera.averages,
-        "Imaging mode": record.camera.mode,
-        "ROI": ";".join(map(str, record.camera.roi.edges)),
-    }
-
-
-def _flat_field(record: ScanRecord, s: ScanSettings) -> dict[str, Value]:
-    """Where the sample went for the flat field, if an axis took it there."""
-    flat = s.motors.get(record.flat_axis)
-    block = next((b for b in record.blocks if b.kind == "flat"), None)
-    if flat is None or block is None:
-        return {}
-    sign = record.machine.axes[record.flat_axis].settings_sign
-    return {
-        "Flat field axis": record.flat_axis,
-        "Flat Field position": sign * float(block.positions[record.flat_axis][0]),
-        "Scan position": flat.value,
-    }
-
-
-def _data_set(record: ScanRecord) -> dict[str, Value]:
-    rows, cols = record.camera.shape
-    n = record.count("projection")
-    return {
-        "time": f"{record.stopped:%m/%d/%Y %I:%M:%S %p}",
-        "number offset images": str(record.count("dark")),
-        "number gain images": str(record.count("flat")),
-        "number projections": str(n),
-        "import ROI": f"0;0;{cols};{rows};",
-        "import last projection": str(max(n - 1, 0)),
-        "import projections": str(n),
-    }
-
-
-def _ct_parameters(
-    record: ScanRecord, s: ScanSettings, stated: Mapping[str, Value]
-) -> dict[str, Value]:
-    rows, cols = record.camera.shape
-    values = {
-        **stated,
-        "Pixel size": s.binned_pixel_mm,
-        "Voxel size": (s.voxel_um or 0.0) / 1000.0,
-        "zmax": rows - 1.0,
-        "z_end": rows - 1.0,
-        "x_end": cols - 1.0,
-        "y_end": cols - 1.0,
-    }
-    return {key: f"{value:f}" for key, value in values.items()}
-
-
-def _utc(moment: datetime) -> str:
-    utc = moment if moment.tzinfo is None else moment.astimezone(UTC)
-    return f"{utc:%Y-%m-%d %H:%M:%S}.{utc.microsecond:06d}0 UTC"
-
-
-def _duration(seconds: float) -> str:
-    whole = int(seconds)
-    return f"{whole // 3600:02d}:{whole // 60 % 60:02d}:{whole % 60:02d}"
+    texts = [f"{value:.4f}".rstrip("0").rstrip(".") for value in vector]
+    return f"[{';'.join('0' if text in ('-0', '') else text for text in texts)}]"
 
 
 @dataclass(frozen=True)
@@ -351,25 +272,6 @@ def _wrong(section: str, key: str, text: str, allowed: str) -> DatasetFormatErro
     said = f"{XRE_SETTINGS}: [{section}] {key} is {text[:80]!r}"
     where = {"path": XRE_SETTINGS, "section": section, "key": key}
     return DatasetFormatError.instead(said, text[:200], allowed, **where)
-
-
-def format_xre(record: ScanRecord) -> str:
-    """The text of `data settings XRE.txt` (CRLF) for a scan."""
-    return format_sections(sections_of(record))
-
-
-def format_settings(settings: ScanSettings) -> str:
-    """The text of `data settings XRE.txt` as far as `XreSettings.settings` would read it."""
-    return format_sections(stated_sections(settings))
-
-
-def format_sections(sections: Sections) -> str:
-    """Sections as text: quoted texts, TRUE and FALSE, `%d` and `%f` numbers."""
-    blocks = [
-        EOL.join([f"[{clean(name)}]", *(f"{k} = {_written(v)}" for k, v in entries.items())])
-        for name, entries in sections.items()
-    ]
-    return (EOL + EOL).join(blocks) + EOL
 
 
 def parse_xre(text: str, file: str = XRE_SETTINGS) -> XreSettings:
