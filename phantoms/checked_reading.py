@@ -13,7 +13,7 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import fields
+from dataclasses import fields as fields_of
 from functools import partial
 from typing import Annotated, Any, Final, TypeVar
 
@@ -30,6 +30,8 @@ LARGEST: Final = 1e9
 SMALLEST: Final = 1e-9
 """Of lengths [mm]."""
 _T = TypeVar("_T")
+Reader = Callable[[object, str], Any]
+NONE: Final[Mapping[str, Reader]] = {}
 IT: Final = "it"
 """The key path of a field that pydantic has named already."""
 
@@ -54,10 +56,24 @@ def mapping(value: object, where: str) -> Mapping[str, object]:
 
 def get(document: object, key: str, where: str) -> object:
     """Field `key` of `document`, which must have it."""
-    fields = mapping(document, where)
-    if key not in fields:
+    given = mapping(document, where)
+    if key not in given:
         raise PhantomError(f"{where}.{key} is missing", {"path": f"{where}.{key}"})
-    return fields[key]
+    return given[key]
+
+
+def fields(
+    value: object, where: str, needed: Mapping[str, Reader], others: Mapping[str, Reader] = NONE
+) -> dict[str, Any]:
+    """The fields of an object as their readers have them: all that are needed, and of the others
+    those that are there. One that nobody reads is an error."""
+    readers = {**needed, **others}
+    for key in mapping(value, where):
+        if key not in readers:
+            said = f"{where}: unknown key {key!r}"
+            raise PhantomError.instead(said, key, list(readers), path=f"{where}.{key}")
+    given = {name: get(value, name, where) for name in needed} | dict(mapping(value, where))
+    return {name: readers[name](one, f"{where}.{name}") for name, one in given.items()}
 
 
 def string(value: object, where: str) -> str:
@@ -176,7 +192,7 @@ _KINDS: Final[Mapping[str, type[analytic.Shape]]] = {
 }
 _KIND_OF: Final[Mapping[type[analytic.Shape], str]] = {cls: kind for kind, cls in _KINDS.items()}
 
-_READERS: Final[Mapping[str, Callable[[object, str], object]]] = {
+_READERS: Final[Mapping[str, Reader]] = {
     "center": vector,
     "size": lengths,
     "semi_axes": lengths,
@@ -206,7 +222,7 @@ def scene_to_dict(scene: analytic.Scene) -> dict[str, object]:
             {
                 "shape": {
                     "kind": _KIND_OF[type(s.shape)],
-                    **{f.name: getattr(s.shape, f.name) for f in fields(s.shape)},
+                    **{f.name: getattr(s.shape, f.name) for f in fields_of(s.shape)},
                 },
                 "material": s.material,
                 "mu_per_mm": s.mu_per_mm,
@@ -247,15 +263,8 @@ def shape_from_dict(document: object, where: str) -> analytic.Shape:
     kind = get(document, "kind", where)
     if not isinstance(kind, str) or kind not in _KINDS:
         raise wrong(kind, f"{where}.kind", ", ".join(_KINDS))
-    given = mapping(document, where)
-    names = [f.name for f in fields(_KINDS[kind])]
-    unknown = sorted(str(key) for key in given if key not in (*names, "kind"))
-    if unknown:
-        said = f"{where}: a {kind} has no {', '.join(unknown)}"
-        raise PhantomError.instead(said, unknown, names, path=where)
-    values: dict[str, Any] = {
-        name: _READERS[name](get(given, name, where), f"{where}.{name}")
-        for name in names
-        if name in given or name not in _OPTIONAL
-    }
-    return _KINDS[kind](**values)
+    names = [f.name for f in fields_of(_KINDS[kind])]
+    given = {key: one for key, one in mapping(document, where).items() if key != "kind"}
+    needed = {name: _READERS[name] for name in names if name not in _OPTIONAL}
+    others = {name: _READERS[name] for name in names if name in _OPTIONAL}
+    return _KINDS[kind](**fields(given, where, needed, others))

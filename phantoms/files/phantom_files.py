@@ -15,6 +15,7 @@ import json
 import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -29,14 +30,12 @@ from flexdt.phantoms.phantom import Phantom, assemble
 from flexdt.phantoms.pieces import size_about_origin
 from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.projection import TriangleMesh
-from flexdt.twin.projection.analytic_solids import Scene, Solid
+from flexdt.twin.projection.analytic_solids import Scene, Solid, Vector
 
 CHECKED_ALONG: Final = 96
 """Voxels along the longest side in which `require_replaced` looks."""
 ABSENT: Final = 0.25
 """Part of a voxel that may be replaced without being there."""
-BEAD_KEYS: Final = ("schema", "name", "description", "body", "bead", "spiral")
-SCENE_KEYS: Final = ("schema", "name", "description", "solid", "mesh")
 
 
 def read_phantom_file(path: Path) -> Phantom:
@@ -83,25 +82,26 @@ def phantom_of(document: Mapping[str, object], folder: Path | None = None) -> Ph
     return _bead_file(document)
 
 
+def _version(value: object, where: str) -> object:
+    if value != 1:
+        raise reading.wrong(value, where, "1")
+    return value
+
+
 def _scene_file(document: Mapping[str, object], folder: Path | None) -> Phantom:
-    _known(document, SCENE_KEYS, "phantom")
-    if document.get("schema", 1) != 1:
-        raise reading.wrong(document["schema"], "phantom.schema", "1")
-    name = reading.string(document.get("name", "scene"), "phantom.name")
-    told = reading.string(document.get("description", ""), "phantom.description")
-    listed = reading.each(document.get("solid", []), "phantom.solid", solids_of)
+    given = reading.fields(document, "phantom", {}, {
+        "schema": _version, "name": reading.string, "description": reading.string,
+        "solid": partial(reading.each, read=solids_of),
+        "mesh": partial(reading.each, read=partial(_mesh, folder=folder)),
+    })  # fmt: skip
+    name, listed = given.get("name", "scene"), given.get("solid", ())
     if len(listed) > MAX_SOLIDS:
         raise reading.wrong(f"{len(listed)} solids", "phantom.solid", f"at most {MAX_SOLIDS}")
     scene = Scene(tuple(solid for several in listed for solid in several))
-    parts = [] if not listed else [Phantom(name, "", scene, size_about_origin(scene))]
-
-    def read(value: object, where: str) -> tuple[Phantom, float]:
-        rank = reading.number(_default(value, "priority", 0), f"{where}.priority")
-        return _mesh(value, where, folder), rank
-
-    meshes = reading.each(document.get("mesh", []), "phantom.mesh", read)
-    ranks = [0.0] * len(parts) + [rank for _, rank in meshes]
-    whole = assemble(name, parts + [mesh for mesh, _ in meshes], told, ranks)
+    parts = [] if not listed else [(Phantom(name, "", scene, size_about_origin(scene)), 0.0)]
+    parts += given.get("mesh", ())
+    told, ranks = given.get("description", ""), [rank for _, rank in parts]
+    whole = assemble(name, [part for part, _ in parts], told, ranks)
     require_replaced(whole, document.get("solid", []))
     return whole
 
@@ -143,96 +143,91 @@ def solids_of(value: object, where: str) -> tuple[Solid, ...]:
     return (Solid(shape, gone.name, -gone.mu_per_mm), own)
 
 
-def _mesh(value: object, where: str, folder: Path | None) -> Phantom:
-    _known(value, ("file", "material", "unit", "position_mm", "priority"), where)
-    file = reading.string(reading.get(value, "file", where), f"{where}.file")
+def _mesh(value: object, where: str, folder: Path | None) -> tuple[Phantom, float]:
+    """The mesh of a scene file and its priority."""
+    given = reading.fields(
+        value,
+        where,
+        {"file": reading.string, "material": reading.string},
+        {"unit": _unit, "position_mm": reading.vector, "priority": reading.number},
+    )
     if folder is None:
         raise PhantomError(
-            f"{where}.file is {file!r}, but a text by itself has no folder to look in; read the "
-            "scene from its file, or send it as `flexdt sample FILE` does, with the mesh inside",
-            {"path": f"{where}.file", "asked": file},
+            f"{where}.file is {given['file']!r}, but a text by itself has no folder to look in; "
+            "read the scene from its file, or send it as `flexdt sample FILE` does, with the mesh "
+            "inside",
+            {"path": f"{where}.file", "asked": given["file"]},
         )
-    unit = _default(value, "unit", None)
-    if unit is not None and unit not in UNITS_MM:
-        raise reading.wrong(unit, f"{where}.unit", ", ".join(UNITS_MM))
-    at = _default(value, "position_mm", None)
-    return mesh_phantom(
-        folder / file,
-        unit=None if unit is None else str(unit),
-        material=reading.string(reading.get(value, "material", where), f"{where}.material"),
+    at = given.get("position_mm")
+    mesh = mesh_phantom(
+        folder / given["file"],
+        unit=given.get("unit"),
+        material=given["material"],
         place="keep" if at is None else "center",
-        at_mm=(0.0, 0.0, 0.0) if at is None else reading.vector(at, f"{where}.position_mm"),
+        at_mm=at or (0.0, 0.0, 0.0),
     )
+    return mesh, given.get("priority", 0.0)
+
+
+def _unit(value: object, where: str) -> object:
+    if value not in UNITS_MM:
+        raise reading.wrong(value, where, ", ".join(UNITS_MM))
+    return value
 
 
 def _bead_file(document: Mapping[str, object]) -> Phantom:
-    _known(document, BEAD_KEYS, "phantom")
-    if reading.get(document, "schema", "phantom") != 1:
-        raise reading.wrong(document["schema"], "phantom.schema", "1")
-    name = reading.string(reading.get(document, "name", "phantom"), "phantom.name")
-    body, size = None, None
-    if "body" in document:
-        _known(document["body"], ("size_mm", "material"), "phantom.body")
-        size = reading.lengths(reading.get(document["body"], "size_mm", "phantom.body"), "body")
-        body = reading.string(_default(document["body"], "material", "abs"), "body.material")
-    if ("bead" in document) == ("spiral" in document):
+    given = reading.fields(
+        document,
+        "phantom",
+        {"schema": _version, "name": reading.string},
+        {"description": reading.string, "body": _body, "bead": _beads, "spiral": _spiral},
+    )
+    if ("bead" in given) == ("spiral" in given):
         raise PhantomError("phantom: give either [[bead]] tables or one [spiral]")
-    if "spiral" in document:
+    size, body = given.get("body", (None, None))
+    if "spiral" in given:
         if size is None:
             raise PhantomError("phantom.spiral: a spiral needs a [body] to fit into")
-        where = "phantom.spiral"
-        _known(document["spiral"], ("beads", "radius_mm", "material"), where)
-        count = reading.positive(reading.get(document["spiral"], "beads", where), f"{where}.beads")
-        if count != int(count):
-            raise reading.wrong(count, f"{where}.beads", "a whole number")
-        radius = reading.positive(_default(document["spiral"], "radius_mm", 2.0), where)
-        metal = reading.string(_default(document["spiral"], "material", "steel"), where)
-        centers = spiral_positions(size, int(count), radius)
-        radii, metals = np.full(len(centers), radius), (metal,) * len(centers)
+        count, radius, metal = given["spiral"]
+        centers = spiral_positions(size, count, radius)
+        radii, metals = np.full(count, radius), [metal] * count
     else:
-        beads = reading.each(document["bead"], "phantom.bead", _bead)
-        centers = np.array([b[0] for b in beads], dtype=np.float64).reshape(-1, 3)
-        radii, metals = np.array([b[1] for b in beads]), tuple(b[2] for b in beads)
+        places, sizes, metals = zip(*given["bead"], strict=True) if given["bead"] else ((), (), ())
+        centers, radii = np.array(places).reshape(-1, 3), np.array(sizes)
     overlap = worst_overlap(centers, radii)
-    if overlap is not None and "bead" in document:
+    if overlap is not None and "bead" in given:
         raise PhantomError(
             f"phantom.bead: beads {overlap[0]} and {overlap[1]} overlap by {overlap[2]:.4g} mm; "
             "attenuation is additive, so solids must not overlap",
             {"beads": [overlap[0], overlap[1]], "asked": -overlap[2], "allowed": ">= 0"},
         )
     if size is None:
-        x, y, z = (2.0 * np.max(np.abs(centers) + radii[:, None], axis=0)).tolist()
-        size = (x, y, z)
-    default = f"{len(centers)} beads in {body if body is not None else 'air'}"
-    return cuboid_with_beads(
-        name,
-        size,
-        centers,
-        radii,
-        body_material=body,
-        bead_materials=metals,
-        description=reading.string(document.get("description", default), "phantom.description"),
-    )
+        size = tuple((2.0 * np.max(np.abs(centers) + radii[:, None], axis=0)).tolist())
+    told = given.get("description", f"{len(centers)} beads in {body or 'air'}")
+    return cuboid_with_beads(given["name"], size, centers, radii, body_material=body,
+                             bead_materials=metals, description=told)  # fmt: skip
 
 
-def _bead(value: object, where: str) -> tuple[tuple[float, float, float], float, str]:
-    _known(value, ("position_mm", "radius_mm", "material"), where)
-    return (
-        reading.vector(reading.get(value, "position_mm", where), f"{where}.position_mm"),
-        reading.positive(reading.get(value, "radius_mm", where), f"{where}.radius_mm"),
-        reading.string(_default(value, "material", "steel"), f"{where}.material"),
-    )
+def _body(value: object, where: str) -> tuple[Vector, str]:
+    given = reading.fields(value, where, {"size_mm": reading.lengths}, {"material": reading.string})
+    return given["size_mm"], given.get("material", "abs")
 
 
-def _known(value: object, allowed: tuple[str, ...], where: str) -> None:
-    for key in reading.mapping(value, where):
-        if key not in allowed:
-            said = f"{where}: unknown key {key!r}"
-            raise PhantomError.instead(said, key, allowed, path=f"{where}.{key}")
+def _beads(value: object, where: str) -> tuple[tuple[Vector, float, str], ...]:
+    def read(one: object, at: str) -> tuple[Vector, float, str]:
+        needed = {"position_mm": reading.vector, "radius_mm": reading.positive}
+        given = reading.fields(one, at, needed, {"material": reading.string})
+        return given["position_mm"], given["radius_mm"], given.get("material", "steel")
+
+    return reading.each(value, where, read)
 
 
-def _default(value: object, key: str, default: object) -> object:
-    return reading.mapping(value, "phantom").get(key, default)
+def _spiral(value: object, where: str) -> tuple[int, float, str]:
+    others = {"radius_mm": reading.positive, "material": reading.string}
+    given = reading.fields(value, where, {"beads": reading.positive}, others)
+    if given["beads"] != int(given["beads"]):
+        raise reading.wrong(given["beads"], f"{where}.beads", "a whole number")
+    return int(given["beads"]), given.get("radius_mm", 2.0), given.get("material", "steel")
 
 
 MAX_SENT_SOLIDS: Final = 500

@@ -78,7 +78,7 @@ def test_a_scene_with_a_mesh_is_sent_whole(tmp_path: Path) -> None:
         ("[1, 2", "not valid TOML"),
         ({"schema": 1, "solid": [{**BALL, "material": "cheese"}]}, "unknown material 'cheese'"),
         ({"schema": 1, "solid": [{**BALL, "radius": -1}]}, "radius is -1"),
-        ({"schema": 1, "solid": [{**BALL, "color": 3}]}, "has no color"),
+        ({"schema": 1, "solid": [{**BALL, "color": 3}]}, "unknown key 'color'"),
         ({"schema": 1, "solid": [BALL] * 501}, "501 solids; allowed: 500"),
         ({"schema": 1, "solid": [{**BALL, "center": [0, 0, 3000]}]}, "measures 6040 mm"),
         ({"schema": 1, "solid": []}, "nothing in it"),
