@@ -32,7 +32,7 @@ from flexdt.twin.exchange.number_tables import (
 )
 from flexdt.twin.geometry.cone_vec import ConeVec, Shape2, check_spread
 from flexdt.twin.geometry.conventions import FloatArray, as_numbers
-from flexdt.twin.lazy_backend import File
+from flexdt.twin.signatures import File
 
 BY_ENDING: Final = {
     ending: format for format in FORMATS for ending in ENDINGS[format] if ending != ".json"

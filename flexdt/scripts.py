@@ -12,7 +12,6 @@ from flexdt.phantoms import Phantom
 from flexdt.phantoms.samples import as_phantom
 from flexdt.twin.collision.convex_solids import convex_pieces
 from flexdt.twin.collision.plan_report import collision_check
-from flexdt.twin.lazy_backend import File
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.script import (
     CheckReport,
@@ -23,7 +22,7 @@ from flexdt.twin.script import (
 )
 from flexdt.twin.script.dry_run import CollisionCheck, check_plan
 from flexdt.twin.script.plan import StartState
-from flexdt.twin.signatures import public
+from flexdt.twin.signatures import File, public
 
 machine = public(find_machine)
 

@@ -15,7 +15,6 @@ from flexdt.phantoms.beads import (
 from flexdt.phantoms.beads import bead_phantom as beads
 from flexdt.phantoms.bricks import lego_phantom
 from flexdt.phantoms.bricks import lego_phantom as lego
-from flexdt.phantoms.catalog import is_shipped, load_phantom, phantom_names, shepp_logan
 from flexdt.phantoms.checked_reading import PhantomError, scene_from_dict, scene_to_dict
 from flexdt.phantoms.files.mesh_files import mesh_phantom, voxel_phantom
 from flexdt.phantoms.files.mesh_files import mesh_phantom as from_mesh
@@ -23,7 +22,7 @@ from flexdt.phantoms.files.phantom_files import load_phantom_file
 from flexdt.phantoms.materials import Material, material, materials, stated_keV
 from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.pieces import Surface, Voxels
-from flexdt.phantoms.samples import as_phantom
+from flexdt.phantoms.samples import as_phantom, is_shipped, load_phantom, phantom_names, shepp_logan
 
 __all__ = [
     "Material",

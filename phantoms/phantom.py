@@ -20,7 +20,16 @@ from pydantic import PlainSerializer, PlainValidator, ValidationError
 
 from flexdt.phantoms import checked_reading as reading
 from flexdt.phantoms.checked_reading import PhantomError, scene_from_dict, scene_to_dict
-from flexdt.phantoms.pieces import Surface, Voxels, boxes, cut, freeze
+from flexdt.phantoms.pieces import (
+    Surface,
+    SurfacePart,
+    Voxels,
+    boxes,
+    cut,
+    freeze,
+    joined,
+    parts_of,
+)
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.values import ArrayValue, adapter_of, told
@@ -28,7 +37,6 @@ from flexdt.twin.values import ArrayValue, adapter_of, told
 if TYPE_CHECKING:
     import trimesh
 
-    from flexdt.phantoms.surface import SurfacePart
     from flexdt.twin.projection import Volume
 
 SCHEMA = 1
@@ -119,8 +127,6 @@ class Phantom(ArrayValue):
 
     def parts(self) -> tuple[SurfacePart, ...]:
         """The scene side piece by piece: one closed mesh for each solid, with its material."""
-        from flexdt.phantoms.surface import parts_of
-
         return parts_of(self)
 
     def mesh(self, *, around: bool = False) -> trimesh.Trimesh:
@@ -132,8 +138,6 @@ class Phantom(ArrayValue):
             around: for collisions: the polyhedra of round solids hold them, instead of lying
                 inside them.
         """
-        from flexdt.phantoms.surface import joined, parts_of
-
         return joined(parts_of(self, around=around))
 
     def volume(self, voxel_mm: float | None = None, *, oversample: int = 2) -> Volume:

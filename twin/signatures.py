@@ -3,6 +3,10 @@
 `public` compares the arguments of a call with the annotations of the signature, so that a misspelt
 keyword, two arguments in the wrong order or a value of another type is one sentence that says what
 was given and what is allowed. Values are checked by what is called, as before.
+
+Methods such as `ConeVec.load` and `Volume.save` belong to the values for the reader's sake, but the
+core reads no files and draws no figures. `lazy_backend` is the module that does, by its name, when
+such a method is called.
 """
 
 from __future__ import annotations
@@ -16,8 +20,9 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from functools import cached_property, wraps
+from importlib import import_module
 from numbers import Real
-from typing import Annotated, Any, Final, Literal, NamedTuple, ParamSpec, TypeVar
+from typing import Annotated, Any, Final, Literal, NamedTuple, ParamSpec, Protocol, TypeVar
 
 from flexdt.twin.errors import GeometryError, LimitError
 
@@ -38,6 +43,22 @@ class ArgumentError(GeometryError, LimitError, TypeError):
 
     Who handles the errors that these functions raise for wrong values handles this one, too.
     """
+
+
+class PathLike(Protocol):
+    """A path as an object, such as one of `pathlib`."""
+
+    def __fspath__(self) -> str:
+        """As text."""
+
+
+File = str | PathLike
+"""A path, as text or as an object of `pathlib`."""
+
+
+def lazy_backend(module: str) -> Any:
+    """The module `flexdt.<module>`."""
+    return import_module(f"flexdt.{module}")
 
 
 class Array:

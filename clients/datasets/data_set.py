@@ -28,10 +28,9 @@ from flexdt.twin.geometry.motion import Motion
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.panel import Panel
 from flexdt.twin.geometry.poses import Poses
-from flexdt.twin.lazy_backend import File, lazy_backend
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.scanner.state import NamedCorrection
-from flexdt.twin.signatures import public
+from flexdt.twin.signatures import File, lazy_backend, public
 
 if TYPE_CHECKING:
     from flexdt.clients.calibration.align_dataset import Aligned

@@ -38,8 +38,8 @@ from flexdt.twin.errors import GeometryError
 from flexdt.twin.exchange.geometry import ScanGeometry
 from flexdt.twin.exchange.number_tables import VECTOR_NAMES, geometry_text
 from flexdt.twin.geometry.poses import Poses
-from flexdt.twin.lazy_backend import File
 from flexdt.twin.projection.volume import Volume
+from flexdt.twin.signatures import File
 
 
 def save_data_set(data: DataSet, folder: File) -> None:

@@ -23,8 +23,8 @@ import numpy.typing as npt
 from flexdt.clients.datasets.pictures import png
 from flexdt.clients.extras import extension, package
 from flexdt.twin.errors import LimitError
-from flexdt.twin.lazy_backend import File
 from flexdt.twin.projection import Grid, Volume
+from flexdt.twin.signatures import File
 
 if TYPE_CHECKING:
     from flexdt.twin.geometry.conventions import Float32Array

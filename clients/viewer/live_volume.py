@@ -50,7 +50,7 @@ from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_volume
 from flexdt.phantoms import load_phantom
-from flexdt.phantoms.catalog import is_shipped
+from flexdt.phantoms.samples import is_shipped
 from flexdt.runtime.files.dataset_folder import read_image
 from flexdt.runtime.files.own_documents import file_stem
 from flexdt.twin.dataset.normalise import binned_mean

@@ -28,8 +28,7 @@ from flexdt.twin.geometry.conventions import (
     rotation_z,
     turn_detector,
 )
-from flexdt.twin.lazy_backend import File, lazy_backend
-from flexdt.twin.signatures import public
+from flexdt.twin.signatures import File, lazy_backend, public
 
 ROW_LENGTH = 12
 DEGENERATE = 1e-12

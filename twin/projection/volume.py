@@ -20,8 +20,7 @@ import numpy.typing as npt
 
 from flexdt.twin.errors import GeometryError, NotBuiltError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray, as_numbers
-from flexdt.twin.lazy_backend import File, lazy_backend
-from flexdt.twin.signatures import public
+from flexdt.twin.signatures import File, lazy_backend, public
 
 WARNED: Final = 0.03
 """Relative bound from which on a warning tells of it, where a tenth of the even places have more.

@@ -18,11 +18,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from flexdt.twin.lazy_backend import PathLike, lazy_backend
 from flexdt.twin.script import commands as c
 from flexdt.twin.script import grammar
 from flexdt.twin.script.grammar import ArgumentError, Spec, shorten
 from flexdt.twin.script.problems import ScriptError, ScriptProblem, in_order
+from flexdt.twin.signatures import PathLike, lazy_backend
 
 LIGHT_BYTES: Final = 8 << 10
 """A script or list of poses up to this size may be planned in a thread."""

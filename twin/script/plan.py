@@ -23,7 +23,6 @@ import numpy.typing as npt
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.poses import Poses
-from flexdt.twin.lazy_backend import lazy_backend
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine, Profile, Timing
 from flexdt.twin.machine.kinematics import motor_poses
@@ -31,6 +30,7 @@ from flexdt.twin.motion.profiles import AxisPath, Trajectory
 from flexdt.twin.scanner.state import StagePlacement
 from flexdt.twin.script.commands import AnyCommand, ImageKind
 from flexdt.twin.script.problems import ScriptProblem, WithProblems
+from flexdt.twin.signatures import lazy_backend
 from flexdt.twin.values import Array, ArrayValue, JsonValue
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ import pytest
         ("flexdt.twin.calibration.fit.fit", 10),
         ("flexdt.twin.calibration.fit.identifiability", 8),
         ("flexdt.phantoms.beads", 5),
-        ("flexdt.phantoms.catalog", 4),
+        ("flexdt.phantoms.samples", 5),
         ("flexdt.phantoms.bricks", 1),
     ],
 )
