@@ -347,11 +347,8 @@ class DataSet:
     @cached_property
     def dark(self) -> Float32Array:
         """Mean of the dark images, (rows, cols); zero, with a warning, if there is none."""
-        if self.arrays is not None and self.arrays.darks is not None:
-            return np.asarray(self.arrays.darks.mean(axis=0), dtype=np.float32)
-        if not self.darks:
-            return np.zeros(self.shape, dtype=np.float32)
-        return mean_image(self.darks, self.shape)
+        dark = self._mean(self.darks, None if self.arrays is None else self.arrays.darks)
+        return np.zeros(self.shape, dtype=np.float32) if dark is None else dark
 
     @cached_property
     def flat(self) -> Float32Array:
@@ -360,15 +357,19 @@ class DataSet:
         Raises:
             DatasetMissingError: there is none.
         """
-        if self.arrays is not None and self.arrays.flats is not None:
-            return np.asarray(self.arrays.flats.mean(axis=0), dtype=np.float32)
-        if not self.flats:
+        flat = self._mean(self.flats, None if self.arrays is None else self.arrays.flats)
+        if flat is None:
             raise DatasetMissingError(
                 f"{self.where}: no flat field (io000000.tif); without one there are no line "
                 "integrals",
                 {"path": self.where, "missing": ["io000000.tif"]},
             )
-        return mean_image(self.flats, self.shape)
+        return flat
+
+    def _mean(self, files: Sequence[Path], images: npt.NDArray[Any] | None) -> Float32Array | None:
+        if images is not None:
+            return np.asarray(images.mean(axis=0), dtype=np.float32)
+        return mean_image(files, self.shape) if files else None
 
     @cached_property
     def normalisation(self) -> LineIntegrals:
@@ -539,7 +540,7 @@ class DataSet:
             ...     sorted(file.name for file in Path(folder).iterdir())[:3]
             ['data settings XRE.txt', 'geometry.json', 'io000000.tif']
         """
-        lazy_backend("clients.datasets.nxtomo").save_data_set(self, folder)
+        lazy_backend("clients.datasets.dataset").save_data_set(self, folder)
 
     def to_nxtomo(self, file: File) -> None:
         """Write NeXus's NXtomo (HDF5), which needs h5py (the extra `io`).
@@ -558,7 +559,7 @@ class DataSet:
             ...     Path(folder, "scan.nx").exists()
             True
         """
-        lazy_backend("clients.datasets.nxtomo").save_nxtomo(self, file)
+        lazy_backend("clients.datasets.foreign_files").save_nxtomo(self, file)
 
     def to_xarray(self) -> Any:
         """Line integrals as an xarray DataArray (view, row, column), which needs xarray.
@@ -573,7 +574,7 @@ class DataSet:
             >>> data.to_xarray().dims
             ('view', 'row', 'column')
         """
-        return lazy_backend("clients.datasets.nxtomo").to_xarray(self)
+        return lazy_backend("clients.datasets.foreign_files").to_xarray(self)
 
     def plot(self, index: int = 0, axes: Any = None) -> Any:
         """Show one projection's line integrals; needs matplotlib (the extra `plots`).
@@ -629,3 +630,15 @@ def _several(
             {"asked": list(values.shape), "allowed": list(shape)},
         )
     return values
+
+
+def references(data: DataSet) -> list[tuple[str, Counts]]:
+    """Dark and flat images with their names; means that are no whole numbers are rounded."""
+    if data.arrays is None:
+        return [(path.name, read_image(path)) for path in (*data.darks, *data.flats)]
+    kinds = (("di", data.arrays.darks), ("io", data.arrays.flats))
+    return [
+        (f"{kind}{i:06d}.tif", np.rint(image).astype(np.uint16))
+        for kind, images in kinds
+        for i, image in enumerate(() if images is None else images)
+    ]

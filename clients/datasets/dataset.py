@@ -1,4 +1,4 @@
-"""Reads data sets from folders: which frames there are, their geometry, completeness.
+"""Data sets in folders: which frames there are, their geometry, completeness; and saved ones.
 
 Works on folders that this package wrote and on a scanner's own (TIFFs and the two settings texts
 alone). Errors are typed and name the file; what leaves the rest usable is a warning in `warnings`.
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import fnmatch
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Final
@@ -17,31 +16,43 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.clients.datasets.data_set import DataSet
-from flexdt.clients.datasets.foreign_files import NO_DARK, by_numbers, doubts, listed, open_file
+from flexdt.clients.datasets.data_set import DataSet, references
+from flexdt.clients.datasets.foreign_files import NO_DARK, by_numbers, listed, open_file
 from flexdt.runtime.files.dataset_folder import (
     Folder,
     list_folder,
     read_image,
     read_text,
     read_values,
+    tiff_bytes,
 )
+from flexdt.runtime.files.directory import Directory
 from flexdt.twin.dataset.dataset_errors import (
     DOCUMENT,
     GEOMETRY,
     SCAN_SETTINGS,
+    SCRIPT,
     XRE_SETTINGS,
     DatasetError,
+    DatasetExistsError,
     DatasetFormatError,
     DatasetMissingError,
 )
-from flexdt.twin.dataset.flexdt_json import parse_document
-from flexdt.twin.dataset.rebuild import rebuild
-from flexdt.twin.dataset.scan_settings import ScanSettings, parse_scan_settings
-from flexdt.twin.dataset.xre import parse_xre
-from flexdt.twin.errors import TwinError
-from flexdt.twin.exchange.number_tables import read_geometry_text
+from flexdt.twin.dataset.flexdt_json import CorrectionEntry, parse_document
+from flexdt.twin.dataset.rebuild import MATCH_MM, rebuild
+from flexdt.twin.dataset.scan_settings import (
+    ScanSettings,
+    figures_of,
+    format_scan_settings,
+    parse_scan_settings,
+    poses_of,
+)
+from flexdt.twin.dataset.xre import format_settings, parse_xre
+from flexdt.twin.errors import GeometryError, TwinError
+from flexdt.twin.exchange.geometry import ScanGeometry
+from flexdt.twin.exchange.number_tables import geometry_text, read_geometry_text
 from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.description import (
     Machine,
     Profile,
@@ -50,7 +61,7 @@ from flexdt.twin.machine.description import (
     builtin_profile,
     builtin_profiles,
 )
-from flexdt.twin.signatures import public
+from flexdt.twin.signatures import File, public
 
 AGREE_MM: Final = 1e-6
 """How far the cone_vec of a file may lie from what its motor positions give [mm]."""
@@ -193,22 +204,21 @@ def _from_document(content: Folder, machine: Machine | None, profile: Profile | 
     if not files:
         raise DatasetMissingError(f"{path} lists no projections", {"path": str(path)})
     cone_vec = doc.cone_vec() if own else found.cone_vec()
-    frames = content.frames(files, shapes)
     warnings: list[str] = []
     settings = read_settings(content, warnings)
     if np.abs(found.cone_vec().rows - cone_vec.rows).max() > AGREE_MM:
         warnings.append(f"{path}: cone_vec does not follow from its motor positions")
-    lost = content.lost((*doc.files("dark"), *doc.files("flat"), *files))
-    unfinished = "" if doc.complete else doc.reason or "the scan did not finish"
-    return DataSet(
-        doc.name,
-        frames,
-        shapes[0],
+    return listed(
+        content,
         cone_vec,
-        doc.correction_in_force(),
-        content.path,
-        content.paths(doc.files("dark")),
-        content.paths(doc.files("flat")),
+        files,
+        doc.files("dark"),
+        doc.files("flat"),
+        doc.name,
+        shapes,
+        [] if doc.complete else [doc.reason or "the scan did not finish"],
+        warnings,
+        correction=doc.correction_in_force(),
         nominal=found,
         positions=doc.positions(),
         machine=machine,
@@ -216,9 +226,6 @@ def _from_document(content: Folder, machine: Machine | None, profile: Profile | 
         settings=settings,
         document=doc,
         full_scale=(1 << machine.detector.bits) - 1,
-        complete=doc.complete and not lost,
-        reason="; ".join(filter(None, (unfinished, lost))),
-        warnings=tuple(warnings + doubts(doc.files("dark"))),
     )
 
 
@@ -227,10 +234,10 @@ def _from_geometry(content: Folder) -> DataSet:
     path = content.path / GEOMETRY
     geometry = read_geometry_text(read_text(path), str(path))
     names = geometry.files or [content.projection_name(i) for i in range(len(geometry))]
-    found = listed(content, geometry.cone_vec.with_shape(geometry.shape), names,
-                   content.darks, content.flats, geometry.name)  # fmt: skip
     notes = [note for note in geometry.notes if not note.startswith(NO_DARK)]
-    return replace(found, warnings=(*found.warnings, *notes), full_scale=geometry.full_scale)
+    cone = geometry.cone_vec.with_shape(geometry.shape)
+    return listed(content, cone, names, content.darks, content.flats, geometry.name,
+                  warnings=notes, full_scale=geometry.full_scale)  # fmt: skip
 
 
 def _from_texts(content: Folder, machine: Machine | None, profile: Profile | None) -> DataSet:
@@ -257,31 +264,27 @@ def _from_texts(content: Folder, machine: Machine | None, profile: Profile | Non
     said_in = str(content.path / SCAN_SETTINGS)
     rebuilt = rebuild(settings, count, shape, machines, profiles, file=said_in)
     names = [content.projection_name(i) for i in range(count)]
-    reasons = ["the text says SCRIPT CANCELLED!"] if settings.cancelled else []
-    reasons += filter(None, [content.lost(names)])
     if settings.projections is not None and count > settings.projections:
         warnings.append(
             f"{count} projections are there, the text says {settings.projections}; angles follow "
             "the text"
         )
-    return DataSet(
-        settings.scan_id or content.path.name,
-        content.frames(names, [shape] * count),
-        shape,
+    return listed(
+        content,
         rebuilt.poses.cone_vec(),
-        None,
-        content.path,
-        content.paths(content.darks),
-        content.paths(content.flats),
+        names,
+        content.darks,
+        content.flats,
+        settings.scan_id or "",
+        [shape] * count,
+        ["the text says SCRIPT CANCELLED!"] if settings.cancelled else [],
+        [*warnings, *rebuilt.notes],
         nominal=rebuilt.poses,
         positions=rebuilt.positions,
         machine=rebuilt.machine,
         profile=rebuilt.profile,
         settings=settings,
         full_scale=None if rebuilt.machine is None else (1 << rebuilt.machine.detector.bits) - 1,
-        complete=not reasons,
-        reason="; ".join(reasons),
-        warnings=(*warnings, *rebuilt.notes, *doubts(content.darks)),
     )
 
 
@@ -328,3 +331,84 @@ def _require_one_circle(content: Folder) -> None:
             f"state the pose of one only; {DOCUMENT} is needed",
             {"path": str(path), "missing": [DOCUMENT]},
         )
+
+
+def save_data_set(data: DataSet, folder: File) -> None:
+    """See `DataSet.save`."""
+    path = Path(folder)
+    path.mkdir(parents=True, exist_ok=True)
+    if any(path.iterdir()):
+        raise DatasetExistsError(
+            f"{path} is not empty; allowed: a new or an empty folder", {"path": str(path)}
+        )
+    with Directory(path, sync=False) as out:
+        for name, image in references(data):
+            out.put(name, tiff_bytes(image))
+        for i in data.present:
+            out.put(data.frames[i].file, tiff_bytes(data.counts(i)))
+        for name in (SCAN_SETTINGS, XRE_SETTINGS, SCRIPT):
+            if data.folder is not None and (data.folder / name).is_file():
+                out.put(name, (data.folder / name).read_bytes())
+        stated = stated_settings(data) if data.folder is None else None
+        if stated is not None:
+            out.put(SCAN_SETTINGS, format_scan_settings(stated).encode())
+            out.put(XRE_SETTINGS, format_settings(stated).encode())
+        out.put(*_geometry(data))
+
+
+def stated_settings(data: DataSet) -> ScanSettings | None:
+    """What the scanner's texts say of a data set in memory.
+
+    Returns:
+        None where they cannot say its geometry: they know one circle in the plane of the sample's
+        reference point, with equal steps and an upright panel of square pixels.
+    """
+    geometry, shape = data.geometry, data.shape
+    try:
+        poses = Poses.from_cone_vec(geometry)
+    except GeometryError:
+        return None
+    even = np.linspace(poses.angle[0], poses.angle[-1], len(poses.angle))
+    figures = figures_of(poses[:1], shape)
+    said = poses_of(figures, shape, even).cone_vec().rows
+    # The pitches are small: at the panel's edge they count by half its pixels.
+    weights = np.repeat([1.0, 1.0, shape[1] / 2.0, shape[0] / 2.0], 3)
+    if np.abs((said - geometry.rows) * weights).max() > MATCH_MM:
+        return None
+    exposure, camera = (getattr(data.truth, name, None) for name in ("exposure", "camera"))
+    before = [name[:2] for name, _ in references(data)]
+    start, last = np.degrees(even[[0, -1]]).tolist()
+    return ScanSettings(
+        scan_id=data.name,
+        **figures.stated,
+        sample_name=data.name,
+        software="flexdt",
+        kV=None if exposure is None else exposure.kV,
+        power_W=None if exposure is None else exposure.power_W,
+        exposure_ms=None if camera is None else camera.exposure_ms,
+        averages=None if camera is None else float(camera.averages),
+        scan_type="step scan",
+        projections=len(data),
+        start_angle_deg=start,
+        last_angle_deg=last,
+        pre_flats=before.count("io"),
+        post_flats=0,
+        darks=before.count("di"),
+    )
+
+
+def _geometry(data: DataSet) -> tuple[str, bytes]:
+    """The file that says the geometry: the document as it was, or the geometry by itself."""
+    files = tuple(frame.file for frame in data.frames)
+    document = data.document
+    moved = data.nominal is not None and not np.allclose(
+        data.nominal.cone_vec().rows, data.cone_vec.rows, rtol=0.0, atol=1e-6
+    )
+    if document is None or moved or document.files("projection") != files:
+        geometry = ScanGeometry(
+            data.geometry, data.shape, name=data.name, files=files, notes=data.warnings,
+            full_scale=data.full_scale,
+        )  # fmt: skip
+        return GEOMETRY, geometry_text(geometry).encode()
+    entry = CorrectionEntry.of(data.correction)
+    return DOCUMENT, document.model_copy(update={"correction": entry}).to_json().encode()

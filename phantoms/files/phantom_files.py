@@ -190,10 +190,12 @@ def _bead_file(document: Mapping[str, object]) -> Phantom:
             raise PhantomError("phantom.spiral: a spiral needs a [body] to fit into")
         count, radius, metal = given["spiral"]
         centers = spiral_positions(size, count, radius)
-        radii, metals = np.full(count, radius), [metal] * count
+        radii, metals = np.full(count, radius), (metal,) * count
     else:
-        places, sizes, metals = zip(*given["bead"], strict=True) if given["bead"] else ((), (), ())
-        centers, radii = np.array(places).reshape(-1, 3), np.array(sizes)
+        beads: tuple[tuple[Vector, float, str], ...] = given["bead"]
+        metals = tuple(metal for *_, metal in beads)
+        centers = np.array([at for at, *_ in beads]).reshape(-1, 3)
+        radii = np.array([radius for _, radius, _ in beads])
     overlap = worst_overlap(centers, radii)
     if overlap is not None and "bead" in given:
         raise PhantomError(

@@ -315,7 +315,7 @@ class Volume:
             >>> Volume(np.zeros((6, 4, 4)), voxel_mm=0.5).to_xarray().dims
             ('z', 'y', 'x')
         """
-        return lazy_backend("clients.datasets.nxtomo").volume_to_xarray(self)
+        return lazy_backend("clients.datasets.foreign_files").volume_to_xarray(self)
 
     def save(self, file: File) -> None:
         """Write the volume; the ending chooses the format: .tif, .nrrd, .mha, .nii.gz, .h5, .zarr.
