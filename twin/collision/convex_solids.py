@@ -284,10 +284,8 @@ def convex_pieces(
     """
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     if len(mesh.faces) == 0 or not np.isfinite(vertices).all():
-        raise GeometryError(
-            f"a sample mesh needs faces and finite vertices; this has {len(mesh.faces)} faces",
-            {"faces": len(mesh.faces), "vertices": len(vertices)},
-        )
+        what = f"a sample mesh needs faces and finite vertices; this has {len(mesh.faces)} faces"
+        raise GeometryError(what, {"faces": len(mesh.faces), "vertices": len(vertices)})
     turn = np.eye(3) if rotation is None else np.asarray(rotation, dtype=np.float64)
     placed = vertices @ turn.T + np.asarray(offset, dtype=np.float64)
     triangles = placed[np.asarray(mesh.faces)]

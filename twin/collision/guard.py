@@ -369,10 +369,7 @@ class _Overlap:
         turn with either body. How far that body reaches across them does not change, so that one
         of many corners costs no more than another.
         """
-        turned = (
-            np.eye(3) if turn_a is None else turn_a,
-            np.eye(3) if turn_b is None else turn_b,
-        )
+        turned = (np.eye(3) if turn_a is None else turn_a, np.eye(3) if turn_b is None else turn_b)
         off = (np.abs(now - then).max() for now, then in zip(turned, self.turned, strict=True))
         turns = max(off) > STANDING
         widest, across = -math.inf, self.directions[0]
@@ -494,31 +491,29 @@ def check_home(machine: Machine, profile: Profile, file: str) -> None:
     Raises:
         MachineFileError: file, what is wrong, and where.
     """
+
+    def wrong(what: str, **data: object) -> MachineFileError:
+        return MachineFileError(f"{file}: axes: {what}", {"file": file, "path": "axes", **data})
+
     stage, panel = place(machine, "object_y"), place(machine, "detector_y")
     sod, sdd = stage.home, panel.home
     if not (math.isfinite(sod) and 0.0 < sod < sdd):
-        raise MachineFileError(
-            f"{file}: axes: at home SOD is {sod:g} mm and SDD {sdd:g} mm; allowed: 0 < SOD < SDD "
-            "(flexdt machine check prints what they are the sum of)",
-            {"file": file, "path": "axes", "sod": sod, "sdd": sdd},
-        )
+        what = f"at home SOD is {sod:g} mm and SDD {sdd:g} mm; allowed: 0 < SOD < SDD"
+        more = "(flexdt machine check prints what they are the sum of)"
+        raise wrong(f"{what} {more}", sod=sod, sdd=sdd)
     for at, offset in ((stage, profile.c_obj), (panel, profile.c_det)):
         least, most = at.least + offset, at.most + offset
         if least <= 0.0:
-            raise MachineFileError(
-                f"{file}: axes: {at.name} goes from {least:g} to {most:g} mm over the travel "
-                f"({at.total}; zero offset {offset:g} mm); allowed: above 0 everywhere, in front "
-                "of the focal spot",
-                {"file": file, "path": "axes", "asked": [least, most], "allowed": "> 0"},
-            )
+            what = f"{at.name} goes from {least:g} to {most:g} mm over the travel ({at.total}; zero"
+            more = f"offset {offset:g} mm); allowed: above 0 everywhere, in front of the focal spot"
+            raise wrong(f"{what} {more}", asked=[least, most], allowed="> 0")
     found = touching(build_scene(machine, profile), {})
     if found:
-        raise MachineFileError(
-            f"{file}: axes: at home {_pairs(found)}; the safety margin is "
-            f"{machine.safety_margin_mm:g} mm (another home, other sizes or places; or say in "
-            "allowed_contacts that they are mounted on each other)",
-            {"file": file, "path": "axes", "pairs": [list(pair) for pair, _ in found]},
+        what = f"at home {_pairs(found)}; the safety margin is {machine.safety_margin_mm:g} mm"
+        more = (
+            "another home, other sizes or places; or say in allowed_contacts that they are mounted"
         )
+        raise wrong(f"{what} ({more} on each other)", pairs=[list(pair) for pair, _ in found])
 
 
 def _pairs(found: Iterable[tuple[tuple[str, str], float]]) -> str:

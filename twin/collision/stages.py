@@ -157,10 +157,7 @@ def stage_bodies(machine: Machine, profile: Profile, parameters: Offsets = NOMIN
 
 
 def sample_bodies(
-    machine: Machine,
-    profile: Profile,
-    sample: Sequence[ConvexSolid],
-    parameters: Offsets = NOMINAL,
+    machine: Machine, profile: Profile, sample: Sequence[ConvexSolid], parameters: Offsets = NOMINAL
 ) -> list[Body]:
     """The sample's pieces as bodies on the component whose role is `sample_holder`.
 

@@ -130,10 +130,8 @@ class Follower:
             if path is not None and path.end < told < now - axis.delay_s - SLACK_S:
                 mirror = self._arrival(mirror, name, axis.position, path.target, now)
         if mirror.due_s is not None and now > mirror.due_s + SLACK_S:
-            what = (
-                f"the script is late: {self._next(mirror)} was due {now - mirror.due_s:.1f} s ago"
-            )
-            mirror = _alarm(mirror, now, "error", "late", "script", what)
+            due = f"{self._next(mirror)} was due {now - mirror.due_s:.1f} s ago"
+            mirror = _alarm(mirror, now, "error", "late", "script", f"the script is late: {due}")
         return mirror
 
     def linked(self, mirror: Mirror, connected: bool, now: float, why: str = "") -> Mirror:
@@ -315,10 +313,8 @@ class Follower:
         unheard = waiting is None and heard.what == "ACK"
         mirror = replace(mirror.finished(command, unheard), ends=True)
         if heard.what == "ERR":
-            mirror = _alarm(
-                mirror, now, "error", "failed", heard.words[0],
-                f"{heard.text}: the machine says {heard.reply[:200]!r}",
-            )  # fmt: skip
+            what = f"{heard.text}: the machine says {heard.reply[:200]!r}"
+            mirror = _alarm(mirror, now, "error", "failed", heard.words[0], what)
             return _rests(mirror, waiting)
         mirror = mirror.cleared(heard.words[0], "failed")
         if waiting is None:

@@ -300,9 +300,8 @@ class Mirror:
             "waiting": list(self.under_way),
             "next_line": self.next_line,
             "alarms": [
-                {"age_s": ago(a.at_s), "severity": a.severity, "kind": a.kind, "about": a.about,
-                 "message": a.message}
+                {"age_s": ago(a.at_s), **{n: x for n, x in vars(a).items() if n != "at_s"}}
                 for a in self.alarms
             ],
             "raised": self.raised,
-        }  # fmt: skip
+        }

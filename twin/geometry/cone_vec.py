@@ -446,10 +446,8 @@ class ConeVec:
         try:
             rows = np.asarray(document["rows"], dtype=np.float64)
         except (KeyError, TypeError, ValueError) as error:
-            raise GeometryError(
-                f"a geometry's document has rows of twelve numbers: {error!r}",
-                {"asked": repr(document)[:100], "allowed": "rows"},
-            ) from None
+            what = f"a geometry's document has rows of twelve numbers: {error!r}"
+            raise GeometryError(what, {"asked": repr(document)[:100], "allowed": "rows"}) from None
         return cls(rows, document.get("detector_shape"))
 
     @property
@@ -674,10 +672,8 @@ class ConeVec:
         """
         rows, cols = self.of_shape(shape)
         if factor not in range(1, min(rows, cols) + 1):
-            raise GeometryError(
-                f"binning by {factor!r}; allowed: a whole number from 1 to {min(rows, cols)}",
-                {"asked": repr(factor), "allowed": [1, min(rows, cols)]},
-            )
+            what = f"binning by {factor!r}; allowed: a whole number from 1 to {min(rows, cols)}"
+            raise GeometryError(what, {"asked": repr(factor), "allowed": [1, min(rows, cols)]})
         shift_u = (cols // factor * factor - cols) / 2
         shift_v = (rows // factor * factor - rows) / 2
         centre = self.detector + shift_u * self.u + shift_v * self.v
@@ -689,10 +685,8 @@ def check_shape(shape: Shape2) -> Shape2:
     """(rows, cols) as positive integers, or GeometryError."""
     rows, cols = map(operator.index, shape)
     if rows <= 0 or cols <= 0:
-        raise GeometryError(
-            f"detector shape {shape!r}; allowed: (rows, cols), both positive",
-            {"asked": repr(shape), "allowed": ["rows", "cols"]},
-        )
+        what = f"detector shape {shape!r}; allowed: (rows, cols), both positive"
+        raise GeometryError(what, {"asked": repr(shape), "allowed": ["rows", "cols"]})
     return rows, cols
 
 
@@ -707,10 +701,8 @@ def _stage_angles(angles: int | npt.ArrayLike, turns: float = 1.0) -> FloatArray
         found = np.linspace(0.0, FULL_TURN * turns, max(int(angles), 0), endpoint=False)
     if found.ndim != 1 or len(found) == 0 or not np.isfinite(found).all():
         shown = angles if np.ndim(angles) == 0 else f"an array of shape {found.shape}"
-        raise GeometryError(
-            f"angles: {shown}; allowed: a number of views from 1, or finite angles (n,) [deg]",
-            {"asked": repr(angles)[:100], "allowed": "views, or (n,) deg"},
-        )
+        what = f"angles: {shown}; allowed: a number of views from 1, or finite angles (n,) [deg]"
+        raise GeometryError(what, {"asked": repr(angles)[:100], "allowed": "views, or (n,) deg"})
     return found
 
 
@@ -722,10 +714,8 @@ def _numbers(
         array = np.full(count, array)
     if array.shape != (count,) or not np.isfinite(array).all():
         wanted = "one finite number" if count == 1 else f"{count} finite numbers"
-        raise GeometryError(
-            f"{name} is {value!r}; allowed: {wanted} [{unit}]",
-            {"asked": repr(value)[:100], "allowed": wanted},
-        )
+        what = f"{name} is {value!r}; allowed: {wanted} [{unit}]"
+        raise GeometryError(what, {"asked": repr(value)[:100], "allowed": wanted})
     return tuple(array.tolist())
 
 

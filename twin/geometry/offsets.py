@@ -90,10 +90,8 @@ def require_plausible(parameters: Offsets, reach_mm: float) -> None:
         low, high = ranges[UNITS[name]]
         if name != "alpha" and not low <= value <= high:
             unit = "" if UNITS[name] == "1" else f" {UNITS[name]}"
-            raise GeometryError(
-                f"{name} {value:g}{unit}; allowed: {low:g} to {high:g}",
-                {"check": name, "asked": value, "allowed": [low, high]},
-            )
+            what = f"{name} {value:g}{unit}; allowed: {low:g} to {high:g}"
+            raise GeometryError(what, {"check": name, "asked": value, "allowed": [low, high]})
 
 
 def to_internal(name: str, value: float) -> float:

@@ -125,10 +125,8 @@ class Poses:
         standing = np.hypot(u[:, 0], u[:, 1]) < 1e-6 * np.linalg.norm(u, axis=1)
         if standing.any():
             i = int(np.argmax(standing))
-            raise GeometryError(
-                f"cone_vec row {i}: u is vertical, so the stage angle cannot be read from it",
-                {"row": i},
-            )
+            what = f"cone_vec row {i}: u is vertical, so the stage angle cannot be read from it"
+            raise GeometryError(what, {"row": i})
         # stage_rotation(phi)^-1 turns +x to (cos phi, sin phi).
         angle = np.unwrap(np.arctan2(u[:, 1], u[:, 0]))
         world = cone_vec.moved(stage_rotation(angle), np.zeros(3))

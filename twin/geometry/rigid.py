@@ -90,10 +90,8 @@ class Rigid:
         """
         if isinstance(axis, str):
             if axis not in AXES:
-                raise GeometryError(
-                    f"axis {axis!r}; allowed: x, y, z or a direction (3,)",
-                    {"asked": axis, "allowed": list(AXES)},
-                )
+                what = f"axis {axis!r}; allowed: x, y, z or a direction (3,)"
+                raise GeometryError(what, {"asked": axis, "allowed": list(AXES)})
             axis = AXES[axis]
         turn = rotation_about(axis, math.radians(angle_deg))
         point = np.asarray(about, dtype=np.float64)

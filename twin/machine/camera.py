@@ -152,10 +152,8 @@ def binning_of(mode: str, modes: Mapping[str, int] | None = None) -> int:
 
 def no_mode(mode: str, allowed: Sequence[str]) -> LimitError:
     """The error for a camera mode that is not among those `allowed`."""
-    return LimitError(
-        f"camera mode {mode!r} does not exist; allowed: {', '.join(allowed)}",
-        {"asked": mode, "allowed": list(allowed)},
-    )
+    what = f"camera mode {mode!r} does not exist; allowed: {', '.join(allowed)}"
+    return LimitError(what, {"asked": mode, "allowed": list(allowed)})
 
 
 def without_number(mode: str) -> str:

@@ -39,10 +39,8 @@ def fitted_text(
     blocks = {f"axes.{name}": _axis_table(name, machine.axes[name]) for name in axes}
     made = _replaced(text, {**blocks, "timing": _timing_table(machine.timing)})
     if parse(made, "fitted machine") != machine:
-        raise MachineFileError(
-            "the base machine's file must write axes as tables [axes.NAME] and times as [timing]",
-            {"allowed": ["[axes.NAME]", "[timing]"]},
-        )
+        what = "the base machine's file must write axes as tables [axes.NAME] and times as [timing]"
+        raise MachineFileError(what, {"allowed": ["[axes.NAME]", "[timing]"]})
     return made
 
 

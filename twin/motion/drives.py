@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 from flexdt.twin.errors import LimitError
@@ -40,40 +40,23 @@ class Drive:
 
     Attributes:
         speed, acceleration: of motions to come.
-        trajectories: on the programme's own clock.
-        origin: the time at which that clock shows 0 [s].
+        trajectories: in force or to come.
     """
 
     speed: float
     acceleration: float
     trajectories: tuple[Trajectory, ...]
-    origin: float = 0.0
-    _shifted: dict[int, Trajectory] = field(
-        default_factory=dict, init=False, compare=False, repr=False
-    )
-    """The trajectory in force on the twin's clock, made on first use."""
 
     @cached_property
     def _starts(self) -> tuple[float, ...]:
-        # Rounded as `shifted` rounds: where one leg ends in motion, the next one has begun.
-        return tuple(t.start + self.origin for t in self.trajectories)
+        return tuple(t.start for t in self.trajectories)
 
     def _index(self, now: float) -> int:
         return max(0, bisect_right(self._starts, now) - 1)
 
-    def _leg(self, index: int) -> Trajectory:
-        if not self.origin:
-            return self.trajectories[index]
-        leg = self._shifted.get(index)
-        if leg is None:  # threads that ask at once may both make it: the two are equal
-            leg = self.trajectories[index].shifted(self.origin)
-            self._shifted.clear()
-            self._shifted[index] = leg
-        return leg
-
     def at(self, now: float) -> Trajectory:
         """The trajectory in force at `now` [s]."""
-        return self._leg(self._index(now))
+        return self.trajectories[self._index(now)]
 
     def next_start(self, now: float) -> float:
         """When the trajectory after the one in force begins [s]; inf if there is none."""
@@ -83,7 +66,7 @@ class Drive:
     @property
     def end(self) -> float:
         """When the motor comes to its last rest [s]."""
-        return self.trajectories[-1].end + self.origin
+        return self.trajectories[-1].end
 
     @property
     def final(self) -> float:
@@ -92,13 +75,12 @@ class Drive:
 
     def ahead(self, now: float) -> Trajectory:
         """All that it is to follow from `now` on, as one trajectory."""
-        begun = self._index(now)
-        left = [self._leg(begun), *(t.shifted(self.origin) for t in self.trajectories[begun + 1 :])]
+        left = self.trajectories[self._index(now) :]
         return left[0] if len(left) == 1 else motion.joined(left)
 
-    def following(self, *trajectories: Trajectory, origin: float = 0.0) -> Drive:
+    def following(self, *trajectories: Trajectory) -> Drive:
         """The same motor on `trajectories` alone."""
-        return replace(self, trajectories=trajectories, origin=origin)
+        return replace(self, trajectories=trajectories)
 
 
 Drives = Mapping[str, Drive]
@@ -178,10 +160,8 @@ def plan_jog(
     """
     moves = machine.moves(axis)
     if not (math.isfinite(lease_s) and lease_s > 0):
-        raise LimitError(
-            f"jog lease {lease_s} s must be positive and finite",
-            {"asked": str(lease_s), "allowed": "> 0"},
-        )
+        what = f"jog lease {lease_s} s must be positive and finite"
+        raise LimitError(what, {"asked": str(lease_s), "allowed": "> 0"})
     pace = _paces(machine, drives, {axis: velocity})
     limit, name = min((machine.axes[n].max_speed / abs(f), n) for n, f in moves.items())
     if not abs(velocity) <= limit:
@@ -251,10 +231,8 @@ def _refuse_double(machine: Machine, targets: Mapping[str, float]) -> None:
     for name in targets:
         for motor in machine.moves(name):
             if motor in seen:
-                raise LimitError(
-                    f"{motor} is asked to move twice: by {seen[motor]} and by {name}",
-                    {"axis": motor, "asked": [seen[motor], name]},
-                )
+                what = f"{motor} is asked to move twice: by {seen[motor]} and by {name}"
+                raise LimitError(what, {"axis": motor, "asked": [seen[motor], name]})
             seen[motor] = name
 
 

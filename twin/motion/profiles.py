@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
@@ -144,7 +144,9 @@ class Trajectory:
 
     def shifted(self, dt: float) -> Trajectory:
         """The same motion `dt` seconds later."""
-        pieces = tuple(replace(p, start=p.start + dt) for p in self.pieces)
+        pieces = tuple(
+            Piece(p.start + dt, p.position, p.velocity, p.acceleration) for p in self.pieces
+        )
         return Trajectory(pieces, self.end + dt, self.target)
 
     def time_at(self, position: float) -> float | None:
@@ -221,12 +223,7 @@ def at_rest(position: float, time: float = 0.0) -> Trajectory:
 
 
 def move(
-    position: float,
-    velocity: float,
-    target: float,
-    speed: float,
-    acceleration: float,
-    time: float,
+    position: float, velocity: float, target: float, speed: float, acceleration: float, time: float
 ) -> Trajectory:
     """Fastest trapezoidal motion to rest at `target` from any state of motion.
 
@@ -286,12 +283,7 @@ def stop(position: float, velocity: float, acceleration: float, time: float) -> 
 
 
 def jog(
-    position: float,
-    velocity: float,
-    wanted: float,
-    lease: float,
-    acceleration: float,
-    time: float,
+    position: float, velocity: float, wanted: float, lease: float, acceleration: float, time: float
 ) -> Trajectory:
     """Run at velocity `wanted` (signed) until `lease` seconds from now, then brake to rest.
 

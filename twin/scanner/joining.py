@@ -32,7 +32,7 @@ from flexdt.twin.motion.drives import (
     programme_time_at_rest,
 )
 from flexdt.twin.motion.profiles import Trajectory
-from flexdt.twin.scanner.safety import Contact, Guard, floor
+from flexdt.twin.scanner.safety import Contact, Guard, floor, would_touch
 from flexdt.twin.scanner.state import NamedCorrection, Sample
 
 LEAST_STEP = 0.05
@@ -54,6 +54,8 @@ Trajectories = Mapping[str, Trajectory]
 @dataclass(frozen=True)
 class Joined:
     """A certified programme that does what was asked, or as much of it as is free.
+
+    Of a change of the stage: what is under way, or the halt of it.
 
     Attributes:
         trajectories: of the motors whose programme changes; none if nothing does.
@@ -398,19 +400,6 @@ MANY_LEGS = 500
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """A change that may be put in force.
-
-    Attributes:
-        contact: what lies ahead of the motion under way on the new stage; None if it is free.
-        halted: motor -> trajectory that rests before that contact; None where all carry on.
-    """
-
-    contact: Contact | None = None
-    halted: Trajectories | None = None
-
-
-@dataclass(frozen=True)
 class StageChange:
     """A change with all that its sweep needs; frozen, so that the sweep may run in a thread.
 
@@ -432,7 +421,7 @@ class StageChange:
     moves: Mapping[str, Trajectory] = field(repr=False)
     targets: Mapping[str, float]
     paces: Mapping[str, tuple[float, float]]
-    found: Verdict | None = None
+    found: Joined | None = None
     """What `certified` has found."""
 
     def certified(self) -> StageChange:
@@ -443,7 +432,7 @@ class StageChange:
         """
         return replace(self, found=self.verdict())
 
-    def renewed(self, before: StageChange) -> Verdict:
+    def renewed(self, before: StageChange) -> Joined:
         """The verdict at the takeover, from the one that was found `before`; raises as `verdict`.
 
         Raises:
@@ -451,19 +440,17 @@ class StageChange:
         """
         still, found = before.version == self.version and not self.moves, before.found
         if still and found is not None and found.contact is None:
-            return Verdict()  # what was free to its end is so still
+            return Joined({})  # what was free to its end is so still
         if self.ahead.legs <= MANY_LEGS:
             return self.verdict()
         if still and found is not None and found.contact is not None:
             halted = self.ahead.halted_at_once(found.contact)
             if halted is not None:
-                return Verdict(found.contact, halted)
-        raise SafetyError(
-            "the motion under way has changed meanwhile; nothing changes",
-            {"allowed": "asking again"},
-        )
+                return Joined(halted, found.contact)
+        what = "the motion under way has changed meanwhile; nothing changes"
+        raise SafetyError(what, {"allowed": "asking again"})
 
-    def verdict(self) -> Verdict:
+    def verdict(self) -> Joined:
         """Whether what is under way may carry on, or how it is halted; raises as `certified`."""
         changed, now = self.ahead.on(self.guard), self.ahead.now
         under_way = self.ahead.ahead()
@@ -474,32 +461,26 @@ class StageChange:
             if pair not in before or clearance < floor(before[pair], margin):
                 raise self._refused(pair, 0.0, {})
         contact = changed.contact(under_way) if under_way else None
-        halted = None
+        halted: Trajectories = {}
         if contact is not None:
-            halted = changed.halted(under_way, contact)
-            if halted is None or self.moves:
+            found = changed.halted(under_way, contact)
+            if found is None or self.moves:
                 raise self._refused(contact.pair, contact.time - now, contact.last_free)
+            halted = found
         if self.moves:
             met = changed.contact({**under_way, **self.moves})
             if met is not None:
                 raise self._refused(met.pair, met.time - now, met.last_free)
-        return Verdict(contact, halted)
+        return Joined(halted, contact)
 
     def _refused(
         self, pair: tuple[str, str], seconds: float, last_free: Mapping[str, float]
     ) -> CollisionError:
-        how = f"would collide in {seconds:.3g} s" if seconds > 0.0 else "would be too close"
         what = f"sample {self.sample.name!r}" if self.sample.name else "the empty stage"
         if self.correction is not None:
             what += f" with correction {self.correction.name!r}"
-        return CollisionError(
-            f"{what}: {' and '.join(pair)} {how}; nothing changes",
-            {
-                "asked": what,
-                "pair": list(pair),
-                "time_s": seconds,
-                "last_free": dict(last_free),
-                "halts_at": {},
-                "allowed": "a pose at which it is free, or another placement",
-            },
-        )
+        allowed = "a pose at which it is free, or another placement"
+        return would_touch(
+            what, pair, seconds, last_free, "would be too close", "nothing changes",
+            halts_at={}, allowed=allowed,
+        )  # fmt: skip

@@ -182,22 +182,22 @@ def collision_error(
         what: the command, for people.
         halts_at: where motors come to rest instead [mm, deg]; empty where nothing changes.
     """
-    first, second = contact.pair
     ahead = contact.time - now
-    how = f"would collide in {ahead:.3g} s" if ahead > 0.0 else "are too close already"
     where = ", ".join(f"{axis} {value:.4g}" for axis, value in halts_at.items())
     outcome = f"motion halts at {where}" if where else "nothing changes"
-    return CollisionError(
-        f"{what}: {first} and {second} {how}; {outcome} "
-        f"(blocked attempt {safety.blocked_attempts} of {safety.max_blocked_attempts})",
-        {
-            "asked": what,
-            "pair": [first, second],
-            "time_s": ahead,
-            "last_free": dict(contact.last_free),
-            "halts_at": dict(halts_at),
-            "blocked_attempts": safety.blocked_attempts,
-            "max_blocked_attempts": safety.max_blocked_attempts,
-            "state": safety.state,
-        },
-    )
+    count, most = safety.blocked_attempts, safety.max_blocked_attempts
+    return would_touch(
+        what, contact.pair, ahead, contact.last_free, "are too close already",
+        f"{outcome} (blocked attempt {count} of {most})", halts_at=dict(halts_at),
+        blocked_attempts=count, max_blocked_attempts=most, state=safety.state,
+    )  # fmt: skip
+
+
+def would_touch(
+    what: str, pair: tuple[str, str], ahead: float, last_free: Mapping[str, float], near: str,
+    outcome: str, **data: object,
+) -> CollisionError:  # fmt: skip
+    """The error for a command, `what`, after which two parts meet in `ahead` [s], or are `near`."""
+    how = f"would collide in {ahead:.3g} s" if ahead > 0.0 else near
+    told = {"asked": what, "pair": list(pair), "time_s": ahead, "last_free": dict(last_free)}
+    return CollisionError(f"{what}: {' and '.join(pair)} {how}; {outcome}", {**told, **data})

@@ -27,6 +27,7 @@ from flexdt.twin.motion import drives as plan
 from flexdt.twin.motion import profiles as motion
 from flexdt.twin.motion.drives import Drive, coasting
 from flexdt.twin.motion.profiles import Trajectory
+from flexdt.twin.scanner import safety as rules
 from flexdt.twin.scanner.joining import (
     LEAST_STEP,
     CertifiedProgramme,
@@ -37,17 +38,7 @@ from flexdt.twin.scanner.joining import (
     StopMotion,
     UnsweptProgramme,
 )
-from flexdt.twin.scanner.safety import (
-    ROUNDING_MM,
-    Guard,
-    after_contact,
-    after_free_motion,
-    collision_error,
-    estopped,
-    in_contact,
-    released,
-    require_ready,
-)
+from flexdt.twin.scanner.safety import Guard, after_contact, collision_error, in_contact
 from flexdt.twin.scanner.state import (
     AxisReading,
     CameraChange,
@@ -253,7 +244,7 @@ class ScannerTwin:
         if joined.contact is not None:
             what = "move " + ", ".join(f"{name}={value:g}" for name, value in targets.items())
             raise self._blocked(joined, now, what)
-        self.safety = after_free_motion(self.safety)
+        self.safety = rules.after_free_motion(self.safety)
         self._take(joined.trajectories)
         return {name: max(0.0, t.end - now) for name, t in new.items()}
 
@@ -289,7 +280,7 @@ class ScannerTwin:
             abs(t.target - t.position(now)) >= LEAST_STEP for t in joined.trajectories.values()
         )
         if joined.contact is None and goes:
-            self.safety = after_free_motion(self.safety)
+            self.safety = rules.after_free_motion(self.safety)
         self._take(joined.trajectories)
         seconds = max((t.end - now for t in joined.trajectories.values()), default=0.0)
         rests = {name: t.target for name, t in joined.trajectories.items()}
@@ -311,7 +302,7 @@ class ScannerTwin:
             by: who pressed it.
         """
         self.tube = switched(self.machine, self.tube, False, now, warm=True)
-        self.safety = estopped(self.safety, by)
+        self.safety = rules.estopped(self.safety, by)
         ahead = self._lookahead(now)
         if now < self._coasts_until:
             return self.stop(now)
@@ -334,7 +325,7 @@ class ScannerTwin:
                 there has been another stop since `stop`; nothing is released.
         """
         self._require_power("a reset", now)
-        self.safety = released(self._safety_at(now), stop)
+        self.safety = rules.released(self._safety_at(now), stop)
 
     def place(self, positions: Mapping[str, float], now: float) -> None:
         """Put motors where they are known to stand, at rest: a start, not a motion.
@@ -396,16 +387,15 @@ class ScannerTwin:
         if certificate.contact is not None and self.holds(certificate):
             raise self._blocked(Joined({}, certificate.contact), now, "the programme", now)
         if not self.may_follow(certificate, now):
-            raise SafetyError(
-                "the programme was checked for another stage or another start; nothing moves",
-                {"asked": "a programme", "allowed": "checking it again"},
-            )
+            what = "the programme was checked for another stage or another start; nothing moves"
+            raise SafetyError(what, {"asked": "a programme", "allowed": "checking it again"})
         self._programmes += 1
         for name, trajectories in prepared.programme.items():
             if trajectories:
                 here = motion.at_rest(prepared.start[name], 0.0)
-                wait = (here,) if trajectories[0].start > 0.0 else ()
-                self._drives[name] = self._drives[name].following(*wait, *trajectories, origin=now)
+                legs = (*((here,) if trajectories[0].start > 0.0 else ()), *trajectories)
+                shifted = (leg.shifted(now) for leg in legs)
+                self._drives[name] = self._drives[name].following(*shifted)
 
     # The stage ----------------------------------------------------------------------------------
 
@@ -483,8 +473,8 @@ class ScannerTwin:
         if anew.moves:
             self._take(anew.moves)
         self.safety = self._safety_at(now)
-        contact, halted = verdict.contact, verdict.halted
-        if contact is None or halted is None:
+        contact, halted = verdict.contact, verdict.trajectories
+        if contact is None:
             return None
         # Also when that was once too often: another stop would not be certified on this stage.
         self.safety = after_contact(self.safety, contact)
@@ -604,7 +594,7 @@ class ScannerTwin:
         positions = self.positions(now)
         made_of = (tuple(positions.values()), self._stage)
         if self._judged[0] != made_of:
-            least = self.machine.safety_margin_mm - 2.0 * ROUNDING_MM
+            least = self.machine.safety_margin_mm - 2.0 * rules.ROUNDING_MM
             near = {} if self.guard is None else self.guard.touching(positions)
             found = {pair: mm for pair, mm in near.items() if mm <= 0.0 or mm < least}
             self._judged = (made_of, min(found, key=lambda pair: found[pair], default=None))
@@ -616,7 +606,7 @@ class ScannerTwin:
 
     def _require_ready(self, what: str, now: float) -> None:
         self.safety = self._safety_at(now)
-        require_ready(self.safety, what)
+        rules.require_ready(self.safety, what)
 
     def _blocked(self, joined: Joined, now: float, what: str, zero: float = 0.0) -> CollisionError:
         """Halt before the contact, or stop everything when that was once too often; what to raise.

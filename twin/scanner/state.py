@@ -90,10 +90,8 @@ class StagePlacement:
     def __post_init__(self) -> None:
         for f in fields(self):
             if not math.isfinite(getattr(self, f.name)):
-                raise LimitError(
-                    f"sample offset {f.name} is {getattr(self, f.name)}; it must be finite",
-                    {"asked": str(getattr(self, f.name)), "setting": f.name},
-                )
+                what = f"sample offset {f.name} is {getattr(self, f.name)}; it must be finite"
+                raise LimitError(what, {"asked": str(getattr(self, f.name)), "setting": f.name})
 
     @property
     def rotation(self) -> FloatArray:
@@ -313,11 +311,8 @@ def changed_tube(
     Raises:
         LimitError: outside the tube's range; the message names the setting.
     """
-    new = replace(
-        tube,
-        kV=tube.kV if kV is None else kV,
-        power_W=tube.power_W if power_W is None else power_W,
-    )
+    kV, power_W = tube.kV if kV is None else kV, tube.power_W if power_W is None else power_W
+    new = replace(tube, kV=kV, power_W=power_W)
     _require_within("tube", "kV", new.kV, spec.min_kV, spec.max_kV)
     _require_within("tube", "power_W", new.power_W, 0.0, spec.max_W)
     return new
@@ -344,10 +339,8 @@ def changed_camera(
 
 def _require_within(device: str, name: str, value: float, lower: float, upper: float) -> None:
     if not lower <= value <= upper:
-        raise LimitError(
-            f"{device} {name} {value:g} is outside [{lower:g}, {upper:g}]",
-            {"setting": name, "asked": value, "allowed": [lower, upper]},
-        )
+        what = f"{device} {name} {value:g} is outside [{lower:g}, {upper:g}]"
+        raise LimitError(what, {"setting": name, "asked": value, "allowed": [lower, upper]})
 
 
 def require_applicable(

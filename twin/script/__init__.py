@@ -2,13 +2,7 @@
 
 from flexdt.twin.script.commands import Script, Wait
 from flexdt.twin.script.compose import ScanRequest, compose_script
-from flexdt.twin.script.dry_run import (
-    CheckReport,
-    Clearance,
-    Collision,
-    check_plan,
-    check_script,
-)
+from flexdt.twin.script.dry_run import CheckReport, Clearance, Collision, check_plan, check_script
 from flexdt.twin.script.dry_run_report import html_report
 from flexdt.twin.script.parse import parse_script, read_script
 from flexdt.twin.script.plan import Exposure, PlanStep, SampleSize, ScanPlan, StartState

@@ -11,7 +11,7 @@ result is checked by planning it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -141,19 +141,16 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
 
 def _usual(request: ScanRequest, places: _Places) -> Iterator[tuple[float, float, float]]:
     """SOD, SDD and height as asked for, else as is usual, else as at home, to be tried in turn."""
-    yield from product(
-        *(
-            (asked,) if asked is not None else dict.fromkeys((usual, places.at_home(quantity)))
-            for quantity, usual, asked in (
-                ("object_y", 600.0, request.sod_mm),
-                ("detector_y", 1059.0, request.sdd_mm),
-                (
-                    "source_z",
-                    places.at_home("object_z" if places.has("source_z") else "source_z"),
-                    request.height_mm,
-                ),
-            )
-        )
+
+    def tried(asked: float | None, *usual: float) -> Iterable[float]:
+        return dict.fromkeys(usual) if asked is None else (asked,)
+
+    home = places.at_home
+    height = home("object_z" if places.has("source_z") else "source_z")
+    return product(
+        tried(request.sod_mm, 600.0, home("object_y")),
+        tried(request.sdd_mm, 1059.0, home("detector_y")),
+        tried(request.height_mm, height, home("source_z")),
     )
 
 
@@ -247,25 +244,23 @@ class _Places:
             LimitError: no motor is left for it.
         """
         if quantity not in self.drivers:
-            raise LimitError(
-                f"{self.machine.name} has no motor of its own for {_QUANTITIES[quantity]}",
-                {"missing": quantity},
-            )
+            what = f"has no motor of its own for {_QUANTITIES[quantity]}"
+            raise self.lacking(what, missing=quantity)
         return self.drivers[quantity]
 
-    def need(self, what: str, *quantities: str) -> None:
-        """Check that motors move all of `quantities`.
+    def need(self, what: str, quantity: str) -> None:
+        """Check that motors move a quantity.
 
         Raises:
             LimitError: what cannot be done, and which quantity no motor moves.
         """
-        for quantity in quantities:
-            if not self.has(quantity):
-                raise LimitError(
-                    f"{self.machine.name} has no motor for {_QUANTITIES[quantity]}, which {what} "
-                    "needs",
-                    {"asked": what, "missing": quantity},
-                )
+        if not self.has(quantity):
+            none = f"has no motor for {_QUANTITIES[quantity]}, which {what} needs"
+            raise self.lacking(none, asked=what, missing=quantity)
+
+    def lacking(self, what: str, **data: object) -> LimitError:
+        """The error that says what this machine lacks."""
+        return LimitError(f"{self.machine.name} {what}", data)
 
     @property
     def aside(self) -> tuple[str, ...]:
@@ -297,11 +292,8 @@ def beside_beam(
     """
     places = _Places(machine, profile)
     if not places.aside:
-        raise LimitError(
-            f"{machine.name} has no motor that takes the sample out of the beam, so no flat image "
-            "can be taken",
-            {"asked": "a flat field", "missing": ["object_x", "object_z"]},
-        )
+        what = "has no motor that takes the sample out of the beam, so no flat image can be taken"
+        raise places.lacking(what, asked="a flat field", missing=["object_x", "object_z"])
     [quantity] = places.aside
     name = places.drivers[quantity]
     axis, factor = machine.axis(name), machine.geometry[quantity][name]
@@ -331,13 +323,9 @@ class _Writer(_Places):
         yield from self.settings()
         yield from self.moves(self.station(w.sod_mm) | out)
         yield from self.references()
-        yield from {
-            "fly": self.fly,
-            "step": self.step,
-            "tiled": self.tiled,
-            "helical": self.helical,
-            "calibration": self.calibration,
-        }[w.kind]()
+        kinds = {"fly": self.fly, "step": self.step, "tiled": self.tiled, "helical": self.helical,
+                 "calibration": self.calibration}  # fmt: skip
+        yield from kinds[w.kind]()
         yield _row("tube", "xrayoff")
 
     def settings(self) -> Iterator[str]:
@@ -409,11 +397,12 @@ class _Writer(_Places):
         if not self.has(*moved):
             moved = ("object_z",)
         if not self.has(*moved):
-            raise LimitError(
-                f"{m.name} has no motors that raise source and detector together, and none that "
-                "lowers the sample, which a helical scan needs",
-                {"asked": "helical", "missing": ["source_z", "detector_z", "object_z"]},
+            what = (
+                "has no motors that raise source and detector together, and none that lowers the "
+                "sample, which a helical scan needs"
             )
+            missing = ["source_z", "detector_z", "object_z"]
+            raise self.lacking(what, asked="helical", missing=missing)
         yield from self.go(*self.aside)
         station = self.station(w.sod_mm)
         targets: dict[str, tuple[float, float, float]] = {}
@@ -421,11 +410,9 @@ class _Writer(_Places):
             motor = self.drivers.get(quantity, "")
             moves = [q for q, factors in m.geometry.items() if motor in factors]
             if list(m.geometry[quantity]) != [motor] or moves != [quantity]:
-                raise LimitError(
-                    f"{m.name} raises or lowers with motors that move something else too, so "
-                    "flexdt writes no helical scan for it",
-                    {"asked": "helical", "axes": list(m.geometry[quantity])},
-                )
+                what = "raises or lowers with motors that move something else too, so flexdt writes"
+                axes = list(m.geometry[quantity])
+                raise self.lacking(f"{what} no helical scan for it", asked="helical", axes=axes)
             at, factor = station[motor], m.geometry[quantity][motor]
             axis = m.axis(motor)
             pace = rise_speed / abs(factor)
@@ -439,11 +426,8 @@ class _Writer(_Places):
             ramp = 0.5 * pace**2 / axis.acceleration
             below = (w.rise_mm / 2 / abs(factor) + pace * lead_s - ramp) * math.copysign(1, factor)
             below = -below if quantity == "object_z" else below
-            targets[motor] = (
-                check_target(m, motor, at - below),
-                check_target(m, motor, at + below),
-                pace,
-            )
+            low, high = (check_target(m, motor, x) for x in (at - below, at + below))
+            targets[motor] = (low, high, pace)
         yield from self.moves({motor: low for motor, (low, _, _) in targets.items()})
         for motor, (_, _, pace) in targets.items():
             yield _row(motor, "set speed", f"{pace:.10f}")
@@ -510,7 +494,7 @@ class _Writer(_Places):
         yield from self.moves({name: every[name] for name in names})
 
     def station(
-        self, sod: float, lateral: float = 0.0, detector_shift: float = 0.0, lift: float = 0.0
+        self, sod: float, lateral: float = 0.0, detector_shift: float = 0.0
     ) -> dict[str, float]:
         """Motor targets that put everything where it belongs, checked against travel limits.
 
@@ -529,7 +513,7 @@ class _Writer(_Places):
             "object_x": lateral,
         }
         if not self.has("source_z"):
-            wanted["object_z"] = height + lift  # the sample's middle into the beam
+            wanted["object_z"] = height  # the sample's middle into the beam
         # Where no motor brings the region into the beam's middle, the sample goes to the region.
         for across, k in (("x", 0), ("z", 2)):
             if not self.has(f"detector_{across}") and f"object_{across}" in self.drivers:
@@ -549,13 +533,12 @@ class _Writer(_Places):
                 slack = BESIDE * size * (sod / w.sdd_mm if quantity == "object_x" else 1.0)
             if abs(asked - only) <= slack:
                 continue
-            if not self.has(quantity):
-                self.need(f"{asked:g} mm ({only:g} mm is all there is)", quantity)
-            raise LimitError(
-                f"{self.machine.name} has no motor of its own for {_QUANTITIES[quantity]}: "
-                f"{asked:g} mm were asked for, it is {only:g} mm",
-                {"asked": asked, "allowed": only, "missing": quantity},
+            self.need(f"{asked:g} mm ({only:g} mm is all there is)", quantity)
+            what = (
+                f"has no motor of its own for {_QUANTITIES[quantity]}: {asked:g} mm were asked for"
             )
+            it_is = f"{what}, it is {only:g} mm"
+            raise self.lacking(it_is, asked=asked, allowed=only, missing=quantity)
         return {name: check_target(self.machine, name, value) for name, value in found.items()}
 
     def out_of_beam(self) -> dict[str, float]:
@@ -605,10 +588,9 @@ class _Writer(_Places):
         factors = self.machine.geometry["angle"]
         name = next(iter(factors))
         if len(factors) > 1 or abs(factors[name]) != 1.0:
-            raise LimitError(
-                f"{self.machine.name} turns the sample by {factors}; flexdt writes scripts for one "
-                "motor with a factor of 1 or -1",
-                {"asked": dict(factors), "allowed": [1.0, -1.0]},
+            what = f"turns the sample by {factors}; flexdt writes scripts for one motor with a"
+            raise self.lacking(
+                f"{what} factor of 1 or -1", asked=dict(factors), allowed=[1.0, -1.0]
             )
         return name, self.machine.axis(name)
 
@@ -635,10 +617,8 @@ def _check_counts(request: _Request) -> None:
     )
     for name, value, least, most in rules:
         if not (math.isfinite(value) and least <= value <= most):
-            raise LimitError(
-                f"{name} is {value:g}; allowed: {least:g} to {most:g}",
-                {"setting": name, "asked": value, "allowed": [least, most]},
-            )
+            what = f"{name} is {value:g}; allowed: {least:g} to {most:g}"
+            raise LimitError(what, {"setting": name, "asked": value, "allowed": [least, most]})
 
 
 def _row(component: str, command: str, first: str = "", second: str = "", wait: str = "ACK") -> str:

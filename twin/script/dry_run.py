@@ -16,14 +16,7 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.parse import Source, content, read_script
-from flexdt.twin.script.plan import (
-    Range,
-    SampleSize,
-    ScanPlan,
-    StartState,
-    step_range,
-    total_range,
-)
+from flexdt.twin.script.plan import Range, SampleSize, ScanPlan, StartState, step_range, total_range
 from flexdt.twin.script.planner import View, plan_script, views
 from flexdt.twin.script.problems import ScriptProblem, WithProblems, in_order
 
@@ -62,6 +55,7 @@ class Clearance:
     trace: Trace = ()
 
 
+_OF_STEP = ("line", "start_s", "duration_s", "holds_s", "assumed_s", "assumed_from", "what")
 HOME_ASSUMED = "the machine's home, assumed"
 EMPTY, EMPTY_ASSUMED = "none", "empty stage assumed"
 
@@ -98,19 +92,11 @@ class Optics:
 
     def to_dict(self) -> dict[str, object]:
         """JSON form."""
-        return {
-            "lines": list(self.lines),
-            "rows": self.shape[0],
-            "cols": self.shape[1],
-            "pixel_mm": self.pixel_mm,
-            "sod_mm": list(self.sod_mm),
-            "sdd_mm": list(self.sdd_mm),
-            "magnification": list(self.magnification),
-            "voxel_um": list(self.voxel_um),
-            "field_of_view_mm": list(self.field_mm),
-            "full_turn_diameter_mm": self.turn_field_mm,
-            "truncation_px": None if self.truncation is None else dict(self.truncation),
-        }
+        names = {"field_mm": "field_of_view_mm", "turn_field_mm": "full_turn_diameter_mm",
+                 "truncation": "truncation_px"}  # fmt: skip
+        told = {n: list(v) if isinstance(v, tuple) else v for n, v in vars(self).items()}
+        told["rows"], told["cols"] = told.pop("shape")
+        return {names.get(name, name): value for name, value in told.items()}
 
 
 @dataclass(frozen=True)
@@ -176,16 +162,7 @@ class CheckReport(WithProblems):
             "profile": plan.profile.name,
             "problems": [p.to_dict() for p in self.problems],
             "steps": [
-                {
-                    "line": s.line,
-                    "start_s": s.start_s,
-                    "duration_s": s.duration_s,
-                    "holds_s": s.holds_s,
-                    **_range(step_range(s, plan.machine.timing)),
-                    "assumed_s": s.assumed_s,
-                    "assumed_from": s.assumed_from,
-                    "what": s.what,
-                }
+                {n: getattr(s, n) for n in _OF_STEP} | _range(step_range(s, plan.machine.timing))
                 for s in plan.steps
             ],
             "duration_s": plan.duration_s,
@@ -308,13 +285,9 @@ def _optics(view: View) -> Optics:
     m = p.sdd / p.sod
     half = np.minimum(view.axis + 0.5, cols - 0.5 - view.axis) * pixel
     reach = float(np.min(p.sod * np.sin(np.arctan2(np.maximum(half, 0.0), p.sdd))))
-    cut = {
-        "left": float(np.max(view.cut_columns[:, 0])),
-        "right": float(np.max(view.cut_columns[:, 1])),
-    }
+    cut = dict(zip(("left", "right"), view.cut_columns.max(axis=0).tolist(), strict=True))
     if not np.isnan(view.top).any():
-        cut["top"] = float(np.max(view.cut_rows[:, 0]))
-        cut["bottom"] = float(np.max(view.cut_rows[:, 1]))
+        cut |= zip(("top", "bottom"), view.cut_rows.max(axis=0).tolist(), strict=True)
     known = bool((view.right > view.left).any())
     return Optics(
         lines=(min(view.lines), max(view.lines)),

@@ -10,10 +10,11 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Iterable, Sequence
+from itertools import zip_longest
 
 from flexdt.twin.script.dry_run import HOME_ASSUMED, CheckReport, Optics, Trace
 from flexdt.twin.script.log_fit import LogComparison
-from flexdt.twin.script.plan import PlanStep, Range, step_range, total_range
+from flexdt.twin.script.plan import Range, step_range, total_range
 from flexdt.twin.script.problems import ScriptProblem
 
 Facts = Sequence[tuple[str, str]]
@@ -42,15 +43,10 @@ def html_report(report: CheckReport, name: str = "script") -> str:
     """
     verdict = ("ok", "ok") if report.ok else ("bad", "not ok")
     mark = f' <span class="verdict {verdict[0]}">{verdict[1]}</span>'
-    parts = [
-        *_page(f"Dry run of {name}", mark),
-        _facts_html(summary(report)),
-        _problems_html(report.problems),
-        _clearance_html(report),
-        _steps_html(report),
-        _source_html(report.text),
-        "</body></html>",
-    ]
+    facts, problems = _facts_html(summary(report)), _problems_html(report.problems)
+    found = [facts, problems, _clearance_html(report), _steps_html(report)]
+    page = _page(f"Dry run of {name}", mark)
+    parts = [*page, *found, _source_html(report.text), "</body></html>"]
     return "\n".join(p for p in parts if p) + "\n"
 
 
@@ -71,11 +67,7 @@ def against_html(found: LogComparison, name: str = "script") -> str:
         found: the comparison.
         name: what to call the script.
     """
-    rows = "".join(
-        "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>"
-        for row in found.table()
-    )
-    table = f"<table>{_head(*found.HEADER)}{rows}</table>"
+    table = _table(found.HEADER, found.table())
     facts = _facts_html(against_summary(found))
     parts = [facts, _problems_html(found.problems), table]
     return "\n".join([*_page(f"{name}: predicted and executed"), *parts, "</body></html>"])
@@ -196,34 +188,36 @@ def _facts_html(facts: Facts) -> str:
 def _problems_html(problems: Sequence[ScriptProblem]) -> str:
     if not problems:
         return ""
-    rows = "".join(
-        f'<tr class="{p.severity}"><td class="n">{p.line}</td><td>{p.severity}</td>'
-        f"<td>{html.escape(p.code)}</td><td>{html.escape(p.message)}</td></tr>"
-        for p in problems
-    )
-    return f"<h2>Problems</h2><table>{_head('line', 'severity', 'code', 'what')}{rows}</table>"
+    rows = [(str(p.line), p.severity, p.code, p.message) for p in problems]
+    table = _table(("line", "severity", "code", "what"), rows, [p.severity for p in problems])
+    return f"<h2>Problems</h2>{table}"
 
 
 def _steps_html(report: CheckReport) -> str:
     timing = report.plan.machine.timing
-    rows = "".join(_step_html(s, between(step_range(s, timing))) for s in report.plan.steps)
-    head = _head("line", "start [s]", "takes [s]", "90 %", "of it commands", "effect")
-    return f"<h2>Steps</h2><table>{head}{rows}</table>"
+    rows = [
+        (
+            *(str(s.line), f"{s.start_s:.3f}", f"{s.duration_s:.3f}"),
+            between(step_range(s, timing)),
+            f"{s.assumed_s:.3f} s {s.assumed_from}" if s.assumed_s else "",
+            s.what,
+        )
+        for s in report.plan.steps
+    ]
+    head = ("line", "start [s]", "takes [s]", "90 %", "of it commands", "effect")
+    return f"<h2>Steps</h2>{_table(head, rows)}"
 
 
-def _step_html(s: PlanStep, nine_of_ten: str) -> str:
-    assumed = f"{s.assumed_s:.3f} s {html.escape(s.assumed_from)}" if s.assumed_s else ""
-    return (
-        f'<tr><td class="n">{s.line}</td><td class="n">{s.start_s:.3f}</td>'
-        f'<td class="n">{s.duration_s:.3f}</td><td>{nine_of_ten}</td><td class="a">{assumed}</td>'
-        f"<td>{html.escape(s.what)}</td></tr>"
-    )
-
-
-def _head(*names: str) -> str:
-    number = ("line", "start [s]", "takes [s]")
-    cells = "".join(f"<th{' class=n' if n in number else ''}>{n}</th>" for n in names)
-    return f"<tr>{cells}</tr>"
+def _table(names: Sequence[str], rows: Sequence[Sequence[str]], kinds: Sequence[str] = ()) -> str:
+    """A table with a head; `kinds` are the classes of its rows."""
+    classes = {"line": "n", "start [s]": "n", "takes [s]": "n", "of it commands": "a"}
+    marks = [f' class="{classes[n]}"' if n in classes else "" for n in names]
+    parts = [f"<th{mark}>{name}</th>" for mark, name in zip(marks, names, strict=True)]
+    for row, kind in zip_longest(rows, kinds):
+        parts.append("</tr>" + (f'<tr class="{kind}">' if kind else "<tr>"))
+        cells = zip(marks, row, strict=True)
+        parts += [f"<td{mark}>{html.escape(cell)}</td>" for mark, cell in cells]
+    return f"<table><tr>{''.join(parts)}</tr></table>"
 
 
 def _source_html(text: str) -> str:

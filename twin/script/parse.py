@@ -273,12 +273,21 @@ class _Parts:
     expected: Field
 
 
+class _Refused(Exception):
+    """A line that cannot be read at all, and where."""
+
+    def __init__(self, code: str, column: int, message: str) -> None:
+        super().__init__(message)
+        self.code, self.column = code, column
+
+
 class _Line:
     """Reads one row and notes what is wrong with it."""
 
     def __init__(self, row: CodeLine, problems: list[ScriptProblem]) -> None:
         self.row, self.problems = row, problems
         self.component = row.columns[0] if row.columns else row.words()[0]
+        self.end = Field("", len(row.text) + 1)
 
     def error(self, code: str, column: int, message: str) -> None:
         self.problems.append(ScriptProblem("error", code, self.row.line, column, message))
@@ -287,34 +296,28 @@ class _Line:
         self.problems.append(ScriptProblem("warning", code, self.row.line, column, message))
 
     def command(self) -> c.Command | None:
-        name = self.component.text
-        if not name:
-            self.error("syntax", 1, "the component (first column) is missing")
+        try:
+            if not self.component.text:
+                raise _Refused("syntax", 1, "the component (first column) is missing")
+            parts = self._padded() if self.row.columns is None else self._tabbed(self.row.columns)
+            return self._unknown() if parts is None else self._build(parts)
+        except _Refused as refused:
+            self.error(refused.code, refused.column, str(refused))
             return None
-        parts = self._padded() if self.row.columns is None else self._tabbed(self.row.columns)
-        if parts is None:
-            return None if self._complained() else self._unknown()
-        return self._build(parts)
-
-    def _complained(self) -> bool:
-        return bool(self.problems) and self.problems[-1].line == self.row.line
 
     def _tabbed(self, columns: tuple[Field, ...]) -> _Parts | None:
-        verb = columns[1] if len(columns) > 1 else Field("", len(self.row.text) + 1)
+        verb = columns[1] if len(columns) > 1 else self.end
         spec = grammar.find(self.component.text, verb.text) if verb.text else None
         if spec is None:  # a multi-word command may be split over columns here too
             return self._padded()
-        end = Field("", len(self.row.text) + 1)
-        rest = (*columns[2:], *[end] * 5)
-        for extra in rest[5:]:
-            if extra.text:
-                self.error(
-                    "syntax",
-                    extra.column,
-                    f"column 8 holds {shorten(extra.text)!r}; a line has seven columns: component, "
-                    "command, argument 1, argument 2, wait, timeout, expected",
-                )
-                return None
+        rest = (*columns[2:], *[self.end] * 5)
+        extra = next((field for field in rest[5:] if field.text), None)
+        if extra is not None:
+            what = (
+                f"column 8 holds {shorten(extra.text)!r}; a line has seven columns: component, "
+                "command, argument 1, argument 2, wait, timeout, expected"
+            )
+            raise _Refused("syntax", extra.column, what)
         return _Parts(spec, *rest[:5])
 
     def _padded(self) -> _Parts | None:
@@ -329,22 +332,16 @@ class _Line:
             comment = next((i for i in range(start, at) if _is_comment(words[i])), None)
             if comment is not None:
                 words, at, width = words[:comment], comment, 0
-        end = Field("", len(self.row.text) + 1)
-        wait = end
+        wait = self.end
         if width:
             wait = Field(" ".join(w.text for w in words[at : at + width]), words[at].column)
         tail = _until_comment(words[at + width : at + width + 3])[:2]
         # One number after the wait stands where the TAB form has the expected duration.
-        timeout, expected = (tail[0], tail[1]) if len(tail) == 2 else (end, (*tail, end)[0])
-        body = words[start:at]
-        first, second = self._arguments(spec, body)
-        if first is None or second is None:
-            return None
+        timeout, expected = tail if len(tail) == 2 else (self.end, *tail, self.end)[:2]
+        first, second = self._arguments(spec, words[start:at])
         return _Parts(spec, first, second, wait, timeout, expected)
 
-    def _arguments(
-        self, spec: Spec, body: Sequence[Field]
-    ) -> tuple[Field, Field] | tuple[None, None]:
+    def _arguments(self, spec: Spec, body: Sequence[Field]) -> tuple[Field, Field]:
         none = Field("", body[0].column if body else len(self.row.text) + 1)
         if not body:
             return none, none
@@ -356,13 +353,8 @@ class _Line:
         if len(body) > spec.arguments:
             extra = body[spec.arguments]
             allowed = ("no argument", "one argument", "at most two arguments")[spec.arguments]
-            self.error(
-                "syntax",
-                extra.column,
-                f"{shorten(extra.text)!r} is not expected here: the command takes {allowed}, then "
-                "ACK, no wait, POS or RCV",
-            )
-            return None, None
+            what = f"{shorten(extra.text)!r} is not expected here: the command takes {allowed}"
+            raise _Refused("syntax", extra.column, f"{what}, then ACK, no wait, POS or RCV")
         return body[0], body[1] if len(body) > 1 else none
 
     def _span(self, body: Sequence[Field]) -> Field:
@@ -370,45 +362,29 @@ class _Line:
         last = body[-1]
         return Field(self.row.text[start - 1 : last.column - 1 + len(last.text)], start)
 
-    def _unknown(self) -> c.Command | None:
+    def _unknown(self) -> c.Command:
         name = self.component.text
         fields = [f for f in (self.row.columns or self.row.words())[1:] if f.text]
         if name.lower() in grammar.FIXED or grammar.is_reserved(name):
             allowed = grammar.vocabulary(name)
+            knows = f"; it knows: {', '.join(allowed)}"
             if not fields:
-                self.error(
-                    "syntax",
-                    len(self.row.text) + 1,
-                    f"{name} without a command; it knows: {', '.join(allowed)}",
-                )
-                return None
+                raise _Refused("syntax", self.end.column, f"{name} without a command{knows}")
             asked = fields[0].text if self.row.columns else " ".join(f.text for f in fields[:3])
-            self.error(
-                "unknown_command",
-                fields[0].column,
-                f"{name} does not know {shorten(asked)!r}{_meant(asked, allowed)}; it knows: "
-                f"{', '.join(allowed)}",
-            )
-            return None
+            what = f"{name} does not know {shorten(asked)!r}{_meant(asked, allowed)}{knows}"
+            raise _Refused("unknown_command", fields[0].column, what)
         if not self._custom_form(fields):
-            self.error(
-                "unknown_component" if fields else "syntax",
-                self.component.column,
+            what = (
                 f"{shorten(name)!r} is not a component of the scanner"
                 f"{_meant(name, (*grammar.FIXED,))}; a custom component needs a name, a command "
-                "and a wait",
+                "and a wait"
             )
-            return None
-        self.warn(
-            "custom_component",
-            self.component.column,
-            f"{shorten(name)!r} is a custom component: allowed, without effect here",
-        )
+            raise _Refused("unknown_component" if fields else "syntax", self.component.column, what)
+        what = f"{shorten(name)!r} is a custom component: allowed, without effect here"
+        self.warn("custom_component", self.component.column, what)
+        words = tuple(f.text for f in fields)
         return c.Custom(
-            line=self.row.line,
-            column=self.component.column,
-            component=name,
-            words=tuple(f.text for f in fields),
+            line=self.row.line, column=self.component.column, component=name, words=words
         )
 
     def _custom_form(self, fields: Sequence[Field]) -> bool:
@@ -431,13 +407,9 @@ class _Line:
             fields["component"] = self.component.text
         for i, argument in enumerate((parts.first, parts.second)):
             if argument.text and i >= parts.spec.arguments:
-                self.error(
-                    "syntax",
-                    argument.column,
-                    f"{shorten(argument.text)!r} is not expected: the command takes "
-                    f"{parts.spec.arguments or 'no'} argument"
-                    f"{'s' if parts.spec.arguments > 1 else ''}",
-                )
+                takes = ("no argument", "1 argument")[parts.spec.arguments]
+                what = f"{shorten(argument.text)!r} is not expected: the command takes {takes}"
+                self.error("syntax", argument.column, what)
         try:
             fields.update(parts.spec.read(parts.first.text, parts.second.text))
         except ArgumentError as error:
@@ -455,35 +427,25 @@ class _Line:
 
     def _wait(self, parts: _Parts) -> c.Wait:
         is_move = parts.spec.type is c.MoveAbsolute
-        text, column = parts.wait.text, parts.wait.column
+        text, column, trigger = parts.wait.text, parts.wait.column, parts.second
         if not text:
             assumed = c.Wait.NO_WAIT if is_move else c.Wait.ACK
-            self.warn(
-                "wait_missing",
-                column,
-                f"no wait is written (ACK, no wait, POS or RCV); {assumed.value!r} is assumed",
-            )
+            what = f"no wait is written (ACK, no wait, POS or RCV); {assumed.value!r} is assumed"
+            self.warn("wait_missing", column, what)
             return assumed
         wait = grammar.WAITS.get(" ".join(text.lower().split()))
         if wait is None:
-            self.error(
-                "wait", column, f"wait is {shorten(text)!r}; allowed: ACK, no wait, POS, RCV"
-            )
+            what = f"wait is {shorten(text)!r}; allowed: ACK, no wait, POS, RCV"
+            self.error("wait", column, what)
             return c.Wait.ACK
         if wait is c.Wait.POS and not is_move:
             self.error("wait", column, "POS is for moves only: it waits for a position")
-        elif wait is c.Wait.POS and not parts.second.text:
-            self.error(
-                "trigger",
-                parts.second.column,
-                "POS needs the trigger position as argument 2 of the move",
-            )
-        elif is_move and parts.second.text and wait is not c.Wait.POS:
-            self.warn(
-                "trigger_unused",
-                parts.second.column,
-                f"the trigger position is used with POS only; the wait is {wait.value!r}",
-            )
+        elif wait is c.Wait.POS and not trigger.text:
+            what = "POS needs the trigger position as argument 2 of the move"
+            self.error("trigger", trigger.column, what)
+        elif is_move and trigger.text and wait is not c.Wait.POS:
+            what = f"the trigger position is used with POS only; the wait is {wait.value!r}"
+            self.warn("trigger_unused", trigger.column, what)
         return wait
 
 

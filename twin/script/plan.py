@@ -342,13 +342,10 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
         in the exposure the trigger falls), so their mean has no bias against it.
         """
         offsets = (np.arange(samples) + 0.5) / samples - 0.5
-        lengths = np.concatenate(
-            [
-                np.full(len(g), g.camera.exposure_ms * g.camera.averages / 1000.0 * g.moving)
-                for g in self.groups
-            ]
-            or [np.empty(0)]
-        )
+        of_group = [g.camera.exposure_ms * g.camera.averages / 1000.0 * g.moving
+                    for g in self.groups]  # fmt: skip
+        counts = np.array([len(g) for g in self.groups], dtype=int)
+        lengths = np.repeat(np.array(of_group), counts)
         times = self.starts[:, None] + lengths[:, None] * offsets
         nominal = self.image_positions
         moved = self.positions(times)
@@ -359,8 +356,7 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
     def exposures(self) -> tuple[Exposure, ...]:
         """Every image, one by one."""
         names = list(self.image_positions)
-        table = np.stack([self.image_positions[n] for n in names], axis=1) if names else None
-        rows = [] if table is None else table.tolist()
+        rows = np.array([self.image_positions[n] for n in names]).T.tolist()
         out: list[Exposure] = []
         for g in self.groups:
             files: Sequence[str | None] = g.files or [None] * len(g)

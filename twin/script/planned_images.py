@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine
@@ -40,22 +39,6 @@ def run_up(speed: float, acceleration: float, period_s: float) -> float:
 
 
 @dataclass(frozen=True)
-class Flight:
-    """The settings of a fly scan in a script; lengths unsigned. None: left out."""
-
-    speed: float
-    acceleration: float
-    run_up: float
-    """From the start of the motion to the trigger."""
-    run: float
-    """From the trigger to the end of the motion."""
-    exposure_s: float
-    frames: int | None
-    averages: int | None
-    rotation: bool = True
-
-
-@dataclass(frozen=True)
 class Inference:
     """What fills the gaps; `notes` says for each setting how it was found."""
 
@@ -67,7 +50,9 @@ class Inference:
     notes: dict[str, str]
 
 
-def infer(flight: Flight) -> Inference | None:
+def infer(
+    trigger: planned.Trigger, exposure_s: float, frames: int | None, averages: int | None
+) -> Inference | None:
     """Averages, then frames, then the increment; None if speed and run-up do not tell.
 
     The scan's length is the motion's less one run-up at each end (the end is symmetric), rounded
@@ -76,16 +61,14 @@ def infer(flight: Flight) -> Inference | None:
     lie at turn / (frames - 1), as the scanner's own software counts; otherwise they lie where the
     motor is.
     """
-    length = _length(flight)
+    length, rotation = _length(trigger), trigger.unit == "deg"
     notes: dict[str, str] = {}
-    averages = flight.averages
     if averages is None:
-        found = _averages(flight, length)
+        found = _averages(trigger, exposure_s, frames, length)
         if found is None:
             return None
         averages, notes["averages"] = found
-    step = flight.speed * flight.exposure_s * averages
-    frames = flight.frames
+    step = trigger.speed * exposure_s * averages
     if frames is None:
         steps = length / step
         if not 0.5 <= steps < MAX_STEPS:
@@ -95,7 +78,7 @@ def infer(flight: Flight) -> Inference | None:
             f"{steps:.2f} steps of {step:.6g} at this speed, exposure and averages make "
             f"{length:g}; rounded, {frames} frames"
         )
-    increment, mismatch = images(step, frames, flight.rotation)
+    increment, mismatch = images(step, frames, rotation)
     return Inference(frames, averages, increment, mismatch, notes)
 
 
@@ -108,23 +91,25 @@ def images(step: float, frames: int, rotation: bool) -> tuple[float, float]:
     return step, 0.0
 
 
-def _length(flight: Flight) -> float:
-    length = flight.run - flight.run_up
+def _length(trigger: planned.Trigger) -> float:
+    length = abs(trigger.trajectory.target - trigger.position) - trigger.run_up
     turns = round(length / FULL_TURN)
-    if flight.rotation and turns >= 1 and abs(length - turns * FULL_TURN) < 1.0:
+    if trigger.unit == "deg" and turns >= 1 and abs(length - turns * FULL_TURN) < 1.0:
         return turns * FULL_TURN
     return length
 
 
-def _averages(flight: Flight, length: float) -> tuple[int, str] | None:
-    if flight.frames is not None and flight.frames > 1 and length > 0.0:
-        period = length / (flight.frames - 1) / flight.speed
-        how = f"speed and {flight.frames} frames"
+def _averages(
+    trigger: planned.Trigger, exposure_s: float, frames: int | None, length: float
+) -> tuple[int, str] | None:
+    speed, acceleration = trigger.speed, trigger.acceleration
+    if frames is not None and frames > 1 and length > 0.0:
+        period = length / (frames - 1) / speed
+        how = f"speed and {frames} frames"
     else:
-        ramp = flight.speed**2 / (2.0 * flight.acceleration)
-        period = (flight.run_up - ramp) / (MARGIN_IMAGES * flight.speed)
-        how = f"speed, run-up {flight.run_up:.6f} and acceleration {flight.acceleration:g}"
-    ratio = period / flight.exposure_s
+        period = (trigger.run_up - speed**2 / (2.0 * acceleration)) / (MARGIN_IMAGES * speed)
+        how = f"speed, run-up {trigger.run_up:.6f} and acceleration {acceleration:g}"
+    ratio = period / exposure_s
     averages = round(ratio)
     if averages < 1 or abs(ratio - averages) > 0.02 * averages:
         return None
@@ -209,11 +194,9 @@ class ImageCollector:
         if trigger is not None and inference is not None:
             starts, exact = self._fly(trigger, inference, start, period)
         elif moving and frames > 1:
-            self.findings.warn(
-                "no_trigger",
-                f"{', '.join(moving)} moves during the sequence without a trigger (POS): where "
-                "each image lies depends on the timing of commands",
-            )
+            what = f"{', '.join(moving)} moves during the sequence without a trigger (POS)"
+            which = "where each image lies depends on the timing of commands"
+            self.findings.warn("no_trigger", f"{what}: {which}")
         files = sequence_names(command.prefix, command.first, frames)
         draft = self._taken(starts, start, step, command.line, kind_of(files[0]), files, exact)
         if draft.kind == "projection" and frames > 1 and not moving:
@@ -271,12 +254,17 @@ class ImageCollector:
         frames = camera.settings.frames if "frames" in camera.said else None
         found = None
         if trigger is not None:
-            found = infer(self._flight(trigger, frames, averages))
-        if found is None and trigger is not None and (averages is None or frames is None):
-            fallback = camera.settings.averages if averages is None else averages
-            found = infer(self._flight(trigger, frames, fallback))
-        if averages is None:
-            self._averages(found)
+            exposure_s = camera.settings.exposure_ms / 1000.0
+            found = infer(trigger, exposure_s, frames, averages)
+            if found is None and averages is None:
+                found = infer(trigger, exposure_s, frames, camera.settings.averages)
+        if averages is None and found is not None and "averages" in found.notes:
+            self.inferred_averages = found.averages
+            camera.assume("averages", found.averages)
+            how = f"{found.averages} inferred ({found.notes['averages']})"
+            what = f"the number of averages is not set; {how}, and taken for images before this"
+            self.findings.warn("averages_unsaid", f"{what} line too")
+            self._complained.add("averages")
         if frames is None:
             count = 1 if found is None else found.frames
             how = "1 is assumed" if found is None else f"inferred from {found.notes['frames']}"
@@ -284,50 +272,18 @@ class ImageCollector:
             camera.assume("frames", count)
         return found
 
-    def _averages(self, found: Inference | None) -> None:
-        if found is not None and "averages" in found.notes:
-            self.inferred_averages = found.averages
-            self.camera.assume("averages", found.averages)
-            self.findings.warn(
-                "averages_unsaid",
-                f"the number of averages is not set; {found.averages} inferred "
-                f"({found.notes['averages']}), and taken for images before this line too",
-            )
-            self._complained.add("averages")
-
-    def _flight(self, trigger: planned.Trigger, frames: int | None, averages: int | None) -> Flight:
-        pieces = trigger.trajectory.pieces
-        return Flight(
-            speed=max(abs(p.velocity) for p in pieces),
-            acceleration=max(abs(p.acceleration) for p in pieces),
-            run_up=abs(trigger.run_up),
-            run=abs(trigger.trajectory.target - trigger.position),
-            exposure_s=self.camera.settings.exposure_ms / 1000.0,
-            frames=frames,
-            averages=averages,
-            rotation=self.machine.axes[trigger.motor].kind == "rotation",
-        )
-
     def _fly(
-        self,
-        trigger: planned.Trigger,
-        found: Inference,
-        start: float,
-        period: float,
+        self, trigger: planned.Trigger, found: Inference, start: float, period: float
     ) -> tuple[FloatArray, dict[str, FloatArray]]:
         """Nominal moments of the images, and their positions where the rule gives them."""
-        trajectory = trigger.trajectory
-        unit = self.machine.axes[trigger.motor].unit
-        speed = max(abs(p.velocity) for p in trajectory.pieces)
+        trajectory, unit, speed = trigger.trajectory, trigger.unit, trigger.speed
         sign = 1.0 if trajectory.target >= trigger.position else -1.0
         count = np.arange(found.frames, dtype=np.float64)
         late = start - trigger.time
         if late > _TIME_EPS:
-            self.findings.warn(
-                "late_start",
-                f"the sequence starts {late:.3g} s after {trigger.axis} passed its trigger: image "
-                f"0 is at {trajectory.position(start):.6g}, not {trigger.position:g} {unit}",
-            )
+            what = f"the sequence starts {late:.3g} s after {trigger.axis} passed its trigger"
+            where = f"{trajectory.position(start):.6g}, not {trigger.position:g} {unit}"
+            self.findings.warn("late_start", f"{what}: image 0 is at {where}")
         if abs(found.mismatch) > _MISMATCH_STEPS * found.increment and "frames" not in found.notes:
             self.findings.warn(
                 "frame_angles",
@@ -341,26 +297,17 @@ class ImageCollector:
         off = np.abs(trajectory.positions(starts) - wanted) > _POSITION_EPS
         exact = {trigger.motor: wanted}
         if off.any():
-            self._not_steady(trigger, off, unit)
+            velocity = abs(trajectory.velocity(trigger.time))
+            if velocity < speed * (1 - 1e-9):
+                short = f"the run-up of {trigger.run_up:.4g} {unit} is too short"
+                what = f"passes the trigger at {velocity:.4g} of {speed:.4g} {unit}/s: {short}"
+            else:
+                which = f"(from image {int(np.argmax(off))} on)"
+                what = f"slows down before the last of {len(off)} images {which}"
+            code = "run_up" if velocity < speed * (1 - 1e-9) else "scan_overrun"
+            self.findings.warn(code, f"{trigger.axis} {what}; images lie where the motor is")
             starts, exact = start + period * count, {}
         return starts, exact
-
-    def _not_steady(self, trigger: planned.Trigger, off: npt.NDArray[np.bool_], unit: str) -> None:
-        speed = max(abs(p.velocity) for p in trigger.trajectory.pieces)
-        velocity = abs(trigger.trajectory.velocity(trigger.time))
-        if velocity < speed * (1 - 1e-9):
-            self.findings.warn(
-                "run_up",
-                f"{trigger.axis} passes the trigger at {velocity:.4g} of {speed:.4g} {unit}/s: the "
-                f"run-up of {abs(trigger.run_up):.4g} {unit} is too short; images lie where the "
-                "motor is",
-            )
-        else:
-            self.findings.warn(
-                "scan_overrun",
-                f"{trigger.axis} slows down before the last of {len(off)} images (from image "
-                f"{int(np.argmax(off))} on); images lie where the motor is",
-            )
 
     # what is worth saying about a saved image ----------------------------------------------
 

@@ -35,15 +35,25 @@ class Span:
 
 @dataclass(frozen=True)
 class Trigger:
-    """The last move that waited for a position; `run_up` is signed, from its start."""
+    """The last move that waited for a position; `run_up` is the length before it."""
 
     axis: str
     motor: str
+    unit: str
     trajectory: Trajectory
     position: float
     time: float
     run_up: float
-    line: int
+
+    @property
+    def speed(self) -> float:
+        """The greatest on the way."""
+        return max(abs(p.velocity) for p in self.trajectory.pieces)
+
+    @property
+    def acceleration(self) -> float:
+        """The greatest on the way."""
+        return max(abs(p.acceleration) for p in self.trajectory.pieces)
 
 
 class Motor:

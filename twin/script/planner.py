@@ -277,27 +277,25 @@ class View:
     @property
     def cut_columns(self) -> FloatArray:
         """Columns of the projection beyond the left and the right edge, (n, 2)."""
-        cols = self.camera.shape[1]
-        return np.maximum(np.stack([-0.5 - self.left, self.right - (cols - 0.5)], axis=1), 0.0)
+        return _beyond(self.left, self.right, self.camera.shape[1])
 
     @property
     def cut_rows(self) -> FloatArray:
         """Rows of the projection beyond the top and the bottom edge, (n, 2); NaN if unknown."""
-        rows = self.camera.shape[0]
-        return np.maximum(np.stack([-0.5 - self.top, self.bottom - (rows - 0.5)], axis=1), 0.0)
+        return _beyond(self.top, self.bottom, self.camera.shape[0])
+
+
+def _beyond(low: FloatArray, high: FloatArray, size: int) -> FloatArray:
+    return np.maximum(np.stack([-0.5 - low, high - (size - 0.5)], axis=1), 0.0)
 
 
 def views(plan: ScanPlan) -> Iterator[View]:
     """The saved images of `plan` by camera setting and kind; long sequences are sampled."""
     batches: dict[tuple[CameraSettings, ImageKind], tuple[list[int], list[int]]] = {}
-    seen: dict[CameraSettings, CameraSettings] = {}
     first = 0
     for g in plan.groups:
         if g.files and min(g.camera.shape) > 0:
-            camera = seen.get(g.camera)
-            if camera is None:
-                camera = replace(g.camera, frames=1, averages=1, exposure_ms=1.0)
-                seen[g.camera] = camera
+            camera = replace(g.camera, frames=1, averages=1, exposure_ms=1.0)
             index, lines = batches.setdefault((camera, g.kind), ([], []))
             count = min(len(g), _PROBES) if g.moving else 1
             probes = np.linspace(0, len(g) - 1, count).round().astype(int).tolist()
@@ -381,27 +379,19 @@ def _tangents(p: Poses, radius: float) -> list[FloatArray]:
     sine = np.minimum(radius / distance, 1.0)
     cosine = np.sqrt(1.0 - sine**2)
     across = np.stack([-toward[:, 1], toward[:, 0]], axis=1)
-    out = []
-    for sign in (1.0, -1.0):
-        point = p.axis.copy()
-        point[:, :2] += radius * (sine * toward + sign * cosine * across)
-        point[:, 2] = p.source[:, 2]
-        out.append(point)
-    return out
+    aside = [radius * (sine * toward + sign * cosine * across) for sign in (1.0, -1.0)]
+    return [np.column_stack([p.axis[:, :2] + xy, p.source[:, 2]]) for xy in aside]
 
 
 def _rims(p: Poses, radius: float, half_height: float) -> list[FloatArray]:
     """Nearest and farthest points of the cylinder's two rims."""
     along = (p.source - p.axis)[:, :2]
     along = along / np.linalg.norm(along, axis=1, keepdims=True)
-    out = []
-    for depth in (radius, -radius):
-        for height in (half_height, -half_height):
-            point = p.axis.copy()
-            point[:, :2] += depth * along
-            point[:, 2] += height
-            out.append(point)
-    return out
+    return [
+        p.axis + np.column_stack([depth * along, np.full(len(along), height)])
+        for depth in (radius, -radius)
+        for height in (half_height, -half_height)
+    ]
 
 
 def _project(p: Poses, points: FloatArray, shape: tuple[int, int]) -> FloatArray:

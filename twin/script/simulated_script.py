@@ -1,6 +1,6 @@
 """Runs the commands of a script on a virtual clock and records steps, motion, images and problems.
 
-There is one method for each type of command. Each returns when the command takes effect and when it
+There is one method for each kind of command. Each returns when the command takes effect and when it
 is complete; the command's wait decides when the script continues. A problem never ends the
 planning: steps and frames are planned all the same. `planner` judges the beam's view.
 """
@@ -77,7 +77,8 @@ class Simulation:
             before = self.now
             if isinstance(command, _CAMERA):  # a busy camera keeps the script waiting (assumed)
                 self.now = max(self.now, self.camera.free_at)
-            span = _EFFECTS[type(command)](self, command)
+            effect = next(_EFFECTS[cls] for cls in type(command).__mro__ if cls in _EFFECTS)
+            span = effect(self, command)
             self.now = self._release(command, span)
             holds = self.now - before
             self.steps.append(
@@ -159,10 +160,8 @@ class Simulation:
 
     def _ready(self, _command: c.WaitXrayReady) -> planned.Span:
         if not self.tube.on:
-            self.findings.error(
-                "xray_never_ready",
-                "waits until the X-rays are ready, but they are off: the script would hang here",
-            )
+            what = "waits until the X-rays are ready, but they are off: the script would hang here"
+            self.findings.error("xray_never_ready", what)
             return self.timed("command")
         left = self.tube.ready_at - self.now
         if left <= 0.0:
@@ -288,14 +287,9 @@ class Simulation:
             )
             self.imaging.trigger = None
             return end
+        unit, run_up = self.machine.axes[motor].unit, abs(position - begin[motor])
         self.imaging.trigger = planned.Trigger(
-            command.component,
-            motor,
-            trajectory,
-            position,
-            time,
-            position - begin[motor],
-            command.line,
+            command.component, motor, unit, trajectory, position, time, run_up
         )
         return time
 
@@ -304,21 +298,15 @@ _CAMERA: Final = (c.CameraSetting, c.TakeImage, c.SaveImage, c.TakeSequence)
 _Effect = Callable[[Simulation, Any], planned.Span]
 
 _EFFECTS: Final[Mapping[type[c.Command], _Effect]] = {
+    c.Command: lambda s, _: s.timed("command"),
     c.Pause: lambda s, k: s.timed("command", k.duration_ms / 1000.0),
-    c.SetOutputPath: lambda s, _: s.timed("command"),
     c.SetSampleInfo: Simulation._sample_info,
-    c.KeepXrayOn: lambda s, _: s.timed("command"),
     c.WriteSettingsFile: Simulation._write_settings,
     c.XrayOn: Simulation._xray_on,
     c.XrayOff: Simulation._xray_off,
     c.WaitXrayReady: Simulation._ready,
-    c.SetVoltage: lambda s, k: s._tube(kV=k.kV),
-    c.SetPower: lambda s, k: s._tube(power_W=k.power_W),
-    c.SetMode: lambda s, k: s._stated({"mode": k.mode}),
-    c.SetExposure: lambda s, k: s._stated({"exposure_ms": k.exposure_ms}),
-    c.SetFrames: lambda s, k: s._stated({"frames": k.frames}),
-    c.SetAverages: lambda s, k: s._stated({"averages": k.averages}),
-    c.SetRoi: lambda s, k: s._stated({"roi": k.roi}),
+    c.TubeSetting: lambda s, k: s._tube(**k.arguments),
+    c.CameraSetting: lambda s, k: s._stated(k.arguments),
     c.TakeImage: lambda s, k: s.imaging.take(k, s.now, len(s.steps)),
     c.SaveImage: lambda s, k: s.imaging.save(k, s.now, len(s.steps)),
     c.TakeSequence: lambda s, k: s.imaging.sequence(k, s.now, len(s.steps)),
@@ -327,3 +315,4 @@ _EFFECTS: Final[Mapping[type[c.Command], _Effect]] = {
     c.SetAcceleration: Simulation._set_rate,
     c.Custom: Simulation._custom,
 }
+"""By the command's type, or the nearest above it."""
