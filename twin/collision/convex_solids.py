@@ -289,7 +289,7 @@ def convex_pieces(
     turn = np.eye(3) if rotation is None else np.asarray(rotation, dtype=np.float64)
     placed = vertices @ turn.T + np.asarray(offset, dtype=np.float64)
     triangles = placed[np.asarray(mesh.faces)]
-    whole = _Piece.of(triangles)
+    whole = _Piece(triangles)
     if len(triangles) > MAX_CUTTING_FACES:
         return (whole.hull,)
     pieces = [whole]
@@ -308,15 +308,10 @@ def convex_pieces(
 class _Piece:
     """Triangles whose hull holds a part of the solid."""
 
-    def __init__(self, triangles: FloatArray, solid: Polytope) -> None:
-        self.triangles = triangles
-        self.hull = solid
-        corners = solid.vertices[solid.faces]
+    def __init__(self, triangles: FloatArray) -> None:
+        self.triangles, self.hull = triangles, hull(triangles.reshape(-1, 3))
+        corners = self.hull.vertices[self.hull.faces]
         self.volume = float(np.linalg.det(corners).sum()) / 6.0
-
-    @classmethod
-    def of(cls, triangles: FloatArray) -> _Piece:
-        return cls(triangles, hull(triangles.reshape(-1, 3)))
 
 
 def _best_cut(piece: _Piece) -> Sequence[_Piece] | None:
@@ -330,7 +325,7 @@ def _best_cut(piece: _Piece) -> Sequence[_Piece] | None:
             halves = [_clip(piece.triangles, axis, at, side) for side in (-1.0, 1.0)]
             if any(len(h) == 0 for h in halves):
                 continue
-            made = [_Piece.of(h) for h in halves]
+            made = [_Piece(h) for h in halves]
             volume = sum(m.volume for m in made)
             if volume < wanted:
                 best, wanted = made, volume

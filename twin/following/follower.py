@@ -23,7 +23,7 @@ from flexdt.twin.following.mirror import MOST_WAITING, Alarm, Heard, Mirror, Wai
 from flexdt.twin.machine.description import Machine, Profile, unknown_axis
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.dry_run import CollisionCheck, check_plan
-from flexdt.twin.script.executed_log import MotorReply, log_line, motor_reply
+from flexdt.twin.script.executed_log import MotorReply, log_line, motor_reply, reply_bytes
 from flexdt.twin.script.grammar import FIXED, ArgumentError, describe, find, number
 from flexdt.twin.script.plan import PlanStep, Range, SampleSize, step_range, total_range
 from flexdt.twin.script.planner import plan_script, simulated
@@ -248,8 +248,8 @@ class Follower:
         for name in moved:
             path = sim.motors.all[name].moves[-1][1]
             rests = mirror.axes[name].at_rest
-            rests = replace(rests, begun_s=waiting.heard.late_s, delay_s=delay)
-            axis = replace(rests, path=path, target=path.target, mover=waiting.heard.identity)
+            axis = replace(rests, begun_s=waiting.heard.late_s, delay_s=delay, path=path,
+                           target=path.target, mover=waiting.heard.identity)  # fmt: skip
             mirror = replace(mirror, axes={**mirror.axes, name: axis})
             mirror = self._near_limit(mirror, name, path.target, now)
         known = waiting.heard.words[0] in (*self.machine.axes, *self.machine.virtual_axes)
@@ -342,7 +342,7 @@ class Follower:
     def _arrived(self, mirror: Mirror, waiting: Waiting, heard: Heard, now: float) -> Mirror:
         """A move has ended: where, and with which limits, as its reply says."""
         axis = waiting.heard.words[0]
-        motor = motor_reply(_bytes(heard.reply))
+        motor = motor_reply(reply_bytes(heard.reply))
         at = motor.position if motor is not None else _number(heard.reply)
         own = [n for n in waiting.targets if _stays(mirror, n, waiting)]
         mirror = _rests(mirror, waiting)
@@ -382,7 +382,7 @@ class Follower:
     def _read(self, mirror: Mirror, heard: Heard, waiting: Waiting | None, now: float) -> Mirror:
         """Feedback, or the answer to a question: a motor's position is compared with its path."""
         asks = heard.asks or (waiting.heard.asks if waiting is not None else "")
-        axis, motor = heard.words[0], motor_reply(_bytes(heard.reply))
+        axis, motor = heard.words[0], motor_reply(reply_bytes(heard.reply))
         at = motor.position if motor is not None else _number(heard.reply)
         moves = waiting is not None and bool(waiting.targets)
         known = self.machine.has(axis) and (moves or asks == "position" or motor is not None)
@@ -500,15 +500,7 @@ def _line(waiting: Waiting, wait: str, took: float, reply: str) -> tuple[bytes, 
         return ()
     if isinstance(command, c.MoveAbsolute) and words[1] != "move absolute":
         words = (words[0], "move absolute", repr(command.target), "")
-    return (log_line(words, wait, took, _bytes(reply), waiting.heard.stamp),)
-
-
-def _bytes(text: str) -> bytes:
-    """A reply's bytes: one for each character, as clusters come; or UTF-8."""
-    try:
-        return text.encode("latin-1")
-    except UnicodeEncodeError:
-        return text.encode("utf-8", "replace")
+    return (log_line(words, wait, took, reply_bytes(reply), waiting.heard.stamp),)
 
 
 def _number(text: str) -> float | None:

@@ -167,14 +167,10 @@ def check_roi(roi: Roi, grid: PixelGrid, binning: int) -> Roi:
     Raises:
         LimitError: says which edge, its value and what is allowed.
     """
-    for name, value, size in (
-        ("left", roi.left, grid.columns),
-        ("right", roi.right, grid.columns),
-        ("top", roi.top, grid.rows),
-        ("bottom", roi.bottom, grid.rows),
-    ):
+    for name, value in vars(roi).items():
+        sides = name in ("left", "right")
+        what, size = ("columns", grid.columns) if sides else ("rows", grid.rows)
         if not 0 <= value < size:
-            what = "columns" if name in ("left", "right") else "rows"
             raise LimitError(
                 f"ROI {roi}: {name} {value} is outside the sensor's {size} {what} "
                 f"(allowed: 0 to {size - 1})",

@@ -130,14 +130,8 @@ def plan_move(
     for name, target in motors.items():
         current = drives[name].at(now)
         speed, acceleration = pace[name]
-        out[name] = motion.move(
-            current.position(now),
-            current.velocity(now),
-            target,
-            speed,
-            max(acceleration, current.acceleration(now)),
-            now,
-        )
+        acceleration = max(acceleration, current.acceleration(now))
+        out[name] = current.redirected(target, speed, acceleration, now)
     return out
 
 
@@ -174,13 +168,14 @@ def plan_jog(
     def run(name: str, lease: float) -> Trajectory:
         """A motor's share: it runs for `lease` [s], or as far as its limit."""
         axis, current = machine.axes[name], drives[name].at(now)
-        begin, wanted = (current.position(now), current.velocity(now)), velocity * moves[name]
+        wanted = velocity * moves[name]
         acceleration = max(pace[name][1], current.acceleration(now))
-        free = motion.jog(*begin, wanted, lease, acceleration, now)
+        here = current.position(now), current.velocity(now)
+        free = motion.jog(*here, wanted, lease, acceleration, now)
         if axis.lower <= free.target <= axis.upper:
             return free
         limit = axis.upper if free.target > axis.upper else axis.lower
-        return motion.move(*begin, limit, max(abs(wanted), 1e-9), acceleration, now)
+        return current.redirected(limit, max(abs(wanted), 1e-9), acceleration, now)
 
     # Coupled motors brake together, when the first of them has to brake for its limit.
     lease = lease_s

@@ -142,6 +142,12 @@ class Trajectory:
             for p, stop in ends
         )
 
+    def redirected(
+        self, target: float, speed: float, acceleration: float, time: float
+    ) -> Trajectory:
+        """The motion to rest at `target` from what this one does at `time`, as `move` plans it."""
+        return move(self.position(time), self.velocity(time), target, speed, acceleration, time)
+
     def shifted(self, dt: float) -> Trajectory:
         """The same motion `dt` seconds later."""
         pieces = tuple(

@@ -205,14 +205,9 @@ class Lookahead:
             return None
         ((name, planned),) = new.items()
         current = self.drives[name].at(self.now)
-        way = motion.move(
-            current.position(self.now),
-            current.velocity(self.now),
-            contact.last_free[name],
-            max(planned.top_speed, motion.LEAST_RATE),
-            max(planned.acceleration(self.now), motion.LEAST_RATE),
-            self.now,
-        )
+        speed = max(planned.top_speed, motion.LEAST_RATE)
+        acceleration = max(planned.acceleration(self.now), motion.LEAST_RATE)
+        way = current.redirected(contact.last_free[name], speed, acceleration, self.now)
         halted = {name: way}
         return halted if self.contact(halted) is None else None
 
@@ -377,14 +372,19 @@ class UnsweptProgramme:
 
     def certified(self) -> CertifiedProgramme:
         """Sweep all of it; takes about 60 ms for 1440 steps."""
-        trajectories = {name: motion.at_rest(x, 0.0) for name, x in self.start.items()}
+        standing = {name: motion.at_rest(x, 0.0) for name, x in self.start.items()}
+        legs = {name: motion.joined(legs) for name, legs in self.legs.items()}
+        contact = None if self.guard is None else self.guard({**standing, **legs}, 0.0)
+        return CertifiedProgramme(self, contact)
+
+    @property
+    def legs(self) -> dict[str, tuple[Trajectory, ...]]:
+        """Motor -> what it follows, the wait for a first leg that begins later included."""
+        out = {}
         for name, legs in self.programme.items():
-            if legs:
-                wait = [trajectories[name]] if legs[0].start > 0.0 else []
-                trajectories[name] = motion.joined([*wait, *legs])
-        return CertifiedProgramme(
-            self, None if self.guard is None else self.guard(trajectories, 0.0)
-        )
+            wait = [motion.at_rest(self.start[name], 0.0)] if legs and legs[0].start > 0.0 else []
+            out[name] = (*wait, *legs)
+        return {name: legs for name, legs in out.items() if legs}
 
 
 @dataclass(frozen=True)

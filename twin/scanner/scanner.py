@@ -390,12 +390,9 @@ class ScannerTwin:
             what = "the programme was checked for another stage or another start; nothing moves"
             raise SafetyError(what, {"asked": "a programme", "allowed": "checking it again"})
         self._programmes += 1
-        for name, trajectories in prepared.programme.items():
-            if trajectories:
-                here = motion.at_rest(prepared.start[name], 0.0)
-                legs = (*((here,) if trajectories[0].start > 0.0 else ()), *trajectories)
-                shifted = (leg.shifted(now) for leg in legs)
-                self._drives[name] = self._drives[name].following(*shifted)
+        for name, legs in prepared.legs.items():
+            shifted = (leg.shifted(now) for leg in legs)
+            self._drives[name] = self._drives[name].following(*shifted)
 
     # The stage ----------------------------------------------------------------------------------
 

@@ -162,11 +162,15 @@ def log_line(words: tuple[str, ...], wait: str, own_s: float, reply: bytes, stam
     """
     plain = [" ".join(word.split()) if "\0" not in word else word for word in words]
     head = "\t".join([*plain, wait, "", "", f"{1000.0 * own_s:.0f}", ""])
+    return reply_bytes(head) + reply + f"\t{stamp}\r\n".encode()
+
+
+def reply_bytes(text: str) -> bytes:
+    """A text's bytes: one for each character, as clusters come; or UTF-8."""
     try:
-        data = head.encode("latin-1")
+        return text.encode("latin-1")
     except UnicodeEncodeError:
-        data = head.encode("utf-8", "replace")
-    return data + reply + f"\t{stamp}\r\n".encode()
+        return text.encode("utf-8", "replace")
 
 
 def motor_cluster(motor: MotorReply) -> bytes:

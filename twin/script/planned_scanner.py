@@ -158,15 +158,11 @@ class PlannedTube:
         """Whether X-rays are on at `time`, not before the last switching."""
         return self.on and time >= self.lit_from
 
-    def set(self, time: float, *, kV: float | None = None, power_W: float | None = None) -> None:
-        """Change a setting at `time`."""
+    def set(self, time: float, name: str, value: float) -> None:
+        """Change `kV` or `power_W` at `time`."""
         self._close(time)
-        if kV is not None:
-            self.kV = kV
-            self.said.add("kV")
-        if power_W is not None:
-            self.power_W = power_W
-            self.said.add("power_W")
+        setattr(self, name, value)
+        self.said.add(name)
 
     def intervals(self, end: float) -> tuple[BeamOn, ...]:
         """When X-rays were on, up to `end`."""

@@ -168,17 +168,16 @@ class Simulation:
             return self.timed("command")
         return planned.Span(self.now, self.now + left, left, "xray_ready")
 
-    def _tube(self, kV: float | None = None, power_W: float | None = None) -> planned.Span:
+    def _tube(self, change: Mapping[str, float]) -> planned.Span:
         """Voltage or power; what the tube does not allow is noted and stays as it was."""
+        [(name, value)] = change.items()
         now = TubeSettings(self.tube.kV, self.tube.power_W)
         try:
-            changed_tube(self.machine.tube, now, kV, power_W)
+            changed_tube(self.machine.tube, now, change.get("kV"), change.get("power_W"))
         except LimitError as error:
             self.findings.error("limit", error.message)
-            kV, power_W = (
-                None if x is None else y for x, y in ((kV, now.kV), (power_W, now.power_W))
-            )
-        self.tube.set(self.now, kV=kV, power_W=power_W)
+            value = getattr(now, name)
+        self.tube.set(self.now, name, value)
         return self.timed("set_tube")
 
     # camera --------------------------------------------------------------------------------
@@ -305,7 +304,7 @@ _EFFECTS: Final[Mapping[type[c.Command], _Effect]] = {
     c.XrayOn: Simulation._xray_on,
     c.XrayOff: Simulation._xray_off,
     c.WaitXrayReady: Simulation._ready,
-    c.TubeSetting: lambda s, k: s._tube(**k.arguments),
+    c.TubeSetting: lambda s, k: s._tube(k.arguments),
     c.CameraSetting: lambda s, k: s._stated(k.arguments),
     c.TakeImage: lambda s, k: s.imaging.take(k, s.now, len(s.steps)),
     c.SaveImage: lambda s, k: s.imaging.save(k, s.now, len(s.steps)),
