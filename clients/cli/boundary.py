@@ -36,25 +36,49 @@ WIRE_EXIT_CODES: Final[Mapping[object, int]] = {
 }
 """Error codes of the wire that have an exit code of their own; all others are invalid input."""
 
+UNREACHABLE: Final = (errno.EADDRINUSE, errno.EADDRNOTAVAIL, errno.ENETUNREACH)
+
 LIMIT_CODES: Final = ("limit", "collision")
 """Codes of a script's problems that mean exit code 3."""
 
 
 def describe(error: Exception) -> tuple[tuple[str, ...], int]:
     """What to print for an error, and the exit code it means."""
-    if isinstance(error, CommandError):
-        return tuple(f"flexdt: {line}" for line in error.lines), error.exit_code
+    from flexdt.protocol.rpc_errors import RpcError
+    from flexdt.twin import errors as twin
+
     if callable(getattr(error, "format_message", None)):  # typer's usage errors, any version
         return _usage(error), USAGE
-    for known in (_wire_error, _twin_error, _system_error):
-        answer = known(error)
-        if answer is not None:
-            return answer
-    kind = type(error).__name__
-    return (
-        f"flexdt: internal error: {kind}: {_first_line(error)}",
-        "flexdt: this is a defect in flexdt; FLEXDT_TRACEBACK=1 shows where it happened",
-    ), INVALID
+    if isinstance(error, RpcError):
+        return _wire_error(error), wire_code(error)
+    lines: Sequence[str] = str(error).splitlines()
+    code = INVALID
+    match error:
+        case CommandError():
+            lines, code = error.lines, error.exit_code
+        case twin.LimitError() | twin.CollisionError():
+            code = LIMIT
+        case twin.SafetyError():
+            code = REFUSED
+        case twin.NotIdentifiableError():
+            code = NOT_IDENTIFIABLE
+        case twin.TwinError():
+            pass
+        case ConnectionError() | TimeoutError():
+            lines, code = [_first_line(error)], REFUSED
+        case OSError() if error.errno in UNREACHABLE:
+            lines, code = [str(error.strerror)], REFUSED
+        case OSError():
+            where = f"{_asked(error.filename)}: " if error.filename else ""
+            lines = [f"{where}{error.strerror or _first_line(error)}"]
+        case UnicodeDecodeError():
+            lines = [f"not valid {error.encoding} text: {error.reason}"]
+        case _:
+            lines = [
+                f"internal error: {type(error).__name__}: {_first_line(error)}",
+                "this is a defect in flexdt; FLEXDT_TRACEBACK=1 shows where it happened",
+            ]
+    return tuple(f"flexdt: {line}" for line in lines), code
 
 
 def _usage(error: Exception) -> tuple[str, ...]:
@@ -72,18 +96,13 @@ def _usage(error: Exception) -> tuple[str, ...]:
     return (f"{command}: {message}", f"Try '{command} --help'.")
 
 
-def _wire_error(error: Exception) -> tuple[tuple[str, ...], int] | None:
+def _wire_error(error: RpcError) -> tuple[str, ...]:
     """An error reply of a server: `code`, `message` and `data` of JSON-RPC."""
-    from flexdt.protocol.rpc_errors import RpcError
-
-    if not isinstance(error, RpcError):
-        return None
     lines = [error.message]
     if isinstance(error.data, Mapping):  # the message states the first parameter's problem
         found = error.data.get("problems", ())
         lines += [f"{p['path']}: {p['message']}" for p in found[1:] if "path" in p]
-    shown = [f"flexdt: {line}" for line in lines]
-    return (*shown, *positions(error.data)), wire_code(error)
+    return (*(f"flexdt: {line}" for line in lines), *positions(error.data))
 
 
 def wire_code(error: RpcError) -> int:
@@ -100,37 +119,6 @@ def verdict(errors: Iterable[str]) -> int:
     if codes - set(LIMIT_CODES):
         return INVALID
     return LIMIT if codes else DONE
-
-
-def _twin_error(error: Exception) -> tuple[tuple[str, ...], int] | None:
-    from flexdt.twin import errors as twin
-
-    lines = tuple(f"flexdt: {line}" for line in str(error).splitlines())
-    match error:
-        case twin.LimitError() | twin.CollisionError():
-            return lines, LIMIT
-        case twin.SafetyError():
-            return lines, REFUSED
-        case twin.NotIdentifiableError():
-            return lines, NOT_IDENTIFIABLE
-        case twin.TwinError():
-            return lines, INVALID
-    return None
-
-
-def _system_error(error: Exception) -> tuple[tuple[str, ...], int] | None:
-    if isinstance(error, ConnectionError | TimeoutError):
-        return (f"flexdt: {_first_line(error)}",), REFUSED
-    if isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError):
-        return (f"flexdt: {_asked(error.filename)}: {error.strerror}",), INVALID
-    if isinstance(error, OSError):
-        if error.errno in (errno.EADDRINUSE, errno.EADDRNOTAVAIL, errno.ENETUNREACH):
-            return (f"flexdt: {error.strerror}",), REFUSED
-        where = f"{_asked(error.filename)}: " if error.filename else ""
-        return (f"flexdt: {where}{error.strerror or _first_line(error)}",), INVALID
-    if isinstance(error, UnicodeDecodeError):
-        return (f"flexdt: not valid {error.encoding} text: {error.reason}",), INVALID
-    return None
 
 
 def _asked(file: object) -> str:

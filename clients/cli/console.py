@@ -133,26 +133,11 @@ class ProgressBar:
     def __enter__(self) -> ProgressBar:
         if self._terminal:
             from rich.console import Console
-            from rich.progress import (
-                BarColumn,
-                MofNCompleteColumn,
-                Progress,
-                TextColumn,
-                TimeElapsedColumn,
-                TimeRemainingColumn,
-            )
+            from rich.progress import MofNCompleteColumn, Progress, TextColumn
 
-            self._bar = Progress(
-                TextColumn("{task.description}"),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TextColumn(self._unit),
-                TimeElapsedColumn(),
-                TextColumn("left"),
-                TimeRemainingColumn(),
-                console=Console(stderr=True),
-                transient=False,
-            )
+            usual = Progress.get_default_columns()  # description, bar, percentage, time left
+            counted = MofNCompleteColumn(), TextColumn(self._unit)
+            self._bar = Progress(*usual, *counted, console=Console(stderr=True))
             self._bar.start()
             self._task = self._bar.add_task(self._title, total=None)
         else:

@@ -248,20 +248,15 @@ def moved(data: DataSet, report: Report) -> DataSet:
     from flexdt.twin.errors import TwinError
     from flexdt.twin.geometry.motion import Motion
 
-    folders = report.document.get("datasets")
-    if not (
-        isinstance(told, list)
-        and isinstance(folders, list)
-        and len(told) == len(folders) > 0
-        and all(isinstance(m, dict) and all(isinstance(c, dict) for c in m.values()) for m in told)
-    ):
-        raise CommandError(f"{path}: its motion is not that of a report of flexdt calibrate")
-    moving = [m for m in told if any(c.get("moves") for c in m.values())]
-    here = [
-        m
-        for m, f in zip(told, folders, strict=True)
-        if data.folder is not None and Path(str(f)).resolve() == data.folder.resolve()
-    ]
+    folders: Any = report.document.get("datasets")
+    own = data.folder and data.folder.resolve()
+    try:
+        moving = [m for m in told if any(c.get("moves") for c in m.values())]
+        pairs = list(zip(told, folders, strict=True))
+    except (AttributeError, TypeError, ValueError):
+        why = f"{path}: its motion is not that of a report of flexdt calibrate"
+        raise CommandError(why) from None
+    here = [m for m, folder in pairs if own and Path(str(folder)).resolve() == own]
     if moving and len(here) != 1:
         note(
             f"{path}: warning: the motion in it is that of {', '.join(map(str, folders))} and is "

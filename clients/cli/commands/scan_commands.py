@@ -387,12 +387,12 @@ def list_jobs(twin: Twin) -> Answer:
     yield table(rows, ("job", "state", "frames", "data set")) if rows else "no jobs yet"
 
 
-def _on_job(does: str, act: Callable[[TwinClient, str | None], JobStatus]) -> Callable[..., Answer]:
+def _on_job(does: str, method: str) -> Callable[..., Answer]:
     """A command that does something with one job and shows how the job is then."""
 
     def command(twin: Twin, job: Job = None) -> Answer:
         with twin() as client:
-            status = act(client, job)
+            status: JobStatus = getattr(client, method)(job)
         warn(status.warnings)
         yield status
         yield describe(status)
@@ -419,19 +419,11 @@ def describe(status: JobStatus) -> str:
 
 JOB_COMMANDS: Final = {
     "list": list_jobs,
-    "status": _on_job("Show how far a job is.", lambda client, job: client.job_status(job)),
-    "pause": _on_job(
-        "Pause a job; a frame under exposure is taken again.",
-        lambda client, job: client.pause_job(job),
-    ),
-    "resume": _on_job(
-        "Return to the pose of the pause and go on.", lambda client, job: client.resume_job(job)
-    ),
-    "step": _on_job("Run a paused job for one step.", lambda client, job: client.step_job(job)),
-    "abort": _on_job(
-        "End a job; its data set stays, marked incomplete.",
-        lambda client, job: client.abort_job(job),
-    ),
+    "status": _on_job("Show how far a job is.", "job_status"),
+    "pause": _on_job("Pause a job; a frame under exposure is taken again.", "pause_job"),
+    "resume": _on_job("Return to the pose of the pause and go on.", "resume_job"),
+    "step": _on_job("Run a paused job for one step.", "step_job"),
+    "abort": _on_job("End a job; its data set stays, marked incomplete.", "abort_job"),
 }
 """Commands of the group by name."""
 
