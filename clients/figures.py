@@ -11,14 +11,13 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from itertools import cycle
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.errors import TwinError
+from flexdt.clients.extras import package
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,11 +45,7 @@ def require_plots() -> None:
     Raises:
         TwinError: matplotlib is not installed.
     """
-    if find_spec("matplotlib") is None:
-        raise TwinError(
-            "figures need matplotlib, which is not installed: pip install 'flexdt[plots]'",
-            {"asked": "matplotlib", "allowed": ["reports as JSON"]},
-        )
+    package("matplotlib", "a figure", "plots")
 
 
 def blank(width: float, height: float) -> Figure:

@@ -21,6 +21,7 @@ import os
 import ssl as tls
 import threading
 from collections.abc import Callable, Coroutine, Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Any, Final, Generic, ParamSpec, Protocol, TypeVar, overload
 
 from flexdt.clients.client import twin_methods as m
@@ -63,40 +64,33 @@ class Listener(Protocol):
         """No more events will come."""
 
 
+@dataclass(eq=False)
 class Core:
     """A client's connection and what it keeps between calls.
 
-    Args:
+    Attributes:
         transport: to the server.
         name: of this program, for people who look at the server.
         token: where the server requires one.
         timeout_s: for an answer [s].
         reconnect_s: how long to try after a connection has been lost [s].
         wait_s: how long to try the first time, for a server that is just starting [s].
-
-    Attributes:
         hello: the server's answer to the newest greeting; None before the first.
         link: the newest connection, which may have ended.
         closed: whether the client has been closed for good.
     """
 
-    def __init__(
-        self,
-        transport: Transport,
-        *,
-        name: str,
-        token: str | None,
-        timeout_s: float,
-        reconnect_s: float,
-        wait_s: float,
-    ) -> None:
-        self.transport, self._name, self._token = transport, name, token
-        self.timeout_s, self.reconnect_s, self.wait_s = timeout_s, reconnect_s, wait_s
-        self.hello: HelloResult | None = None
-        self.link: Link | None = None
-        self.closed = False
-        self._listeners: dict[Listener, Mapping[str, object]] = {}
-        self._connecting = asyncio.Lock()
+    transport: Transport
+    name: str
+    token: str | None
+    timeout_s: float
+    reconnect_s: float
+    wait_s: float
+    hello: HelloResult | None = None
+    link: Link | None = None
+    closed: bool = False
+    _listeners: dict[Listener, Mapping[str, object]] = field(default_factory=dict)
+    _connecting: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     async def connected(self) -> Link:
         """A link that is alive.
@@ -223,7 +217,7 @@ class Core:
         await self.transport.open()
         link = Link(self.transport, self._deliver, self._ended)
         try:
-            params = hello_params(self._name, self._token)
+            params = hello_params(self.name, self.token)
             answer = await link.request("session.hello", params, self.timeout_s)
             hello = parse_result(HelloResult, answer)
             for wanted in list(self._listeners.values()):
@@ -374,10 +368,8 @@ class AsyncTwinClient(SharedMethods):
         wait_s: float = 0.0,
         ssl: tls.SSLContext | None = None,
     ) -> None:
-        self.core = Core(
-            TcpTransport(host, port, ssl=ssl) if transport is None else transport,
-            name=name, token=token, timeout_s=timeout_s, reconnect_s=reconnect_s, wait_s=wait_s,
-        )  # fmt: skip
+        link = TcpTransport(host, port, ssl=ssl) if transport is None else transport
+        self.core = Core(link, name, token, timeout_s, reconnect_s, wait_s)
 
     async def connect(self) -> AsyncTwinClient:
         """Connect now; returns the client.
