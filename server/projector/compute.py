@@ -1,11 +1,12 @@
-"""The one thread that computes, and the jobs it works on block by block.
+"""The one thread that computes, and the work of a request, which it does block by block.
 
 Numba's kernels use all cores by themselves and release the interpreter, so one thread is enough
 and the event loop stays responsive. A job's blocks go to the loop as they are made.
 
-Lanes of the queue take turns, so a long scan never starves a single view. A lane is one client's
-batch work or one client's interactive work. Within a lane tasks keep their order. Thread-safe: one
-thread takes, any thread puts.
+Steps are computed in the order in which they come, and a lane has one of them in the queue at a
+time, so lanes take turns and a long scan never starves a single view. A lane is one client's batch
+work or one client's interactive work. A block is asked for when the one before it has been sent: of
+a client that does not read nothing is computed.
 
 `begin` sets the number of threads and compiles before the first request.
 """
@@ -17,256 +18,113 @@ import logging
 import os
 import threading
 import time
-from collections import OrderedDict, deque
-from collections.abc import Callable, Hashable, Iterator
-from dataclasses import dataclass, field
-from typing import Final, Generic, TypeVar
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from dataclasses import dataclass
+from queue import SimpleQueue
+from typing import Final
 
 import numba
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.protocol.rpc_errors import RpcError, internal, invalid_params, too_large
 from flexdt.runtime import compile_ahead
-from flexdt.runtime.log import log
-from flexdt.twin.errors import TwinError
 from flexdt.twin.projection import Body, gpu, project_body
 from flexdt.twin.projection.analytic import warm_up_forward
 from flexdt.twin.projection.kernels.compiling import LOG
-
-T = TypeVar("T")
-
-
-class FairQueue(Generic[T]):
-    """Round-robin over lanes.
-
-    Args:
-        ready: whether a lane may be served now (its client has room for results).
-    """
-
-    def __init__(self, ready: Callable[[Hashable], bool] = lambda lane: True) -> None:
-        self._ready = ready
-        self._lanes: OrderedDict[Hashable, deque[T]] = OrderedDict()
-        self._changed = threading.Condition()
-        self._closed = False
-
-    def __len__(self) -> int:
-        with self._changed:
-            return sum(len(lane) for lane in self._lanes.values())
-
-    def put(self, lane: Hashable, task: T, *, front: bool = False) -> None:
-        """Add a task to the end of its lane (or put one back to the front)."""
-        with self._changed:
-            waiting = self._lanes.setdefault(lane, deque())
-            if front:
-                waiting.appendleft(task)
-            else:
-                waiting.append(task)
-            self._changed.notify()
-
-    def take(self) -> T | None:
-        """Wait for a task of the lane whose turn it is; None once the queue is closed."""
-        with self._changed:
-            while not self._closed:
-                for lane, waiting in self._lanes.items():
-                    if self._ready(lane):
-                        task = waiting.popleft()
-                        if waiting:
-                            self._lanes.move_to_end(lane)
-                        else:
-                            del self._lanes[lane]
-                        return task
-                self._changed.wait()
-            return None
-
-    def remove(self, wanted: Callable[[T], bool]) -> list[T]:
-        """Take out all tasks that are `wanted`, in order."""
-        out: list[T] = []
-        with self._changed:
-            for lane in list(self._lanes):
-                kept: deque[T] = deque()
-                for task in self._lanes[lane]:
-                    (out if wanted(task) else kept).append(task)
-                if kept:
-                    self._lanes[lane] = kept
-                else:
-                    del self._lanes[lane]
-        return out
-
-    def wake(self) -> None:
-        """A lane may have become ready."""
-        with self._changed:
-            self._changed.notify()
-
-    def close(self) -> None:
-        """No more tasks; `take` returns None."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-
 
 COMPILE_BACK_AFTER_S: Final = 60.0
 """So that the first scan of a new installation has both cores."""
 BLOCK_BYTES: Final = 12 * 2**20
 """Result of one turn of a job: below a frame, and short enough to share the machine fairly."""
 BLOCK_VIEWS: Final = 32
-CREDIT: Final = 3
-"""Blocks a client may have computed but not taken."""
 
 Step = Callable[[], object]
-"""A piece of work; its value goes to whoever waits for the job."""
-
-
-class Customer:
-    """A client as the compute thread sees it: how many results it has yet to take."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._untaken: dict[ComputeJob, int] = {}
-
-    @property
-    def has_room(self) -> bool:
-        """Whether a further block may be computed for it."""
-        with self._lock:
-            return sum(self._untaken.values()) < CREDIT
-
-    def begin(self, job: ComputeJob) -> bool:
-        """Count a block of `job`; False if the job is over (compute thread)."""
-        with self._lock:
-            if not job.over:
-                self._untaken[job] = self._untaken.get(job, 0) + 1
-            return not job.over
-
-    def took(self, job: ComputeJob) -> None:
-        """The client has taken a block (event loop)."""
-        with self._lock:
-            self._untaken[job] -= 1
-
-    def finish(self, job: ComputeJob) -> None:
-        """The job's request has been answered: what was not taken never will be (event loop)."""
-        with self._lock:
-            job.over = True
-            self._untaken.pop(job, None)
+"""A piece of work; its value goes to whoever waits for it."""
 
 
 @dataclass(eq=False)
 class ComputeJob:
-    """Steps of one request, run in order; results arrive in `results` on the event loop.
+    """The steps of one request, one after the other.
 
     Attributes:
-        customer: whose it is.
-        steps: the work, made lazily.
+        lane: held by the step of the lane that is in the queue.
         key: interactive requests have one (a newer one takes this one's place).
+        error: why it was given up.
     """
 
-    customer: Customer
-    steps: Iterator[Step]
+    lane: asyncio.Lock
     key: str | None = None
-    results: asyncio.Queue[object] = field(default_factory=asyncio.Queue)
-    over: bool = False
+    error: Exception | None = None
+    _turn: asyncio.Task[object] | None = None
+    _step: Future[object] | None = None
 
     @property
-    def lane(self) -> Hashable:
-        """Interactive and batch work of one client take turns."""
-        return (self.customer, self.key is not None)
+    def waits(self) -> bool:
+        """Whether a step of it waits and is not being computed."""
+        running = self._step is not None and self._step.running()
+        return self._turn is not None and not (running or self._turn.done())
 
     def end(self, error: Exception) -> None:
-        """Give up the job (event loop only): whoever waits for it gets `error`."""
-        if not self.over:
-            self.over = True
-            self.results.put_nowait(error)
+        """Give it up: whoever waits for a step of it gets `error`, and there are no more."""
+        self.error = self.error or error
+        if self._turn is not None:
+            self._turn.cancel()
 
-    async def next(self) -> object:
-        """The next result.
+    async def run(self, compute: ComputeThread, step: Step) -> object:
+        """The value of a step, once it has had its turn.
 
         Raises:
-            RpcError: the job failed, was cancelled or superseded.
+            Exception: the step's, or the one that the job was given up with.
         """
-        result = await self.results.get()
-        if isinstance(result, Exception):
-            raise result
-        return result
+        if self.error is not None:
+            raise self.error
+        self._turn = asyncio.create_task(self._in_turn(compute, step))
+        try:
+            return await self._turn
+        except asyncio.CancelledError:
+            if self.error is None:
+                raise
+            raise self.error from None
+
+    async def _in_turn(self, compute: ComputeThread, step: Step) -> object:
+        async with self.lane:
+            self._step = compute.put(step)
+            return await asyncio.wrap_future(self._step)
 
 
 class ComputeThread:
-    """Runs jobs in a thread of its own.
+    """Computes steps in a thread of its own.
 
     Args:
         begin: called first in that thread (thread count, compilation).
     """
 
     def __init__(self, begin: Callable[[], None]) -> None:
-        self._begin = begin
-        self._loop = asyncio.get_running_loop()
-        self.queue: FairQueue[tuple[ComputeJob, Step]] = FairQueue(_has_room)
-        self.ready: asyncio.Future[None] = self._loop.create_future()
+        self._steps: SimpleQueue[tuple[Future[object], Step] | None] = SimpleQueue()
+        self.ready = asyncio.wrap_future(self.put(begin))
         self._thread = threading.Thread(target=self._run, name="projector-compute", daemon=True)
         self._thread.start()
 
-    def submit(self, job: ComputeJob) -> ComputeJob:
-        """Queue a job's first step."""
-        self._next_step(job)
-        return job
-
-    def give_up(self, wanted: Callable[[ComputeJob], bool], error: Exception) -> int:
-        """End all jobs that wait and are `wanted`; how many there were."""
-        removed = self.queue.remove(lambda task: wanted(task[0]))
-        for job, _ in removed:
-            job.end(error)
-        return len(removed)
+    def put(self, step: Step) -> Future[object]:
+        """Put a step into the queue."""
+        future: Future[object] = Future()
+        self._steps.put((future, step))
+        return future
 
     def close(self, timeout_s: float = 5.0) -> None:
-        """Stop after the current step."""
-        self.queue.close()
+        """Stop after the steps that are in the queue and still wanted."""
+        self._steps.put(None)
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
-        try:
-            self._begin()
-        except Exception as error:
-            self._post(self.ready.set_exception, error)
-            return
-        self._post(self.ready.set_result, None)
-        while (task := self.queue.take()) is not None:
-            job, step = task
-            if not job.customer.begin(job):
-                continue
-            result = _guarded(step)
-            if not isinstance(result, Exception):
-                self._next_step(job, front=True)
-            self._post(job.results.put_nowait, result)
-
-    def _next_step(self, job: ComputeJob, *, front: bool = False) -> None:
-        step = next(job.steps, None)
-        if step is not None and not job.over:
-            self.queue.put(job.lane, (job, step), front=front)
-
-    def _post(self, call: Callable[..., object], value: object) -> None:
-        try:
-            self._loop.call_soon_threadsafe(call, value)
-        except RuntimeError:
-            self.queue.close()  # the loop has ended, so nobody wants results any more
-
-
-def _has_room(lane: Hashable) -> bool:
-    assert isinstance(lane, tuple)
-    customer = lane[0]
-    return isinstance(customer, Customer) and customer.has_room
-
-
-def _guarded(step: Step) -> object:
-    """The step's value, or the error to answer with."""
-    try:
-        return step()
-    except RpcError as error:
-        return error
-    except TwinError as error:
-        return invalid_params(error.message, [], error.data or None)
-    except MemoryError as error:
-        return too_large(f"a result ({error})", "more", 0, "bytes of free memory")
-    except Exception:
-        log("computation failed", logging.ERROR, error=True)
-        return internal()
+        while (put := self._steps.get()) is not None:
+            future, step = put
+            if future.set_running_or_notify_cancel():
+                try:
+                    future.set_result(step())
+                except Exception as error:
+                    future.set_exception(error)
 
 
 def projection_steps(

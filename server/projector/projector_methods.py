@@ -41,7 +41,7 @@ from flexdt.server.network.shell_parts import TokenCheck
 from flexdt.server.projector.compute import (
     ComputeJob,
     ComputeThread,
-    Customer,
+    Step,
     projection_steps,
     views_a_block,
 )
@@ -56,17 +56,22 @@ SPARE: Final = 4096
 """Room for everything but the payload in a frame."""
 
 
-class JobClient(Customer):
+class JobClient:
     """One connection, its jobs and its requests that are under way."""
 
     def __init__(self, link: FrameLink, token: str | None, lines: Sparing) -> None:
-        super().__init__()
         self.link, self.let_in = link, token is None
+        self.lanes = asyncio.Lock(), asyncio.Lock()
         self.jobs: dict[Id, ComputeJob] = {}
         self.calls: Correlation[None] = Correlation(Role.SERVER)
         self.tasks: set[asyncio.Task[None]] = set()
         self.pending_bytes = 0
         self.token_check = TokenCheck(token, self._close_soon, lines)
+
+    def begin(self, id: Id, key: str | None = None) -> ComputeJob:
+        """The work of a request, known by its id until that is answered."""
+        job = self.jobs[id] = ComputeJob(self.lanes[key is not None], key)
+        return job
 
     def _close_soon(self) -> None:
         """End the connection once its last answer has gone out."""
@@ -101,36 +106,21 @@ class Context:
     superseded: int = 0
     lines: Sparing = field(default_factory=Sparing)
 
-    def start(self, client: JobClient, id: Id, job: ComputeJob) -> ComputeJob:
-        """Submit a job, known by its request's id until that is answered."""
-        client.jobs[id] = job
-        return self.compute.submit(job)
+    @property
+    def waiting(self) -> int:
+        """Requests whose work waits for its turn."""
+        return sum(job.waits for client in self.clients.values() for job in client.jobs.values())
 
-    async def run(self, client: JobClient, id: Id, step: Callable[[], object]) -> object:
-        """One step in the compute thread; returns its value.
-
-        Raises:
-            RpcError: the step failed or was cancelled.
-        """
-        return await self.start(client, id, ComputeJob(client, iter((step,)))).next()
-
-    def took(self, client: JobClient, job: ComputeJob) -> None:
-        """A client has taken a block: the next may be computed."""
-        client.took(job)
-        self.compute.queue.wake()
-
-    def finish(self, client: JobClient, id: Id) -> None:
-        """A request has been answered."""
-        job = client.jobs.pop(id, None)
-        if job is not None:
-            client.finish(job)
-            self.compute.queue.wake()
+    async def run(self, client: JobClient, id: Id, step: Step) -> object:
+        """The value of the one step of a request."""
+        return await client.begin(id).run(self.compute, step)
 
     def supersede(self, client: JobClient, key: str) -> None:
         """End this client's interactive jobs of that key that have not been computed."""
-        self.superseded += self.compute.give_up(
-            lambda job: job.customer is client and job.key == key, superseded(key)
-        )
+        for job in client.jobs.values():
+            if job.key == key and job.waits:
+                job.end(superseded(key))
+                self.superseded += 1
 
     async def send_array(
         self, client: JobClient, id: Id, array: npt.NDArray[np.generic]
@@ -226,17 +216,15 @@ async def project(context: Context, client: JobClient, id: Id, p: Project) -> ob
     block = views_a_block(p.detector)
     if p.key is not None:
         context.supersede(client, p.key)
-    steps = projection_steps(volume, rows, p.detector, block)
-    job = context.start(client, id, ComputeJob(client, steps, p.key))
-    parts = 0
-    for start in range(0, len(rows), block):
-        views = await job.next()
+    job, parts, done = client.begin(id, p.key), 0, 0
+    for step in projection_steps(volume, rows, p.detector, block):
+        views = await job.run(context.compute, step)
         assert isinstance(views, np.ndarray)
         context.views += len(views)
         if len(views) == len(rows) and views.nbytes + SPARE <= MAX_FRAME:
             return image.encode(views)
-        parts += await context.send_parts(client, id, views, start * view)
-        context.took(client, job)
+        parts += await context.send_parts(client, id, views, done * view)
+        done += len(views)
     return {"dtype": "float32", "shape": [len(rows), *p.detector], "parts": parts}
 
 
@@ -265,7 +253,7 @@ async def health(context: Context, client: JobClient, id: Id, p: Params) -> obje
         **context.facts,
         "uptime_s": time.monotonic() - context.started,
         "clients": len(context.clients),
-        "waiting": len(context.compute.queue),
+        "waiting": context.waiting,
         "views": context.views,
         "superseded": context.superseded,
         "volumes": len(context.store),
@@ -277,12 +265,9 @@ async def health(context: Context, client: JobClient, id: Id, p: Params) -> obje
 async def cancel(context: Context, client: JobClient, id: Id, p: Cancel) -> object:
     """Give up a request."""
     job = client.jobs.get(p.request)
-    if job is None:
-        return {"cancelled": False}
-    error = cancelled(p.request)
-    job.end(error)
-    context.compute.give_up(lambda other: other is job, error)
-    return {"cancelled": True}
+    if job is not None:
+        job.end(cancelled(p.request))
+    return {"cancelled": job is not None}
 
 
 async def discover(context: Context, client: JobClient, id: Id, p: Params) -> object:

@@ -1,6 +1,6 @@
 """The projector server: connections come and go, requests are answered side by side.
 
-Compute work goes through the fair queue and results are sent as they are made. The methods are in
+Work is computed in turns (see `compute`) and results are sent as they are made. The methods are in
 `projector_methods`.
 
 On its health and metrics pages volumes are counted but not named, since names may reveal a user's
@@ -39,6 +39,7 @@ from flexdt.protocol.rpc_errors import (
     invalid_params,
     invalid_request,
     not_authorised,
+    too_large,
 )
 from flexdt.runtime.access import ConnectionLimits, check_bind
 from flexdt.runtime.http_pages import Pages, watching_pages
@@ -94,10 +95,6 @@ class ProjectorServer(ListeningServer):
     def lost(self, link: FrameLink) -> None:
         """A client has gone: nothing more is computed for it."""
         client = self.context.clients.pop(link)
-        error = ConnectionResetError("the client has gone")
-        for job in list(client.jobs.values()):
-            job.end(error)
-        self.context.compute.give_up(lambda job: job.customer is client, error)
         self.context.store.forget(client)
         for task in client.tasks:
             task.cancel()
@@ -151,7 +148,7 @@ class ProjectorServer(ListeningServer):
             log("reply not sent", logging.ERROR, error=True, client=client.link.peer)
             client.link.transport.abort()
         finally:
-            self.context.finish(client, request)
+            client.jobs.pop(request, None)
             client.pending_bytes -= len(body)
             if client.pending_bytes <= MAX_PENDING_BYTES and not client.link.lost:
                 client.link.transport.resume_reading()
@@ -173,6 +170,8 @@ class ProjectorServer(ListeningServer):
             return Failure(id, error)
         except TwinError as error:
             return Failure(id, invalid_params(error.message, [], error.data or None))
+        except MemoryError as error:
+            return Failure(id, too_large(f"a result ({error})", "more", 0, "bytes of free memory"))
         except ConnectionError:
             raise
         except Exception:
@@ -255,7 +254,7 @@ def projector_pages(server: ProjectorServer, requests: Requests) -> Pages:
             gauge("flexdt_connections", "Clients connected.", len(context.clients)),
             counter("flexdt_views_total", "Views projected.", context.views),
             counter("flexdt_superseded_total", "Requests overtaken.", context.superseded),
-            gauge("flexdt_waiting", "Pieces of work that wait.", len(context.compute.queue)),
+            gauge("flexdt_waiting", "Pieces of work that wait.", context.waiting),
             gauge("flexdt_volumes", "Volumes and scenes held.", len(store)),
             gauge("flexdt_volume_bytes", "Memory they take.", store.used),
             gauge("flexdt_volume_limit_bytes", "Memory they may take.", store.limit),

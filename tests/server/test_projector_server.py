@@ -289,7 +289,7 @@ def test_keys_of_different_clients_do_not_touch(monkeypatch: pytest.MonkeyPatch)
         links = [await ProjectorLink.connect("127.0.0.1", server.port) for _ in range(2)]
         first = [asyncio.create_task(keyed(link, views(1)[0])) for link in links]
         await until(gate.entered.is_set)
-        await until(lambda: len(server.context.compute.queue) == 1)
+        await until(lambda: server.context.waiting == 1)
         gate.open.set()
         assert all(isinstance(r, np.ndarray) for r in await asyncio.gather(*first))
         for link in links:
@@ -311,7 +311,7 @@ def test_a_long_scan_does_not_starve_another_clients_single_view(
         await until(gate.entered.is_set)
         async with ProjectorUser(port=server.port) as other:
             single = asyncio.create_task(other.project("v", views(1), SHAPE))
-            await until(lambda: len(server.context.compute.queue) == 1)
+            await until(lambda: server.context.waiting == 1)
             gate.open.set()
             await asyncio.gather(scan, single)
         position = next(i for i, mark in enumerate(gate.order) if mark < 500)
@@ -329,9 +329,9 @@ def test_a_cancelled_call_is_not_computed(monkeypatch: pytest.MonkeyPatch) -> No
         cone = views(3)
         tasks = [asyncio.create_task(client.project("v", row, SHAPE)) for row in cone]
         await until(gate.entered.is_set)
-        await until(lambda: len(server.context.compute.queue) == 2)
+        await until(lambda: server.context.waiting == 2)
         tasks[1].cancel()
-        await until(lambda: len(server.context.compute.queue) == 1)
+        await until(lambda: server.context.waiting == 1)
         gate.open.set()
         results = await asyncio.gather(*tasks, return_exceptions=True)
         assert isinstance(results[1], asyncio.CancelledError)
@@ -366,9 +366,9 @@ def test_a_client_gone_in_mid_request_leaves_no_work(monkeypatch: pytest.MonkeyP
         other = ProjectorUser(port=server.port, patience_s=0.0)
         tasks = [asyncio.create_task(other.project("v", row, SHAPE)) for row in views(5)]
         await until(gate.entered.is_set)
-        await until(lambda: len(server.context.compute.queue) == 4)
+        await until(lambda: server.context.waiting == 4)
         await other.close()
-        await until(lambda: len(server.context.compute.queue) == 0)
+        await until(lambda: server.context.waiting == 0)
         gate.open.set()
         results = await asyncio.gather(*tasks, return_exceptions=True)
         assert all(isinstance(r, ProjectorUnavailable) for r in results)
@@ -525,7 +525,7 @@ def test_a_client_that_never_reads_is_cut_off_and_others_are_served() -> None:
         for _ in range(5):
             assert (await client.project("s", views(1), SHAPE)).shape == (1, *SHAPE)
         await until(lambda: len(server.context.clients) == 1)
-        await until(lambda: len(server.context.compute.queue) == 0)
+        await until(lambda: server.context.waiting == 0)
         views_made = (await client.health()).views
         assert views_made < 200  # nothing was computed for long that nobody took
         writer.close()

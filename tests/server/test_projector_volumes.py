@@ -1,81 +1,15 @@
-"""The fair queue and the volume store by themselves."""
+"""The volume store by itself."""
 
 from __future__ import annotations
 
-import threading
-from collections import Counter
-
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from flexdt.protocol import RpcError
 from flexdt.protocol.projector import VoxelGrid
-from flexdt.server.projector.compute import FairQueue
 from flexdt.server.projector.volumes import SOLID_BYTES, VolumeStore
 from flexdt.twin.projection import Volume
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
-
-
-@given(st.lists(st.tuples(st.integers(0, 4), st.integers()), max_size=60))
-def test_lanes_take_turns_and_keep_their_order(tasks: list[tuple[int, int]]) -> None:
-    queue: FairQueue[tuple[int, int]] = FairQueue()
-    for lane, value in tasks:
-        queue.put(lane, (lane, value))
-    assert len(queue) == len(tasks)
-    taken = []
-    for _ in tasks:
-        task = queue.take()
-        assert task is not None
-        taken.append(task)
-    for lane in range(5):
-        assert [t for t in taken if t[0] == lane] == [t for t in tasks if t[0] == lane]
-    # As long as a lane has work, it is served once in every round of the others.
-    left = Counter(lane for lane, _ in tasks)
-    round_: set[int] = set()
-    for lane, _ in taken:
-        if lane in round_:
-            assert not [other for other, n in left.items() if n and other not in round_]
-            round_ = set()
-        round_.add(lane)
-        left[lane] -= 1
-
-
-def test_a_task_put_back_to_the_front_is_next_in_its_lane_but_not_in_the_queue() -> None:
-    queue: FairQueue[str] = FairQueue()
-    queue.put("scan", "scan 1")
-    queue.put("scan", "later")
-    queue.put("single", "single")
-    assert queue.take() == "scan 1"
-    queue.put("scan", "scan 2", front=True)
-    assert [queue.take() for _ in range(3)] == ["single", "scan 2", "later"]
-
-
-def test_a_lane_that_is_not_ready_does_not_hold_up_the_others() -> None:
-    blocked = {"slow"}
-    queue: FairQueue[str] = FairQueue(lambda lane: lane not in blocked)
-    queue.put("slow", "a")
-    queue.put("quick", "b")
-    assert queue.take() == "b"
-    got: list[str | None] = []
-    taker = threading.Thread(target=lambda: got.append(queue.take()))
-    taker.start()
-    blocked.clear()
-    queue.wake()
-    taker.join(5)
-    assert got == ["a"]
-
-
-def test_removing_and_closing() -> None:
-    queue: FairQueue[int] = FairQueue()
-    for i in range(6):
-        queue.put(i % 2, i)
-    assert sorted(queue.remove(lambda task: task > 2)) == [3, 4, 5]
-    assert len(queue) == 3
-    queue.close()
-    assert queue.take() is None
-
 
 GRID = VoxelGrid(shape=(2, 3, 4), voxel_mm=(1.0, 1.0, 1.0))
 DATA = np.arange(24, dtype=np.float32)
