@@ -245,23 +245,24 @@ def through_server() -> list[Entry]:
 
 
 async def _through(host: str, port: int) -> list[Entry]:
-    from flexdt.server.imaging.projector_pool import ProjectorClient
+    from flexdt.server.imaging.projector_pool import ProjectorClient, ProjectorPool
 
     volume, view = noise(C1_SHAPE), circle(1, BINNED)
     out = np.empty((1, *BINNED), np.float32)
     remote, direct = [], []
-    async with ProjectorClient(host, port, patience_s=120.0) as client:
-        await client.put("C1", volume)
-        await client.project("C1", view, BINNED)
+    client = ProjectorPool([ProjectorClient(host, port)], patience_s=120.0)
+    await client.put("C1", volume)
+    await client.project("C1", view, BINNED)
+    forward(volume, view, BINNED, out)
+    for _ in range(15):
+        start = time.perf_counter()
+        images = await client.project("C1", view, BINNED)
+        remote.append(time.perf_counter() - start)
+        start = time.perf_counter()
         forward(volume, view, BINNED, out)
-        for _ in range(15):
-            start = time.perf_counter()
-            images = await client.project("C1", view, BINNED)
-            remote.append(time.perf_counter() - start)
-            start = time.perf_counter()
-            forward(volume, view, BINNED, out)
-            direct.append(time.perf_counter() - start)
-        await client.remove("C1")
+        direct.append(time.perf_counter() - start)
+    await client.remove("C1")
+    await client.close()
     same = bool(np.array_equal(images, out))
     entry = plain("server-C1", min(remote) * 1e3, "C1 through the projector server")
     entry["median_ms_per_view"] = float(np.median(remote)) * 1e3

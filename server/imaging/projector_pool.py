@@ -1,24 +1,23 @@
-"""Several projector servers as one: each request goes to one that is free.
+"""One or several projector servers behind one twin: each request goes to one that is free.
 
-A projector holds at most `OPEN` requests, so a fast one, which is free more often, gets more of
-them. One that is lost rests for a while, and its requests go to others. One that takes much longer
-than it is known for is not given up, but a second one is asked as well, and the first answer
-counts: all projectors of one kind give the same bytes. Volumes are sent to a projector when it is
-first asked for them.
+A projector of several holds at most `OPEN` requests, so a fast one, which is free more often, gets
+more of them. One that is lost rests for a while, and its requests go to others, or to itself once
+it has rested. One that takes much longer than it is known for is not given up, but a second one is
+asked as well, and the first answer counts: all projectors of one kind give the same bytes. When the
+pool's patience ends, it raises `ProjectorUnavailable`.
 
-`ProjectorClient` has one projector's methods, for an asyncio program such as the twin server.
-Several requests may be open at once. The client keeps the volumes it has sent and, after a
-reconnect with back-off, sends them again to a server that has restarted; requests are stateless and
-are simply repeated. When its patience ends, it raises `ProjectorUnavailable`.
+`ProjectorClient` has one projector's methods. It connects when it is asked for something, and sends
+a volume when it is first asked for it, and again to a server that has restarted or lost it.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import ssl as tls
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -27,7 +26,7 @@ import numpy.typing as npt
 from flexdt.phantoms.checked_reading import scene_to_dict
 from flexdt.protocol import Code, RpcError, hello_params, image, parse_result
 from flexdt.protocol.projector import Health
-from flexdt.runtime.log import log
+from flexdt.runtime.log import Sparing, log
 from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.projector.wire import LinkLost, ProjectorLink
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -39,18 +38,15 @@ _T = TypeVar("_T")
 
 CHUNK: Final = 8 * 2**20
 """Bytes of a volume in one message."""
-FIRST_PAUSE_S: Final = 0.02
-LONGEST_PAUSE_S: Final = 1.0
 
 
 @dataclass(eq=False, repr=False)
 class ProjectorClient:
-    """A connection to a projector server that is restored when it is lost.
+    """A connection to a projector server that is made anew when it is lost.
 
     Attributes:
         host, port: of the server.
         token: where it wants one.
-        patience_s: how long a call tries to reach the server [s].
         ssl: a client's TLS context.
     """
 
@@ -58,14 +54,13 @@ class ProjectorClient:
     port: int = 55001
     _: KW_ONLY
     token: str | None = None
-    patience_s: float = 5.0
     ssl: tls.SSLContext | None = None
 
     def __post_init__(self) -> None:
-        self._volumes: dict[str, Body] = {}
-        self._instance: str | None = None
+        self._sent: dict[str, Body] = {}
+        self._instance: object = None
         self._channel: ProjectorLink | None = None
-        self._connecting = asyncio.Lock()
+        self._connecting, self._sending = asyncio.Lock(), asyncio.Lock()
         self._closed = False
 
     @property
@@ -79,31 +74,34 @@ class ProjectorClient:
         if self._channel is not None:
             self._channel.close()
 
-    # -- methods -----------------------------------------------------------------------------
-
-    async def put(self, name: str, body: Body) -> None:
-        """Store a body under `name`, and keep it to be sent again.
+    async def give(self, name: str, body: Body) -> None:
+        """Make sure that the server has `body` under `name`.
 
         Raises:
             RpcError: -32008, above the server's memory limit; -32602, a mesh that does not close.
             ProjectorUnavailable: the server does not answer.
         """
-        await self._persist("volume.put", lambda channel: _send(channel, name, body))
-        self._volumes[name] = body
+        async with self._sending:
+            await self._ask("volume.put", lambda channel: self._give(channel, name, body))
+
+    async def _give(self, channel: ProjectorLink, name: str, body: Body) -> None:
+        if self._sent.get(name) is not body:
+            await _send(channel, name, body)
+            self._sent[name] = body
 
     async def remove(self, name: str) -> None:
-        """Remove a volume, here and on the server."""
-        self._volumes.pop(name, None)
-        await self._ask("volume.remove", {"name": name})
+        """Have the server forget what it was given under `name`."""
+        if self._sent.pop(name, None) is not None:
+            await self.ask("volume.remove", {"name": name})
 
     async def project(
-        self, name: str, cone_vec: ConeVec | npt.ArrayLike, shape: tuple[int, int]
+        self, name: str, body: Body | None, cone_vec: ConeVec, shape: tuple[int, int]
     ) -> npt.NDArray[np.float32]:
-        """Line integrals of a named volume or scene.
+        """Line integrals.
 
         Args:
-            name: it was put under.
-            cone_vec: ConeVec or (n, 12) [mm], object frame.
+            name, body: what is projected; None if it is there already.
+            cone_vec: n views, object frame.
             shape: detector (rows, cols).
 
         Returns:
@@ -113,92 +111,58 @@ class ProjectorClient:
             RpcError: invalid parameters, or an unknown volume.
             ProjectorUnavailable: the server does not answer.
         """
-        rows = cone_vec.rows if isinstance(cone_vec, ConeVec) else np.asarray(cone_vec, np.float64)
-        rows = np.atleast_2d(rows)
         params: dict[str, object] = {
-            "volume": name, "cone_vec": image.encode(rows), "detector": list(shape),
+            "volume": name, "cone_vec": image.encode(cone_vec.rows), "detector": list(shape),
         }  # fmt: skip
-        whole = (len(rows), *shape)
+        whole = (len(cone_vec), *shape)
+        if body is not None:
+            await self.give(name, body)
         try:
-            return await self._persist("project", lambda c: c.ask_array("project", params, whole))
+            return await self._ask("project", lambda c: c.ask_array("project", params, whole))
         except RpcError as error:
-            if not self._lacks_volume(error, name):
+            there = error.data.get("allowed") if isinstance(error.data, Mapping) else None
+            if body is None or not isinstance(there, list) or name in there:
                 raise
-        await self.put(name, self._volumes[name])  # another client removed it
-        return await self._persist("project", lambda c: c.ask_array("project", params, whole))
+        self._sent.pop(name, None)  # another client has removed it
+        await self.give(name, body)
+        return await self._ask("project", lambda c: c.ask_array("project", params, whole))
 
     async def health(self) -> Health:
         """The server's version, load and memory."""
-        return parse_result(Health, await self._ask("health", {}))
+        return parse_result(Health, await self.ask("health", {}))
 
-    # -- requests ----------------------------------------------------------------------------
+    async def ask(self, method: str, params: Mapping[str, object]) -> object:
+        """The result of any method; raises as `project`."""
+        return await self._ask(method, lambda channel: channel.ask(method, params))
 
-    async def _ask(self, method: str, params: Mapping[str, object]) -> object:
-        return await self._persist(method, lambda channel: channel.ask(method, params))
-
-    async def _persist(self, method: str, work: Callable[[ProjectorLink], Awaitable[_T]]) -> _T:
-        """Do `work`; after a lost connection repeat it.
-
-        Raises:
-            ProjectorUnavailable: the client's patience has ended.
-            RpcError: the server's answer is an error.
-        """
-        loop = asyncio.get_running_loop()
-        deadline = loop.time() + self.patience_s
-        while True:
-            channel = await self._connected()
-            try:
-                return await work(channel)
-            except LinkLost:
-                if self._closed or loop.time() > deadline:
-                    raise ProjectorUnavailable(
-                        f"the projector at {self.host}:{self.port} went away during {method}"
-                    ) from None
-
-    def _lacks_volume(self, error: RpcError, name: str) -> bool:
-        unknown = isinstance(error.data, Mapping) and name not in (error.data.get("allowed") or ())
-        return error.code == Code.INVALID_PARAMS and name in self._volumes and unknown
-
-    # -- connection --------------------------------------------------------------------------
-
-    async def _connected(self) -> ProjectorLink:
-        if self._closed:
-            raise ProjectorUnavailable("the projector client is closed")
-        if self._channel is not None and not self._channel.lost:
-            return self._channel
+    async def _ask(self, method: str, work: Callable[[ProjectorLink], Awaitable[_T]]) -> _T:
         async with self._connecting:
             if self._channel is None or self._channel.lost:
                 self._channel = await self._connect()
-            return self._channel
+            channel = self._channel
+        try:
+            return await work(channel)
+        except LinkLost:
+            raise ProjectorUnavailable(
+                f"the projector at {self.host}:{self.port} went away during {method}"
+            ) from None
 
     async def _connect(self) -> ProjectorLink:
-        loop = asyncio.get_running_loop()
-        deadline = loop.time() + self.patience_s
-        pause = FIRST_PAUSE_S
-        while True:
-            try:
-                return await self._open()
-            except OSError as error:
-                if loop.time() + pause > deadline or self._closed:
-                    why = getattr(error, "strerror", None) or str(error) or "no answer"
-                    raise ProjectorUnavailable(
-                        f"no projector at {self.host}:{self.port} ({why})"
-                    ) from None
-            await asyncio.sleep(pause)
-            pause = min(2 * pause, LONGEST_PAUSE_S)
-
-    async def _open(self) -> ProjectorLink:
-        channel = await ProjectorLink.connect(self.host, self.port, self.ssl)
+        if self._closed:
+            raise ProjectorUnavailable("the projector client is closed")
         try:
-            answer = await channel.ask("session.hello", hello_params("flexdt twin", self.token))
-            instance = answer.get("instance") if isinstance(answer, Mapping) else None
-            if instance != self._instance:
-                for name, value in list(self._volumes.items()):
-                    await _send(channel, name, value)
-                self._instance = instance if isinstance(instance, str) else None
-        except BaseException:
-            channel.close()
-            raise
+            channel = await ProjectorLink.connect(self.host, self.port, self.ssl)
+            try:
+                answer = await channel.ask("session.hello", hello_params("flexdt twin", self.token))
+            except BaseException:
+                channel.close()
+                raise
+        except OSError as error:
+            why = getattr(error, "strerror", None) or str(error) or "no answer"
+            raise ProjectorUnavailable(f"no projector at {self.host}:{self.port} ({why})") from None
+        instance = answer.get("instance") if isinstance(answer, Mapping) else None
+        if instance != self._instance:
+            self._instance, self._sent = instance, {}
         return channel
 
 
@@ -236,12 +200,10 @@ class _Member:
     """A projector of the pool.
 
     Attributes:
-        client: its client, without patience.
+        client: its client.
         open: requests under way.
         pace_s: for a view, lately; None before the first.
         rests_until: when it may be asked again, on the loop's clock.
-        has: what it was sent, by name.
-        sending: held while something is sent.
         kind: version and backend; None while unknown.
         views: made so far.
     """
@@ -250,24 +212,15 @@ class _Member:
     open: int = 0
     pace_s: float | None = None
     rests_until: float = 0.0
-    has: dict[str, Body] = field(default_factory=dict)
-    sending: asyncio.Lock = field(default_factory=asyncio.Lock)
     kind: tuple[str, str] | None = None
     views: int = 0
-
-    async def give(self, name: str, value: Body) -> None:
-        """Make sure that it has `value`."""
-        async with self.sending:
-            if self.has.get(name) is not value:
-                await self.client.put(name, value)
-                self.has[name] = value
 
 
 class ProjectorPool:
     """Projector servers behind one twin.
 
     Args:
-        clients: of the servers, with a patience of 0 s: the pool's is what counts.
+        clients: of the servers.
         patience_s: how long a call goes on when every server fails [s].
     """
 
@@ -277,6 +230,7 @@ class ProjectorPool:
         self._values: dict[str, Body] = {}
         self._turn: asyncio.Future[None] | None = None
         self._open: set[asyncio.Task[Float32Array | None]] = set()
+        self._lines = Sparing()
 
     def __len__(self) -> int:
         return len(self._members)
@@ -306,8 +260,8 @@ class ProjectorPool:
     async def remove(self, name: str) -> None:
         """Have the projectors forget it; those that do not answer forget it when they restart."""
         self._values.pop(name, None)
-        having = [member for member in self._members if member.has.pop(name, None) is not None]
-        await asyncio.gather(*(m.client.remove(name) for m in having), return_exceptions=True)
+        removals = (member.client.remove(name) for member in self._members)
+        await asyncio.gather(*removals, return_exceptions=True)
 
     async def project(self, name: str, cone_vec: ConeVec, shape: tuple[int, int]) -> Float32Array:
         """Line integrals, float32 (n, rows, cols); errors as `ProjectorClient.project`."""
@@ -324,7 +278,7 @@ class ProjectorPool:
             ProjectorUnavailable: none has answered within the patience.
             RpcError: an error that another projector would answer, too.
         """
-        loop, value = asyncio.get_running_loop(), self._values[name]
+        loop, value = asyncio.get_running_loop(), self._values.get(name)
         deadline, late = loop.time() + self.patience_s, 0.0
         running: dict[asyncio.Future[Any], _Member] = {}
         asked: set[_Member] = set()
@@ -370,8 +324,9 @@ class ProjectorPool:
 
     def _free(self, asked: set[_Member], now: float) -> _Member | None:
         """Who is asked next: of those that are free the one with least to do, then the fastest."""
+        most = OPEN if len(self) > 1 else math.inf
         free = (
-            m for m in self._members if m not in asked and m.open < OPEN and m.rests_until <= now
+            m for m in self._members if m not in asked and m.open < most and m.rests_until <= now
         )
         return min(free, key=lambda m: (m.open, m.pace_s or 0.0), default=None)
 
@@ -395,7 +350,12 @@ class ProjectorPool:
         return task
 
     async def _ask(
-        self, member: _Member, name: str, value: Body, views: ConeVec | None, shape: tuple[int, int]
+        self,
+        member: _Member,
+        name: str,
+        value: Body | None,
+        views: ConeVec | None,
+        shape: tuple[int, int],
     ) -> Float32Array | None:
         loop = asyncio.get_running_loop()
         try:
@@ -403,14 +363,16 @@ class ProjectorPool:
                 health = await member.client.health()
                 member.kind = (health.version, health.backend)
                 self._compare()
-            await member.give(name, value)
+            if value is not None:
+                await member.client.give(name, value)
             if views is None:
                 return None
             begun = loop.time()
-            images = await member.client.project(name, views, shape)
+            images = await member.client.project(name, value, views, shape)
         except (ProjectorUnavailable, RpcError) as error:
-            member.rests_until, member.kind = loop.time() + REST_S, None
-            log("a projector gave no answer", logging.WARNING, reason=str(error))
+            if isinstance(error, ProjectorUnavailable) or len(self) > 1:
+                member.rests_until, member.kind = loop.time() + REST_S, None
+                self._lines.log("a projector gave no answer", logging.WARNING, reason=str(error))
             raise
         taken = (loop.time() - begun) / len(views)
         member.pace_s = taken if member.pace_s is None else (3 * member.pace_s + taken) / 4

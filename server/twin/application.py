@@ -19,7 +19,7 @@ from flexdt.runtime.files.directory import free_bytes
 from flexdt.runtime.http_pages import Pages, watching_pages
 from flexdt.runtime.metrics import Figure, Requests, counter, gauge
 from flexdt.runtime.wire_errors import explain, is_user_error
-from flexdt.server.imaging.projector_pool import ProjectorClient, ProjectorPool
+from flexdt.server.imaging.projector_pool import ProjectorPool
 from flexdt.server.network.shell_parts import Peer
 from flexdt.server.network.tcp import TcpServer
 from flexdt.server.twin.core import TwinServer
@@ -76,7 +76,7 @@ class TwinSession:
 def twin_pages(
     twin: TwinServer,
     server: TcpServer,
-    projector: ProjectorClient | ProjectorPool,
+    projector: ProjectorPool,
     requests: Requests,
 ) -> Pages:
     """The pages of a twin server that runs."""
@@ -94,9 +94,7 @@ def twin_pages(
     )
 
 
-def _figures(
-    twin: TwinServer, server: TcpServer, projector: ProjectorClient | ProjectorPool
-) -> list[Figure]:
+def _figures(twin: TwinServer, server: TcpServer, projector: ProjectorPool) -> list[Figure]:
     phases = Counter(job.phase for job in twin.jobs.all())
     by_phase = tuple(({"state": p}, float(phases[p])) for p in get_args(JobPhase))
     events = tuple(({"topic": t}, float(twin.hub.count(t))) for t in get_args(Topic))
@@ -104,8 +102,7 @@ def _figures(
         ({"state": s}, float(twin.scanner.safety.state == s))
         for s in ("ready", "blocked", "estopped")
     )
-    views = projector.views if isinstance(projector, ProjectorPool) else {}
-    by_projector = tuple(({"projector": name}, float(n)) for name, n in views.items())
+    by_projector = tuple(({"projector": name}, float(n)) for name, n in projector.views.items())
     factor = twin.clock.real_time_factor
     free = [room for room in (free_bytes(twin.root),) if room is not None]
     return [

@@ -59,15 +59,10 @@ async def run(options: TwinSettings) -> int:
     truth = None if options.truth is None else load_truth(options.truth, root)
     token = read_token(options.projector_token_file)
     secure = client_tls(options.projector_tls_ca)
-    places = options.places
     clients = [
-        ProjectorClient(
-            place.host, place.port, token=token, ssl=secure,
-            patience_s=0.0 if len(places) > 1 else PATIENCE_S,
-        )
-        for place in places
-    ]  # fmt: skip
-    projector = ProjectorPool(clients, PATIENCE_S) if len(clients) > 1 else clients[0]
+        ProjectorClient(place.host, place.port, token=token, ssl=secure) for place in options.places
+    ]
+    projector = ProjectorPool(clients, PATIENCE_S)
     requests, reader = Requests(), Reader()
     twin = TwinServer(
         machine,

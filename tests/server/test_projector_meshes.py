@@ -102,7 +102,7 @@ def test_what_is_no_closed_mesh_is_refused_and_the_server_lives_on() -> None:
             data = points.astype("<f8").tobytes() + triangles.astype("<i4").tobytes()
             size = {"vertices": len(points), "triangles": len(triangles)}
             params = {"name": "m", "mesh": size, "start": 0, "data": data, **more}
-            return await client._ask("volume.put", params)
+            return await client.client.ask("volume.put", params)
 
         lost = corners.copy()
         lost[3, 1] = np.nan
@@ -128,7 +128,7 @@ def test_what_is_no_closed_mesh_is_refused_and_the_server_lives_on() -> None:
             assert (await client.volumes()).volumes == []
         await put(corners, faces)
         with pytest.raises(RpcError, match="has no voxels"):
-            await client._ask("volume.get", {"name": "m"})
+            await client.client.ask("volume.get", {"name": "m"})
         assert (await client.project("m", views(np.random.default_rng(1), 1), SHAPE)).any()
 
     run(body)

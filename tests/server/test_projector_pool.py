@@ -55,7 +55,7 @@ class Stand:
         if (error := self.fails()) is not None:
             raise error
 
-    async def put(self, name: str, scene: Scene) -> None:
+    async def give(self, name: str, scene: Scene) -> None:
         self.check()
         self.held[name] = scene
 
@@ -63,7 +63,7 @@ class Stand:
         self.check()
         del self.held[name]
 
-    async def project(self, name: str, views: ConeVec, shape: tuple[int, int]) -> Any:
+    async def project(self, name: str, body: Scene, views: ConeVec, shape: tuple[int, int]) -> Any:
         self.calls.append(asyncio.get_running_loop().time())
         self.busy += 1
         self.most = max(self.most, self.busy)

@@ -208,7 +208,7 @@ def test_backprojection_in_one_and_in_several_requests() -> None:
         assert_array_equal(await backprojected(server, stack, cone), expected.data)
         made = await backprojected(server, stack, cone, into="sum")
         assert_allclose(made, expected.data, rtol=1e-5)
-        await client.remove("sum")
+        await client.client.ask("volume.remove", {"name": "sum"})
         assert (await client.volumes()).volumes == []
 
     run(body)
@@ -363,15 +363,17 @@ def test_a_client_gone_in_mid_request_leaves_no_work(monkeypatch: pytest.MonkeyP
 
     async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         await client.put("v", VOLUME)
-        other = ProjectorUser(port=server.port, patience_s=0.0)
-        tasks = [asyncio.create_task(other.project("v", row, SHAPE)) for row in views(5)]
+        other = await ProjectorLink.connect("127.0.0.1", server.port)
+        asked = [{"volume": "v", "cone_vec": image.encode(row[None]), "detector": SHAPE}
+                 for row in views(5)]  # fmt: skip
+        tasks = [asyncio.create_task(other.ask("project", params)) for params in asked]
         await until(gate.entered.is_set)
         await until(lambda: server.context.waiting == 4)
-        await other.close()
+        other.close()
         await until(lambda: server.context.waiting == 0)
         gate.open.set()
         results = await asyncio.gather(*tasks, return_exceptions=True)
-        assert all(isinstance(r, ProjectorUnavailable) for r in results)
+        assert all(isinstance(r, LinkLost) for r in results)
         assert (await client.project("v", views(1), SHAPE)).shape == (1, *SHAPE)
         assert (await client.health()).clients == 1
 
@@ -547,6 +549,7 @@ def test_a_restarted_server_gets_the_volumes_again() -> None:
         assert not waiting.done()
         server = await serve_projector(port=port, memory_limit=LIMIT)
         assert_array_equal(await waiting, before)
+        assert (await client.project("s", views(1), SHAPE)).any()
         assert len((await client.volumes()).volumes) == 2
         await client.close()
         await server.close()

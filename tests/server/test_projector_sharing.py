@@ -13,7 +13,7 @@ import pytest
 from flexdt.phantoms import Phantom, load_phantom, voxel_phantom
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.imaging.projections import Imaging, digest_of
-from flexdt.server.imaging.projector_pool import ProjectorPool
+from flexdt.server.imaging.projector_pool import ProjectorClient, ProjectorPool
 from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.projector.service import ProjectorServer, serve_projector
 from flexdt.server.storage.stored_samples import SampleStore
@@ -59,7 +59,7 @@ def run(work: Any, limit: int = LIMIT) -> None:
     async def main() -> None:
         server = await serve_projector(memory_limit=limit)
         one, other = (ProjectorUser(port=server.port) for _ in range(2))
-        pool = ProjectorPool([ProjectorUser(port=server.port, patience_s=0.0)])
+        pool = ProjectorPool([ProjectorClient(port=server.port), ProjectorClient(port=server.port)])
         try:
             await asyncio.wait_for(work(server, one, other, pool), 300)
         finally:
