@@ -2,7 +2,8 @@
 
 Beyond the loopback, pages other than `/healthz` need the server's token (`Authorization: Bearer
 ...`). Twin, projector and viewer supply the figures; this module puts them into the pages. A page
-is made in a turn of the event loop, to which the figures belong.
+is made in a turn of the event loop, to which the figures belong. Requests are counted as they are
+answered; gauges are read at the moment of the scrape.
 """
 
 from __future__ import annotations
@@ -14,22 +15,75 @@ import socket
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
+from functools import partial
 from http import HTTPStatus
 from threading import Thread
 from typing import Any, Final
 from wsgiref.simple_server import WSGIRequestHandler, make_server
 
+from prometheus_client import Counter, Metric, ProcessCollector, generate_latest
+from prometheus_client.exposition import ThreadingWSGIServer
+
 from flexdt.process_settings import ServerSettings
 from flexdt.runtime.access import check_bind, is_loopback, read_token, token_matches
 from flexdt.runtime.log import dropped
-from flexdt.runtime.loop import Holds, ServerLoop
-from flexdt.runtime.metrics import CONTENT_TYPE, Figure, Requests, counter, gauge, render
+from flexdt.runtime.process import ServerLoop, durations
 
 SILENT_S: Final = 5.0
 """A client that sends nothing for so long is left."""
 HELD_S: Final = 60.0
 """An event loop that gives no page for so long is told as failed (503)."""
 OPEN_PAGES: Final = ("/healthz",)
+CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
+
+
+def _figure(
+    kind: str, name: str, help: str, values: float | Mapping[str, float], label: str = ""
+) -> Metric:
+    """A figure: its value, or the values of a label's values."""
+    metric = Metric(name.removesuffix("_total"), help, kind)
+    for what, value in values.items() if isinstance(values, Mapping) else [("", values)]:
+        metric.add_sample(name, {label: what} if label else {}, value)
+    return metric
+
+
+gauge, counter = partial(_figure, "gauge"), partial(_figure, "counter")
+"""What may go up and down; what only grows."""
+
+
+class Requests:
+    """Counts and durations of requests, by method."""
+
+    def __init__(self) -> None:
+        what = "Requests answered, by method and error code."
+        self._counts = Counter("flexdt_requests", what, ["method", "code"], registry=None)
+        what = "Time from a request's turn to its answer."
+        self._times = durations("flexdt_request_seconds", what, ["method"])
+
+    def observe(self, method: str, seconds: float, code: int | None) -> None:
+        """A request has been answered; `code` of the error, None for a result."""
+        self._counts.labels(method, "ok" if code is None else code).inc()
+        self._times.labels(method).observe(seconds)
+
+    def figures(self) -> list[Metric]:
+        """What has been counted."""
+        return [*self._counts.collect(), *self._times.collect()]
+
+
+@dataclass(frozen=True)
+class _Collected:
+    """What `generate_latest` reads; a registry of the library would hold the same and more."""
+
+    metrics: list[Metric]
+
+    def collect(self) -> list[Metric]:
+        return self.metrics
+
+
+def render(figures: Iterable[Metric]) -> str:
+    """The page in Prometheus's text format, with what the library knows of the process."""
+    process = ProcessCollector(registry=None).collect()
+    return generate_latest(_Collected([*figures, *process])).decode()
 
 
 @dataclass(frozen=True)
@@ -112,8 +166,6 @@ async def served_pages(pages: Pages, settings: ServerSettings) -> AsyncIterator[
     if settings.http_port is None:
         yield {}
         return
-    from prometheus_client.exposition import ThreadingWSGIServer
-
     host, token = settings.http_host, read_token(settings.token_file)
     check_bind(host, token)
 
@@ -133,7 +185,7 @@ async def served_pages(pages: Pages, settings: ServerSettings) -> AsyncIterator[
 
 def watching_pages(
     health: Callable[[], Mapping[str, object]],
-    figures: Callable[[], Iterable[Figure]],
+    figures: Callable[[], Iterable[Metric]],
     requests: Requests | None = None,
     *,
     failed: Callable[[], bool] = lambda: False,
@@ -158,17 +210,11 @@ def watching_pages(
         page.append(
             counter("flexdt_log_dropped_total", "Log lines nobody took in time.", dropped())
         )
-        holds = _holds()
-        if holds is not None:
-            what = "How long each turn held the event loop."
-            page.append(Figure("flexdt_loop_hold_seconds", "histogram", what, (({}, holds.turns),)))
+        loop = asyncio.get_running_loop()
+        if isinstance(loop, ServerLoop):
+            page += loop.holds.turns.collect()
             worst = "The longest turn since the last scrape."
-            page.append(gauge("flexdt_loop_hold_worst_seconds", worst, holds.worst()))
+            page.append(gauge("flexdt_loop_hold_worst_seconds", worst, loop.holds.worst()))
         return HttpResponse(render(page), content_type=CONTENT_TYPE)
 
     return {"/healthz": healthz, "/metrics": metrics}
-
-
-def _holds() -> Holds | None:
-    loop = asyncio.get_running_loop()
-    return loop.holds if isinstance(loop, ServerLoop) else None

@@ -36,7 +36,7 @@ from websockets.typing import Subprotocol
 from flexdt.clients.viewer.viser_gate import MARK, MessageFilter, parted
 from flexdt.runtime.access import check_bind, is_loopback, token_matches
 from flexdt.runtime.log import log
-from flexdt.runtime.loop import one_at_a_time
+from flexdt.runtime.process import one_at_a_time
 
 COOKIE: Final = "flexdt_viewer"
 MAX_FROM_PAGE: Final = 16 << 20

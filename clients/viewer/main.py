@@ -13,6 +13,8 @@ from contextlib import redirect_stdout
 from importlib.metadata import version
 from typing import TYPE_CHECKING, TextIO
 
+from prometheus_client import Metric
+
 from flexdt import machines
 from flexdt.clients.client.kept_connection import TwinAddress
 from flexdt.process_settings import Address, ViewerSettings, parse
@@ -23,9 +25,8 @@ from flexdt.runtime.access import (
     server_tls,
     with_limits,
 )
-from flexdt.runtime.http_pages import Pages, served_pages, watching_pages
+from flexdt.runtime.http_pages import Pages, counter, gauge, served_pages, watching_pages
 from flexdt.runtime.log import LEVELS, set_up
-from flexdt.runtime.metrics import Figure, counter, gauge
 from flexdt.runtime.process import (
     FAILED,
     OK,
@@ -85,7 +86,7 @@ def viewer_pages(viewer: Viewer) -> Pages:
             "twin": "connected" if viewer.link.connected else "not connected",
         }
 
-    def figures() -> list[Figure]:
+    def figures() -> list[Metric]:
         front = viewer.front
         return [
             gauge("flexdt_pages", "Pages open.", len(viewer.open_pages)),

@@ -1,7 +1,9 @@
 """From nominal poses to line integrals: the one path on which the true geometry is used.
 
 Adds the hidden truth, transforms into the sample's frame, makes sure that the projector has the
-sample, and requests the projection. Images are the only results that depend on the truth.
+sample, and requests the projection. Images are the only results that depend on the truth: it is
+read once and never shown. Calibration is to find it, so no reply, log line, state, data set or
+printed form may carry it, and true geometries are handed out, never the parameters.
 
 A projector may serve several twins, whose samples may have equal names and different contents, so
 it knows each as `NAME #digest of the content`. Of a sample that changes, the version before the
@@ -13,8 +15,10 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import json
+import tomllib
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, Literal, Protocol
 
 import numpy as np
@@ -24,17 +28,84 @@ from flexdt.phantoms.channels import Channel, attenuating, channels, scatter_obj
 from flexdt.phantoms.checked_reading import scene_to_dict
 from flexdt.protocol import Code, RpcError
 from flexdt.runtime.wire_errors import ProjectorUnavailable
-from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.storage.stored_samples import SampleStore
+from flexdt.twin.errors import MachineFileError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec, check_cone_vec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings, PixelGrid
 from flexdt.twin.physics.chain import spot_views
 from flexdt.twin.physics.scatter.simulation import Object
 from flexdt.twin.projection import Body, TriangleMesh
 from flexdt.twin.projection.analytic_solids import Scene
-from flexdt.twin.scanner.state import Sample
+from flexdt.twin.scanner.state import Sample, StagePlacement
+
+LARGEST = 1e6
+"""Above any value of a truth file [mm, deg]; NaN and infinities are not below it."""
+
+
+class TrueGeometry:
+    """Turns nominal poses into the geometry that X-rays really see.
+
+    Args:
+        parameters: the misalignment; none by default.
+    """
+
+    __slots__ = ("__parameters",)
+
+    def __init__(self, parameters: Offsets = NOMINAL) -> None:
+        self.__parameters = parameters
+
+    def __repr__(self) -> str:
+        return "TrueGeometry(hidden)"
+
+    def cone_vec(self, poses: Poses, placement: StagePlacement) -> ConeVec:
+        """True geometry of each pose, in the frame of a sample placed at `placement`.
+
+        Args:
+            poses: nominal.
+            placement: of the sample.
+        """
+        return placement.to_sample(poses.cone_vec(self.__parameters))
+
+
+def load_truth(path: Path, data: Path) -> TrueGeometry:
+    """Read a truth file: TOML, parameter = value [mm, deg].
+
+    Args:
+        path: the file.
+        data: the data directory, in which it must not lie.
+
+    Raises:
+        MachineFileError: file, key, and what is allowed; no value of the file is repeated.
+    """
+    file = path.resolve()
+    if file.is_relative_to(data.resolve()):
+        raise MachineFileError(
+            f"the truth file {path} lies inside the data directory {data}; it must not",
+            {"file": str(path), "allowed": "outside the data directory"},
+        )
+    try:
+        values = tomllib.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise MachineFileError(
+            f"cannot read {path}: {error.strerror}", {"file": str(path)}
+        ) from None
+    except ValueError:
+        raise MachineFileError(f"{path}: not valid TOML", {"file": str(path)}) from None
+    for name, value in values.items():
+        if type(value) not in (int, float) or not abs(value) < LARGEST:
+            raise MachineFileError(
+                f"{path}: {name}: the value must be a number below {LARGEST:g}",
+                {"file": str(path), "path": name, "allowed": [-LARGEST, LARGEST]},
+            )
+    try:
+        parameters = Offsets.from_edge({k: float(v) for k, v in values.items()})
+    except TwinError as error:
+        raise MachineFileError(f"{path}: {error.message}", {"file": str(path)}) from None
+    return TrueGeometry(parameters)
+
 
 VERSIONS: Final = 2
 """Of a sample that the projector keeps."""

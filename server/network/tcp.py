@@ -58,7 +58,7 @@ from flexdt.protocol.rpc_errors import (
 )
 from flexdt.runtime.access import ConnectionLimits, check_bind
 from flexdt.runtime.log import Sparing
-from flexdt.runtime.loop import ListeningServer, tune
+from flexdt.runtime.process import ListeningServer, tune
 from flexdt.server.network.shell_parts import (
     FIRST,
     ORDINARY,

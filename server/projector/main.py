@@ -13,13 +13,12 @@ from flexdt.process_settings import ProjectorSettings, parse
 from flexdt.runtime.access import ConnectionLimits, read_token, server_tls, with_limits
 from flexdt.runtime.files.directory import memory_bytes
 from flexdt.runtime.log import LEVELS, set_up
-from flexdt.runtime.metrics import Requests
 from flexdt.runtime.process import OK, announce, announce_bound, run_process, stop_signal
 
 
 async def run(options: ProjectorSettings) -> int:
     """Serve until SIGTERM or SIGINT; returns the exit code."""
-    from flexdt.runtime.http_pages import served_pages
+    from flexdt.runtime.http_pages import Requests, served_pages
     from flexdt.server.projector.compute import backend, begin
     from flexdt.server.projector.service import projector_pages, serve_projector
     from flexdt.twin.projection.cpu import threads as all_threads

@@ -17,6 +17,8 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Final
 
+from prometheus_client import Metric
+
 from flexdt.protocol import (
     MAX_FRAME,
     Batch,
@@ -42,14 +44,12 @@ from flexdt.protocol.rpc_errors import (
     too_large,
 )
 from flexdt.runtime.access import ConnectionLimits, check_bind
-from flexdt.runtime.http_pages import Pages, watching_pages
+from flexdt.runtime.http_pages import Pages, Requests, counter, gauge, watching_pages
 from flexdt.runtime.log import current, log
-from flexdt.runtime.loop import ListeningServer
-from flexdt.runtime.metrics import Figure, Requests, counter, gauge
+from flexdt.runtime.process import ListeningServer
 from flexdt.server.network.shell_parts import Observe, answered, unobserved
 from flexdt.server.projector.compute import ComputeThread
-from flexdt.server.projector.projector_methods import ANSWERS, Context, JobClient
-from flexdt.server.projector.volumes import VolumeStore
+from flexdt.server.projector.projector_methods import ANSWERS, Context, JobClient, VolumeStore
 from flexdt.server.projector.wire import FrameLink
 from flexdt.twin.errors import TwinError
 
@@ -248,7 +248,7 @@ def projector_pages(server: ProjectorServer, requests: Requests) -> Pages:
     def health() -> dict[str, object]:
         return {"server": f"flexdt projector {version('flexdt')}"}
 
-    def figures() -> list[Figure]:
+    def figures() -> list[Metric]:
         store = context.store
         return [
             gauge("flexdt_connections", "Clients connected.", len(context.clients)),

@@ -42,7 +42,7 @@ from flexdt.protocol.connection import pack
 from flexdt.protocol.projector import Array
 from flexdt.protocol.rpc_errors import parse_error, too_large
 from flexdt.runtime.log import current, log
-from flexdt.runtime.loop import tune
+from flexdt.runtime.process import tune
 from flexdt.server.network.shell_parts import Deadlines
 
 SILENT_S: Final = 10.0

@@ -21,7 +21,7 @@ from flexdt.protocol.codec import write_json, write_msgpack
 from flexdt.protocol.connection import MAX_ANSWER
 from flexdt.protocol.methods.job_messages import CHECK_LIMITS
 from flexdt.protocol.rpc_errors import Code, RpcError, too_large
-from flexdt.runtime.loop import ServerLoop
+from flexdt.runtime.process import ServerLoop
 from flexdt.runtime.workers import Workers
 from flexdt.server.scans.scan_record import PoseList, ScanSource
 from flexdt.twin.collision.collision_scene import build_scene

@@ -12,12 +12,13 @@ from collections import Counter
 from contextlib import AbstractContextManager, nullcontext
 from typing import get_args
 
+from prometheus_client import Metric
+
 from flexdt.protocol import AnyMethod
 from flexdt.protocol.fields import Params
 from flexdt.protocol.state_model import JobPhase
 from flexdt.runtime.files.directory import free_bytes
-from flexdt.runtime.http_pages import Pages, watching_pages
-from flexdt.runtime.metrics import Figure, Requests, counter, gauge
+from flexdt.runtime.http_pages import Pages, Requests, counter, gauge, watching_pages
 from flexdt.runtime.wire_errors import explain, is_user_error
 from flexdt.server.imaging.projector_pool import ProjectorPool
 from flexdt.server.network.shell_parts import Peer
@@ -94,27 +95,25 @@ def twin_pages(
     )
 
 
-def _figures(twin: TwinServer, server: TcpServer, projector: ProjectorPool) -> list[Figure]:
-    phases = Counter(job.phase for job in twin.jobs.all())
-    by_phase = tuple(({"state": p}, float(phases[p])) for p in get_args(JobPhase))
-    events = tuple(({"topic": t}, float(twin.hub.count(t))) for t in get_args(Topic))
-    safety = tuple(
-        ({"state": s}, float(twin.scanner.safety.state == s))
-        for s in ("ready", "blocked", "estopped")
-    )
-    by_projector = tuple(({"projector": name}, float(n)) for name, n in projector.views.items())
+def _figures(twin: TwinServer, server: TcpServer, projector: ProjectorPool) -> list[Metric]:
+    jobs = Counter(job.phase for job in twin.jobs.all())
+    phases: dict[str, float] = {phase: jobs[phase] for phase in get_args(JobPhase)}
+    events: dict[str, float] = {topic: twin.hub.count(topic) for topic in get_args(Topic)}
+    in_force = twin.scanner.safety.state
+    safety = {state: float(in_force == state) for state in ("ready", "blocked", "estopped")}
     factor = twin.clock.real_time_factor
-    free = [room for room in (free_bytes(twin.root),) if room is not None]
+    views, free = projector.views, free_bytes(twin.root)
+    room = [] if free is None else [gauge("flexdt_data_free_bytes", "Room on the data disk.", free)]
     return [
         gauge("flexdt_connections", "Clients connected.", len(server.links)),
         counter("flexdt_connections_total", "Clients that ever connected.", server.opened),
-        Figure("flexdt_events_total", "counter", "Events published, by topic.", events),
-        Figure("flexdt_jobs", "gauge", "Jobs known, by state.", by_phase),
+        counter("flexdt_events_total", "Events published, by topic.", events, "topic"),
+        gauge("flexdt_jobs", "Jobs known, by state.", phases, "state"),
         counter("flexdt_frames_total", "Projections of scans made.", twin.jobs.frames_made),
-        Figure("flexdt_safety", "gauge", "1 for the safety state in force.", safety),
+        gauge("flexdt_safety", "1 for the safety state in force.", safety, "state"),
         gauge("flexdt_clock_seconds", "The twin's clock.", twin.clock.now()),
         gauge("flexdt_real_time_factor", "Twin seconds a second.", factor or 0.0),
-        gauge("flexdt_projector_connected", "Whether there is one.", float(projector.connected)),
-        Figure("flexdt_projector_views_total", "counter", "Views by projector.", by_projector),
-        *(gauge("flexdt_data_free_bytes", "Room on the data disk.", room) for room in free),
+        gauge("flexdt_projector_connected", "Whether there is one.", projector.connected),
+        counter("flexdt_projector_views_total", "Views by projector.", views, "projector"),
+        *room,
     ]

@@ -25,17 +25,21 @@ from flexdt.runtime.access import TwinLimits
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.own_documents import settle
 from flexdt.runtime.log import LEVELS, log
-from flexdt.server.imaging.exposure_quality import predictors
-from flexdt.server.imaging.projections import Imaging, Projector
-from flexdt.server.imaging.radiography import Physics, Radiography, with_spectra
-from flexdt.server.imaging.truth import TrueGeometry
+from flexdt.server.imaging.projections import Imaging, Projector, TrueGeometry
+from flexdt.server.imaging.radiography import Physics, Radiography, predictors, with_spectra
 from flexdt.server.scans.job import Job
 from flexdt.server.scans.jobs import Jobs, fresh_seed
 from flexdt.server.scans.stage import Shapes, Stage
 from flexdt.server.scans.submission import RESERVED, Submissions
 from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
-from flexdt.server.storage.corrections import Corrections
-from flexdt.server.storage.memory import Memory, StateStore, read_memory, remember, restore
+from flexdt.server.storage.memory import (
+    Corrections,
+    Memory,
+    StateStore,
+    read_memory,
+    remember,
+    restore,
+)
 from flexdt.server.storage.past_scans import PastScans
 from flexdt.server.storage.stored_samples import ReceivedSample, SampleStore, sample_material
 from flexdt.server.twin import wire_values as views

@@ -19,9 +19,8 @@ from flexdt.protocol import RpcError, image
 from flexdt.protocol.methods.image_messages import Projection
 from flexdt.protocol.state_model import ImageFlags
 from flexdt.runtime.log import log
-from flexdt.server.imaging.exposure_quality import flags_of
-from flexdt.server.imaging.radiography import Radiography
-from flexdt.server.imaging.truth import TrueGeometry
+from flexdt.server.imaging.projections import TrueGeometry
+from flexdt.server.imaging.radiography import Radiography, flags_of
 from flexdt.server.scans.twin_clock import TwinClock
 from flexdt.server.twin.hub import Hub, ImageWish
 from flexdt.twin.dataset.normalise import binned_mean

@@ -44,15 +44,14 @@ async def run(options: TwinSettings) -> int:
     directory = open_data(root)
     release = lock_folder(directory)
 
-    from flexdt.runtime.http_pages import served_pages
-    from flexdt.runtime.metrics import Requests
+    from flexdt.runtime.http_pages import Requests, served_pages
+    from flexdt.server.imaging.projections import load_truth
     from flexdt.server.imaging.projector_pool import ProjectorClient, ProjectorPool
-    from flexdt.server.imaging.truth import load_truth
     from flexdt.server.network.tcp import serve
     from flexdt.server.scans.jobs import fresh_seed
     from flexdt.server.twin.application import TwinSession, twin_pages
     from flexdt.server.twin.core import TwinServer
-    from flexdt.server.twin.handlers.document_methods import document
+    from flexdt.server.twin.handlers.session_methods import document
     from flexdt.server.twin.message_reading import Reader
     from flexdt.twin.scanner.state import Sample
 

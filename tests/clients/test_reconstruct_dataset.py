@@ -24,9 +24,8 @@ from flexdt.clients.reconstruction.reconstruct import (
 from flexdt.clients.reconstruction.volume_files import middle_slices, read_volume
 from flexdt.phantoms import lego_phantom
 from flexdt.runtime.files.directory import open_data
-from flexdt.server.imaging.projections import Imaging
+from flexdt.server.imaging.projections import Imaging, TrueGeometry
 from flexdt.server.imaging.radiography import Radiography
-from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.scans.acquisition import Acquisition
 from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.server.storage.stored_samples import SampleStore

@@ -21,9 +21,8 @@ from flexdt.phantoms import Phantom, load_phantom, material
 from flexdt.phantoms.channels import channels, scatter_object
 from flexdt.phantoms.samples import as_phantom
 from flexdt.runtime.files.directory import open_data
-from flexdt.server.imaging.projections import Imaging
+from flexdt.server.imaging.projections import Imaging, TrueGeometry
 from flexdt.server.imaging.radiography import Radiography
-from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.testing.in_process import DirectProjector
 from flexdt.twin.attenuation.substances import Substance

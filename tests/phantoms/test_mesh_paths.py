@@ -16,8 +16,7 @@ from flexdt.phantoms import material, mesh_phantom
 from flexdt.phantoms.channels import attenuating, channels, line_integrals
 from flexdt.phantoms.pieces import PhantomError
 from flexdt.phantoms.samples import as_phantom
-from flexdt.server.imaging.projections import Imaging
-from flexdt.server.imaging.truth import TrueGeometry
+from flexdt.server.imaging.projections import Imaging, TrueGeometry
 from flexdt.testing.in_process import DirectProjector
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import CameraSettings, Roi

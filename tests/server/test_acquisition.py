@@ -10,9 +10,8 @@ import numpy.typing as npt
 import pytest
 
 from flexdt.runtime.files.directory import open_data
-from flexdt.server.imaging.projections import Imaging
+from flexdt.server.imaging.projections import Imaging, TrueGeometry, load_truth
 from flexdt.server.imaging.radiography import Radiography
-from flexdt.server.imaging.truth import TrueGeometry, load_truth
 from flexdt.server.scans.acquisition import Acquisition
 from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.twin.dataset.normalise import binned_mean

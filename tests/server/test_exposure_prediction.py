@@ -15,7 +15,7 @@ import flexdt as fx
 from flexdt.phantoms.samples import as_phantom
 from flexdt.protocol import METHODS, Codec, RpcError
 from flexdt.protocol.methods.image_messages import ExposurePrediction
-from flexdt.server.imaging.exposure_quality import BEST, predict
+from flexdt.server.imaging.radiography import BEST, predict
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.scanner.state import changed_camera

@@ -24,10 +24,16 @@ from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods.scanner_messages import TubeSet
 from flexdt.protocol.rpc_errors import Code, RpcError
 from flexdt.runtime.files.directory import open_data
-from flexdt.server.imaging.exposure_quality import CUT_OFF, SATURATED, STARVED, flags_of, marks_of
-from flexdt.server.imaging.projections import Imaging
-from flexdt.server.imaging.radiography import Radiography, with_spectra
-from flexdt.server.imaging.truth import TrueGeometry
+from flexdt.server.imaging.projections import Imaging, TrueGeometry
+from flexdt.server.imaging.radiography import (
+    CUT_OFF,
+    SATURATED,
+    STARVED,
+    Radiography,
+    flags_of,
+    marks_of,
+    with_spectra,
+)
 from flexdt.server.scans.acquisition import Acquisition
 from flexdt.server.scans.scan_record import BEGINNING, ScanSource, StartConditions
 from flexdt.server.storage.stored_samples import SampleStore

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from flexdt.server.imaging.truth import load_truth
+from flexdt.server.imaging.projections import load_truth
 from flexdt.twin.errors import MachineFileError
 
 

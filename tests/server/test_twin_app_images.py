@@ -15,7 +15,7 @@ import pytest
 from in_process import ROI, Lab, M, PointProjector, run, script
 
 from flexdt.protocol import image as wire_image
-from flexdt.server.imaging.truth import TrueGeometry
+from flexdt.server.imaging.projections import TrueGeometry
 from flexdt.server.twin import live, wire_values
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets

@@ -20,8 +20,8 @@ from pathlib import Path
 import pytest
 from lab import Process, Wire, fly_script, projector, twin
 
+from flexdt.runtime.http_pages import Requests, gauge, render
 from flexdt.runtime.log import Apart, JsonLines
-from flexdt.runtime.metrics import Figure, Requests, render
 
 pytestmark = [pytest.mark.timeout(240), pytest.mark.slow]
 WATCHED = ("--http-port", "0", "--log-level", "debug")
@@ -167,7 +167,7 @@ def test_metrics_escape_and_buckets_add_up() -> None:
     requests = Requests()
     for seconds in (0.0005, 0.003, 0.003, 99.0):
         requests.observe("m", seconds, None)
-    odd = Figure("g", "gauge", "A gauge.", (({"label": 'a"b\\c\nd'}, 1.0),))
+    odd = gauge("g", "A gauge.", {'a"b\\c\nd': 1.0}, "label")
     found = samples(render([*requests.figures(), odd]))
     assert found['flexdt_request_seconds_bucket{le="0.001",method="m"}'] == 1.0
     assert found['flexdt_request_seconds_bucket{le="0.005",method="m"}'] == 3.0

@@ -8,9 +8,8 @@ from datetime import datetime
 from pathlib import Path
 
 from flexdt.runtime.files.directory import open_data
-from flexdt.server.imaging.projections import Imaging
+from flexdt.server.imaging.projections import Imaging, TrueGeometry
 from flexdt.server.imaging.radiography import Radiography
-from flexdt.server.imaging.truth import TrueGeometry
 from flexdt.server.scans.acquisition import Acquisition
 from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.server.storage.stored_samples import SampleStore

@@ -8,7 +8,6 @@ from types import ModuleType
 from flexdt.protocol import METHODS
 from flexdt.server.twin.handlers import (
     calibration_methods,
-    document_methods,
     image_methods,
     job_methods,
     motion_methods,
@@ -35,6 +34,6 @@ def table(*modules: ModuleType) -> Mapping[str, Handler]:
 
 HANDLERS = table(
     session_methods, motion_methods, sample_methods, image_methods, job_methods,
-    calibration_methods, document_methods,
+    calibration_methods,
 )  # fmt: skip
 """Method name -> what answers it."""

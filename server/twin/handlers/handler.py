@@ -19,8 +19,7 @@ from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods.document_messages import Scene
 from flexdt.runtime.files.own_documents import Changes
 from flexdt.server.network.shell_parts import Peer
-from flexdt.server.storage.corrections import History
-from flexdt.server.storage.memory import Memory, apply_settings, as_of, paces_of
+from flexdt.server.storage.memory import History, Memory, apply_settings, as_of, paces_of
 from flexdt.server.storage.stored_samples import ReceivedSample
 from flexdt.server.twin.core import TwinServer
 from flexdt.twin.scanner.scanner import ScannerTwin

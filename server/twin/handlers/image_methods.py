@@ -15,8 +15,8 @@ from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import image_messages as p
 from flexdt.protocol.methods.scanner_messages import CameraSet, TubeSet
 from flexdt.protocol.rpc_errors import invalid_params, too_large
-from flexdt.server.imaging.exposure_quality import marks_of
-from flexdt.server.imaging.exposure_quality import predict as forecast
+from flexdt.server.imaging.radiography import marks_of
+from flexdt.server.imaging.radiography import predict as forecast
 from flexdt.server.storage.stored_samples import EMPTY
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, answers

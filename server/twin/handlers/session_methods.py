@@ -1,15 +1,24 @@
-"""session.* and state.*."""
+"""session.*, state.*, scene.* and rpc.discover: who is there, the whole state, the wire itself."""
 
 from __future__ import annotations
+
+import asyncio
+from datetime import UTC, datetime
+from functools import cache
+from typing import Any
 
 from flexdt.protocol import PROTOCOL, require_compatible
 from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty, Nothing
+from flexdt.protocol.methods import document_messages as d
+from flexdt.protocol.methods import openrpc_document
 from flexdt.protocol.methods import session_messages as p
 from flexdt.server.scans.job import ENDED
+from flexdt.server.storage.memory import require_fit, sample_of, save_scene
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import Client, answers
+from flexdt.server.twin.handlers.handler import Client, answers, change_stage, ensure_idle
 from flexdt.server.twin.hub import ImageWish
+from flexdt.twin.errors import SafetyError
 
 
 @answers(p.SESSION_HELLO)
@@ -80,3 +89,59 @@ def unsubscribe(twin: TwinServer, client: Client, params: p.Unsubscribe) -> Noth
     """No more of these."""
     twin.hub.unsubscribe(client.peer, params.topics)
     return Nothing()
+
+
+@answers(d.SCENE_SAVE)
+def save(twin: TwinServer, client: Client, params: d.SceneSave) -> d.SceneResult:
+    """Where motors are bound, settings, sample, correction."""
+    scene = save_scene(
+        twin.scanner,
+        twin.clock.now(),
+        name=params.name or "",
+        saved=datetime.now(UTC).isoformat(timespec="seconds"),
+        version=twin.version,
+    )
+    return d.SceneResult(document=scene.model_dump(mode="json", by_alias=True))
+
+
+@answers(d.SCENE_LOAD)
+async def load(twin: TwinServer, client: Client, params: d.SceneLoad) -> w.State:
+    """Checked whole first, the motion included; then all of it changes and the motors set off."""
+    scene, stops = params.document, twin.scanner.stops
+    require_fit(scene, twin.scanner)
+    sample = sample_of(scene)
+    if sample.name:
+        async with twin.samples.turn:
+            await asyncio.to_thread(twin.samples.load, sample.name, sample.material)
+
+    def ready() -> None:
+        if twin.scanner.stops != stops:
+            raise SafetyError(
+                "the scene is not loaded: motion was stopped meanwhile",
+                {"asked": "scene.load", "allowed": "asking again"},
+            )
+        ensure_idle(twin, client, "scene.load", "a scene")()
+
+    ready()
+    async with twin.stage_turn:
+        correction, in_force = None, twin.corrections.in_force
+        if scene.correction is not None:
+            c = scene.correction
+            correction = twin.corrections.make(c.parameters, c.name, c.comment)
+        history = None if correction == in_force else twin.corrections.after(correction)
+        warnings = await change_stage(
+            twin, sample, correction, ready, history=history, source="scene", scene=scene
+        )
+    for warning in warnings:
+        twin.tell("warning", f"the scene was loaded: {warning}")
+    return twin.state()
+
+
+@answers(d.RPC_DISCOVER)
+def discover(twin: TwinServer, client: Client, params: Empty) -> dict[str, Any]:
+    """The wire as an OpenRPC document."""
+    return document()
+
+
+document = cache(openrpc_document)
+"""Made once: it takes 0.1 s of the loop."""
