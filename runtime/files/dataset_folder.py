@@ -22,15 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.runtime.files.directory import Directory
-from flexdt.twin.dataset.dataset_errors import (
-    DOCUMENT,
-    GEOMETRY,
-    SCAN_SETTINGS,
-    XRE_SETTINGS,
-    DatasetFormatError,
-    DatasetMissingError,
-    plain_name,
-)
+from flexdt.twin.dataset import dataset_errors as ds
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, ScanRecord, parse_document
 from flexdt.twin.dataset.scan_settings import format_scan_settings
 from flexdt.twin.dataset.xre import format_xre
@@ -65,22 +57,22 @@ class Folder:
     @property
     def document(self) -> str | None:
         """Name of flexdt.json, if it is there."""
-        return DOCUMENT if DOCUMENT in self.names else None
+        return ds.DOCUMENT if ds.DOCUMENT in self.names else None
 
     @property
     def geometry(self) -> str | None:
         """Name of geometry.json, if it is there."""
-        return GEOMETRY if GEOMETRY in self.names else None
+        return ds.GEOMETRY if ds.GEOMETRY in self.names else None
 
     @property
     def scan_settings(self) -> str | None:
         """Name of `scan settings.txt`, any case, if it is there."""
-        return self._find(SCAN_SETTINGS)
+        return self._find(ds.SCAN_SETTINGS)
 
     @property
     def xre_settings(self) -> str | None:
         """Name of `data settings XRE.txt`, any case, if it is there."""
-        return self._find(XRE_SETTINGS)
+        return self._find(ds.XRE_SETTINGS)
 
     @cached_property
     def darks(self) -> tuple[str, ...]:
@@ -186,7 +178,7 @@ def list_folder(path: Path) -> Folder:
             links = within is None
             names = frozenset(e.name for e in entries if e.is_file(follow_symlinks=links))
     except OSError as error:
-        raise DatasetMissingError(
+        raise ds.DatasetMissingError(
             f"cannot read folder {path}: {error.strerror}", {"path": str(path)}
         ) from None
     return Folder(path, names)
@@ -203,10 +195,10 @@ def read_text(path: Path, most: int = MAX_TEXT_BYTES) -> str:
             size = os.fstat(file.fileno()).st_size
             if size > most:
                 said = f"{path} has {size} bytes"
-                raise DatasetFormatError.instead(said, size, most, path=str(path))
+                raise ds.DatasetFormatError.instead(said, size, most, path=str(path))
             raw = file.read()
     except OSError as error:
-        raise DatasetFormatError(
+        raise ds.DatasetFormatError(
             f"cannot read {path}: {error.strerror}", {"path": str(path)}
         ) from None
     try:
@@ -217,9 +209,9 @@ def read_text(path: Path, most: int = MAX_TEXT_BYTES) -> str:
 
 def put_texts(files: Directory, record: ScanRecord) -> None:
     """Write what describes a data set: the scanner's two texts, then flexdt.json."""
-    files.put(SCAN_SETTINGS, format_scan_settings(record).encode("utf-8"))
-    files.put(XRE_SETTINGS, format_xre(record).encode("utf-8"))
-    files.put(DOCUMENT, DatasetDocument.of(record).to_json().encode("utf-8"))
+    files.put(ds.SCAN_SETTINGS, format_scan_settings(record).encode("utf-8"))
+    files.put(ds.XRE_SETTINGS, format_xre(record).encode("utf-8"))
+    files.put(ds.DOCUMENT, DatasetDocument.of(record).to_json().encode("utf-8"))
 
 
 def read_document(folder: Directory) -> DatasetDocument:
@@ -229,13 +221,13 @@ def read_document(folder: Directory) -> DatasetDocument:
         FileNotFoundError: there is none.
         DatasetFormatError: it cannot be read, or is no such document.
     """
-    path = folder.path / DOCUMENT
+    path = folder.path / ds.DOCUMENT
     try:
-        text = folder.read(DOCUMENT).decode()
+        text = folder.read(ds.DOCUMENT).decode()
     except FileNotFoundError:
         raise
     except (OSError, UnicodeDecodeError) as error:
-        raise DatasetFormatError(f"cannot read {path}: {error}", {"path": str(path)}) from None
+        raise ds.DatasetFormatError(f"cannot read {path}: {error}", {"path": str(path)}) from None
     return parse_document(text, str(path))
 
 
@@ -255,18 +247,18 @@ def read_values(
     """
     try:
         image = _decoded(path, kinds)
-    except DatasetFormatError:
+    except ds.DatasetFormatError:
         raise
     except FileNotFoundError:
-        raise DatasetMissingError(f"{path} is missing", {"path": str(path)}) from None
+        raise ds.DatasetMissingError(f"{path} is missing", {"path": str(path)}) from None
     except OSError as error:
-        raise DatasetFormatError(f"cannot read {path}: {error}", {"path": str(path)}) from None
+        raise ds.DatasetFormatError(f"cannot read {path}: {error}", {"path": str(path)}) from None
     except Exception as error:  # A third party's parser on a damaged file: anything may come.
-        raise DatasetFormatError(
+        raise ds.DatasetFormatError(
             f"{path} is not a readable TIFF image: {error}", {"path": str(path)}
         ) from None
     if shape is not None and image.shape != shape:
-        raise DatasetFormatError(
+        raise ds.DatasetFormatError(
             f"{path} has {image.shape[1]} x {image.shape[0]} pixels, the data set has {shape[1]} "
             f"x {shape[0]}",
             {"path": str(path), "asked": list(image.shape), "allowed": list(shape)},
@@ -289,14 +281,14 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
         allowed = [np.dtype(k) for k in ("u2", "f4", "f8") if k[0] in kinds]
         if len(shape) != 2 or kind.newbyteorder("=") not in allowed:
             words = " or ".join(map(str, allowed))
-            raise DatasetFormatError(
+            raise ds.DatasetFormatError(
                 f"{path} is {kind} of shape {shape}; allowed: {words} (rows, columns)",
                 {"path": str(path), "asked": [str(kind), list(shape)]},
             )
         size = kind.itemsize * math.prod(shape)
         if size > MAX_IMAGE_BYTES:
             said, most = f"{path} claims {shape[1]} x {shape[0]} pixels", f"{MAX_IMAGE_BYTES} bytes"
-            raise DatasetFormatError.instead(said, size, most, path=str(path))
+            raise ds.DatasetFormatError.instead(said, size, most, path=str(path))
         wanted = np.uint16 if kind.kind == "u" else np.float32
         packing = tifffile.COMPRESSION
         if page.compression in (packing.ADOBE_DEFLATE, packing.DEFLATE):
@@ -319,7 +311,7 @@ def _check_inflation(path: Path, raw: BinaryIO, page: Any, size: int) -> None:
     for start, length in zip(page.dataoffsets, page.databytecounts, strict=True):
         inflated = zlib.decompressobj().decompress(content[start : start + length], size + 1)
         if len(inflated) > size:
-            raise DatasetFormatError(
+            raise ds.DatasetFormatError(
                 f"{path} inflates to more than its {size} bytes of pixels", {"path": str(path)}
             )
 
@@ -370,7 +362,7 @@ def free_name(root: Directory, wish: str) -> str:
     Raises:
         DatasetNameError: `wish` is not plain.
     """
-    plain_name(wish, "data set")
+    ds.plain_name(wish, "data set")
     candidates: Iterable[str] = (wish if n == 1 else f"{wish}-{n}" for n in range(1, 1_000_000))
     return next(n for n in candidates if root.stat(n) is None)
 

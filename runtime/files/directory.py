@@ -22,12 +22,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from flexdt.twin.dataset.dataset_errors import (
-    DatasetNameError,
-    DatasetWriteError,
-    DiskFullError,
-    plain_name,
-)
+from flexdt.twin.dataset import dataset_errors as ds
 
 TEMPORARY: Final = ".part-"
 """Prefix of temporary names; no plain name starts with a dot, so they never collide."""
@@ -63,7 +58,7 @@ def writing(path: Path, refused: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        kind = DiskFullError if error.errno in _NO_ROOM else DatasetWriteError
+        kind = ds.DiskFullError if error.errno in _NO_ROOM else ds.DatasetWriteError
         raise kind(
             f"{refused}: {error.strerror or error}", {"path": str(path), "errno": error.errno}
         ) from None
@@ -142,7 +137,7 @@ class Directory:
             except FileExistsError:
                 if self._above.is_directory(self.path.name):
                     return
-                raise DatasetNameError(
+                raise ds.DatasetNameError(
                     f"{self.path} is a link or a file; nothing is written through it",
                     {"path": str(self.path)},
                 ) from None
@@ -161,7 +156,7 @@ class Directory:
             DatasetWriteError: any other refusal of the system.
         """
         if not name.startswith(BEFORE):
-            plain_name(name)
+            ds.plain_name(name)
         try:
             with self._opened() as fd:
                 self._store(fd, name, memoryview(data).cast("B"))
@@ -383,13 +378,13 @@ class Directory:
                 os.unlink(temporary, dir_fd=fd)
             raise
 
-    def _failed(self, name: str, error: OSError, size: int) -> DatasetWriteError:
+    def _failed(self, name: str, error: OSError, size: int) -> ds.DatasetWriteError:
         path = str(self.path / name)
         data = {"path": path, "bytes": size, "errno": error.errno, "free": free_bytes(self.path)}
         if error.errno in _NO_ROOM:
             free = "" if data["free"] is None else f", {data['free']} bytes free"
-            return DiskFullError(f"no room for {path}: {size} bytes asked{free}", data)
-        return DatasetWriteError(f"cannot write {path}: {error.strerror or error}", data)
+            return ds.DiskFullError(f"no room for {path}: {size} bytes asked{free}", data)
+        return ds.DatasetWriteError(f"cannot write {path}: {error.strerror or error}", data)
 
 
 def free_bytes(path: Path) -> int | None:

@@ -34,26 +34,12 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
+from flexdt.twin.physics import exposure as ideal
 from flexdt.twin.physics.chain import Chain, Expected, read_out, without_spot
 from flexdt.twin.physics.detector import Detector, detector_of
-from flexdt.twin.physics.exposure import (
-    FEW_COUNTS,
-    Counts,
-    ExposureSettings,
-    IdealResponse,
-    expose,
-    ideal_response,
-    open_beam,
-)
+from flexdt.twin.physics.exposure import ExposureSettings
 from flexdt.twin.physics.radiograph import Radiograph, radiographs
-from flexdt.twin.physics.scatter.simulation import (
-    Beam,
-    Object,
-    Scatter,
-    Scattered,
-    ScatterSettings,
-    view_scatter,
-)
+from flexdt.twin.physics.scatter import simulation as mc
 from flexdt.twin.physics.spectrum import TubeModel, tube_of, voltages
 from flexdt.twin.scanner.state import Sample
 
@@ -98,11 +84,11 @@ class Radiography:
     """
 
     imaging: Imaging
-    model: IdealResponse
+    model: ideal.IdealResponse
     physics: Physics = "ideal"
     panel: Detector = field(default_factory=Detector)
     tube: TubeModel = field(default_factory=TubeModel)
-    scatter: Scatter = "off"
+    scatter: mc.Scatter = "off"
 
     @classmethod
     def of(
@@ -110,7 +96,7 @@ class Radiography:
         imaging: Imaging,
         machine: Machine,
         physics: Physics = "ideal",
-        scatter: Scatter = "off",
+        scatter: mc.Scatter = "off",
     ) -> Radiography:
         """For a machine's tube and detector.
 
@@ -123,7 +109,7 @@ class Radiography:
                 {"asked": scatter, "allowed": ["off"]},
             )
         panel, tube = detector_of(machine.detector), tube_of(machine.tube)
-        return cls(imaging, ideal_response(machine), physics, panel, tube, scatter)
+        return cls(imaging, ideal.ideal_response(machine), physics, panel, tube, scatter)
 
     @property
     def remembers(self) -> bool:
@@ -192,7 +178,7 @@ class Radiography:
         chain = chain_through(channels, self.panel, self.tube, mono_keV)
         if points > 1:
             chain, moments = without_spot(chain), moments * points
-        added: list[Scattered] = []
+        added: list[mc.Scattered] = []
         if self.scatter != "off" and channels:
             thing = await self.imaging.scatterer(sample, self._settings.voxels)
             middles = views[moments // 2 :: moments]
@@ -202,21 +188,21 @@ class Radiography:
         return await asyncio.to_thread(radiographs, chain, paths, views, exposures, moments, added)
 
     @property
-    def _settings(self) -> ScatterSettings:
-        return ScatterSettings()
+    def _settings(self) -> mc.ScatterSettings:
+        return mc.ScatterSettings()
 
     def _scattered(
         self,
-        thing: Object,
+        thing: mc.Object,
         chain: Chain,
         views: FloatArray,
         camera: CameraSettings,
         exposures: Sequence[ExposureSettings],
-    ) -> list[Scattered]:
+    ) -> list[mc.Scattered]:
         """Of each image by its own view alone, so that a scan resumed has the bytes of one."""
-        beams = {kV: Beam.of(chain, kV) for kV in {exposure.kV for exposure in exposures}}
+        beams = {kV: mc.Beam.of(chain, kV) for kV in {exposure.kV for exposure in exposures}}
         return [
-            view_scatter(thing, view, camera.shape, beams[exposure.kV], self._settings)
+            mc.view_scatter(thing, view, camera.shape, beams[exposure.kV], self._settings)
             for view, exposure in zip(views, exposures, strict=True)
         ]
 
@@ -244,7 +230,7 @@ class Radiography:
         if radiograph.expected is not None:
             return radiograph.expected.mean_e / np.float32(self.panel.gain(camera))
         lit = replace(exposure, xrays_on=True)
-        return np.exp(-radiograph.shown) * np.float32(open_beam(self.model, lit))
+        return np.exp(-radiograph.shown) * np.float32(ideal.open_beam(self.model, lit))
 
     def counts(
         self,
@@ -254,11 +240,11 @@ class Radiography:
         rng: np.random.Generator | None,
         before: Before = (),
         trapped: Float32Array | None = None,
-    ) -> Counts:
+    ) -> ideal.Counts:
         """What the camera saves of a radiograph, uint16 (rows, cols)."""
         expected = radiograph.expected
         if expected is None:
-            return expose(self.model, radiograph.integrals, exposure, rng)
+            return ideal.expose(self.model, radiograph.integrals, exposure, rng)
         if not exposure.xrays_on:
             expected = self.dark(camera).expected
             assert expected is not None
@@ -296,7 +282,7 @@ def marks_of(
     lines = radiograph.shown
     signal = radiography.signal(radiograph, camera, exposure)
     marks = np.where(signal >= radiography.full_scale - radiography.offset, SATURATED, 0)
-    marks += np.where(signal < FEW_COUNTS, STARVED, 0)
+    marks += np.where(signal < ideal.FEW_COUNTS, STARVED, 0)
     edge = np.ones(lines.shape, np.bool_)
     edge[1:-1, 1:-1] = False
     marks += np.where(edge & (lines > SHADOW), CUT_OFF, 0)
@@ -334,10 +320,10 @@ def flags_of(
     return ImageFlags(
         time=time,
         saturated=float(np.mean(signal >= top)),
-        starved=float(np.mean(signal < FEW_COUNTS)),
+        starved=float(np.mean(signal < ideal.FEW_COUNTS)),
         truncated=[name for name, edge in edges.items() if float(edge.max()) > SHADOW],  # type: ignore[misc]
-        good_counts=(radiography.offset + FEW_COUNTS, radiography.full_scale),
-        good_lines=(round(beam - math.log(top), 2), round(beam - math.log(FEW_COUNTS), 2)),
+        good_counts=(radiography.offset + ideal.FEW_COUNTS, radiography.full_scale),
+        good_lines=(round(beam - math.log(top), 2), round(beam - math.log(ideal.FEW_COUNTS), 2)),
     )
 
 

@@ -26,20 +26,9 @@ from typing import Protocol
 
 from pydantic import BaseModel
 
-from flexdt.protocol import (
-    AnyMethod,
-    Codec,
-    Connection,
-    Failure,
-    Message,
-    Notification,
-    Prepared,
-    Request,
-    Response,
-    RpcError,
-)
+from flexdt.protocol import AnyMethod, Codec, Connection, Prepared, RpcError
+from flexdt.protocol import messages as m
 from flexdt.protocol.fields import Params
-from flexdt.protocol.messages import Id, Single, to_plain
 from flexdt.protocol.rpc_errors import internal, not_authorised
 from flexdt.runtime.access import ConnectionLimits, token_matches
 from flexdt.runtime.log import LOGGER, Sparing, log, traced
@@ -165,14 +154,14 @@ class TokenCheck:
 
 
 async def answered(
-    work: Awaitable[Response | Failure],
+    work: Awaitable[m.Response | m.Failure],
     method: str,
     *,
     trace: str,
     client: str,
     known: Collection[str],
     observe: Observe,
-) -> Response | Failure:
+) -> m.Response | m.Failure:
     """Await the answer to a request, count it, and log it at the level `debug`.
 
     Args:
@@ -188,7 +177,7 @@ async def answered(
     with traced(trace):
         answer = await work
     taken = clock() - begun
-    code = answer.error.code if isinstance(answer, Failure) else None
+    code = answer.error.code if isinstance(answer, m.Failure) else None
     observe(method if method in known else "unknown", taken, code)
     if LOGGER.isEnabledFor(logging.DEBUG):
         log("request", logging.DEBUG, trace=trace, client=client, method=method[:100],
@@ -212,15 +201,15 @@ class Call:
         answered: whether it wants an answer (a notification does not).
     """
 
-    id: Id
+    id: m.Id
     method: str
     params: Params | RpcError
     answered: bool
 
     @property
-    def message(self) -> Request | Notification:
+    def message(self) -> m.Request | m.Notification:
         """The message as it concerns the order of requests and answers: without parameters."""
-        return Request(self.id, self.method) if self.answered else Notification(self.method)
+        return m.Request(self.id, self.method) if self.answered else m.Notification(self.method)
 
 
 @dataclass(frozen=True)
@@ -235,9 +224,9 @@ class Frozen:
     data: bytes
     method: str
 
-    def thawed(self) -> Single | Call:
+    def thawed(self) -> m.Single | Call:
         """The message."""
-        message: Single | Call = pickle.loads(self.data)
+        message: m.Single | Call = pickle.loads(self.data)
         return message
 
 
@@ -267,7 +256,7 @@ class Peer(Protocol):
     def codec(self) -> Codec:
         """The codec of the connection."""
 
-    def post(self, message: Message | Prepared, slot: str | None = None) -> None:
+    def post(self, message: m.Message | Prepared, slot: str | None = None) -> None:
         """Send an event: the newest of its `slot`, or (None) in order with all others."""
 
     def close(self, reason: str) -> None:
@@ -352,9 +341,9 @@ class Outbox:
         self.over = False
         self.queue: deque[bytes] = deque()
         self.unsent = 0
-        self.slots: dict[str, Message | Prepared] = {}
+        self.slots: dict[str, m.Message | Prepared] = {}
 
-    def reply(self, message: Response | Failure) -> None:
+    def reply(self, message: m.Response | m.Failure) -> None:
         """Send or queue an answer."""
         self.send(self.encode(message))
 
@@ -364,24 +353,24 @@ class Outbox:
         try:
             pieces = wire.framed(body)
         except RpcError as error:  # `encode` has seen to it that this is a batch
-            pieces = wire.framed(wire.body(Failure(None, error)))
+            pieces = wire.framed(wire.body(m.Failure(None, error)))
         self._put_all(pieces)
 
-    def encode(self, message: Response | Failure) -> list[bytes]:
+    def encode(self, message: m.Response | m.Failure) -> list[bytes]:
         """The body of an answer, or of why it cannot be sent."""
         wire = self.link.wire
         try:
             body = wire.body(message)
             wire.framed(body)
         except RpcError as error:
-            return wire.body(Failure(message.id, error))
+            return wire.body(m.Failure(message.id, error))
         except (ValueError, TypeError, OverflowError):
-            where = _not_finite(to_plain(message))
+            where = _not_finite(m.to_plain(message))
             self.link.log("reply not sent", logging.ERROR, error=True, where=where)
-            return wire.body(Failure(message.id, internal()))
+            return wire.body(m.Failure(message.id, internal()))
         return body
 
-    def event(self, message: Message | Prepared, slot: str | None) -> None:
+    def event(self, message: m.Message | Prepared, slot: str | None) -> None:
         """Send an event now, or keep it: newest of its slot, or (None) in order."""
         if self.over or self.link.transport.is_closing():
             return
@@ -394,7 +383,7 @@ class Outbox:
             return
         self._put_event(message)
 
-    def _put_event(self, message: Message | Prepared) -> None:
+    def _put_event(self, message: m.Message | Prepared) -> None:
         try:
             self._put_all(self.link.wire.pieces(message))
         except (RpcError, ValueError, TypeError, OverflowError):

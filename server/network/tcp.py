@@ -23,63 +23,18 @@ from collections.abc import Coroutine, Mapping, Sequence
 from dataclasses import dataclass
 from typing import cast
 
-from flexdt.protocol import (
-    METHODS,
-    AnyMethod,
-    Batch,
-    Codec,
-    Connection,
-    Correlation,
-    Failure,
-    Malformed,
-    Message,
-    Notification,
-    Prepared,
-    Request,
-    Response,
-    Role,
-    RpcError,
-    find,
-    parse_params,
-    require_compatible,
-)
+from flexdt.protocol import METHODS, AnyMethod, Codec, Connection, Correlation, Prepared, Role, find
+from flexdt.protocol import messages as m
+from flexdt.protocol import rpc_errors as errors
 from flexdt.protocol.connection import MAX_ANSWER
 from flexdt.protocol.fields import Params
-from flexdt.protocol.messages import Id, Single
+from flexdt.protocol.method import parse_params, require_compatible
 from flexdt.protocol.methods.session_messages import Hello
-from flexdt.protocol.rpc_errors import (
-    ProtocolError,
-    busy,
-    internal,
-    invalid_request,
-    not_authorised,
-    parse_error,
-    too_large,
-)
+from flexdt.protocol.rpc_errors import ProtocolError, RpcError
 from flexdt.runtime.access import ConnectionLimits, check_bind
 from flexdt.runtime.log import Sparing
 from flexdt.runtime.process import ListeningServer, tune
-from flexdt.server.network.shell_parts import (
-    FIRST,
-    ORDINARY,
-    URGENT,
-    WAITING,
-    Call,
-    Deadlines,
-    Frozen,
-    Guest,
-    LoopTurns,
-    Observe,
-    Open,
-    Outbox,
-    Read,
-    Room,
-    Session,
-    TokenCheck,
-    answered,
-    neighbourhood,
-    unobserved,
-)
+from flexdt.server.network import shell_parts as parts
 
 READ_AHEAD = 512 << 10
 """Bytes of whole messages that one connection may have waiting; then it is read no further."""
@@ -106,19 +61,19 @@ HELLO = "session.hello"
 class TcpServer(ListeningServer):
     """A listening server; made by `serve`."""
 
-    open: Open
+    open: parts.Open
     limits: ConnectionLimits
     token: str | None
     methods: Mapping[str, AnyMethod]
-    observe: Observe = unobserved
-    read: Read | None = None
+    observe: parts.Observe = parts.unobserved
+    read: parts.Read | None = None
 
     def __post_init__(self) -> None:
         self.links: set[_Link] = set()
-        self.waiting, self.reserved = Room(WAITING), Room(RESERVED)
+        self.waiting, self.reserved = parts.Room(parts.WAITING), parts.Room(RESERVED)
         self.lines = Sparing()
-        self.turns = LoopTurns()
-        self.urgent = tuple(m.name.encode() for m in self.methods.values() if m.urgent)
+        self.turns = parts.LoopTurns()
+        self.urgent = tuple(x.name.encode() for x in self.methods.values() if x.urgent)
         self._to_look_at: dict[_Link, None] = {}  # in the order in which they came
         self._look_due = False
         self.opened = 0
@@ -152,14 +107,14 @@ class TcpServer(ListeningServer):
         """Stop listening, end every connection, wait until all are gone."""
         if self.server is not None:
             self.server.close()
-        links: list[Guest] = [*self.links, *self.waiting.guests, *self.reserved.guests]
+        links: list[parts.Guest] = [*self.links, *self.waiting.guests, *self.reserved.guests]
         for link in links:
             link.end()
         await asyncio.gather(*(link.gone.wait() for link in links))
 
 
 async def serve(
-    open: Open,
+    open: parts.Open,
     host: str = "127.0.0.1",
     port: int = 0,
     *,
@@ -167,8 +122,8 @@ async def serve(
     token: str | None = None,
     ssl: tls.SSLContext | None = None,
     methods: Mapping[str, AnyMethod] = METHODS,
-    observe: Observe = unobserved,
-    read: Read | None = None,
+    observe: parts.Observe = parts.unobserved,
+    read: parts.Read | None = None,
 ) -> TcpServer:
     """Listen on `host`:`port` (0: any free port) and serve an application.
 
@@ -203,20 +158,20 @@ class _Link(asyncio.Protocol):
         self.number = self.served = 0
         self.calls: Correlation[None] = Correlation(Role.SERVER)
         self.gone = asyncio.Event()
-        self.session: Session | None = None
+        self.session: parts.Session | None = None
         self.let_in = server.token is None
         self.arrived = asyncio.Event()
         self.ended = False
         self.broken = 0
-        self.token_check = TokenCheck(
+        self.token_check = parts.TokenCheck(
             server.token, lambda: self.loop.call_soon(self.close, "wrong tokens"), server.lines
         )
         self.allowance = 0.0
         self.allowance_at = 0.0
-        self.out = Outbox(self)
+        self.out = parts.Outbox(self)
         self.worker: asyncio.Task[None] | None = None
         self.tasks: set[asyncio.Task[None]] = set()
-        self.deadlines = Deadlines(
+        self.deadlines = parts.Deadlines(
             lambda what, seconds: self.abort(f"no {what} within {seconds:g} s")
         )
 
@@ -231,7 +186,7 @@ class _Link(asyncio.Protocol):
         self.name = f"{peer[0]}:{peer[1]}#{self.number}"
         self.transport.set_write_buffer_limits(high=64 * 1024)
         tune(self.transport.get_extra_info("socket"))
-        self.address = neighbourhood(str(peer[0]))
+        self.address = parts.neighbourhood(str(peer[0]))
         if self.let_in:
             self._open()
         else:
@@ -249,7 +204,7 @@ class _Link(asyncio.Protocol):
         return self in links
 
     def _no_place(self) -> RpcError:
-        return busy("too many clients", {"allowed": self.limits.max_clients})
+        return errors.busy("too many clients", {"allowed": self.limits.max_clients})
 
     def data_received(self, data: bytes) -> None:
         before = self.wire.waiting
@@ -273,14 +228,16 @@ class _Link(asyncio.Protocol):
         """Begin with what is urgent of what has come, wherever in the queue it stands."""
         if self.gone.is_set() or not self.let_in:
             return
-        found: list[Message] = []
+        found: list[m.Message] = []
 
         def wanted(raw: bytes) -> bool:
             if len(raw) > LARGE:
                 return False  # it costs more than a look; it is urgent in its turn
             message = self.wire.decode(raw)
             lane, served = self._lane(message), len(self.tasks) + len(found)
-            if lane == ORDINARY or served >= URGENT_AT_ONCE * (4 if lane == FIRST else 1):
+            if lane == parts.ORDINARY or served >= URGENT_AT_ONCE * (
+                4 if lane == parts.FIRST else 1
+            ):
                 return False
             found.append(message)
             return True
@@ -331,7 +288,7 @@ class _Link(asyncio.Protocol):
     def codec(self) -> Codec:
         return self.wire.codec or Codec.JSON
 
-    def post(self, message: Message | Prepared, slot: str | None = None) -> None:
+    def post(self, message: m.Message | Prepared, slot: str | None = None) -> None:
         self.out.event(message, slot)
 
     def close(self, reason: str) -> None:
@@ -346,7 +303,7 @@ class _Link(asyncio.Protocol):
     def displace(self) -> None:
         """A newer connection needs the room: a client learns why it ends, a stranger does not."""
         if self.let_in:
-            self.out.reply(Failure(None, self._no_place()))
+            self.out.reply(m.Failure(None, self._no_place()))
         if self.let_in and not self.transport.get_write_buffer_size():
             self.close("displaced by a newer connection")
         else:  # a client that does not read would stay until a time-out
@@ -379,32 +336,32 @@ class _Link(asyncio.Protocol):
             self.log("open failed", logging.ERROR, error=True)
             self.abort("the application did not open a session")
 
-    def _lane(self, message: Message | Frozen) -> int:
+    def _lane(self, message: m.Message | parts.Frozen) -> int:
         """Which lane it may take: an E-stop's, one of the urgent, the ordinary."""
         name = ""
         match message:
-            case Batch(items):
-                return min(map(self._lane, items), default=ORDINARY)
-            case Frozen(method=method):
+            case m.Batch(items):
+                return min(map(self._lane, items), default=parts.ORDINARY)
+            case parts.Frozen(method=method):
                 name = method
-            case Request(method=method) | Notification(method=method):
+            case m.Request(method=method) | m.Notification(method=method):
                 name = method
         known = self.server.methods.get(name)
         if not self.let_in or known is None or not known.urgent:
-            return ORDINARY
-        return FIRST if name == ESTOP else URGENT
+            return parts.ORDINARY
+        return parts.FIRST if name == ESTOP else parts.URGENT
 
     async def _work(self) -> None:
         while True:
             while self.wire.whole:
-                await self.server.turns.take(self, ORDINARY if self.let_in else URGENT)
+                await self.server.turns.take(self, parts.ORDINARY if self.let_in else parts.URGENT)
                 raw = self.wire.next_raw()
                 self._relax()
-                if isinstance(raw, Malformed) and raw.fatal:
+                if isinstance(raw, m.Malformed) and raw.fatal:
                     self.out.reply(raw.reply)
                     self.close(raw.error.message)
                     return
-                if isinstance(raw, Malformed):
+                if isinstance(raw, m.Malformed):
                     await self._serve(raw)
                 elif raw is not None:
                     await self._serve(await self._decoded(raw))
@@ -424,28 +381,28 @@ class _Link(asyncio.Protocol):
         try:
             self.wire.receive_end()
         except ProtocolError as error:
-            self.out.reply(Failure(None, parse_error(str(error))))
+            self.out.reply(m.Failure(None, errors.parse_error(str(error))))
 
-    async def _decoded(self, raw: bytes) -> Message | Frozen | tuple[Frozen, ...]:
+    async def _decoded(self, raw: bytes) -> m.Message | parts.Frozen | tuple[parts.Frozen, ...]:
         read = self.server.read
         if not self.let_in and len(raw) > LARGE:
-            return Malformed(not_authorised())
+            return m.Malformed(errors.not_authorised())
         if read is None or len(raw) <= LARGE:
             return self.wire.decode(raw)
         try:
             return await read(raw, self.wire)
         except RpcError as error:
-            return Malformed(error)
+            return m.Malformed(error)
         except Exception:
             self.log("a message was not read", logging.ERROR, error=True)
-            return Malformed(internal())
+            return m.Malformed(errors.internal())
 
     async def _serve(
-        self, message: Message | Frozen | tuple[Frozen, ...], *, urgent: bool = False
+        self, message: m.Message | parts.Frozen | tuple[parts.Frozen, ...], *, urgent: bool = False
     ) -> None:
         """Answer one message, in a turn that it has; urgent: get one first."""
         match message:
-            case Batch(items):
+            case m.Batch(items):
                 body = await self._batch(items, urgent)
             case tuple():
                 body = await self._batch(message, urgent)
@@ -458,7 +415,9 @@ class _Link(asyncio.Protocol):
             self.out.send(body)
             await self.out.room()
 
-    async def _batch(self, items: Sequence[Single | Frozen], waits: bool) -> list[bytes] | None:
+    async def _batch(
+        self, items: Sequence[m.Single | parts.Frozen], waits: bool
+    ) -> list[bytes] | None:
         """Each item in a turn of its own, urgent ones first; answers in the order of the batch.
 
         An answer is encoded when it is made; where all together become too large, the others are
@@ -470,38 +429,38 @@ class _Link(asyncio.Protocol):
             if waits:
                 await self._turn(item)
             waits = True
-            full = size > most and self._lane(item) == ORDINARY
-            error = too_large("the answers to a batch", f"more than {most}", most)
+            full = size > most and self._lane(item) == parts.ORDINARY
+            error = errors.too_large("the answers to a batch", f"more than {most}", most)
             answer = await self._answer(item, error if full else None)
             if answer is not None:
                 bodies[i] = self.out.encode(answer)
                 more = sum(map(len, bodies[i]))
                 if size + more > most:
-                    bodies[i] = self.out.encode(Failure(answer.id, error))
+                    bodies[i] = self.out.encode(m.Failure(answer.id, error))
                 size += more
         return self.wire.batch([b for _, b in sorted(bodies.items())]) if bodies else None
 
-    async def _turn(self, message: Message | Frozen) -> None:
+    async def _turn(self, message: m.Message | parts.Frozen) -> None:
         await self.server.turns.take(self, self._lane(message))
 
     async def _answer(
-        self, message: Message | Frozen, refused: RpcError | None = None
-    ) -> Response | Failure | None:
-        item = message.thawed() if isinstance(message, Frozen) else message
+        self, message: m.Message | parts.Frozen, refused: RpcError | None = None
+    ) -> m.Response | m.Failure | None:
+        item = message.thawed() if isinstance(message, parts.Frozen) else message
         try:
-            self.calls.receive(item.message if isinstance(item, Call) else item)
+            self.calls.receive(item.message if isinstance(item, parts.Call) else item)
         except ProtocolError as error:
             self.loop.call_soon(self.close, str(error))
-            return Failure(None, invalid_request(str(error)))
+            return m.Failure(None, errors.invalid_request(str(error)))
         match item:
-            case Request(id, name, params) | Call(id, name, params, True):
+            case m.Request(id, name, params) | parts.Call(id, name, params, True):
                 answer = await self._call(id, name, params if refused is None else refused)
                 self._count(broken=False)
                 return self.calls.answer(answer)
-            case Notification(name, params) | Call(_, name, params, False):
+            case m.Notification(name, params) | parts.Call(_, name, params, False):
                 await self._call(None, name, params if refused is None else refused)
                 self._count(broken=False)
-            case Malformed() as malformed:
+            case m.Malformed() as malformed:
                 self._count(broken=True)
                 return self.calls.answer(malformed.reply)
         return None
@@ -512,18 +471,18 @@ class _Link(asyncio.Protocol):
         if self.broken >= (self.limits.malformed if self.let_in else STRANGE):
             self.loop.call_soon(self.close, f"{self.broken} broken messages in a row")
 
-    async def _call(self, id: Id, name: str, given: Given) -> Response | Failure:
+    async def _call(self, id: m.Id, name: str, given: Given) -> m.Response | m.Failure:
         self.served += 1
         trace = f"{self.number}.{self.served}"
-        return await answered(
+        return await parts.answered(
             self._try(id, name, given, trace), name, trace=trace, client=self.name,
             known=self.server.methods, observe=self.server.observe,
         )  # fmt: skip
 
-    async def _try(self, id: Id, name: str, given: Given, trace: str) -> Response | Failure:
+    async def _try(self, id: m.Id, name: str, given: Given, trace: str) -> m.Response | m.Failure:
         try:
             if not self.let_in and name != HELLO:
-                raise not_authorised()
+                raise errors.not_authorised()
             method = find(name, self.server.methods)
             if not method.urgent:
                 self._check_rate()
@@ -535,14 +494,14 @@ class _Link(asyncio.Protocol):
             if isinstance(params, Hello):
                 await self._check_token(params)
             if self.session is None:
-                raise not_authorised()
-            return Response(id, await self.session.handle(method, params))
+                raise errors.not_authorised()
+            return m.Response(id, await self.session.handle(method, params))
         except RpcError as error:
-            return Failure(id, error)
+            return m.Failure(id, error)
         except Exception:
             self.log("handler failed", logging.ERROR, error=True, method=name[:100])
             # The id is what a person needs to find the traceback.
-            return Failure(id, internal(trace))
+            return m.Failure(id, errors.internal(trace))
 
     async def _check_token(self, hello: Hello) -> None:
         if self.server.token is None:
@@ -560,7 +519,7 @@ class _Link(asyncio.Protocol):
         self.allowance = min(rate, self.allowance + (now - self.allowance_at) * rate)
         self.allowance_at = now
         if self.allowance < 1.0:
-            raise busy(f"more than {rate:g} requests/s", {"allowed": rate, "unit": "1/s"})
+            raise errors.busy(f"more than {rate:g} requests/s", {"allowed": rate, "unit": "1/s"})
         self.allowance -= 1.0
 
     @property

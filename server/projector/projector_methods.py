@@ -25,21 +25,11 @@ import numpy.typing as npt
 
 from flexdt.phantoms.checked_reading import scene_from_dict
 from flexdt.protocol import MAX_FRAME, PROTOCOL, Correlation, Notification, Role, image
+from flexdt.protocol import projector as wire
 from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Id
 from flexdt.protocol.methods import openrpc_document
 from flexdt.protocol.methods.session_messages import Hello
-from flexdt.protocol.projector import (
-    PROJECTOR_METHODS,
-    Backproject,
-    Cancel,
-    MeshSize,
-    Project,
-    VolumeInfo,
-    VolumePut,
-    VolumeRef,
-    VoxelGrid,
-)
 from flexdt.protocol.rpc_errors import RpcError, cancelled, invalid_params, superseded, too_large
 from flexdt.runtime.log import Sparing
 from flexdt.server.network.shell_parts import TokenCheck
@@ -66,7 +56,7 @@ class _Upload:
     """Voxels or a mesh that are still coming, and their bytes."""
 
     owner: object
-    what: VoxelGrid | MeshSize
+    what: wire.VoxelGrid | wire.MeshSize
     data: np.ndarray[tuple[int], np.dtype[np.uint8]]
     received: int = 0
 
@@ -76,7 +66,7 @@ class _Upload:
         Raises:
             GeometryError: a mesh that does not close.
         """
-        if isinstance(self.what, VoxelGrid):
+        if isinstance(self.what, wire.VoxelGrid):
             voxels = self.data.view("<f4").reshape(self.what.shape)
             return Volume(voxels, self.what.voxel_mm, self.what.center_mm)
         corners = 24 * self.what.vertices
@@ -134,7 +124,12 @@ class VolumeStore:
         self._held[name] = value
 
     def chunk(
-        self, owner: object, name: str, what: VoxelGrid | MeshSize, start: int, data: memoryview
+        self,
+        owner: object,
+        name: str,
+        what: wire.VoxelGrid | wire.MeshSize,
+        start: int,
+        data: memoryview,
     ) -> tuple[int, Callable[[], Volume | TriangleMesh] | None]:
         """Take a chunk of voxels or of a mesh.
 
@@ -176,7 +171,7 @@ class VolumeStore:
         for key in [k for k in self._uploads if k[0] is owner]:
             del self._uploads[key]
 
-    def describe(self) -> list[VolumeInfo]:
+    def describe(self) -> list[wire.VolumeInfo]:
         """All volumes, by name."""
         return [_info(name, self._held[name]) for name in sorted(self._held)]
 
@@ -200,8 +195,8 @@ def memory_of(value: Body) -> int:
     return SOLID_BYTES * max(1, len(value.solids))
 
 
-def _needed(what: VoxelGrid | MeshSize) -> int:
-    if isinstance(what, VoxelGrid):
+def _needed(what: wire.VoxelGrid | wire.MeshSize) -> int:
+    if isinstance(what, wire.VoxelGrid):
         return LAYOUT_COPIES * what.nbytes
     return 24 * (what.vertices + what.triangles) + what.nbytes
 
@@ -214,12 +209,12 @@ def _bad_chunk(name: str, asked: int, allowed: int) -> RpcError:
     )
 
 
-def _info(name: str, value: Body) -> VolumeInfo:
+def _info(name: str, value: Body) -> wire.VolumeInfo:
     if isinstance(value, TriangleMesh):
         triangles = len(value.faces)
-        return VolumeInfo(name=name, kind="mesh", bytes=memory_of(value), triangles=triangles)
+        return wire.VolumeInfo(name=name, kind="mesh", bytes=memory_of(value), triangles=triangles)
     if isinstance(value, Volume):
-        return VolumeInfo(
+        return wire.VolumeInfo(
             name=name,
             kind="voxels",
             bytes=memory_of(value),
@@ -227,7 +222,9 @@ def _info(name: str, value: Body) -> VolumeInfo:
             voxel_mm=value.voxel_xyz,
             center_mm=value.center_mm,
         )
-    return VolumeInfo(name=name, kind="scene", bytes=memory_of(value), solids=len(value.solids))
+    return wire.VolumeInfo(
+        name=name, kind="scene", bytes=memory_of(value), solids=len(value.solids)
+    )
 
 
 PART_BYTES: Final = 8 * 2**20
@@ -342,7 +339,7 @@ async def hello(context: Context, client: JobClient, id: Id, p: Hello) -> object
     }  # fmt: skip
 
 
-async def volume_put(context: Context, client: JobClient, id: Id, p: VolumePut) -> object:
+async def volume_put(context: Context, client: JobClient, id: Id, p: wire.VolumePut) -> object:
     """Store a scene, or a chunk of voxels or of a mesh."""
     if p.scene is not None:
         context.store.put(p.name, scene_from_dict(p.scene))
@@ -360,7 +357,7 @@ async def volume_put(context: Context, client: JobClient, id: Id, p: VolumePut) 
     return {"name": p.name, "received": received, "total": what.nbytes, "complete": complete}
 
 
-async def volume_get(context: Context, client: JobClient, id: Id, p: VolumeRef) -> object:
+async def volume_get(context: Context, client: JobClient, id: Id, p: wire.VolumeRef) -> object:
     """Send a volume's voxels."""
     volume = context.store.get(p.name)
     if not isinstance(volume, Volume):
@@ -380,12 +377,12 @@ async def volume_list(context: Context, client: JobClient, id: Id, p: Params) ->
     }
 
 
-async def volume_remove(context: Context, client: JobClient, id: Id, p: VolumeRef) -> object:
+async def volume_remove(context: Context, client: JobClient, id: Id, p: wire.VolumeRef) -> object:
     """Forget a volume."""
     return {"removed": context.store.remove(p.name)}
 
 
-async def project(context: Context, client: JobClient, id: Id, p: Project) -> object:
+async def project(context: Context, client: JobClient, id: Id, p: wire.Project) -> object:
     """Line integrals, view block by view block."""
     volume = context.store.get(p.volume)
     view = math.prod(p.detector)
@@ -408,7 +405,7 @@ async def project(context: Context, client: JobClient, id: Id, p: Project) -> ob
     return {"dtype": "float32", "shape": [len(rows), *p.detector], "parts": parts}
 
 
-async def backproject(context: Context, client: JobClient, id: Id, p: Backproject) -> object:
+async def backproject(context: Context, client: JobClient, id: Id, p: wire.Backproject) -> object:
     """The adjoint, answered or added to a named volume."""
     if len(p.projections) != len(p.cone_vec):
         raise invalid_params(
@@ -442,7 +439,7 @@ async def health(context: Context, client: JobClient, id: Id, p: Params) -> obje
     }
 
 
-async def cancel(context: Context, client: JobClient, id: Id, p: Cancel) -> object:
+async def cancel(context: Context, client: JobClient, id: Id, p: wire.Cancel) -> object:
     """Give up a request."""
     job = client.jobs.get(p.request)
     if job is not None:
@@ -457,10 +454,10 @@ async def discover(context: Context, client: JobClient, id: Id, p: Params) -> ob
 
 @cache
 def _document() -> object:
-    return openrpc_document(PROJECTOR_METHODS, title="flexdt projector server")
+    return openrpc_document(wire.PROJECTOR_METHODS, title="flexdt projector server")
 
 
-def _accumulator(context: Context, name: str | None, grid: VoxelGrid) -> Volume | None:
+def _accumulator(context: Context, name: str | None, grid: wire.VoxelGrid) -> Volume | None:
     if name is None or name not in context.store:
         return None
     held = context.store.get(name)
@@ -477,7 +474,7 @@ def _prepared(volume: Volume | TriangleMesh) -> Volume | TriangleMesh:
     return volume
 
 
-def _backproject(p: Backproject, old: Volume | None) -> Volume:
+def _backproject(p: wire.Backproject, old: Volume | None) -> Volume:
     blank = np.broadcast_to(np.float32(0), p.grid.shape)
     made = back(p.projections, p.cone_vec, Volume(blank, p.grid.voxel_mm, p.grid.center_mm))
     data = np.ascontiguousarray(made.data)

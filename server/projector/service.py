@@ -19,30 +19,11 @@ from typing import Final
 
 from prometheus_client import Metric
 
-from flexdt.protocol import (
-    MAX_FRAME,
-    Batch,
-    Failure,
-    Malformed,
-    Notification,
-    ProtocolError,
-    Request,
-    Response,
-    RpcError,
-    find,
-    parse_params,
-)
+from flexdt.protocol import MAX_FRAME, ProtocolError, RpcError, find, parse_params
 from flexdt.protocol import connection as frames
-from flexdt.protocol.messages import Id
+from flexdt.protocol import messages as m
+from flexdt.protocol import rpc_errors as errors
 from flexdt.protocol.projector import PROJECTOR_METHODS
-from flexdt.protocol.rpc_errors import (
-    busy,
-    internal,
-    invalid_params,
-    invalid_request,
-    not_authorised,
-    too_large,
-)
 from flexdt.runtime.access import ConnectionLimits, check_bind
 from flexdt.runtime.http_pages import Pages, Requests, counter, gauge, watching_pages
 from flexdt.runtime.log import current, log
@@ -88,7 +69,7 @@ class ProjectorServer(ListeningServer):
         self.context.clients[link] = client
         if len(self.context.clients) > self.limits.max_clients:
             allowed = {"allowed": self.limits.max_clients}
-            self.refuse(link, busy("too many clients", allowed))
+            self.refuse(link, errors.busy("too many clients", allowed))
         elif not client.let_in:
             link.deadlines.start("hello", self.limits.hello_timeout_s)
 
@@ -102,13 +83,13 @@ class ProjectorServer(ListeningServer):
     def refuse(self, link: FrameLink, error: RpcError) -> None:
         """Send an error and end the connection."""
         self.context.lines.log("refused", logging.WARNING, client=link.peer, reason=error.message)
-        link.dismiss(Failure(None, error))
+        link.dismiss(m.Failure(None, error))
 
     def frame(self, link: FrameLink, body: memoryview) -> None:
         """A client's message."""
         client = self.context.clients[link]
         if len(client.tasks) >= self.limits.max_waiting:
-            self.refuse(link, busy("too many requests under way"))
+            self.refuse(link, errors.busy("too many requests under way"))
             return
         client.pending_bytes += len(body)
         if client.pending_bytes > MAX_PENDING_BYTES:
@@ -120,28 +101,28 @@ class ProjectorServer(ListeningServer):
     # -- requests ----------------------------------------------------------------------------
 
     async def _serve(self, client: JobClient, body: memoryview) -> None:
-        request: Id = None
+        request: m.Id = None
         link, calls = client.link, client.calls
         try:
             match message := frames.unpack(body):
-                case Batch():
-                    await link.send(Failure(None, invalid_request("one request a frame")))
+                case m.Batch():
+                    await link.send(m.Failure(None, errors.invalid_request("one request a frame")))
                     return
-                case Request(id) if calls.owes(id):
-                    error = invalid_request(f"request id {id!r} is in use")
-                    await link.send(Failure(id, error))
+                case m.Request(id) if calls.owes(id):
+                    error = errors.invalid_request(f"request id {id!r} is in use")
+                    await link.send(m.Failure(id, error))
                     return
             calls.receive(message)
             match message:
-                case Request(id, name, params):
+                case m.Request(id, name, params):
                     request = id
                     await link.send(calls.answer(await self._call(client, id, name, params)))
-                case Notification("cancel", params):
+                case m.Notification("cancel", params):
                     await self._call(client, None, "cancel", params)
-                case Malformed() as broken:
+                case m.Malformed() as broken:
                     await link.send(calls.answer(broken.reply))
         except ProtocolError as broken:
-            self.refuse(link, invalid_request(str(broken)))
+            self.refuse(link, errors.invalid_request(str(broken)))
         except ConnectionError:
             pass  # the client has gone; `lost` cleans up
         except Exception:
@@ -153,30 +134,36 @@ class ProjectorServer(ListeningServer):
             if client.pending_bytes <= MAX_PENDING_BYTES and not client.link.lost:
                 client.link.transport.resume_reading()
 
-    async def _call(self, client: JobClient, id: Id, name: str, given: Given) -> Response | Failure:
+    async def _call(
+        self, client: JobClient, id: m.Id, name: str, given: Given
+    ) -> m.Response | m.Failure:
         return await answered(
             self._try(client, id, name, given), name, trace=str(id), client=client.link.peer,
             known=PROJECTOR_METHODS, observe=self.observe,
         )  # fmt: skip
 
-    async def _try(self, client: JobClient, id: Id, name: str, given: Given) -> Response | Failure:
+    async def _try(
+        self, client: JobClient, id: m.Id, name: str, given: Given
+    ) -> m.Response | m.Failure:
         try:
             if not client.let_in and name != "session.hello":
-                raise not_authorised()
+                raise errors.not_authorised()
             method = find(name, PROJECTOR_METHODS)
             params = parse_params(method, given)
-            return Response(id, await ANSWERS[name](self.context, client, id, params))
+            return m.Response(id, await ANSWERS[name](self.context, client, id, params))
         except RpcError as error:
-            return Failure(id, error)
+            return m.Failure(id, error)
         except TwinError as error:
-            return Failure(id, invalid_params(error.message, [], error.data or None))
+            return m.Failure(id, errors.invalid_params(error.message, [], error.data or None))
         except MemoryError as error:
-            return Failure(id, too_large(f"a result ({error})", "more", 0, "bytes of free memory"))
+            return m.Failure(
+                id, errors.too_large(f"a result ({error})", "more", 0, "bytes of free memory")
+            )
         except ConnectionError:
             raise
         except Exception:
             log("handler failed", logging.ERROR, error=True, method=name, client=client.link.peer)
-            return Failure(id, internal(current()))
+            return m.Failure(id, errors.internal(current()))
 
 
 async def serve_projector(

@@ -24,23 +24,12 @@ from typing import Any, Final, Self, cast
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.protocol import (
-    MAX_FRAME,
-    Answered,
-    Code,
-    Correlation,
-    Message,
-    Notification,
-    ProtocolError,
-    Role,
-    RpcError,
-    image,
-    parse_result,
-)
+from flexdt.protocol import MAX_FRAME, Answered, Code, Correlation, Role, image, parse_result
 from flexdt.protocol import connection as frames
+from flexdt.protocol import messages as m
 from flexdt.protocol.connection import pack
 from flexdt.protocol.projector import Array
-from flexdt.protocol.rpc_errors import parse_error, too_large
+from flexdt.protocol.rpc_errors import ProtocolError, RpcError, parse_error, too_large
 from flexdt.runtime.log import current, log
 from flexdt.runtime.process import tune
 from flexdt.server.network.shell_parts import Deadlines
@@ -170,7 +159,7 @@ class FrameLink(asyncio.BufferedProtocol):
 
     # -- for the owner -----------------------------------------------------------------------
 
-    async def send(self, message: Message) -> None:
+    async def send(self, message: m.Message) -> None:
         """Send a message; returns when the transport has taken it.
 
         Raises:
@@ -184,7 +173,7 @@ class FrameLink(asyncio.BufferedProtocol):
                 await self._send_payload(payload)
             await self._writable.wait()
 
-    def dismiss(self, message: Message) -> None:
+    def dismiss(self, message: m.Message) -> None:
         """Send a last message and end the connection; what still comes in is thrown away.
 
         Closing at once with bytes unread would reset the connection and lose the message.
@@ -313,7 +302,7 @@ class ProjectorLink:
         except asyncio.CancelledError:
             sent = True  # perhaps, so the answer may come
             if not self.lost:
-                cancel = Notification("cancel", {"request": request.id})
+                cancel = m.Notification("cancel", {"request": request.id})
                 self._keep(asyncio.ensure_future(self.link.send(cancel)))
             raise
         finally:
@@ -349,7 +338,7 @@ class ProjectorLink:
             match item:
                 case Answered(pending) if not pending.answer.done():
                     pending.answer.set_result(item)
-                case Notification("part", params) if isinstance(params, Mapping):
+                case m.Notification("part", params) if isinstance(params, Mapping):
                     if (waiter := self._calls.waiter(params.get("request"))) is not None:
                         waiter.part(params)
 

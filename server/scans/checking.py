@@ -30,14 +30,7 @@ from flexdt.twin.collision.obstacle_path import free_moves
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import Machine, Profile
-from flexdt.twin.script import ScanPlan, ScriptProblem, StartState, plan_poses
-from flexdt.twin.script.dry_run import (
-    CheckReport,
-    Clearance,
-    CollisionCheck,
-    check_plan,
-    check_script,
-)
+from flexdt.twin.script import ScanPlan, ScriptProblem, StartState, dry_run, plan_poses
 from flexdt.twin.script.parse import LIGHT_BYTES, is_light
 from flexdt.twin.script.plan import SampleSize
 
@@ -85,18 +78,18 @@ class CheckInput:
             return is_light(script)
         return len(self.wish.poses.text) <= LIGHT_BYTES
 
-    def report(self, bytes_at_most: int | None = None) -> CheckReport:
+    def report(self, bytes_at_most: int | None = None) -> dry_run.CheckReport:
         """Do it; blocks.
 
         Raises:
             RpcError: -32008, the report would be larger than that; nothing is swept then.
         """
         wish, machine = self.wish, self.machine
-        sweep: CollisionCheck | None = None
+        sweep: dry_run.CollisionCheck | None = None
         if machine.components:
             sweep = _bounded(collision_check(self.pieces, self.parameters), bytes_at_most)
         if wish.poses is None:
-            return check_script(
+            return dry_run.check_script(
                 wish.script, machine, self.profile,
                 start=self.start, sample=self.size, collision=sweep,
             )  # fmt: skip
@@ -104,7 +97,7 @@ class CheckInput:
             wish.poses.decoded(), machine, self.profile, wish.exposure_ms, start=self.start,
             sample=self.size, flat=wish.flat, route=self.free_moves if sweep else None,
         )  # fmt: skip
-        return check_plan(plan, (), sweep)
+        return dry_run.check_plan(plan, (), sweep)
 
     def free_moves(
         self, start: Mapping[str, float], goal: Mapping[str, float]
@@ -248,10 +241,10 @@ def _encoded(matter: CheckInput, codec: Codec) -> list[bytes]:
     return [data[at : at + ANSWER_PIECE] for at in range(0, len(data), ANSWER_PIECE)]
 
 
-def _bounded(sweep: CollisionCheck, most: int | None) -> CollisionCheck:
+def _bounded(sweep: dry_run.CollisionCheck, most: int | None) -> dry_run.CollisionCheck:
     def bounded(
         plan: ScanPlan, machine: Machine, profile: Profile, size: SampleSize | None
-    ) -> Clearance:
+    ) -> dry_run.Clearance:
         size_of = sum(STEP_BYTES + len(s.what) + len(s.assumed_from) for s in plan.steps)
         if most is not None and size_of > most:
             raise too_large("a report", f"more than {size_of}", most)
@@ -260,7 +253,7 @@ def _bounded(sweep: CollisionCheck, most: int | None) -> CollisionCheck:
     return bounded
 
 
-def require_sound(report: CheckReport) -> None:
+def require_sound(report: dry_run.CheckReport) -> None:
     """Raise unless the plan may run.
 
     Raises:

@@ -31,15 +31,7 @@ from flexdt.server.scans.stage import Stage
 from flexdt.server.scans.twin_clock import SpeedUp
 from flexdt.server.storage.dataset_writer import RESERVE_BYTES, DatasetWriter
 from flexdt.server.storage.memory import Memory, StateStore, with_job
-from flexdt.twin.dataset.dataset_errors import (
-    DOCUMENT,
-    SCAN_SETTINGS,
-    SCRIPT,
-    XRE_SETTINGS,
-    DatasetError,
-    DiskFullError,
-    plain_name,
-)
+from flexdt.twin.dataset import dataset_errors as ds
 from flexdt.twin.dataset.flexdt_json import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.geometry.cone_vec import check_cone_vec
 from flexdt.twin.scanner.scanner import ScannerTwin
@@ -302,7 +294,7 @@ class Submissions:
             DatasetNameError: no plain name.
             RpcError: -32602, the name is taken by something that cannot be resumed.
         """
-        plain_name(name, "data set")
+        ds.plain_name(name, "data set")
         if name in RESERVED:
             raise name_conflict(name, "it is reserved")
         folder = self.root.folder(name)
@@ -318,13 +310,13 @@ class Submissions:
                 there = {e.name for e in entries if not e.name.startswith(".")}
             # A server killed while it made the folder leaves no document, and no image either.
             complete = False
-            if DOCUMENT in there or there - {SCRIPT, SCAN_SETTINGS, XRE_SETTINGS}:
+            if ds.DOCUMENT in there or there - {ds.SCRIPT, ds.SCAN_SETTINGS, ds.XRE_SETTINGS}:
                 complete = read_document(folder).complete
         except FileNotFoundError:
             raise name_conflict(
                 name, "there is something that no scan of this twin has begun"
             ) from None
-        except (OSError, DatasetError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ds.DatasetError, ValueError, KeyError, TypeError) as error:
             raise name_conflict(
                 name, f"it holds something that cannot be resumed ({error})"
             ) from None
@@ -354,7 +346,7 @@ class Submissions:
             left = max(0, self.quota - used_bytes(self.root))
             free = left if free is None else min(free, left)
         if free is not None and free < need:
-            raise DiskFullError(
+            raise ds.DiskFullError(
                 f"{name} needs {need / 1e6:.1f} MB, of which {RESERVE_BYTES / 1e6:.1f} MB are to "
                 f"stay free; {free / 1e6:.1f} MB are free in {self.root.path}",
                 {"asked": need, "allowed": free, "path": str(self.root.path)},

@@ -20,16 +20,7 @@ import tifffile
 
 from flexdt.runtime.files.dataset_folder import put_texts, read_document, tiff_bytes
 from flexdt.runtime.files.directory import Directory, Write, free_bytes, write_some
-from flexdt.twin.dataset.dataset_errors import (
-    DOCUMENT,
-    SCRIPT,
-    DatasetError,
-    DatasetExistsError,
-    DatasetMissingError,
-    DatasetWriteError,
-    DiskFullError,
-    plain_name,
-)
+from flexdt.twin.dataset import dataset_errors as ds
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, ScanRecord
 
 RESERVE_BYTES: Final = 16 << 20
@@ -66,9 +57,9 @@ class DatasetWriter:
         write: Write = write_some,
     ) -> None:
         for file in record.files:
-            plain_name(file)
+            ds.plain_name(file)
         self.record = replace(record, complete=False, reason=record.reason or INTERRUPTED)
-        self._files = root.folder(plain_name(record.name, "data set"), sync=sync, write=write)
+        self._files = root.folder(ds.plain_name(record.name, "data set"), sync=sync, write=write)
         self._files.make()
         self._files.held()
         self.folder = self._files.path
@@ -78,7 +69,7 @@ class DatasetWriter:
             self._present = self._begin(resume)
             self._check_room()
             if script is not None:
-                self._files.put(SCRIPT, script)
+                self._files.put(ds.SCRIPT, script)
             put_texts(self._files, self.record)
         except BaseException:
             self._files.close()
@@ -108,15 +99,15 @@ class DatasetWriter:
             DatasetWriteError: not an image of this scan, or the system cannot write.
             DiskFullError: no room; nothing of the file is left behind.
         """
-        plain_name(name)
+        ds.plain_name(name)
         expected = self._shapes.get(name)
         if expected is None:
-            raise DatasetWriteError(
+            raise ds.DatasetWriteError(
                 f"{name} is no image of scan {self.record.name}", {"asked": name}
             )
         if image.shape != expected or image.dtype != np.uint16:
             found = f"{image.dtype} of shape {image.shape}"
-            raise DatasetWriteError.instead(
+            raise ds.DatasetWriteError.instead(
                 f"{name}: image is {found}", found, f"uint16 of shape {expected}"
             )
         self._files.put(name, tiff_bytes(image))
@@ -134,7 +125,7 @@ class DatasetWriter:
         """
         missing = self.missing
         if missing:
-            raise DatasetMissingError(
+            raise ds.DatasetMissingError(
                 f"{self.folder}: {len(missing)} of {len(self.record.files)} images are missing: "
                 f"{summary(missing)}",
                 {"path": str(self.folder), "missing": list(missing[:100])},
@@ -152,11 +143,11 @@ class DatasetWriter:
     def _begin(self, resume: bool) -> set[str]:
         there = self._files.names()
         if there and not resume:
-            raise DatasetExistsError(
+            raise ds.DatasetExistsError(
                 f"{self.folder} holds {len(there)} files already; allowed: another name, or resume",
                 {"path": str(self.folder), "files": len(there)},
             )
-        if DOCUMENT in there:
+        if ds.DOCUMENT in there:
             self._check_same()
         self._files.sweep()
         found = there & set(self.record.files)
@@ -177,11 +168,11 @@ class DatasetWriter:
             return False
 
     def _check_same(self) -> None:
-        path = self.folder / DOCUMENT
+        path = self.folder / ds.DOCUMENT
         try:
             found = read_document(self._files)
-        except (DatasetError, OSError) as error:
-            raise DatasetExistsError(
+        except (ds.DatasetError, OSError) as error:
+            raise ds.DatasetExistsError(
                 f"{path} cannot be read, so the scan cannot be resumed: {error}",
                 {"path": str(path)},
             ) from None
@@ -193,7 +184,7 @@ class DatasetWriter:
             ("noise", found.noise, ours.noise),
         ):
             if a != b:
-                raise DatasetExistsError(
+                raise ds.DatasetExistsError(
                     f"{self.folder} holds another scan (its {what} differ); allowed: another name",
                     {"path": str(self.folder), "differs": what},
                 )
@@ -207,7 +198,7 @@ class DatasetWriter:
         need = sum(2 * self._shapes[f][0] * self._shapes[f][1] for f in missing) + RESERVE_BYTES
         free = free_bytes(self.folder)
         if free is not None and free < need:
-            raise DiskFullError(
+            raise ds.DiskFullError(
                 f"{self.folder}: {len(missing)} images need {need} bytes, {free} bytes are free",
                 {"path": str(self.folder), "bytes": need, "free": free},
             )

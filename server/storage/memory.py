@@ -34,24 +34,11 @@ from annotated_types import Ge, Le
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from flexdt.protocol.fields import ShortText, SpeedUp
-from flexdt.protocol.methods.document_messages import (
-    CameraPart,
-    CorrectionPart,
-    SamplePart,
-    Scene,
-    TubePart,
-)
-from flexdt.protocol.methods.document_messages import Placement as WirePlacement
+from flexdt.protocol.methods import document_messages as p
 from flexdt.protocol.rpc_errors import RpcError, invalid_params
 from flexdt.protocol.state_model import JobPhase
+from flexdt.runtime.files import own_documents as own
 from flexdt.runtime.files.directory import Directory
-from flexdt.runtime.files.own_documents import (
-    Changes,
-    file_stem,
-    ours,
-    read_json,
-    read_or_set_aside,
-)
 from flexdt.runtime.log import log
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetWriteError, plain_name
 from flexdt.twin.errors import TwinError, UnknownNameError
@@ -65,9 +52,9 @@ from flexdt.twin.scanner.state import NamedCorrection, Sample, StagePlacement
 
 def save_scene(
     scanner: ScannerTwin, now: float, *, name: str = "", saved: str = "", version: str = ""
-) -> Scene:
+) -> p.Scene:
     """The scanner as a document; a motor under way is saved where it is bound."""
-    return Scene(
+    return p.Scene(
         schema=1,
         flexdt=version,
         name=name,
@@ -77,16 +64,16 @@ def save_scene(
         positions=scanner.targets(now),
         speeds={axis: pace[0] for axis, pace in scanner.paces.items()},
         accelerations={axis: pace[1] for axis, pace in scanner.paces.items()},
-        tube=TubePart(kV=scanner.tube.kV, power_W=scanner.tube.power_W, on=scanner.tube.on),
-        camera=CameraPart(**scanner.camera.stated),
-        sample=SamplePart(
+        tube=p.TubePart(kV=scanner.tube.kV, power_W=scanner.tube.power_W, on=scanner.tube.on),
+        camera=p.CameraPart(**scanner.camera.stated),
+        sample=p.SamplePart(
             name=scanner.sample.name,
             material=scanner.sample.material,
-            offset=WirePlacement(**asdict(scanner.sample.offset)),
+            offset=p.Placement(**asdict(scanner.sample.offset)),
         ),
         correction=None
         if scanner.correction is None
-        else CorrectionPart(**correction_fields(scanner.correction)),
+        else p.CorrectionPart(**correction_fields(scanner.correction)),
     )
 
 
@@ -100,7 +87,7 @@ def correction_fields(correction: NamedCorrection) -> dict[str, Any]:
     }
 
 
-def correction_of(part: CorrectionPart) -> NamedCorrection:
+def correction_of(part: p.CorrectionPart) -> NamedCorrection:
     """The correction of a document.
 
     Raises:
@@ -109,7 +96,7 @@ def correction_of(part: CorrectionPart) -> NamedCorrection:
     return NamedCorrection.from_edge(part.name, part.date, part.parameters, part.comment)
 
 
-def require_fit(scene: Scene, scanner: ScannerTwin) -> None:
+def require_fit(scene: p.Scene, scanner: ScannerTwin) -> None:
     """Check that a scene fits this scanner.
 
     Raises:
@@ -130,7 +117,7 @@ def require_fit(scene: Scene, scanner: ScannerTwin) -> None:
         trial.require_applicable(correction_of(scene.correction))
 
 
-def paces_of(scene: Scene, scanner: ScannerTwin) -> dict[str, tuple[float, float]]:
+def paces_of(scene: p.Scene, scanner: ScannerTwin) -> dict[str, tuple[float, float]]:
     """Motor -> (speed, acceleration) with the scene's where it has them."""
     return {
         axis: (scene.speeds.get(axis, speed), scene.accelerations.get(axis, acceleration))
@@ -138,7 +125,7 @@ def paces_of(scene: Scene, scanner: ScannerTwin) -> dict[str, tuple[float, float
     }
 
 
-def apply_settings(scene: Scene, scanner: ScannerTwin) -> None:
+def apply_settings(scene: p.Scene, scanner: ScannerTwin) -> None:
     """Set tube, camera and paces as in the scene; X-rays are not switched."""
     for axis, speed in scene.speeds.items():
         scanner.set_axis(axis, speed=speed)
@@ -149,7 +136,7 @@ def apply_settings(scene: Scene, scanner: ScannerTwin) -> None:
     scanner.set_camera(**camera | {"roi": Roi(*scene.camera.roi)})
 
 
-def sample_of(scene: Scene) -> Sample:
+def sample_of(scene: p.Scene) -> Sample:
     """The scene's sample."""
     return Sample(
         scene.sample.name, StagePlacement(**scene.sample.offset.model_dump()), scene.sample.material
@@ -199,7 +186,7 @@ class Memory(_Part):
     schema_version: Literal[1] = Field(alias="schema")
     saved: str
     ended: bool = False
-    scene: Scene
+    scene: p.Scene
     estop: bool = False
     jobs: list[JobMemory] = Field(default_factory=list)
     jobs_made: Count = 0
@@ -254,10 +241,10 @@ def with_job(memory: Memory, job: JobMemory) -> Memory:
 
 def read_memory(root: Directory) -> Memory | None:
     """What was remembered in data directory `root`; None where there is nothing to read."""
-    return read_or_set_aside(
+    return own.read_or_set_aside(
         root,
         FILE,
-        lambda data: Memory.model_validate(read_json(data)),
+        lambda data: Memory.model_validate(own.read_json(data)),
         "the last state cannot be read; starting anew",
     )
 
@@ -267,7 +254,7 @@ def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
 
     None where the memory is of another machine or no longer allowed: then only an E-stop is kept.
     """
-    known: Scene | None
+    known: p.Scene | None
     known, spec = memory.scene, scanner.machine.tube
     # Which correction is in force the history says.
     known = known.model_copy(update={"correction": None})
@@ -342,7 +329,7 @@ class StateStore:
         self,
         take: Callable[[], T],
         after: Callable[[Memory], Memory] | None = None,
-        files: Callable[[Changes], None] | None = None,
+        files: Callable[[own.Changes], None] | None = None,
     ) -> T:
         """Write a change that must survive, then apply it.
 
@@ -363,11 +350,11 @@ class StateStore:
         self,
         take: Callable[[], T],
         after: Callable[[Memory], Memory] | None,
-        files: Callable[[Changes], None] | None,
+        files: Callable[[own.Changes], None] | None,
     ) -> T:
         async with self._writing:
             document = None if after is None else after(self._make(False))
-            changes = Changes()
+            changes = own.Changes()
             try:
                 await asyncio.to_thread(self._put_all, changes, document, files)
                 taken = take()
@@ -394,7 +381,10 @@ class StateStore:
             self._root.keep(FILE, memory.model_dump_json(by_alias=True).encode("utf-8"))
 
     def _put_all(
-        self, changes: Changes, document: Memory | None, files: Callable[[Changes], None] | None
+        self,
+        changes: own.Changes,
+        document: Memory | None,
+        files: Callable[[own.Changes], None] | None,
     ) -> None:
         with self._file:
             if self._ended:
@@ -405,7 +395,7 @@ class StateStore:
                 text = document.model_dump_json(by_alias=True).encode("utf-8")
                 changes.put(self._root, FILE, text)
 
-    def _undo(self, changes: Changes) -> None:
+    def _undo(self, changes: own.Changes) -> None:
         with self._file:
             changes.undo()
 
@@ -422,7 +412,7 @@ KEPT = 1000
 History = list[str | None]
 
 
-class CorrectionFile(CorrectionPart):
+class CorrectionFile(p.CorrectionPart):
     """A correction as a document."""
 
     schema_version: Literal[1] = Field(alias="schema")
@@ -441,9 +431,9 @@ class Corrections:
         self._folder = folder
         self._all: dict[str, NamedCorrection] = {}
         self._sources: dict[str, str | None] = {}
-        for file in ours(folder):
+        for file in own.ours(folder):
             without = "a correction cannot be read; without it"
-            found = read_or_set_aside(folder, file, _read, without)
+            found = own.read_or_set_aside(folder, file, _read, without)
             if found is not None:
                 self.know(*found)
         known = list(history)
@@ -511,7 +501,7 @@ class Corrections:
             return self.history
         return [*self.history, name][-KEPT:]
 
-    def store(self, changes: Changes, correction: NamedCorrection, source: str | None) -> None:
+    def store(self, changes: own.Changes, correction: NamedCorrection, source: str | None) -> None:
         """Write a new correction; one that is known stays as it is.
 
         Raises:
@@ -521,7 +511,7 @@ class Corrections:
             return
         document = CorrectionFile(schema=1, source=source, **correction_fields(correction))
         stamp = correction.date.split(".")[0].replace(":", "")
-        name = f"{stamp} {file_stem(correction.name)}.json"
+        name = f"{stamp} {own.file_stem(correction.name)}.json"
         changes.put_json(self._folder, name, document.model_dump(by_alias=True))
 
     def know(self, correction: NamedCorrection, source: str | None) -> None:
@@ -539,7 +529,7 @@ class Corrections:
 
 
 def _read(data: bytes) -> tuple[NamedCorrection, str | None]:
-    document = CorrectionFile.model_validate(read_json(data))
+    document = CorrectionFile.model_validate(own.read_json(data))
     correction = correction_of(document)
     require_plausible(correction.parameters, math.inf)
     return correction, document.source

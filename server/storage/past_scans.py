@@ -28,27 +28,12 @@ from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import calibration_messages as p
 from flexdt.protocol.methods.calibration_messages import CalibrationAlign, CalibrationFit
 from flexdt.protocol.rpc_errors import too_large
-from flexdt.runtime.files.dataset_folder import (
-    Folder,
-    confined,
-    list_folder,
-    mean_image,
-    opened,
-    read_image,
-    read_text,
-)
+from flexdt.runtime.files import dataset_folder as files
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.wire_errors import from_root
 from flexdt.runtime.workers import Workers
 from flexdt.server.storage import dataset_fits
-from flexdt.twin.dataset.dataset_errors import (
-    DOCUMENT,
-    SCRIPT,
-    DatasetError,
-    DatasetMissingError,
-    DatasetNameError,
-    plain_name,
-)
+from flexdt.twin.dataset import dataset_errors as ds
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, FrameEntry, FrameKind, parse_document
 from flexdt.twin.dataset.normalise import LineIntegrals, binned_mean
 from flexdt.twin.errors import LimitError, TwinError
@@ -126,11 +111,11 @@ def work(root: Path, asked: Params, around: TwinContext, codec: Codec) -> list[b
     """In the worker: the encoded answer."""
     try:
         directory = Directory(root)
-        with directory, confined(directory):
+        with directory, files.confined(directory):
             result = _ANSWERS[type(asked)](directory, asked, around, codec)
     except OSError as error:  # it has gone meanwhile, or the disk fails
         name = getattr(asked, "name", "the data directory")
-        raise DatasetMissingError(f"{name} cannot be read: {error.strerror}") from None
+        raise ds.DatasetMissingError(f"{name} cannot be read: {error.strerror}") from None
     return list(encoded(result, codec).pieces)
 
 
@@ -190,7 +175,7 @@ class _Scan:
         key: changes with the folder.
     """
 
-    folder: Folder
+    folder: files.Folder
     images: _Images = ()
     document: DatasetDocument | None = None
     texts: Any = None
@@ -206,20 +191,22 @@ class _Scan:
 
 def _place(root: Directory, name: str) -> tuple[Path, tuple[object, ...]]:
     """A data set's folder, and a key that changes with its files and its document."""
-    about = root.stat(plain_name(name, "data set"))
+    about = root.stat(ds.plain_name(name, "data set"))
     if about is None or not stat.S_ISDIR(about.st_mode):
-        raise DatasetMissingError(f"no data set {name!r} in the data directory", {"asked": name})
-    parts = [s for s in (about, root.folder(name).stat(DOCUMENT)) if s is not None]
+        raise ds.DatasetMissingError(f"no data set {name!r} in the data directory", {"asked": name})
+    parts = [s for s in (about, root.folder(name).stat(ds.DOCUMENT)) if s is not None]
     return root.path / name, (name, *((s.st_ino, s.st_mtime_ns, s.st_size) for s in parts))
 
 
-def _scan(folder: Folder, most: int) -> _Scan:
+def _scan(folder: files.Folder, most: int) -> _Scan:
     try:
         if folder.document is None:
-            raise DatasetMissingError(f"there is no {DOCUMENT}: poses and settings are not known")
-        document = parse_document(read_text(folder.path / DOCUMENT, most), DOCUMENT)
+            raise ds.DatasetMissingError(
+                f"there is no {ds.DOCUMENT}: poses and settings are not known"
+            )
+        document = parse_document(files.read_text(folder.path / ds.DOCUMENT, most), ds.DOCUMENT)
         return _Scan(folder, tuple(document.frames), document)
-    except DatasetError as error:
+    except ds.DatasetError as error:
         if not folder.projections:
             raise
         texts, problem = _texts(folder), error.message
@@ -241,10 +228,10 @@ def _scan(folder: Folder, most: int) -> _Scan:
         )
         for frame, row in zip(texts.frames, texts.cone_vec.rows.tolist(), strict=True)
     ]  # fmt: skip
-    return _Scan(folder, tuple(bare), None, texts, f"there is no {DOCUMENT}: its texts are read")
+    return _Scan(folder, tuple(bare), None, texts, f"there is no {ds.DOCUMENT}: its texts are read")
 
 
-def _texts(folder: Folder) -> Any:
+def _texts(folder: files.Folder) -> Any:
     """What the scanner's own texts say of a folder without a document; None for nothing."""
     if folder.document:
         return None
@@ -261,7 +248,7 @@ def _opened(root: Directory, name: str) -> _Scan:
 
 @lru_cache(4)
 def _kept_scan(path: Path, key: tuple[object, ...]) -> _Scan:
-    return replace(_scan(list_folder(path), MAX_DOCUMENT), key=key)
+    return replace(_scan(files.list_folder(path), MAX_DOCUMENT), key=key)
 
 
 def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
@@ -285,7 +272,7 @@ def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
         )  # fmt: skip
         return info.model_copy(update=told)
     lost = folder.lost([f.file for f in document.frames])
-    files = document.files("projection")
+    taken = document.files("projection")
     detector, named = document.detector, document.machine.get("name")
     return p.DatasetInfo(
         name=path.name,
@@ -294,8 +281,8 @@ def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
         duration_s=document.duration_s,
         state="complete" if document.complete and not lost else "incomplete",
         reason=(document.complete and lost) or document.reason,
-        projections=len(files),
-        present=sum(f in folder.names for f in files),
+        projections=len(taken),
+        present=sum(f in folder.names for f in taken),
         machine=str(named)[:100],
         sample=document.sample.name,
         operator=document.operator,
@@ -318,9 +305,9 @@ def _list(
         for entry in entries:
             try:
                 if entry.is_dir(follow_symlinks=False) and not entry.name.startswith("."):
-                    plain_name(entry.name)
+                    ds.plain_name(entry.name)
                     folders.append((entry.stat(follow_symlinks=False).st_mtime, entry.name))
-            except DatasetNameError:
+            except ds.DatasetNameError:
                 left_out += 1
             except OSError:  # it has gone meanwhile
                 continue
@@ -333,7 +320,7 @@ def _list(
             path, key = _place(root, name)
             late = key not in _INFOS and time.monotonic() > until
             info = None if late else _INFOS.get(key, lambda: _listed(path, modified))  # noqa: B023
-        except DatasetError:
+        except ds.DatasetError:
             continue  # it has gone meanwhile, or is no data set
         if info is None:
             info = p.DatasetInfo(name=name, modified=modified, problem="not read yet")
@@ -361,7 +348,7 @@ def _as_it_runs(info: p.DatasetInfo, around: TwinContext) -> p.DatasetInfo:
 
 def _listed(path: Path, modified: float) -> p.DatasetInfo | str:
     """A data set in a few words; "" for a folder that holds none."""
-    folder = list_folder(path)
+    folder = files.list_folder(path)
     if folder.document is None and not folder.projections:
         return ""
     try:
@@ -374,13 +361,13 @@ def _listed(path: Path, modified: float) -> p.DatasetInfo | str:
 
 def _with_thumbnail(root: Directory, info: p.DatasetInfo, side: int, until: float) -> p.DatasetInfo:
     def make() -> ImageValue | str:
-        folder = list_folder(path)
-        files = list(folder.projections.values())
-        if not files:
+        folder = files.list_folder(path)
+        images = list(folder.projections.values())
+        if not images:
             return ""
         try:
-            pixels = read_image(path / files[len(files) // 2])
-        except DatasetError:
+            pixels = files.read_image(path / images[len(images) // 2])
+        except ds.DatasetError:
             return ""
         factor = math.ceil(max(pixels.shape) / side)
         narrow = min(pixels.shape) < factor
@@ -394,7 +381,7 @@ def _with_thumbnail(root: Directory, info: p.DatasetInfo, side: int, until: floa
         if (side, key) not in _THUMBNAILS and time.monotonic() > until:
             return info
         made = _THUMBNAILS.get((side, key), make)
-    except DatasetError:
+    except ds.DatasetError:
         return info
     return info.model_copy(update={"thumbnail": made or None})
 
@@ -441,10 +428,10 @@ def _same(scan: _Scan, around: TwinContext) -> bool:
     return profile == around.profile and all(own.get(k) == machine.get(k) for k in parts)
 
 
-def _script(folder: Folder) -> str:
-    if SCRIPT not in folder.names:
-        raise DatasetMissingError(f"{folder.path.name}: no script lies with this data set")
-    with opened(folder.path / SCRIPT) as file:
+def _script(folder: files.Folder) -> str:
+    if ds.SCRIPT not in folder.names:
+        raise ds.DatasetMissingError(f"{folder.path.name}: no script lies with this data set")
+    with files.opened(folder.path / ds.SCRIPT) as file:
         if (size := os.fstat(file.fileno()).st_size) > MAX_SCRIPT:
             raise too_large("the script of a data set", size, MAX_SCRIPT)
         return file.read().decode("utf-8", "replace")
@@ -458,7 +445,7 @@ def _measured(scan: _Scan, at: tuple[int, ...]) -> dict[str, Any]:
         try:
             path = scan.folder.path / _there(scan.folder, scan.images[i].file)
             counts.append(None if time.monotonic() > until else _mean(path, scan.key))
-        except DatasetError:
+        except ds.DatasetError:
             counts.append(None)
     if scan.document is None:
         return {"counts": counts}
@@ -471,7 +458,7 @@ def _measured(scan: _Scan, at: tuple[int, ...]) -> dict[str, Any]:
 
 @lru_cache(16 * 2000)
 def _mean(path: Path, key: tuple[object, ...]) -> float:
-    return float(read_image(path).mean())
+    return float(files.read_image(path).mean())
 
 
 @lru_cache(4)
@@ -511,7 +498,7 @@ def _frame(
         )
     frame = images[asked.index]
     shape = document.shape_of(frame) if document and isinstance(frame, FrameEntry) else None
-    counts = read_image(folder.path / _there(folder, frame.file), shape)
+    counts = files.read_image(folder.path / _there(folder, frame.file), shape)
     if asked.binning > min(counts.shape):
         raise LimitError(f"binning {asked.binning} leaves nothing of {counts.shape} pixels")
     pixels: npt.NDArray[np.generic] = counts
@@ -547,9 +534,9 @@ def _frame(
     )  # fmt: skip
 
 
-def _there(folder: Folder, file: str) -> str:
+def _there(folder: files.Folder, file: str) -> str:
     if file not in folder.names:
-        raise DatasetMissingError(f"{folder.path.name}: {file} is not there", {"path": file})
+        raise ds.DatasetMissingError(f"{folder.path.name}: {file} is not there", {"path": file})
     return file
 
 
@@ -561,10 +548,10 @@ def _normal(scan: _Scan, shape: tuple[int, int]) -> LineIntegrals:
     )
     if not flat:
         name = folder.path.name
-        raise DatasetMissingError(f"{name} has no flat image: there are no line integrals")
-    opened = mean_image(flat, shape)
-    lost = mean_image(dark, shape) if dark else np.zeros_like(opened)
-    return LineIntegrals.of(lost, opened)
+        raise ds.DatasetMissingError(f"{name} has no flat image: there are no line integrals")
+    light = files.mean_image(flat, shape)
+    lost = files.mean_image(dark, shape) if dark else np.zeros_like(light)
+    return LineIntegrals.of(lost, light)
 
 
 _ANSWERS: Final[Mapping[type[Params], Callable[..., object]]] = {

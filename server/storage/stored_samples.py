@@ -29,31 +29,15 @@ from typing import Annotated, BinaryIO, Literal
 import numpy as np
 from pydantic import Field, StringConstraints
 
-from flexdt.phantoms import (
-    Phantom,
-    PhantomError,
-    is_shipped,
-    load_phantom,
-    mesh_phantom,
-    phantom_names,
-    voxel_phantom,
-)
-from flexdt.phantoms import material as material_of
+from flexdt import phantoms
+from flexdt.phantoms import Phantom, PhantomError
 from flexdt.phantoms.files.mesh_files import default_unit
 from flexdt.phantoms.files.phantom_files import sent_scene
 from flexdt.protocol.fields import Payload
 from flexdt.protocol.methods.scanner_messages import LengthUnit, SampleUpload
 from flexdt.protocol.rpc_errors import Code, RpcError, too_large
+from flexdt.runtime.files import own_documents as own
 from flexdt.runtime.files.directory import TEMPORARY, Directory, writing
-from flexdt.runtime.files.own_documents import (
-    ASIDE,
-    Changes,
-    file_stem,
-    ours,
-    read_json,
-    read_or_set_aside,
-    set_aside,
-)
 from flexdt.runtime.log import log
 from flexdt.runtime.worker import document
 from flexdt.runtime.workers import Worker
@@ -219,7 +203,7 @@ def mesh_apart(raw: bytes, *, unit: str, material: str, file_type: str, name: st
         PhantomError: as there, unknown material, or reading it takes too much time or memory.
     """
     how = {"unit": unit, "material": material, "file_type": file_type, "name": name}
-    return _apart(mesh_phantom, how, raw)
+    return _apart(phantoms.mesh_phantom, how, raw)
 
 
 def scene_apart(raw: bytes, *, name: str) -> Phantom:
@@ -296,10 +280,10 @@ class SampleStore:
         self._heads: dict[str, UploadHead] = {}
         self._stored: dict[str, str] = {}
         """Revisions of uploads as their files say; those of older servers say nothing."""
-        for file in ours(folder):
+        for file in own.ours(folder):
             without = "an upload cannot be read; without it"
-            head = read_or_set_aside(folder, file, _head_of(file), without)
-            if head is not None and head.name != EMPTY and not is_shipped(head.name):
+            head = own.read_or_set_aside(folder, file, _head_of(file), without)
+            if head is not None and head.name != EMPTY and not phantoms.is_shipped(head.name):
                 self._heads[head.name] = head
                 if head.revision is not None:
                     self._stored[head.name] = head.revision
@@ -317,7 +301,7 @@ class SampleStore:
     @property
     def names(self) -> tuple[str, ...]:
         """Shipped phantoms, then uploads."""
-        return (*phantom_names(), *self._heads)
+        return (*phantoms.phantom_names(), *self._heads)
 
     @property
     def uploads(self) -> tuple[str, ...]:
@@ -375,13 +359,13 @@ class SampleStore:
         """
         if head.total > self._limit:
             raise too_large("an upload", head.total, self._limit)
-        if head.name == EMPTY or is_shipped(head.name):
+        if head.name == EMPTY or phantoms.is_shipped(head.name):
             what = "the empty stage" if head.name == EMPTY else "a shipped phantom"
             raise LimitError(
                 f"{head.name!r} is {what}'s name; choose another",
-                {"asked": head.name, "taken": [EMPTY, *phantom_names()]},
+                {"asked": head.name, "taken": [EMPTY, *phantoms.phantom_names()]},
             )
-        file_stem(head.name)
+        own.file_stem(head.name)
         return self._incoming.receive(head, start, data)
 
     def parse(self, name: str, material: str | None = None) -> ReceivedSample:
@@ -399,13 +383,13 @@ class SampleStore:
         worn = None if material is None else (material, _parse(head, raw, material))
         return ReceivedSample(head, raw, phantom, _revision(head, raw), worn)
 
-    def store(self, changes: Changes, upload: ReceivedSample) -> None:
+    def store(self, changes: own.Changes, upload: ReceivedSample) -> None:
         """Write an upload; the previous one of that name stays beside it until `know`.
 
         Raises:
             DatasetWriteError: the system cannot write.
         """
-        head, stem = upload.head, file_stem(upload.head.name)
+        head, stem = upload.head, own.file_stem(upload.head.name)
         changes.put(self._folder, _bytes_file(head.name, upload.revision), upload.raw)
         document = head.model_dump(by_alias=True, exclude={"start", "data"})
         document["revision"] = upload.revision
@@ -429,7 +413,7 @@ class SampleStore:
             known = {_bytes_file(name, self._stored.get(name)) for name in self._heads}
         there = self._folder.names()
         for file in fnmatch.filter(there, f"*.{'?' * 16}.bin"):
-            damaged = f"{file.split('.')[0]}{ASIDE}.json" in there
+            damaged = f"{file.split('.')[0]}{own.ASIDE}.json" in there
             if file not in known and not damaged:
                 with suppress(OSError):
                     self._folder.unlink(file)
@@ -445,7 +429,7 @@ class SampleStore:
                     {"asked": material, "allowed": None},
                 )
             try:
-                return load_phantom(name), None
+                return phantoms.load_phantom(name), None
             except UnknownNameError:
                 problem = f"no sample called {name!r}; there are"
                 raise UnknownNameError.among(problem, name, self.names) from None
@@ -468,10 +452,10 @@ class SampleStore:
             with self._lock:
                 if self._heads.get(head.name) is head:  # else another has come under this name
                     del self._heads[head.name]
-                    for damaged in (file, f"{file_stem(head.name)}.json"):
+                    for damaged in (file, f"{own.file_stem(head.name)}.json"):
                         if self._folder.stat(damaged) is not None:
                             without = "an upload cannot be read; without it"
-                            set_aside(self._folder, damaged, error, without)
+                            own.set_aside(self._folder, damaged, error, without)
             raise PhantomError(f"the upload {head.name!r} cannot be read: {error}") from None
         return raw
 
@@ -499,7 +483,7 @@ def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
     if head.kind == "scene":
         return scene_apart(raw, name=head.name)
     if material is not None:
-        material_of(material)
+        phantoms.material(material)
     assert head.shape is not None
     assert head.voxel_mm is not None
     size = 4 * math.prod(head.shape)
@@ -511,20 +495,26 @@ def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
     data = np.frombuffer(raw, dtype="<f4").reshape(head.shape)
     if not np.isfinite(data).all():
         raise PhantomError(f"{head.name}: voxels must be finite numbers")
-    return voxel_phantom(data.astype(np.float32), head.voxel_mm, name=head.name, material=material)
+    return phantoms.voxel_phantom(
+        data.astype(np.float32), head.voxel_mm, name=head.name, material=material
+    )
 
 
 def _bytes_file(name: str, revision: str | None) -> str:
     """The file of an upload's bytes; earlier servers kept one file for each name."""
-    return f"{file_stem(name)}.bin" if revision is None else f"{file_stem(name)}.{revision}.bin"
+    return (
+        f"{own.file_stem(name)}.bin"
+        if revision is None
+        else f"{own.file_stem(name)}.{revision}.bin"
+    )
 
 
 def _head_of(file: str) -> Callable[[bytes], UploadHead]:
     """Reads what lies beside an upload, as if it was uploaded now."""
 
     def read(data: bytes) -> UploadHead:
-        head = UploadHead.model_validate(read_json(data))
-        if file != f"{file_stem(head.name)}.json":
+        head = UploadHead.model_validate(own.read_json(data))
+        if file != f"{own.file_stem(head.name)}.json":
             raise ValueError(f"it is about {head.name!r}")
         return head
 

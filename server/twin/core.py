@@ -32,14 +32,7 @@ from flexdt.server.scans.jobs import Jobs, fresh_seed
 from flexdt.server.scans.stage import Shapes, Stage
 from flexdt.server.scans.submission import RESERVED, Submissions
 from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
-from flexdt.server.storage.memory import (
-    Corrections,
-    Memory,
-    StateStore,
-    read_memory,
-    remember,
-    restore,
-)
+from flexdt.server.storage import memory as kept
 from flexdt.server.storage.past_scans import PastScans
 from flexdt.server.storage.stored_samples import ReceivedSample, SampleStore, sample_material
 from flexdt.server.twin import wire_values as views
@@ -186,9 +179,9 @@ class TwinServer:
         self.shapes = Shapes()
         self.past_scans = PastScans(self.root, machine, profile)
         self.predictors = predictors()
-        self.remembered = read_memory(root)
+        self.remembered = kept.read_memory(root)
         known = [] if self.remembered is None else self.remembered.corrections
-        self.corrections = Corrections(root.folder("corrections"), known)
+        self.corrections = kept.Corrections(root.folder("corrections"), known)
         self._apply_last()
         self.stage_turn = asyncio.Lock()
         """Held while the stage is changed: such changes come one after the other."""
@@ -208,7 +201,7 @@ class TwinServer:
         self.feed = StateFeed(
             self.scanner, self.clock, self.hub, self.state, lambda: self.jobs.running
         )
-        self.keeper = StateStore(root, self._memory)
+        self.keeper = kept.StateStore(root, self._memory)
         self.submissions = Submissions(
             self.scanner,
             self.jobs,
@@ -265,7 +258,7 @@ class TwinServer:
         if memory is None:
             return None
         left = self.jobs.recall(memory.jobs, memory.jobs_made, self.directory)
-        sample = restore(memory, self.scanner, self.clock.now())
+        sample = kept.restore(memory, self.scanner, self.clock.now())
         if not memory.ended or left:
             names = [job.id for job in left]
             self.tell(
@@ -392,10 +385,10 @@ class TwinServer:
         now = self.clock.now()
         return self.scanner.rest_time(now) > now
 
-    def _memory(self, ended: bool) -> Memory:
+    def _memory(self, ended: bool) -> kept.Memory:
         jobs, made = self.jobs.memory()
         history = self.corrections.history
-        return remember(self.scanner, self.clock.now(), jobs, made, history, ended=ended)
+        return kept.remember(self.scanner, self.clock.now(), jobs, made, history, ended=ended)
 
     async def certified_stage(
         self,

@@ -12,16 +12,7 @@ from collections.abc import Sequence
 
 from flexdt import machines
 from flexdt.process_settings import TwinSettings, parse
-from flexdt.runtime.access import (
-    ConnectionLimits,
-    TwinLimits,
-    check_bind,
-    client_tls,
-    limit_names,
-    read_token,
-    server_tls,
-    with_limits,
-)
+from flexdt.runtime import access
 from flexdt.runtime.log import LEVELS, set_up
 from flexdt.runtime.process import FAILED, OK, announce, first_of, run_process, stop_signal
 
@@ -40,7 +31,7 @@ async def run(options: TwinSettings) -> int:
     machine = machines.machine(options.machine)
     profile = machines.profile(options.profile, machine, options.machine)
     root = options.data.absolute()
-    check_bind(options.host, read_token(options.token_file))
+    access.check_bind(options.host, access.read_token(options.token_file))
     directory = open_data(root)
     release = lock_folder(directory)
 
@@ -56,8 +47,8 @@ async def run(options: TwinSettings) -> int:
     from flexdt.twin.scanner.state import Sample
 
     truth = None if options.truth is None else load_truth(options.truth, root)
-    token = read_token(options.projector_token_file)
-    secure = client_tls(options.projector_tls_ca)
+    token = access.read_token(options.projector_token_file)
+    secure = access.client_tls(options.projector_tls_ca)
     clients = [
         ProjectorClient(place.host, place.port, token=token, ssl=secure) for place in options.places
     ]
@@ -74,7 +65,9 @@ async def run(options: TwinSettings) -> int:
         physics=options.physics,
         scatter=options.scatter,
         projectors=len(clients),
-        limits=with_limits(options.limit, TwinLimits(), limit_names(ConnectionLimits())),
+        limits=access.with_limits(
+            options.limit, access.TwinLimits(), access.limit_names(access.ConnectionLimits())
+        ),
     )
     sample = None if options.fresh else twin.recall()
     if sample is None or options.sample is not None:
@@ -85,9 +78,11 @@ async def run(options: TwinSettings) -> int:
         lambda peer: TwinSession(twin, peer),
         options.host,
         options.port,
-        token=read_token(options.token_file),
-        ssl=server_tls(options.tls_cert, options.tls_key),
-        limits=with_limits(options.limit, ConnectionLimits(), limit_names(TwinLimits())),
+        token=access.read_token(options.token_file),
+        ssl=access.server_tls(options.tls_cert, options.tls_key),
+        limits=access.with_limits(
+            options.limit, access.ConnectionLimits(), access.limit_names(access.TwinLimits())
+        ),
         observe=requests.observe,
         read=reader,
     )

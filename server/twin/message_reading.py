@@ -10,18 +10,9 @@ import pickle
 from dataclasses import replace
 from typing import Final
 
-from flexdt.protocol import (
-    METHODS,
-    Batch,
-    Codec,
-    Connection,
-    Notification,
-    Request,
-    RpcError,
-    find,
-)
+from flexdt.protocol import METHODS, Codec, Connection, RpcError, find
+from flexdt.protocol import messages as m
 from flexdt.protocol.fields import Params
-from flexdt.protocol.messages import Single
 from flexdt.protocol.method import parse_params
 from flexdt.protocol.methods.job_messages import TrajectoryInput
 from flexdt.protocol.rpc_errors import too_large
@@ -60,20 +51,20 @@ class Reader:
 def work(codec: Codec | None, most: int, raw: bytes) -> list[bytes]:
     """In the worker: the items of a message, of a batch of at most so many: method, pickle."""
     message = Connection(codec, max_batch=most).decode(raw)
-    batch = isinstance(message, Batch)
-    items = message.items if isinstance(message, Batch) else (message,)
+    batch = isinstance(message, m.Batch)
+    items = message.items if isinstance(message, m.Batch) else (message,)
     parts = [b"batch" if batch else b"single"]
     for item in items:
-        name = item.method if isinstance(item, Request | Notification) else ""
+        name = item.method if isinstance(item, m.Request | m.Notification) else ""
         parts += [name.encode() if name in METHODS else b"", _frozen(item)]
     return parts
 
 
-def _frozen(message: Single) -> bytes:
-    if not isinstance(message, Request | Notification):
+def _frozen(message: m.Single) -> bytes:
+    if not isinstance(message, m.Request | m.Notification):
         return pickle.dumps(message)
-    answered = isinstance(message, Request)
-    id = message.id if isinstance(message, Request) else None
+    answered = isinstance(message, m.Request)
+    id = message.id if isinstance(message, m.Request) else None
     call = Call(id, message.method, _params(message), answered)
     data = pickle.dumps(call)
     method = METHODS.get(message.method)
@@ -83,7 +74,7 @@ def _frozen(message: Single) -> bytes:
     return data
 
 
-def _params(message: Request | Notification) -> Params | RpcError:
+def _params(message: m.Request | m.Notification) -> Params | RpcError:
     try:
         params = parse_params(find(message.method), message.params)
     except RpcError as error:

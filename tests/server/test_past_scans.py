@@ -177,7 +177,7 @@ def test_mean_counts_that_were_late_are_read_the_next_time(
         return tifffile.imread(path)
 
     monkeypatch.setattr(past_scans, "time", clock)
-    monkeypatch.setattr(past_scans, "read_image", slow)
+    monkeypatch.setattr(past_scans.files, "read_image", slow)
     known = [0]
     while True:
         told = asked(tmp_path, DatasetGet(name="scan", measure=True))

@@ -102,7 +102,7 @@ NEW = ("session.hello", "session.ping", "safety.estop")
 def test_new_clients_are_served_whatever_peers_without_the_token_do(
     seed: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(tcp, "WAITING", 12)
+    monkeypatch.setattr(tcp.parts, "WAITING", 12)
     monkeypatch.setattr(tcp, "RESERVED", 3)
     rng = random.Random(seed)
 

@@ -9,59 +9,54 @@ from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import calibration_messages as p
 from flexdt.protocol.methods.calibration_messages import DATASET_FRAME, DATASET_GET, DATASET_LIST
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import (
-    Client,
-    answers,
-    change_stage,
-    encoded_apart,
-    ensure_allowed,
-    in_turns,
-)
+from flexdt.server.twin.handlers import handler as h
 
 
-@answers(p.CALIBRATION_APPLY)
-async def apply(twin: TwinServer, client: Client, params: p.CalibrationApply) -> p.CorrectionResult:
+@h.answers(p.CALIBRATION_APPLY)
+async def apply(
+    twin: TwinServer, client: h.Client, params: p.CalibrationApply
+) -> p.CorrectionResult:
     """A new correction in force, instead of the last."""
     async with twin.stage_turn:
         correction = twin.corrections.make(params.parameters, params.name, params.comment)
         history = twin.corrections.after(correction)
-        ready = ensure_allowed(twin, client, "calibration.apply")
-        warnings = await change_stage(
+        ready = h.ensure_allowed(twin, client, "calibration.apply")
+        warnings = await h.change_stage(
             twin, twin.scanner.sample, correction, ready, history=history, source=params.source
         )
     return _in_force(twin, f"correction {correction.name!r} is in force", warnings)
 
 
-@answers(p.CALIBRATION_GET)
-def get(twin: TwinServer, client: Client, params: p.CalibrationGet) -> p.CorrectionResult:
+@h.answers(p.CALIBRATION_GET)
+def get(twin: TwinServer, client: h.Client, params: p.CalibrationGet) -> p.CorrectionResult:
     """The one in force, or the one named."""
     if params.name is None:
         return p.CorrectionResult(correction=twin.correction_state(twin.scanner.correction))
     return p.CorrectionResult(correction=twin.correction_state(twin.corrections.get(params.name)))
 
 
-@answers(p.CALIBRATION_LIST)
+@h.answers(p.CALIBRATION_LIST)
 async def list_all(
-    twin: TwinServer, client: Client, params: Empty
+    twin: TwinServer, client: h.Client, params: Empty
 ) -> p.CorrectionListResult | Encoded:
     """All, oldest first."""
     current = twin.scanner.correction
-    views = await in_turns(twin.corrections.all(), twin.correction_state)
+    views = await h.in_turns(twin.corrections.all(), twin.correction_state)
     result = p.CorrectionListResult(
         corrections=[view for view in views if view is not None],
         current=None if current is None else current.name,
     )
-    return await encoded_apart(client, result, len(views))
+    return await h.encoded_apart(client, result, len(views))
 
 
-@answers(p.CALIBRATION_REVERT)
-async def revert(twin: TwinServer, client: Client, params: Empty) -> p.CorrectionResult:
+@h.answers(p.CALIBRATION_REVERT)
+async def revert(twin: TwinServer, client: h.Client, params: Empty) -> p.CorrectionResult:
     """The one before, or none."""
     async with twin.stage_turn:
         history = twin.corrections.history[:-1]
         before = twin.corrections.last(history)
-        ready = ensure_allowed(twin, client, "calibration.revert")
-        warnings = await change_stage(twin, twin.scanner.sample, before, ready, history=history)
+        ready = h.ensure_allowed(twin, client, "calibration.revert")
+        warnings = await h.change_stage(twin, twin.scanner.sample, before, ready, history=history)
     return _in_force(twin, "the correction was reverted", warnings)
 
 
@@ -74,8 +69,8 @@ def _in_force(twin: TwinServer, message: str, warnings: list[str]) -> p.Correcti
     return p.CorrectionResult(correction=correction, warnings=warnings)
 
 
-@answers(DATASET_LIST, DATASET_GET, DATASET_FRAME, p.CALIBRATION_FIT, p.CALIBRATION_ALIGN)
-async def from_data_sets(twin: TwinServer, client: Client, params: Params) -> Encoded:
+@h.answers(DATASET_LIST, DATASET_GET, DATASET_FRAME, p.CALIBRATION_FIT, p.CALIBRATION_ALIGN)
+async def from_data_sets(twin: TwinServer, client: h.Client, params: Params) -> Encoded:
     """What a worker process reads of the data directory."""
     job = twin.jobs.current
     running = "" if job is None else Path(job.folder).name

@@ -18,13 +18,7 @@ from flexdt.protocol.rpc_errors import invalid_params, too_large
 from flexdt.server.scans.job import ENDED, Job
 from flexdt.server.scans.scan_record import ScanSource
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import (
-    Client,
-    answers,
-    encoded_apart,
-    ensure_allowed,
-    in_turns,
-)
+from flexdt.server.twin.handlers import handler as h
 from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.errors import CollisionError
 
@@ -36,38 +30,38 @@ CHECK: tuple[Method[ScanInput, p.CheckResult], ...] = (p.SCRIPT_CHECK, p.TRAJECT
 SUBMIT: tuple[Method[ScanInput, p.SubmitResult], ...] = (p.SCRIPT_SUBMIT, p.TRAJECTORY_SUBMIT)
 
 
-@answers(*CHECK)
-async def check(twin: TwinServer, client: Client, params: ScanInput) -> Encoded:
+@h.answers(*CHECK)
+async def check(twin: TwinServer, client: h.Client, params: ScanInput) -> Encoded:
     """The dry-run report; nothing moves."""
     return await twin.submissions.check(_source(params), client.peer.codec)
 
 
-@answers(*SUBMIT)
-async def submit(twin: TwinServer, client: Client, params: ScanInput) -> p.SubmitResult:
+@h.answers(*SUBMIT)
+async def submit(twin: TwinServer, client: h.Client, params: ScanInput) -> p.SubmitResult:
     """A script as a job, or poses, one image each."""
-    ready = ensure_allowed(twin, client, "a scan")
+    ready = h.ensure_allowed(twin, client, "a scan")
     job = await twin.submissions.submit(
         _source(params), params.name, params.speed_up, client.program, ready
     )
     return p.SubmitResult(job=job.id, dataset=job.folder, warnings=job.warnings)
 
 
-@answers(p.JOB_STATUS)
-def status(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
+@h.answers(p.JOB_STATUS)
+def status(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobStatus:
     """How far a job is."""
     return twin.jobs.status(twin.jobs.get(params.job))
 
 
-@answers(p.JOB_PAUSE)
-async def pause(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
+@h.answers(p.JOB_PAUSE)
+async def pause(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobStatus:
     """Motion stops; frames in the making are finished."""
     job = twin.jobs.get(params.job)
     twin.jobs.pause(job)
     return await _when(twin, job, lambda: job.phase != "running")
 
 
-@answers(p.JOB_RESUME)
-async def resume(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
+@h.answers(p.JOB_RESUME)
+async def resume(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobStatus:
     """Back to the pose of the pause, and on; a job that ended early is queued once more.
 
     Raises:
@@ -75,15 +69,15 @@ async def resume(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobSta
     """
     job = twin.jobs.get(params.job)
     if job.phase in ENDED and job.phase != "done":
-        await twin.submissions.again(job, ensure_allowed(twin, client, "a scan"))
+        await twin.submissions.again(job, h.ensure_allowed(twin, client, "a scan"))
         return twin.jobs.status(job)
     twin.jobs.resume(job)
     status = await _when(twin, job, lambda: job.phase != "paused" or job.error is not None)
     return _unless_obstructed(job, status)
 
 
-@answers(p.JOB_STEP)
-async def step(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatus:
+@h.answers(p.JOB_STEP)
+async def step(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobStatus:
     """One frame or command, then paused again; -32002 as for `resume`."""
     job = twin.jobs.get(params.job)
     twin.jobs.step(job)
@@ -93,8 +87,8 @@ async def step(twin: TwinServer, client: Client, params: p.JobRef) -> w.JobStatu
     )
 
 
-@answers(p.JOB_ABORT)
-async def abort(twin: TwinServer, client: Client, params: p.JobAbort) -> w.JobStatus:
+@h.answers(p.JOB_ABORT)
+async def abort(twin: TwinServer, client: h.Client, params: p.JobAbort) -> w.JobStatus:
     """The data set stays, marked incomplete, and says why."""
     job = twin.jobs.get(params.job)
     twin.jobs.abort(job, params.reason)
@@ -103,11 +97,11 @@ async def abort(twin: TwinServer, client: Client, params: p.JobAbort) -> w.JobSt
     return await _when(twin, job, lambda: job.phase in ENDED)
 
 
-@answers(p.JOB_LIST)
-async def list_jobs(twin: TwinServer, client: Client, params: Empty) -> p.JobListResult | Encoded:
+@h.answers(p.JOB_LIST)
+async def list_jobs(twin: TwinServer, client: h.Client, params: Empty) -> p.JobListResult | Encoded:
     """All jobs, oldest first."""
-    jobs = await in_turns(twin.jobs.all(), twin.jobs.status)
-    return await encoded_apart(client, p.JobListResult(jobs=jobs), len(jobs))
+    jobs = await h.in_turns(twin.jobs.all(), twin.jobs.status)
+    return await h.encoded_apart(client, p.JobListResult(jobs=jobs), len(jobs))
 
 
 async def _when(twin: TwinServer, job: Job, condition: Callable[[], bool]) -> w.JobStatus:

@@ -11,20 +11,13 @@ from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import scanner_messages as p
 from flexdt.server.storage.stored_samples import EMPTY, UploadHead
 from flexdt.server.twin.core import TwinServer
-from flexdt.server.twin.handlers.handler import (
-    Client,
-    answers,
-    change_stage,
-    encoded_apart,
-    ensure_idle,
-    in_turns,
-)
+from flexdt.server.twin.handlers import handler as h
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.scanner.state import Sample, StagePlacement
 
 
-@answers(p.SAMPLE_SET)
-async def set_sample(twin: TwinServer, client: Client, params: p.SampleSet) -> p.SampleResult:
+@h.answers(p.SAMPLE_SET)
+async def set_sample(twin: TwinServer, client: h.Client, params: p.SampleSet) -> p.SampleResult:
     """Put a shipped phantom or an upload on the stage; without an offset it is centred."""
     name = params.file if params.name is None else params.name
     assert name is not None
@@ -40,29 +33,29 @@ async def set_sample(twin: TwinServer, client: Client, params: p.SampleSet) -> p
         async with twin.samples.turn:
             await asyncio.to_thread(twin.samples.load, name, params.material)
         sample = Sample(name, offset, params.material)
-    ready = ensure_idle(twin, client, "sample.set", "a sample")
+    ready = h.ensure_idle(twin, client, "sample.set", "a sample")
     ready()
     async with twin.stage_turn:
-        warnings = await change_stage(twin, sample, twin.scanner.correction, ready)
+        warnings = await h.change_stage(twin, sample, twin.scanner.correction, ready)
     return p.SampleResult(sample=twin.sample_state(), warnings=warnings)
 
 
-@answers(p.SAMPLE_LIST)
+@h.answers(p.SAMPLE_LIST)
 async def list_samples(
-    twin: TwinServer, client: Client, params: Empty
+    twin: TwinServer, client: h.Client, params: Empty
 ) -> p.SampleListResult | Encoded:
     """Everything that may stand on the stage."""
     empty = p.SampleInfo(name=EMPTY, description="nothing on the stage", size_mm=(0.0, 0.0, 0.0))
-    shipped = await in_turns(phantom_names(), lambda name: _info(name, load_phantom(name)))
+    shipped = await h.in_turns(phantom_names(), lambda name: _info(name, load_phantom(name)))
     heads = [head for name in twin.samples.uploads if (head := twin.samples.head(name)) is not None]
-    uploads = await in_turns(heads, _upload_info)
+    uploads = await h.in_turns(heads, _upload_info)
     samples = [empty, *shipped, *uploads]
     result = p.SampleListResult(samples=samples, materials=list(materials()))
-    return await encoded_apart(client, result, len(samples))
+    return await h.encoded_apart(client, result, len(samples))
 
 
-@answers(p.SAMPLE_MESH)
-async def mesh(twin: TwinServer, client: Client, params: p.SampleMesh) -> p.SampleMeshResult:
+@h.answers(p.SAMPLE_MESH)
+async def mesh(twin: TwinServer, client: h.Client, params: p.SampleMesh) -> p.SampleMeshResult:
     """A part of the mesh of the sample on the stage, for drawing."""
     sample = twin.scanner.sample
     if not sample.name:
@@ -86,8 +79,8 @@ async def mesh(twin: TwinServer, client: Client, params: p.SampleMesh) -> p.Samp
     )
 
 
-@answers(p.SAMPLE_UPLOAD)
-async def upload(twin: TwinServer, client: Client, params: p.SampleUpload) -> p.UploadResult:
+@h.answers(p.SAMPLE_UPLOAD)
+async def upload(twin: TwinServer, client: h.Client, params: p.SampleUpload) -> p.UploadResult:
     """One chunk; the last one makes the sample."""
     head = UploadHead.of(params)
     _ensure_idle_if_used(twin, client, head.name)
@@ -104,7 +97,7 @@ async def upload(twin: TwinServer, client: Client, params: p.SampleUpload) -> p.
         upload = await asyncio.to_thread(twin.samples.parse, head.name, material)
         warnings = list(upload.phantom.assumed)
         if there:
-            warnings += await change_stage(
+            warnings += await h.change_stage(
                 twin, stands, twin.scanner.correction,
                 lambda: _ensure_idle_if_used(twin, client, head.name), upload=upload,
             )  # fmt: skip
@@ -124,7 +117,7 @@ async def upload(twin: TwinServer, client: Client, params: p.SampleUpload) -> p.
     )
 
 
-def _ensure_idle_if_used(twin: TwinServer, client: Client, name: str) -> None:
+def _ensure_idle_if_used(twin: TwinServer, client: h.Client, name: str) -> None:
     """Check that a sample may change: if it is on the stage, under this connection's control and in
     no scan.
 
@@ -132,7 +125,7 @@ def _ensure_idle_if_used(twin: TwinServer, client: Client, name: str) -> None:
         RpcError: -32003, names the controller or the job.
     """
     if name == twin.scanner.sample.name:
-        ensure_idle(twin, client, "sample.upload", "sample.upload")()
+        h.ensure_idle(twin, client, "sample.upload", "sample.upload")()
 
 
 def _info(name: str, phantom: Phantom, head: UploadHead | None = None) -> p.SampleInfo:
