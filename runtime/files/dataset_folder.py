@@ -178,9 +178,8 @@ def list_folder(path: Path) -> Folder:
             links = within is None
             names = frozenset(e.name for e in entries if e.is_file(follow_symlinks=links))
     except OSError as error:
-        raise ds.DatasetMissingError(
-            f"cannot read folder {path}: {error.strerror}", {"path": str(path)}
-        ) from None
+        said = f"cannot read folder {path}: {error.strerror}"
+        raise ds.DatasetMissingError(said, {"path": str(path)}) from None
     return Folder(path, names)
 
 
@@ -198,9 +197,8 @@ def read_text(path: Path, most: int = MAX_TEXT_BYTES) -> str:
                 raise ds.DatasetFormatError.instead(said, size, most, path=str(path))
             raw = file.read()
     except OSError as error:
-        raise ds.DatasetFormatError(
-            f"cannot read {path}: {error.strerror}", {"path": str(path)}
-        ) from None
+        said = f"cannot read {path}: {error.strerror}"
+        raise ds.DatasetFormatError(said, {"path": str(path)}) from None
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -254,9 +252,8 @@ def read_values(
     except OSError as error:
         raise ds.DatasetFormatError(f"cannot read {path}: {error}", {"path": str(path)}) from None
     except Exception as error:  # A third party's parser on a damaged file: anything may come.
-        raise ds.DatasetFormatError(
-            f"{path} is not a readable TIFF image: {error}", {"path": str(path)}
-        ) from None
+        said = f"{path} is not a readable TIFF image: {error}"
+        raise ds.DatasetFormatError(said, {"path": str(path)}) from None
     if shape is not None and image.shape != shape:
         raise ds.DatasetFormatError(
             f"{path} has {image.shape[1]} x {image.shape[0]} pixels, the data set has {shape[1]} "

@@ -12,7 +12,7 @@ import gc
 import json
 import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final, TypeVar
 
@@ -38,8 +38,6 @@ AT_ONCE: Final = 2
 """Checks in worker processes at a time; others wait."""
 SECONDS: Final = float(CHECK_LIMITS["seconds"])
 MEMORY_BYTES: Final = int(CHECK_LIMITS["memory_bytes"])
-FEW: Final = 5
-"""Light checks after which a process is started for further ones."""
 MAX_PROBLEMS: Final = 1000
 """Problems that an error or a job's warnings list; the others are counted."""
 STEP_BYTES: Final = 100
@@ -138,8 +136,6 @@ class Checks:
         self._last: Checked | None = None
         # Light checks of many clients take turns, so that a scan always finds a worker thread.
         self._turn = asyncio.Semaphore(AT_ONCE)
-        self._light = 0
-        self._starting: asyncio.Task[None] | None = None
 
     async def report(self, matter: CheckInput, codec: Codec) -> Sequence[bytes]:
         """The dry-run report, encoded.
@@ -176,23 +172,8 @@ class Checks:
         return self._last
 
     def _here(self, matter: CheckInput) -> bool:
-        """Whether to check in a thread: what is light, while there is no process for it.
-
-        Who checks often gets one, which is started meanwhile.
-        """
-        if not self._apart:
-            return True
-        if not matter.light or self._workers.ready:
-            return False
-        self._light += 1
-        if self._light > FEW and self._starting is None:
-            self._starting = asyncio.create_task(self._start(matter))
-        return True
-
-    async def _start(self, matter: CheckInput) -> None:
-        with suppress(RpcError):
-            await self._workers.ask(in_pieces, _bare(matter))
-        self._starting = None
+        """Whether to check in a thread: what is light, while there is no process for it."""
+        return not self._apart or (matter.light and not self._workers.ready)
 
     async def _threaded(self, do: Callable[[], _T]) -> _T:
         async with self._turn:
@@ -200,8 +181,6 @@ class Checks:
 
     def close(self) -> None:
         """End the processes."""
-        if self._starting is not None:
-            self._starting.cancel()
         self._workers.close()
 
 

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from functools import partial
 
 from flexdt.protocol import Codec
 from flexdt.protocol.messages import Encoded
@@ -24,8 +25,7 @@ from flexdt.runtime.files.own_documents import used_bytes
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.scans.acquisition import Acquisition, FrameListener
 from flexdt.server.scans.checking import CheckInput, Checks
-from flexdt.server.scans.job import Job, JobInputs, Prepare
-from flexdt.server.scans.jobs import Jobs
+from flexdt.server.scans.jobs import Job, JobInputs, Jobs, Prepare
 from flexdt.server.scans.scan_record import FOLDER, JobRecord, ScanSource, StartConditions
 from flexdt.server.scans.stage import Stage
 from flexdt.server.scans.twin_clock import SpeedUp
@@ -130,15 +130,13 @@ class Submissions:
         Raises:
             RpcError: as `submit`; -32602 where there is nothing to go on from.
         """
-        name = job.name
+        name, refused = job.name, partial(name_conflict, job.name)
         if self.jobs.uses(job.folder):
-            raise name_conflict(name, "a job is writing it")
+            raise refused("a job is writing it")
         try:
             sidecar = await asyncio.to_thread(JobRecord.read, self.root, name)
         except (OSError, KeyError, TypeError, ValueError) as error:
-            raise name_conflict(
-                name, f"what it started from is not known any more ({error})"
-            ) from None
+            raise refused(f"what it started from is not known any more ({error})") from None
         begun = self.root.stat(name) is not None
         if begun:
             begin = self._resumable(name, sidecar.wish)
@@ -294,12 +292,13 @@ class Submissions:
             DatasetNameError: no plain name.
             RpcError: -32602, the name is taken by something that cannot be resumed.
         """
+        refused = partial(name_conflict, name)
         ds.plain_name(name, "data set")
         if name in RESERVED:
-            raise name_conflict(name, "it is reserved")
+            raise refused("it is reserved")
         folder = self.root.folder(name)
         if self.jobs.uses(str(folder.path)):
-            raise name_conflict(name, "a job is writing it")
+            raise refused("a job is writing it")
         if self.root.stat(name) is None:
             return None
         try:
@@ -313,21 +312,17 @@ class Submissions:
             if ds.DOCUMENT in there or there - {ds.SCRIPT, ds.SCAN_SETTINGS, ds.XRE_SETTINGS}:
                 complete = read_document(folder).complete
         except FileNotFoundError:
-            raise name_conflict(
-                name, "there is something that no scan of this twin has begun"
-            ) from None
+            raise refused("there is something that no scan of this twin has begun") from None
         except (OSError, ds.DatasetError, ValueError, KeyError, TypeError) as error:
-            raise name_conflict(
-                name, f"it holds something that cannot be resumed ({error})"
-            ) from None
+            raise refused(f"it holds something that cannot be resumed ({error})") from None
         if complete:
-            raise name_conflict(name, "that data set is complete")
+            raise refused("that data set is complete")
         asked, known = (
             (w.script, w.poses, w.exposure_ms if w.poses is not None else None)
             for w in (wish, kept.wish)
         )
         if asked != known:
-            raise name_conflict(name, "its script is another one")
+            raise refused("its script is another one")
         return kept.begin
 
     def _free_name(self) -> str:

@@ -27,15 +27,14 @@ from flexdt.runtime.files.own_documents import settle
 from flexdt.runtime.log import LEVELS, log
 from flexdt.server.imaging.projections import Imaging, Projector, TrueGeometry
 from flexdt.server.imaging.radiography import Physics, Radiography, predictors, with_spectra
-from flexdt.server.scans.job import Job
-from flexdt.server.scans.jobs import Jobs, fresh_seed
+from flexdt.server.scans.jobs import Job, Jobs, fresh_seed
 from flexdt.server.scans.stage import Shapes, Stage
 from flexdt.server.scans.submission import RESERVED, Submissions
 from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
 from flexdt.server.storage import memory as kept
 from flexdt.server.storage.past_scans import PastScans
 from flexdt.server.storage.stored_samples import ReceivedSample, SampleStore, sample_material
-from flexdt.server.twin import wire_values as views
+from flexdt.server.twin import live as views
 from flexdt.server.twin.hub import Hub
 from flexdt.server.twin.live import LiveView, Shot, StateFeed
 from flexdt.server.twin.obstacle_move import ObstacleMoves

@@ -28,8 +28,8 @@ from flexdt.runtime.access import (
 from flexdt.runtime.files.directory import open_data
 from flexdt.runtime.files.own_documents import used_bytes
 from flexdt.runtime.wire_errors import ProjectorUnavailable
-from flexdt.server.scans import job as job_module
-from flexdt.server.scans.job import Retry, transient
+from flexdt.server.scans import jobs as job_module
+from flexdt.server.scans.jobs import Retry, transient
 from flexdt.server.twin.core import ControlLease
 from flexdt.twin.dataset.dataset_errors import DiskFullError
 from flexdt.twin.errors import LimitError

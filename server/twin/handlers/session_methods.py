@@ -13,7 +13,7 @@ from flexdt.protocol.fields import Empty, Nothing
 from flexdt.protocol.methods import document_messages as d
 from flexdt.protocol.methods import openrpc_document
 from flexdt.protocol.methods import session_messages as p
-from flexdt.server.scans.job import ENDED
+from flexdt.server.scans.jobs import ENDED
 from flexdt.server.storage.memory import require_fit, sample_of, save_scene
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, answers, change_stage, ensure_idle
