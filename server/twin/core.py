@@ -28,7 +28,7 @@ from flexdt.runtime.log import LEVELS, log
 from flexdt.server.imaging.projections import Imaging, Projector, TrueGeometry
 from flexdt.server.imaging.radiography import Physics, Radiography, predictors, with_spectra
 from flexdt.server.scans.jobs import Job, Jobs, fresh_seed
-from flexdt.server.scans.stage import Shapes, Stage
+from flexdt.server.scans.stage import ObstacleMoves, Shapes, Stage
 from flexdt.server.scans.submission import RESERVED, Submissions
 from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
 from flexdt.server.storage import memory as kept
@@ -37,7 +37,6 @@ from flexdt.server.storage.stored_samples import ReceivedSample, SampleStore, sa
 from flexdt.server.twin import live as views
 from flexdt.server.twin.hub import Hub
 from flexdt.server.twin.live import LiveView, Shot, StateFeed
-from flexdt.server.twin.obstacle_move import ObstacleMoves
 from flexdt.twin.collision.guard import NearestPair, SceneGuard, clearance
 from flexdt.twin.errors import GeometryError, SafetyError
 from flexdt.twin.geometry.offsets import NOMINAL

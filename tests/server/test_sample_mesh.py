@@ -118,9 +118,9 @@ def test_parts_are_bytes_of_the_whole(server: Process) -> None:
 def test_more_triangles_than_are_sent() -> None:
     phantom = load_phantom("normal-3")
     size = 84 + 50 * len(phantom.mesh().faces)
-    assert len(Shapes(size).make("a", None, phantom).stl) == size
+    assert len(Shapes(size).of("a", None, phantom).stl) == size
     with pytest.raises(RpcError) as refused:
-        Shapes(size - 1).make("a", None, phantom)
+        Shapes(size - 1).of("a", None, phantom)
     assert refused.value.code == -32008
 
 

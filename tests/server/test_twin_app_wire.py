@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import types
 from pathlib import Path
 
 import numpy as np
@@ -12,34 +11,16 @@ from in_process import ROI, Lab, M, run
 
 from flexdt.protocol import METHODS
 from flexdt.protocol import image as wire_image
-from flexdt.protocol.fields import Empty, Nothing
-from flexdt.protocol.method import Method
-from flexdt.server.twin import handlers
-from flexdt.server.twin.handlers.handler import answers
-
-TOPICS = [found for name, found in vars(handlers).items() if name.endswith("_methods")]
+from flexdt.server.twin.handlers import HANDLERS
 
 
 def test_every_method_of_the_wire_has_a_handler() -> None:
-    assert set(handlers.table(*TOPICS)) == set(METHODS)
-    for topic in TOPICS:
-        with pytest.raises(TypeError, match=r"not one handler for each method of the wire: \w+\."):
-            handlers.table(*(other for other in TOPICS if other is not topic))
-    with pytest.raises(TypeError, match=r"tube\.set"):
-        handlers.table(*TOPICS, handlers.motion_methods)
-
-
-def test_a_handler_of_an_unknown_method_is_an_error() -> None:
-    further = types.ModuleType("further")
-
-    @answers(Method("no.such", Empty, Nothing, ""))
-    def handler(twin: object, client: object, params: Empty) -> Nothing:
-        return Nothing()
-
-    handler.__module__ = further.__name__
-    vars(further)["handler"] = handler
-    with pytest.raises(TypeError, match=r"wire: no\.such$"):
-        handlers.table(*TOPICS, further)
+    assert set(HANDLERS) == set(METHODS)
+    handlers = list(HANDLERS.values())
+    several = {name for name, handler in HANDLERS.items() if handlers.count(handler) > 1}
+    assert {name.split(".")[0] for name in several} == {
+        "calibration", "dataset", "script", "trajectory",
+    }  # fmt: skip
 
 
 def test_state_motion_and_geometry_agree(tmp_path: Path) -> None:

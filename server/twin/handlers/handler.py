@@ -54,16 +54,18 @@ class Client:
 
 Handler = Callable[[TwinServer, Client, Any], object | Awaitable[object]]
 """(twin, client, parameters) -> result."""
+HANDLERS: dict[str, Handler] = {}
+"""Method name -> what answers it; filled as the modules of `handlers` are imported."""
 Answer: TypeAlias = _R | Encoded | Mapping[str, Any]
 """A method's result: as its model, or as bytes or plain data that were made of it."""
 _Handler: TypeAlias = Callable[[TwinServer, Client, _P], Answer[_R] | Awaitable[Answer[_R]]]
 
 
 def answers(*methods: Method[_P, _R]) -> Callable[[_Handler[_P, _R]], _Handler[_P, _R]]:
-    """Mark a function as the handler of `methods`, whose parameters and result it has."""
+    """Make a function the handler of `methods`, whose parameters and result it has."""
 
     def mark(handler: _Handler[_P, _R]) -> _Handler[_P, _R]:
-        handler.answered = methods  # type: ignore[attr-defined]
+        HANDLERS.update({method.name: handler for method in methods})
         return handler
 
     return mark

@@ -9,10 +9,10 @@ from contextlib import contextmanager
 from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty
 from flexdt.protocol.methods import scanner_messages as p
+from flexdt.server.scans.stage import finished
 from flexdt.server.twin import live as views
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, answers, change_settings, ensure_idle
-from flexdt.server.twin.obstacle_move import finished
 from flexdt.twin.errors import SafetyError
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.scanner.scanner import ScannerTwin
