@@ -44,6 +44,7 @@ from flexdt.twin.physics.spectrum import TubeModel, tube_of, voltages
 from flexdt.twin.scanner.state import Sample
 
 Physics = Literal["ideal", "mono", "poly"]
+SCATTER: Final = mc.ScatterSettings()
 FORGOTTEN_S: Final = 10.0
 """Time after which an earlier frame has left nothing on the panel."""
 
@@ -131,7 +132,7 @@ class Radiography:
             }
         figures = {f"physics_{self.physics}": 1.0, **self.panel.figures()}
         if self.scatter != "off":
-            figures |= {f"scatter_{self.scatter}": 1.0, "scatter_error": self._settings.error}
+            figures |= {f"scatter_{self.scatter}": 1.0, "scatter_error": SCATTER.error}
         return figures | self.tube.figures()
 
     async def take(
@@ -180,16 +181,12 @@ class Radiography:
             chain, moments = without_spot(chain), moments * points
         added: list[mc.Scattered] = []
         if self.scatter != "off" and channels:
-            thing = await self.imaging.scatterer(sample, self._settings.voxels)
+            thing = await self.imaging.scatterer(sample, SCATTER.voxels)
             middles = views[moments // 2 :: moments]
             added = await asyncio.to_thread(
                 self._scattered, thing, chain, middles, camera, exposures
             )
         return await asyncio.to_thread(radiographs, chain, paths, views, exposures, moments, added)
-
-    @property
-    def _settings(self) -> mc.ScatterSettings:
-        return mc.ScatterSettings()
 
     def _scattered(
         self,
@@ -202,7 +199,7 @@ class Radiography:
         """Of each image by its own view alone, so that a scan resumed has the bytes of one."""
         beams = {kV: mc.Beam.of(chain, kV) for kV in {exposure.kV for exposure in exposures}}
         return [
-            mc.view_scatter(thing, view, camera.shape, beams[exposure.kV], self._settings)
+            mc.view_scatter(thing, view, camera.shape, beams[exposure.kV], SCATTER)
             for view, exposure in zip(views, exposures, strict=True)
         ]
 

@@ -20,7 +20,6 @@ import json
 import logging
 import math
 import threading
-from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
@@ -46,8 +45,6 @@ from flexdt.twin.errors import LimitError, UnknownNameError
 
 MOST = 4
 """Uploads under way at a time."""
-TOLD = 100
-"""Names of those that were dropped, kept for their senders."""
 
 
 class UploadHead(SampleUpload):
@@ -88,7 +85,6 @@ class Incoming:
     def __init__(self, folder: Directory, limit: int) -> None:
         self._folder, self._limit = folder, limit
         self._open: dict[str, _Open] = {}
-        self._dropped: deque[str] = deque(maxlen=TOLD)
         self._lock = threading.Lock()
 
     def receive(self, head: UploadHead, start: int, data: bytes) -> int:
@@ -146,8 +142,6 @@ class Incoming:
         with self._writing():
             file = self._folder.nameless()
         self._open[head.name] = made = _Open(head, file)
-        if head.name in self._dropped:
-            self._dropped.remove(head.name)
         return made
 
     def _make_room(self, name: str, more: int) -> None:
@@ -161,7 +155,6 @@ class Incoming:
         log("an unfinished upload was dropped for newer ones", logging.WARNING, name=oldest,
             received=self._open[oldest].received)  # fmt: skip
         self._close(oldest)
-        self._dropped.append(oldest)
 
     def _close(self, name: str) -> None:
         known = self._open.pop(name, None)
@@ -169,15 +162,10 @@ class Incoming:
             known.file.close()
 
     def _gap(self, name: str, start: int, received: int) -> LimitError:
-        why = ""
-        if name in self._dropped:
-            why = (
-                f" (it was dropped for newer ones: {MOST} uploads and {self._limit} bytes are kept "
-                "at a time)"
-            )
         return LimitError(
             f"upload {name!r}: the chunk begins at {start}, but {received} bytes have come; "
-            f"chunks come in order, from 0{why}",
+            f"chunks come in order, from 0, and {MOST} uploads and {self._limit} bytes are kept at "
+            "a time: one begun before may have been dropped for newer ones",
             {"asked": start, "allowed": received},
         )
 
@@ -278,15 +266,12 @@ class SampleStore:
         self._folder, self._limit = folder, limit
         self._incoming: Incoming = Incoming(folder, 2 * limit)
         self._heads: dict[str, UploadHead] = {}
-        self._stored: dict[str, str] = {}
-        """Revisions of uploads as their files say; those of older servers say nothing."""
+        """Their revisions are what their files say; those of older servers say nothing."""
         for file in own.ours(folder):
             without = "an upload cannot be read; without it"
             head = own.read_or_set_aside(folder, file, _head_of(file), without)
             if head is not None and head.name != EMPTY and not phantoms.is_shipped(head.name):
                 self._heads[head.name] = head
-                if head.revision is not None:
-                    self._stored[head.name] = head.revision
         self._revisions: dict[str, str] = {}
         self._loaded: dict[tuple[str, str | None], Phantom] = {}
         self.standing: Callable[[], tuple[str, str | None]] = lambda: ("", None)
@@ -399,7 +384,7 @@ class SampleStore:
         """Make a stored upload the current one of its name; `tidy` removes the previous one."""
         name = upload.head.name
         with self._lock:
-            self._heads[name], self._stored[name] = upload.head, upload.revision
+            self._heads[name] = upload.head.model_copy(update={"revision": upload.revision})
             for key in [k for k in self._loaded if k[0] == name]:
                 del self._loaded[key]
             self._keep((name, None), upload.phantom, upload.revision)
@@ -410,7 +395,7 @@ class SampleStore:
         """Delete bytes that no upload has any more, and what killed writers left behind."""
         self._folder.sweep([TEMPORARY])  # what a change replaces may be needed yet
         with self._lock:
-            known = {_bytes_file(name, self._stored.get(name)) for name in self._heads}
+            known = {_bytes_file(name, head.revision) for name, head in self._heads.items()}
         there = self._folder.names()
         for file in fnmatch.filter(there, f"*.{'?' * 16}.bin"):
             damaged = f"{file.split('.')[0]}{own.ASIDE}.json" in there
@@ -439,8 +424,7 @@ class SampleStore:
 
     def _bytes(self, head: UploadHead) -> bytes:
         """The bytes of an upload; a damaged one is set aside and raises."""
-        with self._lock:
-            stored = self._stored.get(head.name)
+        stored = head.revision
         file = _bytes_file(head.name, stored)
         try:
             raw = self._folder.read(file, head.total)

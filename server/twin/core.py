@@ -13,7 +13,7 @@ import math
 import secrets
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Coroutine, Mapping
+from collections.abc import Callable, Collection, Coroutine
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -43,7 +43,6 @@ from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.physics.radiograph import Radiograph
 from flexdt.twin.physics.scatter.simulation import Scatter
-from flexdt.twin.scanner.joining import StageChange
 from flexdt.twin.scanner.safety import Guard
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import NamedCorrection, Sample, ScannerState, TubeSettings
@@ -222,7 +221,7 @@ class TwinServer:
     async def start(self, sample: Sample | None = None) -> None:
         """Begin to work, with `sample` on the stage wherever the motors stand."""
         shown, correction = sample or Sample(), self.scanner.correction
-        guard = await self._guard(shown, correction)
+        guard = await self.guard(shown, correction)
         for warning in self.scanner.initialise_stage(shown, correction, guard, self.clock.now()):
             self.tell("warning", f"at the start {warning}; motion that brings them apart is free")
         self.changed()
@@ -388,58 +387,13 @@ class TwinServer:
         history = self.corrections.history
         return kept.remember(self.scanner, self.clock.now(), jobs, made, history, ended=ended)
 
-    async def certified_stage(
-        self,
-        sample: Sample,
-        correction: NamedCorrection | None,
-        *,
-        upload: ReceivedSample | None = None,
-        targets: Mapping[str, float] | None = None,
-        paces: Mapping[str, tuple[float, float]] | None = None,
-    ) -> StageChange:
-        """A change of the stage that may be put in force; hold `stage_turn` until it is.
-
-        Args:
-            sample, correction: what is to stand there, and what is to be in force.
-            upload: to come under the sample's name.
-            targets: where motors are sent together with the change [mm, deg].
-            paces: motor -> (speed, acceleration) that are set before.
-
-        Raises:
-            UnknownNameError, LimitError, PhantomError: there is no such sample.
-            GeometryError: a correction that no scanner can have.
-            CollisionError: what is under way, or stands, is not free of it; nothing changes.
-        """
-        self.scanner.require_applicable(correction)  # before anything is built of it
-        guard = await self._guard(sample, correction, upload)
-        change = self.scanner.stage_change(
-            sample, correction, guard, self.clock.now(), targets=targets, paces=paces
-        )
-        return await asyncio.to_thread(change.certified)
-
-    def take_stage(self, change: StageChange) -> list[str]:
-        """Put a certified change in force; motion that is not free of it is halted.
-
-        Returns:
-            What was halted, in words. A running job pauses then.
-
-        Raises:
-            CollisionError, SafetyError: nothing changes (see `ScannerTwin.take_stage`).
-        """
-        halted = self.scanner.take_stage(change, self.clock.now())
-        if halted is not None:
-            self.detours.cancel()
-            if self.jobs.running:
-                self.jobs.interrupt(halted)
-        self.changed()
-        return [] if halted is None else [halted.message]
-
-    async def _guard(
+    async def guard(
         self,
         sample: Sample,
         correction: NamedCorrection | None,
         upload: ReceivedSample | None = None,
     ) -> Guard | None:
+        """What sweeps motion with a sample and a correction; `upload` as for `Stage.pieces`."""
         parameters = NOMINAL if correction is None else correction.parameters
         return await asyncio.to_thread(self.stage.guard, sample, parameters, upload)
 

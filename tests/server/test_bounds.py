@@ -160,7 +160,7 @@ def test_unfinished_uploads_are_bounded_and_their_senders_are_told(tmp_path: Pat
     incoming: Incoming = Incoming(open_data(tmp_path), limit=1000)
     for i in range(MOST + 1):
         assert incoming.receive(head(f"n{i}", 900), 0, b"x" * 10) == 10
-    with pytest.raises(LimitError, match=r"dropped for newer ones: 4 uploads and 1000 bytes"):
+    with pytest.raises(LimitError, match=r"4 uploads and 1000 bytes are kept"):
         incoming.receive(head("n0", 900), 10, b"y")
     assert incoming.receive(head("n4", 900), 10, b"y" * 800) == 810
     assert incoming.receive(head("n3", 900), 10, b"z" * 800) == 810  # those before it are dropped

@@ -157,17 +157,21 @@ async def change_stage(
 
     Raises:
         UnknownNameError, LimitError, PhantomError: there is no such sample.
-        GeometryError, CollisionError: see `TwinServer.certified_stage`; nothing has changed.
+        GeometryError: a correction that no scanner can have.
+        CollisionError, SafetyError: what is under way, or stands, is not free of it; nothing has
+            changed (see `ScannerTwin.take_stage`).
         DatasetWriteError: it cannot be written; nothing has changed.
     """
     names = twin.corrections.history if history is None else history
-    change = await twin.certified_stage(
-        sample,
-        correction,
-        upload=upload,
+    scanner = twin.scanner
+    scanner.require_applicable(correction)  # before anything is built of it
+    guard = await twin.guard(sample, correction, upload)
+    change = scanner.stage_change(
+        sample, correction, guard, twin.clock.now(),
         targets=None if scene is None else scene.positions,
-        paces=None if scene is None else paces_of(scene, twin.scanner),
-    )
+        paces=None if scene is None else paces_of(scene, scanner),
+    )  # fmt: skip
+    change = await asyncio.to_thread(change.certified)
 
     def files(changes: Changes) -> None:
         if upload is not None:
@@ -176,7 +180,7 @@ async def change_stage(
             twin.corrections.store(changes, correction, source)
 
     def after(memory: Memory) -> Memory:
-        trial = copy.copy(twin.scanner)
+        trial = copy.copy(scanner)
         trial.sample, trial.correction = sample, correction
         if scene is not None:
             apply_settings(scene, trial)
@@ -184,15 +188,19 @@ async def change_stage(
 
     def take() -> list[str]:
         ready()
-        warnings = twin.take_stage(change)
+        halted = scanner.take_stage(change, twin.clock.now())
+        if halted is not None:  # motion that is not free of it
+            twin.detours.cancel()
+            if twin.jobs.running:
+                twin.jobs.interrupt(halted)
         if upload is not None:
             twin.samples.know(upload)
         if correction is not None:
             twin.corrections.know(correction, source)
         twin.corrections.history = names
         if scene is not None:
-            apply_settings(scene, twin.scanner)
-        return warnings
+            apply_settings(scene, scanner)
+        return [] if halted is None else [halted.message]
 
     warnings = await twin.keeper.keep(take, after, files)
     twin.changed()
