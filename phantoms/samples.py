@@ -193,17 +193,11 @@ def _one(
         return _mesh(given, material, keep)
     if isinstance(sample, tuple) and len(sample) == 2 and isinstance(sample[1], str | Mapping):
         return _one(sample[0], sample[1], voxel_mm, keep)
-    if material is not None:
-        raise PhantomError(
-            f"a {type(sample).__name__} has its own materials; material is for a mesh or an array",
-            {"asked": material, "allowed": None},
-        )
+    _require_none(material, f"a {type(sample).__name__}")
     if isinstance(sample, Phantom):
         return sample
-    if isinstance(sample, Solid):
-        return _solids(Scene((sample,)))
-    if isinstance(sample, Scene):
-        return _solids(sample)
+    if isinstance(sample, Solid | Scene):
+        return _solids(Scene((sample,)) if isinstance(sample, Solid) else sample)
     if isinstance(sample, Mapping):
         if "kind" not in sample:
             return files.phantom_of(given)
@@ -214,17 +208,19 @@ def _one(
     raise PhantomError.instead(f"a sample cannot be {_shown(sample)}", _shown(sample), FORMS)
 
 
+def _require_none(material: str | None, what: str) -> None:
+    if material is not None:
+        said = f"{what} has its own materials; material is for a mesh or an array"
+        raise PhantomError(said, {"asked": material, "allowed": None})
+
+
 def _named(word: str, material: str | None, keep: bool) -> Phantom:
     path = Path(word)
     kind = path.suffix.lower()
     if kind.lstrip(".") in FORMATS:
         made_of = "abs" if material is None else material
         return mesh_phantom(path, material=made_of, place="keep" if keep else "center")
-    if material is not None:
-        raise PhantomError(
-            f"{word!r} has its own materials; material is for a mesh or an array",
-            {"asked": material, "allowed": None},
-        )
+    _require_none(material, repr(word))
     if is_shipped(word):
         return load_phantom(word)
     if kind in TEXTS or path.is_file():

@@ -65,11 +65,9 @@ class Given:
         """Raise ExchangeError if a file says another pitch."""
         pitch = geometry.pitch_mm
         if self.pitch_mm is not None and not np.allclose(pitch, self.pitch_mm, rtol=1e-3):
-            raise ExchangeError(
-                f"{path} says pixels of {pitch[0]:g} x {pitch[1]:g} mm, not "
-                f"{self.pitch_mm[0]:g} x {self.pitch_mm[1]:g}",
-                {"asked": list(self.pitch_mm), "allowed": list(pitch)},
-            )
+            found, asked = (f"{u:g} x {v:g}" for u, v in (pitch, self.pitch_mm))
+            said = f"{path} says pixels of {found} mm, not {asked}"
+            raise ExchangeError(said, {"asked": list(self.pitch_mm), "allowed": list(pitch)})
 
 
 def geometry_of(dataset: DataSet, parameters: Offsets | None = None) -> ScanGeometry:
@@ -198,17 +196,14 @@ def import_geometry(
         if format in ("ctsimu", "flexdata"):
             raise ExchangeError(f"{format} says by itself which way its rows grow")
         geometry = geometry.rows_up()
-    if known.shape is not None and geometry.shape not in (None, known.shape):
-        raise ExchangeError(
-            f"{path} says {geometry.shape} rows and columns, not {known.shape}",
-            {"asked": list(known.shape), "allowed": geometry.shape},
-        )
+    for what, asked, found in (
+        ("rows and columns", known.shape, geometry.shape),
+        ("views", known.views, len(geometry)),
+    ):
+        if asked is not None and found not in (None, asked):
+            said = f"{path} says {found} {what}, not {asked}"
+            raise ExchangeError(said, {"asked": asked, "allowed": found})
     known.check_pitch(geometry, path)
-    if known.views is not None and len(geometry) != known.views:
-        raise ExchangeError(
-            f"{path} holds {len(geometry)} views, not {known.views}",
-            {"asked": known.views, "allowed": len(geometry)},
-        )
     shape = known.shape if geometry.shape is None else geometry.shape
     return replace(geometry, shape=shape, name=geometry.name or path.stem)
 
@@ -301,10 +296,8 @@ def with_geometry(dataset: DataSet, geometry: ScanGeometry) -> DataSet:
         ExchangeError: another number of projections, or another detector.
     """
     if len(geometry) != len(dataset):
-        raise ExchangeError(
-            f"{dataset.where} has {len(dataset)} projections, the geometry {len(geometry)} views",
-            {"asked": len(geometry), "allowed": len(dataset)},
-        )
+        said = f"{dataset.where} has {len(dataset)} projections, the geometry {len(geometry)} views"
+        raise ExchangeError(said, {"asked": len(geometry), "allowed": len(dataset)})
     if geometry.shape not in (None, dataset.shape):
         raise ExchangeError(
             f"{dataset.where} has images of {dataset.shape}, the geometry is of {geometry.shape} "
