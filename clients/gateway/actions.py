@@ -28,7 +28,6 @@ from flexdt.clients.gateway.vocabulary import (
     StopAll,
     shown,
 )
-from flexdt.protocol.rpc_errors import RpcError
 from flexdt.protocol.state_model import JobStatus, State
 from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.script import commands as c
@@ -260,15 +259,13 @@ async def _run(twin: ConnectedTwin, script: bytes, name: str, progress: CommandP
     """Submit a script and wait for the end of its job; returns the data set's folder."""
     if twin.job is not None:
         raise Refusal(f"{twin.job} is running; wait for it or scanner abort script")
-    taken = name
-    for number in range(2, 1000):
+    for taken in (name, *(f"{name}-{number}" for number in range(2, 1000))):
         try:
             made = await twin.run(m.submit_script(script, taken))
             break
         except Refusal as error:
             if not _name_taken(error):
                 raise
-            taken = f"{name}-{number}"
     else:
         raise Refusal(f"every name from {name} to {taken} is taken")
     twin.job = made.job
@@ -287,12 +284,9 @@ async def _run(twin: ConnectedTwin, script: bytes, name: str, progress: CommandP
 
 
 def _name_taken(refusal: Refusal) -> bool:
-    error = refusal.__cause__
-    if not isinstance(error, RpcError) or not isinstance(error.data, Mapping):
-        return False
-    problems = error.data.get("problems")
-    found = problems if isinstance(problems, list) else []
-    return any(isinstance(p, Mapping) and p.get("path") == "name" for p in found)
+    data = getattr(refusal.__cause__, "data", None)
+    problems = data.get("problems") if isinstance(data, Mapping) else None
+    return any(problem.get("path") == "name" for problem in problems or ())
 
 
 async def _adopt(twin: ConnectedTwin, folder: str, state: State) -> str:

@@ -11,12 +11,10 @@ from __future__ import annotations
 import atexit
 import contextlib
 import json
-import queue
 import signal
 import subprocess
 import sys
 import tempfile
-import threading
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from os import PathLike
@@ -29,6 +27,8 @@ from flexdt.process_settings import words
 from flexdt.twin.signatures import public
 
 STOP_TIMEOUT_S = 30.0
+UP = "flexdt.clients.launch.up"
+LOG = "servers.log"
 
 
 class ServersError(CommandError):
@@ -77,14 +77,7 @@ class Servers:
         self._log_path.parent.mkdir(parents=True, exist_ok=True)
         self._log = self._log_path.open("ab")
         self._process = subprocess.Popen(
-            [
-                sys.executable,
-                "-P",
-                "-m",
-                "flexdt.runtime.child",
-                "flexdt.clients.launch.up",
-                *self._words,
-            ],
+            [sys.executable, "-P", "-m", "flexdt.runtime.child", UP, *self._words],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._log,
@@ -128,33 +121,16 @@ class Servers:
 
     def _wait_ready(self, process: subprocess.Popen[bytes]) -> dict[str, object]:
         assert process.stdout is not None
-        lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        threading.Thread(target=_pump, args=(process.stdout, lines), daemon=True).start()
-        while True:
-            # However long: the supervisor itself ends a service that does nothing.
-            if not (line := lines.get()):
-                process.wait(STOP_TIMEOUT_S)
-                tail = "; ".join(self.log_tail(3))
-                code = process.returncode
-                raise ServersError(
-                    f"the servers did not start (exit code {code}): {tail}",
-                    code if 0 < code <= 5 else 1,
-                )
+        for line in process.stdout:  # however long: the supervisor ends a service that does nothing
             with contextlib.suppress(ValueError, TypeError):
                 message = json.loads(line)
                 if isinstance(message, dict) and message.get("ready") == "up":
                     return message
-
-
-def _pump(pipe: IO[bytes], lines: queue.SimpleQueue[bytes]) -> None:
-    """Keep the pipe empty; an empty line stands for its end."""
-    with contextlib.suppress(ValueError, OSError):
-        for line in pipe:
-            lines.put(line)
-    lines.put(b"")
-
-
-LOG = "servers.log"
+        code = process.wait(STOP_TIMEOUT_S)
+        tail = "; ".join(self.log_tail(3))
+        raise ServersError(
+            f"the servers did not start (exit code {code}): {tail}", code if 0 < code <= 5 else 1
+        )
 
 
 @public

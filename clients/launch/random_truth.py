@@ -15,13 +15,8 @@ from typing import Final
 from flexdt.clients.failure import CommandError
 
 RANGES: Final[Mapping[str, float]] = {
-    "dO_x": 1.0,
-    "dO_y": 1.0,
-    "dO_z": 2.0,
-    "alpha": 5.0,
-    "tau_x": 0.5,
-    "tau_z": 0.5,
-}
+    "dO_x": 1.0, "dO_y": 1.0, "dO_z": 2.0, "alpha": 5.0, "tau_x": 0.5, "tau_z": 0.5,
+}  # fmt: skip
 """Parameter -> largest absolute value drawn [mm, deg]: what a careful operator may be off by."""
 
 
@@ -47,15 +42,13 @@ def read(path: Path) -> dict[str, float]:
 
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:
         raise CommandError(f"{path}: not valid TOML: {error}") from None
-    except UnicodeDecodeError:
-        raise CommandError(f"{path}: no UTF-8 text") from None
     problems = []
     for name, value in content.items():
         if name not in NAMES:
             problems.append(f"{path}: unknown parameter {name!r}; allowed: {', '.join(NAMES)}")
-        elif isinstance(value, bool) or not isinstance(value, int | float):
+        elif type(value) not in (int, float):
             problems.append(f"{path}: {name} = {value!r} is not a number")
     if problems:
         raise CommandError(problems)

@@ -10,14 +10,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import socket
 import sys
 from collections.abc import Sequence
 from typing import TextIO
 
 from flexdt.process_settings import (
     LOOPBACK,
-    Address,
     GatewaySettings,
     TwinSettings,
     UpSettings,
@@ -27,7 +25,6 @@ from flexdt.process_settings import (
     words,
 )
 from flexdt.runtime.access import ViewerLimits, limit_names
-from flexdt.runtime.process import REFUSED
 from flexdt.runtime.supervisor import (
     Addresses,
     Service,
@@ -80,25 +77,6 @@ def port_of(name: str, asked: int, known: Addresses) -> int:
     return known[name].port if name in known else asked
 
 
-def port_problem(host: str, port: int) -> str | None:
-    """Why `port` cannot be listened on, or None; port 0 means any free one."""
-    if port == 0:
-        return None
-    try:
-        family, kind, _, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )[0]
-        with socket.socket(family, kind) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(address)
-    except OSError as error:
-        return (
-            f"cannot listen on {Address(host, port)}: {error.strerror}; choose another port, or 0 "
-            "for any free one"
-        )
-    return None
-
-
 def ready_line(addresses: Addresses, *, secure: bool = False) -> str:
     """The supervisor's `ready` line: the twin's address, and every process's by name."""
     twin = addresses["twin"]
@@ -117,16 +95,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run until stopped; returns the exit code."""
     options = parse(UpSettings, argv)
     secure = options.tls_cert is not None
-    wanted = [(options.host, options.port), (LOOPBACK, options.projector_port)]
-    if not options.no_viewer:
-        wanted.append((options.host, options.viewer_port))
-    if options.gateway_port:
-        wanted += [(LOOPBACK, options.gateway_port), (LOOPBACK, options.gateway_port + 1)]
-    for host, port in wanted:
-        problem = port_problem(host, port)
-        if problem is not None:
-            print(f"flexdt up: {problem}", file=sys.stderr)
-            return REFUSED
     supervisor = Supervisor(
         services(options),
         announce=lambda addresses: _say(ready_line(addresses, secure=secure), sys.stdout),

@@ -12,14 +12,14 @@ import html
 import re
 import time
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any, Final, Literal
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import viser
 
 from flexdt.clients.viewer.feed import ShownImage, grey, window_of
-from flexdt.clients.viewer.page_params import Form
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.painted_meshes import SampleLook
 from flexdt.clients.viewer.scenes.world import FREE, Nodes, Standpoint, world_of
@@ -28,6 +28,8 @@ from flexdt.clients.viewer.viser_gate import Scenes, look_from
 from flexdt.protocol.state_model import State
 from flexdt.twin.machine.description import Machine, Profile
 
+Form = Literal["html", "viser"]
+"""Of an exported file: an HTML page by itself, or viser's own format."""
 FRAMES: Final = 240
 REPLAY_S: Final = 12.0
 LIGHT, DARK = (246, 248, 251), (16, 19, 25)
@@ -46,9 +48,7 @@ def picture(client: viser.ClientHandle, width: int, height: int, dark: bool) -> 
 
 
 def _png(pixels: npt.NDArray[np.uint8]) -> bytes:
-    import imageio.v3 as iio
-
-    return bytes(iio.imwrite("<bytes>", pixels, extension=".png"))
+    return cv2.imencode(".png", pixels[:, :, ::-1])[1].tobytes()
 
 
 def scene_file(

@@ -34,7 +34,7 @@ from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress
 from flexdt.clients.viewer.page import watched
 from flexdt.runtime.log import log
 from flexdt.runtime.workers import ENVIRONMENT
-from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.dataset.normalise import binned_mean
 
 MAGIC = b"FXI2"
 AIR: Final = 0.05
@@ -83,21 +83,10 @@ def window_of(image: ShownImage) -> tuple[float, float]:
 
 def grey(image: ShownImage, window: tuple[float, float]) -> npt.NDArray[np.uint8]:
     """8-bit RGB (rows, cols, 3); line integrals are drawn as a film: matter bright on black."""
-    return np.repeat(_byte(image.pixels, window)[:, :, None], 3, axis=2)
-
-
-def _byte(pixels: npt.NDArray[np.generic], window: tuple[float, float]) -> npt.NDArray[np.uint8]:
     low, high = window
-    scaled = (np.asarray(pixels, dtype=np.float32) - low) * (255.0 / (high - low))
-    return np.asarray(np.nan_to_num(np.clip(scaled, 0.0, 255.0)), dtype=np.uint8)
-
-
-def halved(pixels: npt.NDArray[np.generic]) -> Float32Array:
-    """The mean over 2 x 2 pixels; an odd last row or column is cut off."""
-    rows, cols = pixels.shape[0] // 2 * 2, pixels.shape[1] // 2 * 2
-    p = np.asarray(pixels[:rows, :cols], dtype=np.float32)
-    mean: Float32Array = 0.25 * (p[::2, ::2] + p[1::2, ::2] + p[::2, 1::2] + p[1::2, 1::2])
-    return mean
+    scaled = (np.asarray(image.pixels, dtype=np.float32) - low) * (255.0 / (high - low))
+    byte = np.nan_to_num(np.clip(scaled, 0.0, 255.0)).astype(np.uint8)
+    return np.repeat(byte[:, :, None], 3, axis=2)
 
 
 def packed(
@@ -122,7 +111,7 @@ def packed(
     full, pair = image.pixels.shape, image.virtual is not None
     if image.virtual is not None:
         image = replace(image, pixels=np.concatenate([image.pixels, image.virtual]))
-    values = np.asarray(halved(image.pixels) if coarse else image.pixels, dtype=np.float32)
+    values = np.asarray(binned_mean(image.pixels, 2) if coarse else image.pixels, dtype=np.float32)
     low, scale = 0.0, 1.0
     if image.kind == "line_integral" or coarse:
         low = float(values.min(initial=0.0))

@@ -18,7 +18,6 @@ import logging
 import mimetypes
 import re
 import ssl as tls
-import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
@@ -49,9 +48,6 @@ MAX_HELD: Final = 256 << 20
 """Bytes of messages that have begun and not ended, of all connections together."""
 FAIR: Final = 1 << 20
 """A connection that holds no more than this is not cut for what others hold."""
-RELAYED_HZ: Final = 500.0
-"""Messages of all views together that are passed on a second, each view in its turn."""
-RELAYED_AT_ONCE: Final = 100
 SILENT_S: Final = 60.0
 """A browser that does not answer a ping within this time has gone; busy machines are slow."""
 STILL_S: Final = 8.0
@@ -112,7 +108,6 @@ class Front:
         self.doorkeeper = MessageFilter()
         self._max_scenes, self.scenes = max_scenes, 0
         self._most = max_scenes + max_pages + SPARE
-        self._turn, self._relayed_at = asyncio.Lock(), 0.0
         self._guessing, self._closing = asyncio.Lock(), asyncio.Event()
         self.wrong_tokens = 0
         self._downloads, self._token, self._still = downloads, token, still
@@ -280,18 +275,7 @@ class Front:
     async def _up(self, browser: ServerConnection, viser: ClientConnection) -> None:
         async for message in browser:
             if (admitted := self.doorkeeper.admit(message)) is not None:
-                await self._in_turn()
                 await viser.send(admitted)
-
-    async def _in_turn(self) -> None:
-        """Wait while the views together exceed RELAYED_HZ; each view waits for its own messages."""
-        async with self._turn:
-            now = time.monotonic()
-            self._relayed_at = (
-                max(self._relayed_at, now - RELAYED_AT_ONCE / RELAYED_HZ) + 1.0 / RELAYED_HZ
-            )
-            if self._relayed_at > now:
-                await asyncio.sleep(self._relayed_at - now)
 
 
 async def _down(viser: ClientConnection, browser: ServerConnection) -> None:

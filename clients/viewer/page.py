@@ -226,20 +226,10 @@ class Page:
         self._due.set()
 
     async def _handle(self, text: str) -> None:
-        id: object = None
         try:
-            request = _read(text)
-            id, method = _plain_id(request.get("id")), request["method"]
-            params = request.get("params") or {}
-            if not isinstance(params, dict):
-                raise TypeError("params must be an object")
-            if not isinstance(method, str):
-                raise TypeError("a method is text")
-        except RecursionError:
-            self._fail(id, RpcError(Code.INVALID_REQUEST, "not a request: nested too deep"))
-            return
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            self._fail(id, RpcError(Code.INVALID_REQUEST, f"not a request: {error}"))
+            id, method, params = _read(text)
+        except ValueError as error:
+            self._fail(None, RpcError(Code.INVALID_REQUEST, f"not a request: {error}"))
             return
         known = METHODS.get(method)
         if self._busy >= MAX_ASKED and (known is None or not known.urgent):
@@ -295,26 +285,25 @@ def _words(error: RpcError | ConnectionLost) -> str:
     return error.message
 
 
-def _read(text: str) -> Any:
-    """A message as JSON; one that would take very much memory is not read.
+def _read(text: str) -> tuple[str | int | None, str, dict[str, Any]]:
+    """Id, method and parameters of a message; one that would take very much memory is not read.
 
     Raises:
-        ValueError, RecursionError: it is not JSON.
+        ValueError: it is no request.
     """
     if len(text) > MAX_PARTS and sum(map(text.count, ",[{")) > MAX_PARTS:
         raise ValueError(f"it has more than {MAX_PARTS} parts")
-    return json.loads(text)
-
-
-def _plain_id(id: object) -> str | int | None:
-    match id:
-        case None:
-            return None
-        case str() if len(id) <= MAX_WORD:
-            return id
-        case int() if abs(id) < 2**64:
-            return id
-    raise TypeError(f"an id is a number below 2^64 or a text of at most {MAX_WORD} characters")
+    try:
+        request = json.loads(text)
+    except RecursionError:
+        raise ValueError("nested too deep") from None
+    match request:
+        case {"method": str(method)}:
+            id, params = request.get("id"), request.get("params") or {}
+            short = id is None or (isinstance(id, int | str) and len(str(id)) <= MAX_WORD)
+            if short and isinstance(params, dict):
+                return id, method, params
+    raise ValueError(f"it has a method, params by name, an id of at most {MAX_WORD} characters")
 
 
 def without_bytes(value: Any) -> Any:

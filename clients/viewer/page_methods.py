@@ -2,6 +2,9 @@
 
 Of the twin's commands only a correction passes through here, because it is inspected first; other
 requests go to the twin as they are (see `page`).
+
+Parameters are one model each, as strict and bounded as the wire's. Values that depend on the
+machine, the data directory or a plan are checked in the methods.
 """
 
 from __future__ import annotations
@@ -16,25 +19,43 @@ from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
+from annotated_types import Ge, Le, Len
+from pydantic import Field, create_model, model_validator
 
 from flexdt.clients.client.client import AsyncTwinClient
 from flexdt.clients.client.flows import Ask
 from flexdt.clients.viewer import exports
-from flexdt.clients.viewer import page_params as p
 from flexdt.clients.viewer import scrubbed_plan as plans
+from flexdt.clients.viewer.exports import Form
 from flexdt.clients.viewer.feed import ShownImage, packed, wish
 from flexdt.clients.viewer.front import Download
 from flexdt.clients.viewer.page import Page, without_bytes
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
-from flexdt.clients.viewer.scenes.world import FREE, motors
+from flexdt.clients.viewer.scenes.world import FREE, LAYERS, motors
 from flexdt.clients.viewer.viewer import PageMethod, Viewer
 from flexdt.protocol import Code, Method, RpcError, parse_params
 from flexdt.protocol import image as wire_image
-from flexdt.protocol.fields import Nothing, Params
-from flexdt.protocol.methods.calibration_messages import CalibrationAlign, CalibrationFit
+from flexdt.protocol.fields import (
+    AxisName,
+    Deviation,
+    Exposure,
+    Nothing,
+    Params,
+    PixelAsked,
+    Power,
+    ShortText,
+    Voltage,
+    few,
+)
+from flexdt.protocol.methods.calibration_messages import (
+    CalibrationAlign,
+    CalibrationApply,
+    CalibrationFit,
+)
+from flexdt.protocol.methods.job_messages import ScriptText
 from flexdt.protocol.rpc_errors import busy, link_down
 from flexdt.protocol.state_model import State
 from flexdt.runtime.wire_errors import explain
@@ -44,7 +65,158 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.physics.spectrum import tube_of, tube_spectrum
 from flexdt.twin.scanner.state import readout_of
+from flexdt.twin.script.compose import Kind as KindOfScan
 from flexdt.twin.script.compose import ScanRequest, compose_script
+
+Kind = Literal["line_integral", "counts"]
+View = Literal["iso", "beam", "side", "free"]
+Grey = Annotated[float, Ge(-1e6), Le(1e6)]
+Side = Annotated[int, Ge(16), Le(4096)]
+FileName = Annotated[ShortText, Len(1, 255)]
+Index = Annotated[int, Ge(0), Le(10**6)]
+
+
+_SWITCHES: Any = dict.fromkeys(LAYERS, (bool | None, None))
+_OPACITY: Any = (Annotated[float, Ge(0.05), Le(1)] | None, None)
+Layers: type[Params] = create_model("Layers", __base__=Params, **_SWITCHES, opacity=_OPACITY)
+"""Layers to show or hide on this page; omitted ones stay as they are."""
+
+
+class Theme(Params):
+    """Light or dark, and whether a graphics processor can afford `fine` lighting."""
+
+    dark: bool = False
+    fine: bool = False
+
+
+class Camera(Params):
+    """A view of the page, and whether to look at the sample from there."""
+
+    view: View = "free"
+    sample: bool = False
+
+
+class Ray(Params):
+    """A pixel of the live image to see the ray of; none: show it no longer."""
+
+    pixel: PixelAsked | None = None
+
+
+class Spectrum(Params):
+    """A voltage of the tube."""
+
+    kV: Annotated[float, Ge(0), Le(1000)]
+
+
+class Feed(Params):
+    """Which images a page wants."""
+
+    kind: Kind
+
+
+class Window(Params):
+    """Grey values that are drawn black and white; both or none."""
+
+    low: Grey | None = None
+    high: Grey | None = None
+
+    @model_validator(mode="after")
+    def _both(self) -> Window:
+        if (self.low is None) != (self.high is None):
+            raise ValueError("give both low and high, or neither")
+        if self.low is not None and self.high is not None and self.high <= self.low:
+            raise ValueError("high must be above low")
+        return self
+
+
+class Plan(Params):
+    """A script; none: forget the last one."""
+
+    text: ScriptText | None = ""
+
+
+class Recorded(Params):
+    """A data set to show instead of live images; none: live images again."""
+
+    name: FileName | None = None
+
+
+class RecordedImage(Params):
+    """An image of the data set that is looked at, and with it the virtual one of its pose."""
+
+    index: Annotated[int, Ge(0), Le(10**7)]
+    kind: Kind = "counts"
+    virtual: bool = False
+
+
+class Live(Params):
+    """A data set to reconstruct while it is scanned, and voxels a side; none: no longer."""
+
+    name: FileName | None = None
+    side: Literal[128, 192, 256, 512] = 128
+    past: bool = False
+    """The whole volume of a scan that was made, not one that grows."""
+
+
+class Block(Live):
+    """Which of its volumes: the one that was asked for, its noise, a bound of its bias, its
+    sample's truth, how far they are apart, or the one with the other geometry."""
+
+    what: Literal["volume", "sigma", "bias_bound", "truth", "difference", "other"] = "volume"
+
+
+class Voxel(Live):
+    """A voxel of a volume, by its numbers along x, y and z."""
+
+    at: Annotated[list[Index], Len(3, 3)]
+
+
+class Compose(Params):
+    """The scan to compose a script for."""
+
+    kind: KindOfScan = "fly"
+    frames: Annotated[int, Ge(1), Le(1_000_000)] = 73
+    exposure_ms: Exposure = 100.0
+    kV: Voltage | None = None
+    power_W: Power | None = None
+    voxel_um: Annotated[float, Ge(0.01), Le(1e6)] | None = None
+    """Of the finest details at the axis; none: the distances stay."""
+    keep: Annotated[list[AxisName], Len(0, 64)] = Field(default_factory=list)
+
+
+class Datasets(Params):
+    """Data sets to list: words that each has, and how many newer ones are left out."""
+
+    search: Annotated[ShortText, Len(0, 200)] = ""
+    start: Index = 0
+
+
+class Correct(CalibrationApply):
+    """A correction; on the wire an empty one is a nominal one, on a page it is a slip."""
+
+    parameters: Annotated[dict[AxisName, Deviation], few(64), Len(1, 64)]
+
+
+class Scrub(Params):
+    """A moment of the plan; none: show it no longer."""
+
+    time_s: Annotated[float, Ge(0), Le(1e9)] | None = None
+
+
+class Screenshot(Params):
+    """Which view, and how large the picture [px]."""
+
+    view: View = "free"
+    width: Side = 1600
+    height: Side = 1000
+
+
+class Export(Params):
+    """The scene, or a replay of the plan."""
+
+    format: Form = "html"
+    replay: bool = False
+
 
 APART: Final = 0.01
 """Of two positions that are not the same [mm, deg]."""
@@ -52,7 +224,7 @@ MAX_SHARED: Final = 2
 """Pictures and exports under way at a time, for all pages: each may take hundreds of megabytes."""
 
 
-async def layers(viewer: Viewer, page: Page, params: p.Layers) -> object:
+async def layers(viewer: Viewer, page: Page, params: Params) -> object:
     """Show or hide layers on this page; maps a layer's name to whether it is shown."""
     page.shown = page.shown.changed(**params.model_dump())
     if viewer.lab is not None and viewer.state is not None and "ranges" in page.shown:
@@ -62,14 +234,14 @@ async def layers(viewer: Viewer, page: Page, params: p.Layers) -> object:
     return {}
 
 
-async def theme(viewer: Viewer, page: Page, params: p.Theme) -> object:
+async def theme(viewer: Viewer, page: Page, params: Theme) -> object:
     """Light or dark, plain or fine, for this page's scenes."""
     page.dark = params.dark
     viewer.clients.theme(page.id, page.dark, params.fine)
     return {}
 
 
-async def camera(viewer: Viewer, page: Page, params: p.Camera) -> object:
+async def camera(viewer: Viewer, page: Page, params: Camera) -> object:
     """Put a view of this page back to its preset, or have it look at the sample."""
     if params.sample and viewer.world is not None:
         viewer.clients.look(page.id, params.view, viewer.world.sample.shift, viewer.look.radius_mm)
@@ -78,14 +250,14 @@ async def camera(viewer: Viewer, page: Page, params: p.Camera) -> object:
     return {}
 
 
-async def feed(viewer: Viewer, page: Page, params: p.Feed) -> object:
+async def feed(viewer: Viewer, page: Page, params: Feed) -> object:
     """Which images this page wants: line_integral or counts."""
     page.kind = params.kind
     viewer.refresh_feeds()
     return {}
 
 
-async def window(viewer: Viewer, page: Page, params: p.Window) -> object:
+async def window(viewer: Viewer, page: Page, params: Window) -> object:
     """Set the window [low, high] of the panel in all scenes; None chooses it automatically."""
     low, high = params.low, params.high
     viewer.window = None if low is None or high is None else (low, high)
@@ -93,7 +265,7 @@ async def window(viewer: Viewer, page: Page, params: p.Window) -> object:
     return {}
 
 
-async def ray(viewer: Viewer, page: Page, params: p.Ray) -> object:
+async def ray(viewer: Viewer, page: Page, params: Ray) -> object:
     """Show this page the ray of a pixel; what it goes through."""
     lab, world = _lab(viewer), viewer.world
     clients = viewer.clients.of(page.id)
@@ -106,7 +278,7 @@ async def ray(viewer: Viewer, page: Page, params: p.Ray) -> object:
     return {**told, "length_mm": float(np.linalg.norm(ends[1] - ends[0]))}
 
 
-async def spectrum(viewer: Viewer, page: Page, params: p.Spectrum) -> object:
+async def spectrum(viewer: Viewer, page: Page, params: Spectrum) -> object:
     """Photons by energy at a voltage, behind the filters of the machine's tube; what tube and
     camera allow."""
     machine = _lab(viewer).machine
@@ -126,7 +298,7 @@ async def spectrum(viewer: Viewer, page: Page, params: p.Spectrum) -> object:
     }
 
 
-async def plan(viewer: Viewer, page: Page, params: p.Plan) -> object:
+async def plan(viewer: Viewer, page: Page, params: Plan) -> object:
     """Plan a script to scrub through; none: forget the plan and what this page shows of it."""
     lab, text = _lab(viewer), params.text
     if page.recorded is not None:
@@ -145,7 +317,7 @@ async def plan(viewer: Viewer, page: Page, params: p.Plan) -> object:
     return made.document
 
 
-async def recorded(viewer: Viewer, page: Page, params: p.Recorded) -> object:
+async def recorded(viewer: Viewer, page: Page, params: Recorded) -> object:
     """Show this page the images of a data set instead of live ones; none: live ones again."""
     lab, name = _lab(viewer), params.name
     clients = viewer.clients.of(page.id)
@@ -167,7 +339,7 @@ async def recorded(viewer: Viewer, page: Page, params: p.Recorded) -> object:
     return told or {}
 
 
-async def recorded_image(viewer: Viewer, page: Page, params: p.RecordedImage) -> object:
+async def recorded_image(viewer: Viewer, page: Page, params: RecordedImage) -> object:
     """Show this page an image of its data set, and in its scenes the machine as it stood then."""
     lab, name = _lab(viewer), page.recorded
     if name is None:
@@ -223,7 +395,7 @@ async def _virtual(page: Page, told: Mapping[str, Any]) -> Any:
     return wire_image.decode(await page.link.request("projection.get", asked))  # type: ignore[arg-type]
 
 
-async def live(viewer: Viewer, page: Page, params: p.Live) -> object:
+async def live(viewer: Viewer, page: Page, params: Live) -> object:
     """Grow a volume of a data set from the images so far, for all pages that want one."""
     page.live = params.name is not None
     if params.name is None:
@@ -236,13 +408,13 @@ async def live(viewer: Viewer, page: Page, params: p.Live) -> object:
     return {}
 
 
-async def _of_volume(viewer: Viewer, params: p.Live, *words: str) -> tuple[Any, bytes]:
+async def _of_volume(viewer: Viewer, params: Live, *words: str) -> tuple[Any, bytes]:
     """What the volume's process answers; nothing where it has another volume by now."""
     folder = _data(viewer) / plain_name(params.name or "", "data set")
     return await viewer.grower.ask(wish(folder, params.side, params.past), *words) or ({}, b"")
 
 
-async def volume_block(viewer: Viewer, page: Page, params: p.Block) -> object:
+async def volume_block(viewer: Viewer, page: Page, params: Block) -> object:
     """A volume that is reconstructed as a page draws it: a head, and codes to fetch; empty while
     there is none."""
     head, codes = await _of_volume(viewer, params, "block", params.what)
@@ -254,19 +426,19 @@ async def volume_block(viewer: Viewer, page: Page, params: p.Block) -> object:
     return {**head, **offered}
 
 
-async def voxel(viewer: Viewer, page: Page, params: p.Voxel) -> object:
+async def voxel(viewer: Viewer, page: Page, params: Voxel) -> object:
     """Exact values of a voxel by the names of the volumes there are; None where no data cover."""
     return (await _of_volume(viewer, params, "voxel", *map(str, params.at)))[0]
 
 
-async def volume_compare(viewer: Viewer, page: Page, params: p.Live) -> object:
+async def volume_compare(viewer: Viewer, page: Page, params: Live) -> object:
     """Compare the volume with the truth of its sample; its document brings the figures."""
     correction = None if viewer.state is None else viewer.state.correction
     now = None if correction is None else correction.model_dump(include={"name", "parameters"})
     return (await _of_volume(viewer, params, "compare", json.dumps(now)))[0]
 
 
-async def compose(viewer: Viewer, page: Page, params: p.Compose) -> object:
+async def compose(viewer: Viewer, page: Page, params: Compose) -> object:
     """Compose a script for the requested scan in the present geometry."""
     lab, state = _lab(viewer), viewer.state
     request = ScanRequest(kind=params.kind, frames=params.frames, exposure_ms=params.exposure_ms)
@@ -308,7 +480,7 @@ def _moved(text: str, lab: LabScene, state: State) -> dict[str, tuple[float, flo
     return found
 
 
-async def datasets(viewer: Viewer, page: Page, params: p.Datasets) -> object:
+async def datasets(viewer: Viewer, page: Page, params: Datasets) -> object:
     """Data sets, newest first, with thumbnails."""
     asked = {"search": params.search, "start": params.start, "thumbnail": 96}
     told: Any = await page.link.request("dataset.list", asked)
@@ -332,12 +504,12 @@ async def estimate(viewer: Viewer, page: Page, params: CalibrationFit | Calibrat
         return without_bytes(await client.core.call(asked))
 
 
-async def correct(viewer: Viewer, page: Page, params: p.Correct) -> object:
+async def correct(viewer: Viewer, page: Page, params: Correct) -> object:
     """A correction for the twin."""
     return await page.link.request("calibration.apply", params.model_dump(exclude_none=True))
 
 
-async def scrub(viewer: Viewer, page: Page, params: p.Scrub) -> object:
+async def scrub(viewer: Viewer, page: Page, params: Scrub) -> object:
     """Draw, for this page, where the plan has the machine at `time_s`; none: no longer."""
     lab, time_s = _lab(viewer), params.time_s
     if time_s is None:
@@ -350,7 +522,7 @@ async def scrub(viewer: Viewer, page: Page, params: p.Scrub) -> object:
     return {"positions": positions}
 
 
-async def screenshot(viewer: Viewer, page: Page, params: p.Screenshot) -> object:
+async def screenshot(viewer: Viewer, page: Page, params: Screenshot) -> object:
     """A picture of one of this page's views, as a download."""
     clients = viewer.clients.of(page.id, params.view)
     if not clients:
@@ -362,7 +534,7 @@ async def screenshot(viewer: Viewer, page: Page, params: p.Screenshot) -> object
     return _offer(viewer, f"flexdt-{params.view}-{_stamp()}.png", content)
 
 
-async def export(viewer: Viewer, page: Page, params: p.Export) -> object:
+async def export(viewer: Viewer, page: Page, params: Export) -> object:
     """The scene, or a replay of this page's plan, as one file: html or viser."""
     lab, form = _lab(viewer), params.format
     if not params.replay:
@@ -424,28 +596,28 @@ def _stamp() -> str:
 Answer = Callable[["Viewer", Page, Any], Awaitable[object]]
 
 METHODS: Mapping[str, tuple[type[Params], Answer]] = {
-    "calibration.apply": (p.Correct, correct),
+    "calibration.apply": (Correct, correct),
     "calibration.fit": (CalibrationFit, estimate),
     "calibration.align": (CalibrationAlign, estimate),
-    "viewer.layers": (p.Layers, layers),
-    "viewer.theme": (p.Theme, theme),
-    "viewer.camera": (p.Camera, camera),
-    "viewer.feed": (p.Feed, feed),
-    "viewer.window": (p.Window, window),
-    "viewer.ray": (p.Ray, ray),
-    "viewer.spectrum": (p.Spectrum, spectrum),
-    "viewer.plan": (p.Plan, plan),
-    "viewer.recorded": (p.Recorded, recorded),
-    "viewer.recorded_image": (p.RecordedImage, recorded_image),
-    "viewer.live": (p.Live, live),
-    "viewer.block": (p.Block, volume_block),
-    "viewer.voxel": (p.Voxel, voxel),
-    "viewer.compare": (p.Live, volume_compare),
-    "viewer.compose": (p.Compose, compose),
-    "viewer.datasets": (p.Datasets, datasets),
-    "viewer.scrub": (p.Scrub, scrub),
-    "viewer.screenshot": (p.Screenshot, screenshot),
-    "viewer.export": (p.Export, export),
+    "viewer.layers": (Layers, layers),
+    "viewer.theme": (Theme, theme),
+    "viewer.camera": (Camera, camera),
+    "viewer.feed": (Feed, feed),
+    "viewer.window": (Window, window),
+    "viewer.ray": (Ray, ray),
+    "viewer.spectrum": (Spectrum, spectrum),
+    "viewer.plan": (Plan, plan),
+    "viewer.recorded": (Recorded, recorded),
+    "viewer.recorded_image": (RecordedImage, recorded_image),
+    "viewer.live": (Live, live),
+    "viewer.block": (Block, volume_block),
+    "viewer.voxel": (Voxel, voxel),
+    "viewer.compare": (Live, volume_compare),
+    "viewer.compose": (Compose, compose),
+    "viewer.datasets": (Datasets, datasets),
+    "viewer.scrub": (Scrub, scrub),
+    "viewer.screenshot": (Screenshot, screenshot),
+    "viewer.export": (Export, export),
 }
 """Method -> its parameters, and what answers it."""
 

@@ -56,7 +56,6 @@ from flexdt.twin.machine.description import Machine, Profile, builtin_machine, p
 DRAW_HZ: Final = 30.0
 ASKED_HZ: Final = 36.0
 """States asked of the twin a second: a little more, since those that come late are dropped."""
-RANGES_S: Final = 0.2
 NAMES_S: Final = 0.25
 BEAT_S: Final = 0.25
 """Between heartbeats to the pages."""
@@ -129,7 +128,7 @@ class Viewer:
         self._due = asyncio.Event()
         self._twin_time, self._told = 0.0, -1
         self._heard_at = time.monotonic()
-        self._ranges_at, self._built = 0.0, 0
+        self._built = 0
         self.near: Sequence[str] = ()
         self.link = KeptConnection(
             address,
@@ -326,9 +325,7 @@ class Viewer:
         near = nearest(state.safety)
         lab.update(state, world)
         self.near = near["pair"] if near["close"] else ()
-        ranges = any("ranges" in page.shown for page in self.pages.values())
-        if ranges and time.monotonic() - self._ranges_at > RANGES_S:
-            self._ranges_at = time.monotonic()
+        if any("ranges" in page.shown for page in self.pages.values()):
             lab.draw_ranges(state)
         self._placed.set()
         camera, framing = views.beam_view(world)

@@ -346,36 +346,6 @@ def test_messages_that_never_end_are_cut_and_others_are_heard(
     with_front(work)
 
 
-def test_a_view_that_says_very_much_does_not_keep_others_waiting(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(module, "RELAYED_AT_ONCE", 5)
-
-    async def run() -> None:
-        front = Front(echo, nowhere, HTML, {})
-        heard: list[str] = []
-
-        async def says(name: str, count: int, pause_s: float) -> int:
-            """At most so many messages of others went before one of its own."""
-            worst = 0
-            for _ in range(count):
-                before = len(heard)
-                await front._in_turn()
-                worst = max(worst, len(heard) - before)
-                heard.append(name)
-                await asyncio.sleep(pause_s)
-            return worst
-
-        begun = time.monotonic()
-        floods = [asyncio.create_task(says("flood", 150, 0.0)) for _ in range(3)]
-        worst = await says("one", 10, 0.02)
-        assert worst < 10, "it waits for a few of the others' messages, not for all"
-        await asyncio.gather(*floods)
-        assert time.monotonic() - begun > 0.8 * 455 / module.RELAYED_HZ
-
-    asyncio.run(run())
-
-
 def test_other_addresses_need_a_token() -> None:
     async def run() -> None:
         front = Front(echo, nowhere, HTML, {})

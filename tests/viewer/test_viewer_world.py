@@ -20,7 +20,7 @@ import viser
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from flexdt.clients.viewer.feed import ShownImage, grey, halved, packed, window_of
+from flexdt.clients.viewer.feed import ShownImage, grey, packed, window_of
 from flexdt.clients.viewer.scenes import painted_meshes as solids
 from flexdt.clients.viewer.scenes.drawing_aids import HULL, MOST, SIDES, Gizmos, fans
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
@@ -44,6 +44,7 @@ from flexdt.phantoms import load_phantom, phantom_names
 from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SampleState, State
 from flexdt.twin.collision.convex_solids import UprightCylinder, hull
+from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import (
@@ -234,7 +235,7 @@ def test_packed_pixels_come_out_within_half_a_step() -> None:
     assert head["shape"] == [15, 20]
     by_hand = [[pixels[2 * r : 2 * r + 2, 2 * c : 2 * c + 2].mean() for c in range(20)]
                for r in range(15)]  # fmt: skip
-    np.testing.assert_allclose(halved(pixels), by_hand, atol=1e-6)
+    np.testing.assert_allclose(binned_mean(pixels, 2), by_hand, atol=1e-6)
 
 
 def test_a_coarse_image_is_near_and_small() -> None:
@@ -243,7 +244,7 @@ def test_a_coarse_image_is_near_and_small() -> None:
     image = ShownImage(pixels.astype(np.float32), "line_integral", (0.0,) * 12, 1.5, 7)
     content = packed(image, coarse=True, beads=[], facts={})
     _, values = _unpack(content)
-    error = values - halved(pixels.astype(np.float32))
+    error = values - binned_mean(pixels.astype(np.float32), 2)
     assert np.sqrt((error**2).mean()) < 0.005 * pixels.max()
     assert len(content) < 50_000
     assert len(packed(image, coarse=False, beads=[], facts={})) < 2 * pixels.size

@@ -31,6 +31,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import viser
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from flexdt.clients.viewer.scenes.painted_meshes import bare, plain
@@ -290,76 +291,31 @@ def laid_out(anchors: FloatArray, sizes: FloatArray, area: tuple[float, float]) 
     """
     turns = np.arange(WAYS) * 2.0 * math.pi / WAYS
     ways = np.stack([np.cos(turns), -np.sin(turns)], axis=1)
-    out = np.full((len(anchors), 2), np.nan)
+    rings = np.repeat(np.arange(len(RINGS_PX)), WAYS)
+    preference = rings + 0.5 * (1.0 + np.tile(ways[:, 1], len(RINGS_PX)))
+    size = sizes.max(axis=0, initial=0.0)  # of every place, so that any name has room in it
+    places, named = np.zeros((0, 2)), np.zeros(0, dtype=int)
     for k in np.argsort(anchors[:, 1]):
         if not ((anchors[k] >= 0.0) & (anchors[k] <= area)).all():
             continue
-        middles = np.concatenate([anchors[k] + r * ways + 0.5 * sizes[k] * ways for r in RINGS_PX])
-        best = math.inf
-        for n, corner in enumerate(middles - 0.5 * sizes[k]):
-            if not _free(corner, sizes[k], out, sizes, area):
-                continue
-            covered = ((anchors > corner - GAP_PX) & (anchors < corner + sizes[k] + GAP_PX)).all(1)
-            ends = corner + 0.5 * sizes[k], anchors[k]
-            through = sum(_cross(*ends, a, b) for a, b in _leaders(anchors, out, sizes))
-            cost = n // WAYS + 4.0 * (covered.sum() + through) + 0.5 * (1.0 + ways[n % WAYS, 1])
-            if cost < best:
-                best, out[k] = cost, corner
-    return _uncrossed(anchors, out, sizes, area)
+        middles = np.concatenate([anchors[k] + (r + 0.5 * size) * ways for r in RINGS_PX])
+        inside = (np.abs(middles - 0.5 * np.array(area)) <= 0.5 * (area - size) - GAP_PX).all(1)
+        apart = (np.abs(middles[:, None] - places) >= size + GAP_PX).any(axis=2).all(axis=1)
+        covered = (np.abs(middles[:, None] - anchors) < 0.5 * size + GAP_PX).all(axis=2).sum(axis=1)
+        cost = np.where(inside & apart, preference + 4.0 * covered, np.inf)
+        if np.isfinite(cost).any():
+            places, named = np.vstack([places, middles[np.argmin(cost)]]), np.append(named, k)
+    # Where two leaders crossed, their names could change places and both would be shorter.
+    lengths = np.linalg.norm(places[:, None] - anchors[named], axis=2)
+    place, name = linear_sum_assignment(lengths)
+    out = np.full((len(anchors), 2), np.nan)
+    out[named] = places[place[np.argsort(name)]] - 0.5 * sizes[named]
+    return out
 
 
 def leader_end(anchor: FloatArray, corner: FloatArray, size: FloatArray) -> FloatArray:
     """The point of a box that is nearest to what it names, (2,)."""
     return np.clip(anchor, corner, corner + size)
-
-
-def _free(
-    corner: FloatArray, size: FloatArray, others: FloatArray, sizes: FloatArray,
-    area: tuple[float, float],
-) -> bool:  # fmt: skip
-    if (corner < GAP_PX).any() or (corner + size > np.asarray(area) - GAP_PX).any():
-        return False
-    apart = (corner + size + GAP_PX <= others) | (others + sizes + GAP_PX <= corner)
-    return bool((apart.any(axis=1) | np.isnan(others[:, 0])).all())
-
-
-def _leaders(
-    anchors: FloatArray, corners: FloatArray, sizes: FloatArray
-) -> list[tuple[FloatArray, FloatArray]]:
-    there = np.flatnonzero(~np.isnan(corners[:, 0]))
-    return [(corners[k] + 0.5 * sizes[k], anchors[k]) for k in there]
-
-
-def _uncrossed(
-    anchors: FloatArray, corners: FloatArray, sizes: FloatArray, area: tuple[float, float]
-) -> FloatArray:
-    middles, there = corners + 0.5 * sizes, np.flatnonzero(~np.isnan(corners[:, 0]))
-    pairs = [(i, j) for i in there for j in there if i < j]
-    changed = True
-    while changed:  # it ends: each change makes the sum of the leaders shorter
-        changed = False
-        for i, j in pairs:
-            if not _cross(middles[i], anchors[i], middles[j], anchors[j]):
-                continue
-            swapped = middles.copy()
-            swapped[[i, j]] = middles[[j, i]]
-            others = swapped - 0.5 * sizes
-            others[[i, j]] = np.nan
-            mine, other = (swapped[k] - 0.5 * sizes[k] for k in (i, j))
-            fits = _free(mine, sizes[i], others, sizes, area)
-            others[i] = mine
-            if fits and _free(other, sizes[j], others, sizes, area):
-                middles, changed = swapped, True
-    return middles - 0.5 * sizes
-
-
-def _cross(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> bool:
-    """Whether the lines from a to b and from c to d cross."""
-
-    def side(p: FloatArray, q: FloatArray, r: FloatArray) -> float:
-        return float((q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]))
-
-    return side(a, b, c) * side(a, b, d) < 0.0 and side(c, d, a) * side(c, d, b) < 0.0
 
 
 LETTER_PX, LINE_PX, PAD_PX = 6.6, 17.0, 10.0

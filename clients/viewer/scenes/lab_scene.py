@@ -1,6 +1,6 @@
 """The scanner in viser: built once, then moved by every state; metres, one frame for each part.
 
-Only changes are sent. Setters may be called from any one thread at a time.
+viser sends only what changes. Setters may be called from any one thread at a time.
 
 The lab has plain lamps for every browser, and finer ones where a graphics processor draws. Without
 one, shadows and an environment take ten times as long as all the rest of a picture.
@@ -259,24 +259,12 @@ class LabScene:
 
     def _place(self, name: str, turn: FloatArray, at: FloatArray) -> None:
         pose = (*quaternion(turn), *(at * MM).tolist())
-        if self._sent.get(name) == pose:
-            return
-        self._sent[name] = pose
-        frame = self._frames[name]
+        self._sent[name], frame = pose, self._frames[name]
         frame.wxyz, frame.position = pose[:4], pose[4:]
 
     def _show_beam(self, state: State, world: World) -> None:
         on = state.tube.on
         points = np.concatenate([world.source[None], world.corners]) * MM
-        key = (
-            *points.reshape(-1).tolist(),
-            *world.axis.tolist(),
-            *world.stage.turn.flat,
-            float(on),
-        )
-        if self._sent.get("beam") == key:
-            return
-        self._sent["beam"] = key
         self._lit, self._lamp.color = on, LAMP[on]
         self._shade.light(on)
         a, b, c, d, e = points
@@ -295,10 +283,6 @@ class LabScene:
         at = (world.detector - GAP_MM * world.normal) * MM
         width = float(np.linalg.norm(world.u)) * cols * MM
         height = float(np.linalg.norm(world.v)) * rows * MM
-        key = (*at.tolist(), width, height, *world.u.tolist(), *world.v.tolist())
-        if self._sent.get("panel") == key:
-            return
-        self._sent["panel"] = key
         u, v = world.u / np.linalg.norm(world.u), world.v / np.linalg.norm(world.v)
         self._image.render_width, self._image.render_height = width, height
         self._image.wxyz = quaternion(np.stack([u, v, np.cross(u, v)], axis=1))

@@ -439,16 +439,14 @@ def cabinet(machine: Machine, floor_mm: float) -> tuple[list[PaintedMesh], Float
     low = np.array(ground.center_mm) - half
     high = np.array(ground.center_mm) + half
     low[2], high[2] = floor_mm, ground.center_mm[2] + towers + ROOM_MM[2]
-    (x0, y0, z0), (x1, y1, z1) = low, high
+    (x0, y0, z0), (x1, y1, _) = low, high
     door_y, (wide, door_top) = 0.3 * y0 + 0.7 * y1, (DOOR_MM[0], z0 + DOOR_MM[1])
     left, right = door_y - wide / 2, door_y + wide / 2
-    walls = [
-        _quad([(x0, y1, z0), (x0, y0, z0), (x0, y0, z1), (x0, y1, z1)][::-1]),
-        _quad([(x1, y0, z0), (x1, y1, z0), (x1, y1, z1), (x1, y0, z1)][::-1]),
-        _quad([(x0, y0, z0), (x1, y0, z0), (x1, y0, z1), (x0, y0, z1)][::-1]),
-        _quad([(x1, y1, z0), (x0, y1, z0), (x0, y1, z1), (x1, y1, z1)][::-1]),
-    ]
-    floor = _quad([(x0, y0, z0), (x1, y0, z0), (x1, y1, z0), (x0, y1, z0)])
+    room = trimesh.creation.box(bounds=[low, high])
+    room.invert()
+    walls, floor, upward = room, room.copy(), room.face_normals[:, 2]
+    walls.update_faces(abs(upward) < 0.5)
+    floor.update_faces(upward > 0.5)
     middle, tall = (door_top + z0) / 2, DOOR_MM[1]
     on_wall = [
         bevelled((8, wide + 60, tall + 60), (x0 + 4, door_y, middle), ANODISED),
@@ -467,11 +465,5 @@ def cabinet(machine: Machine, floor_mm: float) -> tuple[list[PaintedMesh], Float
         bevelled((40, y1 - y0, 60), (x, 0.5 * (y0 + y1), z0 + 30), STEEL)
         for x in (x0 - 20, x1 + 20)
     ]
-    plain = [PaintedMesh(wall, WALL) for wall in walls] + [PaintedMesh(floor, FLOOR)]
-    return plain + on_wall + kerb, np.array([x0 + 45.0, door_y, door_top + 130.0])
-
-
-def _quad(corners: Sequence[Sequence[float]]) -> trimesh.Trimesh:
-    """A rectangle that is seen where its corners go counter-clockwise."""
-    faces = [[0, 1, 2], [0, 2, 3]]
-    return trimesh.Trimesh(np.array(corners, dtype=float), faces, process=False)
+    pieces = [PaintedMesh(walls, WALL), PaintedMesh(floor, FLOOR), *on_wall, *kerb]
+    return pieces, np.array([x0 + 45.0, door_y, door_top + 130.0])
