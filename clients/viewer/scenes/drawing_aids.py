@@ -13,9 +13,9 @@ clamped to their limits. The twin plans and sweeps them as usual, and the stage 
 speed. A drag counts as a command of the page whose frame it is in.
 
 No name covers another: where they stand is a pure function of boxes in pixels. A name's box goes to
-the free place nearest to the point that it names, and a leader joins the two. Where leaders cross,
-names change places, which shortens both leaders, for as long as any do. `NameTags` draws them in
-the views of browsers, whose cameras decide where the boxes are.
+the free place nearest to the point that it names, and a leader joins the two. The names then share
+these places so that their leaders are shortest together: none crosses another. `NameTags` draws
+them in the views of browsers, whose cameras decide where the boxes are.
 
 A scrubbed plan is a blue ghost of the machine and the focal spot's path, drawn for the viser
 clients of one page alone.
