@@ -300,10 +300,10 @@ def _read(text: str) -> tuple[str | int | None, str, dict[str, Any]]:
     match request:
         case {"method": str(method)}:
             id, params = request.get("id"), request.get("params") or {}
-            short = id is None or (isinstance(id, int | str) and len(str(id)) <= MAX_WORD)
-            if short and isinstance(params, dict):
+            named = id is None or (isinstance(id, str) and len(id) <= MAX_WORD)
+            if (named or (isinstance(id, int) and abs(id) < 2**64)) and isinstance(params, dict):
                 return id, method, params
-    raise ValueError(f"it has a method, params by name, an id of at most {MAX_WORD} characters")
+    raise ValueError(f"it has a method, params by name, an id of {MAX_WORD} characters at most")
 
 
 def without_bytes(value: Any) -> Any:
