@@ -443,10 +443,11 @@ def cabinet(machine: Machine, floor_mm: float) -> tuple[list[PaintedMesh], Float
     door_y, (wide, door_top) = 0.3 * y0 + 0.7 * y1, (DOOR_MM[0], z0 + DOOR_MM[1])
     left, right = door_y - wide / 2, door_y + wide / 2
     room = trimesh.creation.box(bounds=[low, high])
-    room.invert()
-    walls, floor, upward = room, room.copy(), room.face_normals[:, 2]
+    upward = room.face_normals[:, 2].copy()
+    room.invert()  # it is seen from within
+    walls, floor = room, room.copy()
     walls.update_faces(abs(upward) < 0.5)
-    floor.update_faces(upward > 0.5)
+    floor.update_faces(upward < -0.5)
     middle, tall = (door_top + z0) / 2, DOOR_MM[1]
     on_wall = [
         bevelled((8, wide + 60, tall + 60), (x0 + 4, door_y, middle), ANODISED),
