@@ -11,6 +11,7 @@ import re
 import shutil
 import subprocess
 import sys
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,8 @@ SOURCE = "".join(
 )
 WORDS = set(re.findall(r"\w+", SOURCE))
 COLUMNS = 120
+HELD = "\0"
+SHORT = 80
 HEAD = """\
 // Written by tests/viewer/test_page_source.py from the OpenRPC document of the wire and of the
 // viewer's own methods: the methods that the page calls, and the types and fields that it names.
@@ -102,11 +105,16 @@ def typed(schema: Mapping[str, Any], asked: bool) -> str:
         return f"Array<{typed(schema.get('items', {}), asked)}>"
     if kind == "object" and schema.get("properties"):
         needed = schema.get("required", []) if asked else schema["properties"]
-        fields = (
-            f"  {name}{'' if name in needed else '?'}: {typed(field, asked)};\n"
+        fields = [
+            f"{name}{'' if name in needed else '?'}: {typed(field, asked)}"
             for name, field in schema["properties"].items()
-        )
-        return f"{{\n{''.join(fields)}}}"
+        ]
+        # As many as a line has room for, as in the page's own modules; a line ends behind a field.
+        held = "; ".join(field.replace(" ", HELD) for field in fields)
+        lines = textwrap.wrap(held, COLUMNS - 2, break_long_words=False, break_on_hyphens=False)
+        if len(held) < SHORT:
+            return f"{{ {lines[0].replace(HELD, ' ')} }}"
+        return "{\n" + "".join(f"  {line.replace(HELD, ' ')}\n" for line in lines) + "}"
     if kind == "object":
         more = schema.get("patternProperties", {"": schema.get("additionalProperties", {})})
         values = [

@@ -88,6 +88,11 @@ export function bytes(n) {
 export function setText(node, text) { if (node.textContent !== text)
     node.textContent = text; }
 export function download(url, name) { const a = el("a", { href: url, download: name }); document.body.append(a); a.click(); a.remove(); }
+export function downloadBlob(blob, name) {
+    const url = URL.createObjectURL(blob);
+    download(url, name);
+    setTimeout(() => URL.revokeObjectURL(url), 10000);
+}
 export function base64(buffer) {
     const b = new Uint8Array(buffer);
     let out = "";
@@ -122,6 +127,16 @@ export function cleared(canvas) {
     canvas.width = canvas.clientWidth * devicePixelRatio;
     canvas.height = canvas.clientHeight * devicePixelRatio;
     return [context2d(canvas), canvas.width, canvas.height];
+}
+// Values along a line as a curve; what is no number has no point.
+export function curve(canvas, values, low, high) {
+    const [x, w, h] = cleared(canvas);
+    x.strokeStyle = getComputedStyle(canvas).getPropertyValue("--accent");
+    x.lineWidth = 1.5 * devicePixelRatio;
+    x.beginPath();
+    values.forEach((v, k) => { if (Number.isFinite(v))
+        x.lineTo((w * k) / Math.max(1, values.length - 1), h - 3 - ((h - 6) * (v - low)) / (high - low || 1)); });
+    x.stroke();
 }
 // How often each value occurs, as its logarithm, so that what is rare shows beside much air.
 export function bars([x, w, h], counts, style) {

@@ -1,6 +1,6 @@
 // Measuring in the radiograph: a loupe, the profile along a line, the statistics of a region, the ray of a pixel. Places are
 // (column, row) of the full image; what was marked stays and is measured anew in every image.
-import { $, $canvas, $select, cleared, field, fixed, parsed, setText, words } from "./dom.js";
+import { $, $canvas, $select, curve, field, fixed, parsed, setText, words } from "./dom.js";
 import { call } from "./link.js";
 const LOUPE = { radius: 72, times: 4 }, SAMPLES = 512;
 const HINTS = { pan: "", loupe: "", profile: "drag a line, or type its ends: column row column row", region: "drag a box, or type its corners: column row column row",
@@ -148,10 +148,5 @@ export function tell(i, value) {
         return;
     }
     setText($("#measured"), `${number(low)} to ${number(high)} · ${fixed(Math.hypot(s[2] - s[0], s[3] - s[1]), 1)} px`);
-    const [plot2d, w, h] = cleared(plot);
-    plot2d.strokeStyle = getComputedStyle(plot).getPropertyValue("--accent");
-    plot2d.lineWidth = 1.5 * devicePixelRatio;
-    plot2d.beginPath();
-    values.forEach((v, k) => plot2d.lineTo((w * k) / Math.max(1, values.length - 1), h - 3 - ((h - 6) * (v - low)) / (high - low || 1)));
-    plot2d.stroke();
+    curve(plot, values, low, high);
 }

@@ -18,7 +18,7 @@ export function drawBar(x, mm, px, unit) {
     x.fillText(`${mm} mm`, 8 * unit, h - 2 * unit);
 }
 // Less than the truth is blue, more is orange.
-function signed(g) { const d = 2 * Math.abs(g - 127.5) | 0; return g < 127.5 ? 0xff000000 | (d << 16) | ((d >> 1) << 8) : 0xff000000 | ((d >> 1) << 8) | d; }
+export function signed(g) { const d = 2 * Math.abs(g - 127.5) | 0; return g < 127.5 ? 0xff000000 | (d << 16) | ((d >> 1) << 8) : 0xff000000 | ((d >> 1) << 8) | d; }
 // `pointed` hears of the voxel under the pointer, `moved` of a cross or a profile that was moved.
 export function slices(canvases, pointed, moved) {
     const table = new Uint32Array(TOP + 2), buffers = {};

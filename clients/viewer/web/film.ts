@@ -6,6 +6,7 @@ import { call, emit, on, store } from "./link.js";
 import * as measure from "./measure.js";
 import * as compare from "./compare.js";
 import * as marks from "./marks.js";
+import { signed } from "./slices.js";
 
 const canvas = $canvas("#film-canvas"), context = context2d(canvas), film = $("#film");
 const buffer = document.createElement("canvas"), pixels2d = context2d(buffer);
@@ -82,8 +83,6 @@ function develop(i: Shown) {
   pixels2d.putImageData(out, 0, 0);
 }
 
-// Less than the reference is blue, as much is black, more is orange.
-function signed(g: number) { const d = 2 * Math.abs(g - 127.5) | 0; return g < 127.5 ? 0xff000000 | (d << 16) | ((d >> 1) << 8) : 0xff000000 | ((d >> 1) << 8) | d; }
 // An image taken with the beam off says so: it is dark, or drawn as though the beam were on.
 function unlit(i: Shown | null) { const tube = store.state?.tube; return i !== null && !i.recorded && tube !== undefined && !(tube.on && tube.ready); }
 function beam(i: Shown | null) {

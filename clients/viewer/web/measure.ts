@@ -1,6 +1,6 @@
 // Measuring in the radiograph: a loupe, the profile along a line, the statistics of a region, the ray of a pixel. Places are
 // (column, row) of the full image; what was marked stays and is measured anew in every image.
-import { $, $canvas, $select, cleared, field, fixed, parsed, setText, words } from "./dom.js";
+import { $, $canvas, $select, curve, field, fixed, parsed, setText, words } from "./dom.js";
 import type { Pair, Shown } from "./viewer.js";
 import { call } from "./link.js";
 
@@ -106,8 +106,5 @@ export function tell(i: Shown | null, value: Value): void {
   const values = profile(value, s).filter(Number.isFinite), low = Math.min(...values), high = Math.max(...values);
   if (!values.length) { setText($("#measured"), "outside the image"); return; }
   setText($("#measured"), `${number(low)} to ${number(high)} · ${fixed(Math.hypot(s[2] - s[0], s[3] - s[1]), 1)} px`);
-  const [plot2d, w, h] = cleared(plot);
-  plot2d.strokeStyle = getComputedStyle(plot).getPropertyValue("--accent"); plot2d.lineWidth = 1.5 * devicePixelRatio; plot2d.beginPath();
-  values.forEach((v, k) => plot2d.lineTo((w * k) / Math.max(1, values.length - 1), h - 3 - ((h - 6) * (v - low)) / (high - low || 1)));
-  plot2d.stroke();
+  curve(plot, values, low, high);
 }

@@ -1,5 +1,5 @@
 // The Share tab: pictures, files that open anywhere, scenes to save and load.
-import { $input, $select, bytes, chosen, clicks, download, words } from "./dom.js";
+import { $input, $select, bytes, chosen, clicks, download, downloadBlob, words } from "./dom.js";
 import { command, emit } from "./link.js";
 import { picture } from "./film.js";
 import { current } from "./views.js";
@@ -25,9 +25,8 @@ const exported = (format: Export["format"], replay = false) => () => offer("view
 async function save() {
   const a = await command("scene.save", {}, "Not saved");
   if (!a) return;
-  const url = URL.createObjectURL(new Blob([JSON.stringify(a.document, null, 2)], { type: "application/json" }));
-  download(url, `flexdt-scene-${new Date().toISOString().slice(0, 19).replace(/[:T]/g, "-")}.json`);
-  setTimeout(() => URL.revokeObjectURL(url), 10000);
+  const scene = new Blob([JSON.stringify(a.document, null, 2)], { type: "application/json" });
+  downloadBlob(scene, `flexdt-scene-${new Date().toISOString().slice(0, 19).replace(/[:T]/g, "-")}.json`);
 }
 clicks({
   "shot": shot, "shot-film": film, "export-html": exported("html"), "export-viser": exported("viser"),

@@ -1,5 +1,5 @@
 // The view of a volume as one HTML file that opens without a server: the same slices and camera, axes and scale, the radiograph and the values.
-import { $, base64, bytes, download, fixed } from "./dom.js";
+import { $, base64, bytes, downloadBlob, fixed } from "./dom.js";
 import { emit } from "./link.js";
 import type { Block, VolumeMessage } from "./viewer.js";
 import { extent, index, type Slices } from "./slices.js";
@@ -47,8 +47,7 @@ export async function shared(three: Slices, solid: Ray | null, m: VolumeMessage)
 ${film ? `<figure><figcaption>radiograph, as windowed when this was shared</figcaption><img alt="radiograph" src="${film}"></figure>` : ""}</div><p id="at">point at a slice</p>
 <table>${rows.map(([name, text]) => `<tr><th>${name}</th><td>${safe(text)}</td></tr>`).join("")}</table>${$("#volume-compared").innerHTML}
 <script type="application/json" id="told">${JSON.stringify(told)}</script><script type="module">${program}\n${START}</script></body></html>`;
-  const blob = new Blob([html], { type: "text/html" }), url = URL.createObjectURL(blob), name = `flexdt-${(m.sample || m.name).replace(/[^\w-]+/g, "-")}-${when.replace(/\D+/g, "-")}.html`;
-  download(url, name);
+  const blob = new Blob([html], { type: "text/html" }), name = `flexdt-${(m.sample || m.name).replace(/[^\w-]+/g, "-")}-${when.replace(/\D+/g, "-")}.html`;
+  downloadBlob(blob, name);
   emit("note", "good", name, bytes(blob.size));
-  setTimeout(() => URL.revokeObjectURL(url), 10000);
 }

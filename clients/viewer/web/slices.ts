@@ -20,7 +20,7 @@ export function drawBar(x: CanvasRenderingContext2D, mm: number, px: number, uni
   x.fillText(`${mm} mm`, 8 * unit, h - 2 * unit);
 }
 // Less than the truth is blue, more is orange.
-function signed(g: number) { const d = 2 * Math.abs(g - 127.5) | 0; return g < 127.5 ? 0xff000000 | (d << 16) | ((d >> 1) << 8) : 0xff000000 | ((d >> 1) << 8) | d; }
+export function signed(g: number) { const d = 2 * Math.abs(g - 127.5) | 0; return g < 127.5 ? 0xff000000 | (d << 16) | ((d >> 1) << 8) : 0xff000000 | ((d >> 1) << 8) | d; }
 
 export interface Slices {
   block: Block | null; window: Pair; cross: Vector; profiling: boolean;

@@ -1,6 +1,6 @@
 // A volume: the one that grows while a scan runs, or a past scan's, as flexdt reconstruct makes it. It comes here as a whole, as slices that
 // scroll and in three dimensions, and beside the truth of its sample.
-import { $, $button, $canvas, $input, $select, bars, cleared, clicks, el, fixed, keep, setText, slid, words } from "./dom.js";
+import { $, $button, $canvas, $input, $select, bars, cleared, clicks, curve, el, fixed, keep, setText, slid, words } from "./dom.js";
 import { call, on, store } from "./link.js";
 import type { Block, Figures, Live, Name, Pair, Vector, VolumeMessage } from "./viewer.js";
 import { folder } from "./data.js";
@@ -147,10 +147,8 @@ function drawProfile() {
   plot.hidden = !line;
   if (three.profiling && !line) setText($("#volume-at"), "drag a line in a slice");
   if (!line) return;
-  const known = line.values.filter(Number.isFinite), low = Math.min(...known), high = Math.max(...known), [x, w, h] = cleared(plot);
-  x.strokeStyle = getComputedStyle(plot).getPropertyValue("--accent"); x.lineWidth = 1.5 * devicePixelRatio; x.beginPath();
-  line.values.forEach((v, k) => { if (Number.isFinite(v)) x.lineTo((w * k) / (line.values.length - 1), h - 3 - ((h - 6) * (v - low)) / (high - low || 1)); });
-  x.stroke();
+  const known = line.values.filter(Number.isFinite), low = Math.min(...known), high = Math.max(...known);
+  curve(plot, line.values, low, high);
   setText($("#volume-at"), known.length ? `${fixed(line.mm, 2)} mm · ${fixed(low, 5)} to ${fixed(high, 5)} per mm` : "no data along this line");
 }
 // The value under the pointer: of the codes at once, and as exact as the volume is when the pointer rests.
