@@ -317,7 +317,7 @@ def assign(
 def _vote(problem: FitProblem, shadows: _Shadows, x: FloatArray) -> FloatArray:
     """`x` with dO_x and dO_y changed so that prediction and spots lie on top of each other."""
     try:
-        predicted = problem.residuals(x)[0] - problem.origin[:, None, :]
+        predicted = _predicted(problem, x)
     except TwinError:
         return x
     difference = shadows.points[:, None, :, :] - predicted[:, :, None, :]
@@ -341,24 +341,45 @@ def _vote(problem: FitProblem, shadows: _Shadows, x: FloatArray) -> FloatArray:
     return out
 
 
+def _predicted(problem: FitProblem, x: FloatArray) -> FloatArray:
+    """Spots (n, k, 2) from the image's centre [px]."""
+    return problem.residuals(x)[0] - problem.origin[:, None, :]
+
+
+def _followed(
+    problem: FitProblem,
+    shadows: _Shadows,
+    x: FloatArray,
+    gates: Iterable[float],
+    solver: Solver,
+    cap: float,
+) -> _Hypothesis:
+    """Assign and fit with each gate in turn, until the last one changes nothing; the loss is per
+    possible match, capped at `cap`."""
+    used, before = math.nan, np.zeros(0, np.int64)
+    try:
+        predicted = _predicted(problem, x)
+        for gate in gates:
+            index = assign(predicted, shadows.points, shadows.counts, gate)
+            if (index >= 0).sum() < 4:
+                return _Hypothesis(x, math.inf, 0)
+            if gate == used and np.array_equal(index, before):
+                break
+            x = solve(_with_tracks(problem, shadows, index), solver, x=x).x
+            predicted, used, before = _predicted(problem, x), gate, index
+    except TwinError:
+        return _Hypothesis(x, math.inf, 0)
+    loss, matches = _loss(predicted, shadows, cap)
+    return _Hypothesis(x, loss, matches)
+
+
 def _rounds(
     problem: FitProblem, shadows: _Shadows, h: _Hypothesis, gates: Sequence[float]
 ) -> _Hypothesis:
     x = h.x if math.isfinite(h.loss) else _vote(problem, shadows, h.x)
     quick = Solver(huber=2.0, trim=math.inf, max_iterations=3, tolerance=0.05)
-    try:
-        for gate in gates:
-            predicted = problem.residuals(x)[0] - problem.origin[:, None, :]
-            index = assign(predicted, shadows.points, shadows.counts, gate)
-            if (index >= 0).sum() < 4:
-                return _Hypothesis(x, math.inf, 0)
-            x = solve(_with_tracks(problem, shadows, index), quick, x=x).x
-        predicted = problem.residuals(x)[0] - problem.origin[:, None, :]
-    except TwinError:
-        return _Hypothesis(h.x, math.inf, 0)
     # One loss for all rounds, so that hypotheses can be compared: capped at the same distance.
-    loss, matches = _loss(predicted, shadows, 40.0)
-    return _Hypothesis(x, loss, matches)
+    return _followed(problem, shadows, x, gates, quick, 40.0)
 
 
 def _loss(predicted: FloatArray, shadows: _Shadows, cap: float) -> tuple[float, int]:
@@ -377,15 +398,10 @@ def _with_tracks(
     problem: FitProblem, shadows: _Shadows, index: npt.NDArray[np.int64]
 ) -> FitProblem:
     """The problem with the assigned spots as measurements of unit weight."""
-    seen = index >= 0
-    rows = np.arange(len(index))[:, None]
-    points = shadows.points[rows, np.maximum(index, 0)]
+    tracks, _, bias = shadows.picked(index, np.zeros((len(index), 2)))
+    whiten = np.broadcast_to([1.0, 0.0, 1.0], (*index.shape, 3)).copy()
     return replace(
-        problem,
-        measured=np.ascontiguousarray(np.where(seen[..., None], points, 0.0)),
-        seen=seen,
-        whiten=np.broadcast_to([1.0, 0.0, 1.0], (*seen.shape, 3)).copy(),
-        bias=np.where(seen, shadows.bias[rows, np.maximum(index, 0)], 0.0),
+        problem, measured=np.nan_to_num(tracks), seen=index >= 0, whiten=whiten, bias=bias
     )
 
 
@@ -406,29 +422,14 @@ def _turn_between(a: FloatArray, b: FloatArray) -> float:
 def _finish(
     problem: FitProblem, shadows: _Shadows, h: _Hypothesis, how: Search, wide_px: float = 20.0
 ) -> _Hypothesis:
-    """Assign and fit on all frames; the loss is per possible match, capped at the final gate.
-
-    The gate narrows from `wide_px`; columns that the hypothesis lacks start where the problem has
-    them.
-    """
+    """Assign and fit on all frames. The gate narrows from `wide_px`; columns that the hypothesis
+    lacks start where the problem has them."""
     x = np.concatenate([h.x, problem.start[len(h.x) :]])
-    gate = max(wide_px, how.gate_px)
-    try:
-        predicted = problem.residuals(x)[0] - problem.origin[:, None, :]
-        for _ in range(12):
-            index = assign(predicted, shadows.points, shadows.counts, gate)
-            if (index >= 0).sum() < 4:
-                break
-            x = solve(_with_tracks(problem, shadows, index), Solver(max_iterations=15), x=x).x
-            predicted = problem.residuals(x)[0] - problem.origin[:, None, :]
-            again = assign(predicted, shadows.points, shadows.counts, how.gate_px)
-            if gate <= how.gate_px and np.array_equal(again, index):
-                break
-            gate = max(0.5 * gate, how.gate_px) if gate > 20.0 else how.gate_px
-    except TwinError:
-        return _Hypothesis(x, math.inf, 0)
-    loss, matches = _loss(predicted, shadows, how.gate_px)
-    return _Hypothesis(x, loss, matches)
+    gates = [max(wide_px, how.gate_px)]
+    while gates[-1] > max(20.0, how.gate_px):
+        gates.append(max(0.5 * gates[-1], how.gate_px))
+    gates += [how.gate_px] * (12 - len(gates))
+    return _followed(problem, shadows, x, gates, Solver(max_iterations=15), how.gate_px)
 
 
 def _report(
@@ -446,7 +447,7 @@ def _report(
             {"detections": int(shadows.counts.sum()), "beads": len(model)},
         )
     best = finals[0]
-    predicted = problem.residuals(best.x)[0] - problem.origin[:, None, :]
+    predicted = _predicted(problem, best.x)
     index = assign(predicted, shadows.points, shadows.counts, how.gate_px)
     geometry = _at(problem, best.x, start)
     turns = round((geometry.alpha - start.alpha) / (2.0 * math.pi))

@@ -31,6 +31,7 @@ from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.windows import (
     Windows,
     blurred_windows,
+    distances2,
     pixel_noise,
     render_windows,
 )
@@ -341,9 +342,7 @@ def _shift_of_beads(
 
 def _rings(windows: Windows) -> npt.NDArray[np.bool_]:
     """Pixels round the beads that no bead touches, (m, side, side)."""
-    i = np.arange(windows.side)
-    x, y = np.moveaxis((windows.predicted - windows.corner)[:, 0], -1, 0)[..., None, None]
-    d2 = (i[None, None, :] - x) ** 2 + (i[None, :, None] - y) ** 2
+    d2 = distances2(windows.corner, windows.side, windows.predicted)[:, 0]
     radii = windows.radii[:, 0, None, None]
     return np.asarray((d2 > (1.15 * radii + 2.0) ** 2) & (d2 < (1.6 * radii + 4.0) ** 2))
 
@@ -441,13 +440,10 @@ def _rolled(plan: Windows, step: int) -> Windows:
 
 def _near(corner: npt.NDArray[np.int64], plan: Windows, some: slice) -> npt.NDArray[np.bool_]:
     """Pixels of windows (n, k, side, side) near to which a bead of that frame stands."""
-    i = np.arange(plan.side)
-    column, row = (corner[..., axis, None] + i for axis in (0, 1))
     reach = (1.12 * plan.radii * plan.stretch[..., 2] + 3.0)[some]
     out = np.zeros((*corner.shape[:2], plan.side, plan.side), dtype=bool)
     for bead in range(reach.shape[1]):
-        x, y = np.moveaxis(plan.predicted[some, bead], -1, 0)[..., None, None]
-        d2 = ((column - x) ** 2)[:, :, None, :] + ((row - y) ** 2)[..., None]
+        d2 = distances2(corner, plan.side, plan.predicted[some, bead, None])
         out |= d2 <= (reach[:, bead] ** 2)[:, None, None, None]
     return out
 

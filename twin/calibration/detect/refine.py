@@ -239,6 +239,10 @@ def seen_sharpness(
     return replace(sharp, true=true, size=sharp.scale / found.scale)
 
 
+_Tried = tuple[FloatArray, FloatArray, FloatArray]
+"""Blurs that were tried with one veil, the misfits of the fits and the sizes they found."""
+
+
 def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sharp:
     """Blur, veil and apparent size from some whole spots, by the fit that leaves least.
 
@@ -248,37 +252,9 @@ def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sh
     if len(sample) < 3:
         return Sharp(blur, 1.0, 0.0, False, blur, 1.0)
     masks, blurs = usable(patches, sample), np.array(BLURS)
-    found = [_Blurs.tried(patches, sample, VEILS[0], masks, blurs)]
-    if not math.isfinite(found[0].least):
-        return Sharp(blur, 1.0, 0.0, False, blur, 1.0)
-    # A veil changes the blur that fits by little, so its neighbours are tried.
-    for trial in VEILS[1:]:
-        found.append(_Blurs.tried(patches, sample, trial, masks, found[-1].near(blurs)))
-        if not found[-1].least < found[-2].least:
-            break
-    misfit = np.array([one.least for one in found])
-    veil, last = _lowest(np.array(VEILS[: len(found)]), misfit), found[int(misfit.argmin())]
-    if veil > 0.0:
-        last = _Blurs.tried(patches, sample, veil, masks, last.near(blurs))
-    best = _lowest(last.blurs, last.misfit)
-    apparent = float(np.interp(best, last.blurs, last.scale))
-    return Sharp(best, apparent, veil, True, best, apparent)
 
-
-@dataclass(frozen=True, eq=False)
-class _Blurs:
-    """Blurs that were tried with one veil, the misfits of the fits and the sizes they found."""
-
-    blurs: FloatArray
-    misfit: FloatArray
-    scale: FloatArray
-
-    @classmethod
-    def tried(
-        cls, patches: Patches, sample: npt.NDArray[np.intp], veil: float,
-        masks: npt.NDArray[np.uint8], blurs: FloatArray,
-    ) -> _Blurs:  # fmt: skip
-        """From the least on, until they leave much more than the one before."""
+    def tried(veil: float, blurs: FloatArray) -> _Tried:
+        """Blurs from the least on, until one leaves much more than the one before."""
         misfit, scale = np.full(len(blurs), np.inf), np.ones(len(blurs))
         for i, trial in enumerate(blurs.tolist()):
             results = fits(patches, sample, (trial, veil), True, masks)
@@ -288,16 +264,28 @@ class _Blurs:
                 scale[i] = float(np.median(results[good, kernels.RADIUS] / patches.radii[good]))
             if i > 0 and misfit[i] > 1.5 * misfit[i - 1]:
                 break
-        return cls(blurs, misfit, scale)
+        return blurs, misfit, scale
 
-    @property
-    def least(self) -> float:
-        return float(self.misfit.min())
-
-    def near(self, blurs: FloatArray) -> FloatArray:
-        """Those of `blurs` next to the one that leaves least."""
-        i = int(np.searchsorted(blurs, self.blurs[int(self.misfit.argmin())]))
+    def near(last: _Tried) -> FloatArray:
+        """The blurs next to the one that leaves least."""
+        i = int(np.searchsorted(blurs, last[0][int(last[1].argmin())]))
         return blurs[max(i - 1, 0) : i + 2]
+
+    found = [tried(VEILS[0], blurs)]
+    if not math.isfinite(found[0][1].min()):
+        return Sharp(blur, 1.0, 0.0, False, blur, 1.0)
+    # A veil changes the blur that fits by little, so its neighbours are tried.
+    for trial in VEILS[1:]:
+        found.append(tried(trial, near(found[-1])))
+        if not found[-1][1].min() < found[-2][1].min():
+            break
+    least = np.array([misfit.min() for _, misfit, _ in found])
+    veil, last = _lowest(np.array(VEILS[: len(found)]), least), found[int(least.argmin())]
+    if veil > 0.0:
+        last = tried(veil, near(last))
+    best = _lowest(last[0], last[1])
+    apparent = float(np.interp(best, last[0], last[2]))
+    return Sharp(best, apparent, veil, True, best, apparent)
 
 
 def _lowest(tried: FloatArray, misfit: FloatArray) -> float:

@@ -289,24 +289,27 @@ def edged(body: Float32Array, windows: Windows, step: float) -> npt.NDArray[np.b
         windows: where.
         step: least height of an edge that counts.
     """
-    n, k = windows.corner.shape[:2]
-    side = windows.side
-    out = np.zeros((n, k), dtype=bool)
-    columns, rows = np.meshgrid(np.arange(side), np.arange(side))
-    offsets = windows.predicted - windows.corner
-    reach = windows.radii * windows.stretch[..., 2] + 2.5
-    for f in range(n):
-        for b in range(k):
-            window = body[f, b]
-            # A ramp has no second difference; an edge has one of its height.
-            bend = np.zeros((side, side), dtype=np.float32)
-            bend[2:-2] = np.abs(window[4:] + window[:-4] - 2.0 * window[2:-2])
-            across = np.abs(window[:, 4:] + window[:, :-4] - 2.0 * window[:, 2:-2])
-            np.maximum(bend[:, 2:-2], across, out=bend[:, 2:-2])
-            x, y = offsets[f, b]
-            near = (columns - x) ** 2 + (rows - y) ** 2 < reach[f, b] ** 2
-            out[f, b] = float(bend[near].max(initial=0.0)) > step
-    return out
+    # A ramp has no second difference; an edge has one of its height.
+    bend = np.zeros_like(body)
+    bend[:, :, 2:-2] = np.abs(body[:, :, 4:] + body[:, :, :-4] - 2.0 * body[:, :, 2:-2])
+    across = np.abs(body[..., 4:] + body[..., :-4] - 2.0 * body[..., 2:-2])
+    np.maximum(bend[..., 2:-2], across, out=bend[..., 2:-2])
+    reach = (windows.radii * windows.stretch[..., 2] + 2.5)[..., None, None]
+    near = distances2(windows.corner, windows.side, windows.predicted) < reach**2
+    return np.asarray(np.where(near, bend, 0.0).max(axis=(2, 3)) > step)
+
+
+def distances2(corner: npt.NDArray[np.int64], side: int, places: FloatArray) -> FloatArray:
+    """Squared distances of the pixels of windows from a place each, (..., side, side) [px^2].
+
+    Args:
+        corner: (..., 2) column and row of each window's first pixel.
+        side: windows are side x side pixels.
+        places: (..., 2) column and row.
+    """
+    i = np.arange(side)
+    x, y = np.moveaxis((places - corner)[..., None], -2, 0)
+    return np.asarray(((i - x) ** 2)[..., None, :] + ((i - y) ** 2)[..., None])
 
 
 def blur_kernel(blur: float) -> FloatArray:
@@ -337,19 +340,13 @@ def blurred_windows(line_integrals: Float32Array, blur: float) -> Float32Array:
     return np.asarray(-np.log(out), dtype=np.float32)
 
 
-def free_of_others(windows: Windows, frame: int, bead: int) -> npt.NDArray[np.uint8]:
-    """1 where no other bead's spot falls in this window."""
-    side = windows.side
-    x, y = windows.corner[frame, bead]
-    columns, rows = np.meshgrid(np.arange(side) + x, np.arange(side) + y)
-    free = np.ones((side, side), np.uint8)
-    for other in range(windows.predicted.shape[1]):
-        if other == bead:
-            continue
-        cx, cy = windows.predicted[frame, other]
-        reach = windows.radii[frame, other] * windows.stretch[frame, other, 2] + 3.0
-        free[(columns - cx) ** 2 + (rows - cy) ** 2 < reach * reach] = 0
-    return free
+def free_of_others(windows: Windows, frame: int, bead: int) -> npt.NDArray[np.bool_]:
+    """Where no other bead's spot falls in this window, (side, side)."""
+    d2 = distances2(windows.corner[frame, bead], windows.side, windows.predicted[frame])
+    reach = windows.radii[frame] * windows.stretch[frame, :, 2] + 3.0
+    touched = d2 < (reach**2)[:, None, None]
+    touched[bead] = False
+    return ~np.asarray(touched.any(axis=0))
 
 
 def pixel_noise(flat: Float32Array, edge: int, width: int) -> FloatArray:

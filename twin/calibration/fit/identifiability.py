@@ -6,7 +6,7 @@ suggestions are planned scans as well and are evaluated in the same way.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -153,8 +153,8 @@ def identifiability(
     suggestions: list[Suggestion] = []
     before = _worst(sigmas)
     if spec.null or spec.weak or before > 1.0:
-        for change, make in _changes(model, poses, sizes):
-            after = predict(*make())[1]
+        for change, plan in _changes(model, poses, sizes).items():
+            after = predict(*plan)[1]
             worst = _worst(after)
             if worst < before * 0.8 or (not np.isfinite(before) and np.isfinite(worst)):
                 suggestions.append(Suggestion(change, worst, before / worst, after))
@@ -197,40 +197,29 @@ def _worst(sigmas: dict[str, float]) -> float:
 _Plan = tuple[BeadModel, Poses, FloatArray]
 
 
-def _changes(
-    model: BeadModel, poses: Poses, sizes: FloatArray
-) -> list[tuple[str, Callable[[], _Plan]]]:
-    """Changes worth trying: what to do, and the plan it gives."""
+def _changes(model: BeadModel, poses: Poses, sizes: FloatArray) -> dict[str, _Plan]:
+    """Changes worth trying: what to do -> the plan it gives."""
 
-    def with_more(more: Poses) -> _Plan:
+    def with_more(axis: float = 0.0, beam: float = 0.0, angle: float = 0.0) -> _Plan:
+        aside = poses.axis + np.array([axis, beam, 0.0])
+        more = replace(poses, axis=aside, angle=poses.angle + angle)
         return model, Poses.concatenate([poses, more]), np.concatenate([sizes, sizes])
 
-    def placement(step: tuple[float, float, float]) -> Callable[[], _Plan]:
-        return lambda: with_more(replace(poses, axis=poses.axis + np.array(step)))
-
-    def more_frames() -> _Plan:
-        half = np.median(np.diff(np.sort(poses.angle))) / 2 if len(poses) > 1 else np.pi / 2
-        return with_more(replace(poses, angle=poses.angle + half))
-
-    def more_beads() -> _Plan:
-        spread = np.ptp(model.beads, axis=0)
-        spread = np.where(spread > 0, spread, max(10.0, float(spread.max())))
-        centre = (model.beads.max(axis=0) + model.beads.min(axis=0)) / 2
-        extra = centre + spread * np.array([[-0.5, 0.25, 0.3], [0.4, -0.5, -0.4]])
-        radius = np.append(model.bead_radius_mm, [model.bead_radius_mm.mean()] * 2)
-        beads = BeadModel(np.concatenate([model.beads, extra]), radius, model.tolerance_mm)
-        return beads, poses, sizes
-
+    half = np.median(np.diff(np.sort(poses.angle))) / 2 if len(poses) > 1 else np.pi / 2
+    spread = np.ptp(model.beads, axis=0)
+    spread = np.where(spread > 0, spread, max(10.0, float(spread.max())))
+    centre = (model.beads.max(axis=0) + model.beads.min(axis=0)) / 2
+    extra = centre + spread * np.array([[-0.5, 0.25, 0.3], [0.4, -0.5, -0.4]])
+    radius = np.append(model.bead_radius_mm, [model.bead_radius_mm.mean()] * 2)
+    beads = BeadModel(np.concatenate([model.beads, extra]), radius, model.tolerance_mm)
     sod = float(np.median(poses.sod))
     near = -round(0.25 * sod / 10) * 10
-    placements = {
-        f"at SOD {sod + near:.0f} mm ({near:+.0f} mm)": (0.0, near, 0.0),
-        f"at SOD {sod - near:.0f} mm ({-near:+.0f} mm)": (0.0, -near, 0.0),
-        "20 mm to the side": (20.0, 0.0, 0.0),
-        f"20 mm to the side and at SOD {sod + near:.0f} mm": (20.0, near, 0.0),
+    place = "add a placement"
+    return {
+        f"{place} at SOD {sod + near:.0f} mm ({near:+.0f} mm)": with_more(beam=near),
+        f"{place} at SOD {sod - near:.0f} mm ({-near:+.0f} mm)": with_more(beam=-near),
+        f"{place} 20 mm to the side": with_more(20.0),
+        f"{place} 20 mm to the side and at SOD {sod + near:.0f} mm": with_more(20.0, near),
+        "take twice as many frames": with_more(angle=float(half)),
+        "use a phantom with two beads more": (beads, poses, sizes),
     }
-    return [
-        *((f"add a placement {where}", placement(step)) for where, step in placements.items()),
-        ("take twice as many frames", more_frames),
-        ("use a phantom with two beads more", more_beads),
-    ]

@@ -127,19 +127,15 @@ def drifts(left: Residuals) -> tuple[Drift, ...]:
         score = np.where(usable, push / np.sqrt(np.maximum(power, 1e-30)) / noise, 0.0)
         for i, c in enumerate(columns):
             part = slice(i * len(shapes), (i + 1) * len(shapes))
-            best = int(np.argmax(np.abs(score[part])))
-            j = i * len(shapes) + best
-            ramp_at = i * len(shapes)
-            if abs(score[ramp_at]) > SUSPECT or abs(score[j]) > SUSPECT_STEP:
-                at = j if abs(score[j]) > SUSPECT_STEP else ramp_at
-                size = float(push[at] / power[at])
-                bias = unit_covariance @ (absorbed[:, at] * size)
-                step = shapes[at - i * len(shapes)][0]
-                suspects.append(Drift(names[c], size, step, float(abs(score[at])), bias))
-            if abs(score[j]) > HINT:
-                size = float(push[j] / power[j])
-                bias = unit_covariance @ (absorbed[:, j] * size)
-                found.append(Drift(names[c], size, shapes[best][0], float(abs(score[j])), bias))
+            each = np.abs(score[part])
+            best = int(np.argmax(each))
+            suspect = best if each[best] > SUSPECT_STEP else 0 if each[0] > SUSPECT else None
+            hint = best if each[best] > HINT else None
+            for at, among in ((suspect, suspects), (hint, found)):
+                if at is not None:
+                    size = float((push[part] / power[part])[at])
+                    bias = unit_covariance @ (absorbed[:, part][:, at] * size)
+                    among.append(Drift(names[c], size, shapes[at][0], float(each[at]), bias))
     if not any(d.score > SIGNIFICANT for d in found):
         return tuple(suspects)
     # Where one thing moves, hints of others count too.
