@@ -60,7 +60,7 @@ def test_bands_and_means_equal_a_dense_model(seed: int) -> None:
     y = rng.normal(size=n * each) + 3 * slopes[:, 0] * np.linspace(-1, 1, n)[frame]
     weight, off = np.array([0.0, 0.5, 0.0]), np.array([0.0, 0.3, 0.0])
     column = np.stack([np.full(n, 2), np.repeat([0, -1], sizes)], axis=1)
-    model = _Mixed.of(rows, y, slopes, frame, sizes, column, weight, off)
+    model = _Mixed(rows, y, slopes, frame, sizes, column, weight, off)
     prior = np.array([[0.0, np.sqrt(0.5), 0.0]])
     x, y1 = np.vstack([rows, prior]), np.r_[y, np.sqrt(0.5) * 0.3]
 
@@ -107,13 +107,13 @@ def test_bands_and_means_equal_a_dense_model(seed: int) -> None:
     theirs = [dense(choice)[0] for choice in choices]
     np.testing.assert_allclose(np.diff(ours), np.diff(theirs), atol=1e-6)
     for choice in choices:
-        answer = model.solved(choice)
+        values, spread, added, _ = model.solved(choice)
         _, found, covariance, noise2 = dense(choice)
-        np.testing.assert_allclose(answer.values.T.ravel(), found[g:], atol=1e-8)
+        np.testing.assert_allclose(values.T.ravel(), found[g:], atol=1e-8)
         sigma = np.sqrt(np.diag(covariance)[g:])
-        np.testing.assert_allclose(answer.sigma.T.ravel(), sigma, rtol=1e-6)
+        np.testing.assert_allclose(spread.T.ravel(), sigma, rtol=1e-6)
         plain = noise2 * np.linalg.inv(x.T @ x)
-        np.testing.assert_allclose(answer.added + plain, covariance[:g, :g], atol=1e-8)
+        np.testing.assert_allclose(added + plain, covariance[:g, :g], atol=1e-8)
 
 
 def test_a_motion_goes_into_poses_and_documents() -> None:

@@ -107,7 +107,7 @@ def estimate_motion(
         held = np.concatenate([m.values for m in known.motions])
         residual = residual + np.einsum("mp,mp->m", motion, held[frame])
     indices = [NAMES.index(name) for name in names]
-    model = _Mixed.of(
+    model = _Mixed(
         rows, residual, motion, frame, sizes.tolist(), problem.layout.colmap[:, indices][group],
         problem.prior_weight(noise), problem.prior_mean - x,
     )  # fmt: skip
@@ -116,22 +116,22 @@ def estimate_motion(
             choice, evidence = _most_likely(model)
         else:
             choice, evidence = known.choice, list(known.motions[0].evidence)
-        answer = model.solved(choice)
+        values, sigma, added, inflation = model.solved(choice)
     except np.linalg.LinAlgError:
         raise TwinError(
             f"the tracks tell too little to find how {', '.join(names)} move; allowed: fewer "
             "parameters, or more frames and beads"
         ) from None
     motions = tuple(
-        Motion(tuple(names), answer.values[group == g], answer.sigma[group == g], tuple(evidence))
+        Motion(tuple(names), values[group == g], sigma[group == g], tuple(evidence))
         for g in range(len(sizes))
     )
     count = problem.layout.parameter_count
     factor = np.array([edge_factor(column) for column in problem.layout.names[:count]])
-    more = answer.added[:count, :count] * np.outer(factor, factor)
+    more = added[:count, :count] * np.outer(factor, factor)
     if fit.identifiable:
         told = fit.certificate.spectrum.unit_covariance[:count, :count]
-        more = more + (answer.inflation - 1.0) * noise**2 * told
+        more = more + (inflation - 1.0) * noise**2 * told
     return MotionFit(motions, more, choice)
 
 
@@ -190,21 +190,13 @@ def derivative(
     return np.asarray(moved.jacobian(moved.start, use).sum(axis=1))
 
 
-@dataclass(frozen=True, eq=False)
-class _Answer:
-    """Deviations (n, p) with sigmas, and what they do to the other parameters (see `MotionFit`)."""
-
-    values: FloatArray
-    sigma: FloatArray
-    added: FloatArray
-    inflation: float
-
-
+_Answer = tuple[FloatArray, FloatArray, FloatArray, float]
+"""Deviations (n, p) with sigmas, what they add to the covariance of the fit's columns, and the
+factor by which they take up its degrees of freedom."""
 _Choice = tuple[tuple[float, float] | None, ...]
 """Width and smoothness of each parameter; None: it does not move."""
 
 
-@dataclass(frozen=True, eq=False)
 class _Mixed:
     """Linear mixed model: the fit's g columns, and p parameters' deviations in n frames.
 
@@ -224,20 +216,8 @@ class _Mixed:
         column: (n, p) column of the fit that a deviation is one from; -1: of none.
     """
 
-    plain: FloatArray
-    push: FloatArray
-    pairs: FloatArray
-    mixed: FloatArray
-    pull: FloatArray
-    scale: FloatArray
-    total: float
-    freedom: int
-    sizes: tuple[int, ...]
-    column: npt.NDArray[np.int64]
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         rows: FloatArray,
         residual: FloatArray,
         motion: FloatArray,
@@ -246,29 +226,26 @@ class _Mixed:
         column: npt.NDArray[np.int64],
         weight: FloatArray,
         off: FloatArray,
-    ) -> _Mixed:
+    ) -> None:
         """From rows (m, g), residuals (m,), derivatives (m, p) by each row's frame's parameters,
         and priors of weight (g,) whose means lie (g,) off."""
-        n, p = sum(sizes), motion.shape[1]
-        scale = np.sqrt(np.einsum("mg,mg->g", rows, rows) + weight)
-        scale[scale == 0.0] = 1.0
-        rows, weight, off = rows / scale, weight / scale**2, off * scale
-        pairs, mixed, pull = np.zeros((n, p, p)), np.zeros((n, rows.shape[1], p)), np.zeros((n, p))
-        np.add.at(pairs, frame, motion[:, :, None] * motion[:, None, :])
-        np.add.at(mixed, frame, rows[:, :, None] * motion[:, None, :])
-        np.add.at(pull, frame, motion * residual[:, None])
-        return cls(
-            plain=cross(rows, rows) + np.diag(weight + 1e-10),
-            push=np.einsum("mg,m->g", rows, residual) + weight * off,
-            pairs=pairs,
-            mixed=mixed,
-            pull=pull,
-            scale=scale,
-            total=float(np.sum(residual**2) + np.sum(weight * off**2)),
-            freedom=max(len(residual) + int((weight > 0).sum()) - rows.shape[1], 1),
-            sizes=tuple(int(size) for size in sizes),
-            column=column,
+        n, p, g = sum(sizes), motion.shape[1], rows.shape[1]
+        self.sizes, self.column = sizes, column
+        self.scale = np.sqrt(np.einsum("mg,mg->g", rows, rows) + weight)
+        self.scale[self.scale == 0.0] = 1.0
+        rows, weight, off = rows / self.scale, weight / self.scale**2, off * self.scale
+        self.pairs, self.mixed, self.pull = (
+            np.zeros((n, p, p)),
+            np.zeros((n, g, p)),
+            np.zeros((n, p)),
         )
+        np.add.at(self.pairs, frame, motion[:, :, None] * motion[:, None, :])
+        np.add.at(self.mixed, frame, rows[:, :, None] * motion[:, None, :])
+        np.add.at(self.pull, frame, motion * residual[:, None])
+        self.plain = cross(rows, rows) + np.diag(weight + 1e-10)
+        self.push = np.einsum("mg,m->g", rows, residual) + weight * off
+        self.total = float(np.sum(residual**2) + np.sum(weight * off**2))
+        self.freedom = max(len(residual) + int((weight > 0).sum()) - g, 1)
 
     def spectrum(self, i: int, pick: tuple[float, float]) -> list[FloatArray]:
         """Variance of the amplitude of each scan's cosines, from none to the most half waves, for
@@ -388,7 +365,7 @@ class _Mixed:
             sigma[:, part.moving] = np.sqrt(noise2 * np.maximum(centred, 0.0)).reshape(n, p)
         added = noise2 * (fixed_covariance - linalg.inv(self.plain))
         added = added / np.outer(self.scale, self.scale)
-        return _Answer(values, sigma, added, self.freedom / max(self.freedom - taken, 1.0))
+        return values, sigma, added, self.freedom / max(self.freedom - taken, 1.0)
 
 
 @dataclass(frozen=True, eq=False)

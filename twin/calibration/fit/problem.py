@@ -201,7 +201,6 @@ class FitProblem:
         layout: columns.
         reading: of eq. 5.4.
         bias: (n, k) sphere-centre bias factor of each position.
-        geometry: (n, 18) the poses as the kernels want them.
         origin: (n, 2) pixel coordinates (column, row) of the detector's centre.
         prior_mean, prior_sigma: of each column, internal units; sigma inf where there is none.
         panel: terms of the panel's distortion; None: it has none.
@@ -217,7 +216,6 @@ class FitProblem:
     layout: ColumnLayout
     reading: Reading
     bias: FloatArray
-    geometry: FloatArray
     origin: FloatArray
     prior_mean: FloatArray
     prior_sigma: FloatArray
@@ -236,8 +234,10 @@ class FitProblem:
     @cached_property
     def data(self) -> kernels.Data:
         """What the kernels want of it."""
+        p = self.poses
         return kernels.Data(
-            self.geometry, self.group, self.reading.pivot, self.model.bead_radius_mm, self.bias,
+            np.column_stack([p.source, p.axis, p.detector, p.u, p.v, p.angle, p.mount[:, :2]]),
+            self.group, self.reading.pivot, self.model.bead_radius_mm, self.bias,
             self.measured, self.whiten, self.layout.active, self.layout.colmap,
             self.layout.bead_column, self.panel_terms,
         )  # fmt: skip
@@ -374,13 +374,15 @@ def build_problem(
         raise TwinError(f"{len(starts)} starts for {count} groups of frames")
     base = np.array([values_in(from_printed_reading(p, reading)) for p in starts])
     widths = {n: to_internal(n, w) for n, w in (priors or {}).items() if w > 0}
-    terms = () if panel is None else panel.names
+    terms, of_terms = ((), ()) if panel is None else (panel.names, panel.sigmas)
     columns = layout(free, count, per_group, k, free_beads, tuple(widths), terms)
     centres = base[0]
     if prior_centre is not None:
         centres = values_in(from_printed_reading(prior_centre, reading))
     bases = [n.split("@")[0] for n in columns.names[: columns.parameter_count]]
     beads = columns.panel_column - len(bases)
+    mean = [centres[NAMES.index(n)] for n in bases]
+    sigma = [widths.get(n, math.inf) for n in bases]
     return FitProblem(
         poses=poses,
         model=model,
@@ -392,32 +394,9 @@ def build_problem(
         layout=columns,
         reading=reading,
         bias=bias_factors(centre, (n, k)),
-        geometry=np.column_stack(
-            [
-                poses.source,
-                poses.axis,
-                poses.detector,
-                poses.u,
-                poses.v,
-                poses.angle,
-                poses.mount[:, :2],
-            ]
-        ),
         origin=origin,
-        prior_mean=np.concatenate(
-            [
-                [centres[NAMES.index(n)] for n in bases],
-                model.beads.ravel()[:beads],
-                np.zeros(len(terms)),
-            ]
-        ),
-        prior_sigma=np.concatenate(
-            [
-                [widths.get(n, math.inf) for n in bases],
-                np.full(beads, bead_tolerance_mm),
-                [] if panel is None else panel.sigmas,
-            ]
-        ),
+        prior_mean=np.concatenate([mean, model.beads.ravel()[:beads], np.zeros(len(terms))]),
+        prior_sigma=np.concatenate([sigma, np.full(beads, bead_tolerance_mm), of_terms]),
         panel=panel,
     )
 
