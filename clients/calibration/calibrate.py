@@ -442,11 +442,7 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
         "cost_reduction_pct": _finite(fit.cost_reduction_pct),
         "iterations": fit.iterations,
         "outliers": [
-            {
-                "frame": o.frame,
-                "marker": o.bead,
-                "px": _finite(off[o.frame, o.bead]),
-            }
+            {"frame": o.frame, "marker": o.bead, "px": _finite(off[o.frame, o.bead])}
             for o in certificate.outliers
         ],
         "noise": _finite(certificate.noise),

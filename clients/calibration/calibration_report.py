@@ -25,15 +25,7 @@ from scipy.special import fdtri
 from flexdt.clients.calibration.calibrate import Outcome, calibrate_datasets, digits
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.datasets.dataset import load_dataset
-from flexdt.clients.figures import (
-    Series,
-    arrows,
-    ellipse_plot,
-    image_under,
-    page,
-    plot,
-    table,
-)
+from flexdt.clients.figures import Series, arrows, ellipse_plot, image_under, page, plot, table
 from flexdt.clients.whole_files import write_whole
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import line_integrals

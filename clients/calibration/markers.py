@@ -32,13 +32,7 @@ from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.frame_source import Frames, FrameSpots, FrameState, SpotFrames
 from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
-from flexdt.twin.calibration.unknown_markers import (
-    ANYWHERE_MM,
-    Index,
-    centred,
-    link,
-    triangulate,
-)
+from flexdt.twin.calibration.unknown_markers import ANYWHERE_MM, Index, centred, link, triangulate
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray

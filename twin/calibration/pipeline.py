@@ -74,12 +74,7 @@ from flexdt.twin.calibration.frame_source import (
     nothing,
     without_repeats,
 )
-from flexdt.twin.calibration.identify import (
-    Identification,
-    Search,
-    attempt,
-    identified,
-)
+from flexdt.twin.calibration.identify import Identification, Search, attempt, identified
 from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.geometry.motion import Motion, require_movable
 from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets

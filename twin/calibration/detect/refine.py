@@ -208,11 +208,7 @@ class Sharp:
 
 
 def seen_sharpness(
-    sharp: Sharp,
-    patches: Patches,
-    sample: npt.NDArray[np.intp],
-    cone: ConeVec,
-    model: BeadModel,
+    sharp: Sharp, patches: Patches, sample: npt.NDArray[np.intp], cone: ConeVec, model: BeadModel
 ) -> Sharp:
     """Blur and size corrected by what the same estimate makes of rendered beads: the fit's profile
     is an approximation, and where a spot is cut by the edge its radius decides its place."""
@@ -426,10 +422,7 @@ def measure_beads(
 
 
 def _measured(
-    patches: Patches,
-    alone: Float32Array | None,
-    body: Float32Array | None,
-    sharp: Sharp,
+    patches: Patches, alone: Float32Array | None, body: Float32Array | None, sharp: Sharp
 ) -> Refined:
     """Centroids and fits, less what the same measurement of the same beads rendered without noise
     (`alone`; None leaves them as they are) shows to be their systematic error.
