@@ -87,27 +87,24 @@ def squared(data: DataSet) -> DataSet:
     return _Square(**own, original=data, ratio=ratio)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class _Square(DataSet):
     """The images of `original` with rows `ratio` times as close."""
 
-    original: DataSet | None = None
-    ratio: float = 1.0
+    original: DataSet
+    ratio: float
 
     def counts(self, index: int | None = None) -> Counts:
-        assert self.original is not None
         if index is None:
             return super().counts()
         return np.rint(self._taken(self.original.counts(index))).clip(0, 65535).astype(np.uint16)
 
     @cached_property
     def dark(self) -> Float32Array:
-        assert self.original is not None
         return self._taken(self.original.dark)
 
     @cached_property
     def flat(self) -> Float32Array:
-        assert self.original is not None
         return self._taken(self.original.flat)
 
     def _taken(self, image: Counts | Float32Array) -> Float32Array:

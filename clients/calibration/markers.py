@@ -241,17 +241,8 @@ def spots_of(markers: Markers, shape: tuple[int, int]) -> tuple[list[FrameSpots]
     for i, row in enumerate(seen):
         k = int(row.sum())
         index[i, row] = np.arange(k)
-        nothing, whole = np.full(k, np.nan), np.ones(k, dtype=bool)
-        looks.append(
-            FrameSpots(
-                Detections(
-                    markers.tracks[i, row],
-                    markers.sigma[i, row][:, None, None] ** 2 * np.eye(2),
-                    nothing, nothing, np.zeros(k), whole, np.ones(k), shape,
-                ),
-                FrameState.USABLE,
-            )
-        )  # fmt: skip
+        spots = markers.tracks[i, row], markers.sigma[i, row], np.nan, shape
+        looks.append(FrameSpots(Detections.of_points(*spots), FrameState.USABLE))
     return looks, index
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -65,14 +66,14 @@ class Detections:
     def of_points(
         cls,
         centers: FloatArray,
-        noise_px: float,
+        noise_px: float | FloatArray,
         radii_px: float | FloatArray,
         shape: tuple[int, int],
     ) -> Detections:
         """Whole spots at points (k, 2) whose coordinates are known to `noise_px`."""
         k = len(centers)
-        covariances = np.tile(noise_px**2 * np.eye(2), (k, 1, 1))
         one = np.ones(k)
+        covariances = np.multiply.outer((noise_px * one) ** 2, np.eye(2))
         return cls(centers, covariances, radii_px * one, one, 0 * one, one.astype(bool), one, shape)
 
 
@@ -129,7 +130,7 @@ def detect_beads(
     factor = 4 if low >= 4.5 else 2 if low >= 2.5 else 1
     whole, cut = _candidates(coarser(data, factor), factor, how)
     found = [r for r in (_measure(data, c, how) for c in whole) if r is not None]
-    found = _alike(_distinct(found), how)
+    found = _alike(_distinct(found, kernels.SCORE, 0.5), how)
     return _pack(found, _cut_beads(data, cut, found), (data.shape[0], data.shape[1]))
 
 
@@ -145,7 +146,8 @@ def coarser(image: Float32Array, factor: int) -> Float32Array:
 
 
 _Candidate = tuple[float, float, float]
-"""Column, row, radius [px]."""
+"""Column, row, radius [px], as in the kernels' results."""
+_Found = TypeVar("_Found", _Candidate, FloatArray)
 
 
 def _candidates(
@@ -193,7 +195,8 @@ def _candidates(
             y = (up + (height - 1) / 2 + 0.5) * factor - 0.5
             spot = (x, y, min(max(radius, low), high))
             (edge if at_edge else inside).append(spot)
-    return _merged(inside), _merged(edge)
+    # The largest outline of a place wins over those at other thresholds.
+    return _distinct(inside, 2, 0.7), _distinct(edge, 2, 0.7)
 
 
 def _middle(values: Float32Array) -> float:
@@ -202,12 +205,12 @@ def _middle(values: Float32Array) -> float:
     return float(np.partition(values, half)[half])
 
 
-def _merged(spots: Sequence[_Candidate]) -> list[_Candidate]:
-    """Drop repeats of a spot at another threshold; the largest outline of a place wins."""
-    out: list[_Candidate] = []
-    for spot in sorted(spots, key=lambda s: -s[2]):
-        if all(math.hypot(spot[0] - o[0], spot[1] - o[1]) > 0.7 * o[2] for o in out):
-            out.append(spot)
+def _distinct(found: Sequence[_Found], by: int, reach: float) -> list[_Found]:
+    """One of several at a place, `reach` of a radius wide: that with most at its place `by`."""
+    out: list[_Found] = []
+    for one in sorted(found, key=lambda r: -r[by]):
+        if all(math.hypot(one[0] - o[0], one[1] - o[1]) > reach * o[2] for o in out):
+            out.append(one)
     return out
 
 
@@ -240,20 +243,6 @@ def _measure(image: Float32Array, spot: _Candidate, how: SpotFinder) -> FloatArr
         and result[kernels.PEAK] > 5.0 * result[kernels.NOISE] * min(1.0, 3.0 / radius)
     )
     return result if good else None
-
-
-def _distinct(found: list[FloatArray]) -> list[FloatArray]:
-    """One result per place, the most ball-like."""
-    out: list[FloatArray] = []
-    for r in sorted(found, key=lambda r: -r[kernels.SCORE]):
-        near = (
-            math.hypot(r[kernels.X] - o[kernels.X], r[kernels.Y] - o[kernels.Y])
-            < 0.5 * o[kernels.RADIUS]
-            for o in out
-        )
-        if not any(near):
-            out.append(r)
-    return out
 
 
 def _alike(found: list[FloatArray], how: SpotFinder) -> list[FloatArray]:
@@ -300,7 +289,7 @@ def _cut_beads(
             result[kernels.VAR_X] += slack
             result[kernels.VAR_Y] += slack
             out.append(result)
-    return _distinct(out)
+    return _distinct(out, kernels.SCORE, 0.5)
 
 
 def _pack(whole: list[FloatArray], cut: list[FloatArray], shape: tuple[int, int]) -> Detections:

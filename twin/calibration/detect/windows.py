@@ -7,7 +7,6 @@ processing whole images.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,8 +31,6 @@ STANDS_OUT = 5.0
 """What a dead pixel differs by from its neighbours in some frame, by the noise."""
 WIDEST_DEAD = 4
 """Pixels along the shorter side of a gap that is filled."""
-BATCH = 12_000_000
-"""Rays rendered at a time, about."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,25 +223,18 @@ def render_windows(scene: Scene, cone: ConeVec, windows: Windows, fine: int = 1)
             One ray puts an edge up to half a pixel off.
     """
     if fine == 1:
-        return np.asarray(_window_rays(scene, cone, windows, [(0.0, 0.0)])[0])
+        return _window_rays(scene, cone, windows, (0.0, 0.0))
     return np.asarray(-np.log(window_intensities(scene, cone, windows, fine)), dtype=np.float32)
 
 
 def window_intensities(scene: Scene, cone: ConeVec, windows: Windows, fine: int) -> Float32Array:
     """Transmitted share of the open beam in every window, averaged over fine x fine rays a pixel,
     (n, k, side, side)."""
-    places = lattice(fine)
     n, k = windows.corner.shape[:2]
-    together = max(1, BATCH // max(n * k * windows.side**2, 1))
     total = np.zeros((n, k, windows.side, windows.side), dtype=np.float32)
-    for start in range(0, len(places), together):
-        rays = _window_rays(scene, cone, windows, places[start : start + together])
-        np.negative(rays, out=rays)
-        np.exp(rays, out=rays)
-        for part in rays:
-            total += part
-    total *= np.float32(1.0 / fine**2)
-    return total
+    for place in lattice(fine):
+        total += np.exp(-_window_rays(scene, cone, windows, place))
+    return total * np.float32(1.0 / fine**2)
 
 
 def lattice(fine: int) -> list[tuple[float, float]]:
@@ -262,23 +252,19 @@ def lattice(fine: int) -> list[tuple[float, float]]:
 
 
 def _window_rays(
-    scene: Scene, cone: ConeVec, windows: Windows, places: Sequence[tuple[float, float]]
+    scene: Scene, cone: ConeVec, windows: Windows, place: tuple[float, float]
 ) -> Float32Array:
-    """Line integrals (p, n, k, side, side) for p places of a ray in its pixel."""
+    """Line integrals (n, k, side, side) for rays at a place in their pixels."""
     n, k = windows.corner.shape[:2]
     rows, cols = windows.shape
     side = windows.side
-    middle = windows.corner + (side - 1) / 2 - (np.array([cols, rows]) - 1) / 2
-    place = middle + np.array(places)[:, None, None, :]
-    whole = (len(places), n, k, 3)
-    detector = cone.detector[:, None] + place[..., :1] * cone.u[:, None]
-    detector = detector + place[..., 1:] * cone.v[:, None]
-    source, u, v = (
-        np.broadcast_to(part[:, None], whole).reshape(-1, 3)
-        for part in (cone.source, cone.u, cone.v)
+    at = windows.corner + (side - 1) / 2 - (np.array([cols, rows]) - 1) / 2 + np.array(place)
+    detector = (
+        cone.detector[:, None] + at[..., :1] * cone.u[:, None] + at[..., 1:] * cone.v[:, None]
     )
+    source, u, v = (np.repeat(part, k, axis=0) for part in (cone.source, cone.u, cone.v))
     near = ConeVec.from_vectors(source, detector.reshape(-1, 3), u, v)
-    return project_scene(scene, near, (side, side)).reshape(len(places), n, k, side, side)
+    return np.asarray(project_scene(scene, near, (side, side)).reshape(n, k, side, side))
 
 
 def edged(body: Float32Array, windows: Windows, step: float) -> npt.NDArray[np.bool_]:
