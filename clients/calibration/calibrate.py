@@ -17,7 +17,7 @@ import shlex
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from itertools import groupby
@@ -389,6 +389,10 @@ def find_phantom(phantom: str | Phantom) -> Phantom:
     return found
 
 
+NUMBERS: Final = ("value", "sigma", "low", "high", "images")
+"""Of an estimate: null where they must not be used."""
+
+
 def calibration_document(result: Calibration, seconds: float) -> dict[str, object]:
     """The JSON of `flexdt calibrate`; numbers are null where they must not be used."""
     fit = result.fit
@@ -421,14 +425,8 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
     parameters = {}
     for name, e in certificate.estimates.items():
         known = offered and math.isfinite(e.sigma)
-        numbers = ("value", "sigma", "low", "high", "images")
-        parameters[name] = {
-            **{number: getattr(e, number) if known else None for number in numbers},
-            "unit": e.unit,
-            "priors": dict(e.priors) if known else {},
-            "prior": e.prior,
-            "asked": e.asked,
-        }
+        hidden = {} if known else dict.fromkeys(NUMBERS) | {"priors": {}}
+        parameters[name] = asdict(e) | hidden
     document |= {
         "parameters": parameters,
         "rank": certificate.spectrum.rank,
