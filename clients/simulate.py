@@ -38,25 +38,27 @@ from flexdt.twin.machine.description import Machine
 from flexdt.twin.physics.chain import (
     Chain,
     Expected,
+    Radiograph,
+    check_rays,
     expected_signal,
     flux_of,
+    radiographs,
     read_out,
     spot_blur_px,
     spot_views,
+    within_pixels,
     without_spot,
 )
 from flexdt.twin.physics.detector import EXPOSURES_MS, Detector, detector_of
 from flexdt.twin.physics.exposure import Counts, ExposureSettings, frame_rng
-from flexdt.twin.physics.radiograph import Radiograph, check_rays, radiographs, within_pixels
-from flexdt.twin.physics.scatter.simulation import (
+from flexdt.twin.physics.scatter import (
     Beam,
     ScanScatter,
     Scatter,
     ScatterSettings,
     scan_scatter,
 )
-from flexdt.twin.physics.spectrum import tube_of
-from flexdt.twin.physics.tube import Tube
+from flexdt.twin.physics.tube import Tube, tube_of
 from flexdt.twin.projection import Volume, forward, project_body
 from flexdt.twin.projection.analytic_solids import Vector
 from flexdt.twin.projection.operators import as_cone_vec

@@ -26,7 +26,7 @@ from flexdt.phantoms import bead_phantom, material
 from flexdt.phantoms.channels import channels
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.physics.effective import effective_beam
-from flexdt.twin.physics.spectrum import tube_spectrum
+from flexdt.twin.physics.tube import tube_spectrum
 from flexdt.twin.projection import project_scene
 
 KV = 90.0

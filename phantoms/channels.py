@@ -27,8 +27,8 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.physics.chain import Chain
 from flexdt.twin.physics.detector import Detector
-from flexdt.twin.physics.scatter.simulation import Object
-from flexdt.twin.physics.spectrum import TubeModel
+from flexdt.twin.physics.scatter import Object
+from flexdt.twin.physics.tube import TubeModel
 from flexdt.twin.projection import Body, TriangleMesh, Volume, project_body
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Vector
 

@@ -25,12 +25,17 @@ from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine, Profile, builtin_machine, profile_of
 from flexdt.twin.machine.kinematics import motor_poses
-from flexdt.twin.physics.chain import Chain, flux_of
+from flexdt.twin.physics.chain import (
+    Chain,
+    air_kerma_mGy,
+    contrast_to_noise,
+    flux_of,
+    pixel_reading,
+    radiographs,
+)
 from flexdt.twin.physics.detector import detector_of
 from flexdt.twin.physics.exposure import FEW_COUNTS, NOTICED, ExposureSettings
-from flexdt.twin.physics.prediction import air_kerma_mGy, contrast_to_noise, pixel_reading
-from flexdt.twin.physics.radiograph import radiographs
-from flexdt.twin.physics.spectrum import Filter, tube_of, voltages
+from flexdt.twin.physics.tube import Filter, tube_of, voltages
 from flexdt.twin.projection import project_body
 from flexdt.twin.projection.analytic_solids import Vector
 from flexdt.twin.scanner.state import CameraChange, changed_camera

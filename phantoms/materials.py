@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
 
-from flexdt.twin.attenuation.substances import Substance, mass_fractions, parse_formula
-from flexdt.twin.attenuation.tables import tables
+from flexdt.twin.attenuation.substances import Substance, mass_fractions, parse_formula, tables
 from flexdt.twin.errors import LimitError, UnknownNameError
 
 

@@ -42,7 +42,7 @@ from flexdt.phantoms import Phantom, load_phantom
 from flexdt.phantoms.files.phantom_files import read_phantom_file
 from flexdt.twin.calibration.detect.detection import SpotFinder
 from flexdt.twin.calibration.detect.windows import Windows, overlap
-from flexdt.twin.calibration.diagnose.finding import Finding, Severity
+from flexdt.twin.calibration.diagnose import Finding, Severity
 from flexdt.twin.calibration.fit.certificate import Estimate
 from flexdt.twin.calibration.fit.fit import image_quantities
 from flexdt.twin.calibration.fit.priors import prior_widths

@@ -26,7 +26,7 @@ from flexdt.phantoms import Phantom
 from flexdt.runtime.files.dataset_folder import Frame, read_text
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections, SpotFinder
-from flexdt.twin.calibration.diagnose.finding import error
+from flexdt.twin.calibration.diagnose import error
 from flexdt.twin.calibration.fit.fit import estimate_geometry
 from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.fit.problem import SIX

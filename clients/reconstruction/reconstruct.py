@@ -62,9 +62,8 @@ from flexdt.twin.reconstruction import (
 from flexdt.twin.reconstruction.scatter_correction import scatterer_of, subtracted
 
 if TYPE_CHECKING:
-    from flexdt.twin.physics.scatter.simulation import ScanScatter
-    from flexdt.twin.physics.spectrum import TubeModel
-    from flexdt.twin.physics.tube import Tube
+    from flexdt.twin.physics.scatter import ScanScatter
+    from flexdt.twin.physics.tube import Tube, TubeModel
     from flexdt.twin.reconstruction import Hardening
 
 Progress = Callable[[float, float], None]
@@ -442,7 +441,7 @@ def _without_scatter(
     from flexdt.phantoms import material
     from flexdt.twin.physics.chain import Chain
     from flexdt.twin.physics.detector import Detector
-    from flexdt.twin.physics.scatter.simulation import Beam, scan_scatter
+    from flexdt.twin.physics.scatter import Beam, scan_scatter
 
     figures = {} if views.dataset.document is None else views.dataset.document.noise.model
     if figures and not any(name.startswith("scatter_") for name in figures):
@@ -490,7 +489,7 @@ def _tube(dataset: DataSet) -> TubeModel:
     Raises:
         TwinError: its images know no beam hardening.
     """
-    from flexdt.twin.physics.spectrum import TubeModel
+    from flexdt.twin.physics.tube import TubeModel
 
     figures = {} if dataset.document is None else dataset.document.noise.model
     made = next((p for p in ("poly", "mono") if f"physics_{p}" in figures), "ideal")

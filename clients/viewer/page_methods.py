@@ -63,7 +63,7 @@ from flexdt.twin.dataset.dataset_errors import plain_name
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import Roi
-from flexdt.twin.physics.spectrum import tube_of, tube_spectrum
+from flexdt.twin.physics.tube import tube_of, tube_spectrum
 from flexdt.twin.scanner.state import readout_of
 from flexdt.twin.script.compose import Kind as KindOfScan
 from flexdt.twin.script.compose import ScanRequest, compose_script

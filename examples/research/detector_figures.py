@@ -21,10 +21,9 @@ import numpy as np
 from image_quality import edge_mtf
 
 import flexdt as fx
-from flexdt.twin.attenuation.substances import Substance
-from flexdt.twin.attenuation.tables import tables
+from flexdt.twin.attenuation.substances import Substance, tables
 from flexdt.twin.physics.detector import FULL_WELL_E, Detector, deposited
-from flexdt.twin.physics.spectrum import Filter, TubeModel, tube_spectrum
+from flexdt.twin.physics.tube import Filter, TubeModel, tube_spectrum
 
 KV, POWER_W, TIME_MS, FAR_MM = 90.0, 50.0, 100.0, 1059.0
 PIXELS_MM = {"unbinned": 0.0748, "binned 2 x 2": 0.1496}

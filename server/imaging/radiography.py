@@ -35,12 +35,18 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.physics import exposure as ideal
-from flexdt.twin.physics.chain import Chain, Expected, read_out, without_spot
+from flexdt.twin.physics.chain import (
+    Chain,
+    Expected,
+    Radiograph,
+    radiographs,
+    read_out,
+    without_spot,
+)
 from flexdt.twin.physics.detector import Detector, detector_of
 from flexdt.twin.physics.exposure import ExposureSettings
-from flexdt.twin.physics.radiograph import Radiograph, radiographs
 from flexdt.twin.physics.scatter import simulation as mc
-from flexdt.twin.physics.spectrum import TubeModel, tube_of, voltages
+from flexdt.twin.physics.tube import TubeModel, tube_of, voltages
 from flexdt.twin.scanner.state import Sample
 
 Physics = Literal["ideal", "mono", "poly"]

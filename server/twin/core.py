@@ -41,8 +41,8 @@ from flexdt.twin.collision.guard import NearestPair, SceneGuard, clearance
 from flexdt.twin.errors import GeometryError, SafetyError
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.description import Machine, Profile
-from flexdt.twin.physics.radiograph import Radiograph
-from flexdt.twin.physics.scatter.simulation import Scatter
+from flexdt.twin.physics.chain import Radiograph
+from flexdt.twin.physics.scatter import Scatter
 from flexdt.twin.scanner.safety import Guard
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import NamedCorrection, Sample, ScannerState, TubeSettings

@@ -35,8 +35,8 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
+from flexdt.twin.physics.chain import Radiograph
 from flexdt.twin.physics.exposure import ExposureSettings
-from flexdt.twin.physics.radiograph import Radiograph
 from flexdt.twin.scanner.joining import StopMotion
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import NamedCorrection, Readout, Safety, Sample, TubeSettings

@@ -12,8 +12,8 @@ import pytest
 import flexdt as fx
 from flexdt.clients.cli.command_tree import run
 from flexdt.clients.expose import exposure_of
-from flexdt.twin.attenuation.tables import tables
-from flexdt.twin.physics.prediction import AIR, compton_share, mass_energy_transfer
+from flexdt.twin.attenuation.substances import tables
+from flexdt.twin.physics.chain import AIR, compton_share, mass_energy_transfer
 
 
 def rod(radius: float, material: str = "pmma") -> dict[str, Any]:

@@ -35,7 +35,7 @@ from flexdt.twin.dataset.flexdt_json import NoiseRecord, SampleRecord, ScanRecor
 from flexdt.twin.errors import GeometryError, LimitError, TwinError, UnknownNameError
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
-from flexdt.twin.physics.spectrum import Filter, TubeModel
+from flexdt.twin.physics.tube import Filter, TubeModel
 from flexdt.twin.projection import Volume
 from flexdt.twin.scanner.state import NamedCorrection, Sample
 from flexdt.twin.script import parse_script, plan_script
@@ -247,7 +247,7 @@ def test_scatter_is_subtracted_from_what_a_scanner_wrote(
     folders: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Less signal is more attenuation, everywhere in the plastic; texts alone are a scanner's."""
-    monkeypatch.setattr("flexdt.twin.physics.scatter.simulation.MOST_HISTORIES", 16)
+    monkeypatch.setattr("flexdt.twin.physics.scatter.MOST_HISTORIES", 16)
     words = ["reconstruct", str(folders["plain"]), *COARSE, "--out"]
     ways = {"raw": [], "less": ["--scatter-correction", "abs,steel"]}
     for name, more in ways.items():

@@ -25,8 +25,7 @@ from flexdt.server.imaging.projections import Imaging, TrueGeometry
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.testing.in_process import DirectProjector
-from flexdt.twin.attenuation.substances import Substance
-from flexdt.twin.attenuation.tables import tables
+from flexdt.twin.attenuation.substances import Substance, tables
 from flexdt.twin.errors import GeometryError, LimitError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import CameraSettings, Roi
@@ -34,9 +33,8 @@ from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.machine.kinematics import poses
 from flexdt.twin.physics.detector import Detector, deposited
 from flexdt.twin.physics.exposure import ExposureSettings, frame_rng
-from flexdt.twin.physics.scatter.simulation import ScatterSettings
-from flexdt.twin.physics.spectrum import Filter
-from flexdt.twin.physics.tube import Tube
+from flexdt.twin.physics.scatter import ScatterSettings
+from flexdt.twin.physics.tube import Filter, Tube
 from flexdt.twin.projection import Volume
 from flexdt.twin.scanner.state import Sample
 from tests.support.phantom_texts import SCENE_FILE

@@ -56,8 +56,8 @@ from flexdt.twin.machine.kinematics import poses
 from flexdt.twin.physics.chain import Chain, weights_of
 from flexdt.twin.physics.detector import Detector
 from flexdt.twin.physics.exposure import FEW_COUNTS, ExposureSettings
-from flexdt.twin.physics.scatter.simulation import Beam, ScatterSettings, scatter_image
-from flexdt.twin.physics.spectrum import Filter, TubeModel, tube_spectrum
+from flexdt.twin.physics.scatter import Beam, ScatterSettings, scatter_image
+from flexdt.twin.physics.tube import Filter, TubeModel, tube_spectrum
 from flexdt.twin.projection import TriangleMesh, Volume, forward, project_body, project_scene
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.scanner.state import Sample
@@ -190,7 +190,7 @@ def test_materials_by_formula() -> None:
 
 def test_every_material_of_the_table_has_its_composition() -> None:
     from flexdt.phantoms import materials
-    from flexdt.twin.attenuation.tables import tables
+    from flexdt.twin.attenuation.substances import tables
 
     for one in materials().values():
         mu = one.substance.attenuation()

@@ -27,7 +27,7 @@ import numpy as np
 import flexdt as fx
 from flexdt.twin.attenuation.scattering import cross_sections
 from flexdt.twin.attenuation.substances import Substance
-from flexdt.twin.physics.scatter.simulation import (
+from flexdt.twin.physics.scatter import (
     Beam,
     Object,
     ScatterImage,

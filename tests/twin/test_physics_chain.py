@@ -23,6 +23,7 @@ from flexdt.twin.physics.chain import (
     flux_of,
     kernel,
     noise_kernel,
+    radiographs,
     read_out,
     spot_blur_px,
     weights_of,
@@ -30,8 +31,7 @@ from flexdt.twin.physics.chain import (
 from flexdt.twin.physics.detector import Detector, pattern
 from flexdt.twin.physics.effective import effective_beam
 from flexdt.twin.physics.exposure import ExposureSettings, frame_rng
-from flexdt.twin.physics.radiograph import radiographs
-from flexdt.twin.physics.spectrum import tube_spectrum
+from flexdt.twin.physics.tube import tube_spectrum
 
 ABS = Substance.of("abs", "C15H17N", 1.05)
 STEEL = Substance.of("steel", "Fe", 7.8)

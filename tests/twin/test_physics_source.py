@@ -7,10 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from flexdt.twin.attenuation.substances import Substance, mass_fractions, parse_formula
-from flexdt.twin.attenuation.tables import tables
+from flexdt.twin.attenuation.substances import Substance, mass_fractions, parse_formula, tables
 from flexdt.twin.errors import LimitError, UnknownNameError
-from flexdt.twin.physics.spectrum import (
+from flexdt.twin.physics.tube import (
     ALUMINIUM,
     Filter,
     Spectrum,

@@ -19,14 +19,13 @@ from hypothesis import strategies as st
 from scipy.interpolate import RectBivariateSpline
 
 from flexdt.twin.attenuation.scattering import cross_sections
-from flexdt.twin.attenuation.substances import Substance
-from flexdt.twin.attenuation.tables import tables
+from flexdt.twin.attenuation.substances import Substance, tables
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.physics import scatter_kernels
 from flexdt.twin.physics.chain import Chain
 from flexdt.twin.physics.detector import Detector
-from flexdt.twin.physics.scatter import scatter_kernels
-from flexdt.twin.physics.scatter.simulation import (
+from flexdt.twin.physics.scatter import (
     Beam,
     Object,
     ScatterImage,
@@ -518,7 +517,7 @@ def test_what_cannot_be_is_refused() -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["flexdt.twin.attenuation.scattering", "flexdt.twin.physics.scatter.simulation",
+    ["flexdt.twin.attenuation.scattering", "flexdt.twin.physics.scatter",
      "flexdt.phantoms.channels", "flexdt.twin.reconstruction.scatter_correction"],
 )  # fmt: skip
 def test_examples(name: str) -> None:

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from flexdt.twin.attenuation.scattering import cross_sections
-from flexdt.twin.attenuation.substances import Substance
-from flexdt.twin.attenuation.tables import tables
+from flexdt.twin.attenuation.substances import Substance, tables
 from flexdt.twin.physics.detector import K_SHELL, deposited
-from flexdt.twin.physics.spectrum import Filter
+from flexdt.twin.physics.tube import Filter
 
 CSI = Substance.of("CsI", "CsI", 4.51)
 GOS = Substance.of("GOS", "Gd2O2S", 7.34)

@@ -16,8 +16,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from flexdt.twin.attenuation.substances import Substance
-from flexdt.twin.attenuation.tables import stored_arrays, tables
+from flexdt.twin.attenuation.substances import Substance, stored_arrays, tables
 from flexdt.twin.geometry.conventions import FloatArray
 
 RADIUS2_BARN = 0.079407877

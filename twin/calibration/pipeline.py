@@ -20,15 +20,16 @@ from flexdt.twin.calibration.detect.background import Lag, lag_of, without_lag
 from flexdt.twin.calibration.detect.detection import SpotFinder
 from flexdt.twin.calibration.detect.refine import FEW_WINDOWS, Refined, contrast_of, measure_beads
 from flexdt.twin.calibration.detect.windows import mended, plan_windows
+from flexdt.twin.calibration.diagnose import Finding, error, warning
 from flexdt.twin.calibration.diagnose.data import (
     WIDE_GATE_PX,
     explain_identification,
     judge_emptiness,
     judge_frames,
 )
-from flexdt.twin.calibration.diagnose.finding import Finding, error, warning
 from flexdt.twin.calibration.diagnose.fitted import (
     MISFIT_PX,
+    OF_MOTION,
     OF_RESIDUALS,
     explain_residuals,
     judge_body,
@@ -48,7 +49,6 @@ from flexdt.twin.calibration.diagnose.fixed_parameters import (
     loosened,
     narrow_priors,
 )
-from flexdt.twin.calibration.diagnose.moving import OF_MOTION
 from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import FitResult, Solver, estimate_geometry, with_start
 from flexdt.twin.calibration.fit.fitted_motion import (

@@ -4,11 +4,13 @@ from flexdt.twin.physics.chain import (
     FWHM,
     Chain,
     blurred,
+    check_rays,
     expected_signal,
     flux_of,
     read_out,
     spot_blur_px,
     weights_of,
+    within_pixels,
 )
 from flexdt.twin.physics.detector import Detector, deposited, detector_of
 from flexdt.twin.physics.effective import EffectiveBeam, effective_beam
@@ -20,9 +22,8 @@ from flexdt.twin.physics.exposure import (
     ideal_response,
     open_beam,
 )
-from flexdt.twin.physics.radiograph import check_rays, within_pixels
-from flexdt.twin.physics.scatter.simulation import Beam, ScanScatter, ScatterSettings, scan_scatter
-from flexdt.twin.physics.spectrum import (
+from flexdt.twin.physics.scatter import Beam, ScanScatter, ScatterSettings, scan_scatter
+from flexdt.twin.physics.tube import (
     Filter,
     Spectrum,
     TubeModel,

@@ -1,8 +1,10 @@
 """The whole chain for one image: path lengths through materials to the counts that are saved.
 
-There are two steps, so that the second can depend on earlier frames: `expected_signal` is free of
-noise and depends on geometry, tube and sample; `read_out` adds lag, noise, blur, fixed pattern and
+There are two steps, so that the second can depend on earlier frames: `radiographs` are free of
+noise and depend on geometry, tube and sample; `read_out` adds lag, noise, blur, fixed pattern and
 conversion. Random numbers are an argument. Scattered radiation is `flexdt.twin.physics.scatter`'s.
+The twin server and `flexdt.simulate` both make images with these functions, so a simulated data set
+and a scan of the twin differ in nothing but their geometry.
 
 The blur has the requested variance, however narrow it is. From 0.7 pixels on its kernel is a
 Gaussian at the pixels' centres, whose modulation is a Gaussian's up to the Nyquist frequency.
@@ -29,7 +31,7 @@ from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.physics.detector import Detector, pattern
 from flexdt.twin.physics.effective import EffectiveBeam, effective_beam
 from flexdt.twin.physics.exposure import FEW, Counts, ExposureSettings
-from flexdt.twin.physics.spectrum import TubeModel, monochromatic, tube_spectrum
+from flexdt.twin.physics.tube import TubeModel, monochromatic, tube_spectrum
 
 FWHM = 2.3548200450309493
 """Full width at half maximum of a Gaussian of standard deviation 1."""
@@ -39,6 +41,8 @@ NARROWEST = 0.02
 """Standard deviation below which nothing is done [pixels]."""
 WIDEST = 1000.0
 """Standard deviation of a blur at most [pixels]."""
+MOST_RAYS = 16
+"""Along each side of a pixel."""
 FREQUENCIES, FOLDS = 512, 20
 """Samples of a noise spectrum at least, and spectra on either side that are folded into it."""
 
@@ -155,12 +159,6 @@ def weights_of(chain: Chain, kV: float) -> tuple[FloatArray, FloatArray]:
         one = monochromatic(chain.mono_keV).fluence
         fluence = one * float((fluence @ charge) / (one @ charge))
     return fluence * charge, fluence * variance
-
-
-def open_electrons(chain: Chain, exposure: ExposureSettings, area_mm2: float) -> float:
-    """Electrons of a pixel of `area_mm2` one metre from the source, nothing in between."""
-    signal, _ = weights_of(chain, exposure.kV)
-    return float(signal.sum()) * mAs(exposure) * area_mm2 / 100.0
 
 
 def mAs(exposure: ExposureSettings) -> float:
@@ -381,3 +379,113 @@ def flux_map(
     out: Float32Array = flux.astype(np.float32)
     out.flags.writeable = False
     return out
+
+
+@dataclass(frozen=True, eq=False)
+class Scattered:
+    """Scatter of one view, in units of the local open beam.
+
+    Attributes:
+        signal: float32 (rows, cols), of the open beam's signal.
+        variance: float32 (rows, cols), of the open beam's variance.
+    """
+
+    signal: Float32Array
+    variance: Float32Array
+
+    def added_to(
+        self, expected: Expected, chain: Chain, view: FloatArray, exposure: ExposureSettings
+    ) -> Expected:
+        """The expected electrons of primary radiation and scatter together."""
+        if not exposure.xrays_on:
+            return expected
+        signal, noise = weights_of(chain, exposure.kV)
+        flux = flux_of(view, self.signal.shape) * np.float32(mAs(exposure))
+        mean = expected.mean_e + self.signal * flux * np.float32(signal.sum())
+        variance = expected.variance_e + self.variance * flux * np.float32(noise.sum())
+        return Expected(mean.astype(np.float32), variance.astype(np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class Radiograph:
+    """What the X-rays of one pose do to the panel, without noise.
+
+    Attributes:
+        integrals: (rows, cols), or (moments, rows, cols): what a logarithm of the flat-corrected
+            image would show.
+        expected: electrons with the tube on; None in ideal physics.
+    """
+
+    integrals: Float32Array
+    expected: Expected | None = None
+
+    @property
+    def shown(self) -> Float32Array:
+        """Line integrals (rows, cols) of the middle moment, for display."""
+        values = self.integrals
+        return values if values.ndim == 2 else values[len(values) // 2]
+
+
+def radiographs(
+    chain: Chain,
+    paths_mm: Float32Array,
+    views: FloatArray,
+    exposures: Sequence[ExposureSettings],
+    moments: int = 1,
+    scatter: Sequence[Scattered] = (),
+) -> list[Radiograph]:
+    """Images of several exposures, taken as if X-rays were on.
+
+    Args:
+        chain: tube, materials, panel.
+        paths_mm: float32 (m, n * moments, rows, cols), one channel a material [mm].
+        views: (n * moments, 12) their cone_vec rows [mm].
+        exposures: tube and time of each of the n images.
+        moments: views spread over each exposure.
+        scatter: of each image; none if left out.
+    """
+    made = []
+    for i, given in enumerate(exposures):
+        exposure = replace(given, xrays_on=True)
+        part = slice(i * moments, (i + 1) * moments)
+        view = views[i * moments + moments // 2]
+        expected = expected_signal(chain, paths_mm[:, part], view, exposure)
+        if scatter:
+            expected = scatter[i].added_to(expected, chain, view, exposure)
+        made.append(Radiograph(_as_line_integrals(chain, expected, view, exposure), expected))
+    return made
+
+
+def _as_line_integrals(
+    chain: Chain, expected: Expected, view: FloatArray, exposure: ExposureSettings
+) -> Float32Array:
+    """-log of the signal over the open beam's."""
+    area = np.float32(weights_of(chain, exposure.kV)[0].sum() * mAs(exposure))
+    least = np.float32(1e-6)
+    lines = np.log(np.maximum(area * flux_of(view, expected.mean_e.shape), least))
+    lines -= np.log(np.maximum(expected.mean_e, least))
+    return np.asarray(lines, dtype=np.float32)
+
+
+def check_rays(rays: int) -> None:
+    """Check a number of rays along each side of a pixel.
+
+    Raises:
+        LimitError: says what is allowed.
+    """
+    if not isinstance(rays, int | np.integer) or rays not in range(1, MOST_RAYS + 1):
+        raise LimitError(
+            f"rays is {rays}; allowed: 1 to {MOST_RAYS} along each side of a pixel",
+            {"asked": rays, "allowed": [1, MOST_RAYS]},
+        )
+
+
+def within_pixels(rows: FloatArray, rays: int) -> FloatArray:
+    """Views through a point in each of rays x rays parts of the pixels of each view, (n * rays^2,
+    12): no two in one row or column, so that edges along them come out in rays^2 steps."""
+    j, i = np.divmod(np.arange(rays**2)[:, None], rays)
+    across = (i + (j + 0.5) / rays) / rays - 0.5
+    down = (j + (rays - i - 0.5) / rays) / rays - 0.5
+    out = np.repeat(rows[:, None], rays**2, axis=1)
+    out[:, :, 3:6] += across * rows[:, None, 6:9] + down * rows[:, None, 9:12]
+    return out.reshape(-1, 12)

@@ -21,13 +21,12 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.attenuation.scattering import ELECTRON_KEV, cross_sections
-from flexdt.twin.attenuation.substances import Substance
-from flexdt.twin.attenuation.tables import tables
+from flexdt.twin.attenuation.substances import Substance, tables
 from flexdt.twin.errors import LimitError, require_within
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.machine.camera import CameraSettings, PixelGrid, Roi
 from flexdt.twin.machine.description import DetectorSpec
-from flexdt.twin.physics.spectrum import Filter
+from flexdt.twin.physics.tube import Filter
 from flexdt.twin.signatures import public
 
 K_SHELL: Final = {

@@ -23,7 +23,7 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.physics.chain import NARROWEST, Chain, mAs, noise_kernel, weights_of
 from flexdt.twin.physics.exposure import ExposureSettings
-from flexdt.twin.physics.spectrum import tube_spectrum
+from flexdt.twin.physics.tube import tube_spectrum
 
 AIR: Final = Substance(
     "air", (("N", 0.755268), ("O", 0.231781), ("Ar", 0.012827), ("C", 0.000124)), 1.20479e-3
@@ -66,7 +66,7 @@ def pixel_reading(
     Example:
         >>> from flexdt.twin.machine.camera import Roi
         >>> from flexdt.twin.physics.detector import Detector
-        >>> from flexdt.twin.physics.spectrum import TubeModel
+        >>> from flexdt.twin.physics.tube import TubeModel
         >>> aluminium = Substance.of("aluminium", "Al", 2.7)
         >>> chain = Chain(Detector(), TubeModel(), (aluminium,), (50.0,))
         >>> camera = CameraSettings("HW2SW1High", Roi(32, 8, 1943, 1527))

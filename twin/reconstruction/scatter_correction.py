@@ -22,16 +22,15 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.attenuation.substances import Substance
-from flexdt.twin.attenuation.tables import tables
+from flexdt.twin.attenuation.substances import Substance, tables
 from flexdt.twin.errors import LimitError, require_within
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.physics.chain import Chain, weights_of
 from flexdt.twin.physics.detector import Detector
 from flexdt.twin.physics.effective import EffectiveBeam, effective_beam
-from flexdt.twin.physics.scatter.simulation import Beam, Object, ScatterSettings, scan_scatter
-from flexdt.twin.physics.spectrum import TubeModel
+from flexdt.twin.physics.scatter import Beam, Object, ScatterSettings, scan_scatter
+from flexdt.twin.physics.tube import TubeModel
 from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.projection.operators import as_cone_vec, check_projections, require_finite
 from flexdt.twin.reconstruction.fdk import fdk_parts

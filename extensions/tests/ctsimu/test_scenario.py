@@ -16,8 +16,7 @@ from required import required
 
 import flexdt as fx
 from flexdt.clients.cli.command_tree import run
-from flexdt.twin.attenuation.substances import Substance
-from flexdt.twin.attenuation.tables import tables
+from flexdt.twin.attenuation.substances import Substance, tables
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt_extensions.ctsimu.ctsimu_scan import read_scenario

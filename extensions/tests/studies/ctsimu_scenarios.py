@@ -39,11 +39,10 @@ import trimesh
 from scipy.optimize import linprog, minimize_scalar
 
 from flexdt.phantoms.pieces import Surface, cut
-from flexdt.twin.attenuation.substances import Substance
-from flexdt.twin.attenuation.tables import tables
+from flexdt.twin.attenuation.substances import Substance, tables
 from flexdt.twin.errors import TwinError
 from flexdt.twin.physics.detector import deposited
-from flexdt.twin.physics.spectrum import ALUMINIUM, Filter, TubeModel, tube_spectrum
+from flexdt.twin.physics.tube import ALUMINIUM, Filter, TubeModel, tube_spectrum
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt_extensions.ctsimu.scenario import ScenarioImages
 

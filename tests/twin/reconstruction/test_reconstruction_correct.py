@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flexdt.twin.attenuation.substances import Substance
-from flexdt.twin.attenuation.tables import tables
+from flexdt.twin.attenuation.substances import Substance, tables
 from flexdt.twin.errors import LimitError
 from flexdt.twin.physics.chain import Chain, weights_of
 from flexdt.twin.physics.detector import Detector

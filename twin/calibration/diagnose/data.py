@@ -15,8 +15,8 @@ import numpy as np
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections, SpotFinder
-from flexdt.twin.calibration.diagnose.finding import Finding, Severity, error, warning
-from flexdt.twin.calibration.diagnose.moving import moving, named_turn
+from flexdt.twin.calibration.diagnose import Finding, Severity, error, warning
+from flexdt.twin.calibration.diagnose.fitted import moving, named_turn
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
 from flexdt.twin.calibration.fit.fitted_motion import MotionFit
 from flexdt.twin.calibration.fit.priors import ASSUMED

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtri
 
-from flexdt.twin.calibration.diagnose.finding import Finding, warning
+from flexdt.twin.calibration.diagnose import Finding, warning
 from flexdt.twin.calibration.fit.fit import RAYLEIGH_MEDIAN, FitResult
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.panel import Border, PanelModel

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
-from flexdt.twin.calibration.diagnose.finding import Finding, error, warning
+from flexdt.twin.calibration.diagnose import Finding, error, warning
 from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.geometry.offsets import to_edge

@@ -1,15 +1,29 @@
-"""How well pairs of views agree on an object's integrals over planes through both their sources.
+"""How well pairs of views agree on integrals over planes through both their sources, and what
+follows: the row of the plane in which the source turns, and shifts of single frames.
 
 The integrals are those of `plane_kernels.py`. Nothing is assumed of their errors but that those of
 frames, distances between views, and heights far apart are their own: what a sum of squares is
 known to follows from how much its parts scatter.
+
+A panel that stands higher than it is said to gives one view of a pair planes that lean to one side
+and the other view such that lean to the other. The panel's height is that at which all pairs agree
+best. The sum of squares is followed by wide steps: noise is in its derivatives too, so that the
+usual normal equations would promise too much and step too short. What noise alone does to that sum
+is seen in images of noise.
+
+How far every frame shows the object aside and down follows from one linear system: each pair of
+views adds as many equations for the shifts of its two frames as it sees planes. What a shift of the
+object does too, a shift common to all frames and one that turns once with the stage, is not told
+from the geometry and left out. The shifts' noise is that of an image made of noise alone, which
+goes the same way. From it and the shifts' own scatter follows how large they are at all, and what
+is left of each where noise dominates.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -316,3 +330,275 @@ def _support(
 
     sides = np.vstack([along(full[:, 0], -cols / 2), along(full[:, -1], cols / 2)])
     return radius, (across(full[0], -rows / 2), across(full[-1], rows / 2), sides)
+
+
+GRID: Final = 25
+"""Heights that are tried first."""
+SURE: Final = 2.0
+"""Standard deviations by which the best of them must be better than any that is not beside it."""
+BENT: Final = 2.5
+"""Standard deviations of its own by which the minimum must be one."""
+LEFT: Final = 0.05
+"""Share of the curvature that is left without any two neighbouring blocks of heights, at least."""
+ROUNDS: Final = 8
+FREE_ROUNDS: Final = 3
+"""In which the level may change."""
+NOISY: Final = 4
+"""Steps to either side of the minimum at which noise alone is looked at."""
+ELSEWHERE: Final = "the views agree about as well with the source's plane at another row"
+
+
+class Height(NamedTuple):
+    """Of the panel above where it was said to be, and its standard deviation [px]."""
+
+    value: float
+    sigma: float
+
+
+class _Bowl(NamedTuple):
+    """Sums of squares about a height, one for each of `LEVELS`: where each would be least, sigmas
+    of that, and second derivatives."""
+
+    aims: FloatArray
+    sigmas: FloatArray
+    bends: FloatArray
+    scale: FloatArray
+
+
+def find_height(
+    fine: PlanePairs, coarse: PlanePairs, reach: float, random: np.random.Generator
+) -> Height:
+    """The panel's height.
+
+    Args:
+        fine: pairs of views.
+        coarse: the same binned twice as much, for the search.
+        reach: heights are tried so far from the start [px].
+        random: for the images of noise.
+
+    Raises:
+        NotIdentifiableError: the disagreement is least nowhere, or about as small elsewhere.
+    """
+    up = np.eye(len(fine.start))[0]
+    bowl, at, h = _settle(fine, coarse, np.linspace(-reach, reach, GRID), up, random)
+    alone = fine.noise(random)
+    places = at + h * np.arange(-NOISY, NOISY + 1)
+    costs = [fine.costs(fine.start + y * up, alone) * bowl.scale for y in places]
+    noise = np.stack([fine.total(c) for c in costs])
+    slopes, bends = (noise[2:] - noise[:-2]) / (2 * h), np.diff(noise, 2, axis=0) / h**2
+    blurred = np.sqrt(np.square(slopes).mean(axis=0)) / bowl.bends
+    flat = bowl.bends < BENT * np.sqrt(np.square(bends).mean(axis=0))
+    sigmas = np.where(flat | (bowl.bends <= 0), np.inf, np.maximum(bowl.sigmas, blurred))
+    level = int(sigmas.argmin())
+    sigma, at = float(sigmas[level]), float(bowl.aims[level])
+    if not math.isfinite(sigma):
+        raise NotIdentifiableError(ELSEWHERE)
+    others = bowl.aims[sigmas < 2 * sigma]
+    variance = sigma**2 + float(np.square(others - at).mean())
+
+    def slope(doubts: FloatArray) -> float:
+        low, high = (fine.costs(fine.start + (at + s * h) * up + doubts) for s in (-1, 1))
+        return float(fine.total((high - low) * bowl.scale)[level]) / (2 * h)
+
+    base = slope(0.0 * up)
+    for doubt in np.eye(len(up))[1:]:
+        variance += ((slope(doubt) - base) / float(bowl.bends[level])) ** 2
+    return Height(at, math.sqrt(variance))
+
+
+def _settle(
+    fine: PlanePairs, coarse: PlanePairs, grid: FloatArray, up: FloatArray,
+    random: np.random.Generator,
+) -> tuple[_Bowl, float, float]:  # fmt: skip
+    """The minimum, its place, and the half width of the steps that found it [px].
+
+    Raises:
+        NotIdentifiableError: as `find_height`.
+    """
+    at, h = _first(coarse, grid, up, random), float(grid[1] - grid[0])
+    level = -1
+    for n in range(ROUNDS):
+        bowl = _bowl(coarse if n == 0 else fine, at, h, up)
+        if n < FREE_ROUNDS or not math.isfinite(bowl.sigmas[level]):
+            level = int(bowl.sigmas.argmin())
+        sigma = float(bowl.sigmas[level])
+        if not math.isfinite(sigma):
+            break
+        step = float(np.clip(bowl.aims[level] - at, -2 * h, 2 * h))
+        if n > 0 and abs(step) < 0.2 * sigma + 0.01:
+            return bowl, at, h
+        at, h = at + step, max(min(h, 4 * sigma), 0.5)
+    raise NotIdentifiableError(ELSEWHERE)
+
+
+def _first(
+    pairs: PlanePairs, grid: FloatArray, up: FloatArray, random: np.random.Generator
+) -> float:
+    """The height on a grid at which the views agree best.
+
+    Raises:
+        NotIdentifiableError: as `find_height`.
+    """
+    costs = np.stack([pairs.costs(pairs.start + y * up) for y in grid])
+    scale = pairs.scales(costs.min(axis=0))
+    noise = pairs.noise(random)
+    alone = np.stack([pairs.total(pairs.costs(pairs.start + y * up, noise) * scale) for y in grid])
+    found: list[tuple[float, float]] = []
+    for of_level, wiggle in zip((costs * scale).swapaxes(0, 1), alone.std(axis=0), strict=True):
+        total = pairs.total(of_level)
+        best = int(total.argmin())
+        # Planes that lie in a flat face of the object agree in a spike, not in a bowl.
+        beside = np.abs(np.arange(len(grid)) - best) == 1
+        spike = total[beside].min() > np.delete(total, best).min()
+        if 0 < best < len(grid) - 1 and not spike:
+            more = of_level[np.abs(np.arange(len(grid)) - best) > 1] - of_level[best]
+            spread = np.maximum(pairs.spread(more), math.sqrt(2.0) * wiggle)
+            better = pairs.total(more) / np.maximum(spread, 1e-300)
+            found.append((float(better.min()), float(grid[best])))
+    sure, height = max(found, default=(0.0, 0.0))
+    if sure < SURE:
+        raise NotIdentifiableError(
+            f"{ELSEWHERE} (the best is better by {sure:.1f} standard deviations; at least {SURE:g})"
+        )
+    return height
+
+
+def _bowl(pairs: PlanePairs, at: float, h: float, up: FloatArray) -> _Bowl:
+    low, mid, high = (pairs.costs(pairs.start + (at + s * h) * up) for s in (-1, 0, 1))
+    scale = pairs.scales(mid)
+    slopes, bends = (high - low) * scale / (2 * h), (high + low - 2 * mid) * scale / h**2
+    slope, bend = pairs.total(slopes), pairs.total(bends)
+    steps = slope / np.where(bend > 0, bend, np.inf)
+    left = pairs.spread(slopes - steps[:, None] * bends, blocks=True)
+    sure = bend / np.maximum(pairs.spread(bends), 1e-300)
+    # Of several levels the one that happens to bend most would be chosen, its sigma too small.
+    wider = np.hypot(1.0, BENT / np.maximum(sure, BENT))
+    sigmas = np.where(sure > BENT, wider * left / np.where(sure > BENT, bend, 1.0), np.inf)
+    # No two neighbouring blocks of heights may have the answer to themselves: a flat face would.
+    parts = pairs.blocks(np.stack([slopes, bends])).sum(axis=-2)
+    rest_slope, rest_bend = np.stack([slope, bend])[..., None] - parts[..., 1:] - parts[..., :-1]
+    alone = ~(rest_bend > np.maximum(LEFT * bend[:, None], 0.0))
+    without = rest_slope / np.where(alone, 1.0, rest_bend) - steps[:, None]
+    doubt = np.where(alone, np.inf, np.abs(without) / 2).max(axis=1)
+    sigmas = np.maximum(sigmas, doubt)
+    return _Bowl(at - steps, sigmas, bend, scale)
+
+
+SHIFT_ROUNDS: Final = 3
+PULLED: Final = 1e-6
+"""Weight that keeps shifts near 0 in directions of which the images say nothing."""
+EVIDENCE: Final = 6.0
+"""Gain in log likelihood from which on frames are said to move, as in `fitted_motion`."""
+WIDER: Final = 1.5
+"""Errors are taken to be so many times what disagreements and noise make of them (assumed)."""
+LARGER: Final = 5.0
+"""Squares of shifts must be so many times those of their errors (assumed)."""
+LEAST_TOLD: Final = 0.1
+"""Share of the slopes' squares that is the object's is taken to be this at least."""
+
+
+class Shifts(NamedTuple):
+    """Of the object in the binned frames, to the right and down, (n, 2) each [px]."""
+
+    values: FloatArray
+    sigmas: FloatArray
+    evidence: tuple[float, float]
+
+
+def find_shifts(
+    pairs: PlanePairs, at: FloatArray, angle: FloatArray, random: np.random.Generator
+) -> Shifts:
+    """Shifts of all frames.
+
+    Args:
+        pairs: the frames' pairs.
+        at: arguments of their geometry.
+        angle: of the stage in each frame, (n,) [rad].
+        random: for the image of noise.
+    """
+    n = len(angle)
+    modes = np.column_stack([np.ones(n), np.cos(angle), np.sin(angle)])
+    free = np.eye(n) - modes @ np.linalg.pinv(modes)
+    values = np.zeros((n, 2))
+    for _ in range(SHIFT_ROUNDS):
+        system = _System(pairs, at, values)
+        values = free @ (values - system.solve(system.rest))
+    system = _System(pairs, at, values)
+    image = pairs.noise(random)
+    noise = system.of(image)
+    # Slopes that are noise in part make the equations stiffer than what there is to be seen.
+    told = np.maximum(1.0 - system.share(image), LEAST_TOLD)
+    scatter = (free @ system.solve(noise)).var(axis=0) / np.square(told)
+    # What planes disagree by beyond noise (sampling, beam hardening) is in the shifts as well.
+    # A face along the beam is sampled alike in all pairs of a frame: more than they tell.
+    scatter *= WIDER**2 * max(1.0, system.power(system.rest) / system.power(noise))
+    found = values.var(axis=0)
+    sigmas, evidence = np.zeros((n, 2)), []
+    for i, (s, v) in enumerate(zip(scatter.tolist(), found.tolist(), strict=True)):
+        gain = n / 2 * (v / s - 1.0 - math.log(v / s)) if v > s else 0.0
+        evidence.append(gain)
+        share = 1.0 - s / v if gain > EVIDENCE and v > LARGER * s else 0.0
+        values[:, i] *= share
+        sigmas[:, i] = math.sqrt(share * s) if share else math.nan
+    return Shifts(values, sigmas, (evidence[0], evidence[1]))
+
+
+class _System:
+    """Equations for changes of shifts, at given ones."""
+
+    def __init__(self, pairs: PlanePairs, at: FloatArray, shifts: FloatArray) -> None:
+        self.pairs, self.at = pairs, at
+        self.views = pairs.rows(at).copy()
+        u, v = self.views[:, 6:9], self.views[:, 9:12]
+        self.views[:, 3:6] -= shifts[:, :1] * u + shifts[:, 1:] * v
+        found, self.ones = pairs.integrals(at, self.views)
+        self.rest = self._difference(found)
+        self.slopes = self._slopes(pairs.sums)
+        usual = np.add.reduceat(np.square(self.rest).sum(axis=1), pairs.starts) / pairs.sizes
+        self.weight = np.repeat(1.0 / np.maximum(usual, 1e-300), pairs.sizes)
+        self.places = (2 * pairs.pairs[:, :, None] + [0, 1]).reshape(-1, 4)
+        n = 2 * len(shifts)
+        self.normal = np.zeros((n, n))
+        blocks = np.einsum("qak,qbk,q->qab", self.slopes, self.slopes, self.weight, optimize=True)
+        np.add.at(self.normal, (self.places[:, :, None], self.places[:, None]), blocks)
+        self.normal[np.diag_indices(n)] += PULLED * np.trace(self.normal) / n + 1e-300
+
+    def _difference(self, found: FloatArray) -> FloatArray:
+        return without(self.ones, found[:, 0] - found[:, 1], self.pairs.valid)
+
+    def _slopes(self, sums: Float32Array) -> FloatArray:
+        """Change of the differences with both shifts of the first view, then of the second,
+        (q, 4, k)."""
+        parts = []
+        for first in (6, 9):
+            ends = []
+            for sign in (0.5, -0.5):
+                moved = self.views.copy()
+                moved[:, 3:6] -= sign * moved[:, first : first + 3]
+                ends.append(self.pairs.integrals(self.at, moved, sums)[0])
+            change = ends[0] - ends[1]
+            parts.append([without(self.ones, s * change[:, i], self.pairs.valid)
+                          for i, s in ((0, 1.0), (1, -1.0))])  # fmt: skip
+        return np.stack([parts[a][side] for side in (0, 1) for a in (0, 1)], axis=1)
+
+    def share(self, noise: Float32Array) -> FloatArray:
+        """What noise adds to the squares of the slopes for either shift, of all there is, (2,)."""
+        own, all_ = (
+            np.einsum("qak,qak,q->a", slopes, slopes, self.weight).reshape(2, 2).sum(axis=0)
+            for slopes in (self._slopes(noise), self.slopes)
+        )
+        return np.asarray(own / np.maximum(all_, 1e-300))
+
+    def of(self, sums: Float32Array) -> FloatArray:
+        """Differences (q, k) in other images, laid out as `PlanePairs.sums`."""
+        return self._difference(self.pairs.integrals(self.at, self.views, sums)[0])
+
+    def solve(self, rest: FloatArray) -> FloatArray:
+        """Shifts (n, 2) that would leave such differences (q, k)."""
+        right = np.zeros(len(self.normal))
+        np.add.at(right, self.places, np.einsum("qak,qk,q->qa", self.slopes, rest, self.weight))
+        return np.asarray(np.linalg.solve(self.normal, right).reshape(-1, 2))
+
+    def power(self, rest: FloatArray) -> float:
+        """Weighted sum of squares."""
+        return float((self.weight[:, None] * np.square(rest)).sum())

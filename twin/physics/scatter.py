@@ -23,8 +23,7 @@ from flexdt.twin.attenuation.scattering import CrossSections, cross_sections
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import GeometryError, LimitError, require_within
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
-from flexdt.twin.physics.chain import Chain, Expected, flux_of, mAs, weights_of
-from flexdt.twin.physics.exposure import ExposureSettings
+from flexdt.twin.physics.chain import Chain, Scattered, weights_of
 
 BATCHES: Final = 32
 """Independent estimates whose spread is the standard error; also the work that threads share."""
@@ -198,7 +197,7 @@ def scatter_image(
     """
     from scipy.stats import qmc
 
-    from flexdt.twin.physics.scatter import scatter_kernels as kernels
+    from flexdt.twin.physics import scatter_kernels as kernels
 
     wanted = ScatterSettings() if settings is None else settings
     row = np.asarray(view, dtype=np.float64)
@@ -315,31 +314,6 @@ def _lit(
         low, high = np.maximum(low, -edge), np.minimum(high, edge)
     high = np.maximum(high, low)
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
-
-
-@dataclass(frozen=True, eq=False)
-class Scattered:
-    """Scatter of one view, in units of the local open beam.
-
-    Attributes:
-        signal: float32 (rows, cols), of the open beam's signal.
-        variance: float32 (rows, cols), of the open beam's variance.
-    """
-
-    signal: Float32Array
-    variance: Float32Array
-
-    def added_to(
-        self, expected: Expected, chain: Chain, view: FloatArray, exposure: ExposureSettings
-    ) -> Expected:
-        """The expected electrons of primary radiation and scatter together."""
-        if not exposure.xrays_on:
-            return expected
-        signal, noise = weights_of(chain, exposure.kV)
-        flux = flux_of(view, self.signal.shape) * np.float32(mAs(exposure))
-        mean = expected.mean_e + self.signal * flux * np.float32(signal.sum())
-        variance = expected.variance_e + self.variance * flux * np.float32(noise.sum())
-        return Expected(mean.astype(np.float32), variance.astype(np.float32))
 
 
 @dataclass(frozen=True, eq=False)
