@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import tomllib
 from collections.abc import Mapping
 from typing import Any, Final
@@ -28,7 +27,14 @@ ROUNDED_MM: Final = 1e-4
 angles with six decimals, which is some 1e-5 mm."""
 UNSUPPORTED: Final = ("axs_roll", "axs_pitch", "vol_rot")
 """Numbers of the format that must be zero to be read: see the documentation."""
-_LISTS: Final = {"vol_tra": 3, "vol_rot": 3, "det_sample": 2, "ang_range": 2, "vol_sample": 3}
+_NUMBERS: Final[Mapping[str, Any]] = {
+    **dict.fromkeys(("src2obj", "det2obj", "src2det"), math.nan),
+    "det_pixel": math.nan, "ang_range": (math.nan, math.nan), "det_sample": (1.0, 1.0),
+    "vol_tra": (0.0, 0.0, 0.0), "vol_rot": (0.0, 0.0, 0.0),
+    **dict.fromkeys(("src_tan", "src_ort", "det_tan", "det_ort", "axs_tan"), 0.0),
+    **dict.fromkeys(("axs_roll", "axs_pitch", "det_roll", "det_yaw", "det_pitch"), 0.0),
+}  # fmt: skip
+"""What is read: name -> values where there are none, of as many as it must have."""
 
 
 def flexdata_text(geometry: ScanGeometry) -> str:
@@ -43,8 +49,12 @@ def flexdata_text(geometry: ScanGeometry) -> str:
     up = geometry.rows_up()
     pitch_u, pitch_v = g.require_panel(up.cone_vec, "flexDATA")
     circle = g.circle_of(up.cone_vec, "flexDATA", ROUNDED_MM)
-    first, last = _equal_steps(circle)
     source, detector = circle.source, circle.detector
+    first, last = float(circle.angle[0]), float(circle.angle[-1])
+    reach = float(np.linalg.norm(source) + np.linalg.norm(detector))
+    beside = np.abs(np.linspace(first, last, len(circle.angle)) - circle.angle) * reach
+    what = "flexDATA's geometry.toml has no list of angles, only first and last; the distance [mm]"
+    g.require_each(f"{what} from equal steps", beside, ROUNDED_MM)
     if source[1] >= 0.0 or detector[1] - source[1] <= 0.0:
         raise ExchangeError("flexDATA: the source must stand before axis and detector")
     axes = np.stack(
@@ -82,28 +92,6 @@ def flexdata_text(geometry: ScanGeometry) -> str:
     return "".join(f"{name} = {json.dumps(value)}\n" for name, value in values.items())
 
 
-def _equal_steps(circle: g.CircularScan) -> tuple[float, float]:
-    """First and last angle [rad].
-
-    Raises:
-        ExchangeError: the steps between them are not equal.
-    """
-    angle = circle.angle
-    first, last = float(angle[0]), float(angle[-1])
-    if len(angle) > 1:
-        reach = float(np.linalg.norm(circle.source) + np.linalg.norm(circle.detector))
-        miss = np.abs(np.linspace(first, last, len(angle)) - angle)
-        if miss.max() * reach > ROUNDED_MM:
-            view = int(np.argmax(miss))
-            raise ExchangeError(
-                f"flexDATA's geometry.toml has no list of angles, only first and last; view {view} "
-                f"lies {math.degrees(miss[view]):.3g} deg, up to {miss[view] * reach:.3g} mm, "
-                f"beside equal steps (allowed: {ROUNDED_MM:g} mm)",
-                {"row": view, "asked": math.degrees(miss[view])},
-            )
-    return first, last
-
-
 def _angles(axes: FloatArray) -> tuple[float, float, float]:
     """Roll about y, then yaw about the turned z, then pitch about the turned x [rad]."""
     yaw = math.asin(max(-1.0, min(1.0, axes[1, 0])))
@@ -129,10 +117,15 @@ def read_flexdata(
     Raises:
         ExchangeError: not such a file, or something of it that is not understood.
     """
-    records = _records(text, file)
-    get = _Getter(records, file)
+    # flexDATA writes tuples, which are no TOML, and repairs them itself on reading.
+    repaired = text.lstrip("\ufeff").translate(str.maketrans("()", "[]"))
+    try:
+        records = tomllib.loads(repaired)
+    except tomllib.TOMLDecodeError as error:
+        raise ExchangeError(f"{file} is not valid TOML: {error}", {"path": file}) from None
+    found = {name: _values(name, records, file) for name in _NUMBERS}
     for name in UNSUPPORTED:
-        if any(get.list_of(name) if name in _LISTS else [get.number(name, 0.0)]):
+        if np.any(found[name]):
             raise ExchangeError(
                 f"{file}: {name} is not zero: flexDATA tilts source and detector orbits about "
                 "different points then, which is not imitated",
@@ -142,69 +135,36 @@ def read_flexdata(
     if not isinstance(count, int) or count < 1:
         raise ExchangeError(f"{file} does not say how many views there are; it must be given")
     if shape is None and "det_rows" in records and "det_cols" in records:
-        shape = (int(get.number("det_rows")), int(get.number("det_cols")))
-    sod = get.number("src2obj", None if "src2det" not in records else math.nan)
-    odd = get.number("det2obj", None if "src2det" not in records else math.nan)
-    if "src2det" in records:
-        sdd = get.number("src2det")
-        sod, odd = (sdd - odd if math.isnan(sod) else sod), (sdd - sod if math.isnan(odd) else odd)
+        shape = (int(records["det_rows"]), int(records["det_cols"]))
+    sod, odd, sdd = (float(found[name]) for name in ("src2obj", "det2obj", "src2det"))
+    sod, odd = (sdd - odd if math.isnan(sod) else sod), (sdd - sod if math.isnan(odd) else odd)
     if math.isnan(sod) or math.isnan(odd):
         raise ExchangeError(f"{file}: two of src2obj, det2obj and src2det are needed")
-    roll, yaw, pitch = (math.radians(get.number(f"det_{n}", 0.0)) for n in ("roll", "yaw", "pitch"))
+    roll, yaw, pitch = (math.radians(found[f"det_{name}"]) for name in ("roll", "yaw", "pitch"))
     axes = rotation_y(roll) @ rotation_z(yaw) @ rotation_x(pitch)
-    axis = get.number("axs_tan", 0.0)
-    sample, moved = get.list_of("det_sample", 1.0), get.list_of("vol_tra")
-    pixel = get.number("det_pixel")
-    first, last = get.list_of("ang_range")
-    angles = np.linspace(first, last, count)
+    axis, moved, sample = found["axs_tan"], found["vol_tra"], found["det_sample"]
     circle = g.CircularScan(
-        np.radians(angles),
+        np.radians(np.linspace(found["ang_range"][0], found["ang_range"][1], count)),
         np.array([-moved[1], -moved[2]]),
-        np.array([get.number("src_tan", 0.0) - axis, -sod, get.number("src_ort", 0.0)]),
-        np.array([get.number("det_tan", 0.0) - axis, odd, get.number("det_ort", 0.0)]),
-        axes[:, 0] * pixel * sample[1],
-        axes[:, 2] * pixel * sample[0],
+        np.array([found["src_tan"] - axis, -sod, found["src_ort"]]),
+        np.array([found["det_tan"] - axis, odd, found["det_ort"]]),
+        axes[:, 0] * found["det_pixel"] * sample[1],
+        axes[:, 2] * found["det_pixel"] * sample[0],
     )
     rows = circle.cone_vec().rows - np.array([0, 0, moved[0]] * 2 + [0.0] * 6)
-    notes = () if records.get("flextoml_version") == VERSION else (
-        f"flextoml_version is {records.get('flextoml_version')!r}; this reads {VERSION}",
-    )  # fmt: skip
+    version = records.get("flextoml_version")
+    said = f"flextoml_version is {version!r}; this reads {VERSION}"
+    notes = () if version == VERSION else (said,)
     return ScanGeometry(cone_vec_of(rows, file), shape, notes=notes).rows_up()
 
 
-def _records(text: str, file: str) -> Mapping[str, Any]:
-    # flexDATA writes tuples, which are no TOML, and repairs them itself on reading.
-    repaired = re.sub(r"[()]", lambda m: "[" if m[0] == "(" else "]", text.lstrip("\ufeff"))
+def _values(name: str, records: Mapping[str, Any], file: str) -> FloatArray:
+    """One of `_NUMBERS`, of the file or as it is where there is none."""
+    usual = np.array(_NUMBERS[name])
     try:
-        return tomllib.loads(repaired)
-    except tomllib.TOMLDecodeError as error:
-        raise ExchangeError(f"{file} is not valid TOML: {error}", {"path": file}) from None
-
-
-class _Getter:
-    """Numbers of the file by name."""
-
-    def __init__(self, records: Mapping[str, Any], file: str) -> None:
-        self._records, self._file = records, file
-
-    def number(self, name: str, default: float | None = None) -> float:
-        value = self._records.get(name, default)
-        if isinstance(value, list) and len(value) == 1:
-            value = value[0]
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            said = "is missing" if value is None else f"= {str(value)[:40]} is no number"
-            raise ExchangeError(f"{self._file}: {name} {said}", {"path": name})
-        if not math.isfinite(value) and value is not default:
-            raise ExchangeError(f"{self._file}: {name} is not finite", {"path": name})
-        return float(value)
-
-    def list_of(self, name: str, default: float = 0.0) -> list[float]:
-        value = self._records.get(name)
-        count = _LISTS[name]
-        if value is None and name != "ang_range":
-            return [default] * count
-        given = value if isinstance(value, list) else []
-        sound = all(isinstance(v, int | float) and math.isfinite(v) for v in given)
-        if not sound or len(given) != count:
-            raise ExchangeError(f"{self._file}: {name} must be {count} numbers", {"path": name})
-        return [float(v) for v in given]
+        values = np.array(records.get(name, usual), dtype=np.float64).reshape(usual.shape)
+    except (TypeError, ValueError):
+        values = usual * math.nan
+    if (name in records or name in ("det_pixel", "ang_range")) and not np.isfinite(values).all():
+        raise ExchangeError(f"{file}: {name} must be {usual.size} finite numbers", {"path": name})
+    return values

@@ -74,17 +74,9 @@ class ScanGeometry:
 
         It belongs to images that are turned upside down.
         """
-        return replace(
-            self,
-            cone_vec=_upside_down(self.cone_vec),
-            real=None if self.real is None else _upside_down(self.real),
-        )
-
-
-def _upside_down(cone_vec: ConeVec) -> ConeVec:
-    rows = cone_vec.rows.copy()
-    rows[:, 9:12] *= -1.0
-    return ConeVec(rows)
+        down = np.repeat([1.0, -1.0], [9, 3])
+        real = None if self.real is None else ConeVec(self.real.rows * down)
+        return replace(self, cone_vec=ConeVec(self.cone_vec.rows * down), real=real)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,15 +119,12 @@ def circle_of(cone_vec: ConeVec, format_name: str, tolerance_mm: float = SAME_MM
     poses = Poses.from_cone_vec(cone_vec)
     angle = poses.angle
     c, s = np.cos(angle), np.sin(angle)
-    one, zero = np.ones_like(c), np.zeros_like(c)
-    # A point p at angle 0 is seen at center + Rz(angle) p: linear in center and p.
-    table = np.concatenate(
-        [np.stack([one, zero, c, -s], axis=1), np.stack([zero, one, s, c], axis=1)]
-    )
-    spread = 0.0 if len(angle) < 2 else float(np.ptp(np.stack([c, s], axis=1), axis=0).max())
-    if spread < 1e-3:  # one direction does not determine the axis; take the object frame's own
-        center = np.zeros(2)
-    else:
+    center = np.zeros(2)
+    # One direction does not determine the axis: it is the object frame's own then.
+    if max(np.ptp(c), np.ptp(s)) >= 1e-3:
+        # A point p at angle 0 is seen at center + Rz(angle) p: linear in center and p.
+        one, zero = np.ones_like(c), np.zeros_like(c)
+        table = np.concatenate([np.c_[one, zero, c, -s], np.c_[zero, one, s, c]])
         target = np.concatenate([cone_vec.source[:, 0], cone_vec.source[:, 1]])
         center = np.linalg.lstsq(table, target, rcond=None)[0][:2]
         center[np.abs(center) < SAME_MM / 10] = 0.0
@@ -143,14 +132,9 @@ def circle_of(cone_vec: ConeVec, format_name: str, tolerance_mm: float = SAME_MM
     world = moved.moved(rotation_z(-angle), np.zeros(3))
     middle = world.rows.mean(axis=0)
     found = CircularScan(angle, center, middle[0:3], middle[3:6], middle[6:9], middle[9:12])
-    miss = np.abs(found.cone_vec().rows - cone_vec.rows)
-    if miss.max() > tolerance_mm:
-        view = int(np.argmax(miss.max(axis=1)))
-        raise ExchangeError(
-            f"{format_name} knows one circle with everything else standing still; view {view} lies "
-            f"{miss[view].max():.3g} mm beside it (allowed: {tolerance_mm:g} mm)",
-            {"row": view, "asked": float(miss[view].max()), "allowed": tolerance_mm},
-        )
+    miss = np.abs(found.cone_vec().rows - cone_vec.rows).max(axis=1)
+    what = f"{format_name} knows one circle with everything else standing still; the distance [mm]"
+    require_each(f"{what} from it", miss, tolerance_mm)
     return found
 
 
@@ -163,18 +147,22 @@ def require_panel(cone_vec: ConeVec, format_name: str) -> tuple[float, float]:
     u, v = cone_vec.u, cone_vec.v
     lengths = np.stack([np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1)], axis=1)
     cosine = np.abs(np.einsum("ni,ni->n", u, v)) / (lengths[:, 0] * lengths[:, 1])
-    if cosine.max() > SQUARE:
-        view = int(np.argmax(cosine))
-        raise ExchangeError(
-            f"{format_name} knows panels with orthogonal rows and columns; in view {view} their "
-            f"cosine is {cosine[view]:.3g}",
-            {"row": view, "asked": float(cosine[view]), "allowed": SQUARE},
-        )
+    what = f"{format_name} knows panels with orthogonal rows and columns; their cosine"
+    require_each(what, cosine, SQUARE)
     change = np.abs(lengths / lengths[0] - 1.0).max(axis=1)
-    if change.max() > SQUARE:
-        view = int(np.argmax(change))
-        raise ExchangeError(
-            f"{format_name} knows one pixel size; in view {view} it is another",
-            {"row": view, "asked": lengths[view].tolist(), "allowed": lengths[0].tolist()},
-        )
+    require_each(f"{format_name} knows one pixel size; its change", change, SQUARE)
     return float(lengths[:, 0].mean()), float(lengths[:, 1].mean())
+
+
+def require_each(what: str, off: FloatArray, most: float) -> None:
+    """Check a figure of every view, (n,).
+
+    Raises:
+        ExchangeError: one is above `most`; says in which view it is largest.
+    """
+    view = int(np.argmax(off))
+    if off[view] > most:
+        raise ExchangeError(
+            f"{what} in view {view} is {off[view]:.3g}; allowed: {most:g}",
+            {"row": view, "asked": float(off[view]), "allowed": most},
+        )

@@ -12,10 +12,11 @@ import io
 import json
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
 
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -42,8 +43,7 @@ def read_vectors_text(text: str, file: str = "<text>") -> ConeVec:
         content = line.split("#", 1)[0].strip()
         if not content:
             continue
-        words = [w for w in re.split(r"[\s,;]+", content) if w]
-        rows.append(_numbers(words, file, number))
+        rows.append(_numbers(re.split(r"[\s,;]+", content.strip(" ,;")), file, number))
     return cone_vec_of(rows, file)
 
 
@@ -73,7 +73,7 @@ def csv_text(geometry: ScanGeometry) -> str:
     return out.getvalue()
 
 
-_SHAPE = re.compile(r"#\s*detector rows (\d+), columns (\d+)\s*")
+_SHAPE = re.compile(r"^\s*#\s*detector rows (\d+), columns (\d+)\s*$", re.MULTILINE)
 
 
 def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
@@ -82,16 +82,13 @@ def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
     Raises:
         ExchangeError: names the line and what is missing.
     """
-    shape = None
-    lines: list[tuple[int, str]] = []
-    for number, line in enumerate(text.splitlines(), 1):
-        if found := _SHAPE.fullmatch(line.strip()):
-            shape = (int(found[1]), int(found[2]))
-        elif line.strip() and not line.startswith("#"):
-            lines.append((number, line))
-    if not lines:
-        raise ExchangeError(f"{file} holds no table", {"allowed": list(VECTOR_NAMES)})
-    header = [name.strip() for name in next(csv.reader([lines[0][1]]))]
+    shape = _SHAPE.search(text)
+    lines = [
+        (number, next(csv.reader([line])))
+        for number, line in enumerate(text.splitlines(), 1)
+        if line.strip() and not line.startswith("#")
+    ]
+    header = [name.strip() for name in lines[0][1]] if lines else []
     lost = [name for name in VECTOR_NAMES if name not in header]
     if lost:
         raise ExchangeError(
@@ -99,8 +96,7 @@ def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
         )
     at = [header.index(name) for name in VECTOR_NAMES]
     rows, files = [], []
-    for number, line in lines[1:]:
-        cells = next(csv.reader([line]))
+    for number, cells in lines[1:]:
         if len(cells) != len(header):
             raise ExchangeError(
                 f"{file}:{number}: {len(cells)} cells; the header has {len(header)}",
@@ -108,8 +104,11 @@ def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
             )
         rows.append(_numbers([cells[i] for i in at], file, number))
         files.append(cells[header.index("file")] if "file" in header else "")
-    cone_vec = cone_vec_of(rows, file)
-    return ScanGeometry(cone_vec, shape, files=tuple(files) if all(files) else ())
+    return ScanGeometry(
+        cone_vec_of(rows, file),
+        (int(shape[1]), int(shape[2])) if shape else None,
+        files=tuple(files) if all(files) else (),
+    )
 
 
 def tomosipo_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
@@ -163,39 +162,35 @@ def cone_vec_of(numbers: npt.ArrayLike, file: str) -> ConeVec:
     rows = np.asarray(numbers, dtype=np.float64).reshape(-1, 12)
     if not len(rows):
         raise ExchangeError(f"{file} holds no view")
-    finite = np.isfinite(rows).all(axis=1)
-    if not finite.all():
-        view = int(np.flatnonzero(~finite)[0])
-        raise ExchangeError(f"{file}: view {view} is not finite", {"row": view})
     area = np.linalg.norm(np.cross(rows[:, 6:9], rows[:, 9:12]), axis=1)
-    if (area <= 0.0).any():
-        view = int(np.argmin(area))
-        raise ExchangeError(f"{file}: in view {view} u and v span no panel", {"row": view})
+    for wrong, what in (
+        (~np.isfinite(rows).all(axis=1), "a number is not finite"),
+        (area <= 0.0, "u and v span no panel"),
+    ):
+        if wrong.any():
+            view = int(np.argmax(wrong))
+            raise ExchangeError(f"{file}: in view {view} {what}", {"row": view})
     return ConeVec(rows)
 
 
 def _numbers(words: Sequence[str], file: str, line: int) -> list[float]:
-    """The twelve finite numbers of a row.
+    """The twelve numbers of a row.
 
     Raises:
         ExchangeError: names file and line.
     """
-    where = {"line": line, "path": file}
-    if len(words) != 12:
+    try:
+        found = [float(word) for word in words]
+    except ValueError as error:
+        word = str(error).partition(": ")[2][:42]
+        said = f"{file}:{line}: {word} is no number"
+        raise ExchangeError(said, {"line": line, "path": file}) from None
+    if len(found) != 12:
         raise ExchangeError(
-            f"{file}:{line}: {len(words)} numbers; needed: 12",
-            {**where, "asked": len(words), "allowed": 12},
+            f"{file}:{line}: {len(found)} numbers; needed: 12",
+            {"line": line, "path": file, "asked": len(found), "allowed": 12},
         )
-    out = []
-    for word in words:
-        try:
-            value = float(word)
-        except ValueError:
-            raise ExchangeError(f"{file}:{line}: {word[:40]!r} is no number", where) from None
-        if not np.isfinite(value):
-            raise ExchangeError(f"{file}:{line}: {word[:40]!r} is not finite", where)
-        out.append(value)
-    return out
+    return found
 
 
 def _real(array: npt.NDArray[np.generic]) -> bool:
@@ -204,6 +199,24 @@ def _real(array: npt.NDArray[np.generic]) -> bool:
 
 KIND: Final = "flexdt geometry"
 SCHEMA: Final = 1
+Rows = list[Annotated[list[float], Field(min_length=12, max_length=12)]]
+Texts = Annotated[tuple[str, ...], Field(strict=False)]
+
+
+class _Panel(BaseModel):
+    rows: PositiveInt | None = None
+    columns: PositiveInt | None = None
+
+
+class _Document(BaseModel):
+    model_config = ConfigDict(strict=True)
+    name: str = ""
+    detector: _Panel = _Panel()
+    cone_vec: Rows
+    real_cone_vec: Rows | None = None
+    files: Texts = ()
+    notes: Texts = ()
+    full_scale: int | None = None
 
 
 def geometry_text(geometry: ScanGeometry) -> str:
@@ -237,31 +250,26 @@ def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
         ExchangeError: names file and key.
     """
     document = read_json(text, file)
-    if document.get("kind") != KIND or document.get("schema") != SCHEMA:
-        raise ExchangeError(
-            f"{file}: kind {document.get('kind')!r}, schema {document.get('schema')!r}; this "
-            f"version reads {KIND!r}, schema {SCHEMA}",
-            {"allowed": [KIND, SCHEMA]},
-        )
-    detector = document.get("detector")
-    sizes = [detector.get(k) if isinstance(detector, dict) else None for k in ("rows", "columns")]
-    shape = None
-    if any(size is not None for size in sizes):
-        if not all(type(size) is int and size > 0 for size in sizes):
-            raise ExchangeError(f"{file}: detector: rows and columns must be whole numbers above 0")
-        shape = (int(sizes[0]), int(sizes[1]))  # type: ignore[arg-type]
-    full_scale = document.get("full_scale")
-    if full_scale is not None and type(full_scale) is not int:
-        raise ExchangeError(f"{file}: full_scale must be a whole number")
-    real = document.get("real_cone_vec")
+    if (said := (document.get("kind"), document.get("schema"))) != (KIND, SCHEMA):
+        what = f"{file}: kind {said[0]!r}, schema {said[1]!r}"
+        raise ExchangeError.instead(what, list(said), f"{KIND!r}, schema {SCHEMA}")
+    try:
+        found = _Document.model_validate(document)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise ExchangeError(f"{file}: {where}: {first['msg']}", {"path": where}) from None
+    rows, columns, real = found.detector.rows, found.detector.columns, found.real_cone_vec
+    if (rows is None) != (columns is None):
+        raise ExchangeError(f"{file}: detector: rows and columns must be whole numbers above 0")
     return ScanGeometry(
-        _cone_vec(document.get("cone_vec"), "cone_vec", file),
-        shape,
-        None if real is None else _cone_vec(real, "real_cone_vec", file),
-        str(document.get("name") or ""),
-        _texts(document.get("files"), "files", file),
-        _texts(document.get("notes"), "notes", file),
-        full_scale,
+        cone_vec_of(found.cone_vec, f"{file}: cone_vec"),
+        None if rows is None or columns is None else (rows, columns),
+        None if real is None else cone_vec_of(real, f"{file}: real_cone_vec"),
+        found.name,
+        found.files,
+        found.notes,
+        found.full_scale,
     )
 
 
@@ -278,21 +286,3 @@ def read_json(text: str, file: str, kind: type[dict[str, Any]] = dict) -> dict[s
     if not isinstance(document, dict):
         raise ExchangeError(f"{file}: not a JSON object", {"path": file})
     return document
-
-
-def _cone_vec(value: object, name: str, file: str) -> ConeVec:
-    try:
-        rows = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        rows = np.zeros(0)
-    if rows.ndim != 2 or rows.shape[1:] != (12,):
-        raise ExchangeError(f"{file}: {name} must be rows of twelve numbers", {"path": name})
-    return cone_vec_of(rows, f"{file}: {name}")
-
-
-def _texts(value: object, name: str, file: str) -> tuple[str, ...]:
-    if value is None:
-        return ()
-    if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
-        raise ExchangeError(f"{file}: {name} must be a list of texts", {"path": name})
-    return tuple(value)

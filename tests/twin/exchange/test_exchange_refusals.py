@@ -39,7 +39,7 @@ def test_flexdata_refuses_what_it_cannot_state() -> None:
     uneven = ScanGeometry(some_poses(np.random.default_rng(2), even=False).cone_vec(), SHAPE)
     with pytest.raises(ExchangeError, match="no list of angles"):
         flexdata_text(uneven)
-    with pytest.raises(ExchangeError, match="view 2 lies"):
+    with pytest.raises(ExchangeError, match=r"one circle .* in view 2"):
         flexdata_text(changed(2, 0.1))
     with pytest.raises(ExchangeError, match="cosine"):
         flexdata_text(changed(9, 0.1))
@@ -55,11 +55,11 @@ def test_flexdata_takes_rounded_angles() -> None:
 
 
 def test_rtk_refuses_skew_and_changing_pixels() -> None:
-    with pytest.raises(ExchangeError, match="view 2 their cosine"):
+    with pytest.raises(ExchangeError, match="their cosine in view 2"):
         rtk_text(changed(9, 0.1))
     rows = STILL.cone_vec.rows.copy()
     rows[3, 6:12] *= 1.01
-    with pytest.raises(ExchangeError, match="one pixel size; in view 3"):
+    with pytest.raises(ExchangeError, match="one pixel size; its change in view 3"):
         rtk_text(ScanGeometry(ConeVec(rows), SHAPE))
     flat = ConeVec.from_vectors([0, 0, 5.0], [9, 0, 5.0], [1.0, 0, 0], [0, 1.0, 0])
     with pytest.raises(ExchangeError, match="panel's plane"):
@@ -109,7 +109,7 @@ def test_bad_arrays(array: np.ndarray[Any, Any]) -> None:
 def test_bad_tables() -> None:
     with pytest.raises(ExchangeError, match="header lacks source_x"):
         read_csv("a,b\n1,2\n")
-    with pytest.raises(ExchangeError, match="holds no table"):
+    with pytest.raises(ExchangeError, match="header lacks source_x"):
         read_csv("# nothing\n")
     good = tomosipo_arrays(STILL)
     with pytest.raises(ExchangeError, match="lacks det_v"):
@@ -150,13 +150,13 @@ def test_bad_rtk(text: str, says: str) -> None:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (("det_pixel", None), "det_pixel is missing"),
-        (("det_pixel", '"big"'), "no number"),
+        (("det_pixel", None), "det_pixel must be 1 finite"),
+        (("det_pixel", '"big"'), "det_pixel must be 1 finite"),
         (("axs_roll", "1.0"), "axs_roll is not zero"),
         (("vol_rot", "[0.0, 1.0, 0.0]"), "vol_rot is not zero"),
-        (("ang_range", "[0.0]"), "ang_range must be 2 numbers"),
+        (("ang_range", "[0.0]"), "ang_range must be 2 finite"),
         (("proj_count", None), "how many views"),
-        (("src2obj", None), "src2obj is missing"),
+        (("src2obj", None), "two of src2obj, det2obj and src2det"),
     ],
 )
 def test_bad_flexdata(change: tuple[str, str | None], says: str) -> None:
