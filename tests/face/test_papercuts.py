@@ -109,7 +109,7 @@ def test_a_signal_of_another_panel_is_not_read_out() -> None:
     machine = builtin_machine()
     signal = np.ones((40, 50), np.float32)
     exposure = ExposureSettings(90.0, 50.0, 100.0)
-    with pytest.raises(LimitError, match=r"\(40, 50\) pixels and a camera of \(760, 956\)"):
+    with pytest.raises(LimitError, match=r"of shape \(40, 50\); allowed: \(760, 956\)"):
         read_out(
             detector_of(machine.detector),
             Expected(signal, signal),

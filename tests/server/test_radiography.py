@@ -659,7 +659,7 @@ def test_a_scan_whose_images_cannot_be_made_fails_and_the_next_one_runs(tmp_path
             assert (bad.phase, good.phase) == ("failed", "done")
             error = twin.jobs.status(bad).error
             assert error is not None
-            assert "no spectrum for 15 kV" in str(error["message"])
+            assert "the voltage of a spectrum is 15;" in str(error["message"])
         finally:
             await twin.stop()
 

@@ -101,7 +101,7 @@ def test_the_tables_agree_with_independent_ones() -> None:
 
     for formula, worst in (("C5H8O2", 0.005), ("H2O", 0.005), ("Al", 0.005), ("Fe", 0.012)):
         one = Substance.of(formula, formula, 1.0)
-        found = cross_sections([one])
+        found = cross_sections((one,))
         for energy in (30.25, 60.25, 150.25):
             at = int(np.searchsorted(ENERGY, energy))
             for kind, values in (("coh", found.coherent), ("incoh", found.incoherent)):

@@ -18,7 +18,7 @@ def followed(
     screen: Filter, keV: float, rng: np.random.Generator, number: int = 200_000
 ) -> np.ndarray:
     """Part of the energy kept, mean and mean square: K and Compton photons fly once more."""
-    sections, energy = cross_sections([screen.substance]), tables().energy_keV
+    sections, energy = cross_sections((screen.substance,)), tables().energy_keV
 
     def at(values: np.ndarray, e: np.ndarray | float) -> np.ndarray:
         return np.interp(e, energy, values)

@@ -212,5 +212,5 @@ def test_setup_names_the_physics_and_draws_the_spectrum(page: Any, wait: Wait) -
     page.click("#predict")
     wait(lambda: "contrast to noise of" in page.inner_text("#predicted"), "a prediction")
     refused = page.evaluate("flexdt.call('viewer.spectrum', {kV: 900}).catch((e) => e.message)")
-    assert "no spectrum for 900 kV" in refused
+    assert "the voltage of a spectrum is 900;" in refused
     page.click("#tabs [data-tab=move]")

@@ -10,7 +10,6 @@ atoms, which shapes coherent scattering below x = 0.3 in liquids, plastics and m
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -27,29 +26,6 @@ ELECTRON_KEV = 510.99895
 """Rest energy of the electron [keV]."""
 AVOGADRO_BARN = 0.602214076
 """Avogadro's number times a barn [cm2/mol]."""
-
-
-@dataclass(frozen=True, eq=False)
-class ScatteringTables:
-    """All arrays are read-only.
-
-    Attributes:
-        x: (q,) momentum transfer sin(theta / 2) / lambda [1/A]; its square root grows evenly.
-        form_factor, incoherent: (92, q) F and S of an atom, by atomic number from 1.
-        provenance: where the numbers come from.
-    """
-
-    x: FloatArray
-    form_factor: FloatArray
-    incoherent: FloatArray
-    provenance: Mapping[str, str]
-
-
-@lru_cache
-def scattering_tables() -> ScatteringTables:
-    """The shipped tables."""
-    arrays, provenance = stored_arrays("scattering.npz")
-    return ScatteringTables(arrays["x"], arrays["form_factor"], arrays["incoherent"], provenance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,38 +52,38 @@ class CrossSections:
     cumulated: FloatArray
 
 
-def cross_sections(substances: Sequence[Substance]) -> CrossSections:
+@lru_cache(maxsize=16)
+def cross_sections(substances: tuple[Substance, ...]) -> CrossSections:
     """Cross-sections of substances at their densities.
 
     Args:
         substances: m materials, at least one.
 
     Example:
-        >>> water = cross_sections([Substance.of("water", "H2O", 1.0)])
+        >>> water = cross_sections((Substance.of("water", "H2O", 1.0),))
         >>> at = int(np.searchsorted(water.energy_keV, 60.0))
         >>> round(float(water.incoherent[0, at]), 4)  # XCOM: 0.0177 1/mm
         0.0177
     """
-    stored, attenuation = scattering_tables(), tables()
-    energy = attenuation.energy_keV
-    form, shell = np.zeros((2, len(substances), len(stored.x)))
+    energy, stored = tables().energy_keV, stored_arrays("scattering.npz")[0]
+    # Of an atom by atomic number from 1, (92, q), at (q,) values of x whose root grows evenly.
+    x, form_factor, function = (stored[name] for name in ("x", "form_factor", "incoherent"))
+    form, shell = np.zeros((2, len(substances), len(x)))
     for m, one in enumerate(substances):
-        whole = sum(part for _, part in one.fractions)
-        for symbol, part in one.fractions:
-            row = attenuation.elements[symbol]
-            atoms = part / whole / attenuation.molar_mass[row] * AVOGADRO_BARN
+        for row, part in one.parts:
+            atoms = part / tables().molar_mass[row] * AVOGADRO_BARN
             atoms = atoms * one.density_g_cm3 / 10.0
-            form[m] += atoms * RADIUS2_BARN * stored.form_factor[row] ** 2
-            shell[m] += atoms * RADIUS2_BARN * stored.incoherent[row]
-    rings = np.diff(stored.x**2) * (form[:, 1:] + form[:, :-1]) / 2.0
+            form[m] += atoms * RADIUS2_BARN * form_factor[row] ** 2
+            shell[m] += atoms * RADIUS2_BARN * function[row]
+    rings = np.diff(x**2) * (form[:, 1:] + form[:, :-1]) / 2.0
     cumulated = np.concatenate([np.zeros((len(form), 1)), np.cumsum(rings, axis=1)], axis=1)
     # Integrals over the sphere, in w = sin(theta / 2)^(1/2): the forward peak is broad there.
     points, weights = np.polynomial.legendre.leggauss(160)
     w, dw = (points + 1.0) / 2.0, weights / 2.0
     cosine, ring = 1.0 - 2.0 * w**4, 2.0 * np.pi * 8.0 * w**3 * dw
-    root_step = float(np.sqrt(stored.x[1]))
+    root_step = float(np.sqrt(x[1]))
     column = np.sqrt(energy[:, None] / HC_KEV_A) * w / root_step
-    index = np.arange(len(stored.x))
+    index = np.arange(len(x))
     k = 1.0 / (1.0 + energy[:, None] / ELECTRON_KEV * (1.0 - cosine))
     thomson = 0.5 * (1.0 + cosine**2) * ring
     klein_nishina = 0.5 * k**2 * (k + 1.0 / k - 1.0 + cosine**2) * ring

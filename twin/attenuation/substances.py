@@ -104,25 +104,23 @@ class Substance:
     density_g_cm3: float
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.density_g_cm3 <= HIGHEST_DENSITY:
-            raise LimitError(
-                f"{self.name}: density {self.density_g_cm3:g} g/cm3; allowed: above 0 and at most "
-                f"{HIGHEST_DENSITY:g}",
-                {"asked": self.density_g_cm3, "allowed": [0.0, HIGHEST_DENSITY]},
-            )
+        if not 0.0 < (density := self.density_g_cm3) <= HIGHEST_DENSITY:
+            said = f"{self.name}: density {density:g} g/cm3"
+            raise LimitError.instead(said, density, f"above 0 and at most {HIGHEST_DENSITY:g}")
         for symbol, part in self.fractions:
             _row(symbol)
             if not part > 0.0:
-                raise LimitError(
-                    f"{self.name}: mass fraction {part:g} of {symbol}; it must be positive",
-                    {"asked": part, "allowed": "> 0"},
-                )
+                said = f"{self.name}: mass fraction {part:g} of {symbol}"
+                raise LimitError.instead(said, part, "above 0")
         whole = sum(part for _, part in self.fractions)
         if not math.isclose(whole, 1.0, abs_tol=2e-3):
-            raise LimitError(
-                f"{self.name}: mass fractions add up to {whole:g}, not 1",
-                {"asked": whole, "allowed": 1.0},
-            )
+            raise LimitError.instead(f"{self.name}: mass fractions add up to {whole:g}", whole, 1.0)
+
+    @property
+    def parts(self) -> list[tuple[int, float]]:
+        """Its elements' rows of the tables and mass fractions, which add up to 1 exactly."""
+        whole = sum(part for _, part in self.fractions)
+        return [(_row(symbol), part / whole) for symbol, part in self.fractions]
 
     @classmethod
     def of(cls, name: str, formula: str, density_g_cm3: float) -> Substance:
@@ -141,24 +139,17 @@ class Substance:
         Raises:
             UnknownNameError, LimitError: as `of`, or it is not written so.
         """
-        formula, at, density = text.partition("@")
+        formula, _, density = text.partition("@")
         try:
             value = float(density)
         except ValueError:
-            why = (
-                f": {density!r} is no density in g/cm3"
-                if at
-                else " is not FORMULA@DENSITY (g/cm3), such as Cu@8.96"
-            )
-            asked = {"asked": text, "allowed": "FORMULA@DENSITY"}
-            raise LimitError(f"material {text!r}{why}", asked) from None
+            allowed = "FORMULA@DENSITY (g/cm3), such as Cu@8.96"
+            raise LimitError.instead(f"material {text!r}", text, allowed) from None
         return cls.of(text, formula.strip(), value)
 
     def mass_attenuation(self) -> FloatArray:
         """mu/rho at the energies of the tables, (e,) [cm2/g]."""
-        whole = sum(part for _, part in self.fractions)
-        mu = sum(part / whole * tables().total[_row(symbol)] for symbol, part in self.fractions)
-        return np.asarray(mu)
+        return np.asarray(sum(part * tables().total[row] for row, part in self.parts))
 
     def attenuation(self) -> FloatArray:
         """Linear attenuation coefficient at the energies of the tables, (e,) [1/mm]."""
@@ -166,10 +157,7 @@ class Substance:
 
     def attenuation_at(self, energy_keV: float) -> float:
         """Linear attenuation coefficient at one energy [1/mm]: that of its own side of an edge."""
-        whole = sum(part for _, part in self.fractions)
-        mu = sum(
-            part / whole * _mass_at(_row(symbol), energy_keV) for symbol, part in self.fractions
-        )
+        mu = sum(part * _mass_at(row, energy_keV) for row, part in self.parts)
         return float(mu * self.density_g_cm3 / 10.0)
 
 
@@ -231,8 +219,6 @@ def _row(symbol: str) -> int:
 
 
 def _unreadable(formula: str, at: int) -> LimitError:
-    return LimitError(
-        f"formula {formula!r} cannot be read at character {at + 1}; allowed: element symbols with "
-        "counts and parentheses, such as C15H17N or Ca5(PO4)3OH",
-        {"asked": formula, "at": at},
-    )
+    allowed = "element symbols with counts and parentheses, such as C15H17N or Ca5(PO4)3OH"
+    said = f"formula {formula!r} cannot be read at character {at + 1}"
+    return LimitError.instead(said, formula, allowed, at=at)

@@ -69,7 +69,7 @@ def deposited(screen: Filter) -> Deposited:
     substance, thick = screen.substance, screen.thickness_mm
     if thick <= 0.0:
         return Deposited(*np.zeros((2, len(tables().energy_keV))))
-    sections, energy = cross_sections([substance]), tables().energy_keV
+    sections, energy = cross_sections((substance,)), tables().energy_keV
     total, compton = sections.total[0], sections.incoherent[0]
     stopping = total - sections.coherent[0]
     photo = stopping - compton

@@ -67,26 +67,16 @@ class EffectiveBeam:
         Returns:
             Two float32 arrays (...), in the units of `signal` and `noise`.
         """
-        shape = paths_mm.shape[1:]
-        flat = paths_mm.reshape(len(paths_mm), int(np.prod(shape)))
-        mean = np.empty(flat.shape[1], np.float32)
-        variance = np.empty_like(mean)
+        flat = paths_mm.reshape(len(paths_mm), int(np.prod(paths_mm.shape[1:])))
         mu = -self.mu.astype(np.float32)
-        signal, noise = self.signal.astype(np.float32), self.noise.astype(np.float32)
-        for start in range(0, len(mean), BLOCK):
-            part = flat[:, start : start + BLOCK]
-            s, v = mean[start : start + BLOCK], variance[start : start + BLOCK]
-            s[:], v[:] = 0.0, 0.0
-            t = np.empty_like(s)
-            more = np.empty_like(s)
-            for k in range(len(signal)):
-                t[:] = 0.0
-                for m in range(len(part)):
-                    t += np.multiply(part[m], mu[m, k], out=more)
-                np.exp(t, out=t)
-                s += np.multiply(t, signal[k], out=more)
-                v += np.multiply(t, noise[k], out=more)
-        return mean.reshape(shape), variance.reshape(shape)
+        weights = np.array([self.signal, self.noise], dtype=np.float32)
+        out = np.empty((2, flat.shape[1]), np.float32)
+        for start in range(0, flat.shape[1], BLOCK):
+            part = slice(start, start + BLOCK)
+            through = np.exp(np.einsum("mk,mp->kp", mu, flat[:, part]))
+            out[:, part] = np.einsum("wk,kp->wp", weights, through)
+        mean, variance = out.reshape(2, *paths_mm.shape[1:])
+        return mean, variance
 
 
 def effective_beam(
@@ -110,11 +100,8 @@ def effective_beam(
         TwinError: not reached with `MOST` energies.
     """
     if not signal.max() > 0.0:
-        raise LimitError(
-            "no photon leaves anything in the detector; allowed: one that absorbs some of the "
-            "spectrum",
-            {"asked": 0.0, "allowed": "> 0"},
-        )
+        said = "no photon leaves anything in the detector"
+        raise LimitError.instead(said, 0.0, "one that absorbs some of the spectrum")
     used = np.flatnonzero(signal > signal.max() * 1e-9)
     mu = np.array([s.attenuation()[used] for s in substances]).reshape(len(substances), len(used))
     paths = sample_paths(mu, signal[used], thickest_mm)

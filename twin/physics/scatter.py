@@ -12,14 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from hashlib import blake2b
 from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.attenuation.scattering import CrossSections, cross_sections
+from flexdt.twin.attenuation.scattering import cross_sections
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import GeometryError, LimitError, require_within
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
@@ -204,10 +204,7 @@ def scatter_image(
     source, centre, u, v = row[0:3], row[3:6], row[6:9], row[9:12]
     rows, cols = shape
     nv, nu = _node_counts(shape, float(np.linalg.norm(v) / np.linalg.norm(u)), wanted.nodes)
-    blank = np.zeros((nv, nu))
-    sections = _sections(thing.substances)
-    if not thing.substances or not thing.amounts.any():
-        return ScatterImage(blank, blank, blank, blank, shape, 0, np.zeros(kernels.TALLIES))
+    sections = cross_sections(thing.substances)
     row_of = np.linspace(0, rows - 1, nv)[:, None, None] - (rows - 1) / 2
     col_of = np.linspace(0, cols - 1, nu)[None, :, None] - (cols - 1) / 2
     nodes = np.ascontiguousarray((centre + row_of * v + col_of * u).reshape(-1, 3))
@@ -216,11 +213,14 @@ def scatter_image(
     away = nodes - source
     distance = np.linalg.norm(away, axis=1)
     per_open = distance**3 / (away @ normal)
-    left, top, right, bottom = _lit(thing, row, shape, wanted.collimated)
+    there = bool(thing.substances) and thing.amounts.any()
+    lit = _lit(thing, row, shape, wanted.collimated) if there else (0.0, 0.0, 0.0, 0.0)
+    left, top, right, bottom = lit
     corner = centre + left * u + top * v
     along_u, along_v = (right - left) * u, (bottom - top) * v
     area = float(np.linalg.norm(np.cross(along_u, along_v)))
     if not area > 0.0:
+        blank = np.zeros((nv, nu))
         return ScatterImage(blank, blank, blank, blank, shape, 0, np.zeros(kernels.TALLIES))
 
     bins = np.flatnonzero(beam.signal > 0.0)
@@ -265,11 +265,6 @@ def scatter_image(
         done * BATCHES,
         tally / max(tally[0], 1e-300),
     )
-
-
-@lru_cache(maxsize=16)
-def _sections(substances: tuple[Substance, ...]) -> CrossSections:
-    return cross_sections(substances)
 
 
 def _energy_chances(

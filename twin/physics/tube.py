@@ -147,11 +147,7 @@ def tube_spectrum(kV: float, tube: TubeModel | None = None) -> Spectrum:
     """
     stored = tables()
     low, high = voltages()
-    if not low <= kV <= high:
-        raise LimitError(
-            f"no spectrum for {kV:g} kV; the tables reach from {low:g} to {high:g} kV",
-            {"asked": kV, "allowed": [low, high], "unit": "kV"},
-        )
+    require_within("the voltage of a spectrum", kV, low, high, "kV")
     after = max(1, int(np.searchsorted(stored.kV, kV)))
     before = after - 1
     part = (kV - stored.kV[before]) / (stored.kV[after] - stored.kV[before])
@@ -160,10 +156,8 @@ def tube_spectrum(kV: float, tube: TubeModel | None = None) -> Spectrum:
     behind = Spectrum(bare).behind(*layers)
     if not behind.photons > NOTHING:
         names = ", ".join(f"{one.thickness_mm:g} mm of {one.substance.name}" for one in layers)
-        raise LimitError(
-            f"at {kV:g} kV nothing comes through the tube's filters ({names})",
-            {"asked": kV, "allowed": "thinner filters or a higher voltage"},
-        )
+        said = f"at {kV:g} kV nothing comes through the tube's filters ({names})"
+        raise LimitError.instead(said, kV, "thinner filters or a higher voltage")
     return behind
 
 
@@ -176,11 +170,7 @@ def monochromatic(energy_keV: float) -> Spectrum:
     energy = tables().energy_keV
     step = float(energy[1] - energy[0])
     low, high = float(energy[0]) - step / 2, float(energy[-1]) + step / 2
-    if not low <= energy_keV <= high:
-        raise LimitError(
-            f"no bin for {energy_keV:g} keV; the tables reach from {low:g} to {high:g} keV",
-            {"asked": energy_keV, "allowed": [low, high], "unit": "keV"},
-        )
+    require_within("the energy of photons", energy_keV, low, high, "keV")
     fluence = np.zeros_like(energy)
     fluence[min(int((energy_keV - low) / step), len(fluence) - 1)] = 1.0
     return Spectrum(fluence)
@@ -225,11 +215,7 @@ class Tube:
         if self.mono_keV is not None:
             monochromatic(self.mono_keV)
         if self.filters is not None:
-            layers = tuple(_filter(one) for one in self.filters)
-            object.__setattr__(self, "filters", layers)
-            for one in layers:
-                name = f"Tube: filter {one.substance.name}"
-                require_within(name, one.thickness_mm, 0.0, 1e3, "mm")
+            object.__setattr__(self, "filters", tuple(map(_filter, self.filters)))
 
     def model(self, design: TubeModel | None = None) -> TubeModel:
         """Filters and focal spot; those of `design` where this tube states none.
@@ -257,8 +243,8 @@ class Tube:
 
 
 def _filter(layer: tuple[str, float] | Filter) -> Filter:
-    if isinstance(layer, Filter):
-        return layer
-    material, thickness_mm = layer
-    require_within(f"Tube: filter {material}", thickness_mm, 0.0, 1e3, "mm")
-    return Filter(Substance.parse(material), float(thickness_mm))
+    if not isinstance(layer, Filter):
+        layer = Filter(Substance.parse(layer[0]), float(layer[1]))
+    name = f"Tube: filter {layer.substance.name}"
+    require_within(name, layer.thickness_mm, 0.0, 1e3, "mm")
+    return layer

@@ -326,7 +326,7 @@ BAD: tuple[tuple[str, Any, str], ...] = (
     ("detector.bad_pixel_map", {"file": {"value": "map.raw"}}, "bad_pixel_map.file .* null"),
     ("detector.image_lag", {"value": 1.0}, "image_lag .* below 1"),
     ("detector.noise.snr_at_imax.value", 0, "snr_at_imax .* above 0"),
-    ("source.voltage", {"value": 300, "unit": "kV"}, "source.voltage: no bin for 300 keV"),
+    ("source.voltage", {"value": 300, "unit": "kV"}, "source.voltage: the energy of photons is"),
     ("source.voltage.unit", "furlong", "source.voltage.unit is \"furlong\"; allowed: kV, V, MV"),
     ("source.current.value", -1, "source.current .* above 0"),
     ("source.target", {"material_id": "Al"}, None),  # read with a computed spectrum alone
