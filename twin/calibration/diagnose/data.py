@@ -10,12 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections, SpotFinder
-from flexdt.twin.calibration.diagnose import Finding, Severity, error, warning
+from flexdt.twin.calibration.diagnose import Finding, error, warning
 from flexdt.twin.calibration.diagnose.fitted import moving, named_turn
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
 from flexdt.twin.calibration.fit.fitted_motion import MotionFit
@@ -77,7 +79,7 @@ def judge_frames(name: str, looks: Sequence[FrameSpots], sought: SpotFinder) -> 
             more = f" (and {len(files) - SHOWN} more)" if len(files) > SHOWN else ""
             text += f"; unusable: {'; '.join(files[:SHOWN])}{more}"
         if some:
-            out.append(Finding(code, Severity.ERROR if len(some) == n else Severity.WARNING, text))
+            out.append((error if len(some) == n else warning)(code, text))
     usable = [look for look in looks if look.state is FrameState.USABLE]
     empty = sum(len(look.detections) == 0 for look in usable)
     if usable and empty == len(usable):
@@ -129,9 +131,9 @@ def explain_identification(
     """Judge an assignment; if it is poor, find the mistake that explains the spots."""
     most = max((len(d) for d in detections), default=0)
     if most == 1:
-        return Finding(
+        judged = warning if len(model) == 1 and found is not None else error
+        return judged(
             "one_bead",
-            Severity.WARNING if len(model) == 1 and found is not None else Severity.ERROR,
             f"{name}: no frame shows more than one bead: one bead alone fixes neither the "
             "scale nor the angle",
         )
@@ -145,39 +147,36 @@ def explain_identification(
         )
     if found is not None:
         found = _without_bad_frames(found)
-    missing = _missing(found)
-    if missing and found is not None and found.explained < SOME_SPOTS:
-        listed = ", ".join(map(str, missing))
-        return warning(
-            "bead_displaced",
-            f"{name}: bead {listed} of {model.name!r} has no spot where it should be, and in "
-            f"each frame {_left_over(found, detections):.1f} spots are no bead: it is "
-            "elsewhere, or lost; the others are used",
-        )
-    if missing:
-        listed = ", ".join(map(str, missing))
-        return warning(
-            "beads_missing",
-            f"{name}: bead {listed} of {model.name!r} has no spot in any frame, and all spots "
-            "fit the others: it is lost or out of view; the others are used",
-        )
-    if found is not None and _convincing(found):
-        if found.explained > SOME_SPOTS or not _extra(found, detections):
-            return None
-        return warning(
-            "extra_spots",
-            f"{name}: in each frame {_left_over(found, detections):.1f} of the spots are none "
-            f"of the beads of {model.name!r}: other balls, or something round; not used",
-        )
+        counts = np.array([len(d) for d in detections])
+        rest = (1.0 - found.explained) * counts.sum() / max(int((counts > 0).sum()), 1)
+        if missing := _missing(found):
+            whose = f"{name}: bead {', '.join(map(str, missing))} of {model.name!r} has no spot"
+            if found.explained >= SOME_SPOTS:
+                return warning(
+                    "beads_missing",
+                    f"{whose} in any frame, and all spots fit the others: it is lost or out of "
+                    "view; the others are used",
+                )
+            return warning(
+                "bead_displaced",
+                f"{whose} where it should be, and in each frame {rest:.1f} spots are no bead: it "
+                "is elsewhere, or lost; the others are used",
+            )
+        if _convincing(found):
+            if found.explained > SOME_SPOTS or not _extra(found, counts):
+                return None
+            return warning(
+                "extra_spots",
+                f"{name}: in each frame {rest:.1f} of the spots are none of the beads of "
+                f"{model.name!r}: other balls, or something round; not used",
+            )
     explanation = _alternative(found, detections, model, poses)
     if explanation is not None:
-        code, text = explanation
-        return error(code, f"{name}: {text}")
+        return replace(explanation, text=f"{name}: {explanation.text}")
     if found is not None and _plausible(found):
         return None
-    if found is None:
-        why = "no orientation of the phantom explains them"
-    else:
+    why = "no orientation of the phantom explains them"
+    if found is not None:
         why = (
             f"at best {100 * found.explained:.0f} % of the shadows are a bead, "
             f"{100 * found.found:.0f} % of the beads in view have a shadow, and they lie "
@@ -196,18 +195,12 @@ def explain_identification(
     )
 
 
-def _extra(found: Identification, detections: Sequence[Detections]) -> bool:
-    """Whether most of the frames in which the beads are where they should be show other spots."""
+def _extra(found: Identification, counts: npt.NDArray[np.intp]) -> bool:
+    """Whether most of the frames in which the beads are where they should be show other spots than
+    them; `counts` are those of all."""
     seen = (found.index >= 0).sum(axis=1)
-    counts = np.array([len(d) for d in detections])
     good = seen >= 0.7 * max(float(np.median(seen)), 1.0)
     return bool(np.mean(counts[good] > seen[good]) > 0.6)
-
-
-def _left_over(found: Identification, detections: Sequence[Detections]) -> float:
-    """Spots of a frame, on average, that are no bead."""
-    counts = np.array([len(d) for d in detections])
-    return float((1.0 - found.explained) * counts.sum() / max(int((counts > 0).sum()), 1))
 
 
 def _without_bad_frames(found: Identification) -> Identification:
@@ -221,9 +214,9 @@ def _without_bad_frames(found: Identification) -> Identification:
     return replace(found, index=np.where(bad[:, None], -1, found.index), rms_px=found.typical_px)
 
 
-def _missing(found: Identification | None) -> list[int]:
+def _missing(found: Identification) -> list[int]:
     """Beads without any spot where every spot fits one of the others, at least three of them."""
-    if found is None or found.explained < GOOD_SHARE or not found.rms_px < GOOD_RMS_PX:
+    if found.explained < GOOD_SHARE or not found.rms_px < GOOD_RMS_PX:
         return []
     share = (found.index >= 0).mean(axis=0)
     lost = share < STRAY_SHARE
@@ -262,46 +255,39 @@ def _alternative(
     detections: Sequence[Detections],
     model: BeadModel,
     poses: Poses,
-) -> tuple[str, str] | None:
+) -> Finding | None:
     """The first mistake under which phantom and spots agree."""
-    n = len(poses)
-    trials: list[tuple[str, str, BeadModel, Poses, Sequence[Detections]]] = []
-    if n > 1:
-        for factor, text in (
-            (n / (n - 1), f"the frames turn by 360 / {n - 1}, not 360 / {n} (endpoint error)"),
-            ((n - 1) / n, f"the frames turn by 360 / {n}, not 360 / {n - 1} (endpoint error)"),
-        ):
-            turned = replace(poses, angle=poses.angle[0] + factor * (poses.angle - poses.angle[0]))
-            trials.append(
-                ("angle_endpoint", f"the angles are off by a factor {factor:.5f}: {text}",
-                 model, turned, detections)
-            )  # fmt: skip
+    n, k = len(poses), len(model)
+    trials: list[tuple[str, str, dict[str, Any]]] = []
+    for factor, true, said in ((n / (n - 1), n - 1, n), ((n - 1) / n, n, n - 1)) if n > 1 else ():
+        turned = replace(poses, angle=poses.angle[0] + factor * (poses.angle - poses.angle[0]))
+        text = (
+            f"the angles are off by a factor {factor:.5f}: the frames turn by 360 / {true}, not "
+            f"360 / {said} (endpoint error)"
+        )
+        trials.append(("angle_endpoint", text, {"poses": turned}))
+    across, along = (_flipped(detections, axis) for axis in (0, 1))
     trials += [
-        ("mirrored_phantom", "the phantom is the mirror image of its model", model.mirrored(),
-         poses, detections),
-        ("angle_reversed", "the stage turns the other way than the angles say: "
-         "negate the angles of the settings or of the geometry", model,
-         replace(poses, angle=-poses.angle), detections),
-        ("image_mirrored", "the images are mirrored left to right", model, poses,
-         _flipped(detections, 0)),
-        ("image_upside_down", "the images are upside down", model, poses, _flipped(detections, 1)),
-        ("image_turned", "the images are upside down and mirrored: turned by 180 deg", model, poses,
-         _flipped(_flipped(detections, 0), 1)),
-        ("phantom_upside_down", "the phantom stands on its head", model.turned_over(), poses,
-         detections),
-        ("not_turning", "the object does not turn although the angles say so", model,
-         replace(poses, angle=np.zeros(n)), detections),
+        ("mirrored_phantom", "the phantom is the mirror image of its model",
+         {"model": model.mirrored()}),
+        ("angle_reversed", "the stage turns the other way than the angles say: negate the angles "
+         "of the settings or of the geometry", {"poses": replace(poses, angle=-poses.angle)}),
+        ("image_mirrored", "the images are mirrored left to right", {"detections": across}),
+        ("image_upside_down", "the images are upside down", {"detections": along}),
+        ("image_turned", "the images are upside down and mirrored: turned by 180 deg",
+         {"detections": _flipped(across, 1)}),
+        ("phantom_upside_down", "the phantom stands on its head", {"model": model.turned_over()}),
+        ("not_turning", "the object does not turn although the angles say so",
+         {"poses": replace(poses, angle=np.zeros(n))}),
     ]  # fmt: skip
-    k = len(model)
     for j in range(k if 4 < k <= MOST_LEFT_OUT else 0):
         others = BeadModel(np.delete(model.beads, j, 0), np.delete(model.bead_radius_mm, j))
-        trials.append(
-            ("bead_displaced", f"without bead {j} the others fit: it is not where the phantom's "
-             "model has it", others, poses, detections)
-        )  # fmt: skip
+        text = f"without bead {j} the others fit: it is not where the phantom's model has it"
+        trials.append(("bead_displaced", text, {"model": others}))
+    given: dict[str, Any] = {"detections": detections, "model": model, "poses": poses}
     best: tuple[float, float, str, str] | None = None
-    for code, text, beads, geometry, shadows in trials:
-        other = attempt(shadows, beads, geometry)
+    for code, text, change in trials:
+        other = attempt(**(given | change))
         if other is None:
             continue
         better = (
@@ -315,7 +301,7 @@ def _alternative(
         if _convincing(other) and better and (best is None or off < best[:2]):
             best = (*off, code, text)
     if best is not None:
-        return best[2:]
+        return error(*best[2:])
     if found is not None and _plausible(found) and found.typical_px > 0.3 * found.rms_px:
         return None  # The right beads in about the right places: the residuals will tell.
     return (
@@ -326,9 +312,7 @@ def _alternative(
     )
 
 
-def _in_motion(
-    detections: Sequence[Detections], model: BeadModel, poses: Poses
-) -> tuple[str, str] | None:
+def _in_motion(detections: Sequence[Detections], model: BeadModel, poses: Poses) -> Finding | None:
     """Whether the spots are those of the phantom, but for something that moves."""
     found = attempt(detections, model, poses, search=Search(gate_px=WIDE_GATE_PX))
     if found is None or min(found.explained, found.found) < GOOD_SHARE:
@@ -347,13 +331,10 @@ def _in_motion(
             priors=ASSUMED, bound=math.inf,
         )  # fmt: skip
 
-    told = moving(fitted(), fitted)
-    return None if told is None else (told.code, told.text)
+    return moving(fitted(), fitted)
 
 
-def _in_parts(
-    detections: Sequence[Detections], model: BeadModel, poses: Poses
-) -> tuple[str, str] | None:
+def _in_parts(detections: Sequence[Detections], model: BeadModel, poses: Poses) -> Finding | None:
     """Whether the first or the last frames by themselves are those of the phantom; if both are, by
     what they differ."""
     n = len(poses)
@@ -369,25 +350,25 @@ def _in_parts(
         return None
     if len(ends) == 1:
         ((part, _),) = ends.values()
-        return "frame_numbers", (
+        return error(
+            "frame_numbers",
             f"frames {part.start} to {part.stop - 1} by themselves fit the phantom, all of "
-            "them do not: frames are missing, or their numbers or angles are wrong"
+            "them do not: frames are missing, or their numbers or angles are wrong",
         )
     first, last = (ends[end][1].to_edge() for end in ("first", "last"))
     turn = (last["alpha"] - first["alpha"] + 180.0) % 360.0 - 180.0
     if abs(turn) > LEAST_TURN_DEG:
         code, text = named_turn(turn, poses.angle)
-        return code, f"between the first and the last frames {text}"
+        return error(code, f"between the first and the last frames {text}")
     name = max(("dO_x", "dO_y", "dO_z"), key=lambda n: abs(last[n] - first[n]))
-    return "drift", (
+    return error(
+        "drift",
         f"the first and the last frames fit the phantom, but {name} changes by "
-        f"{last[name] - first[name]:+.3g} mm between them"
+        f"{last[name] - first[name]:+.3g} mm between them",
     )
 
 
-def _other_turn(
-    detections: Sequence[Detections], model: BeadModel, poses: Poses
-) -> tuple[str, str] | None:
+def _other_turn(detections: Sequence[Detections], model: BeadModel, poses: Poses) -> Finding | None:
     """Whether the stage turns by another angle than is stated, as neighbouring frames tell."""
     turned = poses.angle - poses.angle[0]
     n = int(np.count_nonzero(np.abs(turned) <= FEW_TURNED))
@@ -401,16 +382,15 @@ def _other_turn(
             best = own.rms_px, factor * own.parameters.angle_scale
     if abs(best[1] - 1.0) < LEAST_TURN:
         return None
-    return "angle_turn", (
+    return error(
+        "angle_turn",
         f"the first {n} frames fit the phantom if the stage turns {best[1]:.3f} times as far as "
         f"the angles say: {abs(math.degrees(float(turned[-1]))) * best[1]:.0f} deg from the first "
-        "to the last frame"
+        "to the last frame",
     )
 
 
-def _one_by_one(
-    detections: Sequence[Detections], model: BeadModel, poses: Poses
-) -> tuple[str, str] | None:
+def _one_by_one(detections: Sequence[Detections], model: BeadModel, poses: Poses) -> Finding | None:
     """Whether frames show the phantom each by itself."""
     chosen = np.linspace(0, len(poses) - 1, SAMPLED).astype(int).tolist()
     good = 0
@@ -421,7 +401,8 @@ def _one_by_one(
             good += _convincing(own) and own.explained > SOME_SPOTS
     if good < 0.7 * len(chosen):
         return None
-    return "frame_numbers", (
+    return error(
+        "frame_numbers",
         f"{good} of {len(chosen)} frames that were tried fit the phantom each by itself, together "
-        "they do not: the frames are in another order, or their angles are wrong"
+        "they do not: the frames are in another order, or their angles are wrong",
     )

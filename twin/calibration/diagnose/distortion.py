@@ -36,6 +36,7 @@ CUTS = 48
 """Places in each direction at which a border is tried."""
 
 Refit = Callable[..., FitResult]
+"""Fit again with something else free: options of `pipeline._refit`."""
 
 
 def evidence(fit: FitResult, noise: float) -> float:

@@ -16,8 +16,8 @@ from scipy.special import chdtri
 
 from flexdt.twin.calibration.detect.background import Lag
 from flexdt.twin.calibration.detect.refine import Refined
-from flexdt.twin.calibration.diagnose import Finding, Severity, error, warning
-from flexdt.twin.calibration.diagnose.distortion import better_panel, distorted
+from flexdt.twin.calibration.diagnose import Finding, error, warning
+from flexdt.twin.calibration.diagnose.distortion import Refit, better_panel, distorted
 from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.fitted_motion import MotionFit, derivative, follow_motion
@@ -47,10 +47,6 @@ BODY = 0.5
 hardening alone stays below."""
 BODY_MM = 0.3
 """Shift of the body from its description from which that is said [mm]."""
-
-
-Refit = Callable[..., FitResult]
-"""Fit again with something else free: options of `pipeline._refit`."""
 
 
 def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Finding | None:
@@ -90,9 +86,8 @@ def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Findi
             "are missing there, or the phantom slipped",
         )
     many = len(bad) > 0.3 * n
-    return Finding(
+    return (error if many else warning)(
         "frames_inconsistent",
-        Severity.ERROR if many else Severity.WARNING,
         f"in {len(bad)} of {n} frames ({listed}) the shadows are not where the others put "
         "them" + ("" if many else "; those frames are not used"),
     )
@@ -243,41 +238,30 @@ def explain_residuals(
     if certificate.rms_px < 0.03 or not (structured or bad):
         return fit, out
     if bad or certificate.used.sum() < MOST_USED * fit.problem.seen.sum():
-        explained = _angle_scale(fit, refit)
-        if explained is not None:
-            return fit, [explained]
-    if not free_beads:
-        better = _beads(fit, refit)
-        if better is not None:
-            result, finding = better
-            return result, [*_lost_beads(result), *_drifts(result), finding]
-    if bad:
-        explained = moving(fit, lambda motion: refit(motion=motion))
-        if explained is not None:
-            return fit, [*_lost_beads(fit), explained]
-        # What else the residuals show has no meaning where no cause explains them.
-        return fit, [
-            *_lost_beads(fit),
-            error(
-                "misfit",
-                f"the fit leaves residuals of {certificate.rms_px:.2f} px, and no cause that is "
-                "looked for explains them: check that nothing is loose, or let frames differ, "
-                "--per-frame dO_x,dO_y,alpha",
-            ),
-        ]
-    return fit, out
+        turned = _angle_scale(fit, refit)
+        if turned is not None:
+            return fit, [turned]
+    if not free_beads and (better := _beads(fit, refit)) is not None:
+        result, finding = better
+        return result, [*_lost_beads(result), *_drifts(result), finding]
+    if not bad:
+        return fit, out
+    # What else the residuals show has no meaning where no cause explains them.
+    explained = moving(fit, lambda motion: refit(motion=motion)) or error(
+        "misfit",
+        f"the fit leaves residuals of {certificate.rms_px:.2f} px, and no cause that is looked for "
+        "explains them: check that nothing is loose, or let frames differ, --per-frame "
+        "dO_x,dO_y,alpha",
+    )
+    return fit, [*_lost_beads(fit), explained]
 
 
 def _drifts(fit: FitResult) -> list[Finding]:
     """Drifts and jumps, strongest of each parameter."""
-    certificate = fit.certificate
-    out = []
+    certificate, out = fit.certificate, []
     for drift in certificate.drifts[:1]:
-        unit = (
-            certificate.estimates[drift.column].unit
-            if drift.column in certificate.estimates
-            else ""
-        )
+        estimate = certificate.estimates.get(drift.column)
+        unit = "" if estimate is None else estimate.unit
         how = "during the scan" if drift.step_at is None else f"near frame {drift.step_at}"
         out.append(
             warning(
@@ -287,49 +271,30 @@ def _drifts(fit: FitResult) -> list[Finding]:
                 f"{drift.column.split('@')[0]} would follow it",
             )
         )
-    if certificate.shared:
-        out.append(
-            warning(
-                "vibration",
-                "the beads of a frame err together (vibration or angle jitter): the intervals "
-                "allow for it",
-            )
-        )
-    if certificate.turning:
-        out.append(
-            warning(
-                "bead_errors",
-                "single beads err in a way that repeats as the object turns (bead positions, "
-                "background, distortion): the intervals allow for it",
-            )
-        )
+    for there, code, what in (
+        (certificate.shared, "vibration",
+         "the beads of a frame err together (vibration or angle jitter)"),
+        (certificate.turning, "bead_errors",
+         "single beads err in a way that repeats as the object turns (bead positions, background, "
+         "distortion)"),
+    ):  # fmt: skip
+        if there:
+            out.append(warning(code, f"{what}: the intervals allow for it"))
     return out
 
 
 def _lost_beads(fit: FitResult) -> list[Finding]:
     """Beads that were left out in most of the frames they were seen in."""
     problem, used = fit.problem, fit.certificate.used
-    seen = problem.seen.sum(axis=0)
-    kept = used.sum(axis=0)
-    lost = [int(k) for k in np.flatnonzero((seen >= 3) & (kept < 0.5 * seen))]
-    out = []
+    seen, kept = problem.seen.sum(axis=0), used.sum(axis=0)
+    lost = np.flatnonzero((seen >= 3) & (kept < 0.5 * seen)).tolist()
     if lost:
-        listed = ", ".join(str(k) for k in lost)
-        enough = len(problem.model) - len(lost) >= 3
-        out.append(
-            Finding(
-                "bead_displaced",
-                Severity.WARNING if enough else Severity.ERROR,
-                f"bead {listed} is not where the phantom's model has it and was left out",
-            )
-        )
-    total = int(problem.seen.sum())
-    share = 1.0 - used.sum() / max(total, 1)
-    if share > 0.35 and not lost:
-        out.append(
-            error("too_many_outliers", f"{100 * share:.0f} % of the positions had to be left out")
-        )
-    return out
+        text = f"bead {', '.join(map(str, lost))} is not where the phantom's model has it and was"
+        judged = warning if len(problem.model) - len(lost) >= 3 else error
+        return [judged("bead_displaced", f"{text} left out")]
+    share = 1.0 - used.sum() / max(int(problem.seen.sum()), 1)
+    text = f"{100 * share:.0f} % of the positions had to be left out"
+    return [error("too_many_outliers", text)] if share > 0.35 else []
 
 
 def _explained(better: FitResult, fit: FitResult) -> bool:

@@ -13,7 +13,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from functools import wraps
+from typing import Final, NamedTuple, ParamSpec
 
 import numpy as np
 
@@ -41,6 +42,7 @@ from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.panel import Panel
 from flexdt.twin.geometry.poses import Poses
 
+P = ParamSpec("P")
 FREE: Final = ("dO_x", "det_roll", "det_yaw", "dD_z", "dD_y")
 """Of these the last two are not told, but add to what opposite rays leave open."""
 UNTOLD: Final[Mapping[str, str]] = {
@@ -126,6 +128,21 @@ class Alignment:
         return self.offsets is not None
 
 
+def _or_refused(find: Callable[P, Alignment]) -> Callable[P, Alignment]:
+    """What is not identifiable is refused in the result."""
+
+    @wraps(find)
+    def found(*args: P.args, **options: P.kwargs) -> Alignment:
+        try:
+            return find(*args, **options)
+        except NotIdentifiableError as error:
+            names = ("axis_column_px", "det_roll", "det_yaw", "source_row_px")
+            return Alignment(None, {}, {**dict.fromkeys(names, error.message), **UNTOLD}, (), 0)
+
+    return found
+
+
+@_or_refused
 def align_turn(
     image: Image,
     poses: Poses,
@@ -154,20 +171,6 @@ def align_turn(
     Returns:
         The alignment; what the scan cannot tell is in `refused`.
     """
-    try:
-        return _align(image, poses, present, shape, base, priors, random, per_frame, panel)
-    except NotIdentifiableError as error:
-        why = dict.fromkeys(
-            ("axis_column_px", "det_roll", "det_yaw", "source_row_px"), error.message
-        )
-        return Alignment(None, {}, {**why, **UNTOLD}, (), 0)
-
-
-def _align(
-    image: Image, poses: Poses, present: tuple[int, ...], shape: tuple[int, int],
-    base: Offsets, priors: Mapping[str, float], random: np.random.Generator,
-    per_frame: bool, panel: Panel | None,
-) -> Alignment:  # fmt: skip
     _refuse_if(len(present) == 0, "no frame is there")
     pose = _standing(poses, present)
     rows, cols = shape
@@ -398,10 +401,10 @@ class _Planes:
         """
         stride = -(-len(self.sorted) // MOST_FRAMES)
         fine, coarse = (self._pairs(stride, coarser) for coarser in (1, 2))
-        found = find_height(fine, coarse, REACH * self.turn.mean.shape[0], random)
+        height, sigma = find_height(fine, coarse, REACH * self.turn.mean.shape[0], random)
         step = (0.0, 0.0) if self.turn.step_px is None else self.turn.step_px[0]
         sampled = FLOOR_OF_ROW * self.factor, SHARP_ROWS * sharpness(self.turn.mean) ** 2
-        sigma = math.hypot(found.sigma, *sampled, STEP_OF_ROW * math.hypot(*step))
+        sigma = math.hypot(sigma, *sampled, STEP_OF_ROW * math.hypot(*step))
         sdd = float(self.poses.sdd[self.sorted[0]])
         lean = sdd * math.tan(math.radians(self.priors["axis_tilt_x"]))
         known = math.hypot(self.priors["dD_y"], lean) / self.pitch
@@ -410,7 +413,7 @@ class _Planes:
             f"the images tell it to +- {sigma:.2g} px, the priors of dD_y and axis_tilt_x to +- "
             f"{known:.2g} px",
         )
-        at = np.array([found.value, *(5 * [0.0])])
+        at = np.array([height, *(5 * [0.0])])
         cone_vec = _about_axis(self.poses[self.sorted[:1]], self._of(at))
         level = [[0.0, 0.0, float(cone_vec.source[0, 2])]]
         row = cone_vec.project_points(level, self.turn.mean.shape)[0, 0, 1]

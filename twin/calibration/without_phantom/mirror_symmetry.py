@@ -334,14 +334,11 @@ class _MirrorPairs:
         for at, sign in ((self.at, 1.0), (self.image, -1.0)):
             low = np.floor(at).astype(np.intp)
             part = at - low
-            for right in (0, 1):
-                for down in (0, 1):
-                    share = np.where(right, part[0], 1 - part[0]) * np.where(
-                        down, part[1], 1 - part[1]
-                    )
-                    place = np.minimum(low[1] + down, rows - 1) * cols
-                    place += np.minimum(low[0] + right, cols - 1)
-                    out += np.bincount(place, sign * share * column, rows * cols)
+            for right, down in np.ndindex(2, 2):
+                share = np.abs(1 - right - part[0]) * np.abs(1 - down - part[1])
+                place = np.minimum(low[1] + down, rows - 1) * cols
+                place += np.minimum(low[0] + right, cols - 1)
+                out += np.bincount(place, sign * share * column, rows * cols)
         return np.asarray(
             gaussian_filter(out.reshape(rows, cols), self.level.sigma, mode="nearest")
         )

@@ -316,20 +316,15 @@ def _support(
     x, y = (view[3 + a] - view[a] + i * view[6 + a] for a in (0, 1))
     radius = float((np.abs(view[0] * y - view[1] * x) / np.hypot(x, y)).max())
 
-    def ends(line: npt.NDArray[np.bool_], size: int) -> FloatArray:
-        at = np.flatnonzero(line) - (size - 1) / 2
-        return np.concatenate([at - 0.5, at + 0.5])
+    def ends(line: npt.NDArray[np.bool_], beside: float, turned: int) -> FloatArray:
+        """Of the pixels of an edge: places along it, and `beside`; (column, row) or turned."""
+        at = np.flatnonzero(line) - (len(line) - 1) / 2
+        at = np.concatenate([at - 0.5, at + 0.5])
+        return np.roll(np.column_stack([at, np.full(len(at), beside)]), turned, axis=1)
 
-    def across(line: npt.NDArray[np.bool_], row: float) -> FloatArray:
-        at = ends(line, cols)
-        return np.column_stack([at, np.full(len(at), row)])
-
-    def along(line: npt.NDArray[np.bool_], column: float) -> FloatArray:
-        at = ends(line, rows)
-        return np.column_stack([np.full(len(at), column), at])
-
-    sides = np.vstack([along(full[:, 0], -cols / 2), along(full[:, -1], cols / 2)])
-    return radius, (across(full[0], -rows / 2), across(full[-1], rows / 2), sides)
+    upper, lower = ends(full[0], -rows / 2, 0), ends(full[-1], rows / 2, 0)
+    sides = np.vstack([ends(full[:, 0], -cols / 2, 1), ends(full[:, -1], cols / 2, 1)])
+    return radius, (upper, lower, sides)
 
 
 GRID: Final = 25
@@ -348,13 +343,6 @@ NOISY: Final = 4
 ELSEWHERE: Final = "the views agree about as well with the source's plane at another row"
 
 
-class Height(NamedTuple):
-    """Of the panel above where it was said to be, and its standard deviation [px]."""
-
-    value: float
-    sigma: float
-
-
 class _Bowl(NamedTuple):
     """Sums of squares about a height, one for each of `LEVELS`: where each would be least, sigmas
     of that, and second derivatives."""
@@ -367,8 +355,8 @@ class _Bowl(NamedTuple):
 
 def find_height(
     fine: PlanePairs, coarse: PlanePairs, reach: float, random: np.random.Generator
-) -> Height:
-    """The panel's height.
+) -> tuple[float, float]:
+    """The panel's height above where it was said to be, and its standard deviation [px].
 
     Args:
         fine: pairs of views.
@@ -403,7 +391,7 @@ def find_height(
     base = slope(0.0 * up)
     for doubt in np.eye(len(up))[1:]:
         variance += ((slope(doubt) - base) / float(bowl.bends[level])) ** 2
-    return Height(at, math.sqrt(variance))
+    return at, math.sqrt(variance)
 
 
 def _settle(
