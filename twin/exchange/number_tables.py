@@ -91,17 +91,14 @@ def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
     header = [name.strip() for name in lines[0][1]] if lines else []
     lost = [name for name in VECTOR_NAMES if name not in header]
     if lost:
-        raise ExchangeError(
-            f"{file}: the header lacks {', '.join(lost)}", {"asked": header, "missing": lost}
-        )
+        said = f"{file}: the header lacks {', '.join(lost)}"
+        raise ExchangeError.instead(said, header, VECTOR_NAMES, missing=lost)
     at = [header.index(name) for name in VECTOR_NAMES]
     rows, files = [], []
     for number, cells in lines[1:]:
         if len(cells) != len(header):
-            raise ExchangeError(
-                f"{file}:{number}: {len(cells)} cells; the header has {len(header)}",
-                {"line": number, "asked": len(cells), "allowed": len(header)},
-            )
+            said = f"{file}:{number}: {len(cells)} cells"
+            raise ExchangeError.instead(said, len(cells), len(header), line=number)
         rows.append(_numbers([cells[i] for i in at], file, number))
         files.append(cells[header.index("file")] if "file" in header else "")
     return ScanGeometry(
@@ -136,10 +133,8 @@ def read_tomosipo(
     """
     lost = [name for name in TOMOSIPO_NAMES if name not in arrays]
     if lost:
-        raise ExchangeError(
-            f"{file} lacks {', '.join(lost)}; needed: {', '.join(TOMOSIPO_NAMES)}",
-            {"missing": lost, "allowed": list(TOMOSIPO_NAMES)},
-        )
+        said = f"{file} lacks {', '.join(lost)}"
+        raise ExchangeError.instead(said, list(arrays), TOMOSIPO_NAMES, missing=lost)
     vectors = [arrays[name] for name in TOMOSIPO_NAMES[1:]]
     shape = arrays["shape"]
     for name, array in zip(TOMOSIPO_NAMES[1:], vectors, strict=True):
@@ -179,17 +174,15 @@ def _numbers(words: Sequence[str], file: str, line: int) -> list[float]:
     Raises:
         ExchangeError: names file and line.
     """
+    where: dict[str, object] = {"line": line, "path": file}
     try:
         found = [float(word) for word in words]
     except ValueError as error:
         word = str(error).partition(": ")[2][:42]
-        said = f"{file}:{line}: {word} is no number"
-        raise ExchangeError(said, {"line": line, "path": file}) from None
+        raise ExchangeError(f"{file}:{line}: {word} is no number", where) from None
     if len(found) != 12:
-        raise ExchangeError(
-            f"{file}:{line}: {len(found)} numbers; needed: 12",
-            {"line": line, "path": file, "asked": len(found), "allowed": 12},
-        )
+        said = f"{file}:{line}: {len(found)} numbers"
+        raise ExchangeError.instead(said, len(found), 12, **where)
     return found
 
 

@@ -123,11 +123,8 @@ def read_rtk(
             for entry in element:
                 _take(entry, values, file)
             if values["SourceToDetectorDistance"] == 0.0:
-                raise ExchangeError(
-                    f"{file}: view {len(rows)} is parallel (no source-detector distance); a cone "
-                    "beam is needed",
-                    {"row": len(rows)},
-                )
+                said = f"{file}: view {len(rows)} is parallel (no source-detector distance)"
+                raise ExchangeError.instead(said, 0.0, "a cone beam", row=len(rows))
             rows.append(row_of(tuple(values[n] for n in NAMES), pitch_mm))
         else:
             _take(element, common, file)
@@ -151,10 +148,9 @@ def _take(entry: ElementTree.Element, values: dict[str, float], file: str) -> No
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise ExchangeError(
-            f"{file}: {entry.tag} is {(entry.text or '')[:40]!r}, not a finite number",
-            {"path": entry.tag},
-        )
+        text = (entry.text or "")[:40]
+        said = f"{file}: {entry.tag} is {text!r}"
+        raise ExchangeError.instead(said, text, "a finite number", path=entry.tag)
     if entry.tag in values:
         values[entry.tag] = value
     elif value != 0.0:  # RadiusCylindricalDetector and whatever else bends the geometry

@@ -265,10 +265,8 @@ class Detector:
         """
         pitch = pixels.pitch_mm
         if self.pixel_mm is not None and abs(self.pixel_mm - pitch) > 1e-6 * pitch:
-            raise LimitError(
-                f"the detector's pixel_mm is {self.pixel_mm:g} mm, the geometry's {pitch:g} mm",
-                {"asked": self.pixel_mm, "allowed": pitch, "unit": "mm"},
-            )
+            said = f"the detector's pixel_mm is {self.pixel_mm:g} mm, the geometry's {pitch:g} mm"
+            raise LimitError.instead(said, self.pixel_mm, pitch, unit="mm")
         across, up = pixels.edges_mm
         # In pixels of the twin as it is usually read out, binned 2 x.
         area = across * up / (2 * PixelGrid.pitch_mm) ** 2

@@ -297,10 +297,8 @@ def _lit(
     normal = np.cross(u, v)
     depth = (corners - source) @ normal / ((centre - source) @ normal)
     if depth.min() <= 1e-3:
-        raise GeometryError(
-            "the X-ray source lies in or beside the sample's box: its scatter cannot be simulated",
-            {"asked": source.tolist(), "allowed": "a sample in front of the source"},
-        )
+        said = "the X-ray source lies in or beside the sample's box: its scatter is not simulated"
+        raise GeometryError.instead(said, source.tolist(), "a sample in front of the source")
     on_panel = source + (corners - source) / depth[:, None] - centre
     plane = np.linalg.lstsq(np.stack([u, v], axis=1), on_panel.T, rcond=None)[0]
     low, high = plane.min(axis=1), plane.max(axis=1)

@@ -89,7 +89,7 @@ def test_a_geometry_is_of_one_scan() -> None:
     ("text", "says"),
     [
         ("", "no view"),
-        ("1 2 3", "x:1: 3 numbers; needed: 12"),
+        ("1 2 3", "x:1: 3 numbers; allowed: 12"),
         ("# c\n" + "1 " * 11 + "one", "x:2: 'one' is no number"),
         ("1 " * 11 + "nan", "not finite"),
         ("0 " * 12, "span no panel"),

@@ -165,15 +165,11 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     known = [(i, n, e) for i, (n, e) in enumerate(c.estimates.items()) if e.prior is not None]
     if not loose.identifiable or not known:
         return PriorsJudged(None, 1.0)
-    at = [i for i, *_ in known]
-    width = np.array([e.prior for *_, e in known])
-    means = np.array(
-        [
-            to_edge(name.split("@")[0], mean)
-            for (_, name, _), mean in zip(known, loose.problem.prior_mean[at].tolist(), strict=True)
-        ]
-    )
-    moved = (np.array([e.value for *_, e in known]) - means) / width
+    at, names, found = map(list, zip(*known, strict=True))
+    width = np.array([e.prior for e in found])
+    centres = zip(names, loose.problem.prior_mean[at].tolist(), strict=True)
+    means = np.array([to_edge(name.split("@")[0], mean) for name, mean in centres])
+    moved = (np.array([e.value for e in found]) - means) / width
     values, vectors = np.linalg.eigh(c.covariance[np.ix_(at, at)] / np.outer(width, width))
     values = np.maximum(values, 1e-8)  # exact positions know some directions to rounding
     some = values < 1.0 - MOST_TOLD
@@ -184,9 +180,8 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     square = float(np.sum((vectors.T @ moved)[some] ** 2 / spread))
     count = int(some.sum())
     chance = float(chdtrc(count, square))
-    scores = np.abs(moved) / np.sqrt(
-        1.0 / LOOSE**2 + np.array([e.sigma for *_, e in known]) ** 2 / width**2
-    )
+    sigmas = np.array([e.sigma for e in found])
+    scores = np.abs(moved) / np.sqrt(1.0 / LOOSE**2 + sigmas**2 / width**2)
     # The images alone, as a quadratic of curvature A and gradient y, and what they and all priors
     # but one would say of that one.
     weight = np.where(some, 1.0 / values - 1.0, 0.0)
@@ -209,15 +204,14 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     likely = [i for i in order if gains[i] > max(best - ALIKE, best / 2)] if enough else []
     if max(float(scores.max()), _deviate(chance)) <= HELD_SIGMAS:
         factor = math.sqrt(square / count) if chance < NARROW else 1.0
-        return PriorsJudged(None, factor, tuple(known[i][1] for i in likely))
+        return PriorsJudged(None, factor, tuple(names[i] for i in likely))
     likely = likely or order[:1]
-    causes = tuple(known[i][1] for i in likely)
+    causes = tuple(names[i] for i in likely)
     texts = [
-        f"{n} is known as {means[i]:g} "
-        + ("exactly" if n in exact else f"+- {width[i] / LOOSE:g} {e.unit}")
-        + ", the images say "
-        f"{means[i] + alone[i][0]:.4g} +- {alone[i][1]:.1g} {e.unit}"
-        for i, (_, n, e) in ((i, known[i]) for i in likely)
+        f"{names[i]} is known as {means[i]:g} "
+        + ("exactly" if names[i] in exact else f"+- {width[i] / LOOSE:g} {found[i].unit}")
+        + f", the images say {means[i] + alone[i][0]:.4g} +- {alone[i][1]:.1g} {found[i].unit}"
+        for i in likely
     ]
     which = " or ".join(causes)
     text = f"{'; or '.join(texts)}: free {which} too, or give the prior it has"

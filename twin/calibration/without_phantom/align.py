@@ -262,7 +262,7 @@ def align_turn(
         beside = known[1] * (rays.top - (rows - read) / 2) * (read > 1)
         told[:], values[1], covariance[1], covariance[:, 1] = False, base.det_roll, 0.0, 0.0
         covariance[1, 1] = known[1] ** 2
-    step = (0.0, 0.0) if turn is None or turn.step_px is None else turn.step_px[0]
+    step = (0.0, 0.0) if turn is None else turn.step_px
     covariance[0, 0] += (math.hypot(FLOOR_PX, step[0] / 2, beside) * scales[0]) ** 2
     covariance[1, 1] += math.radians(FLOOR_DEG) ** 2 + (step[0] / rows) ** 2
     slopes = _slopes(seen, values, scales)
@@ -402,9 +402,8 @@ class _Planes:
         stride = -(-len(self.sorted) // MOST_FRAMES)
         fine, coarse = (self._pairs(stride, coarser) for coarser in (1, 2))
         height, sigma = find_height(fine, coarse, REACH * self.turn.mean.shape[0], random)
-        step = (0.0, 0.0) if self.turn.step_px is None else self.turn.step_px[0]
         sampled = FLOOR_OF_ROW * self.factor, SHARP_ROWS * sharpness(self.turn.mean) ** 2
-        sigma = math.hypot(sigma, *sampled, STEP_OF_ROW * math.hypot(*step))
+        sigma = math.hypot(sigma, *sampled, STEP_OF_ROW * math.hypot(*self.turn.step_px))
         sdd = float(self.poses.sdd[self.sorted[0]])
         lean = sdd * math.tan(math.radians(self.priors["axis_tilt_x"]))
         known = math.hypot(self.priors["dD_y"], lean) / self.pitch
@@ -497,10 +496,11 @@ def _warnings(turn: Turn, gap: Gap | None, missing: int) -> tuple[str, ...]:
         out.append(f"frames {list(turn.repeated)} repeat the one before and are left out")
     if missing:
         out.append(f"{missing} frames are missing; the sigmas contain what that may do")
-    if turn.step_px is not None and abs(turn.step_px[0][0]) > STEP_TOLD:
-        (right, down), after = turn.step_px
+    right, down = turn.step_px
+    if abs(right) > STEP_TOLD:
         out.append(
-            f"after frame {after} the images step by {right:.2f} px to the right and {down:.2f} px "
-            "down: a jump there, or a drift over the scan; the sigmas contain half of it"
+            f"after frame {turn.step_after} the images step by {right:.2f} px to the right and "
+            f"{down:.2f} px down: a jump there, or a drift over the scan; the sigmas contain half of "
+            "it"
         )
     return tuple(out)

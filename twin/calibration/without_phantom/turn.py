@@ -33,6 +33,260 @@ from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.panel import Border, Panel
 
+Image = Callable[[int], Float32Array]
+
+THUMB_COLUMNS: Final = 64
+"""Columns of the small copies in which frames are compared, at least where there are as many."""
+DARKEST: Final = 8.0
+"""Line integral above which the noise is taken for that of this one."""
+MEDIAN_OF_CHI_SQUARE: Final = 0.4549
+"""Of one degree of freedom."""
+WHITE: Final = 3.0
+"""Standard deviations of white noise's correlation up to which neighbouring pixels are not alike.
+From twice that on they are."""
+LOST: Final = 2.5
+"""A frame may be missing where two differ by more than so many times what is usual there: with one
+missing it is about four."""
+STEPS: Final = 5.0
+"""A step between neighbours is one when it is so many times the usual spread (assumed)."""
+CLEAR: Final = 1.5
+"""And so many times the next largest elsewhere: faces that lie along the beam leave several."""
+FEWEST: Final = 24
+"""Directions of which a mean is taken, at least."""
+BACK: Final = 0.3
+"""Two steps whose sum is smaller than so much of one are one to and fro (assumed)."""
+WIDEST_GAP: Final = 4.5
+"""Largest gap between neighbouring angles, relative to the usual one: three frames missing."""
+GAP_IMAGES: Final = 6
+"""Images in which the effect of gaps is kept; more gaps than that share them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Turn:
+    """What the frames of a turn come to.
+
+    Attributes:
+        mean: mean line integrals over the angle, (rows, cols).
+        doubts: (k, rows, cols). The first is half of what every second frame says otherwise than
+            those between, so the noise of `mean` and more than its lack of views. Each of the
+            others is what leaving out frames beside a gap, as many as are missing in it, changes,
+            or what a repeated frame may.
+        noise: relative variance of a pixel of `mean`, (rows, cols).
+        used: indices of the frames in the mean.
+        samples: some of these frames, their rows averaged: `averaged_rows`.
+        repeated: indices of frames left out as repeated.
+        step_px: (columns, rows) by which the images step at most between neighbouring frames; 0
+            where no step is significant or none can be told.
+        step_after: the frame before that step.
+    """
+
+    mean: FloatArray
+    doubts: FloatArray
+    noise: FloatArray
+    used: tuple[int, ...]
+    samples: tuple[Float32Array, ...]
+    repeated: tuple[int, ...]
+    step_px: tuple[float, float]
+    step_after: int
+
+
+def read_turn(
+    image: Image,
+    angle: FloatArray,
+    present: Sequence[int],
+    repeated: tuple[int, ...] = (),
+    lost: tuple[int, ...] = (),
+) -> Turn:
+    """Read the frames, twice where some are repeated.
+
+    Args:
+        image: line integrals of a frame, (rows, cols).
+        angle: of the stage in every frame, (n,) [rad].
+        present: indices of the frames that are there.
+        repeated: frames among them that are known to be repeated.
+        lost: frames before which one may be missing, although no angle is.
+
+    Raises:
+        NotIdentifiableError: they are too few, or do not close a turn.
+    """
+    kept = [i for i in present if i not in repeated]
+    index = np.array(sorted(kept, key=lambda i: float(angle[i] % (2 * np.pi))), dtype=np.intp)
+    gaps, usual = _require_turn(angle[index])
+    weights = _coefficients(angle[index], gaps, usual)
+    # After a repeated frame all others may be one step behind what their angles say: what was
+    # seen twice is then missing between the last frame and the first, or where one was lost.
+    ends = np.isin(index, [index.min(), index.max()]) / 2
+    for one in repeated:
+        near = np.abs(index - one) == np.abs(index - one).min()
+        for gap in (ends, *(np.isin(index, [at - 1, at]) / 2 for at in lost)):
+            weights = np.vstack([weights, weights[0] * (near / near.sum() - gap)])
+    total: FloatArray | float = 0.0
+    noise: FloatArray | float = 0.0
+    used, thumbs, samples = tuple(sorted(kept)), [], []
+    sampled = set(used[:: -(-len(used) // FRAMES)])
+    for weight, i in zip(weights.T, index.tolist(), strict=True):
+        g = image(i)
+        thumbs.append(_thumb(g))
+        if i in sampled:
+            samples.append(averaged_rows(g))
+        total = total + weight[:, None, None] * g.astype(np.float64)
+        noise = noise + weight[0] * np.exp(np.minimum(g, DARKEST))
+    views = np.stack(thumbs)
+    if not repeated:
+        again, jumps = (index[places].tolist() for places in _repeated(views, gaps))
+        if again:
+            return read_turn(image, angle, present, tuple(sorted(again)), tuple(jumps))
+    images, (rows, cols) = np.asarray(total), np.shape(noise)
+    (right, down), after = _step(views, gaps, int(index.argmin()))
+    step = right * cols / views.shape[2], down * rows / views.shape[1]
+    return Turn(
+        images[0], images[1:], np.asarray(noise), used, tuple(samples), repeated, step,
+        int(index[after]),
+    )  # fmt: skip
+
+
+def _require_turn(angle: FloatArray) -> tuple[FloatArray, float]:
+    """Gaps behind each of the sorted angles (mod a turn), and the usual one [rad]."""
+    around = angle % (2 * np.pi)
+    gaps = np.diff(around, append=around[:1] + 2 * np.pi)
+    own = gaps[gaps > 1e-6]
+    if len(own) < FEWEST:
+        raise NotIdentifiableError(
+            f"{len(own)} directions; the mean over a turn needs {FEWEST} at least",
+        )
+    usual, widest = float(np.median(own)), float(own.max())
+    if widest > WIDEST_GAP * usual:
+        raise NotIdentifiableError(
+            f"the frames leave {math.degrees(widest):.4g} deg of a full turn without a view (usual "
+            f"step {math.degrees(usual):.4g} deg): only the mean over a full turn is symmetric",
+        )
+    return gaps, usual
+
+
+def _coefficients(angle: FloatArray, gaps: FloatArray, usual: float) -> FloatArray:
+    """Of each frame (sorted by angle) in the mean and in the doubts, (1 + k, n)."""
+    n = len(angle)
+    keep = np.ones(n, dtype=bool)
+    even = np.arange(n) % 2 == 0
+    mean = _weights(angle, keep)
+    out = [mean, (_weights(angle, even) - _weights(angle, ~even)) / 2]
+    wide = np.flatnonzero(gaps > 1.5 * usual)
+    doubts = np.zeros((min(len(wide), GAP_IMAGES), n))
+    for j, place in enumerate(wide.tolist()):
+        missing = round(gaps[place] / usual) - 1
+        left_out = keep.copy()
+        left_out[(place + 2 + np.arange(missing)) % n] = False
+        sign = 1 - 2 * (j // GAP_IMAGES % 2)
+        doubts[j % GAP_IMAGES] += sign * (mean - _weights(angle, left_out))
+    return np.vstack([*out, doubts])
+
+
+def _weights(angle: FloatArray, keep: npt.NDArray[np.bool_]) -> FloatArray:
+    """Of the trapezoidal rule on the circle for those that are kept, 0 for the others."""
+    around = angle[keep] % (2 * np.pi)
+    gaps = np.diff(around, append=around[:1] + 2 * np.pi)
+    out = np.zeros(len(angle))
+    out[keep] = (gaps + np.roll(gaps, 1)) / (4 * np.pi)
+    return out
+
+
+def _thumb(image: Float32Array) -> Float32Array:
+    """Means over square blocks; what is left over at the ends is left out."""
+    factor = max(1, round(image.shape[1] / THUMB_COLUMNS))
+    if min(image.shape) < 2 * factor:
+        raise NotIdentifiableError.instead(
+            f"images of {image.shape[0]} rows and {image.shape[1]} columns show no plane of the "
+            "source and no roll", list(image.shape), f"{2 * factor} rows or more",
+        )  # fmt: skip
+    return np.asarray(binned_mean(image, factor), dtype=np.float32)
+
+
+def _repeated(views: Float32Array, gaps: FloatArray) -> tuple[list[int], list[int]]:
+    """Places of frames that show what the one before shows although the stage turned, and of those
+    that differ from it as if one were missing.
+
+    Two exposures of the same differ by noise alone, in which neighbouring pixels are not alike;
+    what a turn changes spreads over several.
+    """
+    soft = gaussian_filter(views, (0, 2, 2))  # less noise: a copy may have been exposed anew
+    rest = soft - np.roll(soft, 1, axis=0)
+    change, correlation = np.empty((2, len(views)))
+    for i, (down, right) in enumerate(zip(*np.gradient(soft, axis=(1, 2)), strict=True)):
+        # Frames that are shifted against each other change more than a turn makes them.
+        slopes = np.stack([right.ravel(), down.ravel(), np.ones(right.size)], axis=1)
+        shifted = slopes @ np.linalg.lstsq(slopes, rest[i].ravel(), rcond=None)[0]
+        change[i] = np.square(rest[i].ravel() - shifted).mean(dtype=np.float64)
+        own = views[i] - views[i - 1] - shifted.reshape(soft[i].shape)
+        correlation[i] = _neighbours_correlation(own)
+    # Usual for that part of the turn: a round body hardly changes where it turns back.
+    usual = median_filter(change, 5, mode="wrap")
+    turned = np.roll(gaps, 1) > 1e-6
+    ratio = change / np.maximum(usual, 1e-30)
+    limit = WHITE / math.sqrt(views[0].size)
+    white = correlation <= limit
+    white &= median_filter(correlation, 5, mode="wrap") > 2.0 * limit
+    same = np.flatnonzero(white & (ratio <= np.quantile(ratio, 0.1)) & turned)
+    if len(same) > len(views) // 4:
+        return [], []
+    jump = np.where(np.roll(gaps, 1) < 1.5 * np.median(gaps), ratio, 0.0)
+    return same.tolist(), [int(jump.argmax())] if jump.max() > LOST else []
+
+
+def _neighbours_correlation(image: FloatArray) -> float:
+    """Correlation of neighbouring pixels along rows or columns, whichever is larger; 0 of noise."""
+    own = image - image.mean()
+    along = [(own[1:] * own[:-1]).mean(), (own[:, 1:] * own[:, :-1]).mean()]
+    return float(max(along)) / max(float(np.square(own).mean()), 1e-30)
+
+
+def _step(views: Float32Array, gaps: FloatArray, first: int) -> tuple[tuple[float, float], int]:
+    """The largest step (columns, rows) between neighbours and the place before it; `first` is where
+    the frame stands that was taken first. No step where none is significant, or none can be told.
+
+    Each frame is compared with the third-order interpolation of its four neighbours on the circle.
+    A shift d between frame i - 1 and frame i leaves -d/2 in one of them and +d/2 in the other.
+    """
+    n = len(views)
+    soft = gaussian_filter(views, (0, 1, 1))
+
+    def around(by: int) -> Float32Array:
+        return np.asarray(np.roll(soft, by, axis=0))
+
+    rest = soft - (4.0 * (around(1) + around(-1)) - around(2) - around(-2)) / 6.0
+    rest = rest - np.roll(rest, 1, axis=0)
+    down, right = np.gradient(soft, axis=(1, 2))
+    shifts = np.empty((n, 2))
+    for i in range(n):
+        slopes = np.stack([right[i].ravel(), down[i].ravel()])
+        slopes -= slopes.mean(axis=1, keepdims=True)
+        normal = slopes @ slopes.T
+        if not np.linalg.cond(normal) < 1e8:
+            return (0.0, 0.0), 0
+        shifts[i] = -np.linalg.solve(normal, slopes @ rest[i].ravel())
+    even = np.abs(gaps / np.median(gaps) - 1.0) < 0.1
+    valid = np.all([np.roll(even, by) for by in (-1, 0, 1, 2)], axis=0)
+    if valid.sum() < FEWEST // 2:
+        return (0.0, 0.0), 0
+    spread = 1.4826 * np.median(np.abs(shifts[valid]), axis=0) + 1e-6
+    score = np.where(valid, np.abs(shifts / spread).max(axis=1), 0.0)
+    worst = int(score.argmax())
+    others = np.where(_far(n, worst), score, 0.0)
+    # What steps and stays has to step back between the last frame and the first.
+    back = int(others.argmax()) if worst == first else first
+    if np.linalg.norm(shifts[back] + shifts[worst]) < BACK * np.linalg.norm(shifts[worst]):
+        others = np.where(_far(n, back), others, 0.0)
+        worst = back if worst == first else worst
+    if score[worst] < max(STEPS, CLEAR * others.max()):
+        return (0.0, 0.0), 0
+    return (float(shifts[worst, 0]), float(shifts[worst, 1])), (worst - 1) % n
+
+
+def _far(n: int, place: int) -> npt.NDArray[np.bool_]:
+    """(n,) places on the circle that are no near neighbours of one."""
+    apart = np.abs(np.arange(n) - place)
+    return np.asarray(np.minimum(apart, n - apart) > 2)
+
+
 SIDE: Final = 4
 """Columns on each side of a border that are looked at."""
 WIDTHS: Final = np.arange(0.0, 4.01, 0.1)
@@ -160,258 +414,3 @@ def _likelihood(edges: FloatArray, of_distance: PchipInterpolator, width: float)
     white = edges @ (ways / np.sqrt(variance))
     spread = np.log(np.square(white).sum(axis=1)) * (SIDE - 0.5)
     return np.asarray(-spread - float(np.log(variance).sum()) / 2)
-
-
-Image = Callable[[int], Float32Array]
-
-THUMB_COLUMNS: Final = 64
-"""Columns of the small copies in which frames are compared, at least where there are as many."""
-DARKEST: Final = 8.0
-"""Line integral above which the noise is taken for that of this one."""
-MEDIAN_OF_CHI_SQUARE: Final = 0.4549
-"""Of one degree of freedom."""
-WHITE: Final = 3.0
-"""Standard deviations of white noise's correlation up to which neighbouring pixels are not alike.
-From twice that on they are."""
-LOST: Final = 2.5
-"""A frame may be missing where two differ by more than so many times what is usual there: with one
-missing it is about four."""
-STEPS: Final = 5.0
-"""A step between neighbours is one when it is so many times the usual spread (assumed)."""
-CLEAR: Final = 1.5
-"""And so many times the next largest elsewhere: faces that lie along the beam leave several."""
-FEWEST: Final = 24
-"""Directions of which a mean is taken, at least."""
-BACK: Final = 0.3
-"""Two steps whose sum is smaller than so much of one are one to and fro (assumed)."""
-WIDEST_GAP: Final = 4.5
-"""Largest gap between neighbouring angles, relative to the usual one: three frames missing."""
-GAP_IMAGES: Final = 6
-"""Images in which the effect of gaps is kept; more gaps than that share them."""
-
-
-@dataclass(frozen=True, eq=False)
-class Turn:
-    """What the frames of a turn come to.
-
-    Attributes:
-        mean: mean line integrals over the angle, (rows, cols).
-        doubts: (k, rows, cols). The first is half of what every second frame says otherwise than
-            those between, so the noise of `mean` and more than its lack of views. Each of the
-            others is what leaving out frames beside a gap, as many as are missing in it, changes,
-            or what a repeated frame may.
-        noise: relative variance of a pixel of `mean`, (rows, cols).
-        used: indices of the frames in the mean.
-        samples: some of these frames, their rows averaged: `averaged_rows`.
-        repeated: indices of frames left out as repeated.
-        step_px: (columns, rows) by which the images step at most between neighbouring frames, and
-            after which frame; None where no step is significant or none can be told.
-    """
-
-    mean: FloatArray
-    doubts: FloatArray
-    noise: FloatArray
-    used: tuple[int, ...]
-    samples: tuple[Float32Array, ...]
-    repeated: tuple[int, ...]
-    step_px: tuple[tuple[float, float], int] | None
-
-
-def read_turn(
-    image: Image,
-    angle: FloatArray,
-    present: Sequence[int],
-    repeated: tuple[int, ...] = (),
-    lost: tuple[int, ...] = (),
-) -> Turn:
-    """Read the frames, twice where some are repeated.
-
-    Args:
-        image: line integrals of a frame, (rows, cols).
-        angle: of the stage in every frame, (n,) [rad].
-        present: indices of the frames that are there.
-        repeated: frames among them that are known to be repeated.
-        lost: frames before which one may be missing, although no angle is.
-
-    Raises:
-        NotIdentifiableError: they are too few, or do not close a turn.
-    """
-    kept = [i for i in present if i not in repeated]
-    index = np.array(sorted(kept, key=lambda i: float(angle[i] % (2 * np.pi))), dtype=np.intp)
-    gaps, usual = _require_turn(angle[index])
-    weights = _coefficients(angle[index], gaps, usual)
-    # After a repeated frame all others may be one step behind what their angles say: what was
-    # seen twice is then missing between the last frame and the first, or where one was lost.
-    ends = np.isin(index, [index.min(), index.max()]) / 2
-    for one in repeated:
-        near = np.abs(index - one) == np.abs(index - one).min()
-        for gap in (ends, *(np.isin(index, [at - 1, at]) / 2 for at in lost)):
-            weights = np.vstack([weights, weights[0] * (near / near.sum() - gap)])
-    total: FloatArray | float = 0.0
-    noise: FloatArray | float = 0.0
-    used, thumbs, samples = tuple(sorted(kept)), [], []
-    sampled = set(used[:: -(-len(used) // FRAMES)])
-    for weight, i in zip(weights.T, index.tolist(), strict=True):
-        g = image(i)
-        thumbs.append(_thumb(g))
-        if i in sampled:
-            samples.append(averaged_rows(g))
-        total = total + weight[:, None, None] * g.astype(np.float64)
-        noise = noise + weight[0] * np.exp(np.minimum(g, DARKEST))
-    views = np.stack(thumbs)
-    if not repeated:
-        again, jumps = (index[places].tolist() for places in _repeated(views, gaps))
-        if again:
-            return read_turn(image, angle, present, tuple(sorted(again)), tuple(jumps))
-    shape = np.shape(noise)
-    step = _step(views, gaps, int(index.argmin()))
-    if step is not None:
-        (right, down), after = step
-        across, along = shape[1] / views.shape[2], shape[0] / views.shape[1]
-        step = (right * across, down * along), int(index[after])
-    images = np.asarray(total)
-    return Turn(images[0], images[1:], np.asarray(noise), used, tuple(samples), repeated, step)
-
-
-def _require_turn(angle: FloatArray) -> tuple[FloatArray, float]:
-    """Gaps behind each of the sorted angles (mod a turn), and the usual one [rad]."""
-    around = angle % (2 * np.pi)
-    gaps = np.diff(around, append=around[:1] + 2 * np.pi)
-    own = gaps[gaps > 1e-6]
-    if len(own) < FEWEST:
-        raise NotIdentifiableError(
-            f"{len(own)} directions; the mean over a turn needs {FEWEST} at least",
-        )
-    usual, widest = float(np.median(own)), float(own.max())
-    if widest > WIDEST_GAP * usual:
-        raise NotIdentifiableError(
-            f"the frames leave {math.degrees(widest):.4g} deg of a full turn without a view (usual "
-            f"step {math.degrees(usual):.4g} deg): only the mean over a full turn is symmetric",
-        )
-    return gaps, usual
-
-
-def _coefficients(angle: FloatArray, gaps: FloatArray, usual: float) -> FloatArray:
-    """Of each frame (sorted by angle) in the mean and in the doubts, (1 + k, n)."""
-    n = len(angle)
-    keep = np.ones(n, dtype=bool)
-    even = np.arange(n) % 2 == 0
-    mean = _weights(angle, keep)
-    out = [mean, (_weights(angle, even) - _weights(angle, ~even)) / 2]
-    wide = np.flatnonzero(gaps > 1.5 * usual)
-    doubts = np.zeros((min(len(wide), GAP_IMAGES), n))
-    for j, place in enumerate(wide.tolist()):
-        missing = round(gaps[place] / usual) - 1
-        left_out = keep.copy()
-        left_out[(place + 2 + np.arange(missing)) % n] = False
-        sign = 1 - 2 * (j // GAP_IMAGES % 2)
-        doubts[j % GAP_IMAGES] += sign * (mean - _weights(angle, left_out))
-    return np.vstack([*out, doubts])
-
-
-def _weights(angle: FloatArray, keep: npt.NDArray[np.bool_]) -> FloatArray:
-    """Of the trapezoidal rule on the circle for those that are kept, 0 for the others."""
-    around = angle[keep] % (2 * np.pi)
-    gaps = np.diff(around, append=around[:1] + 2 * np.pi)
-    out = np.zeros(len(angle))
-    out[keep] = (gaps + np.roll(gaps, 1)) / (4 * np.pi)
-    return out
-
-
-def _thumb(image: Float32Array) -> Float32Array:
-    """Means over square blocks; what is left over at the ends is left out."""
-    factor = max(1, round(image.shape[1] / THUMB_COLUMNS))
-    if min(image.shape) < 2 * factor:
-        raise NotIdentifiableError.instead(
-            f"images of {image.shape[0]} rows and {image.shape[1]} columns show no plane of the "
-            "source and no roll", list(image.shape), f"{2 * factor} rows or more",
-        )  # fmt: skip
-    return np.asarray(binned_mean(image, factor), dtype=np.float32)
-
-
-def _repeated(views: Float32Array, gaps: FloatArray) -> tuple[list[int], list[int]]:
-    """Places of frames that show what the one before shows although the stage turned, and of those
-    that differ from it as if one were missing.
-
-    Two exposures of the same differ by noise alone, in which neighbouring pixels are not alike;
-    what a turn changes spreads over several.
-    """
-    soft = gaussian_filter(views, (0, 2, 2))  # less noise: a copy may have been exposed anew
-    rest = soft - np.roll(soft, 1, axis=0)
-    change, correlation = np.empty((2, len(views)))
-    for i, (down, right) in enumerate(zip(*np.gradient(soft, axis=(1, 2)), strict=True)):
-        # Frames that are shifted against each other change more than a turn makes them.
-        slopes = np.stack([right.ravel(), down.ravel(), np.ones(right.size)], axis=1)
-        shifted = slopes @ np.linalg.lstsq(slopes, rest[i].ravel(), rcond=None)[0]
-        change[i] = np.square(rest[i].ravel() - shifted).mean(dtype=np.float64)
-        own = views[i] - views[i - 1] - shifted.reshape(soft[i].shape)
-        correlation[i] = _neighbours_correlation(own)
-    # Usual for that part of the turn: a round body hardly changes where it turns back.
-    usual = median_filter(change, 5, mode="wrap")
-    turned = np.roll(gaps, 1) > 1e-6
-    ratio = change / np.maximum(usual, 1e-30)
-    limit = WHITE / math.sqrt(views[0].size)
-    white = correlation <= limit
-    white &= median_filter(correlation, 5, mode="wrap") > 2.0 * limit
-    same = np.flatnonzero(white & (ratio <= np.quantile(ratio, 0.1)) & turned)
-    if len(same) > len(views) // 4:
-        return [], []
-    jump = np.where(np.roll(gaps, 1) < 1.5 * np.median(gaps), ratio, 0.0)
-    return same.tolist(), [int(jump.argmax())] if jump.max() > LOST else []
-
-
-def _neighbours_correlation(image: FloatArray) -> float:
-    """Correlation of neighbouring pixels along rows or columns, whichever is larger; 0 of noise."""
-    own = image - image.mean()
-    along = [(own[1:] * own[:-1]).mean(), (own[:, 1:] * own[:, :-1]).mean()]
-    return float(max(along)) / max(float(np.square(own).mean()), 1e-30)
-
-
-def _step(
-    views: Float32Array, gaps: FloatArray, first: int
-) -> tuple[tuple[float, float], int] | None:
-    """The largest step (columns, rows) between neighbours and the place before it; `first` is where
-    the frame stands that was taken first.
-
-    Each frame is compared with the third-order interpolation of its four neighbours on the circle.
-    A shift d between frame i - 1 and frame i leaves -d/2 in one of them and +d/2 in the other.
-    """
-    n = len(views)
-    soft = gaussian_filter(views, (0, 1, 1))
-
-    def around(by: int) -> Float32Array:
-        return np.asarray(np.roll(soft, by, axis=0))
-
-    rest = soft - (4.0 * (around(1) + around(-1)) - around(2) - around(-2)) / 6.0
-    rest = rest - np.roll(rest, 1, axis=0)
-    down, right = np.gradient(soft, axis=(1, 2))
-    shifts = np.empty((n, 2))
-    for i in range(n):
-        slopes = np.stack([right[i].ravel(), down[i].ravel()])
-        slopes -= slopes.mean(axis=1, keepdims=True)
-        normal = slopes @ slopes.T
-        if not np.linalg.cond(normal) < 1e8:
-            return None
-        shifts[i] = -np.linalg.solve(normal, slopes @ rest[i].ravel())
-    even = np.abs(gaps / np.median(gaps) - 1.0) < 0.1
-    valid = np.all([np.roll(even, by) for by in (-1, 0, 1, 2)], axis=0)
-    if valid.sum() < FEWEST // 2:
-        return None
-    spread = 1.4826 * np.median(np.abs(shifts[valid]), axis=0) + 1e-6
-    score = np.where(valid, np.abs(shifts / spread).max(axis=1), 0.0)
-    worst = int(score.argmax())
-    others = np.where(_far(n, worst), score, 0.0)
-    # What steps and stays has to step back between the last frame and the first.
-    back = int(others.argmax()) if worst == first else first
-    if np.linalg.norm(shifts[back] + shifts[worst]) < BACK * np.linalg.norm(shifts[worst]):
-        others = np.where(_far(n, back), others, 0.0)
-        worst = back if worst == first else worst
-    if score[worst] < max(STEPS, CLEAR * others.max()):
-        return None
-    return (float(shifts[worst, 0]), float(shifts[worst, 1])), (worst - 1) % n
-
-
-def _far(n: int, place: int) -> npt.NDArray[np.bool_]:
-    """(n,) places on the circle that are no near neighbours of one."""
-    apart = np.abs(np.arange(n) - place)
-    return np.asarray(np.minimum(apart, n - apart) > 2)
