@@ -500,7 +500,7 @@ def _warnings(turn: Turn, gap: Gap | None, missing: int) -> tuple[str, ...]:
     if abs(right) > STEP_TOLD:
         out.append(
             f"after frame {turn.step_after} the images step by {right:.2f} px to the right and "
-            f"{down:.2f} px down: a jump there, or a drift over the scan; the sigmas contain half of "
-            "it"
+            f"{down:.2f} px down: a jump there, or a drift over the scan; the sigmas contain half "
+            "of it"
         )
     return tuple(out)
