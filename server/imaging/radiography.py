@@ -35,17 +35,18 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.physics import exposure as ideal
+from flexdt.twin.physics import scatter as mc
 from flexdt.twin.physics.chain import (
     Chain,
     Expected,
     Radiograph,
+    Scattered,
     radiographs,
     read_out,
     without_spot,
 )
 from flexdt.twin.physics.detector import Detector, detector_of
 from flexdt.twin.physics.exposure import ExposureSettings
-from flexdt.twin.physics.scatter import simulation as mc
 from flexdt.twin.physics.tube import TubeModel, tube_of, voltages
 from flexdt.twin.scanner.state import Sample
 
@@ -185,7 +186,7 @@ class Radiography:
         chain = chain_through(channels, self.panel, self.tube, mono_keV)
         if points > 1:
             chain, moments = without_spot(chain), moments * points
-        added: list[mc.Scattered] = []
+        added: list[Scattered] = []
         if self.scatter != "off" and channels:
             thing = await self.imaging.scatterer(sample, SCATTER.voxels)
             middles = views[moments // 2 :: moments]
@@ -201,7 +202,7 @@ class Radiography:
         views: FloatArray,
         camera: CameraSettings,
         exposures: Sequence[ExposureSettings],
-    ) -> list[mc.Scattered]:
+    ) -> list[Scattered]:
         """Of each image by its own view alone, so that a scan resumed has the bytes of one."""
         beams = {kV: mc.Beam.of(chain, kV) for kV in {exposure.kV for exposure in exposures}}
         return [
