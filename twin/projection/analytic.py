@@ -27,7 +27,7 @@ from flexdt.twin.projection.analytic_solids import (
     Scene,
     Solid,
     Sphere,
-    encode,
+    as_convex,
     shadows,
 )
 from flexdt.twin.projection.cpu import threads
@@ -130,13 +130,16 @@ def _project(
     if not solids or out.size == 0:
         out.fill(0)
         return
-    table = encode([solid.shape for solid in solids])
+    shapes = [as_convex(solid.shape) for solid in solids]
+    # What `analytic_kernels` takes: has a quadric, M, c; slabs, and which of them are a solid's.
+    quadric = np.array([[one.curved, *one.matrix.ravel(), *one.center] for one in shapes], float)
+    ends = np.cumsum([0, *(len(one.slabs) for one in shapes)])
     rays = geometry.rays(shape)
     analytic_kernels.project_convex(
-        table.quadric,
-        table.slabs,
-        table.slab_range,
-        shadows(table, rays, shape),
+        quadric,
+        np.concatenate([one.slabs for one in shapes]),
+        np.column_stack([ends[:-1], ends[1:]]),
+        shadows(shapes, rays, shape),
         rays,
         weight,
         channel,

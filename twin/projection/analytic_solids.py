@@ -115,38 +115,6 @@ class Convex:
         return bool(self.matrix.any())
 
 
-@dataclass(frozen=True, eq=False)
-class ConvexTable:
-    """Several shapes as arrays: quadric (k, 13) = has one, M, c; slabs (m, 5), slab_range
-    (k, 2).
-    """
-
-    shapes: tuple[Convex, ...]
-    quadric: FloatArray
-    slabs: FloatArray
-    slab_range: IntArray
-
-
-def encode(shapes: Sequence[Shape]) -> ConvexTable:
-    """Shapes as tables for the kernel.
-
-    Raises:
-        GeometryError: a size is not positive, a direction not of unit length, or a polyhedron is
-            unbounded or empty.
-    """
-    convex = tuple(as_convex(shape) for shape in shapes)
-    quadric = np.zeros((len(convex), 13))
-    ranges = np.zeros((len(convex), 2), np.int64)
-    slabs: list[FloatArray] = [np.zeros((0, 5))]
-    start = 0
-    for i, one in enumerate(convex):
-        quadric[i] = [float(one.curved), *one.matrix.ravel(), *one.center]
-        ranges[i] = start, start + len(one.slabs)
-        start += len(one.slabs)
-        slabs.append(one.slabs)
-    return ConvexTable(convex, quadric, np.concatenate(slabs), ranges)
-
-
 def as_convex(shape: Shape) -> Convex:
     """One shape as quadric and slabs."""
     none = np.zeros((0, 5))
@@ -191,24 +159,33 @@ def as_convex(shape: Shape) -> Convex:
             assert_never(shape)
 
 
-def shadows(table: ConvexTable, rays: FloatArray, shape: tuple[int, int]) -> IntArray:
+def shadows(shapes: Sequence[Convex], rays: FloatArray, shape: tuple[int, int]) -> IntArray:
     """Pixels each solid can darken: (n, k, 4) = first row, last row + 1, first column, last + 1.
 
     Args:
-        table: solids.
+        shapes: the k solids.
         rays: (n, 12) as of `ConeVec.rays`.
         shape: detector (rows, cols).
     """
-    result = np.empty((len(rays), len(table.shapes), 4), np.int64)
-    for i, one in enumerate(table.shapes):
-        if one.semi_axes is None:
-            assert one.corners is not None
+    result = np.empty((len(rays), len(shapes), 4), np.int64)
+    inverse = _inverses(rays)
+    for i, one in enumerate(shapes):
+        if one.corners is not None:
             result[:, i] = corner_shadows(one.corners, rays, shape)
             continue
-        source, first, u, v, normal = _frame(rays)
-        row = _tangents(one, source, np.cross(first, u), np.cross(v, u), normal)
-        column = _tangents(one, source, np.cross(first, v), np.cross(u, v), normal)
-        result[:, i] = _pixels(row, column, shape)
+        # With the ellipsoid's centre q and semi-axes F in pixels and depths, a plane through the
+        # source with normal m touches it when (m . q)^2 = |F' m|^2. For the normals of columns and
+        # rows, (1, 0, -x) and (0, 1, -x), that is a quadratic in x.
+        assert one.semi_axes is not None
+        q = np.einsum("nij,nj->ni", inverse, one.center - rays[:, :3])
+        f = inverse @ one.semi_axes.T
+        d = q[:, :, None] * q[:, None] - f @ f.transpose(0, 2, 1)
+        with np.errstate(all="ignore"):
+            middle, end = d[:, :2, 2], np.stack([d[:, 0, 0], d[:, 1, 1]], axis=1)
+            half = np.sqrt(np.maximum(middle * middle - end * d[:, 2:, 2], 0.0))
+            low, high = (middle - half) / d[:, 2:, 2], (middle + half) / d[:, 2:, 2]
+        ahead = q[:, 2] > np.linalg.norm(f[:, 2], axis=1) * (1 + 1e-9)
+        result[:, i] = _pixels(low, high, ahead, shape)
     return result
 
 
@@ -221,78 +198,30 @@ def corner_shadows(corners: FloatArray, rays: FloatArray, shape: tuple[int, int]
         rays: (n, 12) as of `ConeVec.rays`.
         shape: detector (rows, cols).
     """
-    row, column = _spans(corners, *_frame(rays))
-    return _pixels(row, column, shape)
+    at = np.einsum("nij,nkj->nki", _inverses(rays), corners - rays[:, None, :3])
+    depth = at[:, :, 2]
+    ahead = (depth > 1e-9 * np.abs(depth).max(axis=1, keepdims=True)).all(axis=1)
+    with np.errstate(all="ignore"):
+        at = at[:, :, :2] / depth[:, :, None]
+    return _pixels(at.min(axis=1), at.max(axis=1), ahead, shape)
 
 
-def _frame(rays: FloatArray) -> tuple[FloatArray, ...]:
-    """Source, first pixel's centre from the source, u, v, and the normal away from the source."""
-    source, first, u, v = (rays[:, i : i + 3] for i in (0, 3, 6, 9))
-    normal = np.cross(u, v)
-    normal *= np.where(np.einsum("ni,ni->n", first, normal) < 0, -1.0, 1.0)[:, None]
-    return source, first, u, v, normal
+def _inverses(rays: FloatArray) -> FloatArray:
+    """What takes points seen from the source to (column, row, 1) times their depth, in distances of
+    the panel, (n, 3, 3).
+    """
+    basis = np.stack([rays[:, 6:9], rays[:, 9:12], rays[:, 3:6]], axis=2)
+    return np.asarray(np.linalg.inv(basis))
 
 
 def _pixels(
-    row: tuple[FloatArray, FloatArray],
-    column: tuple[FloatArray, FloatArray],
-    shape: tuple[int, int],
+    low: FloatArray, high: FloatArray, ahead: npt.NDArray[np.bool_], shape: tuple[int, int]
 ) -> IntArray:
-    """Real ranges of pixel coordinates as whole pixels, (n, 4)."""
-    result = np.empty((len(row[0]), 4), np.int64)
-    for at, span, count in ((0, row, shape[0]), (2, column, shape[1])):
-        result[:, at] = np.clip(np.ceil(span[0] - 1e-6), 0, count)
-        result[:, at + 1] = np.clip(np.floor(span[1] + 1e-6) + 1, 0, count)
-    return result
-
-
-def _tangents(
-    one: Convex, source: FloatArray, plane: FloatArray, step: FloatArray, normal: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Pixel coordinates whose planes plane + coordinate * step touch an ellipsoid, (n,) each.
-
-    A plane through the source with normal m touches when (m . p)^2 = |E m|^2, p the centre seen
-    from the source: a quadratic in the coordinate.
-    """
-    assert one.semi_axes is not None
-    p = one.center - source
-    e = one.semi_axes.T
-    a0, a1 = np.einsum("ni,ni->n", plane, p), np.einsum("ni,ni->n", step, p)
-    e0, e1 = plane @ e, step @ e
-    qa = a1 * a1 - np.einsum("ni,ni->n", e1, e1)
-    qb = a0 * a1 - np.einsum("ni,ni->n", e0, e1)
-    qc = a0 * a0 - np.einsum("ni,ni->n", e0, e0)
-    ahead = np.einsum("ni,ni->n", normal, p) > np.linalg.norm(normal @ e, axis=1) * (1 + 1e-9)
-    with np.errstate(all="ignore"):
-        root = np.sqrt(np.maximum(qb * qb - qa * qc, 0.0))
-        ends = np.sort(np.stack([(-qb - root) / qa, (-qb + root) / qa]), axis=0)
-    good = ahead & np.isfinite(ends).all(axis=0) & (qa > 0)
-    return np.where(good, ends[0], -np.inf), np.where(good, ends[1], np.inf)
-
-
-def _spans(
-    corners: FloatArray,
-    source: FloatArray,
-    first: FloatArray,
-    u: FloatArray,
-    v: FloatArray,
-    normal: FloatArray,
-) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
-    """Extreme (rows, columns) of projected corner points, (n,) each; infinite when some corner is
-    not in front of the source.
-    """
-    ray = corners[None] - source[:, None]
-    depth = np.einsum("nki,ni->nk", ray, normal)
-    good = (depth > 1e-9 * np.abs(depth).max(axis=1, keepdims=True)).all(axis=1)
-    basis = np.stack([u, v, first], axis=2)
-    spans = []
-    with np.errstate(all="ignore"):
-        weights = np.einsum("nij,nkj->nki", np.linalg.inv(basis), ray)
-        for i in (1, 0):
-            at = weights[:, :, i] / weights[:, :, 2]
-            low, high = at.min(axis=1), at.max(axis=1)
-            spans.append((np.where(good, low, -np.inf), np.where(good, high, np.inf)))
-    return spans[0], spans[1]
+    """Real ranges (n, 2) of columns and rows as whole pixels, (n, 4); all where not `ahead`."""
+    first = np.where(ahead[:, None], np.ceil(low - 1e-6), 0).clip(0, shape[::-1])
+    last = np.where(ahead[:, None], np.floor(high + 1e-6) + 1, np.inf).clip(0, shape[::-1])
+    ends = [first[:, 1], last[:, 1], first[:, 0], last[:, 0]]
+    return np.column_stack(ends).astype(np.int64)
 
 
 def _corners(center: FloatArray, axes: FloatArray, half: FloatArray) -> FloatArray:

@@ -52,31 +52,25 @@ def project(box: Box, views: FloatArray, out: Float32Array, *, fans: bool = True
         out: C-ordered float32.
         fans: False for rays that all travel alone.
     """
-    from flexdt.twin.projection.kernels import siddon_kernels
+    from flexdt.twin.projection.kernels import fan_kernels, siddon_kernels
 
     shape = (out.shape[1], out.shape[2])
     if not fans:
         siddon_kernels.project_rays(box, views, np.arange(len(views)), out, TILE)
         return
     for some, turned in runs(views, shape):
+        rays, images, seen = views[some], out[some], shape
         if turned:
-            images = np.empty((some.stop - some.start, *shape[::-1]), np.float32)
-            _project(box, exchanged(views[some]), images)
+            rays, seen = exchanged(rays), shape[::-1]
+            images = np.empty((len(rays), *seen), np.float32)
+        plan = plan_fans(rays, (box.nx, box.ny, box.nz), seen)
+        if len(plan.jobs):
+            shadows = box_shadows(box, rays, (0, box.nz), seen)
+            fan_kernels.project_fans(box, plan.fans(rays), shadows, threads(), images)
+        if len(plan.alone):
+            siddon_kernels.project_rays(box, rays, plan.alone, images, TILE)
+        if turned:
             out[some] = images.transpose(0, 2, 1)
-        else:
-            _project(box, views[some], out[some])
-
-
-def _project(box: Box, views: FloatArray, out: Float32Array) -> None:
-    from flexdt.twin.projection.kernels import fan_kernels, siddon_kernels
-
-    shape = (out.shape[1], out.shape[2])
-    plan = plan_fans(views, (box.nx, box.ny, box.nz), shape)
-    if len(plan.jobs):
-        shadows = box_shadows(box, views, (0, box.nz), shape)
-        fan_kernels.project_fans(box, plan.fans(views), shadows, threads(), out)
-    if len(plan.alone):
-        siddon_kernels.project_rays(box, views, plan.alone, out, TILE)
 
 
 def spread(
@@ -91,28 +85,22 @@ def spread(
         clean: box.flat holds zeros; otherwise whatever it holds is overwritten.
         fans: False for rays that all travel alone.
     """
-    if not fans:
-        _spread(box, views, values, clean, fans=False)
-        return
-    for some, turned in runs(views, (values.shape[1], values.shape[2])):
+    shape = (values.shape[1], values.shape[2])
+    for some, turned in runs(views, shape) if fans else [(slice(None), False)]:
+        rays, images = views[some], values[some]
         if turned:
-            images = np.ascontiguousarray(values[some].transpose(0, 2, 1))
-            _spread(box, exchanged(views[some]), images, clean)
-        else:
-            _spread(box, views[some], values[some], clean)
+            rays, images = exchanged(rays), np.ascontiguousarray(images.transpose(0, 2, 1))
+        _spread(box, rays, images, clean, fans)
         clean = True  # from now on it holds what is added to
 
 
-def _spread(
-    box: Box, views: FloatArray, values: Float32Array, clean: bool, *, fans: bool = True
-) -> None:
+def _spread(box: Box, views: FloatArray, values: Float32Array, clean: bool, fans: bool) -> None:
     from flexdt.twin.projection.kernels import fan_kernels, siddon_kernels
 
     shape = (values.shape[1], values.shape[2])
     counts = (box.nx, box.ny, box.nz)
-    plan = plan_fans(views if fans else views[:0], counts, shape)
+    plan, workers = plan_fans(views if fans else views[:0], counts, shape), threads()
     alone = plan.alone if fans else np.arange(len(views))
-    workers = threads()
     turns = plan_turns(plan, views, counts, shape, workers)
     slices = z_slices(box.nz, turns.slices)
     marks = np.full((len(slices), 2 * box.nx * box.ny), int(clean), np.int32)

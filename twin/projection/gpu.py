@@ -34,8 +34,6 @@ CHUNK_BYTES = 256 * 2**20
 """Images on the device at a time."""
 SPARE_BYTES = 256 * 2**20
 """What must stay free on a device: for the driver, and for whoever else uses it."""
-VIEWS_A_DEVICE = 8
-"""So many views of FDK are worth another device."""
 VIEWS_A_THREAD = 7 / 16
 """A volume of the host is worth its way to the device and back from so many views on, for each
 thread of the processor (measured: about 7 views beside 16 threads)."""
@@ -149,20 +147,6 @@ def upload(flat: Float32Array) -> Any:
     from numba import cuda
 
     return cuda.to_device(flat)
-
-
-def devices_for(views: int) -> int:
-    """How many devices are worth it for FDK; at least 1."""
-    counts = [0]
-
-    def ask() -> None:
-        from numba import cuda
-
-        counts[0] = len(cuda.gpus)
-
-    if availability().present:
-        attempt(ask)
-    return max(1, min(counts[0], views // VIEWS_A_DEVICE))
 
 
 def free_bytes() -> int | None:

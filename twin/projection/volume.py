@@ -600,9 +600,7 @@ class Grid:
             [(0, 50), (50, 100)]
         """
         layers = max(1, most_bytes * self.shape[0] // self.bytes)
-        count = math.ceil(self.shape[0] / layers)
-        edges = [round(i * self.shape[0] / count) for i in range(count + 1)]
-        return list(pairwise(edges))
+        return cut(self.shape[0], math.ceil(self.shape[0] / layers))
 
     def blank(self) -> Volume:
         """A volume of zeros on this grid, which takes no memory.
@@ -613,6 +611,11 @@ class Grid:
         """
         zeros = np.broadcast_to(np.zeros((), np.float32), self.shape)
         return Volume(zeros, self.voxel_mm, self.center_mm)
+
+
+def cut(layers: int, count: int) -> list[tuple[int, int]]:
+    """Layers (first, last) of `count` slabs of about equal height."""
+    return list(pairwise(round(i * layers / count) for i in range(count + 1)))
 
 
 def as_volume(volume: Volume | Grid) -> Volume:

@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -27,6 +26,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Grid, Volume, as_volume, gpu
 from flexdt.twin.projection.cpu import threads
+from flexdt.twin.projection.volume import cut
 from flexdt.twin.reconstruction.coverage import Sharing, first_and_steps, normalise_coverage
 from flexdt.twin.reconstruction.noise import NoiseMeter, with_errors
 from flexdt.twin.reconstruction.rectify import (
@@ -149,45 +149,27 @@ class OnProcessor:
         return self._data
 
 
-@dataclass(frozen=True, eq=False)
-class _Layers:
-    """Layers low <= z < high of a volume on one device: what its kernels take."""
-
-    device: int
-    low: int
-    high: int
-    grid: list[Any]
-    flat: Any
-    stream: Any
-
-
 class OnDevice:
-    """On CUDA devices, circles only: images go there, and the volume comes back.
+    """On a CUDA device, circles only: images go there, and the volume comes back.
 
-    Images are copied into one of two page-locked buffers while the devices work on the other. The
+    Images are copied into one of two page-locked buffers while the device works on the other. The
     filter is a plain convolution with the taps of its response, a product for each pair of pixels
-    of a row, without a library for Fourier transforms there. Of several devices each has layers of
-    the volume, and weighs and filters all views.
+    of a row, without a library for Fourier transforms there.
 
     Raises:
-        gpu.DeviceError: from each method; a device failed, and what was added is lost.
+        gpu.DeviceError: from each method; the device failed, and what was added is lost.
     """
 
-    def __init__(self, like: Volume, devices: int = 1) -> None:
-        from numba import cuda
-
+    def __init__(self, like: Volume) -> None:
         nz, ny, nx = like.shape
         self._shape, self._turn = (ny, nx, nz), 0
-        self._buffers: dict[int, tuple[Any, list[Any]]] = {}
-        self._parts: list[_Layers] = []
+        self._buffers: dict[int, tuple[Any, Any]] = {}
 
         def prepare() -> None:
-            for device, (low, high) in enumerate(_cut(nz, min(devices, nz))):
-                with gpu.on(device):
-                    part = like if high - low == nz else _layers(like, low, high)
-                    grid = [cuda.to_device(np.array(numbers)) for numbers in first_and_steps(part)]
-                    flat = gpu.zeros(ny * nx * (high - low))
-                    self._parts.append(_Layers(device, low, high, grid, flat, cuda.stream()))
+            from numba import cuda
+
+            self._grid = [cuda.to_device(np.array(numbers)) for numbers in first_and_steps(like)]
+            self._flat, self._stream = gpu.zeros(ny * nx * nz), cuda.stream()
 
         gpu.demand(prepare)
 
@@ -196,24 +178,14 @@ class OnDevice:
         gpu.demand(lambda: self._add(views))
 
     def _add(self, views: Views) -> None:
-        from numba import cuda
-
-        images, copied = self._staged(views.images)
-        for part in self._parts:
-            with gpu.on(part.device):
-                there = cuda.to_device(images, part.stream)
-                copied.append(cuda.event())
-                copied[-1].record(part.stream)
-                self._work(part, there, views)
-
-    def _work(self, part: _Layers, there: Any, views: Views) -> None:
-        """Weigh, filter and add images that are on a device."""
+        """Weigh, filter and add images."""
         from numba import cuda
 
         from flexdt.twin.reconstruction import gpu_reconstruction_kernels as kernels
 
+        there = self._moved(views.images)
         n, wide, cols, rows = views.sizes
-        (ny, nx, _), nz, stream = self._shape, part.high - part.low, part.stream
+        (ny, nx, nz), stream = self._shape, self._stream
 
         def small(values: FloatArray, kind: type = np.float32) -> Any:
             return cuda.to_device(np.ascontiguousarray(values, dtype=kind), stream)
@@ -231,41 +203,34 @@ class OnDevice:
         )
         blocks = (-(-nz // (kernels.BLOCK[0] * kernels.RUN)), -(-nx // kernels.BLOCK[1]), ny)
         kernels.backproject[blocks, (*kernels.BLOCK, 1), stream](
-            ready.reshape(ready.size), cols, rows, small(views.table, np.float64), *part.grid,
-            part.flat.reshape(ny, nx, nz),
+            ready.reshape(ready.size), cols, rows, small(views.table, np.float64), *self._grid,
+            self._flat.reshape(ny, nx, nz),
         )  # fmt: skip
 
-    def _staged(self, images: Float32Array) -> tuple[Float32Array, list[Any]]:
-        """Images in page-locked memory, from where copies are not waited for, and the list of the
-        events that tell that it is free again.
-        """
+    def _moved(self, images: Float32Array) -> Any:
+        """Images on the device, by page-locked memory, from where copies are not waited for."""
         from numba import cuda
 
         self._turn = 1 - self._turn
-        buffer, copied = self._buffers.get(self._turn, (None, []))
-        for event in copied:
-            event.synchronize()
-        copied.clear()
+        buffer, copied = self._buffers.get(self._turn, (None, None))
+        if copied is not None:
+            copied.synchronize()
         if buffer is None or len(buffer) < len(images):
             buffer = cuda.pinned_array(images.shape, np.float32)
-            self._buffers[self._turn] = buffer, copied
         part = buffer[: len(images)]
         np.copyto(part, images)
-        return part, copied
+        there, copied = cuda.to_device(part, self._stream), cuda.event()
+        copied.record(self._stream)
+        self._buffers[self._turn] = buffer, copied
+        return there
 
     def volume(self) -> Float32Array:
         """See `OnProcessor`."""
         out = np.empty(self._shape, np.float32)
 
         def fetch() -> None:
-            for part in self._parts:
-                with gpu.on(part.device):
-                    part.stream.synchronize()
-                    if len(self._parts) == 1:
-                        part.flat.copy_to_host(out.reshape(-1))
-                    else:
-                        layers = part.flat.copy_to_host().reshape(*self._shape[:2], -1)
-                        out[:, :, part.low : part.high] = layers
+            self._stream.synchronize()
+            self._flat.copy_to_host(out.reshape(-1))
 
         gpu.demand(fetch)
         return out
@@ -371,34 +336,28 @@ def fdk_parts(
         )
 
     if target is None and not circle_of(cone_vec).rise:
-        devices = gpu.devices_for(len(cone_vec))
-        slabs = _slabs(like, shape, devices)
+        slabs = _slabs(like, shape)
         with suppress(gpu.DeviceError):
             if len(slabs) == 1:
-                return onto(OnDevice(like, devices), like, progress)
+                return onto(OnDevice(like), like, progress)
             if slabs:
                 nz, ny, nx = like.shape
                 data = np.empty((ny, nx, nz), np.float32).transpose(2, 0, 1)
                 for k, (first, last) in enumerate(slabs):
                     slab, tell = _layers(like, first, last), _share(progress, k, len(slabs))
-                    data[first:last] = onto(OnDevice(slab, devices), slab, tell).data
+                    data[first:last] = onto(OnDevice(slab), slab, tell).data
                 return replace(like, data=data)
     return onto(target or OnProcessor(like), like, progress)
 
 
-def _slabs(like: Volume, shape: tuple[int, int], devices: int) -> list[tuple[int, int]]:
-    """Layers (first, last) of the slabs that devices have room for one by one; none without one."""
+def _slabs(like: Volume, shape: tuple[int, int]) -> list[tuple[int, int]]:
+    """Layers (first, last) of the slabs that a device has room for one by one; none without one."""
     count, layers = 1, like.shape[0]
-    while not device_takes(_layers(like, 0, -(-layers // (count * devices))), shape):
+    while not device_takes(_layers(like, 0, -(-layers // count)), shape):
         if count >= layers or not gpu.availability().present:
             return []
         count = min(2 * count, layers)
-    return _cut(layers, count)
-
-
-def _cut(layers: int, count: int) -> list[tuple[int, int]]:
-    """Layers (first, last) of `count` slabs of about equal height."""
-    return list(pairwise(round(i * layers / count) for i in range(count + 1)))
+    return cut(layers, count)
 
 
 def _layers(like: Volume, first: int, last: int) -> Volume:

@@ -164,7 +164,7 @@ def tv(*args: Any, **options: Any) -> Volume:
 
 def _minimised(
     problem: LinearSystem,
-    regular: Regular | DeviceRegular,
+    regular: Regular,
     iterations: int,
     weight: float,
     tolerance: float,
@@ -245,7 +245,7 @@ class _Objective:
 
     problem: LinearSystem
     strength: float
-    regular: Regular | DeviceRegular
+    regular: Regular
 
     def at(self, x: Float32Array) -> _At:
         rest = self.problem.project(x) - self.problem.measured
@@ -277,8 +277,8 @@ class Regular:
 
     scale: Float32Array
     lowest: np.float32
-    allowed: npt.NDArray[np.uint8]
-    dual: Float32Array = field(repr=False)
+    allowed: Any
+    dual: Any = field(repr=False)
 
     @classmethod
     def of(cls, like: Volume, nonnegative: bool, mask: npt.ArrayLike | None) -> Regular:
@@ -297,11 +297,11 @@ class Regular:
             np.zeros((3, *like.shape), np.float32),
         )
 
-    def allow(self, x: Float32Array) -> Float32Array:
+    def allow(self, x: Any) -> Any:
         """The allowed values next to x."""
         return np.ascontiguousarray(np.maximum(x, self.lowest) * self.allowed, dtype=np.float32)
 
-    def variation(self, x: Float32Array) -> float:
+    def variation(self, x: Any) -> float:
         """The total variation of x."""
         from flexdt.twin.reconstruction import tv_kernels
 
@@ -309,45 +309,47 @@ class Regular:
         tv_kernels.variation(x, self.scale, layers)
         return float(layers.sum())
 
-    def proximal(self, z: Float32Array, theta: float) -> Float32Array:
+    def proximal(self, z: Any, theta: float) -> Any:
         """The allowed x of least 1/2 sum((x - z)^2) + theta TV(x), nearly."""
-        from flexdt.twin.reconstruction import tv_kernels
-
         if theta == 0.0:
             return self.allow(z)
-        z = np.ascontiguousarray(z)
-        x = np.empty_like(z)
-        ahead = self.dual.copy()
-        small, rate = np.float32(theta), _rate(self.scale, theta)
+        if isinstance(z, np.ndarray):
+            z = np.ascontiguousarray(z)
+        x, ahead = z.copy(), self.dual.copy()
+        # The squared norm of the differences is at most 4 sum(scale^2).
+        rate = np.float32(1.0 / (4.0 * theta * float((self.scale**2).sum())))
         t = 1.0
         for _ in range(INNER):
-            tv_kernels.primal_step(z, ahead, small, self.scale, self.lowest, self.allowed, x)
+            self.primal_step(z, ahead, np.float32(theta), x)
             t, further = momentum(t)
-            tv_kernels.dual_step(x, ahead, self.dual, rate, np.float32(further), self.scale)
-        tv_kernels.primal_step(z, self.dual, small, self.scale, self.lowest, self.allowed, x)
+            self.dual_step(x, ahead, rate, np.float32(further))
+        self.primal_step(z, self.dual, np.float32(theta), x)
         return x
 
+    def primal_step(self, z: Any, dual: Any, theta: np.float32, x: Any) -> None:
+        """See `tv_kernels`; into x."""
+        from flexdt.twin.reconstruction import tv_kernels
 
-def _rate(scale: Float32Array, theta: float) -> np.float32:
-    """Of the dual steps: the squared norm of the differences is at most 4 sum(scale^2)."""
-    return np.float32(1.0 / (4.0 * theta * float((scale**2).sum())))
+        tv_kernels.primal_step(z, dual, theta, self.scale, self.lowest, self.allowed, x)
+
+    def dual_step(self, x: Any, ahead: Any, rate: np.float32, further: np.float32) -> None:
+        """See `tv_kernels`; changes `dual` and `ahead`."""
+        from flexdt.twin.reconstruction import tv_kernels
+
+        tv_kernels.dual_step(x, ahead, self.dual, rate, further, self.scale)
 
 
 @dataclass(frozen=True, eq=False)
-class DeviceRegular:
-    """`Regular` on a CUDA device: volumes are `DeviceArray`."""
-
-    scale: Float32Array
-    lowest: np.float32
-    allowed: DeviceArray
-    dual: Any = field(repr=False)
+class DeviceRegular(Regular):
+    """The same on a CUDA device: every array but `scale` is a `DeviceArray`."""
 
     @classmethod
     def of_host(cls, regular: Regular, like: Volume) -> DeviceRegular:
         """The same there, with all dual variables zero."""
         allowed = DeviceArray.of_voxels(like.like(regular.allowed.astype(np.float32)))
         dual = gpu.demand(lambda: gpu.zeros(3 * allowed.flat.size))
-        return cls(regular.scale, regular.lowest, allowed, dual)
+        flat = DeviceArray.of_images(dual.reshape(1, 1, dual.size))
+        return cls(regular.scale, regular.lowest, allowed, flat)
 
     def allow(self, x: Any) -> Any:
         """See `Regular`."""
@@ -356,24 +358,19 @@ class DeviceRegular:
     def variation(self, x: Any) -> float:
         """See `Regular`."""
         found = x.copy()
-        self._run("lengths", x.flat, *self._form(), found.flat)
+        self._run("lengths", x.flat, *self._form, found.flat)
         return float(found.sum())
 
-    def proximal(self, z: Any, theta: float) -> Any:
+    def primal_step(self, z: Any, dual: Any, theta: np.float32, x: Any) -> None:
         """See `Regular`."""
-        if theta == 0.0:
-            return self.allow(z)
-        x, ahead = z.copy(), DeviceArray.of_images(self.dual.reshape(1, 1, self.dual.size)).copy()
-        small, rate, form = np.float32(theta), _rate(self.scale, theta), self._form()
-        last = (*form, self.lowest, self.allowed.flat, x.flat)
-        t = 1.0
-        for _ in range(INNER):
-            self._run("primal_step", z.flat, ahead.flat, small, *last)
-            t, further = momentum(t)
-            self._run("dual_step", x.flat, ahead.flat, self.dual, rate, np.float32(further), *form)
-        self._run("primal_step", z.flat, self.dual, small, *last)
-        return x
+        last = (self.lowest, self.allowed.flat, x.flat)
+        self._run("primal_step", z.flat, dual.flat, theta, *self._form, *last)
 
+    def dual_step(self, x: Any, ahead: Any, rate: np.float32, further: np.float32) -> None:
+        """See `Regular`."""
+        self._run("dual_step", x.flat, ahead.flat, self.dual.flat, rate, further, *self._form)
+
+    @property
     def _form(self) -> tuple[Any, ...]:
         stride = self.allowed.volume.layout.stride_x
         return self.allowed.shape, stride, tuple(self.scale)
