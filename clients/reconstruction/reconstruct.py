@@ -33,14 +33,13 @@ from flexdt.clients.reconstruction.volume_files import (
 from flexdt.clients.whole_files import free_bytes
 from flexdt.runtime.files.directory import memory_bytes
 from flexdt.twin.dataset.normalise import binned_mean
-from flexdt.twin.errors import LimitError, TwinError, UnknownNameError
+from flexdt.twin.errors import LimitError, TwinError, UnknownNameError, require_within
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.projection import Volume
 from flexdt.twin.reconstruction import (
     Grid,
-    Images,
     Polychromatic,
     Truncation,
     bias_of,
@@ -202,15 +201,9 @@ def views_of(
     """
     rows, cols = dataset.shape
     most = max(1, min(rows, cols) // 2)
-    if not 1 <= binning <= most:
-        raise LimitError(
-            f"binning {binning} of {cols} x {rows} pixels; allowed: 1 to {most}",
-            {"asked": binning, "allowed": [1, most]},
-        )
+    require_within(f"binning of {cols} x {rows} pixels", binning, 1, most)
     if not isinstance(every, int | np.integer) or every < 1:
-        raise LimitError(
-            f"every {every} frames; allowed: a whole number from 1", {"asked": every, "allowed": 1}
-        )
+        raise LimitError.instead(f"every {every} frames", every, "a whole number from 1")
     indices = dataset.present[::every]
     if not indices:
         raise LimitError(f"{dataset.where}: no projections to reconstruct from", {"asked": every})
@@ -353,10 +346,10 @@ def reconstruct_volume(
         warnings.warn(doubt, stacklevel=2)
     if wanted.algorithm != "fdk":
         return _iterative(views, grid, wanted, tell)
-    images = Images(views.cone_vec, views.shape, views.view, views.parts)
     volume, doubts = checked_fdk(
-        images, grid.blank(), wanted.window, lambda done: tell(done, 1.0), errors=errors
-    )
+        views.view, views.parts, views.cone_vec, views.shape, grid, wanted.window,
+        lambda done: tell(done, 1.0), errors=errors,
+    )  # fmt: skip
     for doubt in doubts:
         warnings.warn(doubt, stacklevel=2)
     return volume
@@ -372,11 +365,9 @@ def _task(
         raise UnknownNameError.among(f"unknown algorithm {name!r}; allowed", name, ALGORITHMS)
     several = _names(wanted.material)
     if len(several) > 1 and name not in ("sirt", "sart"):
-        raise LimitError(
-            f"materials {', '.join(several)} with {name}; allowed: one, or several with sirt or "
-            "sart, which follow each through the volume",
-            {"asked": [name, *several], "allowed": ["sirt", "sart"]},
-        )
+        said = f"materials {', '.join(several)} with {name}"
+        wanted = "one, or several with sirt or sart, which follow each through the volume"
+        raise LimitError.instead(said, [name, *several], wanted)
     views = views_of(dataset, parameters, binning=wanted.binning, every=wanted.every)
     views = replace(views, doubts=tuple(image_doubts(dataset, needed=True)))
     return wanted, views, grid_of(views, wanted)
@@ -520,7 +511,7 @@ def _require(where: str, need: int, free: int, grid: Grid) -> None:
         raise LimitError(
             f"{nz} x {ny} x {nx} voxels of {grid.voxel_mm:g} mm (z, y, x) need "
             f"{need / 2**30:.3g} GiB; there are {free / 2**30:.3g} GiB {where}: choose larger "
-            "voxels or a smaller shape",
+            "voxels or a smaller shape (for iterations also binning, or fewer frames)",
             {"asked": need, "allowed": free},
         )
 
@@ -531,14 +522,7 @@ def _iterative(views: ScanFrames, grid: Grid, request: VolumeRequest, tell: Prog
     if views.mixture is not None:
         stacks, grids = stacks + 2 * len(views.mixture.mu), grids + 3
     need = stacks * 4 * len(views.indices) * math.prod(views.shape) + grids * grid.bytes
-    memory = memory_bytes()
-    if need > 0.8 * memory:
-        raise LimitError(
-            f"{request.algorithm} would need about {need / 2**30:.1f} GiB of the machine's "
-            f"{memory / 2**30:.1f}; use binning, fewer frames, or a coarser or smaller volume",
-            {"asked": need, "allowed": int(0.8 * memory)},
-        )
-
+    _require(f"of memory for {request.algorithm}", need, int(0.8 * memory_bytes()), grid)
     asked = {
         "iterations": request.iterations, "weight": request.weight, "hardening": views.mixture,
     }  # fmt: skip

@@ -113,10 +113,8 @@ def save_volume(volume: Volume, file: File) -> None:
     """See `Volume.save`."""
     voxel = volume.voxel_xyz
     if len(set(voxel)) > 1:
-        raise LimitError(
-            f"voxels of {' x '.join(f'{v:g}' for v in voxel)} mm; allowed: cubes",
-            {"asked": list(voxel), "allowed": "three equal edges"},
-        )
+        said = f"voxels of {' x '.join(f'{v:g}' for v in voxel)} mm"
+        raise LimitError.instead(said, list(voxel), "cubes, three equal edges")
     with volume_writer(Path(file), Grid(volume.shape, voxel[0], volume.center_mm)) as write:
         write(volume.data)
 
@@ -241,19 +239,14 @@ def _hdf5(part: Path, grid: Grid) -> Iterator[Sink]:
         values = file.create_dataset("volume", grid.shape, "f4")
         values.attrs.update(unit="1/mm", axes="zyx", voxel_mm=grid.voxel_mm,
                             center_mm=grid.center_mm)  # fmt: skip
-        yield _filling(values)
+        done = 0
 
+        def write(slab: Float32Array) -> None:
+            nonlocal done
+            values[done : done + len(slab)] = slab
+            done += len(slab)
 
-def _filling(values: Any) -> Sink:
-    """Writes slabs one after the other into something that is indexed like an array."""
-    done = 0
-
-    def write(slab: Float32Array) -> None:
-        nonlocal done
-        values[done : done + len(slab)] = slab
-        done += len(slab)
-
-    return write
+        yield write
 
 
 def read_volume(file: File) -> Volume:
@@ -282,15 +275,24 @@ Read = tuple[npt.NDArray[Any], float, Sequence[float], bool]
 """Values, voxel [mm], place (x, y, z) [mm], and whether that is the first voxel's or the middle."""
 
 
-def _read_nrrd(path: Path) -> Read:
+def _header(path: Path, between: str, end: bytes) -> tuple[dict[str, str], int]:
+    """Fields of a header that goes on until `end`, and where the values begin behind it."""
     with path.open("rb") as file:
-        head, end, _ = file.read(4096).partition(b"\n\n")
-    if not head.startswith(b"NRRD") or not end:
-        raise ValueError("no NRRD with its data in the file")
-    lines = head.decode("ascii").splitlines()[1:]
-    fields = {k: v.strip() for k, _, v in (line.partition(":") for line in lines)}
-    nx, ny, nz = map(int, fields["sizes"].split())
-    values = np.memmap(path, "<f4", "r", offset=len(head) + len(end), shape=(nz, ny, nx))
+        head, found, _ = file.read(4096).partition(end)
+    if not found:
+        raise ValueError("no values in the file")
+    fields = (line.partition(between) for line in head.decode("ascii").splitlines())
+    return {key.strip(): value.strip() for key, _, value in fields}, len(head) + len(end)
+
+
+def _mapped(path: Path, offset: int, sizes: str) -> npt.NDArray[np.float32]:
+    nx, ny, nz = map(int, sizes.split())
+    return np.memmap(path, "<f4", "r", offset=offset, shape=(nz, ny, nx))
+
+
+def _read_nrrd(path: Path) -> Read:
+    fields, begin = _header(path, ":", b"\n\n")
+    values = _mapped(path, begin, fields["sizes"])
     voxel = float(fields["space directions"].split(",")[0].strip("("))
     low = [float(v) for v in fields["space origin"].strip("()").split(",")]
     return values, voxel, low, True
@@ -306,13 +308,8 @@ def _read_tiff(path: Path) -> Read:
 
 
 def _read_mha(path: Path) -> Read:
-    with path.open("rb") as file:
-        head, mark, _ = file.read(4096).partition(b"ElementDataFile = LOCAL\n")
-    if not mark:
-        raise ValueError("no MetaImage with its data in the file")
-    fields = dict(line.split(" = ", 1) for line in head.decode("ascii").splitlines())
-    nx, ny, nz = map(int, fields["DimSize"].split())
-    values = np.memmap(path, "<f4", "r", offset=len(head) + len(mark), shape=(nz, ny, nx))
+    fields, begin = _header(path, "=", b"ElementDataFile = LOCAL\n")
+    values = _mapped(path, begin, fields["DimSize"])
     x, y, z = (float(v) for v in fields["Offset"].split())
     low = [-x, -y, z]
     return values, float(fields["ElementSpacing"].split()[0]), low, True

@@ -16,7 +16,7 @@ import numpy as np
 
 import flexdt as fx
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.reconstruction.checked_fdk import Images, checked_fdk
+from flexdt.twin.reconstruction.checked_fdk import checked_fdk
 
 CASES = (
     (360, (128, 128), 1.17, fx.Grid((96, 96, 96), 0.6)),
@@ -46,11 +46,13 @@ if __name__ == "__main__":
             def parts(chunk: Float32Array = chunk, views: int = views) -> Iterator[Float32Array]:
                 return (chunk.copy() for _ in range(views // 8))
 
-            images = Images(scan, shape, lambda number, image=image: image, parts)
             best = [np.inf, np.inf]
             for turn in range(6):
                 begun = time.process_time()
-                checked_fdk(images, grid, errors=bool(turn % 2))
+                checked_fdk(
+                    lambda number, image=image: image, parts, scan, shape, grid,
+                    errors=bool(turn % 2),
+                )  # fmt: skip
                 best[turn % 2] = min(best[turn % 2], time.process_time() - begun)
             print(f"{views} views of {shape} into {grid.shape}, {what}: {best[0]:.2f} and "
                   f"{best[1]:.2f} s, {best[1] / best[0]:.3f}", flush=True)  # fmt: skip

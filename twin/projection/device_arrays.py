@@ -69,8 +69,10 @@ class DeviceArray(NDArrayOperatorsMixin):
         assert self.grid is not None
         return replace(self.grid, layout=replace(self.grid.layout, flat=self.flat))
 
-    def images_of(self, views: npt.NDArray[np.intp]) -> DeviceArray:
-        """A copy of the images of some views."""
+    def __getitem__(self, views: slice | npt.NDArray[np.intp]) -> DeviceArray:
+        """A copy of the images of some views; of a slice, which is of all, these themselves."""
+        if isinstance(views, slice):
+            return self
 
         def gather() -> DeviceArray:
             from numba import cuda
@@ -135,10 +137,7 @@ def _combined(
     least: float = 0.0,
 ) -> DeviceArray:
     if isinstance(b, DeviceArray) and b.shape != a.shape:
-        raise GeometryError(
-            f"arrays of {a.shape} and {b.shape} on the device; allowed: of one shape",
-            {"asked": list(b.shape), "allowed": list(a.shape)},
-        )
+        raise GeometryError.of_shape("an array on the device", b.shape, a.shape, ", the other's")
 
     def launch() -> DeviceArray:
         from numba import cuda

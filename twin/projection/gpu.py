@@ -220,10 +220,8 @@ def is_there(x: object) -> bool:
 def check_host(there: bool, what: str) -> None:
     """Raise NotBuiltError unless an array is in the processor's memory."""
     if not there:
-        raise NotBuiltError(
-            f"{what} is in the memory of a device; allowed: arrays in the processor's memory",
-            {"asked": "device", "allowed": "cpu"},
-        )
+        said = f"{what} is in the memory of a device"
+        raise NotBuiltError.instead(said, "device", "arrays in the processor's memory")
 
 
 def taken(x: Any) -> Any:
@@ -236,10 +234,8 @@ def taken(x: Any) -> Any:
 
     array = x if hasattr(x, "copy_to_host") else cuda.as_cuda_array(x)
     if array.dtype != np.float32 or not array.is_c_contiguous():
-        raise GeometryError(
-            f"an array of {array.dtype} on the device; allowed: float32 in C order",
-            {"asked": str(array.dtype), "allowed": "float32"},
-        )
+        said = f"an array of {array.dtype} on the device"
+        raise GeometryError.instead(said, str(array.dtype), "float32 in C order")
     return array
 
 

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.errors import GeometryError, LimitError, TwinError
+from flexdt.twin.errors import GeometryError, TwinError, require_within
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import gpu
@@ -145,12 +145,11 @@ class Operator:
         """
         if isinstance(x, (Volume, DeviceVolume)):
             if not _same_grid(x, self.like):
-                raise GeometryError(
-                    f"a volume of {x.shape} voxels of {x.voxel_xyz} mm at {x.center_mm} mm; the "
-                    f"operator's grid is {self.like.shape} of {self.like.voxel_xyz} mm at "
-                    f"{self.like.center_mm} mm",
-                    {"asked": list(x.shape), "allowed": list(self.voxel_shape)},
+                said, wanted = (
+                    f"{v.shape} voxels of {v.voxel_xyz} mm at {v.center_mm} mm"
+                    for v in (x, self.like)
                 )
+                raise GeometryError.instead(f"a volume of {said}", list(x.shape), wanted)
             return forward(x, self.geometry, self.detector_shape)
         if _is_tensor(x):
             return self.torch()(x)
@@ -210,11 +209,7 @@ class Operator:
             >>> round(A.norm(), 2)  # one ray through four voxels of 0.5 mm: 0.5 sqrt(4)
             1.0
         """
-        if not SMALLEST_TOLERANCE <= tolerance < 1.0:
-            raise LimitError(
-                f"the tolerance is {tolerance:g}; allowed: {SMALLEST_TOLERANCE:g} to 1",
-                {"asked": tolerance, "allowed": [SMALLEST_TOLERANCE, 1.0]},
-            )
+        require_within("the tolerance", tolerance, SMALLEST_TOLERANCE, 1.0)
         return norm_of(self._forward, self._back, np.ones(self.voxel_shape, np.float32), tolerance)
 
     def gradient(self, x: Volume | npt.ArrayLike, weights: npt.ArrayLike) -> FloatArray:

@@ -352,20 +352,16 @@ def require_line_integrals(projections: Any) -> None:
     """Raise GeometryError for a detector's counts, which are unsigned integers."""
     kind = getattr(projections, "dtype", None)
     if kind is not None and kind.kind == "u":
-        raise GeometryError(
-            f"projections are {kind}, as a detector's counts are; allowed: line integrals, as "
-            "`line_integrals()` of a data set gives them, or floating-point numbers",
-            {"asked": str(kind), "allowed": "floating-point numbers"},
-        )
+        said = f"projections are {kind}, as a detector's counts are"
+        wanted = "line integrals, as `line_integrals()` of a data set gives them"
+        raise GeometryError.instead(said, str(kind), f"{wanted}, or floating-point numbers")
 
 
 def require_finite(values: Any) -> None:
     """Raise GeometryError for projections in memory that are not finite."""
     if not gpu.is_there(values) and not math.isfinite(float(values.sum())):
-        raise GeometryError(
-            "projections hold values that are not finite; allowed: finite line integrals",
-            {"asked": "NaN or infinity", "allowed": "finite"},
-        )
+        said = "projections hold values that are not finite"
+        raise GeometryError.instead(said, "NaN or infinity", "finite line integrals")
 
 
 def voxel_rays(cone_vec: ConeVec, layout: Layout, shape: Shape2) -> FloatArray:
@@ -394,9 +390,9 @@ def check_out(out: Float32Array | None, shape: tuple[int, int, int]) -> Float32A
         or not out.flags.c_contiguous
         or not out.flags.writeable
     ):
-        raise GeometryError(
-            f"out is {out.dtype} {out.shape}; allowed: writeable C-ordered float32 {shape}",
-            {"asked": [str(out.dtype), list(out.shape)], "allowed": ["float32", list(shape)]},
+        given = f"{out.dtype} {out.shape}"
+        raise GeometryError.instead(
+            f"out is {given}", given, f"writeable C-ordered float32 {shape}"
         )
     return out
 

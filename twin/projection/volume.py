@@ -164,11 +164,9 @@ def blank_layout(volume: Volume, room: Float32Array | None = None) -> Layout:
         or steps[2] < nz
         or steps[1] < nx * steps[2]
     ):
-        raise GeometryError(
-            f"out is {data.dtype} {data.shape} with strides {data.strides}; allowed: writeable "
-            f"float32 {volume.shape} with z contiguous in memory, as room_like makes it",
-            {"asked": [str(data.dtype), list(data.shape)], "allowed": list(volume.shape)},
-        )
+        said = f"out is {data.dtype} {data.shape} with strides {data.strides}"
+        wanted = f"writeable float32 {volume.shape} with z contiguous in memory, as room_like makes"
+        raise GeometryError.instead(said, list(data.shape), f"{wanted} it")
     low = [c - size / 2 for c, size in zip(volume.center_mm, volume.size_mm, strict=True)]
     return Layout(
         flat=_flat_alias(data, (ny - 1) * steps[1] + (nx - 1) * steps[2] + nz),
@@ -224,10 +222,8 @@ class Volume:
             object.__setattr__(self, "voxel_mm", _vector((size,) * 3, "voxel_mm")[0])
         object.__setattr__(self, "center_mm", _vector(self.center_mm, "center_mm"))
         if any(size <= 0 for size in self.voxel_xyz):
-            raise GeometryError(
-                f"voxel_mm is {self.voxel_mm}; allowed: positive sizes (x, y, z) in mm",
-                {"asked": list(self.voxel_xyz), "allowed": "> 0"},
-            )
+            said, wanted = f"voxel_mm is {self.voxel_mm}", "positive sizes (x, y, z) in mm"
+            raise GeometryError.instead(said, list(self.voxel_xyz), wanted)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
         """The values, (nz, ny, nx)."""
@@ -570,11 +566,9 @@ class Grid:
 
     def __post_init__(self) -> None:
         if min(self.shape) < 1 or not (math.isfinite(self.voxel_mm) and self.voxel_mm > 0):
-            raise GeometryError(
-                f"grid of {self.shape} voxels of {self.voxel_mm} mm; allowed: three whole numbers "
-                "above 0, and one edge above 0",
-                {"asked": repr((self.shape, self.voxel_mm)), "allowed": "> 0"},
-            )
+            said = f"grid of {self.shape} voxels of {self.voxel_mm} mm"
+            wanted = "three whole numbers above 0, and one edge above 0"
+            raise GeometryError.instead(said, repr((self.shape, self.voxel_mm)), wanted)
 
     @property
     def bytes(self) -> int:
@@ -709,8 +703,6 @@ def _cropped(
 def _vector(value: object, name: str) -> Vector3:
     numbers = np.asarray(value, dtype=np.float64)
     if numbers.shape != (3,) or not np.isfinite(numbers).all():
-        raise GeometryError(
-            f"{name} is {value!r}; allowed: three finite numbers (x, y, z) in mm",
-            {"asked": repr(value), "allowed": "(x, y, z)"},
-        )
+        wanted = "three finite numbers (x, y, z) in mm"
+        raise GeometryError.instead(f"{name} is {value!r}", repr(value), wanted)
     return float(numbers[0]), float(numbers[1]), float(numbers[2])

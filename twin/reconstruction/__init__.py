@@ -3,7 +3,6 @@
 from flexdt.twin.projection.volume import Accuracy, Grid
 from flexdt.twin.reconstruction.bias import Bias, bias_of
 from flexdt.twin.reconstruction.checked_fdk import (
-    Images,
     bias_warnings,
     checked_fdk,
     fdk,
@@ -29,7 +28,6 @@ __all__ = [
     "Bias",
     "Grid",
     "Hardening",
-    "Images",
     "Minimised",
     "Polychromatic",
     "Step",

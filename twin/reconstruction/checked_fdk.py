@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -25,23 +24,6 @@ from flexdt.twin.reconstruction.fdk import CHUNK, PIXELS, Progress, fdk_parts
 from flexdt.twin.reconstruction.noise import with_errors
 from flexdt.twin.reconstruction.truncation import truncation_of
 from flexdt.twin.signatures import public
-
-
-@dataclass(frozen=True)
-class Images:
-    """Line integrals of a scan.
-
-    Attributes:
-        cone_vec: of all views.
-        shape: (rows, cols).
-        view: gives an image by its number, (rows, cols).
-        parts: see `fdk_parts`.
-    """
-
-    cone_vec: ConeVec
-    shape: tuple[int, int]
-    view: Callable[[int], npt.NDArray[np.generic]]
-    parts: Callable[[], Iterable[Float32Array]]
 
 
 @public
@@ -106,15 +88,19 @@ def fdk(
             yield part
 
     shape = values.shape[1], values.shape[2]
-    views = Images(geometry, shape, lambda number: values[number], parts)
-    volume, doubts = checked_fdk(views, like, window, progress, errors=errors)
+    volume, doubts = checked_fdk(
+        values.__getitem__, parts, geometry, shape, like, window, progress, errors=errors
+    )
     for doubt in doubts:
         warnings.warn(doubt, stacklevel=3)
     return volume
 
 
 def checked_fdk(
-    images: Images,
+    image: Callable[[int], npt.NDArray[np.generic]],
+    parts: Callable[[], Iterable[Float32Array]],
+    cone_vec: ConeVec,
+    shape: tuple[int, int],
     like: Volume | Grid,
     window: str = "ram-lak",
     progress: Progress | None = None,
@@ -123,17 +109,20 @@ def checked_fdk(
 ) -> tuple[Volume, list[str]]:
     """A volume of FDK, and what a user has to be warned of.
 
-    Args and raises as `fdk`.
+    Args and raises as `fdk`, but for these:
+
+    Args:
+        image: gives an image by its number, (rows, cols).
+        parts: see `fdk_parts`.
+        cone_vec: of all views.
+        shape: (rows, cols).
     """
-    shape = images.shape
-    truncation = truncation_of(images.view, images.cone_vec, shape)
-    volume = fdk_parts(
-        images.parts, images.cone_vec, shape, like, window, progress, truncation, errors=errors
-    )
+    truncation = truncation_of(image, cone_vec, shape)
+    volume = fdk_parts(parts, cone_vec, shape, like, window, progress, truncation, errors=errors)
     said = layer_warnings(lost_layers(volume.data), len(volume.data))
     if not errors:
         return volume, said
-    bias = bias_of(images.view, images.cone_vec, shape, truncation)
+    bias = bias_of(image, cone_vec, shape, truncation)
     volume = with_errors(volume, bias=bias)
     return volume, [*bias_warnings(bias, volume.accuracy), *said]
 

@@ -18,11 +18,10 @@ from typing import Final
 
 import numpy as np
 
-from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume
-from flexdt.twin.reconstruction.trajectory import Circle, fan_angles, reach
+from flexdt.twin.reconstruction.trajectory import Circle, fan_angles, no_fdk, reach
 
 LEAST_SEEN: Final = 0.4
 """Part of the weight of all views that must see a voxel. At the panel's upper and lower edge it is
@@ -145,12 +144,11 @@ class Sharing:
         # The voxels nearest to the source move farthest on the panel.
         most = float(((rows - 1) * (axis - wide) / scale).min())
         if circle.rise > most:
-            raise GeometryError(
+            raise no_fdk(
                 f"the helix rises by {circle.rise:.4g} mm a turn; FDK needs every voxel in "
                 f"every direction: at most {most:.4g} mm a turn for this panel and a grid as wide "
-                "as this; the iterative methods (sirt, sart, cgls, em) take any trajectory",
-                {"asked": circle.rise, "allowed": most},
-            )
+                "as this", circle.rise, most,
+            )  # fmt: skip
         # Of a direction just missed at an end, the first view is a whole rise further on.
         lack = circle.rise - 0.5 * most
         panel = cone_vec.detector[:, 2] - cone_vec.source[:, 2]

@@ -46,6 +46,7 @@ from flexdt.twin.reconstruction.trajectory import (
     circle_of,
     columns_beyond,
     narrow_overlap,
+    no_fdk,
     redundancy,
 )
 from flexdt.twin.reconstruction.truncation import Truncation
@@ -382,12 +383,9 @@ def _check_steady(circle: Circle, level: ConeVec, shape: tuple[int, int]) -> Non
     columns = level.project_points([[*circle.centre, 0.0]], shape)[:, 0, 0]
     moved = float(np.ptp(columns))
     if not moved <= MOST_ASIDE * shape[1]:
-        raise GeometryError(
-            f"the panel moves {moved:.1f} columns sideways between the views (a tiled scan?); FDK "
-            f"takes {MOST_ASIDE * shape[1]:.1f} at most; the iterative methods (sirt, sart, cgls, "
-            "em) take any trajectory",
-            {"asked": moved, "allowed": MOST_ASIDE * shape[1]},
-        )
+        most = MOST_ASIDE * shape[1]
+        said = f"the panel moves {moved:.1f} columns sideways between the views (a tiled scan?)"
+        raise no_fdk(f"{said}; FDK takes {most:.1f} at most", moved, most)
 
 
 def _fdk(
@@ -408,10 +406,7 @@ def _fdk(
         parts = (part.transpose(0, 2, 1) for part in parts)
         cone_vec, shape = swapped(cone_vec), (shape[1], shape[0])
     if shape[1] < 2:
-        raise GeometryError(
-            "rows of 1 pixel, which cannot be filtered; allowed: 2 or more",
-            {"asked": shape[1], "allowed": 2},
-        )
+        raise GeometryError.instead("rows of 1 pixel, which cannot be filtered", 1, "2 or more")
     tilted, seen = not is_upright(cone_vec), shape
     if leans(cone_vec):
         shape = (shape[0], round(FINER * shape[1]))
@@ -449,11 +444,8 @@ def _fdk(
     for part in parts:
         views = slice(done, done + len(part))
         if part.shape[1:] != seen or views.stop > len(cone_vec):
-            raise GeometryError(
-                f"projections of shape {part.shape} after {done} views; allowed: "
-                f"{len(cone_vec)} views of {seen}",
-                {"asked": list(part.shape), "allowed": [len(cone_vec), *seen]},
-            )
+            said = f"projections of shape {part.shape} after {done} views"
+            raise GeometryError.instead(said, list(part.shape), f"{len(cone_vec)} views of {seen}")
         images, top = part, first
         if panels is not cone_vec:
             images = rectified(part, cone_vec[views], panels[views], shape[1])
@@ -473,9 +465,8 @@ def _fdk(
         if progress is not None:
             progress(done / len(cone_vec))
     if done != len(cone_vec):
-        raise GeometryError(
-            f"{done} projections for {len(cone_vec)} views",
-            {"asked": done, "allowed": len(cone_vec)},
+        raise GeometryError.instead(
+            f"{done} projections", done, f"one for each of {len(cone_vec)} views"
         )
     data = target.volume()
     if sharing is None:

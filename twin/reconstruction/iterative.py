@@ -19,7 +19,9 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.projection.linear_operator import dot
 from flexdt.twin.reconstruction.linear_system import (
+    ALL,
     LinearSystem,
+    Some,
     Step,
     Watch,
     ones,
@@ -102,7 +104,7 @@ def sirt(
     )
     return solved(
         problem,
-        lambda p: _subset_steps(p, [slice(None)], 1.0, iterations, start, nonnegative, watch),
+        lambda p: _subset_steps(p, [ALL], 1.0, iterations, start, nonnegative, watch),
     )
 
 
@@ -143,11 +145,8 @@ def sart(
     )
     count = min(subsets, len(problem.geometry))
     if count < 1 or not 0.0 < relaxation < 2.0:
-        raise LimitError(
-            f"{subsets} subsets, relaxation {relaxation:g}; allowed: at least 1, and between 0 "
-            "and 2",
-            {"asked": [subsets, relaxation]},
-        )
+        said = f"{subsets} subsets, relaxation {relaxation:g}"
+        raise LimitError.instead(said, [subsets, relaxation], "at least 1, and between 0 and 2")
     parts = [np.arange(k, len(problem.geometry), count) for k in far_apart(count)]
     return solved(
         problem,
@@ -157,7 +156,7 @@ def sart(
 
 def _subset_steps(
     problem: LinearSystem,
-    parts: Sequence[slice | npt.NDArray[np.intp]],
+    parts: Sequence[Some],
     relaxation: float,
     iterations: int,
     start: Volume | None,
@@ -171,12 +170,11 @@ def _subset_steps(
     for i in range(iterations):
         squares = noise = 0.0
         for part, (rows, columns) in zip(parts, sums, strict=True):
-            geometry = problem.geometry[part]
             rest, more = problem.misfit(x, part)
             squares += 0.0 if watch is None else dot(rest, rest)
             scaled = rows * rest
             noise += dot(rest, scaled) if weighted else 0.0
-            x = x + np.float32(relaxation) * columns * problem.spread(more * scaled, geometry)
+            x = x + np.float32(relaxation) * columns * problem.spread(more * scaled, part)
             if nonnegative:
                 np.maximum(x, 0.0, out=x)
         if watch is not None:

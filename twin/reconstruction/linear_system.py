@@ -42,6 +42,9 @@ STACKS, VOLUMES = 4, 5
 
 
 Found = TypeVar("Found")
+Some = slice | npt.NDArray[np.intp]
+"""Which views."""
+ALL = slice(None)
 
 
 @dataclass(frozen=True)
@@ -100,10 +103,8 @@ class LinearSystem:
             LimitError: no iterations.
         """
         if iterations < 1:
-            raise LimitError(
-                f"iterations is {iterations!r}; allowed: a whole number from 1",
-                {"asked": repr(iterations), "allowed": 1},
-            )
+            said = f"iterations is {iterations!r}"
+            raise LimitError.instead(said, repr(iterations), "a whole number from 1")
         geometry = as_cone_vec(cone_vec)
         if not len(geometry):
             raise GeometryError("no views; allowed: one or more", {"asked": 0, "allowed": 1})
@@ -115,18 +116,14 @@ class LinearSystem:
         if variances is not None:
             spread = np.asarray(variances, dtype=np.float32)
             if spread.shape != values.shape or not (np.isfinite(spread) & (spread > 0.0)).all():
-                raise GeometryError(
-                    f"variances of shape {spread.shape}, least {spread.min(initial=np.inf):g}; "
-                    f"allowed: one above 0 for each line integral, {values.shape}",
-                    {"asked": list(spread.shape), "allowed": list(values.shape)},
-                )
+                said = f"variances of shape {spread.shape}, least {spread.min(initial=np.inf):g}"
+                wanted = f"one above 0 for each line integral, {values.shape}"
+                raise GeometryError.instead(said, list(spread.shape), wanted)
             weights = 1.0 / spread
         system = cls(values, geometry, as_volume(like), weights, hardening)
         if gpu.is_there(values) and (hardening is not None or surroundings is not None):
-            raise GeometryError(
-                "images on a device, with hardening or surroundings; allowed: images of the host",
-                {"asked": "device", "allowed": "host"},
-            )
+            said = "images on a device, with hardening or surroundings"
+            raise GeometryError.instead(said, "device", "images of the host")
         return system if surroundings is None else RegionSystem.within(system, surroundings)
 
     @property
@@ -141,30 +138,26 @@ class LinearSystem:
         if start.shape != self.like.shape or not np.allclose(
             [start.voxel_xyz, start.center_mm], [self.like.voxel_xyz, self.like.center_mm]
         ):
-            raise GeometryError(
-                f"the first guess is {start!r}; allowed: on the grid of {self.like!r}",
-                {"asked": list(start.shape), "allowed": list(self.like.shape)},
-            )
+            said, wanted = f"the first guess is {start!r}", f"on the grid of {self.like!r}"
+            raise GeometryError.instead(said, list(start.shape), wanted)
         return np.array(start.data, dtype=np.float32)
 
-    def project(self, x: Float32Array, geometry: ConeVec | None = None) -> Float32Array:
-        """Projections of voxels, for the whole scan or for `geometry`."""
-        geometry = self.geometry if geometry is None else geometry
-        return forward(replace(self.like, data=x), geometry, self.shape)
+    def project(self, x: Float32Array, views: Some = ALL) -> Float32Array:
+        """Projections of voxels, of some views."""
+        return forward(replace(self.like, data=x), self.geometry[views], self.shape)
 
-    def spread(self, y: Float32Array, geometry: ConeVec | None = None) -> Float32Array:
+    def spread(self, y: Float32Array, views: Some = ALL) -> Float32Array:
         """The adjoint, in memory that the next call overwrites."""
-        geometry = self.geometry if geometry is None else geometry
-        return back(y, geometry, self.like, self.room).data
+        return back(y, self.geometry[views], self.like, self.room).data
 
-    def misfit(self, x: Any, views: slice | npt.NDArray[np.intp]) -> tuple[Any, Any]:
+    def misfit(self, x: Any, views: Some) -> tuple[Any, Any]:
         """Measured less expected line integrals of some views, and how many times as much a step
         must add to straight ones: straight over expected, 1 without `hardening`.
         """
-        geometry, measured = self.geometry[views], self.part(self.measured, views)
+        measured = self.measured[views]
         if self.hardening is None:
-            return measured - self.project(x, geometry), np.float32(1)
-        paths = np.stack([self.project(one, geometry) for one in self.hardening.amounts(x)])
+            return measured - self.project(x, views), np.float32(1)
+        paths = np.stack([self.project(one, views) for one in self.hardening.amounts(x)])
         rest, more = np.empty_like(measured), np.empty_like(measured)
         for view, image in enumerate(measured):
             expected, more[view] = self.hardening.line_integrals(paths[:, view])
@@ -176,23 +169,18 @@ class LinearSystem:
         """Memory for the adjoint."""
         return room_like(self.like)
 
-    def scales(self, views: slice | npt.NDArray[np.intp]) -> tuple[Float32Array, Float32Array]:
+    def scales(self, views: Some) -> tuple[Float32Array, Float32Array]:
         """Factors of the residuals of some views, and of what they add to the voxels.
 
         Without weights inverse sums of the projector's rows and columns. With weights those, and
         one over the curvature of a paraboloid above the weighted squares, which no step overshoots
         (Erdogan and Fessler 1999). Zero where (nearly) nothing is.
         """
-        geometry = self.geometry[views]
-        rows = self.project(ones(self.first(None)), geometry)
+        rows = self.project(ones(self.first(None)), views)
         if self.weights is None:
-            return inverse(rows), inverse(self.spread(ones(rows), geometry))
-        weights = self.part(self.weights, views)
-        return weights, inverse(self.spread(weights * rows, geometry))
-
-    def part(self, images: Any, views: slice | npt.NDArray[np.intp]) -> Any:
-        """Some views of images."""
-        return images[views]
+            return inverse(rows), inverse(self.spread(ones(rows), views))
+        weights = self.weights[views]
+        return weights, inverse(self.spread(weights * rows, views))
 
     def volume(self, x: Float32Array) -> Volume:
         """The voxels that were found, on their grid."""
@@ -230,20 +218,14 @@ class DeviceProblem(LinearSystem):
             return DeviceArray.of_volume(DeviceVolume.blank(self.like))
         return DeviceArray.of_voxels(replace(self.like, data=super().first(start)))
 
-    def project(self, x: Any, geometry: ConeVec | None = None) -> Any:
+    def project(self, x: Any, views: Some = ALL) -> Any:
         """See `LinearSystem`."""
-        geometry = self.geometry if geometry is None else geometry
-        return DeviceArray.of_images(forward(x.volume, geometry, self.shape))
+        return DeviceArray.of_images(forward(x.volume, self.geometry[views], self.shape))
 
-    def spread(self, y: Any, geometry: ConeVec | None = None) -> Any:
+    def spread(self, y: Any, views: Some = ALL) -> Any:
         """See `LinearSystem`; in memory of its own."""
-        geometry = self.geometry if geometry is None else geometry
-        found: Any = back(y.images, geometry, self.like)
+        found: Any = back(y.images, self.geometry[views], self.like)
         return DeviceArray.of_volume(found)
-
-    def part(self, images: Any, views: slice | npt.NDArray[np.intp]) -> Any:
-        """See `LinearSystem`."""
-        return images if isinstance(views, slice) else images.images_of(views)
 
     def volume(self, x: Any) -> Any:
         """See `LinearSystem`; a `DeviceVolume` where the images were on the device."""
@@ -279,19 +261,14 @@ class RegionSystem(LinearSystem):
         beyond = np.stack([low - wanted.boxes[0, 0], wanted.boxes[0, 1] - high]) / edge
         below, above = np.ceil(np.maximum(beyond - 1e-6, 0.0))
         if not (below.any() or above.any()):
-            raise GeometryError(
-                f"surroundings {wanted!r} within the region {inner.like!r}; allowed: a grid that "
-                "reaches beyond it",
-                {"asked": list(wanted.shape), "allowed": "> region"},
-            )
+            said = f"surroundings {wanted!r} within the region {inner.like!r}"
+            raise GeometryError.instead(said, list(wanted.shape), "a grid that reaches beyond it")
         counts = below + parts + above
         most = MOST_FINER * (math.prod(wanted.shape) + math.prod(inner.like.shape))
         if counts.prod() > most:
-            raise GeometryError(
-                f"{counts.prod():.3g} surrounding voxels, none larger than the region, "
-                f"{inner.like!r}; allowed: {most}, by a larger region or nearer surroundings",
-                {"asked": counts.tolist(), "allowed": most},
-            )
+            said = f"{counts.prod():.3g} voxels about the region, none larger than {inner.like!r}"
+            less = f"{most}, by a larger region or nearer surroundings"
+            raise GeometryError.instead(said, counts.tolist(), less)
         nx, ny, nz = (int(n) for n in counts)
         outside = np.ones((nz, ny, nx), dtype=np.bool_)
         cut = [slice(int(b), int(b + p)) for b, p in zip(below, parts, strict=True)]
@@ -318,19 +295,19 @@ class RegionSystem(LinearSystem):
             self.grids(x)[0][...] = super().first(start)
         return x
 
-    def project(self, x: Float32Array, geometry: ConeVec | None = None) -> Float32Array:
+    def project(self, x: Float32Array, views: Some = ALL) -> Float32Array:
         """See `LinearSystem`."""
         fine, coarse = self.grids(x)
-        geometry = self.geometry if geometry is None else geometry
+        geometry = self.geometry[views]
         images = forward(replace(self.like, data=fine), geometry, self.shape)
         coarse = np.where(self.outside, coarse, np.float32(0))
         images += forward(replace(self.outer, data=coarse), geometry, self.shape)
         return images
 
-    def spread(self, y: Float32Array, geometry: ConeVec | None = None) -> Float32Array:
+    def spread(self, y: Float32Array, views: Some = ALL) -> Float32Array:
         """See `LinearSystem`."""
         fine, coarse = self.grids(self.room)
-        geometry = self.geometry if geometry is None else geometry
+        geometry = self.geometry[views]
         back(y, geometry, self.like, fine)
         back(y, geometry, self.outer, coarse)
         coarse *= self.outside

@@ -18,6 +18,7 @@ import numpy as np
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.cpu import threads
 from flexdt.twin.projection.volume import Volume
+from flexdt.twin.reconstruction.coverage import first_and_steps
 from flexdt.twin.reconstruction.trajectory import Circle
 
 if TYPE_CHECKING:
@@ -124,7 +125,6 @@ class NoiseMeter:
     def add(self, views: Views, columns: Float32Array) -> None:
         """Add views whose filtered columns are at hand, (n, cols, rows); the columns are lost."""
         from flexdt.twin.reconstruction import fdk_kernels
-        from flexdt.twin.reconstruction.coverage import first_and_steps
 
         n, _, _, rows = views.sizes
         signs = self._signs[self._done : self._done + n]

@@ -18,6 +18,7 @@ from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Grid, Volume
+from flexdt.twin.reconstruction.trajectory import no_fdk
 
 UPRIGHT = 1e-7
 """Largest slope of rows and columns of a panel that counts as upright."""
@@ -66,11 +67,10 @@ def upright(cone_vec: ConeVec, finer: float = 1.0) -> ConeVec:
     away = cone_vec.normal * np.sign(cone_vec.source_detector_distance)[:, None]
     level = np.hypot(away[:, 0], away[:, 1])
     if level.min() <= FLAT:
-        raise GeometryError(
-            "a panel lies flat: it has no rows across the rotation axis; FDK needs a panel that "
-            "stands, the iterative methods (sirt, sart, cgls, em) take any",
-            {"asked": float(level.min()), "allowed": f"> {FLAT:g}"},
+        why = (
+            "a panel lies flat: it has no rows across the rotation axis; FDK needs one that stands"
         )
+        raise no_fdk(why, float(level.min()), f"> {FLAT:g}")
     # Down times the normal is to the right, whatever turn the panel had about its normal.
     u = np.column_stack([away[:, 1], -away[:, 0], np.zeros(len(away))])
     u *= (np.linalg.norm(cone_vec.u, axis=1) / level / finer)[:, None]
@@ -130,10 +130,7 @@ def field_of_view(cone_vec: ConeVec, shape: tuple[int, int], voxel_mm: float | N
         (8, 11, 11)
     """
     if voxel_mm is not None and not 0.0 < voxel_mm < math.inf:
-        raise GeometryError(
-            f"voxels of {voxel_mm:g} mm; allowed: more than 0",
-            {"asked": voxel_mm, "allowed": "> 0"},
-        )
+        raise GeometryError.instead(f"voxels of {voxel_mm:g} mm", voxel_mm, "more than 0")
     if on_its_side(cone_vec):
         cone_vec, shape = swapped(cone_vec), (shape[1], shape[0])
     if not is_upright(cone_vec):

@@ -238,10 +238,8 @@ def require_apart(materials: Sequence[Substance], mu: FloatArray) -> None:
     for one, other in pairwise(np.argsort(mu)):
         if mu[other] - mu[one] < APART * mu[other]:
             names = [materials[i].name for i in (one, other)]
-            raise LimitError(
-                f"{' and '.join(names)} attenuate alike: a volume does not tell them apart; "
-                f"allowed: {100 * APART:g} % apart", {"asked": names, "allowed": APART},
-            )  # fmt: skip
+            said = f"{' and '.join(names)} attenuate alike: a volume does not tell them apart"
+            raise LimitError.instead(said, names, f"{100 * APART:g} % apart")
 
 
 ROUNDS, SETTLED = 8, 0.01
@@ -357,9 +355,12 @@ def scatterer_of(
         As `without_scatter`.
     """
     wanted = ScatterSettings() if settings is None else settings
-    stack = as_stack(line_integrals, cone_vec)
+    stack: Float32Array = check_projections(line_integrals, len(cone_vec))
+    require_finite(stack)
     shape = shape_of(stack)
-    grid = coarse_grid(cone_vec, shape, wanted)
+    whole = field_of_view(cone_vec, shape)
+    coarser = (math.prod(whole.shape) / (FINER * wanted.voxels)) ** (1.0 / 3.0)
+    grid = field_of_view(cone_vec, shape, whole.voxel_mm * max(1.0, coarser))
     (mu, straighten), beam = attenuations(chain, kV), Beam.of(chain, kV)
     in_rounds = replace(
         wanted, step_deg=max(wanted.step_deg, ROUND_DEG), nodes=min(wanted.nodes, ROUND_NODES),
@@ -384,13 +385,6 @@ def scatterer_of(
     return Scatterer(thing, tuple(changes), tuple(doubts))
 
 
-def coarse_grid(cone_vec: ConeVec, shape: tuple[int, int], settings: ScatterSettings) -> Grid:
-    """The field of view by voxels that scatter is simulated in."""
-    whole = field_of_view(cone_vec, shape)
-    coarser = (math.prod(whole.shape) / (FINER * settings.voxels)) ** (1.0 / 3.0)
-    return field_of_view(cone_vec, shape, whole.voxel_mm * max(1.0, coarser))
-
-
 def volume_of(stack: Float32Array, cone_vec: ConeVec, grid: Grid) -> Volume:
     """FDK of straightened line integrals, smoothed."""
     shape = shape_of(stack)
@@ -399,17 +393,6 @@ def volume_of(stack: Float32Array, cone_vec: ConeVec, grid: Grid) -> Volume:
         lambda: [stack], cone_vec, shape, grid, "hann", None, truncation, outside=True
     )
     return replace(volume, data=np.nan_to_num(volume.data))  # what no view sees scatters nothing
-
-
-def as_stack(line_integrals: npt.ArrayLike, cone_vec: ConeVec) -> Float32Array:
-    """Finite line integrals, one image for each view, float32 (n, rows, cols).
-
-    Raises:
-        GeometryError: they are not.
-    """
-    stack: Float32Array = check_projections(line_integrals, len(cone_vec))
-    require_finite(stack)
-    return stack
 
 
 def shape_of(stack: Float32Array) -> tuple[int, int]:

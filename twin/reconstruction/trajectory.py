@@ -84,6 +84,12 @@ class Circle:
         return np.asarray(np.interp(angle, at, value, period=TURN))
 
 
+def no_fdk(why: str, asked: object, allowed: object) -> GeometryError:
+    """The error that FDK cannot use a trajectory, and what can."""
+    what_can = "the iterative methods (sirt, sart, cgls, em) take any trajectory"
+    return GeometryError(f"{why}; {what_can}", {"asked": asked, "allowed": allowed})
+
+
 def circle_of(cone_vec: ConeVec) -> Circle:
     """The circle or the helix on which the sources of a scan lie.
 
@@ -92,9 +98,7 @@ def circle_of(cone_vec: ConeVec) -> Circle:
     """
     s = cone_vec.source
     if len(s) < 3:
-        raise GeometryError(
-            f"{len(s)} views; FDK needs a circle of at least 3", {"asked": len(s), "allowed": 3}
-        )
+        raise GeometryError.instead(f"{len(s)} views", len(s), "for FDK a circle of at least 3")
     # x^2 + y^2 = 2 a x + 2 b y + c, least squares
     rows = np.column_stack([2.0 * s[:, :2], np.ones(len(s))])
     (a, b, c), _, rank, _ = np.linalg.lstsq(rows, (s[:, :2] ** 2).sum(axis=1), rcond=None)
@@ -107,12 +111,11 @@ def circle_of(cone_vec: ConeVec) -> Circle:
     if helix is None:
         worst = max(worst, float(np.abs(s[:, 2] - s[:, 2].mean()).max()))
     if worst > FLATNESS * radius:
-        raise GeometryError(
+        raise no_fdk(
             f"the sources leave a horizontal circle of radius {radius:.4g} mm by {worst:.4g} mm; "
             "FDK needs a circle, or a helix that rises steadily for a turn or more and has no gap "
-            "of angles; the iterative methods (sirt, sart, cgls, em) take any trajectory",
-            {"asked": worst, "allowed": FLATNESS * radius},
-        )
+            "of angles", worst, FLATNESS * radius,
+        )  # fmt: skip
     return helix or _turn(azimuth % TURN, centre, radius)
 
 
@@ -267,13 +270,11 @@ def _check_covered(circle: Circle, widest: float) -> None:
         listed = ", ".join(
             f"{first:.4g} to {last:.4g}" for first, last in np.rad2deg(circle.gaps[:3])
         )
-        raise GeometryError(
+        raise no_fdk(
             f"the views span {span:.4g} deg of the circle, and with the gap at {listed} deg they "
             f"do not see every line: FDK needs {need:.4g} deg (half a turn and the fan) without a "
-            "gap, or gaps that have views on the other side; the iterative methods (sirt, sart, "
-            "cgls, em) take any trajectory",
-            {"asked": float(span), "allowed": [float(need), 360.0]},
-        )
+            "gap, or gaps that have views on the other side", float(span), [float(need), 360.0],
+        )  # fmt: skip
 
 
 def _unseen(gaps: FloatArray, widest: float) -> float:

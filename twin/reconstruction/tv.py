@@ -132,9 +132,7 @@ def minimise_tv(
         ("weight", weight, 0.0), ("tolerance", tolerance, 0.0), ("subsets", subsets, 1),
     ):  # fmt: skip
         if not least <= value < math.inf:
-            raise LimitError(
-                f"{name} {value:g}; allowed: {least:g} or more", {"asked": value, "allowed": least}
-            )
+            raise LimitError.instead(f"{name} {value:g}", value, f"{least:g} or more")
     regular = Regular.of(problem.like, nonnegative, mask)
 
     def minimised(problem: LinearSystem) -> Minimised:
@@ -263,11 +261,8 @@ class _Objective:
         x = x.copy()
         for k in far_apart(count):
             part = np.arange(k, n, count)
-            geometry = self.problem.geometry[part]
-            rest = self.problem.project(x, geometry) - self.problem.part(
-                self.problem.measured, part
-            )
-            x -= np.float32(step * n / len(part)) * self.problem.spread(rest, geometry)
+            rest = self.problem.project(x, part) - self.problem.measured[part]
+            x -= np.float32(step * n / len(part)) * self.problem.spread(rest, part)
         return self.regular.proximal(x, count * step * self.strength)
 
 

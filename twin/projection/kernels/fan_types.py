@@ -119,16 +119,6 @@ class Rays(NamedTuple):
     picked: Any
 
 
-class Part(NamedTuple):
-    """Neighbours in a sorted fan: what the correction at a vertex touches."""
-
-    acc: Any
-    weight: Any
-    tilt: Any
-    level: Any
-    picked: Any
-
-
 class Work(NamedTuple):
     """A worker's arrays by slab (head of the list of crossings), by bin (first ray) and by level
     (S or, transposed, what the level is to receive; Q likewise; jump at a vertex; zeros).

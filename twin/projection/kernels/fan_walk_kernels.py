@@ -23,7 +23,6 @@ import math
 import numpy as np
 
 from flexdt.twin.projection.kernels.compiling import fused, inline, kernel, prefetch
-from flexdt.twin.projection.kernels.fan_types import Part
 from flexdt.twin.projection.kernels.siddon_kernels import open_column
 
 NONE = np.uint32(0xFFFFFFFF)
@@ -69,14 +68,9 @@ def mix(out, right, left, right_before, left_before):
 
 @inline
 def part_of(rays, first, last):
-    """Rays first to last - 1 of a sorted fan."""
-    return Part(
-        rays.acc[first:last],
-        rays.weight[first:last],
-        rays.tilt[first:last],
-        rays.level[first:last],
-        rays.picked[first:last],
-    )
+    """What the correction at a vertex touches, of rays first to last - 1 of a sorted fan."""
+    some = slice(first, last)
+    return rays.acc[some], rays.weight[some], rays.tilt[some], rays.level[some], rays.picked[some]
 
 
 @fused
