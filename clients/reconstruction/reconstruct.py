@@ -216,11 +216,11 @@ def views_of(
 def grid_of(views: ScanFrames, request: VolumeRequest) -> Grid:
     """The grid of a requested volume."""
     whole = field_of_view(views.cone_vec, views.shape, request.voxel_mm)
-    if request.shape is None:
-        center = whole.center_mm if request.center_mm is None else request.center_mm
-        return Grid(whole.shape, whole.voxel_mm, center)
-    center = (0.0, 0.0, 0.0) if request.center_mm is None else request.center_mm
-    return Grid(request.shape, whole.voxel_mm, center)
+    shape, center = whole.shape, whole.center_mm
+    if request.shape is not None:
+        shape, center = request.shape, (0.0, 0.0, 0.0)
+    chosen = center if request.center_mm is None else request.center_mm
+    return Grid(shape, whole.voxel_mm, chosen)
 
 
 def reconstruct_dataset(
@@ -459,8 +459,10 @@ def _source(dataset: DataSet, request: VolumeRequest) -> tuple[float, TubeModel,
 
     Raises:
         LimitError: neither says the voltage.
-        TwinError: as `_tube`.
+        TwinError: the data set's images know no beam hardening.
     """
+    from flexdt.twin.physics.tube import TubeModel
+
     if request.tube is not None:
         return request.tube.kV, request.tube.model(), request.tube.mono_keV
     said = None if dataset.settings is None else dataset.settings.kV
@@ -471,17 +473,6 @@ def _source(dataset: DataSet, request: VolumeRequest) -> tuple[float, TubeModel,
             "and scatter need; give kV= or tube=",
             {"missing": "kV"},
         )
-    return kV, _tube(dataset), None
-
-
-def _tube(dataset: DataSet) -> TubeModel:
-    """The tube that a data set names, else the default one.
-
-    Raises:
-        TwinError: its images know no beam hardening.
-    """
-    from flexdt.twin.physics.tube import TubeModel
-
     figures = {} if dataset.document is None else dataset.document.noise.model
     made = next((p for p in ("poly", "mono") if f"physics_{p}" in figures), "ideal")
     if figures and made != "poly":
@@ -490,7 +481,7 @@ def _tube(dataset: DataSet) -> TubeModel:
             "straight, and a correction of beam hardening would bend them",
             {"asked": "material", "allowed": "physics poly, or a scanner's data"},
         )
-    return TubeModel.of_figures(figures)
+    return kV, TubeModel.of_figures(figures), None
 
 
 def _require_room(out: Path, grid: Grid) -> None:

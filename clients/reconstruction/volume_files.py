@@ -225,10 +225,7 @@ def _nifti_header(grid: Grid) -> bytes:
     return block + bytes(352 - len(block))
 
 
-HEADERS: Final[Mapping[str, Callable[[Grid], bytes]]] = {
-    ".nrrd": _nrrd_header,
-    ".mha": _mha_header,
-}
+HEADERS: Final[Mapping[str, Callable[[Grid], bytes]]] = {".nrrd": _nrrd_header, ".mha": _mha_header}
 """Formats that are a header and the values after it."""
 
 

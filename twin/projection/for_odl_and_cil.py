@@ -56,11 +56,7 @@ def odl_operator(
 
 
 def cil_operator(
-    project: _Map,
-    spread: _Map,
-    like: Volume,
-    geometry: ConeVec,
-    image_shape: tuple[int, int, int],
+    project: _Map, spread: _Map, like: Volume, geometry: ConeVec, image_shape: tuple[int, int, int]
 ) -> Any:
     """A `LinearOperator` from `ImageData` (vertical, horizontal_y, horizontal_x) to
     `AcquisitionData` (angle, vertical, horizontal).

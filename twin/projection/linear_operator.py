@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.errors import GeometryError, TwinError, require_within
+from flexdt.twin.errors import GeometryError, LimitError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import gpu
@@ -43,9 +43,7 @@ HOST = 1
 """DLPack's number for the processor's memory."""
 
 
-def on_host(
-    function: Callable[[npt.NDArray[Any]], Float32Array],
-) -> Callable[[Any], Any]:
+def on_host(function: Callable[[npt.NDArray[Any]], Float32Array]) -> Callable[[Any], Any]:
     """A function of a numpy array for arrays of any library.
 
     Anything that numpy itself can read gives a numpy array. Of other arrays the memory is shared by
@@ -109,10 +107,7 @@ class Operator:
     dtype: ClassVar = np.dtype(np.float32)
 
     def __init__(
-        self,
-        geometry: ConeVec | npt.ArrayLike,
-        like: Volume | Grid,
-        shape: Shape2 | None = None,
+        self, geometry: ConeVec | npt.ArrayLike, like: Volume | Grid, shape: Shape2 | None = None
     ) -> None:
         scan = as_cone_vec(geometry)
         object.__setattr__(self, "geometry", scan)
@@ -149,7 +144,9 @@ class Operator:
                     f"{v.shape} voxels of {v.voxel_xyz} mm at {v.center_mm} mm"
                     for v in (x, self.like)
                 )
-                raise GeometryError.instead(f"a volume of {said}", list(x.shape), wanted)
+                raise GeometryError.instead(
+                    f"a volume of {said}", list(x.shape), f"the operator's grid, {wanted}"
+                )
             return forward(x, self.geometry, self.detector_shape)
         if _is_tensor(x):
             return self.torch()(x)
@@ -209,7 +206,9 @@ class Operator:
             >>> round(A.norm(), 2)  # one ray through four voxels of 0.5 mm: 0.5 sqrt(4)
             1.0
         """
-        require_within("the tolerance", tolerance, SMALLEST_TOLERANCE, 1.0)
+        if not SMALLEST_TOLERANCE <= tolerance < 1.0:
+            said = f"the tolerance is {tolerance:g}"
+            raise LimitError.instead(said, tolerance, f"{SMALLEST_TOLERANCE:g} to 1")
         return norm_of(self._forward, self._back, np.ones(self.voxel_shape, np.float32), tolerance)
 
     def gradient(self, x: Volume | npt.ArrayLike, weights: npt.ArrayLike) -> FloatArray:

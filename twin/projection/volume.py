@@ -477,7 +477,27 @@ class Volume:
             flat = aligned_zeros(ny * stride_y)
             bring_over(self.data, flat, stride_x, stride_y)
         layout_kernels.occupied(flat, stride_x, stride_y, nz, first, last)
-        return _cropped(self, flat, stride_x, stride_y, first, last)
+        filled = last > first
+        if not filled.any():
+            none, origin = np.zeros(0, np.int32), (0.0, 0.0, 0.0)
+            return Layout(flat, 0, stride_x, stride_y, (0, 0, 0), origin, self.voxel_xyz, none)
+        # Only offsets and counts change.
+        ys, xs = (np.flatnonzero(filled.any(axis=axis)) for axis in (1, 0))
+        x0, x1, y0, y1 = int(xs[0]), int(xs[-1]) + 1, int(ys[0]), int(ys[-1]) + 1
+        z0, z1 = int(first[filled].min()), int(last[filled].max())
+        box = (slice(y0, y1), slice(x0, x1))
+        low = self.boxes[0, 0] + np.array([x0, y0, z0]) * self.voxel_xyz
+        ends = np.stack([first[box], last[box]], axis=-1) - z0
+        return Layout(
+            flat=flat,
+            base=x0 * stride_x + y0 * stride_y + z0,
+            stride_x=stride_x,
+            stride_y=stride_y,
+            counts=(x1 - x0, y1 - y0, z1 - z0),
+            low_mm=_vector(low, "low_mm"),
+            voxel_mm=self.voxel_xyz,
+            spans=np.where(filled[box][..., None], ends, 0).astype(np.int32).ravel(),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -661,43 +681,6 @@ def _flat_alias(data: Float32Array, count: int) -> Float32Array:
     write is compiled for plain arrays only. Projection never writes into a volume.
     """
     return np.asarray(_Memory(data, count))
-
-
-def _cropped(
-    volume: Volume,
-    flat: Float32Array,
-    stride_x: int,
-    stride_y: int,
-    first: IntArray,
-    last: IntArray,
-) -> Layout:
-    """The occupied box of a z-contiguous storage: only offsets and counts change."""
-    filled = last > first
-    if not filled.any():
-        none = np.zeros(0, np.int32)
-        origin = (0.0, 0.0, 0.0)
-        return Layout(flat, 0, stride_x, stride_y, (0, 0, 0), origin, volume.voxel_xyz, none)
-    ys = np.flatnonzero(filled.any(axis=1))
-    xs = np.flatnonzero(filled.any(axis=0))
-    x0, x1, y0, y1 = int(xs[0]), int(xs[-1]) + 1, int(ys[0]), int(ys[-1]) + 1
-    z0, z1 = int(first[filled].min()), int(last[filled].max())
-    box = (slice(y0, y1), slice(x0, x1))
-    half = [size / 2 for size in volume.size_mm]
-    low = [
-        c - h + i * v
-        for c, h, i, v in zip(volume.center_mm, half, (x0, y0, z0), volume.voxel_xyz, strict=True)
-    ]
-    ends = np.stack([first[box], last[box]], axis=-1) - z0
-    return Layout(
-        flat=flat,
-        base=x0 * stride_x + y0 * stride_y + z0,
-        stride_x=stride_x,
-        stride_y=stride_y,
-        counts=(x1 - x0, y1 - y0, z1 - z0),
-        low_mm=(low[0], low[1], low[2]),
-        voxel_mm=volume.voxel_xyz,
-        spans=np.where(filled[box][..., None], ends, 0).astype(np.int32).ravel(),
-    )
 
 
 def _vector(value: object, name: str) -> Vector3:

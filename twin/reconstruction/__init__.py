@@ -2,11 +2,7 @@
 
 from flexdt.twin.projection.volume import Accuracy, Grid
 from flexdt.twin.reconstruction.bias import Bias, bias_of
-from flexdt.twin.reconstruction.checked_fdk import (
-    bias_warnings,
-    checked_fdk,
-    fdk,
-)
+from flexdt.twin.reconstruction.checked_fdk import bias_warnings, checked_fdk, fdk
 from flexdt.twin.reconstruction.coverage import layer_warnings, lost_layers
 from flexdt.twin.reconstruction.fdk import fdk_parts
 from flexdt.twin.reconstruction.iterative import cgls, em, sart, sirt

@@ -24,13 +24,7 @@ from numba.core.codegen import get_host_cpu_features
 from numba.extending import intrinsic
 
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.projection.kernels.compiling import (
-    fetch_next,
-    fused,
-    inline,
-    kernel,
-    parallel,
-)
+from flexdt.twin.projection.kernels.compiling import fetch_next, fused, inline, kernel, parallel
 from flexdt.twin.projection.volume import aligned_zeros
 
 

@@ -103,8 +103,7 @@ def sirt(
         projections, cone_vec, like, iterations, variances, hardening, surroundings
     )
     return solved(
-        problem,
-        lambda p: _subset_steps(p, [ALL], 1.0, iterations, start, nonnegative, watch),
+        problem, lambda p: _subset_steps(p, [ALL], 1.0, iterations, start, nonnegative, watch)
     )
 
 

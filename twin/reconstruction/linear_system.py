@@ -266,7 +266,7 @@ class RegionSystem(LinearSystem):
         counts = below + parts + above
         most = MOST_FINER * (math.prod(wanted.shape) + math.prod(inner.like.shape))
         if counts.prod() > most:
-            said = f"{counts.prod():.3g} voxels about the region, none larger than {inner.like!r}"
+            said = f"{counts.prod():.3g} voxels, none larger than the region {inner.like!r}"
             less = f"{most}, by a larger region or nearer surroundings"
             raise GeometryError.instead(said, counts.tolist(), less)
         nx, ny, nz = (int(n) for n in counts)

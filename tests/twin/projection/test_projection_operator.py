@@ -139,7 +139,7 @@ def test_grids_and_shapes_that_do_not_fit(operator, scan):
         Operator(scan.rows, grid)
     with pytest.raises(GeometryError, match=r"\(2, 3\); allowed: \(2, 3, 4\)"):
         operator @ np.zeros((2, 3))
-    with pytest.raises(GeometryError, match="the operator's grid is"):
+    with pytest.raises(GeometryError, match="allowed: the operator's grid"):
         operator @ Volume(np.zeros((2, 3, 4)), 1.0)
     with pytest.raises(GeometryError, match=r"projections of shape \(24,\)"):
         operator.T @ np.zeros(24)
