@@ -366,8 +366,8 @@ def _task(
     several = _names(wanted.material)
     if len(several) > 1 and name not in ("sirt", "sart"):
         said = f"materials {', '.join(several)} with {name}"
-        wanted = "one, or several with sirt or sart, which follow each through the volume"
-        raise LimitError.instead(said, [name, *several], wanted)
+        allowed = "one, or several with sirt or sart, which follow each through the volume"
+        raise LimitError.instead(said, [name, *several], allowed)
     views = views_of(dataset, parameters, binning=wanted.binning, every=wanted.every)
     views = replace(views, doubts=tuple(image_doubts(dataset, needed=True)))
     return wanted, views, grid_of(views, wanted)

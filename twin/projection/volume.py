@@ -222,8 +222,8 @@ class Volume:
             object.__setattr__(self, "voxel_mm", _vector((size,) * 3, "voxel_mm")[0])
         object.__setattr__(self, "center_mm", _vector(self.center_mm, "center_mm"))
         if any(size <= 0 for size in self.voxel_xyz):
-            said, wanted = f"voxel_mm is {self.voxel_mm}", "positive sizes (x, y, z) in mm"
-            raise GeometryError.instead(said, list(self.voxel_xyz), wanted)
+            said, sizes = f"voxel_mm is {self.voxel_mm}", list(self.voxel_xyz)
+            raise GeometryError.instead(said, sizes, "positive sizes (x, y, z) in mm")
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
         """The values, (nz, ny, nx)."""

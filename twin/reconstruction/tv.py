@@ -250,12 +250,12 @@ class _Objective:
         cost = 0.5 * dot(rest, rest) + self.strength * self.regular.variation(x)
         return _At(x, rest, cost)
 
-    def step(self, at: _At, step: float) -> Float32Array:
+    def step(self, at: _At, step: float) -> Any:
         """A step down the slope of the squares, and the proximal map of all the rest."""
         z = at.x - np.float32(step) * self.problem.spread(at.rest)
         return self.regular.proximal(z, step * self.strength)
 
-    def subset_pass(self, x: Float32Array, step: float, count: int) -> Float32Array:
+    def subset_pass(self, x: Float32Array, step: float, count: int) -> Any:
         """Such a step for each subset of views, and one proximal map in the end."""
         n = len(self.problem.geometry)
         x = x.copy()
