@@ -133,7 +133,7 @@ def drifts(left: Residuals) -> tuple[Drift, ...]:
             hint = best if each[best] > HINT else None
             for at, among in ((suspect, suspects), (hint, found)):
                 if at is not None:
-                    size = float((push[part] / power[part])[at])
+                    size = float(push[part][at] / power[part][at])
                     bias = unit_covariance @ (absorbed[:, part][:, at] * size)
                     among.append(Drift(names[c], size, shapes[at][0], float(each[at]), bias))
     if not any(d.score > SIGNIFICANT for d in found):
