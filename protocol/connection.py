@@ -45,6 +45,7 @@ _MARK: Final = b"\xa4data\xc6"
 _WINDOWS: Final = (4096, 2**20)
 _ATTEMPTS: Final = 4
 
+_size = struct.Struct(">I").unpack_from
 _HTTP: Final = re.compile(
     rb"(?:GET|HEAD|POST|PUT|DELETE|CONNECT|OPTIONS|TRACE|PATCH|PRI) \S{0,8192} HTTP/"
 )
@@ -83,7 +84,7 @@ class Connection:
         self.max_batch = max_batch
         self.closed = False
         self._ready = deque[bytes | Malformed]()
-        """Whole messages, and errors found in dividing; an empty line counts."""
+        """Whole messages, and errors found in dividing; empty lines are none."""
         self._judged = 0
         """How many of these `overtake` has examined."""
         self._held = 0
@@ -147,6 +148,19 @@ class Connection:
             self._feed_frames(data)
 
     def _feed_lines(self, data: bytes) -> None:
+        first, last = data.find(b"\n") + 1, data.rfind(b"\n") + 1
+        if first == last or len(data) > self.max_message or b" HTTP/" in data:
+            self._feed_each_line(data)
+            return
+        # Of many short lines only the first, which may have begun before, can be one to refuse.
+        self._feed_each_line(data[:first])
+        if not self._broken:
+            lines = [*filter(bytes.strip, data[first : last - 1].split(b"\n"))]
+            self._ready.extend(lines)
+            self._held += sum(map(len, lines))
+            self._begun += data[last:]
+
+    def _feed_each_line(self, data: bytes) -> None:
         *ends, rest = data.split(b"\n")
         for end in ends:
             line = bytes(self._begun) + end
@@ -160,8 +174,9 @@ class Connection:
                 why = "this is a JSON-RPC server, not an HTTP one"
                 self._refuse(RpcError(Code.INVALID_REQUEST, why), fatal=True)
                 return
-            else:
-                self._put(line)
+            elif line.strip():
+                self._ready.append(line)
+                self._held += len(line)
         if not self._skip:
             self._begun += rest
         if (came := len(self._begun)) > self.max_message:
@@ -173,25 +188,25 @@ class Connection:
         self._skip -= skipped
         begun, at = self._begun, 0
         begun += memoryview(data)[skipped:]
-        while len(begun) - at >= 4:
-            (size,) = struct.unpack_from(">I", begun, at)
+        held: bytes | bytearray = begun
+        while (there := len(held)) - at >= 4:
+            (size,) = _size(held, at)
             end = at + 4 + size
-            if size > MAX_FRAME:
+            if size <= self.max_message:
+                if end > there:
+                    break
+                if held is begun:  # once, because bytes are cut faster
+                    held = bytes(begun)
+                self._ready.append(bytes(held[at + 4 : end]))
+                self._held += size
+            elif size <= MAX_FRAME:
+                self._ready.append(Malformed(too_large("a frame", size, self.max_message)))
+                self._skip = max(0, end - there)
+            else:
                 self._refuse(too_large("a frame", size, MAX_FRAME), fatal=True)
                 return
-            if size > self.max_message:
-                self._ready.append(Malformed(too_large("a frame", size, self.max_message)))
-                self._skip = max(0, end - len(begun))
-            elif end > len(begun):
-                break
-            else:
-                self._put(bytes(memoryview(begun)[at + 4 : end]))
-            at = min(end, len(begun))
+            at = min(end, there)
         del begun[:at]
-
-    def _put(self, message: bytes) -> None:
-        self._ready.append(message)
-        self._held += len(message)
 
     def _refuse(self, error: RpcError, *, fatal: bool = False) -> None:
         """Put an error where the message would be, of which nothing is kept."""
@@ -201,17 +216,15 @@ class Connection:
 
     def next_raw(self) -> bytes | Malformed | None:
         """The next message's bytes for `decode`, or an error found before that; None: no more."""
-        while self._ready and not self.closed:
-            raw = self._ready.popleft()
-            self._judged = max(0, self._judged - 1)
-            if isinstance(raw, Malformed):
-                if raw.fatal:
-                    self._end()
-                return raw
+        if not self._ready:
+            return None
+        raw = self._ready.popleft()
+        self._judged = max(0, self._judged - 1)
+        if not isinstance(raw, Malformed):
             self._held -= len(raw)
-            if self.codec is Codec.MSGPACK or raw.strip(b" \t\r"):
-                return raw
-        return None
+        elif raw.fatal:
+            self._end()
+        return raw
 
     def decode(self, raw: bytes) -> Message:
         """The message in the bytes that `next_raw` returned."""
@@ -244,10 +257,11 @@ class Connection:
         Returns:
             The bytes of the messages taken out, in order.
         """
-        queue, out, looked = list(self._ready), list[bytes](), 0
         searched = self._searched()
         if not any(name in searched for name in names):
-            self._judged = len(queue)
+            self._judged = len(self._ready)
+            return []
+        queue, out, looked = list(self._ready), list[bytes](), 0
         while self._judged < len(queue) and looked < most:
             message = queue[self._judged]
             if _small(message) and any(name in message for name in names):
@@ -267,7 +281,8 @@ class Connection:
 
     def _searched(self) -> bytes:
         """What `overtake` has not examined yet, in one piece."""
-        return b"\n".join(filter(_small, islice(self._ready, self._judged, None)))
+        new = islice(self._ready, self._judged, None)
+        return b"\n".join([m for m in new if isinstance(m, bytes) and len(m) <= LARGE])
 
     def _end(self) -> None:
         """Close the connection and discard everything received."""

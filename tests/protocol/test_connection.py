@@ -343,8 +343,9 @@ class Queue:
     def feed(self, data: bytes) -> None:
         self.rest += data
         while size := self.end():
-            self.whole.append(self.rest[:size])
-            self.rest = self.rest[size:]
+            message, self.rest = self.rest[:size], self.rest[size:]
+            if message.strip() or not self.json:
+                self.whole.append(message)
 
     def urgent(self, message: bytes) -> bool:
         return b"stop" in message and len(self.body(message)) <= PIECE
@@ -353,12 +354,10 @@ class Queue:
         return message[:-1] if self.json else message[4:]
 
     def next(self) -> bytes | None:
-        while self.whole:
-            body = self.body(self.whole.pop(0))
-            self.judged = max(0, self.judged - 1)
-            if body.strip() or not self.json:
-                return body
-        return None
+        if not self.whole:
+            return None
+        self.judged = max(0, self.judged - 1)
+        return self.body(self.whole.pop(0))
 
     def overtake(self, most: int, shown: list[bytes]) -> list[bytes]:
         out, seen = [], 0

@@ -451,11 +451,11 @@ def test_the_beam_at_home_goes_through_the_middle_of_the_sample() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ('beam = "parallel"', r"beam: Input should be 'cone'; docs/limits.md says"),
-        ('[detector]\nshape = "curved"', r"detector.shape: Input should be 'flat'; docs/limits.md"),
-        ("[[tube]]\nmax_kV = 90.0", r"tube must be a table, \[tube\]; docs/limits.md"),
-        ("[tube2]\nmax_kV = 90.0", r"tube2: there is no such key; docs/limits.md"),
-        ('[axes.X]\nunit = "deg"', r"axes.X.unit: there is no such key; docs/limits.md"),
+        ('beam = "parallel"', r"beam: Input should be 'cone'; .* parallel .*limits.md"),
+        ('[detector]\nshape = "curved"', r"detector.shape: Input should be 'flat'; curved .*s.md"),
+        ("[[tube]]\nmax_kV = 90.0", r"tube must be a table, .*one tube and one flat panel.*s.md"),
+        ("[tube2]\nmax_kV = 90.0", r"tube2: there is no such key; .*one tube and .*limits.md"),
+        ('[axes.X]\nunit = "deg"', r"axes.X.unit: there is no such key; linear .*limits.md"),
         ("[detector]\nbits = 24", "detector.bits: Input should be less than or equal to 16"),
         ("[geometry]\nsource_angle = { R = 1.0 }", "a known quantity: .* not modelled .*C-arms"),
         ("[geometry]\nsource_x = { R = 1.0 }", "geometry.source_x: .*linear axes.*C-arms"),
