@@ -5,8 +5,9 @@ and the event loop stays responsive. A job's blocks go to the loop as they are m
 
 Steps are computed in the order in which they come, and a lane has one of them in the queue at a
 time, so lanes take turns and a long scan never starves a single view. A lane is one client's batch
-work or one client's interactive work. A block is asked for when the one before it has been sent: of
-a client that does not read nothing is computed.
+work or one client's interactive work. A block is asked for when the one before it has been sent,
+and at most `IN_HAND` requests of a lane have results on their way: of a client that does not read
+no more than these is computed.
 
 `begin` sets the number of threads and compiles before the first request.
 """
@@ -39,8 +40,19 @@ BLOCK_BYTES: Final = 12 * 2**20
 """Result of one turn of a job: below a frame, and short enough to share the machine fairly."""
 BLOCK_VIEWS: Final = 32
 
+IN_HAND: Final = 3
+"""Of a lane, requests that are computed or sent: one is computed while others are sent."""
+
 Step = Callable[[], object]
 """A piece of work; its value goes to whoever waits for it."""
+
+
+class Lane(asyncio.Lock):
+    """One client's batch work, or its interactive work; held by the step that is in the queue."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.in_hand = asyncio.Semaphore(IN_HAND)
 
 
 @dataclass(eq=False)
@@ -48,16 +60,17 @@ class ComputeJob:
     """The steps of one request, one after the other.
 
     Attributes:
-        lane: held by the step of the lane that is in the queue.
+        lane: whose steps these are.
         key: interactive requests have one (a newer one takes this one's place).
         error: why it was given up.
     """
 
-    lane: asyncio.Lock
+    lane: Lane
     key: str | None = None
     error: Exception | None = None
     _turn: asyncio.Task[object] | None = None
     _step: Future[object] | None = None
+    _in_hand: bool = False
 
     @property
     def waits(self) -> bool:
@@ -88,9 +101,17 @@ class ComputeJob:
             raise self.error from None
 
     async def _in_turn(self, compute: ComputeThread, step: Step) -> object:
+        if not self._in_hand:
+            self._in_hand = await self.lane.in_hand.acquire()
         async with self.lane:
             self._step = compute.put(step)
             return await asyncio.wrap_future(self._step)
+
+    def sent(self) -> None:
+        """Its answer has gone out, or nobody waits for it: another request of the lane begins."""
+        if self._in_hand:
+            self._in_hand = False
+            self.lane.in_hand.release()
 
 
 class ComputeThread:

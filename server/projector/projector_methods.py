@@ -36,6 +36,7 @@ from flexdt.server.network.shell_parts import TokenCheck
 from flexdt.server.projector.compute import (
     ComputeJob,
     ComputeThread,
+    Lane,
     Step,
     projection_steps,
     views_a_block,
@@ -238,7 +239,7 @@ class JobClient:
 
     def __init__(self, link: FrameLink, token: str | None, lines: Sparing) -> None:
         self.link, self.let_in = link, token is None
-        self.lanes = asyncio.Lock(), asyncio.Lock()
+        self.lanes = Lane(), Lane()
         self.jobs: dict[Id, ComputeJob] = {}
         self.calls: Correlation[None] = Correlation(Role.SERVER)
         self.tasks: set[asyncio.Task[None]] = set()

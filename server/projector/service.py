@@ -129,7 +129,8 @@ class ProjectorServer(ListeningServer):
             log("reply not sent", logging.ERROR, error=True, client=client.link.peer)
             client.link.transport.abort()
         finally:
-            client.jobs.pop(request, None)
+            if (job := client.jobs.pop(request, None)) is not None:
+                job.sent()
             client.pending_bytes -= len(body)
             if client.pending_bytes <= MAX_PENDING_BYTES and not client.link.lost:
                 client.link.transport.resume_reading()

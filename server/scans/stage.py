@@ -160,14 +160,19 @@ class Shapes:
         self._limit = limit
         self._kept: Shape | None = None
 
+    def known(self, name: str, revision: str | None) -> Shape | None:
+        """The shape that was asked for last, if it is this one."""
+        kept = self._kept
+        same = kept is not None and (kept.name, kept.revision) == (name, revision)
+        return kept if same else None
+
     def of(self, name: str, revision: str | None, phantom: Phantom) -> Shape:
         """The shape of `phantom`; it may take a second.
 
         Raises:
             RpcError: -32008, more triangles than are sent.
         """
-        kept = self._kept
-        if kept is not None and (kept.name, kept.revision) == (name, revision):
+        if (kept := self.known(name, revision)) is not None:
             return kept
         mesh: Any = phantom.mesh()
         size = HEADER + FACE * len(mesh.faces)

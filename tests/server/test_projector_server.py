@@ -515,15 +515,18 @@ def test_broken_bytes_half_a_frame_and_answers_end_in_an_error() -> None:
     run(body)
 
 
-def test_a_client_that_never_reads_is_cut_off_and_others_are_served() -> None:
+@pytest.mark.parametrize("requests", [1, 60])
+def test_a_client_that_never_reads_is_cut_off_and_others_are_served(requests: int) -> None:
     async def body(server: ProjectorServer, client: ProjectorUser) -> None:
         await client.put("s", SCENE)
         _, writer = await asyncio.open_connection("127.0.0.1", server.port)
         writer.transport.pause_reading()  # type: ignore[attr-defined]
-        asked = {"volume": "s", "cone_vec": views(300, 0.02).tolist(), "detector": [700, 700]}
-        message = {"jsonrpc": "2.0", "id": 1, "method": "project", "params": asked}
-        body = msgpack.packb(message)
-        writer.write(len(body).to_bytes(4, "big") + body)
+        each = views(300, 0.02).reshape(requests, -1, 12)
+        for id, rows in enumerate(each):
+            asked = {"volume": "s", "cone_vec": rows.tolist(), "detector": [700, 700]}
+            message = {"jsonrpc": "2.0", "id": id, "method": "project", "params": asked}
+            body = msgpack.packb(message)
+            writer.write(len(body).to_bytes(4, "big") + body)
         for _ in range(5):
             assert (await client.project("s", views(1), SHAPE)).shape == (1, *SHAPE)
         await until(lambda: len(server.context.clients) == 1)

@@ -65,7 +65,9 @@ def answers(*methods: Method[_P, _R]) -> Callable[[_Handler[_P, _R]], _Handler[_
     """Make a function the handler of `methods`, whose parameters and result it has."""
 
     def mark(handler: _Handler[_P, _R]) -> _Handler[_P, _R]:
-        HANDLERS.update({method.name: handler for method in methods})
+        for method in methods:
+            assert method.name not in HANDLERS, f"{method.name} has a handler"
+            HANDLERS[method.name] = handler
         return handler
 
     return mark

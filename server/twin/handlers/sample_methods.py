@@ -61,9 +61,11 @@ async def mesh(twin: TwinServer, client: h.Client, params: p.SampleMesh) -> p.Sa
     if not sample.name:
         raise LimitError("nothing stands on the stage", {"asked": "sample.mesh"})
     revision = twin.samples.revision(sample.name)
-    async with twin.samples.turn:  # one at a time, so that a scan always finds a thread
-        phantom = await asyncio.to_thread(twin.samples.load, sample.name, sample.material)
-        shape = await asyncio.to_thread(twin.shapes.of, sample.name, revision, phantom)
+    shape = twin.shapes.known(sample.name, revision)
+    if shape is None:
+        async with twin.samples.turn:  # one at a time, so that a scan always finds a thread
+            phantom = await asyncio.to_thread(twin.samples.load, sample.name, sample.material)
+            shape = await asyncio.to_thread(twin.shapes.of, sample.name, revision, phantom)
     part = shape.stl[params.start : params.start + params.count]
     return p.SampleMeshResult(
         name=shape.name,
