@@ -350,7 +350,7 @@ def parameters(settings: type[Settings]) -> dict[str, inspect.Parameter]:
         flags = f.metadata["flags"] or (f"--{f.name.replace('_', '-')}",)
         default = str(f.default) if isinstance(f.default, Address) else f.default
         kind: Any = list[str] if isinstance(default, tuple) else hints[f.name]
-        details = {"help": helps[f.name], **f.metadata["details"]}
+        details = {"help": helps.get(f.name, ""), **f.metadata["details"]}
         found[f.name] = inspect.Parameter(
             f.name, inspect.Parameter.KEYWORD_ONLY,
             default=[*default] if isinstance(default, tuple) else default,

@@ -10,12 +10,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import socket
 import sys
 from collections.abc import Sequence
 from typing import TextIO
 
 from flexdt.process_settings import (
     LOOPBACK,
+    Address,
     GatewaySettings,
     TwinSettings,
     UpSettings,
@@ -25,6 +27,7 @@ from flexdt.process_settings import (
     words,
 )
 from flexdt.runtime.access import ViewerLimits, limit_names
+from flexdt.runtime.process import REFUSED
 from flexdt.runtime.supervisor import (
     Addresses,
     Service,
@@ -77,6 +80,18 @@ def port_of(name: str, asked: int, known: Addresses) -> int:
     return known[name].port if name in known else asked
 
 
+def port_problem(host: str, port: int) -> str | None:
+    """Why `port` cannot be listened on, or None; port 0 means any free one."""
+    try:
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((host, port))
+    except OSError as error:
+        where = f"cannot listen on {Address(host, port)}: {error.strerror}"
+        return f"{where}; choose another port, or 0 for any free one"
+    return None
+
+
 def ready_line(addresses: Addresses, *, secure: bool = False) -> str:
     """The supervisor's `ready` line: the twin's address, and every process's by name."""
     twin = addresses["twin"]
@@ -95,6 +110,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run until stopped; returns the exit code."""
     options = parse(UpSettings, argv)
     secure = options.tls_cert is not None
+    wanted = [(options.host, options.port), (LOOPBACK, options.projector_port)]
+    if not options.no_viewer:
+        wanted.append((options.host, options.viewer_port))
+    if options.gateway_port:
+        wanted += [(LOOPBACK, options.gateway_port), (LOOPBACK, options.gateway_port + 1)]
+    # Before anything starts: a server would say it once its kernels are compiled.
+    for problem in filter(None, (port_problem(*place) for place in wanted)):
+        print(f"flexdt up: {problem}", file=sys.stderr)
+        return REFUSED
     supervisor = Supervisor(
         services(options),
         announce=lambda addresses: _say(ready_line(addresses, secure=secure), sys.stdout),

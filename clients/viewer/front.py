@@ -52,6 +52,8 @@ SILENT_S: Final = 60.0
 """A browser that does not answer a ping within this time has gone; busy machines are slow."""
 STILL_S: Final = 8.0
 """A picture that takes longer is none: websockets cuts a connection that has no answer for 10 s."""
+RELAYED_HZ: Final = 500.0
+"""Messages of one view that are passed to viser in a second; a hand that drags sends 60."""
 GUESS_S: Final = 0.4
 """How long the answer to a wrong token takes; wrong ones wait for each other."""
 PAGE_PATH: Final = re.compile(r"/ws/([0-9a-f]{8,64})")
@@ -276,6 +278,8 @@ class Front:
         async for message in browser:
             if (admitted := self.doorkeeper.admit(message)) is not None:
                 await viser.send(admitted)
+            # Nothing else lets others have a turn while messages of one view are at hand.
+            await asyncio.sleep(1.0 / RELAYED_HZ)
 
 
 async def _down(viser: ClientConnection, browser: ServerConnection) -> None:

@@ -19,6 +19,7 @@ import socket
 import struct
 import tempfile
 import threading
+import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, redirect_stdout
 from pathlib import Path
@@ -53,6 +54,9 @@ MAX_SMALL: Final = 4096
 SHOWN: Final = 40
 LONGEST_TMP: Final = 70
 """Bytes of the folder for temporary files; a socket's path has at most about a hundred."""
+PREFIX: Final = "flexdt-viser-"
+YOUNG_S: Final = 60.0
+"""A younger folder may belong to a viewer that does not listen yet."""
 
 
 class GateError(RuntimeError):
@@ -70,7 +74,8 @@ class Scenes:
     def __init__(self, label: str | None = None) -> None:
         usual = tempfile.gettempdir()
         short = usual if len(usual.encode()) <= LONGEST_TMP else "/tmp"
-        self._folder = Path(tempfile.mkdtemp(prefix="flexdt-viser-", dir=short))  # 0700
+        clear_left_behind(Path(short))
+        self._folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=short))  # 0700
         self.path = self._folder / "viser"
         try:
             with _listening_at(self.path), redirect_stdout(io.StringIO()):  # its banner
@@ -122,6 +127,18 @@ class Scenes:
         with redirect_stdout(io.StringIO()):
             self.server.stop()
         shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def clear_left_behind(folder: Path) -> None:
+    """Remove the sockets of viewers that were killed, on which no process listens any more."""
+    for left in folder.glob(f"{PREFIX}*"):
+        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as probe:
+            if time.time() - left.stat().st_mtime < YOUNG_S:
+                continue
+            try:
+                probe.connect(str(left / "viser"))
+            except ConnectionRefusedError:
+                shutil.rmtree(left, ignore_errors=True)
 
 
 def set_nodes(client: viser.ClientHandle, nodes: Nodes) -> None:

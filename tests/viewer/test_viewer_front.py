@@ -346,6 +346,32 @@ def test_messages_that_never_end_are_cut_and_others_are_heard(
     with_front(work)
 
 
+def test_a_view_that_says_very_much_leaves_others_their_turns() -> None:
+    async def run() -> None:
+        front, passed, turns = Front(echo, nowhere, HTML, {}), 0, 0
+
+        class Viser:
+            async def send(self, message: bytes) -> None:
+                nonlocal passed
+                passed += 1
+
+        async def flood() -> AsyncIterator[bytes]:
+            while True:
+                yield b""
+
+        front.doorkeeper.admit = lambda message: message  # type: ignore[method-assign,assignment]
+        begun = time.monotonic()
+        up = asyncio.create_task(front._up(flood(), Viser()))  # type: ignore[arg-type]
+        while time.monotonic() - begun < 0.3:
+            await asyncio.sleep(0)
+            turns += 1
+        assert turns > passed > 0
+        assert passed < 2 + module.RELAYED_HZ * (time.monotonic() - begun)
+        up.cancel()
+
+    asyncio.run(run())
+
+
 def test_other_addresses_need_a_token() -> None:
     async def run() -> None:
         front = Front(echo, nowhere, HTML, {})

@@ -7,7 +7,10 @@ at.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
+import os
+import socket
 import struct
 import tempfile
 from collections.abc import Awaitable, Callable
@@ -311,3 +314,25 @@ def test_a_page_opens_no_tunnel(monkeypatch: pytest.MonkeyPatch) -> None:
 
     with_scenes(work)
     assert told == ["'ShareUrlRequest'", "no message", "text", "'ShareUrlDisconnect'"]
+
+
+def test_folders_of_killed_viewers_are_removed_and_those_of_others_stay() -> None:
+    with tempfile.TemporaryDirectory(prefix="gate-") as name:  # short: it is a socket's path
+        folder = Path(name)
+        with contextlib.ExitStack() as stack:
+            for each in ("dead", "alive", "young"):
+                place = folder / f"flexdt-viser-{each}"
+                place.mkdir()
+                listener = stack.enter_context(socket.socket(socket.AF_UNIX))
+                listener.bind(str(place / "viser"))
+                if each == "alive":
+                    listener.listen()
+                else:
+                    listener.close()
+                if each != "young":
+                    os.utime(place, (0, 0))
+            (folder / "somebody-else").mkdir()
+            gate.clear_left_behind(folder)
+            assert sorted(p.name for p in folder.iterdir()) == [
+                "flexdt-viser-alive", "flexdt-viser-young", "somebody-else",
+            ]  # fmt: skip
