@@ -396,8 +396,8 @@ def test_a_motor_that_passes_from_one_leg_to_the_next_never_shows_rest() -> None
         after = Trajectory(
             (Piece(end, first.target, 15.0 * end, -15.0),), 2 * end, 2 * first.target
         )
-        drive = Drive(50.0, 15.0, (first.shifted(origin), after.shifted(origin)))
-        moment = drive.trajectories[0].end
+        drive = Drive(50.0, 15.0, (first, after), origin)
+        moment = first.shifted(origin).end
         assert drive.next_start(math.nextafter(moment, 0.0)) == moment
         assert drive.at(moment).velocity(moment) == 15.0 * end
 

@@ -11,7 +11,7 @@ atoms, which shapes coherent scattering below x = 0.3 in liquids, plastics and m
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 
@@ -52,9 +52,14 @@ class CrossSections:
     cumulated: FloatArray
 
 
+@cache
+def _scattering() -> dict[str, FloatArray]:
+    return stored_arrays("scattering.npz")[0]
+
+
 @lru_cache(maxsize=16)
 def cross_sections(substances: tuple[Substance, ...]) -> CrossSections:
-    """Cross-sections of substances at their densities.
+    """Cross-sections of substances at their densities; their arrays cannot be written to.
 
     Args:
         substances: m materials, at least one.
@@ -65,7 +70,7 @@ def cross_sections(substances: tuple[Substance, ...]) -> CrossSections:
         >>> round(float(water.incoherent[0, at]), 4)  # XCOM: 0.0177 1/mm
         0.0177
     """
-    energy, stored = tables().energy_keV, stored_arrays("scattering.npz")[0]
+    energy, stored = tables().energy_keV, _scattering()
     # Of an atom by atomic number from 1, (92, q), at (q,) values of x whose root grows evenly.
     x, form_factor, function = (stored[name] for name in ("x", "form_factor", "incoherent"))
     form, shell = np.zeros((2, len(substances), len(x)))
@@ -90,13 +95,7 @@ def cross_sections(substances: tuple[Substance, ...]) -> CrossSections:
     coherent = [(np.interp(column, index, row) * thomson).sum(axis=1) for row in form]
     incoherent = [(np.interp(column, index, row) * klein_nishina).sum(axis=1) for row in shell]
     total = [one.attenuation() for one in substances]
-    return CrossSections(
-        energy,
-        np.array(total),
-        np.array(coherent),
-        np.array(incoherent),
-        root_step,
-        form,
-        shell,
-        cumulated,
-    )
+    arrays = np.array(total), np.array(coherent), np.array(incoherent), form, shell, cumulated
+    for array in arrays:  # everybody has the same ones
+        array.flags.writeable = False
+    return CrossSections(energy, *arrays[:3], root_step, *arrays[3:])

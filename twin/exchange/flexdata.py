@@ -29,7 +29,8 @@ UNSUPPORTED: Final = ("axs_roll", "axs_pitch", "vol_rot")
 """Numbers of the format that must be zero to be read: see the documentation."""
 _NUMBERS: Final[Mapping[str, Any]] = {
     **dict.fromkeys(("src2obj", "det2obj", "src2det"), math.nan),
-    "det_pixel": math.nan, "ang_range": (math.nan, math.nan), "det_sample": (1.0, 1.0),
+    **dict.fromkeys(("det_rows", "det_cols", "det_pixel"), math.nan),
+    "ang_range": (math.nan, math.nan), "det_sample": (1.0, 1.0),
     "vol_tra": (0.0, 0.0, 0.0), "vol_rot": (0.0, 0.0, 0.0),
     **dict.fromkeys(("src_tan", "src_ort", "det_tan", "det_ort", "axs_tan"), 0.0),
     **dict.fromkeys(("axs_roll", "axs_pitch", "det_roll", "det_yaw", "det_pitch"), 0.0),
@@ -135,7 +136,7 @@ def read_flexdata(
     if not isinstance(count, int) or count < 1:
         raise ExchangeError(f"{file} does not say how many views there are; it must be given")
     if shape is None and "det_rows" in records and "det_cols" in records:
-        shape = (int(records["det_rows"]), int(records["det_cols"]))
+        shape = (int(found["det_rows"]), int(found["det_cols"]))
     sod, odd, sdd = (float(found[name]) for name in ("src2obj", "det2obj", "src2det"))
     sod, odd = (sdd - odd if math.isnan(sod) else sod), (sdd - sod if math.isnan(odd) else odd)
     if math.isnan(sod) or math.isnan(odd):
@@ -161,9 +162,12 @@ def read_flexdata(
 def _values(name: str, records: Mapping[str, Any], file: str) -> FloatArray:
     """One of `_NUMBERS`, of the file or as it is where there is none."""
     usual = np.array(_NUMBERS[name])
+    given = records.get(name, usual.tolist())
+    each = given if isinstance(given, list) else [given]
     try:
-        values = np.array(records.get(name, usual), dtype=np.float64).reshape(usual.shape)
-    except (TypeError, ValueError):
+        known = len(each) == usual.size and all(type(v) in (int, float) for v in each)
+        values = np.reshape([float(v) for v in each], usual.shape) if known else usual * math.nan
+    except OverflowError:
         values = usual * math.nan
     if (name in records or name in ("det_pixel", "ang_range")) and not np.isfinite(values).all():
         raise ExchangeError(f"{file}: {name} must be {usual.size} finite numbers", {"path": name})

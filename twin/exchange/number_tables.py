@@ -43,7 +43,7 @@ def read_vectors_text(text: str, file: str = "<text>") -> ConeVec:
         content = line.split("#", 1)[0].strip()
         if not content:
             continue
-        rows.append(_numbers(re.split(r"[\s,;]+", content.strip(" ,;")), file, number))
+        rows.append(_numbers(re.split(r"[\s,;]+", content.strip(" \t,;")), file, number))
     return cone_vec_of(rows, file)
 
 
@@ -197,6 +197,7 @@ Texts = Annotated[tuple[str, ...], Field(strict=False)]
 
 
 class _Panel(BaseModel):
+    model_config = ConfigDict(strict=True)
     rows: PositiveInt | None = None
     columns: PositiveInt | None = None
 
@@ -247,7 +248,7 @@ def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
         what = f"{file}: kind {said[0]!r}, schema {said[1]!r}"
         raise ExchangeError.instead(what, list(said), f"{KIND!r}, schema {SCHEMA}")
     try:
-        found = _Document.model_validate(document)
+        found = _Document.model_validate({k: v for k, v in document.items() if v is not None})
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))

@@ -73,9 +73,6 @@ OUTSIDE = (
     "gantries), stages that tilt, curved panels, parallel beams"
 )
 
-_MODELLED = "; docs/limits.md says what is modelled"
-"""Ends errors of what no machine file can have."""
-
 SAMPLE: Final = "sample"
 """Name of the sample's pieces in pairs of bodies; no component may be called so."""
 _AREA_SLACK_MM: Final = 0.5
@@ -866,7 +863,7 @@ def _inherited(own: Raw) -> Raw:
         if key == "components" and not all(isinstance(part, dict) for part in parts):
             raise UnknownNameError(f"components must be tables, [[components]] (value: {value!r})")
         if isinstance(base.get(key), dict) and not isinstance(value, dict):
-            most = f"must be a table, [{key}]{_MODELLED}"
+            most = f"must be a table, [{key}]{_limit(key)}"
             raise UnknownNameError(f"{key} {most} (value: {value!r})")
     if "name" in own:
         base["default_profile"] = ""  # the base's zero offsets are of that machine alone
@@ -962,10 +959,29 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
             value = e["input"] if at is None else e["ctx"]["value"]
             said = "there is no such key" if e["type"] == "extra_forbidden" else message_of(e)
             if e["type"] in ("extra_forbidden", "literal_error", "model_type"):
-                said += _MODELLED
+                said += _limit(path)
             lines.append(f"{file}: {path}: {said} (value: {value!r})")
             data.append({"path": path, "message": said, "value": repr(value)})
         raise MachineFileError("\n".join(lines), {"file": file, "problems": data}) from None
+
+
+_ONE: Final = "a machine has one tube and one flat panel, [tube] and [detector]"
+_LIMITS: Final = {
+    "beam": "the beam is a cone from one focal spot; parallel and fan beams are not modelled",
+    "tube": _ONE,
+    "source": _ONE,
+    "detector": _ONE,
+    "shape": "curved panels and line detectors are not modelled",
+    "unit": 'linear axes are in mm, axes with kind = "rotation" in deg',
+    "kind": "axes slide or turn about the vertical; what tilts is not modelled",
+}
+
+
+def _limit(path: str) -> str:
+    """What docs/limits.md says of a key, to end an error with."""
+    last = path.rpartition(".")[2].lower()
+    said = next((text for key, text in _LIMITS.items() if last.startswith(key)), None)
+    return f"; {said} (docs/limits.md)" if said else ""
 
 
 def _require(

@@ -40,23 +40,28 @@ class Drive:
 
     Attributes:
         speed, acceleration: of motions to come.
-        trajectories: in force or to come.
+        trajectories: on the programme's own clock; a programme may have 100 000 of them, which
+            take most of a second to shift.
+        origin: the time at which that clock shows 0 [s].
     """
 
     speed: float
     acceleration: float
     trajectories: tuple[Trajectory, ...]
+    origin: float = 0.0
 
     @cached_property
     def _starts(self) -> tuple[float, ...]:
-        return tuple(t.start for t in self.trajectories)
+        # Rounded as `shifted` rounds: where one leg ends in motion, the next one has begun.
+        return tuple(t.start + self.origin for t in self.trajectories)
 
     def _index(self, now: float) -> int:
         return max(0, bisect_right(self._starts, now) - 1)
 
     def at(self, now: float) -> Trajectory:
         """The trajectory in force at `now` [s]."""
-        return self.trajectories[self._index(now)]
+        leg = self.trajectories[self._index(now)]
+        return leg.shifted(self.origin) if self.origin else leg
 
     def next_start(self, now: float) -> float:
         """When the trajectory after the one in force begins [s]; inf if there is none."""
@@ -66,7 +71,7 @@ class Drive:
     @property
     def end(self) -> float:
         """When the motor comes to its last rest [s]."""
-        return self.trajectories[-1].end
+        return self.trajectories[-1].end + self.origin
 
     @property
     def final(self) -> float:
@@ -76,11 +81,13 @@ class Drive:
     def ahead(self, now: float) -> Trajectory:
         """All that it is to follow from `now` on, as one trajectory."""
         left = self.trajectories[self._index(now) :]
+        if self.origin:
+            left = tuple(leg.shifted(self.origin) for leg in left)
         return left[0] if len(left) == 1 else motion.joined(left)
 
-    def following(self, *trajectories: Trajectory) -> Drive:
+    def following(self, *trajectories: Trajectory, origin: float = 0.0) -> Drive:
         """The same motor on `trajectories` alone."""
-        return replace(self, trajectories=trajectories)
+        return replace(self, trajectories=trajectories, origin=origin)
 
 
 Drives = Mapping[str, Drive]

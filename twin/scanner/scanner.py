@@ -391,8 +391,7 @@ class ScannerTwin:
             raise SafetyError(what, {"asked": "a programme", "allowed": "checking it again"})
         self._programmes += 1
         for name, legs in prepared.legs.items():
-            shifted = (leg.shifted(now) for leg in legs)
-            self._drives[name] = self._drives[name].following(*shifted)
+            self._drives[name] = self._drives[name].following(*legs, origin=now)
 
     # The stage ----------------------------------------------------------------------------------
 

@@ -157,6 +157,11 @@ def test_bad_rtk(text: str, says: str) -> None:
         (("ang_range", "[0.0]"), "ang_range must be 2 finite"),
         (("proj_count", None), "how many views"),
         (("src2obj", None), "two of src2obj, det2obj and src2det"),
+        *(
+            (("det_rows", wrong), "det_rows must be 1 finite")
+            for wrong in ("nan", "inf", '"12"', "true", "[10, 2]", "{x = 1}")
+        ),
+        (("det_sample", "[[1], [2]]"), "det_sample must be 2 finite"),
     ],
 )
 def test_bad_flexdata(change: tuple[str, str | None], says: str) -> None:

@@ -281,8 +281,11 @@ def edged(body: Float32Array, windows: Windows, step: float) -> npt.NDArray[np.b
     across = np.abs(body[..., 4:] + body[..., :-4] - 2.0 * body[..., 2:-2])
     np.maximum(bend[..., 2:-2], across, out=bend[..., 2:-2])
     reach = (windows.radii * windows.stretch[..., 2] + 2.5)[..., None, None]
-    near = distances2(windows.corner, windows.side, windows.predicted) < reach**2
-    return np.asarray(np.where(near, bend, 0.0).max(axis=(2, 3)) > step)
+    found = np.empty(body.shape[:2], np.bool_)
+    for i, at in enumerate(windows.corner):  # distances of one frame at a time: they are float64
+        near = distances2(at, windows.side, windows.predicted[i]) < reach[i] ** 2
+        found[i] = (bend[i] * near).max(axis=(1, 2)) > step
+    return found
 
 
 def distances2(corner: npt.NDArray[np.int64], side: int, places: FloatArray) -> FloatArray:
