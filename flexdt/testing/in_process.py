@@ -22,7 +22,7 @@ from contextlib import contextmanager, nullcontext
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, Protocol, TypeVar
 
 from flexdt import machines
 from flexdt.clients.client.client import TwinClient
@@ -154,6 +154,16 @@ class DirectProjector:
         return project_body(self.known[name], cone_vec, shape)
 
 
+class _Receiver(Protocol):
+    """A server's end of one connection."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None: ...
+
+    def connection_lost(self, exc: Exception | None) -> None: ...
+
+    def data_received(self, data: bytes) -> None: ...
+
+
 class InProcessTransport(asyncio.Transport):
     """A client's transport to a server of the same event loop; to the server it is asyncio's.
 
@@ -162,12 +172,10 @@ class InProcessTransport(asyncio.Transport):
         serve: makes the server's end of a connection.
     """
 
-    def __init__(
-        self, loop: asyncio.AbstractEventLoop, serve: Callable[[], asyncio.Protocol]
-    ) -> None:
+    def __init__(self, loop: asyncio.AbstractEventLoop, serve: Callable[[], _Receiver]) -> None:
         super().__init__({"peername": ("in-process", 0)})
         self._loop, self._serve = loop, serve
-        self._server: asyncio.Protocol | None = None
+        self._server: _Receiver | None = None
 
     async def open(self) -> None:
         """Connect anew.

@@ -80,7 +80,7 @@ class TcpServer(ListeningServer):
         self._look_due = False
         self.opened = 0
 
-    def connection(self) -> asyncio.Protocol:
+    def connection(self) -> _Link:
         """What serves one connection, whatever carries its bytes."""
         return _Link(self)
 
