@@ -299,12 +299,13 @@ class ImageCollector:
         if off.any():
             velocity = abs(trajectory.velocity(trigger.time))
             if velocity < speed * (1 - 1e-9):
+                code = "run_up"
                 short = f"the run-up of {trigger.run_up:.4g} {unit} is too short"
                 what = f"passes the trigger at {velocity:.4g} of {speed:.4g} {unit}/s: {short}"
             else:
+                code = "scan_overrun"
                 which = f"(from image {int(np.argmax(off))} on)"
                 what = f"slows down before the last of {len(off)} images {which}"
-            code = "run_up" if velocity < speed * (1 - 1e-9) else "scan_overrun"
             self.findings.warn(code, f"{trigger.axis} {what}; images lie where the motor is")
             starts, exact = start + period * count, {}
         return starts, exact
