@@ -99,10 +99,9 @@ studies: $(TEST_STAMP)
 	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'slow and not browser and not night' \
 	  --junitxml=build/durations/studies.xml
 
-# The page in a browser, which draws on all cores: nothing else runs beside it. One of its modules takes
-# a third of the time, so who has finished takes tests of it over.
+# The page in a browser, which draws on all cores: nothing else runs beside it.
 page: $(TEST_STAMP)
-	$(BIN)/pytest -n 3 --dist worksteal -m 'browser and not night' tests/viewer \
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'browser and not night' tests/viewer \
 	  --junitxml=build/durations/page.xml
 
 # Every seed and every case: hours in all. Nothing waits for it.
