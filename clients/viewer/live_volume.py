@@ -419,10 +419,6 @@ def warm() -> None:
     fdk_parts(lambda: [np.zeros((4, 4, 4), np.float32)], scan, (4, 4), like)
 
 
-if __name__ == "__main__":
-    main()
-
-
 Mask = npt.NDArray[np.bool_]
 LEVELS: Final = 240
 """Bins of the attenuation's logarithm in which the sample's main material is looked for."""
@@ -573,3 +569,7 @@ def extent(values: Float32Array, truth: Float32Array, axis: int, seen: float, mu
         for k, step in ((above[0], -1), (above[-1], 1))
     ]
     return float(above[-1] - above[0] + sum(ends))
+
+
+if __name__ == "__main__":
+    main()
