@@ -404,3 +404,17 @@ def test_an_import_path_that_moved_names_the_new_one(old: str, statement: str) -
         exec(statement.format(old=old, package=package, module=module), {})
     assert f"{old} has moved to {moved.MOVED[old]}" in str(raised.value)
     assert importlib.util.find_spec(moved.MOVED[old]) is not None
+
+
+def test_a_module_that_is_a_program_begins_below_all_that_it_needs() -> None:
+    """A merge left one's beginning above functions that its work calls minutes later."""
+    programs = [
+        path
+        for folder in CODE
+        for path in (ROOT / folder).rglob("*.py")
+        if "node_modules" not in path.parts and "\nif __name__ ==" in path.read_text("utf-8")
+    ]
+    assert len(programs) >= 5
+    for path in programs:
+        last = path.read_text("utf-8").rpartition("\nif __name__ ==")[2]
+        assert all(line[:1].isspace() or not line for line in last.splitlines()[1:]), path
