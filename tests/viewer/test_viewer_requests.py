@@ -34,7 +34,7 @@ from flexdt.protocol import Connection, Notification, Request, Response
 
 pytestmark = pytest.mark.slow
 
-PATIENCE_S = 60.0
+PATIENCE_S = 240.0
 NOWHERE = TwinAddress("127.0.0.1", 1)
 
 
