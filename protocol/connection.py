@@ -18,7 +18,7 @@ from __future__ import annotations
 import re
 import struct
 from collections import deque
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from itertools import chain, islice
 from typing import Any, Final, TypeGuard
 
@@ -85,10 +85,14 @@ class Connection:
         self.closed = False
         self._ready = deque[bytes | Malformed]()
         """Whole messages, and errors found in dividing; empty lines are none."""
-        self._judged = 0
-        """How many of these `overtake` has examined."""
+        self._new = deque[bytes | Malformed]()
+        """Those that follow and that `overtake` has not examined."""
+        self._fed = 0
+        """How many of `_new` had come before the last `feed`."""
+        self._suspect = False
+        """Whether `overtake` has found a name in `_new` and not come to its end since."""
         self._held = 0
-        """Bytes of these."""
+        """Bytes of all these."""
         self._begun = bytearray()
         """The beginning of a message whose end has not come."""
         self._skip = 0
@@ -100,17 +104,17 @@ class Connection:
     def pending(self) -> int:
         """Bytes held of messages that have not been taken out, framing included."""
         framing = 1 if self.codec is Codec.JSON else 4
-        return self._held + framing * len(self._ready) + len(self._begun)
+        return self._held + framing * self.waiting + len(self._begun)
 
     @property
     def waiting(self) -> int:
         """How many messages wait to be taken out."""
-        return len(self._ready)
+        return len(self._ready) + len(self._new)
 
     @property
     def whole(self) -> bool:
         """Whether `next_raw` has something to return."""
-        return bool(self._ready)
+        return bool(self._ready or self._new)
 
     @property
     def mid_message(self) -> bool:
@@ -138,6 +142,7 @@ class Connection:
 
     def feed(self, data: bytes | bytearray | memoryview) -> None:
         """Take bytes from the peer without decoding them: see `next_raw`."""
+        self._fed = len(self._new)
         if self.closed or self._broken or not data:
             return
         if self.codec is None:
@@ -156,7 +161,7 @@ class Connection:
         self._feed_each_line(data[:first])
         if not self._broken:
             lines = [*filter(bytes.strip, data[first : last - 1].split(b"\n"))]
-            self._ready.extend(lines)
+            self._new.extend(lines)
             self._held += sum(map(len, lines))
             self._begun += data[last:]
 
@@ -175,7 +180,7 @@ class Connection:
                 self._refuse(RpcError(Code.INVALID_REQUEST, why), fatal=True)
                 return
             elif line.strip():
-                self._ready.append(line)
+                self._new.append(line)
                 self._held += len(line)
         if not self._skip:
             self._begun += rest
@@ -197,10 +202,10 @@ class Connection:
                     break
                 if held is begun:  # once, because bytes are cut faster
                     held = bytes(begun)
-                self._ready.append(bytes(held[at + 4 : end]))
+                self._new.append(bytes(held[at + 4 : end]))
                 self._held += size
             elif size <= MAX_FRAME:
-                self._ready.append(Malformed(too_large("a frame", size, self.max_message)))
+                self._new.append(Malformed(too_large("a frame", size, self.max_message)))
                 self._skip = max(0, end - there)
             else:
                 self._refuse(too_large("a frame", size, MAX_FRAME), fatal=True)
@@ -210,16 +215,15 @@ class Connection:
 
     def _refuse(self, error: RpcError, *, fatal: bool = False) -> None:
         """Put an error where the message would be, of which nothing is kept."""
-        self._ready.append(Malformed(error, fatal=fatal))
+        self._new.append(Malformed(error, fatal=fatal))
         self._broken = fatal
         self._begun.clear()
 
     def next_raw(self) -> bytes | Malformed | None:
         """The next message's bytes for `decode`, or an error found before that; None: no more."""
-        if not self._ready:
+        if not self.whole:
             return None
-        raw = self._ready.popleft()
-        self._judged = max(0, self._judged - 1)
+        raw = (self._ready or self._new).popleft()
         if not isinstance(raw, Malformed):
             self._held -= len(raw)
         elif raw.fatal:
@@ -238,7 +242,7 @@ class Connection:
     @property
     def unjudged(self) -> bool:
         """Whether there are messages that `overtake` has not examined."""
-        return self._judged < len(self._ready) and not self.closed
+        return bool(self._new)
 
     def overtake(
         self, names: Collection[bytes], wanted: Callable[[bytes], bool], most: int = 32
@@ -257,39 +261,36 @@ class Connection:
         Returns:
             The bytes of the messages taken out, in order.
         """
-        searched = self._searched()
-        if not any(name in searched for name in names):
-            self._judged = len(self._ready)
-            return []
-        queue, out, looked = list(self._ready), list[bytes](), 0
-        while self._judged < len(queue) and looked < most:
-            message = queue[self._judged]
+        out, looked = list[bytes](), 0
+        if not self._suspect:
+            searched = _joined(self._new)
+            self._suspect = any(name in searched for name in names)
+        if not self._suspect:
+            self._ready += self._new
+            self._new.clear()
+        while self._new and looked < most:
+            message = self._new.popleft()
             if _small(message) and any(name in message for name in names):
                 looked += 1
                 if wanted(message):
                     out.append(message)
-                    del queue[self._judged]
                     self._held -= len(message)
                     continue
-            self._judged += 1
-        self._ready = deque(queue)
+            self._ready.append(message)
+        self._suspect = bool(self._new)
         return out
 
     def holds(self, name: bytes) -> bool:
-        """Whether a message that `overtake` has not examined yet contains these bytes."""
-        return self.unjudged and name in self._searched()
-
-    def _searched(self) -> bytes:
-        """What `overtake` has not examined yet, in one piece."""
-        new = islice(self._ready, self._judged, None)
-        return b"\n".join([m for m in new if isinstance(m, bytes) and len(m) <= LARGE])
+        """Whether a message that the last `feed` has completed contains these bytes."""
+        return name in _joined(islice(self._new, self._fed, None))
 
     def _end(self) -> None:
         """Close the connection and discard everything received."""
         self.closed = True
         self._ready.clear()
+        self._new.clear()
         self._begun.clear()
-        self._judged = self._held = self._skip = 0
+        self._held = self._skip = 0
 
     def send(self, message: Message | Prepared) -> bytes:
         """The bytes of a message, framing included; JSON until the peer's first byte is known.
@@ -331,6 +332,11 @@ class Connection:
             RpcError: -32008, a MessagePack frame of 16 MiB or more.
         """
         return _framed(self.codec or Codec.JSON, body)
+
+
+def _joined(messages: Iterable[bytes | Malformed]) -> bytes:
+    """The small ones in one piece, to be searched; of 10^4 messages in a millisecond."""
+    return b"\n".join([m for m in messages if isinstance(m, bytes) and len(m) <= LARGE])
 
 
 def _small(message: bytes | Malformed) -> TypeGuard[bytes]:

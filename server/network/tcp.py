@@ -164,6 +164,7 @@ class _Link(asyncio.BufferedProtocol):
         self.session: parts.Session | None = None
         self.let_in = server.token is None
         self.arrived = asyncio.Event()
+        self.estop_came = False  # and stands, maybe, among what has not been looked at
         self.ended = False
         self.broken = 0
         self.token_check = parts.TokenCheck(
@@ -219,6 +220,7 @@ class _Link(asyncio.BufferedProtocol):
         before = self.wire.waiting
         self.wire.feed(data)
         if self.wire.holds(ESTOP_BYTES):
+            self.estop_came = True
             self.overtake()
         elif self.wire.unjudged:
             self.server.look_soon(self)
@@ -255,7 +257,8 @@ class _Link(asyncio.BufferedProtocol):
             self.wire.overtake(self.server.urgent, wanted)
             for message in found:
                 self._start(self._serve(message, urgent=True))
-            if self.wire.holds(ESTOP_BYTES):
+            self.estop_came = self.estop_came and self.wire.unjudged
+            if self.estop_came:
                 self.loop.call_soon(self.overtake)
             elif self.wire.unjudged:
                 self.server.look_soon(self)

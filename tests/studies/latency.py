@@ -78,6 +78,22 @@ def pipeline(count: int, what: bytes = GET * 100) -> Callable[[int, float], int]
     return load
 
 
+def flood(what: bytes) -> Callable[[int, float], int]:
+    """Bytes that are no request, by a connection that is made anew whenever it is cut."""
+
+    def load(port: int, seconds: float) -> int:
+        until, sent = time.monotonic() + seconds, 0
+        while time.monotonic() < until:
+            with contextlib.suppress(OSError), dial(port) as sock:
+                drain(sock)
+                while time.monotonic() < until:
+                    sock.sendall(what)
+                    sent += len(what)
+        return sent
+
+    return load
+
+
 def asking(*lines: bytes, count: int = 1, once: bool = False) -> Callable[[int, float], int]:
     """`count` connections that send these lines in turn, each after the answer to the last."""
 
@@ -183,6 +199,9 @@ def loads(scale: float) -> dict[str, Callable[[int, float], int]]:
         "uploads of 100 MB": upload(100 * mb),
         "batches of 1000": asking(batch(1000)),
         "deep JSON": asking(b"[" * 30_000 + b"\n", b'{"a":' * 6_000 + b"\n", GET),
+        "blank lines": flood(b"\n" * (1 << 18)),
+        "two-byte lines": flood(b"1\n" * (1 << 17)),
+        "empty frames": flood(bytes(4) * (1 << 16)),
         "50 clients check 200 poses": asking(poses(200), count=int(50 * scale) or 1),
         "5 observers want images": asking(line("projection.get", b"{}"), count=5),
         "5 observers subscribe and subscribe": pipeline(
