@@ -18,18 +18,12 @@ viewer waits for it.
 A page draws a volume from 16-bit codes of voxels, or of means over cubes of them. It gets them
 once, and then scrolls, windows and turns it without asking; single voxels it asks for by `exact`,
 because codes are rounded.
-
-A volume beside what its sample is made of, where the twin knows that.
-
-The truth is the phantom of the scan's record, where it stood on the stage, at the energy at which
-phantoms state their attenuation. The twin's hidden misalignment is not part of it and is not read.
 """
 
 from __future__ import annotations
 
 import base64
 import json
-import math
 import os
 import sys
 import threading
@@ -43,16 +37,12 @@ from typing import Any, Final
 
 import numba
 import numpy as np
-import numpy.typing as npt
-from scipy import ndimage
 
 from flexdt.clients.datasets.data_set import DataSet
 from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_volume
-from flexdt.phantoms import load_phantom
-from flexdt.phantoms.samples import is_shipped
+from flexdt.clients.viewer.volume_truth import figures, truth_of
 from flexdt.runtime.files.dataset_folder import read_image
-from flexdt.runtime.files.own_documents import file_stem
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -61,7 +51,7 @@ from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.projection import Volume, as_volume
 from flexdt.twin.reconstruction.fdk import OnProcessor, fdk_parts
 from flexdt.twin.reconstruction.rectify import field_of_view
-from flexdt.twin.scanner.state import NamedCorrection, StagePlacement
+from flexdt.twin.scanner.state import NamedCorrection
 
 MOST_VOXELS: Final = 14 << 20
 """Of a finished volume: 28 MB, and 239 x 239 x 190 voxels of the usual camera mode as they are."""
@@ -73,6 +63,16 @@ DARKEST: Final = 0.3
 """Streaks below air count up to this part of what is bright, so that air is dark."""
 SAMPLES: Final = 200_000
 """Voxels from which the window is chosen."""
+MOST_VIEWS: Final = 360
+"""Of a longer scan every n-th image is taken."""
+LOOK_S: Final = 0.1
+TELL_S: Final = 0.4
+"""Between two lines, at least."""
+COARSE: Final = 64
+"""Cells along the longest side of the grid on which the surface is looked for."""
+MOST_POINTS: Final = 12_000
+
+Tell = Callable[[dict[str, Any]], None]
 
 
 def block(data: Float32Array, most: int = MOST_VOXELS) -> tuple[dict[str, Any], bytes]:
@@ -118,19 +118,6 @@ def exact(data: Float32Array, place: tuple[int, int, int]) -> float | None:
         return None
     value = float(data[z, y, x])
     return value if np.isfinite(value) else None
-
-
-MOST_VIEWS: Final = 360
-"""Of a longer scan every n-th image is taken."""
-LOOK_S: Final = 0.1
-TELL_S: Final = 0.4
-"""Between two lines, at least."""
-COARSE: Final = 64
-"""Cells along the longest side of the grid on which the surface is looked for."""
-MOST_POINTS: Final = 12_000
-NICENESS: Final = 5
-
-Tell = Callable[[dict[str, Any]], None]
 
 
 @dataclass
@@ -392,7 +379,7 @@ def _told(held: Held, work: Callable[[], object], problem: str = "problem") -> N
 def main() -> None:
     """The process: what was asked for in a thread, questions from standard input meanwhile."""
     parent, served = os.getppid(), Served()
-    os.nice(NICENESS)
+    os.nice(5)  # neither twin nor viewer waits for a volume
     warm()
     if not (line := sys.stdin.readline()):
         return  # nobody needed it
@@ -417,158 +404,6 @@ def warm() -> None:
     scan = ConeVec.circular(sod=100, sdd=200, angles=4, shape=(4, 4), pixel=1)
     like = as_volume(field_of_view(scan, (4, 4)))
     fdk_parts(lambda: [np.zeros((4, 4, 4), np.float32)], scan, (4, 4), like)
-
-
-Mask = npt.NDArray[np.bool_]
-LEVELS: Final = 240
-"""Bins of the attenuation's logarithm in which the sample's main material is looked for."""
-NOTHING: Final = 1e-6
-"""Less attenuation than any matter's [1/mm]."""
-ALIKE: Final = 0.1
-"""Voxels are of the main material within this part of its attenuation."""
-
-
-def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
-    """The sample's attenuation [1/mm] on the grid of a volume, (z, y, x).
-
-    Raises:
-        TwinError: nobody has said what the sample is.
-    """
-    document = dataset.document
-    name = "" if document is None else document.sample.name
-    if not is_shipped(name):
-        raise TwinError(
-            f"{dataset.where}: what the sample {name!r} is made of is not known here; known: the "
-            "phantoms of flexdt, in scans of the twin",
-            {"asked": name, "allowed": "a phantom that ships with flexdt"},
-        )
-    phantom, voxel = load_phantom(name), min(like.voxel_xyz)
-    if phantom.is_voxels:
-        whole, data, half = phantom.volume(), phantom.volume().data, 0.0
-    else:  # means over two voxels a side, which lie half a voxel before the later one
-        whole = phantom.volume(voxel / 2)
-        data, half = np.pad(whole.data, (0, 1)), 0.5
-        for axis in range(3):
-            data = (data + np.roll(data, 1, axis)) / np.float32(2)
-    stands = StagePlacement() if dataset.folder is None else placement(dataset.folder)
-    back = stands.rotation.T
-    shift = np.array([stands.x, stands.y, stands.z])
-    nz, ny, nx = like.shape
-    axes = [
-        (np.arange(n) - (n - 1) / 2) * step + center
-        for n, step, center in zip((nx, ny, nz), like.voxel_xyz, like.center_mm, strict=True)
-    ]
-    y, x = np.meshgrid(axes[1], axes[0], indexing="ij")
-    out = np.zeros(like.shape, np.float32)
-    ends = (np.array(whole.shape[::-1]) - 1) / 2
-    for k, z in enumerate(axes[2]):  # a layer at a time: places take six times as much as voxels
-        seen = np.stack([x - shift[0], y - shift[1], np.full_like(x, z - shift[2])])
-        inside = np.tensordot(back, seen, axes=1) - np.reshape(whole.center_mm, (3, 1, 1))
-        at = inside / np.reshape(whole.voxel_xyz, (3, 1, 1)) + ends.reshape(3, 1, 1) + half
-        out[k] = ndimage.map_coordinates(data, at[::-1], order=1, mode="constant")
-    return np.maximum(out, 0.0, out=out)  # what a hole takes away leaves a rounding error
-
-
-def placement(folder: Path) -> StagePlacement:
-    """Where the sample of a data set stood, as its job's record has it; without one: in place."""
-    try:
-        file = folder.parent / "jobs" / f"{file_stem(folder.name)}.json"
-        return StagePlacement(**json.loads(file.read_text("utf-8"))["sample"]["offset"])
-    except (OSError, ValueError, LookupError, TypeError, TwinError):
-        return StagePlacement()
-
-
-def figures(values: Float32Array, truth: Float32Array, voxel_mm: float) -> dict[str, Any]:
-    """What is measured in a volume, and the same of the truth.
-
-    Args:
-        values: (z, y, x) [1/mm], not a number where no data cover.
-        truth: of the same shape.
-        voxel_mm: edge of a voxel.
-
-    Returns:
-        `attenuation` of the main material, a voxel and more inside it [1/mm]; `void` part of what
-        its outlines enclose, layer by layer; `x_mm`, `y_mm`, `z_mm` from face to face; each as
-        measured and as true, None where nothing can be said. And the `rms` difference [1/mm] in
-        the box around the sample.
-    """
-    mu = main_level(truth)
-    known = np.isfinite(values)
-    alike = (np.abs(truth - mu) < ALIKE * mu) & known
-    inside = ndimage.binary_erosion(alike)
-    if not inside.any():  # walls of a few voxels
-        inside = alike
-    seen_mu = float(values[inside].mean()) if inside.any() else math.nan
-    solid, seen = truth > mu / 2, known & (values > seen_mu / 2)
-    enclosed = known & np.stack([ndimage.binary_fill_holes(layer) for layer in solid])
-    whole = max(1, int(enclosed.sum()))
-    box = ndimage.find_objects(solid.astype(np.int8))
-    around = tuple(slice(max(0, s.start - 3), s.stop + 3) for s in box[0]) if box else ...
-    apart = (values[around] - truth[around])[known[around]]
-    rms = float(np.sqrt(np.mean(np.square(apart, dtype=np.float64)))) if apart.size else math.nan
-    filled = np.where(known, values, 0.0)
-    pairs = {
-        "attenuation": (seen_mu, mu),
-        "void": (1 - (seen & enclosed).sum() / whole, 1 - (solid & enclosed).sum() / whole),
-        **{
-            f"{name}_mm": tuple(
-                voxel_mm * extent(data, truth, axis, level, mu)
-                for data, level in ((filled, seen_mu), (truth, mu))
-            )
-            for name, axis in (("x", 2), ("y", 1), ("z", 0))
-        },
-    }
-    return {
-        "rms": told(rms),
-        **{name: [told(float(v)) for v in pair] for name, pair in pairs.items()},
-    }
-
-
-def told(value: float) -> float | None:
-    """A figure for JSON, which knows no NaN."""
-    return value if math.isfinite(value) else None
-
-
-def main_level(truth: Float32Array) -> float:
-    """The attenuation that most of the sample has [1/mm]; partly filled voxels differ all."""
-    there = np.log(truth[truth > NOTHING].astype(np.float64))
-    if not there.size:
-        return math.nan
-    counts, edges = np.histogram(there, LEVELS)
-    most = int(np.argmax(counts))
-    last = most == LEVELS - 1
-    alike = (there >= edges[most]) & (
-        (there <= edges[most + 1]) if last else there < edges[most + 1]
-    )
-    return float(np.exp(np.median(there[alike])))
-
-
-def extent(values: Float32Array, truth: Float32Array, axis: int, seen: float, mu: float) -> float:
-    """Voxels from one face to the other along an axis, where the truth is widest.
-
-    The profile is the median over all lines that meet both faces, so that neither noise nor streaks
-    count, and is followed to half of the material's attenuation, between two voxels.
-
-    Args:
-        values: measured, or the truth itself; `seen` is their attenuation of the main material.
-        truth: which says where the faces are; `mu` is its own attenuation.
-        axis: of both arrays.
-    """
-    solid = np.moveaxis(truth, axis, -1) > mu / 2
-    there = solid.any(axis=-1)
-    if not there.any():
-        return math.nan
-    first, last = solid.argmax(axis=-1), solid.shape[-1] - 1 - solid[..., ::-1].argmax(axis=-1)
-    widest = there & (last - first >= (last - first)[there].max() - 1)
-    profile = np.pad(np.median(np.moveaxis(values, axis, -1)[widest], axis=0), 1)
-    above = np.flatnonzero(profile > seen / 2)
-    if not above.size:
-        return math.nan
-    ends = [
-        (profile[k] - seen / 2) / (profile[k] - profile[k + step])
-        for k, step in ((above[0], -1), (above[-1], 1))
-    ]
-    return float(above[-1] - above[0] + sum(ends))
 
 
 if __name__ == "__main__":

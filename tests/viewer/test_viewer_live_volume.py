@@ -28,14 +28,12 @@ from flexdt.clients.viewer.live_volume import (
     block,
     compare,
     exact,
-    figures,
     grow,
-    main_level,
     points_of,
     reconstruct,
     surface,
-    truth_of,
 )
+from flexdt.clients.viewer.volume_truth import figures, main_level, truth_of
 from flexdt.phantoms import load_phantom
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.storage.dataset_writer import DatasetWriter
