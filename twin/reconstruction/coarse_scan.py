@@ -137,7 +137,8 @@ class CoarseScan:
         """Where some views do not see the grid, (ny, nx)."""
         x, y, _ = self.grid.centers()
         away = np.hypot(x - self.circle.centre[0], (y - self.circle.centre[1])[:, None])
-        return np.asarray(away > max(self.ends) - 1.5 * self.grid.voxel_xyz[0])
+        # A voxel and a half. Nodes lie at just that distance; rounding shall not decide on them.
+        return np.asarray(away > max(self.ends) - 1.49 * self.grid.voxel_xyz[0])
 
     @cached_property
     def more(self) -> int:
@@ -206,7 +207,8 @@ class CoarseScan:
         # As far behind the object as the source is before it: twice as large.
         panel, down = centre - far + u * (ends[1] - ends[0]), (0.0, 0.0, -2.0 * tall)
         views = ConeVec.from_vectors(centre + far, panel, 2.0 * side * u, [down] * len(u))
-        return Rung(flaw, views, (self.grid.shape[0] + 2 * self.more, int(sum(ends) / side) + 2))
+        cols = int(sum(ends) / side + 1e-6) + 2  # often a whole number, but for its rounding
+        return Rung(flaw, views, (self.grid.shape[0] + 2 * self.more, cols))
 
     def ladder(self) -> list[Rung]:
         """From parallel rays of a panel in the middle to the scan; flaws that it does not have are
