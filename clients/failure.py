@@ -10,7 +10,7 @@ class CommandError(Exception):
 
     Attributes:
         lines: what to print, at least one line.
-        exit_code: of INTERFACE's table; 1 is invalid input.
+        exit_code: of the table in docs/command-line.md; 1 is invalid input.
     """
 
     def __init__(self, lines: str | Iterable[str], exit_code: int = 1) -> None:

@@ -1,6 +1,6 @@
 """`flexdt calibrate` without its command line: data sets in, JSON documents out.
 
-The functions return plain values in the JSON shapes of INTERFACE.md, and the full outcome.
+The functions return plain values in the JSON shapes of docs/calibration.md, and the full outcome.
 
 Rows of a data set whose pixels are not square are taken anew, so that its pixels are square. Spots
 of balls are then nearly round, as detection and the second look expect. Columns stay what they are,

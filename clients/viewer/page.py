@@ -226,10 +226,12 @@ class Page:
         self._due.set()
 
     async def _handle(self, text: str) -> None:
+        id: object = None
         try:
-            id, method, params = _read(text)
+            id, request = _read(text)
+            method, params = _request(request)
         except ValueError as error:
-            self._fail(None, RpcError(Code.INVALID_REQUEST, f"not a request: {error}"))
+            self._fail(id, RpcError(Code.INVALID_REQUEST, f"not a request: {error}"))
             return
         known = METHODS.get(method)
         if self._busy >= MAX_ASKED and (known is None or not known.urgent):
@@ -285,11 +287,11 @@ def _words(error: RpcError | ConnectionLost) -> str:
     return error.message
 
 
-def _read(text: str) -> tuple[str | int | None, str, dict[str, Any]]:
-    """Id, method and parameters of a message; one that would take very much memory is not read.
+def _read(text: str) -> tuple[str | int | None, dict[str, Any]]:
+    """Id and content of a message; one that would take very much memory is not read.
 
     Raises:
-        ValueError: it is no request.
+        ValueError: it is no object with an id that can be answered.
     """
     if len(text) > MAX_PARTS and sum(map(text.count, ",[{")) > MAX_PARTS:
         raise ValueError(f"it has more than {MAX_PARTS} parts")
@@ -297,13 +299,23 @@ def _read(text: str) -> tuple[str | int | None, str, dict[str, Any]]:
         request = json.loads(text)
     except RecursionError:
         raise ValueError("nested too deep") from None
-    match request:
-        case {"method": str(method)}:
-            id, params = request.get("id"), request.get("params") or {}
-            named = id is None or (isinstance(id, str) and len(id) <= MAX_WORD)
-            if (named or (isinstance(id, int) and abs(id) < 2**64)) and isinstance(params, dict):
-                return id, method, params
-    raise ValueError(f"it has a method, params by name, an id of {MAX_WORD} characters at most")
+    id: Any = request.get("id") if isinstance(request, dict) else ()
+    named = id is None or (isinstance(id, str) and len(id) <= MAX_WORD)
+    if named or (isinstance(id, int) and abs(id) < 2**64):
+        return id, request
+    raise ValueError(f"it is an object with an id of {MAX_WORD} characters at most")
+
+
+def _request(message: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Method and parameters of a message.
+
+    Raises:
+        ValueError: it has none.
+    """
+    method, params = message.get("method"), message.get("params") or {}
+    if isinstance(method, str) and isinstance(params, dict):
+        return method, params
+    raise ValueError("it has a method, and params by name")
 
 
 def without_bytes(value: Any) -> Any:

@@ -225,7 +225,7 @@ MAX_SHARED: Final = 2
 
 
 async def layers(viewer: Viewer, page: Page, params: Params) -> object:
-    """Show or hide layers on this page; maps a layer's name to whether it is shown."""
+    """Show or hide layers on this page."""
     page.shown = page.shown.changed(**params.model_dump())
     if viewer.lab is not None and viewer.state is not None and "ranges" in page.shown:
         viewer.lab.draw_ranges(viewer.state)

@@ -1,4 +1,4 @@
-"""Every class of error leaves with INTERFACE's exit code, readable lines and no traceback."""
+"""Every class of error leaves with its exit code, readable lines and no traceback."""
 
 from __future__ import annotations
 

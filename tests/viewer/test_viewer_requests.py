@@ -180,7 +180,8 @@ def test_what_the_wire_has_no_bytes_for_is_refused_with_its_field(lab: Any) -> N
 def test_requests_that_are_none_are_told_and_the_page_goes_on(lab: Any) -> None:
     async def work(page: ClientConnection) -> None:
         for text in (
-            '{"id": 1, "method": 7}', '{"id": 1, "method": ["x"]}', '{"id": 1}', "3", "\x00",
+            '{"id": 1, "method": 7}', '{"id": 1, "method": ["x"]}', '{"id": 1, "many": 1}',
+            '{"id": 1, "method": "state.get", "params": [1]}', "3", "\x00",
             f'{{"id": {2**70}, "method": "state.get"}}', f'{{"id": {"9" * 5000}, "method": "x"}}',
             '{"id": "%s", "method": "state.get"}' % ("i" * 1000), '{"id": 1e300, "method": "x"}',
             "[" + "1," * 600_000 + "1]",
@@ -188,6 +189,7 @@ def test_requests_that_are_none_are_told_and_the_page_goes_on(lab: Any) -> None:
             await page.send(text)
             got = await hear(page, lambda m: isinstance(m, dict) and m["type"] == "answer")
             assert got["error"]["code"] == -32600, (text[:60], got)
+            assert got["id"] == (1 if text.startswith('{"id": 1, "m') else None), text[:60]
         got = await ask(page, "\ud800" * 10**6, {}, 1)
         assert got["error"]["code"] == -32601
         assert len(json.dumps(got)) < 2000

@@ -353,16 +353,19 @@ def _followed(
     gates: Iterable[float],
     solver: Solver,
     cap: float,
+    give_up: bool,
 ) -> _Hypothesis:
     """Assign and fit with each gate in turn, until the last one changes nothing; the loss is per
-    possible match, capped at `cap`."""
+    possible match, capped at `cap`. It is infinite where fewer than four match, to `give_up`."""
     used, before = math.nan, np.zeros(0, np.int64)
     try:
         predicted = _predicted(problem, x)
         for gate in gates:
             index = assign(predicted, shadows.points, shadows.counts, gate)
             if (index >= 0).sum() < 4:
-                return _Hypothesis(x, math.inf, 0)
+                if give_up:
+                    return _Hypothesis(x, math.inf, 0)
+                break
             if gate == used and np.array_equal(index, before):
                 break
             x = solve(_with_tracks(problem, shadows, index), solver, x=x).x
@@ -379,7 +382,8 @@ def _rounds(
     x = h.x if math.isfinite(h.loss) else _vote(problem, shadows, h.x)
     quick = Solver(huber=2.0, trim=math.inf, max_iterations=3, tolerance=0.05)
     # One loss for all rounds, so that hypotheses can be compared: capped at the same distance.
-    return _followed(problem, shadows, x, gates, quick, 40.0)
+    found = _followed(problem, shadows, x, gates, quick, 40.0, give_up=True)
+    return found if math.isfinite(found.loss) else replace(found, x=h.x)
 
 
 def _loss(predicted: FloatArray, shadows: _Shadows, cap: float) -> tuple[float, int]:
@@ -429,7 +433,8 @@ def _finish(
     while gates[-1] > max(20.0, how.gate_px):
         gates.append(max(0.5 * gates[-1], how.gate_px))
     gates += [how.gate_px] * (12 - len(gates))
-    return _followed(problem, shadows, x, gates, Solver(max_iterations=15), how.gate_px)
+    solver = Solver(max_iterations=15)
+    return _followed(problem, shadows, x, gates, solver, how.gate_px, give_up=False)
 
 
 def _report(

@@ -3,7 +3,7 @@ import { $, $$, el } from "./dom.js";
 import { call, emit, on, pageId, store } from "./link.js";
 import { remember } from "./address.js";
 const NAMES = { iso: "Isometric", beam: "Beam’s eye", side: "Side", free: "Free" };
-const WIDE = 1.35; // aspect for which the cameras are made, as in standpoints.py
+const WIDE = 1.35; // aspect for which the cameras are made, as in scenes/world.py
 const open = new Map();
 $("#view-switch").append(...Object.entries({ four: "Four views", ...NAMES }).map(([name, words]) => el("button", { "data-layout": name, onclick: () => layout(name, true) }, words)));
 export let current = null;

@@ -350,11 +350,11 @@ class LabScene:
         known = self._server.scene.get_handle_by_name(name)
         if known is not None:
             known.remove()
+        self._solids["object"] = []
         if mount is None or not look.skins:
             return
         low = mount.center_mm[2] + mount.size_mm[2] / 2 - self.machine.sample_height_mm
         high = min(float(skin.vertices[:, 2].min()) for skin in look.skins) / MM
-        self._solids["object"] = []
         if high > low:
             rod = solids.cylinder(5.0, high - low, (0.0, 0.0, 0.5 * (low + high)), solids.RUBBER)
             self._solids["object"] = cut([rod])

@@ -1,9 +1,8 @@
 """The sample and the scanner's parts as coloured meshes.
 
-The sample has one for each material.
-
-Shipped phantoms are made from their names; meshes of uploads come from the twin. Until an upload's
-mesh has arrived, and where it has too many triangles to send, a box of its size stands in.
+The sample has one mesh for each material. Shipped phantoms are made from their names; meshes of
+uploads come from the twin. Until an upload's mesh has arrived, and where it has too many triangles
+to send, a box of its size stands in.
 
 Shipped shapes are bevelled boxes, extrusions and cylinders, mm in and metres out, as a list of
 painted meshes that becomes one GLB. Uploads are fetched by `sample.mesh`, for a bounded time and up
@@ -13,7 +12,7 @@ The scanner's components are recognisable machine parts, from the machine file's
 
 `data/parts.toml` says of which pieces a look consists. Components of other names and roles become
 bevelled boxes or cylinders, so another machine file still draws; a part with a mesh of its own is
-drawn as that. Lengths are in mm.
+drawn as that.
 
 The lead cabinet around the machine is drawn only; no collision knows of it. Its walls are seen from
 the inside alone, so whatever stands between a camera and the machine is cut away. A kerb shows
@@ -74,6 +73,8 @@ BRAND = Paint((28, 120, 200), 0.0, 0.45)
 BRASS = Paint((206, 168, 92), 0.3, 0.35)
 SIGNAL = Paint((255, 140, 0), 0.0, 0.5, (0.25, 0.12, 0.0))
 RUBBER = Paint((34, 37, 43), 0.0, 0.8)
+PAINTS: Final = {name: value for name, value in globals().items() if isinstance(value, Paint)}
+"""By their names in `data/parts.toml`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -367,7 +368,7 @@ def _pieces(piece: Mapping[str, Any], sides: FloatArray) -> list[PaintedMesh]:
         (sides * piece.get(share, MIDDLE) + piece.get(more, MIDDLE)).tolist()
         for share, more in (("share", "mm"), ("at", "at_mm"))
     )
-    paint, axis = globals()[piece["paint"]], piece.get("axis", "z")
+    paint, axis = PAINTS[piece["paint"]], piece.get("axis", "z")
     made = []
     for angle in np.radians(piece.get("turned_deg", [0.0])):
         match piece["solid"]:

@@ -5,7 +5,7 @@ import { call, emit, on, pageId, store } from "./link.js";
 import { remember } from "./address.js";
 
 const NAMES: Record<View, string> = { iso: "Isometric", beam: "Beam’s eye", side: "Side", free: "Free" };
-const WIDE = 1.35; // aspect for which the cameras are made, as in standpoints.py
+const WIDE = 1.35; // aspect for which the cameras are made, as in scenes/world.py
 type Layout = View | "four" | "none";
 interface Frame { box: HTMLElement; iframe: HTMLIFrameElement; crop?: HTMLElement; tag: HTMLElement; src: string }
 const open = new Map<View, Frame>();

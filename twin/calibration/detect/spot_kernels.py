@@ -16,13 +16,13 @@ X, Y, RADIUS, PEAK, NOISE, SCORE, BIAS, VAR_X, COV_XY, VAR_Y, OK = range(11)
 """Places in the result of `measure` and `fit_ball`."""
 RESULTS = 11
 
-FIT_FLOOR_PX = 0.0025
-"""The same for a fitted ball, whose assumed profile is never quite the pixels'."""
 PARTIAL = 0.004
 """Error of a partial spot's place per radius and missing share (measured: 0.007 px where a tenth
 is missing)."""
 FLOOR_PX = 0.0015
 """Error a centroid keeps even without noise: sampling on pixels (measured on clean images)."""
+FIT_FLOOR_PX = 0.0025
+"""The same for a fitted ball, whose assumed profile is never quite the pixels'."""
 
 
 @linked

@@ -355,7 +355,7 @@ def estimate_geometry(
         tracks: (n, k, 2) pixels (column, row), nan where a bead was not seen.
         phantom: k beads: anything with `beads` and `bead_radius_mm`, or their centres (k, 3) [mm].
         geometry: nominal geometry of each of the n frames.
-        free: parameters to estimate, names of INTERFACE; what has no prior either stays at
+        free: parameters to estimate, of `geometry.offsets.NAMES`; what has no prior either stays at
             `start`. If source, stage and detector shifts of one direction are all free, the source
             is fixed.
         shape: detector (rows, cols); None is the default machine's camera.

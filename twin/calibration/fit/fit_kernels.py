@@ -1,4 +1,4 @@
-"""Compiled kernels of the fit: residuals, analytic Jacobian, normal equations.
+"""Compiled kernels of the fit: residuals, exact derivatives, normal equations.
 
 For any subset of the seventeen parameters, and for the beads themselves, they compute what
 `Poses.cone_vec(parameters).project_points(beads)` computes. That makes this the second place where

@@ -1,7 +1,7 @@
 """The calibration problem as a value: which frames, beads, measurements and free parameters.
 
 It converts the public arguments to the plain arrays of the kernels and back, and knows the two
-readings of eq. 5.4 and the gauge. `solver` solves it.
+readings of eq. 5.4 and the gauge. `fit` solves it.
 """
 
 from __future__ import annotations
