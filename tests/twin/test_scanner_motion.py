@@ -17,7 +17,8 @@ from flexdt.twin.machine.description import (
     parse_machine,
     profile_of,
 )
-from flexdt.twin.motion.drives import braked_apart, home, plan_jog, plan_move
+from flexdt.twin.motion import profiles as motion
+from flexdt.twin.motion.drives import Drive, braked_apart, home, plan_jog, plan_move
 from flexdt.twin.motion.profiles import at_rest
 from flexdt.twin.scanner.scanner import ScannerTwin
 
@@ -332,3 +333,14 @@ def test_a_programme_is_followed_at_its_times_and_stop_ends_it() -> None:
     assert s.positions(20.0)["mag_obj"] == 600.0
     s.stop(8.0)
     assert s.positions(20.0)["mag_obj"] == 650.0
+
+
+def test_a_leg_of_a_programme_on_a_clock_of_its_own_is_shifted_once() -> None:
+    """At rest, each of the scanner's motors is read some thirty times a second."""
+    legs = motion.move(0.0, 0.0, 10.0, 5.0, 20.0, 0.0), motion.move(10.0, 0.0, 0.0, 5.0, 20.0, 4.0)
+    drive = Drive(5.0, 20.0, legs, origin=100.0)
+    first = drive.at(101.0)
+    assert first == legs[0].shifted(100.0)
+    assert drive.at(102.0) is first
+    assert drive.at(104.5) == legs[1].shifted(100.0)
+    assert drive.at(101.0) == first

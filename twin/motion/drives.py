@@ -60,8 +60,20 @@ class Drive:
 
     def at(self, now: float) -> Trajectory:
         """The trajectory in force at `now` [s]."""
-        leg = self.trajectories[self._index(now)]
-        return leg.shifted(self.origin) if self.origin else leg
+        index = self._index(now)
+        if not self.origin:
+            return self.trajectories[index]
+        leg = self._latest.get(index)
+        if leg is None:
+            leg = self.trajectories[index].shifted(self.origin)
+            self._latest.clear()
+            self._latest[index] = leg
+        return leg
+
+    @cached_property
+    def _latest(self) -> dict[int, Trajectory]:
+        """The leg that was asked for last, by its index, on the clock of `now`."""
+        return {}
 
     def next_start(self, now: float) -> float:
         """When the trajectory after the one in force begins [s]; inf if there is none."""

@@ -644,8 +644,8 @@ class ScannerTwin:
         lower, upper = sorted(virtual.constant + virtual.factor * x for x in other.limits)
         return replace(
             other,
-            position=virtual_reading(self.machine, name, self.positions(now)),
-            target=virtual_reading(self.machine, name, self.targets(now)),
+            position=virtual_reading(self.machine, name, {virtual.of: other.position}),
+            target=virtual_reading(self.machine, name, {virtual.of: other.target}),
             velocity=virtual.factor * other.velocity + 0.0,  # no negative zero
             limits=(lower, upper),
             speed=other.speed * abs(virtual.factor),
