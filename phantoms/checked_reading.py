@@ -1,7 +1,7 @@
 """Validated reading of JSON-able documents: each reader takes a value and its key path.
 
 Documents come from outside, so every reader either returns the right type or raises PhantomError
-with the path, the value and what is allowed. `Text`, `Number`, `Lengths`, `Place` and `Packed` make
+with the path, the value and what is allowed. `Text`, `Number`, `Lengths`, `Place` and `packed` make
 pydantic read the fields of a dataclass so.
 
 `scene_to_dict` and `scene_from_dict` are a scene as such a document and back; shapes are tagged by

@@ -148,3 +148,10 @@ def test_an_exchange_tells_what_becomes_of_a_command() -> None:
     end = exchange.done("90")
     assert (end.reply_type, end.reply, end.comp_type) == (ReplyType.ACK, "90", "tube")
     assert exchange.failed("why").reply_type is ReplyType.ERR
+
+
+@pytest.mark.parametrize("digits", ["26481", "-7"])
+def test_digits_as_text_are_the_same_command_as_the_number(digits: str) -> None:
+    text, number = (AcquilaEvent("tube", "xrayon", uuid=u) for u in (digits, int(digits)))
+    assert text.key == number.key
+    assert AcquilaEvent("tube", "xrayon", uuid="26ef64cc-01ab").key == "26ef64cc-01ab"

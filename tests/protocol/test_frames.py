@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import base64
+import json
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -18,6 +21,7 @@ from flexdt.protocol import (
     RpcError,
     image,
 )
+from flexdt.protocol.codec import write_json
 from flexdt.protocol.connection import SMALL, pack, unpack
 
 
@@ -108,3 +112,12 @@ def test_16_mib_are_refused() -> None:
     assert len(whole(Response(1, {"data": fits}))) == 4 + 2**24 - 1
     with pytest.raises(RpcError):
         pack(Response(1, {"data": fits + b"x"}))
+
+
+@pytest.mark.parametrize("size", [65_535, 65_536, 3 << 16, (3 << 16) + 1, 500_000])
+def test_large_bytes_are_whole_in_json(size: int) -> None:
+    data = np.random.default_rng(size).bytes(size)
+    found = json.loads(write_json({"a": data, "n": 1, "b": data[::-1]}))
+    assert base64.b64decode(found["a"]) == data
+    assert base64.b64decode(found["b"]) == data[::-1]
+    assert found["n"] == 1

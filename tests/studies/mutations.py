@@ -48,6 +48,7 @@ TESTS = (
     "twin/script/test_*.py", "twin/test_[!ceps]*.py",
     "twin/test_collision_*.py", "twin/test_scanner_*.py", "twin/test_script_*.py",
     "twin/exchange/test_exchange_r*.py", "twin/calibration/test_calibration_m*.py",
+    "twin/calibration/test_panel_distortion.py",
     "twin/projection/test_projection_hard.py",
 )  # fmt: skip
 """In `tests/`: what covers the code under mutation and takes seconds, not minutes."""

@@ -17,6 +17,7 @@ from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.geometry.cone_vec import check_cone_vec
 from flexdt.twin.geometry.motion import Motion
+from flexdt.twin.geometry.panel import Border, PanelModel
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.geometry.rigid import Rigid
 from flexdt.twin.machine.description import builtin_machine, profile_of
@@ -487,3 +488,9 @@ def test_pixels_are_checked_to_a_millionth_and_axes_to_their_right_angle(pixel: 
         else:
             with pytest.raises(GeometryError, match="row 1: u and v are not orthogonal"):
                 check_cone_vec(ConeVec(rows), pixel)
+
+
+def test_gaps_and_bends_of_a_panel_have_priors_of_their_own() -> None:
+    """Two stretches and two of each of seven powers, then two for each border."""
+    panel = PanelModel(0.5, (60, 80), (Border(0, 40.0), Border(1, 30.0)))
+    assert panel.sigmas.tolist() == [0.5] * 16 + [5.0] * 4

@@ -604,3 +604,26 @@ def test_a_short_file_from_a_few_answers() -> None:
         new_machine_text(Answers("lab", "micro_ct", sod_mm=(10.0, 20.0)))
     with pytest.raises(UnknownNameError, match="tilt"):
         new_machine_text(Answers("lab", "micro_ct", limits={"tilt": (0.0, 1.0)}))
+
+
+def test_an_axis_that_is_left_out_takes_only_the_virtual_axis_that_is_read_from_it() -> None:
+    def virtual_without(*axes: str) -> dict[str, dict[str, float]]:
+        names = ", ".join(f'"{name}"' for name in axes)
+        machine = parse_machine(f'base = "flexray"\nwithout = [{names}]\n')
+        return {name: dict(axis.moves) for name, axis in machine.virtual_axes.items()}
+
+    assert virtual_without("ver_tube") == {}
+    assert set(virtual_without("tra_obj")) == {"ver_obj"}
+    assert virtual_without("ver_det")["ver_obj"] == {"ver_tube": -1.0}
+
+
+def test_a_detector_s_response_reaches_to_the_tube_s_highest_voltage() -> None:
+    most = builtin_machine().tube.max_kV
+
+    def with_response_up_to(kV: float) -> object:
+        text = f'base = "flexray"\n[detector]\nresponse = [[10.0, 8.0], [{kV}, 30.0]]\n'
+        return parse_machine(text).detector.response[-1]
+
+    assert with_response_up_to(most) == (most, 30.0)
+    with pytest.raises(MachineFileError, match="measured up to the tube's max_kV"):
+        with_response_up_to(most - 0.5)

@@ -6,8 +6,7 @@ without computing a distance.
 A `SceneGuard` is the look-ahead of the scanner: given where every motor is bound, the first contact
 or None. A guard belongs to one scene: another sample, profile or correction is another guard.
 
-Bodies that overlap
-already (after a restart) may only come apart: a retreat.
+Bodies that overlap already (after a restart) may only come apart: a retreat.
 
 A sweep cannot measure how deep two bodies overlap, so every motion that begins in an overlap would
 be a contact, a retreat included. Here such a pair is judged by its separation: the gap between the
@@ -363,7 +362,7 @@ class _Overlap:
     def separate(
         self, offset: FloatArray, turn_a: FloatArray | None, turn_b: FloatArray | None
     ) -> Separation:
-        """Width of the widest slab between them [mm] and its direction, as `nearest.Separate`.
+        """Width of the widest slab between them [mm] and its direction, as `relative.Separate`.
 
         The width is negative for an overlap, and never too large. Looked at are directions that
         turn with either body. How far that body reaches across them does not change, so that one

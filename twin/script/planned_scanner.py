@@ -68,11 +68,6 @@ class Motor:
         """When the motor comes to rest."""
         return self.moves[-1][1].end if self.moves else 0.0
 
-    @property
-    def target(self) -> float:
-        """Where it stands or is bound for."""
-        return self.moves[-1][1].target if self.moves else self.home
-
     def position(self, time: float) -> float:
         """Position at `time`, which is not before the last move."""
         return self.moves[-1][1].position(time) if self.moves else self.home

@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from smooth_rule import smooth_scan
 
@@ -114,10 +114,16 @@ PLACES = st.fixed_dictionaries({
     "mag_obj": st.floats(100, 700), "mag_det": st.floats(800, 1050), "tra_obj": st.floats(-4, 4),
     "tra_det": st.floats(-200, 200), "ver_tube": st.floats(0, 100), "ver_det": st.floats(4, 100),
 })  # fmt: skip
+WHOLLY_ABOVE_THE_BEAM = {
+    "mag_obj": 400.0, "mag_det": 1000.0, "tra_obj": 0.0,
+    "tra_det": 0.0, "ver_tube": 0.0, "ver_det": 100.0,
+}  # fmt: skip
+"""The lower edge of its projection is that of the far rim."""
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(PLACES, min_size=1, max_size=3), st.floats(1, 60), st.none() | st.floats(0.2, 90))
+@example([WHOLLY_ABOVE_THE_BEAM], 60.0, 20.0)
 def test_the_sample_s_projection_is_that_of_its_cylinder(
     places: list[dict[str, float]], radius: float, high: float | None
 ) -> None:

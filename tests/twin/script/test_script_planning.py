@@ -409,6 +409,15 @@ def test_settings_file_has_the_moment_s_readings(planned: Planner) -> None:
     assert plan.settings.time_s == plan.steps[2].start_s
 
 
+@pytest.mark.parametrize(("before", "on"), [([], None), (["on"], True), (["on", "off"], False)])
+def test_settings_file_says_whether_x_rays_are_on_once_that_is_known(
+    planned: Planner, before: list[str], on: bool | None
+) -> None:
+    plan = planned(*(f"tube xray{k} ACK" for k in before), "scanner write settings file ACK")
+    assert plan.settings is not None
+    assert plan.settings.xrays_on is on
+
+
 def test_start_state_is_where_the_plan_begins(flexray: Machine, profile: Profile) -> None:
     home = StartState.of(flexray)
     start = StartState(
