@@ -70,6 +70,7 @@ def test_bytes_that_look_like_a_payload_do_not_mislead() -> None:
     inner = b"\xa4data\xc6" + (90_000).to_bytes(4, "big") + b"x" * 90_000
     for message in (
         Response(1, {"blob": inner}),
+        Response(1, [{"data": b"x" * 90_000}]),
         Response(1, {"data": b"x" * 5, "blob": inner}),
         Response(1, inner),
         Notification("x", [inner]),
