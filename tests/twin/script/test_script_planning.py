@@ -522,7 +522,7 @@ def test_a_rate_of_a_geared_virtual_axis_is_shared_out() -> None:
     assert [plan.settings.accelerations[n] for n in ("ver_tube", "ver_det")] == [8.0, 2.0]
 
 
-@pytest.mark.parametrize("at", [(0.0, 0.0, 0.0), (3.0, -4.0, 0.0), (-6.0, 2.5, 7.0)])
+@pytest.mark.parametrize("at", [(0.0, 0.0, 0.0), (3.0, -4.0, -2.0), (-6.0, 2.5, 7.0)])
 @pytest.mark.parametrize("tilted", [False, True])
 def test_the_cylinder_about_a_box_holds_its_corners_at_every_angle(
     at: tuple[float, float, float], tilted: bool

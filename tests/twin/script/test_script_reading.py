@@ -109,6 +109,11 @@ def test_a_problem_is_told_at_the_column_of_its_field(
     assert (problem.line, problem.column, problem.code) == (3, text.index("odd") + 1, expected)
 
 
+def test_a_missing_component_is_told_at_the_first_column() -> None:
+    [problem, *_] = read_script("\tmove absolute\t3\t\tACK")[1]
+    assert (problem.line, problem.column, problem.code) == (1, 1, "syntax")
+
+
 def test_a_command_may_be_split_over_columns() -> None:
     """Then the whole line is read by its words."""
     found = one(b"camera\tset\texposure\t40\tACK\t1\t2")
