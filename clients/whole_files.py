@@ -9,8 +9,11 @@ from pathlib import Path
 def write_whole(path: Path, content: str | bytes) -> None:
     """Write a file, text as UTF-8; one of that name is replaced as a whole."""
     part = path.with_name(path.name + ".part")
-    part.write_bytes(content.encode() if isinstance(content, str) else content)
-    part.replace(path)
+    try:
+        part.write_bytes(content.encode() if isinstance(content, str) else content)
+        part.replace(path)
+    finally:  # a disk that is full leaves no part
+        part.unlink(missing_ok=True)
 
 
 def nearest_there(path: Path) -> Path:

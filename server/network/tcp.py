@@ -219,6 +219,8 @@ class _Link(asyncio.BufferedProtocol):
     def data_received(self, data: bytes) -> None:
         before = self.wire.waiting
         self.wire.feed(data)
+        if self.wire.waiting > before:  # before an E-stop is taken out
+            self.deadlines.stop("message")
         if self.wire.holds(ESTOP_BYTES):
             self.estop_came = True
             self.overtake()
@@ -226,8 +228,6 @@ class _Link(asyncio.BufferedProtocol):
             self.server.look_soon(self)
         if self.wire.whole:
             self.arrived.set()
-        if self.wire.waiting > before:
-            self.deadlines.stop("message")
         if self.wire.mid_message:
             self.deadlines.start("message", self.limits.message_timeout_s)
             self.arrived.set()  # a line too long is refused before its end

@@ -68,6 +68,7 @@ class Job:
     phase: JobPhase = "queued"
     error: dict[str, object] | None = None
     runner: ScanRunner | None = None
+    aborted_for: str | None = None
     last: Progress | None = None
     published_at: float = 0.0
     frames_seen: int = 0
@@ -406,7 +407,7 @@ class Jobs:
         if job.runner is not None and job.phase not in ENDED:
             job.runner.abort(reason)
         elif job.phase == "queued":
-            job.phase = "aborted"
+            job.phase, job.aborted_for = "aborted", reason
             self._notify(job)
 
     def interrupt(self, reason: Exception) -> None:
@@ -482,7 +483,7 @@ class Jobs:
         try:
             runner = await self._runner_of(job, scan)
             if job.phase != "queued":  # aborted while it was being prepared
-                raise JobAborted
+                raise JobAborted(job.aborted_for)
             job.runner, job.phase = runner, "running"
             job.frames_seen = job.runner.progress.frames_done
             if (stopped := self._stopped()) is not None:

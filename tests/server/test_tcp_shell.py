@@ -479,6 +479,23 @@ def test_slowloris_is_cut_off_but_a_steady_talker_is_not() -> None:
     run(body, limits=ConnectionLimits(message_timeout_s=2.0))
 
 
+def test_an_estop_that_comes_in_two_parts_leaves_no_time_out_behind() -> None:
+    """It is taken out of the queue as it comes, and the wait for its end went on for a minute."""
+
+    async def body(server: TcpServer, app: FakeApp) -> None:
+        reader, writer = await dial(server)
+        line = call("safety.estop") + b"\n"
+        for half in (line[:20], line[20:]):
+            writer.write(half)
+            await asyncio.sleep(0.1)
+        assert "result" in json.loads(await reader.readline())
+        [link] = server.links
+        assert "message" not in link.deadlines._timers
+        writer.close()
+
+    run(body)
+
+
 def test_http_is_turned_away_before_its_body_is_read() -> None:
     async def body(server: TcpServer, app: FakeApp) -> None:
         reader, writer = await dial(server)

@@ -281,15 +281,17 @@ def test_a_scan_that_is_being_prepared_can_be_aborted_and_stopped(tmp_path: Path
         c, anyone = lab.client(), lab.client()
         await c.call("clock.set", speed_up=1.0)  # the scan waits for a slow move to end
         await c.call("axes.move", targets={"tra_obj": 100.0})
-        job = (await c.call("script.submit", text=script()))["job"]
+        job = (await c.call("script.submit", text=script(), name="early"))["job"]
         await lab.until(lambda: lab.twin.jobs.current is not None, "its turn has come")
-        assert (await anyone.call("job.abort", job=job))["state"] == "aborted"
+        assert (await anyone.call("job.abort", job=job, reason="no"))["state"] == "aborted"
         await anyone.call("axes.stop")
         await lab.until(lambda: lab.twin.jobs.current is None, "it has ended")
         state = await c.call("state.get")
         assert state["axes"]["rot_obj"]["target"] == 0.0
         assert state["axes"]["tra_obj"]["target"] < 100.0
         assert (await c.call("job.status", job=job))["state"] == "aborted"
+        document = json.loads((lab.root / "early" / "flexdt.json").read_text())
+        assert document["reason"] == "aborted: no"
 
         await c.call("axes.move", targets={"tra_obj": 100.0})
         job = (await c.call("script.submit", text=script()))["job"]

@@ -202,8 +202,7 @@ async def change_stage(
         twin.corrections.history = names
         if scene is not None:
             apply_settings(scene, scanner)
+        twin.changed()  # here: who asked may be gone when this is kept
         return [] if halted is None else [halted.message]
 
-    warnings = await twin.keeper.keep(take, after, files)
-    twin.changed()
-    return warnings
+    return await twin.keeper.keep(take, after, files)
