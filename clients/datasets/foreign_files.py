@@ -33,6 +33,7 @@ import numpy.typing as npt
 
 from flexdt.clients.datasets.data_set import Arrays, DataSet, references
 from flexdt.clients.extras import package
+from flexdt.clients.whole_files import whole_file
 from flexdt.runtime.files.dataset_folder import Folder, list_folder, opened, read_image
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
 from flexdt.twin.errors import TwinError
@@ -382,14 +383,8 @@ def save_nxtomo(data: DataSet, file: File) -> None:
         raise DatasetFormatError(
             f"{data.where}: projections of several shapes; NXtomo has one", {"path": data.where}
         )
-    path = Path(file)
-    part = path.with_name(f".{path.name}.part")
-    try:
-        with h5py.File(part, "w") as out:
-            _write(data, out)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with whole_file(Path(file)) as part, h5py.File(part, "w") as out:
+        _write(data, out)
 
 
 def _write(data: DataSet, out: Any) -> None:

@@ -127,9 +127,9 @@ async def change_settings(
     def take() -> None:
         ready()
         change(twin.scanner)
+        twin.changed()  # here: who asked may be gone when this is kept
 
     await twin.keeper.keep(take, after)
-    twin.changed()
 
 
 async def change_stage(
@@ -202,7 +202,7 @@ async def change_stage(
         twin.corrections.history = names
         if scene is not None:
             apply_settings(scene, scanner)
-        twin.changed()  # here: who asked may be gone when this is kept
+        twin.changed()
         return [] if halted is None else [halted.message]
 
     return await twin.keeper.keep(take, after, files)
