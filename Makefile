@@ -6,7 +6,6 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 COMPILED := $(VENV)/.compiled
 TEST_STAMP := $(VENV)/.installed-test
-TYPES := .typing/.linked
 LINTED := build/.linted
 TYPED := build/.typed
 WEB := clients/viewer/web
@@ -24,7 +23,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: install demo kernels quick test test-extensions slow studies page campaigns failed docs web lint typecheck lowest newest clean
 
-install: $(COMPILED) $(TYPES)
+install: $(COMPILED)
 
 $(STAMP): pyproject.toml extensions/pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -48,11 +47,6 @@ $(WEB_STAMP): $(TEST_STAMP) $(WEB)/package-lock.json
 	@(PATH="$(CURDIR)/$(BIN):$$PATH" npm ci --prefix $(WEB) --no-audit --no-fund --silent --fetch-retries=1 && touch $@) \
 	  || echo "npm could not install TypeScript and eslint: the page's source is not checked"
 
-# Type checkers and import-linter need to see the folders as the one package that they install as.
-$(TYPES): $(STAMP) .ci/link_types.py $(wildcard flexdt/*.py)
-	$(BIN)/python .ci/link_types.py
-	touch $@
-
 demo: $(STAMP)
 	$(BIN)/flexdt demo --no-viewer
 
@@ -61,13 +55,13 @@ lint: $(LINTED)
 typecheck: $(TYPED)
 
 # What linters and types depend on: each stage of CI asks for both, and they run once.
-SOURCES := $(shell find . -name .venv -prune -o -name build -prune -o -name .typing -prune \
+SOURCES := $(shell find . -name .venv -prune -o -name build -prune \
   -o -name node_modules -prune -o -name '*.py' -print -o -name '*.pyi' -print) pyproject.toml
 
 $(LINTED): $(SOURCES) | install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	cd .typing && ../$(BIN)/lint-imports --config ../pyproject.toml
+	$(BIN)/lint-imports
 	@mkdir -p $(@D) && touch $@
 
 $(TYPED): $(SOURCES) | install $(TEST_STAMP)
@@ -128,4 +122,4 @@ lowest newest:
 	PYTHON=$(PYTHON) .ci/resolution $@
 
 clean:
-	rm -rf $(VENV) .typing build docs/_build docs/_generated *.egg-info
+	rm -rf $(VENV) build docs/_build docs/_generated src/*.egg-info extensions/src/*.egg-info

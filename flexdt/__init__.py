@@ -8,10 +8,7 @@ compares the two and asks each name for a docstring with an example. Whatever el
 with an underscore, so that completers show the public names alone.
 """
 
-import os as _os
 import typing as _typing
-
-from flexdt import moved as _moved
 
 if _typing.TYPE_CHECKING:
     from flexdt import phantoms as phantoms
@@ -48,13 +45,7 @@ if _typing.TYPE_CHECKING:
     open = load_dataset
     __version__: str
 
-if not _os.path.isdir(_os.path.join(__path__[0], "twin")):
-    # In a clone the other parts lie beside this folder, and Python that is started there finds it
-    # before any flexdt that is installed.
-    __path__.append(_os.path.dirname(__path__[0]))
-_moved.watch()
-
-from flexdt import progress_lines as _progress_lines  # noqa: E402  (found through the path)
+from flexdt import progress_lines as _progress_lines
 
 _progress_lines.watch()
 

@@ -7,6 +7,7 @@ import importlib.util
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -18,18 +19,12 @@ from types import ModuleType
 
 import pytest
 import yaml
-
-from flexdt import moved
+from setuptools import find_packages
 
 ROOT = Path(__file__).resolve().parents[1]
 CODE = ("protocol", "twin", "phantoms", "runtime", "server", "clients")
 FOLDERS = ("flexdt", *CODE)
-
-
-def listed() -> dict[str, list[str]]:
-    with (ROOT / "pyproject.toml").open("rb") as file:
-        tool = tomllib.load(file)["tool"]["setuptools"]
-    return {"packages": tool["packages"], "folders": list(tool["package-dir"])}
+TEXTS = ("pyproject.toml", "README.md", "LICENSE")
 
 
 def present() -> set[str]:
@@ -38,8 +33,15 @@ def present() -> set[str]:
     return {".".join(p if p[0] == "flexdt" else ("flexdt", *p)) for p in inside}
 
 
-def test_every_package_is_listed_and_every_listed_package_is_there() -> None:
-    assert sorted(listed()["packages"]) == sorted(present())
+def test_the_package_is_seen_whole_through_its_links() -> None:
+    """setuptools, type checkers and import-linter walk `src/`, and must find what lies on top."""
+    walked = find_packages(str(ROOT / "src"))
+    assert sorted(walked) == sorted(present())
+    for folder in CODE:
+        assert (ROOT / "src" / "flexdt" / folder).resolve() == ROOT / folder
+    assert find_packages(str(ROOT / "extensions" / "src")) == find_packages(
+        str(ROOT / "extensions"), include=["flexdt_extensions*"]
+    )
 
 
 def sources(folder: str) -> list[Path]:
@@ -79,11 +81,10 @@ def built(out: Path, place: str) -> Path:
         cwd=ROOT, capture_output=True, check=True,
     ).stdout.decode().split("\0")  # fmt: skip
     for name in filter(None, tracked):
-        if name.split("/")[0] in (*FOLDERS, "extensions", "pyproject.toml", "README.md", "LICENSE"):
+        if name.split("/")[0] in (*FOLDERS, "src", "extensions", *TEXTS) and (ROOT / name).exists():
             target = source / name
             target.parent.mkdir(parents=True, exist_ok=True)
-            if (ROOT / name).is_file():
-                target.write_bytes((ROOT / name).read_bytes())
+            shutil.copy2(ROOT / name, target, follow_symlinks=False)
     subprocess.run(
         [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), "."],
         cwd=source / place, check=True, capture_output=True,
@@ -111,7 +112,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def outside(installed: Path, tmp_path: Path, *words: str) -> subprocess.CompletedProcess[str]:
     """Run Python so that flexdt can only come from the installed wheel.
 
-    -S leaves out the editable install's import hook; the dependencies' folder is named instead.
+    -S leaves out the editable install's path; the dependencies' folder is named instead.
     """
     dependencies = [p for p in sys.path if p.endswith("site-packages")]
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
@@ -209,14 +210,20 @@ def test_a_folder_of_its_name_does_not_stand_in_an_installed_flexdts_way(
     assert done.stdout.split() == ["9", str(installed / "flexdt" / "__init__.py")]
 
 
-def test_a_clone_is_the_package_where_python_starts_in_it(tmp_path: Path) -> None:
-    python = environment_with(tmp_path / "venv")
+@pytest.mark.parametrize("place", ["inside", "beside", "far"])
+def test_an_editable_install_is_found_from_everywhere(place: str, tmp_path: Path) -> None:
+    """A clone called `flexdt` is a folder without `__init__.py` that Python meets first."""
+    python = environment_with(tmp_path / "venv", ROOT / "src")
+    (tmp_path / "beside").mkdir()
+    (tmp_path / "beside" / "flexdt").symlink_to(ROOT, target_is_directory=True)
+    (tmp_path / "far").mkdir()
+    where = {"inside": ROOT, "beside": tmp_path / "beside", "far": tmp_path / "far"}[place]
     words = [
         python,
         "-c",
         "import flexdt as fx; print(fx.ConeVec.__name__, fx.TwinClient.__name__)",
     ]
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    done = subprocess.run(words, cwd=where, capture_output=True, text=True, check=False)
     assert (done.stdout, done.stderr) == ("ConeVec TwinClient\n", "")
 
 
@@ -260,34 +267,11 @@ def load(path: Path) -> ModuleType:
     return module
 
 
-def test_links_for_type_checkers_follow_new_and_removed_modules(tmp_path: Path) -> None:
-    links = load(ROOT / ".ci" / "link_types.py")
-    for folder in FOLDERS:
-        (tmp_path / folder).mkdir()
-    (tmp_path / "flexdt" / "__init__.py").touch()
-    (tmp_path / "flexdt" / "old.py").touch()
-    package = links.lay_out(tmp_path) / "flexdt"
-    assert sorted(p.name for p in package.iterdir()) == sorted([*CODE, "__init__.py", "old.py"])
-
-    (tmp_path / "twin" / "new.py").touch()  # nothing to be done for this one
-    assert (package / "twin" / "new.py").is_file()
-
-    (tmp_path / "flexdt" / "old.py").unlink()
-    (tmp_path / "flexdt" / "face.py").touch()
-    links.lay_out(tmp_path)
-    assert sorted(p.name for p in package.iterdir()) == sorted([*CODE, "__init__.py", "face.py"])
-
-
 @pytest.mark.slow
 @pytest.mark.campaign
 def test_a_users_type_checker_sees_the_types(tmp_path: Path) -> None:
-    """What `make install` does for type checkers, in an environment of its own."""
-    python = environment_with(tmp_path / "venv")
-    (site,) = (tmp_path / "venv").glob("lib/python*/site-packages")
-    subprocess.run(
-        [sys.executable, str(ROOT / ".ci" / "link_types.py"), "--site-packages", str(site)],
-        check=True,
-    )
+    """An editable install puts `src/` on the path; type checkers follow it."""
+    python = environment_with(tmp_path / "venv", ROOT / "src")
     user = tmp_path / "user" / "program.py"
     user.parent.mkdir()
     user.write_text(
@@ -318,7 +302,7 @@ def test_a_users_type_checker_sees_the_types(tmp_path: Path) -> None:
 
 def test_the_image_is_built_from_every_folder_of_the_package() -> None:
     copied = (ROOT / "docker" / "Dockerfile").read_text()
-    assert [f for f in FOLDERS if f"COPY {f} {f}\n" not in copied] == []
+    assert [f for f in ("src", *FOLDERS) if f"COPY {f} {f}\n" not in copied] == []
 
 
 def test_one_version_everywhere() -> None:
@@ -394,16 +378,6 @@ def test_code_lines_are_counted_without_blanks_comments_and_docstrings() -> None
         '"""What\nfor."""\n\n# why\nx = [\n    1,\n]\n\ndef f():\n    """Says."""\n    return x\n'
     )
     assert count(source) == len(["x = [", "1,", "]", "def f():", "return x"])
-
-
-@pytest.mark.parametrize("old", moved.MOVED)
-@pytest.mark.parametrize("statement", ["import {old}", "from {package} import {module}"])
-def test_an_import_path_that_moved_names_the_new_one(old: str, statement: str) -> None:
-    package, _, module = old.rpartition(".")
-    with pytest.raises(ModuleNotFoundError) as raised:
-        exec(statement.format(old=old, package=package, module=module), {})
-    assert f"{old} has moved to {moved.MOVED[old]}" in str(raised.value)
-    assert importlib.util.find_spec(moved.MOVED[old]) is not None
 
 
 def test_a_module_that_is_a_program_begins_below_all_that_it_needs() -> None:
