@@ -12,8 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flexdt.clients.datasets.dataset import load_dataset
-from flexdt.clients.datasets.exchange import (
+from flexdt.library.datasets.exchange import (
     FORMATS,
     ExchangeError,
     Given,
@@ -21,6 +20,7 @@ from flexdt.clients.datasets.exchange import (
     geometry_of,
     import_geometry,
 )
+from flexdt.library.reading.folders import load_dataset
 
 ENDINGS = {"ctsimu": ".json", "rtk": ".xml", "tomosipo": ".npz", "flexdata": ".toml", "csv": ".csv"}
 

@@ -12,7 +12,7 @@ import warnings
 
 import numpy as np
 
-from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.library.reading.folders import load_dataset
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # its wrappers warn while they load

@@ -23,13 +23,13 @@ import numpy as np
 
 from flexdt.clients import TwinClient
 from flexdt.clients.cli.commands.scan_commands import follow
-from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.launch.processes import Servers
-from flexdt.clients.reconstruction.reconstruct import (
+from flexdt.library.reading.folders import load_dataset
+from flexdt.library.reconstruction.reconstruct import (
     VolumeRequest,
     reconstruct_dataset,
 )
-from flexdt.clients.reconstruction.volume_files import read_volume
+from flexdt.library.reconstruction.volume_files import read_volume
 from flexdt.phantoms import lego_phantom
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.projection import Volume

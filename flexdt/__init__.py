@@ -12,20 +12,20 @@ import typing as _typing
 
 if _typing.TYPE_CHECKING:
     from flexdt import phantoms as phantoms
-    from flexdt.analysis import align as align
-    from flexdt.analysis import calibrate as calibrate
-    from flexdt.analysis import reconstruct as reconstruct
     from flexdt.clients import AsyncTwinClient as AsyncTwinClient
     from flexdt.clients import TwinClient as TwinClient
-    from flexdt.clients.datasets.data_set import DataSet as DataSet
-    from flexdt.clients.datasets.dataset import load_dataset
-    from flexdt.clients.datasets.dataset import read_tiffs as read_tiffs
-    from flexdt.clients.expose import expose as expose
     from flexdt.clients.launch.processes import LocalTwin as LocalTwin
-    from flexdt.clients.simulate import project as project
-    from flexdt.clients.simulate import simulate as simulate
-    from flexdt.scripts import machine as machine
-    from flexdt.scripts import plan as plan
+    from flexdt.library.analysis import align as align
+    from flexdt.library.analysis import calibrate as calibrate
+    from flexdt.library.analysis import reconstruct as reconstruct
+    from flexdt.library.data_set import DataSet as DataSet
+    from flexdt.library.expose import expose as expose
+    from flexdt.library.reading.folders import load_dataset
+    from flexdt.library.reading.folders import read_tiffs as read_tiffs
+    from flexdt.library.scripts import machine as machine
+    from flexdt.library.scripts import plan as plan
+    from flexdt.library.simulate import project as project
+    from flexdt.library.simulate import simulate as simulate
     from flexdt.twin.errors import NotBuiltError as NotBuiltError
     from flexdt.twin.errors import TwinError as TwinError
     from flexdt.twin.geometry.cone_vec import ConeVec as ConeVec
@@ -45,14 +45,14 @@ if _typing.TYPE_CHECKING:
     open = load_dataset
     __version__: str
 
-from flexdt import progress_lines as _progress_lines
+from flexdt.runtime import progress_lines as _progress_lines
 
 _progress_lines.watch()
 
 _HOMES: _typing.Final = {
     "AsyncTwinClient": "flexdt.clients",
     "ConeVec": "flexdt.twin.geometry.cone_vec",
-    "DataSet": "flexdt.clients.datasets.data_set",
+    "DataSet": "flexdt.library.data_set",
     "Detector": "flexdt.twin.physics.detector",
     "Grid": "flexdt.twin.projection.volume",
     "LocalTwin": "flexdt.clients.launch.processes",
@@ -63,21 +63,21 @@ _HOMES: _typing.Final = {
     "TwinClient": "flexdt.clients",
     "TwinError": "flexdt.twin.errors",
     "Volume": "flexdt.twin.projection.volume",
-    "align": "flexdt.analysis",
+    "align": "flexdt.library.analysis",
     "back": "flexdt.twin.projection.operators",
-    "calibrate": "flexdt.analysis",
+    "calibrate": "flexdt.library.analysis",
     "cgls": "flexdt.twin.reconstruction.iterative",
-    "expose": "flexdt.clients.expose",
+    "expose": "flexdt.library.expose",
     "fdk": "flexdt.twin.reconstruction.checked_fdk",
     "forward": "flexdt.twin.projection.operators",
-    "machine": "flexdt.scripts",
-    "open": "flexdt.clients.datasets.dataset:load_dataset",
+    "machine": "flexdt.library.scripts",
+    "open": "flexdt.library.reading.folders:load_dataset",
     "phantoms": "flexdt.phantoms:",
-    "plan": "flexdt.scripts",
-    "project": "flexdt.clients.simulate",
-    "read_tiffs": "flexdt.clients.datasets.dataset",
-    "reconstruct": "flexdt.analysis",
-    "simulate": "flexdt.clients.simulate",
+    "plan": "flexdt.library.scripts",
+    "project": "flexdt.library.simulate",
+    "read_tiffs": "flexdt.library.reading.folders",
+    "reconstruct": "flexdt.library.analysis",
+    "simulate": "flexdt.library.simulate",
     "sirt": "flexdt.twin.reconstruction.iterative",
     "tv": "flexdt.twin.reconstruction.tv",
 }

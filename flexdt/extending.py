@@ -28,12 +28,12 @@ from flexdt.clients.cli.options import (
     position,
     triple,
 )
-from flexdt.clients.extras import package
-from flexdt.clients.failure import CommandError
-from flexdt.clients.reconstruction.volume_files import volume_writer
-from flexdt.clients.whole_files import free_bytes, write_whole
-from flexdt.process_settings import OneLine
+from flexdt.library.extras import package
+from flexdt.library.failure import CommandError
+from flexdt.library.reconstruction.volume_files import volume_writer
 from flexdt.runtime.files.dataset_folder import tiff_bytes
+from flexdt.runtime.files.whole_files import free_bytes, write_whole
+from flexdt.runtime.process_settings import OneLine
 from flexdt.twin.values import message_of
 
 __all__ = [

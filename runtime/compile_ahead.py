@@ -18,7 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from flexdt.progress_lines import SILENT_S
+from flexdt.runtime.progress_lines import SILENT_S
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Grid
 from flexdt.twin.projection.analytic import warm_up_back, warm_up_forward

@@ -24,10 +24,10 @@ from wsgiref.simple_server import WSGIRequestHandler, make_server
 from prometheus_client import Counter, Metric, ProcessCollector, generate_latest
 from prometheus_client.exposition import ThreadingWSGIServer
 
-from flexdt.process_settings import ServerSettings
 from flexdt.runtime.access import check_bind, is_loopback, read_token, token_matches
 from flexdt.runtime.log import dropped
 from flexdt.runtime.process import ServerLoop, durations
+from flexdt.runtime.process_settings import ServerSettings
 
 SILENT_S: Final = 5.0
 """A client that sends nothing for so long is left."""

@@ -27,9 +27,9 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, Final, TextIO, TypeVar
 
-from flexdt.process_settings import ProcessSettings
 from flexdt.runtime.access import AccessError, AccessFileError
 from flexdt.runtime.log import Sparing
+from flexdt.runtime.process_settings import ProcessSettings
 from flexdt.twin.errors import TwinError
 
 if TYPE_CHECKING:

@@ -24,8 +24,8 @@ from asyncio.subprocess import PIPE, Process
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from flexdt.process_settings import Address
 from flexdt.runtime.process import SUPERVISED, session_seconds, stop_signal
+from flexdt.runtime.process_settings import Address
 
 STALLED_S = 300.0
 """A service that is not ready and has used no processor time for so long waits for something that

@@ -3,10 +3,6 @@
 `public` compares the arguments of a call with the annotations of the signature, so that a misspelt
 keyword, two arguments in the wrong order or a value of another type is one sentence that says what
 was given and what is allowed. Values are checked by what is called, as before.
-
-Methods such as `ConeVec.load` and `Volume.save` belong to the values for the reader's sake, but the
-core reads no files and draws no figures. `lazy_backend` is the module that does, by its name, when
-such a method is called.
 """
 
 from __future__ import annotations
@@ -20,7 +16,6 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from functools import cached_property, wraps
-from importlib import import_module
 from numbers import Real
 from typing import Annotated, Any, Final, Literal, NamedTuple, ParamSpec, Protocol, TypeVar
 
@@ -54,11 +49,6 @@ class PathLike(Protocol):
 
 File = str | PathLike
 """A path, as text or as an object of `pathlib`."""
-
-
-def lazy_backend(module: str) -> Any:
-    """The module `flexdt.<module>`."""
-    return import_module(f"flexdt.{module}")
 
 
 class Array:
@@ -158,7 +148,7 @@ class Known:
     def __init__(self, function: Callable[..., Any], text: str) -> None:
         self.function, self.text = function, text
         self.allowed: set[tuple[Any, ...]] = set()
-        self.where = function.__qualname__.split("<locals>.")[-1].removesuffix(".__init__")
+        self.qualname = function.__qualname__.split("<locals>.")[-1]
 
     @cached_property
     def signature(self) -> inspect.Signature:
@@ -183,12 +173,13 @@ class Known:
         Raises:
             ArgumentError: arguments that the signature does not allow.
         """
-        named = self._renamed(named)
+        where = self._name_for(given)
+        named = self._renamed(where, named)
         try:
             bound = self.signature.bind(*given, **named).arguments
         except TypeError as error:
             raise ArgumentError.instead(
-                f"{self.where}: {error}", [*map(_shown, given), *named], self._names()
+                f"{where}: {error}", [*map(_shown, given), *named], self._names()
             ) from None
         for name, value in bound.items():
             kind, form = self.kinds.get(name), self.signature.parameters[name].kind
@@ -197,13 +188,21 @@ class Known:
                 continue
             for label, one in members.items():
                 if not kind.holds(one):
-                    raise self._mistake(name, label, one, bound)
+                    raise self._mistake(where, name, label, one, bound)
         return named
+
+    def _name_for(self, given: tuple[Any, ...]) -> str:
+        """Name the function as the caller does: a method by the class that it was called on."""
+        owner, dot, method = self.qualname.rpartition(".")
+        called = given[0] if given and isinstance(given[0], type) else type(next(iter(given), None))
+        known = any(base.__name__ == owner for base in called.__mro__)
+        name = f"{called.__name__ if known else owner}{dot}{method}"
+        return name.removesuffix(".__init__")
 
     def _names(self) -> list[str]:
         return [name for name in self.signature.parameters if name not in ("self", "cls")]
 
-    def _renamed(self, named: dict[str, Any]) -> dict[str, Any]:
+    def _renamed(self, where: str, named: dict[str, Any]) -> dict[str, Any]:
         takes = self.signature.parameters
         if any(one.kind is inspect.Parameter.VAR_KEYWORD for one in takes.values()):
             return named
@@ -213,18 +212,18 @@ class Known:
             if name in takes:
                 found[name] = value
             elif other in takes and other not in named:
-                text = f"{self.where}: {name} is called {other} here"
+                text = f"{where}: {name} is called {other} here"
                 warnings.warn(text, DeprecationWarning, stacklevel=4)
                 found[other] = value
             else:
                 near = get_close_matches(name, self._names(), 1)
                 hint = f" (did you mean {near[0]!r}?)" if near else ""
-                said = f"{self.where} has no argument {name!r}{hint}"
+                said = f"{where} has no argument {name!r}{hint}"
                 raise ArgumentError.instead(said, name, self._names())
         return found
 
     def _mistake(
-        self, name: str, label: str, value: object, values: Mapping[str, Any]
+        self, where: str, name: str, label: str, value: object, values: Mapping[str, Any]
     ) -> ArgumentError:
         *first, last = self.kinds[name].words
         words = f"{', '.join(first)} or {last}" if first else last
@@ -240,7 +239,7 @@ class Known:
         hint = f"; are {label} and {swapped[-1]} in the wrong order?" if swapped else ""
         told = re.search(rf"^ +(?:\w+, )*{name}(?:, \w+)*: (.*(?:\n {{8}}.*)*)", self.text, re.M)
         more = f" ({' '.join(told[1].split()).split('. ')[0].rstrip('.')})" if told else ""
-        said = f"{self.where}: {label} is {_shown(value)}"
+        said = f"{where}: {label} is {_shown(value)}"
         return ArgumentError.instead(said, repr(value)[:100], words + more + hint, argument=label)
 
 

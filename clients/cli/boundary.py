@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
-from flexdt.clients.failure import CommandError
+from flexdt.library.failure import CommandError
 
 if TYPE_CHECKING:
     from flexdt.protocol.rpc_errors import RpcError

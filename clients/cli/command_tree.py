@@ -190,7 +190,7 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
 
 def found(name: str) -> Callable[..., Any] | None:
     """The function of a command, a word or two, that an installed distribution offers."""
-    from flexdt.clients.extras import offered
+    from flexdt.library.extras import offered
 
     function: Callable[..., Any] | None = offered(name.replace(" ", "."), GROUP)
     return function
@@ -200,7 +200,7 @@ def listed(name: str) -> Callable[..., None]:
     """A command for the help page; where it is run, its distribution is missing."""
 
     def command(words: list[str] | None = argument(None, "...")) -> None:
-        from flexdt.clients.extras import extension
+        from flexdt.library.extras import extension
 
         extension(name.replace(" ", "."), f"`flexdt {name}`", GROUP)
 

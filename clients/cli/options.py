@@ -22,8 +22,8 @@ import typer
 
 from flexdt.clients.cli.console import emit, say
 from flexdt.clients.cli.settings_file import configuration
-from flexdt.clients.failure import CommandError
-from flexdt.process_settings import LOOPBACK, address, described, has_parameters
+from flexdt.library.failure import CommandError
+from flexdt.runtime.process_settings import LOOPBACK, address, described, has_parameters
 
 if TYPE_CHECKING:
     from flexdt.clients.client.client import TwinClient

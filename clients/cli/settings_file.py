@@ -25,8 +25,8 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
-from flexdt.clients.failure import CommandError
-from flexdt.process_settings import (
+from flexdt.library.failure import CommandError
+from flexdt.runtime.process_settings import (
     GatewaySettings,
     ProjectorSettings,
     Settings,

@@ -73,7 +73,7 @@ class Projection:
 
     def _repr_png_(self) -> bytes:
         """PNG for notebooks: dense parts dark, windowed between percentiles, marks in colour."""
-        from flexdt.clients.datasets.pictures import png
+        from flexdt.library.datasets.pictures import png
 
         return png(self.image, dark_is_dense=self.kind == "line_integral", marks=self.marks)
 

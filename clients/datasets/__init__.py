@@ -1,1 +1,1 @@
-"""Reading data sets, and exchanging their geometry with other programs."""
+"""Deprecated import paths."""

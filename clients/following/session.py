@@ -32,13 +32,13 @@ from typing import BinaryIO, Final
 import cv2
 import numpy as np
 
-from flexdt.clients.datasets.pictures import png
 from flexdt.clients.gateway.vocabulary import Question, Refusal, read_command
-from flexdt.clients.whole_files import write_whole
+from flexdt.library.datasets.pictures import png
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import line_integrals as projected
 from flexdt.protocol.acquila import AcquilaError, AcquilaEvent, parse_event
 from flexdt.runtime.files.dataset_folder import list_folder, mean_image, read_image
+from flexdt.runtime.files.whole_files import write_whole
 from flexdt.twin.dataset.normalise import LineIntegrals
 from flexdt.twin.errors import TwinError
 from flexdt.twin.following.follower import Follower

@@ -12,10 +12,9 @@ import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
 
-from flexdt import machines
 from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress
 from flexdt.clients.gateway.connected_twin import ConnectedTwin
-from flexdt.process_settings import GatewaySettings, parse
+from flexdt.library import machines
 from flexdt.runtime.access import client_tls, read_token
 from flexdt.runtime.log import set_up
 from flexdt.runtime.process import (
@@ -26,6 +25,7 @@ from flexdt.runtime.process import (
     run_process,
     stop_signal,
 )
+from flexdt.runtime.process_settings import GatewaySettings, parse
 from flexdt.twin.machine.description import parse_profile
 
 EVENTS_HZ = 20.0

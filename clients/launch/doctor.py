@@ -18,8 +18,8 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Final, Literal
 
-from flexdt.clients.whole_files import free_bytes, nearest_there
 from flexdt.runtime.files.directory import memory_bytes
+from flexdt.runtime.files.whole_files import free_bytes, nearest_there
 
 Verdict = Literal["ok", "warning", "error"]
 WORST_ERROR: Final = 1e-5

@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import IO, Literal
 
 from flexdt.clients.client.client import TwinClient
-from flexdt.clients.failure import CommandError
-from flexdt.process_settings import words
+from flexdt.library.failure import CommandError
+from flexdt.runtime.process_settings import words
 from flexdt.twin.signatures import public
 
 STOP_TIMEOUT_S = 30.0

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from flexdt.clients.failure import CommandError
+from flexdt.library.failure import CommandError
 
 RANGES: Final[Mapping[str, float]] = {
     "dO_x": 1.0, "dO_y": 1.0, "dO_z": 2.0, "alpha": 5.0, "tau_x": 0.5, "tau_z": 0.5,

@@ -15,7 +15,9 @@ import sys
 from collections.abc import Sequence
 from typing import TextIO
 
-from flexdt.process_settings import (
+from flexdt.runtime.access import ViewerLimits, limit_names
+from flexdt.runtime.process import REFUSED
+from flexdt.runtime.process_settings import (
     LOOPBACK,
     Address,
     GatewaySettings,
@@ -26,8 +28,6 @@ from flexdt.process_settings import (
     shared,
     words,
 )
-from flexdt.runtime.access import ViewerLimits, limit_names
-from flexdt.runtime.process import REFUSED
 from flexdt.runtime.supervisor import (
     Addresses,
     Service,

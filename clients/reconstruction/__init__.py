@@ -1,1 +1,1 @@
-"""Volumes from data sets, and volume files."""
+"""Deprecated import paths."""

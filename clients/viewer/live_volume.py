@@ -38,10 +38,10 @@ from typing import Any, Final
 import numba
 import numpy as np
 
-from flexdt.clients.datasets.data_set import DataSet
-from flexdt.clients.datasets.dataset import load_dataset
-from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_volume
 from flexdt.clients.viewer.volume_truth import figures, truth_of
+from flexdt.library.data_set import DataSet
+from flexdt.library.reading.folders import load_dataset
+from flexdt.library.reconstruction.reconstruct import VolumeRequest, reconstruct_volume
 from flexdt.runtime.files.dataset_folder import read_image
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import TwinError

@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, TextIO
 
 from prometheus_client import Metric
 
-from flexdt import machines
 from flexdt.clients.client.kept_connection import TwinAddress
-from flexdt.process_settings import Address, ViewerSettings, parse
+from flexdt.library import machines
 from flexdt.runtime.access import (
     ViewerLimits,
     client_tls,
@@ -36,6 +35,7 @@ from flexdt.runtime.process import (
     run_process,
     stop_signal,
 )
+from flexdt.runtime.process_settings import Address, ViewerSettings, parse
 from flexdt.twin.machine.description import parse_profile
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from flexdt.clients.datasets.data_set import DataSet
+from flexdt.library.data_set import DataSet
 from flexdt.phantoms import load_phantom
 from flexdt.phantoms.samples import is_shipped
 from flexdt.runtime.files.own_documents import file_stem

@@ -16,8 +16,8 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from flexdt.clients.calibration.calibrate import DatasetFrames, calibrate_datasets, find_phantom
-from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.library.calibration.calibrate import DatasetFrames, calibrate_datasets, find_phantom
+from flexdt.library.reading.folders import load_dataset
 from flexdt.twin.calibration.fit.fit import solve
 from flexdt.twin.calibration.pipeline import Scan, calibrate
 from flexdt.twin.errors import TwinError

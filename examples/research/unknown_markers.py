@@ -22,14 +22,14 @@ import numpy as np
 import numpy.typing as npt
 from prior_coverage import PIXEL, SDD, SHAPE, SOD, drawn, pixels, radiographs
 
-from flexdt.clients.calibration.markers import (
+from flexdt.library.calibration.markers import (
     Markers,
     Scale,
     calibrate_unknown,
-    markers_alone,
     seen_alone,
 )
-from flexdt.clients.datasets.data_set import DataSet
+from flexdt.library.data_set import DataSet
+from flexdt.library.reading.listed_images import markers_alone
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest
 from flexdt.twin.geometry.cone_vec import ConeVec

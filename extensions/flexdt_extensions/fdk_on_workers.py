@@ -29,8 +29,8 @@ from typing import Any, Final, TypeVar
 import numpy as np
 import zarr
 
-from flexdt.clients.reconstruction.reconstruct import ScanFrames, VolumeRequest
 from flexdt.extending import volume_writer
+from flexdt.library.reconstruction.reconstruct import ScanFrames, VolumeRequest
 from flexdt.measuring import gpu
 from flexdt.twin.errors import LimitError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec

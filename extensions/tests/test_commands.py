@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from flexdt.clients import extras
 from flexdt.clients.cli.command_tree import GROUP, KNOWN, run
+from flexdt.library import extras
 
 Run = Callable[..., tuple[int, str, str]]
 

@@ -24,9 +24,9 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar
 
-from flexdt import machines
 from flexdt.clients.client.client import TwinClient
 from flexdt.clients.client.transport import ConnectionLost, Transport
+from flexdt.library import machines
 from flexdt.protocol import METHODS, Codec, Connection, Message
 from flexdt.runtime.access import ConnectionLimits
 from flexdt.runtime.files.directory import open_data

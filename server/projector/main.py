@@ -9,11 +9,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from flexdt.process_settings import ProjectorSettings, parse
 from flexdt.runtime.access import ConnectionLimits, read_token, server_tls, with_limits
 from flexdt.runtime.files.directory import memory_bytes
 from flexdt.runtime.log import LEVELS, set_up
 from flexdt.runtime.process import OK, announce, announce_bound, run_process, stop_signal
+from flexdt.runtime.process_settings import ProjectorSettings, parse
 
 
 async def run(options: ProjectorSettings) -> int:

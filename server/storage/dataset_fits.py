@@ -6,7 +6,6 @@ and memory; one runs at a time, and it ends when nobody waits for it any more.
 
 from __future__ import annotations
 
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
@@ -28,7 +27,9 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
     Raises:
         TwinError: there is no such data set or phantom, or nothing can be fitted.
     """
-    # Here: the server's own process fits nothing, and these load what fits.
+    # Here, as only workers fit: the server's own process loads nothing of it.
+    from flexdt.library.analysis import calibrate
+    from flexdt.library.calibration.calibration_report import tracks_document
     from flexdt.twin.calibration.fit.fit import covariance_by_step
     from flexdt.twin.calibration.unknown_markers import UNKNOWN
 
@@ -40,7 +41,7 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
     marks = None
     if asked.markers is not None:
         marks = [(m.frame, m.marker, m.column, m.row, m.sigma) for m in asked.markers]
-    found = _face().calibrate(
+    found = calibrate(
         [_there(root, name) for name in asked.datasets], phantom,
         free=asked.free, priors=asked.priors, per_frame=asked.per_frame,
         markers=marks, scale=asked.scale,
@@ -59,14 +60,15 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
             for n, matrix in covariance_by_step(fitted, asked.steps)
         ]
     if asked.tracks:
-        report = import_module("flexdt.clients.calibration.calibration_report")
-        told["tracks"] = report.tracks_document(found)
+        told["tracks"] = tracks_document(found)
     return p.CalibrationFitResult.model_validate(from_root(told, root.path))
 
 
 def align(root: Directory, asked: p.CalibrationAlign, *_: object) -> p.CalibrationAlignResult:
     """Align; blocks. Raises as `fit`."""
-    found = _face().align(_there(root, asked.name), per_frame=asked.per_frame)
+    from flexdt.library.analysis import align as align_data_set
+
+    found = align_data_set(_there(root, asked.name), per_frame=asked.per_frame)
     return p.CalibrationAlignResult.model_validate(from_root(found.document, root.path))
 
 
@@ -81,8 +83,3 @@ def _text(root: Directory, name: str) -> str:
     if plain_name(name, "phantom") not in root.names():
         raise DatasetMissingError(f"no phantom {name!r} in the data directory", {"asked": name})
     return read_text(root.path / name)
-
-
-def _face() -> Any:
-    """The package's own functions, which know all rooms; by name, as servers know no clients."""
-    return import_module("flexdt")

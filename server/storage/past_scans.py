@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
@@ -233,10 +232,12 @@ def _scan(folder: files.Folder, most: int) -> _Scan:
 
 def _texts(folder: files.Folder) -> Any:
     """What the scanner's own texts say of a folder without a document; None for nothing."""
+    from flexdt.library.reading.folders import load_dataset  # heavy: only workers need it
+
     if folder.document:
         return None
     try:
-        return import_module("flexdt").open(folder.path)
+        return load_dataset(folder.path)
     except TwinError:
         return None
 

@@ -10,11 +10,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from flexdt import machines
-from flexdt.process_settings import TwinSettings, parse
+from flexdt.library import machines
 from flexdt.runtime import access
 from flexdt.runtime.log import LEVELS, set_up
 from flexdt.runtime.process import FAILED, OK, announce, first_of, run_process, stop_signal
+from flexdt.runtime.process_settings import TwinSettings, parse
 
 DEFAULT_SAMPLE = "lego"
 SWITCH_S = 0.001

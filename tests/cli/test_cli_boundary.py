@@ -12,13 +12,13 @@ import pytest
 
 from flexdt.clients.cli import boundary, command_tree
 from flexdt.clients.cli.commands import process_commands as processes
-from flexdt.clients.failure import CommandError
-from flexdt.process_settings import words
+from flexdt.library.failure import CommandError
 from flexdt.protocol.rpc_errors import RpcError
+from flexdt.runtime.process_settings import words
 from flexdt.twin import errors as twin
 
 HEAVY = ("numpy", "scipy", "numba", "trimesh", "fcl", "cv2", "viser", "pydantic", "tifffile",
-         "msgpack", "flexdt.twin", "flexdt.server", "zarr", "dask", "distributed", "bluesky",
+         "msgpack", "flexdt.twin.errors", "flexdt.server", "zarr", "dask", "distributed", "bluesky",
          "ophyd_async")  # fmt: skip
 
 

@@ -18,8 +18,8 @@ from flexdt.clients.cli.settings_file import (
     config_file,
     configuration,
 )
-from flexdt.clients.failure import CommandError
-from flexdt.process_settings import ProcessSettings
+from flexdt.library.failure import CommandError
+from flexdt.runtime.process_settings import ProcessSettings
 
 NOBODY = "127.0.0.1:9"  # the port of the discard service
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import typer
 
-from flexdt import machines
 from flexdt.clients.cli.command_tree import run
+from flexdt.library import machines
 from flexdt.twin.collision.guard import check_home
 from flexdt.twin.errors import GeometryError, MachineFileError
 from flexdt.twin.machine.description import Profile, parse_machine

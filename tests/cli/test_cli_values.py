@@ -9,9 +9,9 @@ import typer
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flexdt import process_settings
 from flexdt.clients.cli import console, options
 from flexdt.clients.cli.console import PLAIN_INTERVAL_S, ProgressBar
+from flexdt.runtime import process_settings
 
 
 def test_assignments_keep_order_and_signs() -> None:

@@ -19,13 +19,13 @@ import unknown_markers as study
 from prior_coverage import PIXEL, SDD, SHAPE, SOD, pixels, radiographs
 
 import flexdt as fx
-from flexdt.clients.calibration.markers import (
+from flexdt.clients.cli.command_tree import run
+from flexdt.library.calibration.markers import (
     Scale,
     calibrate_unknown,
-    markers_alone,
     read_markers,
 )
-from flexdt.clients.cli.command_tree import run
+from flexdt.library.reading.listed_images import markers_alone
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration import Detections, detect_beads
 from flexdt.twin.calibration.frame_source import nothing

@@ -14,19 +14,18 @@ import pytest
 import tifffile
 from bead_scan import bead_scan
 
-from flexdt.clients.calibration.calibrate import (
+from flexdt.clients.cli.command_tree import run
+from flexdt.library.calibration.calibrate import (
     calibrate_datasets,
     find_phantom,
     inside_95,
 )
-from flexdt.clients.calibration.calibration_report import (
-    compare_folder,
-    write_comparison,
+from flexdt.library.calibration.calibration_report import (
     write_report,
     write_tracks,
 )
-from flexdt.clients.cli.command_tree import run
-from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.library.comparison import compare_folder, write_comparison
+from flexdt.library.reading.folders import load_dataset
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.pipeline import CalibrationRequest
 from flexdt.twin.errors import TwinError, UnknownNameError

@@ -10,9 +10,9 @@ import pytest
 from typer.main import get_command
 
 import flexdt as fx
-from flexdt.clients.calibration.calibrate import NEXT, digits, ranges, rounded_up
 from flexdt.clients.cli.command_tree import build
 from flexdt.clients.cli.commands.calibrate_commands import show
+from flexdt.library.calibration.calibrate import NEXT, digits, ranges, rounded_up
 
 SCAN = fx.ConeVec.circular(sod=600, sdd=1059, angles=24, shape=(380, 478), pixel=0.2992)
 

@@ -13,11 +13,11 @@ import scanner_traffic
 from bead_scan import bead_scan
 from past_laboratory import Laboratory
 
-from flexdt import machines
 from flexdt.clients.cli.command_tree import run
 from flexdt.clients.cli.commands.scan_commands import read_log_file
-from flexdt.clients.commission import commission
 from flexdt.clients.following.session import Recorded, format_recorded
+from flexdt.library import machines
+from flexdt.library.commission import commission
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.script.executed_log import read_log
 
@@ -187,7 +187,7 @@ def test_errors_are_sentences_and_nothing_is_left(
     def full(*_: object) -> str:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("flexdt.clients.figures.page", full)
+    monkeypatch.setattr("flexdt.library.figures.page", full)
     assert run(["commission", str(lab[1][0]), "--out", str(out)]) == 1
     assert "No space left" in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["empty", "taken"]

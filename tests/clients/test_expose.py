@@ -11,7 +11,7 @@ import pytest
 
 import flexdt as fx
 from flexdt.clients.cli.command_tree import run
-from flexdt.clients.expose import exposure_of
+from flexdt.library.expose import exposure_of
 from flexdt.twin.attenuation.substances import tables
 from flexdt.twin.physics.chain import AIR, compton_share, mass_energy_transfer
 

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from bead_scan import bead_scan_on
 
-from flexdt.clients.calibration.calibrate import calibrate_datasets
-from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.launch.processes import LocalTwin
-from flexdt.clients.reconstruction.reconstruct import (
+from flexdt.library.calibration.calibrate import calibrate_datasets
+from flexdt.library.reading.folders import load_dataset
+from flexdt.library.reconstruction.reconstruct import (
     VolumeRequest,
     reconstruct_dataset,
 )
-from flexdt.clients.reconstruction.volume_files import read_volume
+from flexdt.library.reconstruction.volume_files import read_volume
 from flexdt.phantoms import lego_phantom
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.offsets import Offsets

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 from flexdt.clients.cli import main
-from flexdt.clients.datasets.data_set import DataSet
-from flexdt.clients.datasets.dataset import load_dataset
-from flexdt.clients.reconstruction.reconstruct import VolumeRequest as Request
-from flexdt.clients.reconstruction.reconstruct import (
+from flexdt.library.data_set import DataSet
+from flexdt.library.reading.folders import load_dataset
+from flexdt.library.reconstruction.reconstruct import VolumeRequest as Request
+from flexdt.library.reconstruction.reconstruct import (
     preview,
     reconstruct_dataset,
 )
-from flexdt.clients.reconstruction.volume_files import middle_slices, read_volume
+from flexdt.library.reconstruction.volume_files import middle_slices, read_volume
 from flexdt.phantoms import lego_phantom
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.imaging.projections import Imaging, TrueGeometry
@@ -150,7 +150,7 @@ def test_formats_hold_the_same_values(
     )
     data = load_dataset(folders["plain"])
     made = reconstruct_dataset(data, tmp_path / "whole.mha", request)
-    monkeypatch.setattr("flexdt.clients.reconstruction.reconstruct.SLAB_BYTES", 7 * 24 * 28 * 4)
+    monkeypatch.setattr("flexdt.library.reconstruction.reconstruct.SLAB_BYTES", 7 * 24 * 28 * 4)
     reconstruct_dataset(data, tmp_path / name, request)
     values = read_volume(tmp_path / name).data
     assert values.shape == (20, 24, 28)

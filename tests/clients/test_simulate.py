@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from flexdt.clients.datasets.dataset import load_dataset
-from flexdt.clients.simulate import project, simulate
+from flexdt.library.reading.folders import load_dataset
+from flexdt.library.simulate import project, simulate
 from flexdt.phantoms import Phantom, load_phantom, material
 from flexdt.phantoms.channels import channels, scatter_object
 from flexdt.phantoms.samples import as_phantom

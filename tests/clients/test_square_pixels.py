@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import flexdt as fx
-from flexdt.clients.calibration.calibrate import squared
+from flexdt.library.calibration.calibrate import squared
 from flexdt.twin.dataset.dataset_errors import DatasetMissingError
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses

@@ -13,7 +13,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import flexdt as fx
-from flexdt.clients.reconstruction.volume_files import volume_writer
+from flexdt.library.reconstruction.volume_files import volume_writer
 
 NEEDS = {".nii.gz": "nibabel", ".h5": "h5py"}
 ENDINGS = [".tif", ".nrrd", ".mha", ".nii.gz", ".h5"]
@@ -125,7 +125,7 @@ def test_what_cannot_be_written_or_read_is_said(
 def test_zarr_without_the_extensions_says_how_to_install_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("flexdt.clients.extras.entry_points", lambda **named: ())
+    monkeypatch.setattr("flexdt.library.extras.entry_points", lambda **named: ())
     (tmp_path / "v.zarr").mkdir()
     for use in (VOLUME.save, fx.Volume.load):
         with pytest.raises(fx.TwinError, match=r"in \.zarr needs .*: pip install flexdt"):

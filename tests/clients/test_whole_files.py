@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from flexdt.clients.whole_files import write_whole
+from flexdt.runtime.files.whole_files import write_whole
 
 
 def test_a_file_that_cannot_be_written_whole_leaves_no_part(

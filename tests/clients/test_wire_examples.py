@@ -18,7 +18,7 @@ import tifffile
 from flexdt.clients import TwinClient
 from flexdt.clients.cli.command_tree import run
 from flexdt.clients.launch.processes import Servers
-from flexdt.clients.reconstruction.volume_files import read_volume
+from flexdt.library.reconstruction.volume_files import read_volume
 
 pytestmark = [pytest.mark.timeout(300), pytest.mark.slow]
 

@@ -17,7 +17,7 @@ import tifffile
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.library.reading.folders import load_dataset
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetFormatError, DatasetMissingError
 from flexdt.twin.dataset.flexdt_json import (
     DatasetDocument,

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 
 from flexdt.clients.cli.command_tree import run
-from flexdt.clients.datasets.dataset import load_dataset
-from flexdt.clients.datasets.exchange import (
+from flexdt.library.datasets.exchange import (
     ExchangeError,
     export_dataset,
     geometry_of,
@@ -24,6 +23,7 @@ from flexdt.clients.datasets.exchange import (
     save_geometry,
     with_geometry,
 )
+from flexdt.library.reading.folders import load_dataset
 from flexdt.twin.dataset.flexdt_json import FrameBlock, ScanRecord
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.projection import Volume

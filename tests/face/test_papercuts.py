@@ -17,7 +17,7 @@ import pytest
 import flexdt as fx
 from flexdt.clients.cli import main
 from flexdt.clients.cli.commands.calibrate_commands import show
-from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_dataset
+from flexdt.library.reconstruction.reconstruct import VolumeRequest, reconstruct_dataset
 from flexdt.twin.dataset.flexdt_json import parse_document
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile, parse_machine

@@ -20,8 +20,8 @@ import pytest
 import tifffile
 
 from flexdt.clients import TwinClient
-from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.launch.processes import Servers
+from flexdt.library.reading.folders import load_dataset
 from flexdt.twin.projection import Volume, back
 
 Array = npt.NDArray[np.float64]

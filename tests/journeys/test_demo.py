@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.library.reading.folders import load_dataset
 from flexdt.twin.geometry.offsets import Offsets
 
 # Twelve digits: a good calibration shares the first five or six with the truth by merit.

@@ -21,9 +21,9 @@ import pytest
 import tifffile
 import zmq
 
-from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.following.session import FollowSession
 from flexdt.clients.launch.processes import Servers
+from flexdt.library.reading.folders import load_dataset
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 

@@ -9,7 +9,7 @@ import pytest
 
 from flexdt.clients.cli.command_tree import run
 from flexdt.clients.launch.processes import Servers
-from flexdt.clients.reconstruction.volume_files import read_volume
+from flexdt.library.reconstruction.volume_files import read_volume
 from flexdt.phantoms import lego_phantom
 
 VOXEL = 0.3

@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
 import flexdt
 from flexdt.clients.cli.command_tree import run
-from flexdt.clients.reconstruction.volume_files import read_volume
+from flexdt.library.reconstruction.volume_files import read_volume
 from flexdt.phantoms import lego_phantom
 from flexdt.protocol.image import decode
 from flexdt.runtime.files.directory import open_data

@@ -8,7 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from flexdt.process_settings import (
+from flexdt.runtime.files import directory
+from flexdt.runtime.files.directory import Directory
+from flexdt.runtime.files.own_documents import lock_folder
+from flexdt.runtime.process_settings import (
     Address,
     GatewaySettings,
     ProcessSettings,
@@ -20,9 +23,6 @@ from flexdt.process_settings import (
     shared,
     words,
 )
-from flexdt.runtime.files import directory
-from flexdt.runtime.files.directory import Directory
-from flexdt.runtime.files.own_documents import lock_folder
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 
 PROCESSES = (UpSettings, TwinSettings, ProjectorSettings, ViewerSettings, GatewaySettings)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import typer
 
-from flexdt.process_settings import memory_size
+from flexdt.runtime.process_settings import memory_size
 from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.projector import compute, wire
 from flexdt.server.projector.service import serve_projector

@@ -15,7 +15,7 @@ import numpy.typing as npt
 import pytest
 import trimesh
 
-from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.library.reading.folders import load_dataset
 from flexdt.phantoms import bead_phantom, load_phantom, material, mesh_phantom, voxel_phantom
 from flexdt.phantoms.channels import chain_through, channels, scatter_object
 from flexdt.phantoms.materials import stated_keV

@@ -21,7 +21,7 @@ import numpy as np
 from past_laboratory import LINEAR, Laboratory
 
 from flexdt.clients.cli.commands.scan_commands import read_log_file
-from flexdt.clients.commission import Commissioned, commission
+from flexdt.library.commission import Commissioned, commission
 
 
 @dataclass

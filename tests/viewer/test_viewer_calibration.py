@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from flexdt.clients.client.client import TwinClient
-from flexdt.clients.datasets.dataset import load_dataset
+from flexdt.library.reading.folders import load_dataset
 from flexdt.phantoms import load_phantom
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import builtin_machine, profile_of

@@ -19,7 +19,6 @@ import pytest
 import tifffile
 
 from flexdt.clients.cli import main
-from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.viewer.feed import LiveReconstruction, wish
 from flexdt.clients.viewer.live_volume import (
     MOST_POINTS,
@@ -34,6 +33,7 @@ from flexdt.clients.viewer.live_volume import (
     surface,
 )
 from flexdt.clients.viewer.volume_truth import figures, main_level, truth_of
+from flexdt.library.reading.folders import load_dataset
 from flexdt.phantoms import load_phantom
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.storage.dataset_writer import DatasetWriter

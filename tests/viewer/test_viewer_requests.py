@@ -28,9 +28,9 @@ from flexdt.clients.viewer import viewer as app
 from flexdt.clients.viewer.feed import ImageFeed, ShownImage
 from flexdt.clients.viewer.page import HIDDEN, MAX_NOTES, Page
 from flexdt.clients.viewer.page_methods import METHODS, serve
-from flexdt.process_settings import Address, UpSettings, ViewerSettings, parse
 from flexdt.protocol import METHODS as WIRE
 from flexdt.protocol import Connection, Notification, Request, Response
+from flexdt.runtime.process_settings import Address, UpSettings, ViewerSettings, parse
 
 pytestmark = pytest.mark.slow
 

@@ -17,8 +17,8 @@ import zstandard
 from PIL import Image
 
 from flexdt.clients.client.client import TwinClient
-from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.viewer.scenes.world import FREE
+from flexdt.library.reading.folders import load_dataset
 from tests.viewer.looking import begun, changed, drawn, film, picture, point_at, seen
 
 pytestmark = pytest.mark.browser

@@ -1,7 +1,7 @@
 """Geometry in the formats of other programs, and back: text and numbers in, text and numbers out.
 
 Every reader returns a `ScanGeometry` in the project's frame, every writer takes one. A geometry
-that a format cannot represent is an error. `flexdt.clients.datasets.exchange` reads and writes the
+that a format cannot represent is an error. `flexdt.library.datasets.exchange` reads and writes the
 files.
 """
 

@@ -3,8 +3,7 @@
 A row is source, detector centre, u (step to the next column), v (step to the next row), in mm and
 in the object's frame (see `conventions`). A geometry may carry the number of its detector's pixels;
 methods that need it take it as an argument otherwise, and an argument that contradicts it is an
-error. Files, other programs' objects and figures are handled by `flexdt.geometry_formats` and
-`flexdt.plots`, which are loaded when a method asks for them.
+error. Files, other programs' objects and figures are the library's (`flexdt.twin.backends`).
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.backends import backend
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.conventions import (
     COLUMN_DIRECTION,
@@ -28,7 +28,7 @@ from flexdt.twin.geometry.conventions import (
     rotation_z,
     turn_detector,
 )
-from flexdt.twin.signatures import File, lazy_backend, public
+from flexdt.twin.signatures import File, public
 
 ROW_LENGTH = 12
 DEGENERATE = 1e-12
@@ -513,7 +513,7 @@ class ConeVec:
             >>> type(scan.plot()).__name__
             'Axes3D'
         """
-        return lazy_backend("plots").plot_geometry(self, axes)
+        return backend("plots").plot_geometry(self, axes)
 
     @property
     def source(self) -> FloatArray:
@@ -720,7 +720,7 @@ def _numbers(
 
 
 def _formats() -> Any:
-    return lazy_backend("geometry_formats")
+    return backend("geometry files")
 
 
 def _span(values: FloatArray) -> str:

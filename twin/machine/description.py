@@ -716,7 +716,8 @@ def parse_machine(text: str, file: str = "<machine>", corners: Corners | None = 
     Args:
         text: TOML.
         file: name for error messages.
-        corners: reads the meshes that it names (`flexdt.machines.parsed` does, beside the file).
+        corners: reads the meshes that it names (`flexdt.library.machines.parsed` reads those
+            beside the file).
 
     Raises:
         MachineFileError: TOML or content does not hold; file, key path, value, allowed.

@@ -18,9 +18,10 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.backends import backend
 from flexdt.twin.errors import GeometryError, NotBuiltError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray, as_numbers
-from flexdt.twin.signatures import File, lazy_backend, public
+from flexdt.twin.signatures import File, public
 
 WARNED: Final = 0.03
 """Relative bound from which on a warning tells of it, where a tenth of the even places have more.
@@ -299,7 +300,7 @@ class Volume:
             >>> Volume(np.zeros((6, 4, 4)), voxel_mm=0.5).plot().get_title()
             'z = 0.25 mm'
         """
-        return lazy_backend("plots").plot_volume(self, axes, what)
+        return backend("plots").plot_volume(self, axes, what)
 
     def to_xarray(self) -> Any:
         """The values as an xarray DataArray (z, y, x) with positions [mm], which needs xarray.
@@ -311,7 +312,7 @@ class Volume:
             >>> Volume(np.zeros((6, 4, 4)), voxel_mm=0.5).to_xarray().dims
             ('z', 'y', 'x')
         """
-        return lazy_backend("clients.datasets.foreign_files").volume_to_xarray(self)
+        return backend("xarray").volume_to_xarray(self)
 
     def save(self, file: File) -> None:
         """Write the volume; the ending chooses the format: .tif, .nrrd, .mha, .nii.gz, .h5, .zarr.
@@ -328,7 +329,7 @@ class Volume:
             ...     Volume.load(f"{folder}/volume.nrrd")
             <Volume: 6 x 4 x 4 voxels (z, y, x) of 0.5 mm about (0, 0, 0) mm>
         """
-        lazy_backend("clients.reconstruction.volume_files").save_volume(self, file)
+        backend("volume files").save_volume(self, file)
 
     @classmethod
     def load(cls, file: File) -> Volume:
@@ -346,7 +347,7 @@ class Volume:
             ...     Volume.load(f"{folder}/volume.tif").voxel_mm
             0.5
         """
-        volume: Volume = lazy_backend("clients.reconstruction.volume_files").read_volume(file)
+        volume: Volume = backend("volume files").read_volume(file)
         return volume
 
     @property

@@ -18,11 +18,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from flexdt.twin.backends import backend
 from flexdt.twin.script import commands as c
 from flexdt.twin.script import grammar
 from flexdt.twin.script.grammar import ArgumentError, Spec, shorten
 from flexdt.twin.script.problems import ScriptError, ScriptProblem, in_order
-from flexdt.twin.signatures import PathLike, lazy_backend
+from flexdt.twin.signatures import PathLike
 
 LIGHT_BYTES: Final = 8 << 10
 """A script or list of poses up to this size may be planned in a thread."""
@@ -257,7 +258,7 @@ def content(text: Source) -> str | bytes:
     """The text or bytes of a script; those of the file where a path is given."""
     if isinstance(text, str | bytes):
         return text
-    read: bytes = lazy_backend("scripts").read(text)
+    read: bytes = backend("scripts").read(text)
     return read
 
 

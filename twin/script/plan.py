@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.backends import backend
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.poses import Poses
@@ -30,7 +31,6 @@ from flexdt.twin.motion.profiles import AxisPath, Trajectory
 from flexdt.twin.scanner.state import StagePlacement
 from flexdt.twin.script.commands import AnyCommand, ImageKind
 from flexdt.twin.script.problems import ScriptProblem, WithProblems
-from flexdt.twin.signatures import lazy_backend
 from flexdt.twin.values import Array, ArrayValue, JsonValue
 
 if TYPE_CHECKING:
@@ -293,7 +293,7 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
             `ok` is False with an error or a collision, and
             `to_dict()` is the JSON.
         """
-        report: CheckReport = lazy_backend("scripts").check(self, sample)
+        report: CheckReport = backend("scripts").check(self, sample)
         return report
 
     def plot(self, report: CheckReport | None = None) -> Any:
@@ -305,7 +305,7 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
         Returns:
             matplotlib's figure.
         """
-        return lazy_backend("plots").plot_plan(self, self.check() if report is None else report)
+        return backend("plots").plot_plan(self, self.check() if report is None else report)
 
     @cached_property
     def paths(self) -> Mapping[str, AxisPath]:

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from flexdt import machines
 from flexdt.clients.cli import options
 from flexdt.clients.cli.commands.scan_commands import read_log_file, tell
 from flexdt.clients.cli.console import note, table
 from flexdt.clients.cli.options import Answer, argument, option
 from flexdt.clients.cli.settings_file import MachineNewSettings, PhantomMakeSettings, chosen
-from flexdt.clients.failure import CommandError
+from flexdt.library import machines
+from flexdt.library.failure import CommandError
 
 if TYPE_CHECKING:
     from flexdt.phantoms import Phantom
@@ -333,9 +333,9 @@ def commission(
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise CommandError(f"{out} is there; allowed: a new or an empty folder")
-    from flexdt.clients.commission import commission as commissioned
-    from flexdt.clients.commission import write_commission
-    from flexdt.clients.figures import cell_text
+    from flexdt.library.commission import commission as commissioned
+    from flexdt.library.commission import write_commission
+    from flexdt.library.figures import cell_text
 
     found = commissioned(folders, traffic, read_log_file)
     write_commission(found, out)

@@ -1,7 +1,7 @@
 """`flexdt calibrate`, `align` and `compare`: geometry from scans with and without a
 bead phantom, and a check of it.
 
-The work is in `flexdt.clients.calibration`; these commands pass options to it, print the result and
+The work is in `flexdt.library.calibration`; these commands pass options to it, print the result and
 choose the exit code.
 """
 
@@ -19,13 +19,13 @@ from flexdt.clients.cli.commands.data_commands import said
 from flexdt.clients.cli.console import as_json, note, table, warn
 from flexdt.clients.cli.options import Answer, Twin, argument, option
 from flexdt.clients.cli.settings_file import CalibrateSettings, chosen
-from flexdt.clients.failure import CommandError
-from flexdt.clients.whole_files import write_whole
+from flexdt.library.failure import CommandError
+from flexdt.runtime.files.whole_files import write_whole
 
 if TYPE_CHECKING:
     from flexdt.clients.client.client import TwinClient
-    from flexdt.clients.datasets.data_set import DataSet
-    from flexdt.clients.datasets.exchange import Given
+    from flexdt.library.data_set import DataSet
+    from flexdt.library.datasets.exchange import Given
     from flexdt.twin.calibration.pipeline import CalibrationRequest
     from flexdt.twin.scanner.state import NamedCorrection
 
@@ -80,10 +80,10 @@ def calibrate(
     """
     if report is not None:
         options.require_ending(report, ".html", ".json")
-    from flexdt.clients.calibration.calibrate import calibrate_datasets
-    from flexdt.clients.calibration.calibration_report import write_report
-    from flexdt.clients.calibration.markers import Scale
-    from flexdt.clients.figures import require_plots
+    from flexdt.library.calibration.calibrate import calibrate_datasets
+    from flexdt.library.calibration.calibration_report import write_report
+    from flexdt.library.calibration.markers import Scale
+    from flexdt.library.figures import require_plots
 
     request = _request(phantom, free, per_scan, per_frame, reading, bead_tolerance, prior, start)
     target = _named(phantom)
@@ -102,7 +102,7 @@ def calibrate(
     if report is not None:
         write_report(outcome, report)
     if tracks is not None:
-        from flexdt.clients.calibration.calibration_report import write_tracks
+        from flexdt.library.calibration.calibration_report import write_tracks
 
         write_tracks(outcome, tracks)
     yield document
@@ -173,10 +173,10 @@ def _given(
 
     cone = ConeVec.load(geometries[0], shape=known.shape, pixel=known.pitch_mm)
     if frames is not None:
-        from flexdt.clients.datasets.dataset import read_tiffs
+        from flexdt.library.reading.folders import read_tiffs
 
         return [read_tiffs(frames, cone)]
-    from flexdt.clients.calibration.markers import markers_alone
+    from flexdt.library.reading.listed_images import markers_alone
 
     assert markers is not None
     return [markers_alone(cone, markers.stem)]
@@ -184,8 +184,8 @@ def _given(
 
 def _opened(folders: list[Path], geometries: list[Path] | None) -> list[DataSet]:
     """The data sets, each with its own geometry or the one of a file."""
-    from flexdt.clients.datasets.dataset import load_dataset
-    from flexdt.clients.datasets.exchange import load_geometry, with_geometry
+    from flexdt.library.datasets.exchange import load_geometry, with_geometry
+    from flexdt.library.reading.folders import load_dataset
 
     data = [load_dataset(folder) for folder in folders]
     if not geometries:
@@ -215,7 +215,7 @@ def align(
     """
     if out is not None:
         options.require_ending(out, ".json")
-    from flexdt.clients.calibration.align_dataset import align_dataset
+    from flexdt.library.calibration.align_dataset import align_dataset
 
     if push:
         _require_answer(twin)
@@ -258,8 +258,8 @@ def compare(
         tolerance: Exit with 1 where the beads' rms is above this.
         out: Write a report and difference images to this folder.
     """
-    from flexdt.clients.calibration.calibration_report import compare_folder, write_comparison
-    from flexdt.clients.figures import require_plots
+    from flexdt.library.comparison import compare_folder, write_comparison
+    from flexdt.library.figures import require_plots
 
     if out is not None:
         require_plots()
@@ -327,7 +327,7 @@ def show(document: Mapping[str, Any]) -> Iterator[str]:
         yield "(name): not asked for; of images: the part of sigma that is the images' noise"
     rms, seconds = _number(document["rms_px"], 4), _number(document["seconds"], 2)
     yield f"{seen}, {len(document['outliers'])} of these left out, rms {rms} px, {seconds} s"
-    from flexdt.clients.calibration.calibrate import ranges
+    from flexdt.library.calibration.calibrate import ranges
 
     frames: dict[int, list[int]] = {}
     for one in document["outliers"]:
@@ -382,7 +382,7 @@ def write_json(path: Path, document: Mapping[str, object]) -> None:
 
 def _rounded(estimate: Mapping[str, Any], *names: str) -> Iterator[str]:
     """Numbers of an estimate, to the digits that its sigma leaves."""
-    from flexdt.clients.calibration.calibrate import digits
+    from flexdt.library.calibration.calibrate import digits
 
     return (digits(estimate[name], estimate["sigma"]) for name in names)
 

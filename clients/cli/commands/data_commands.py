@@ -1,6 +1,6 @@
 """`flexdt reconstruct`, `export` and `import`: volumes from data sets, geometry in other formats.
 
-The work is in `flexdt.clients.reconstruction` and `flexdt.clients.datasets.exchange`.
+The work is in `flexdt.library.reconstruction` and `flexdt.library.datasets.exchange`.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from flexdt.clients.cli import options
 from flexdt.clients.cli.console import ProgressBar, duration, note, size, warn
 from flexdt.clients.cli.options import Answer, Twin, argument, option
 from flexdt.clients.cli.settings_file import ReconstructSettings, chosen
-from flexdt.clients.failure import CommandError
+from flexdt.library.failure import CommandError
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from flexdt.clients.datasets.data_set import DataSet
-    from flexdt.clients.datasets.exchange import Given
+    from flexdt.library.data_set import DataSet
+    from flexdt.library.datasets.exchange import Given
     from flexdt.twin.geometry.offsets import Offsets
 
 Algorithm = Literal["fdk", "sirt", "sart", "cgls", "em", "tv"]
@@ -86,8 +86,8 @@ def reconstruct(
     other = {"kv": kv, "correction": correction, "geometry": geometry}
     given = {name: value for name, value in (own | other).items() if value is not None}
     _check_together(given, out, [name for name in own if name in given] if preview else [])
-    from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_dataset
-    from flexdt.clients.reconstruction.reconstruct import preview as quick_look
+    from flexdt.library.reconstruction.reconstruct import VolumeRequest, reconstruct_dataset
+    from flexdt.library.reconstruction.reconstruct import preview as quick_look
     from flexdt.twin.projection.volume import Accuracy
 
     voxels = None if shape is None else _shape(shape)
@@ -132,7 +132,7 @@ def reconstruct(
 
 def _check_together(given: Mapping[str, object], out: Path, kept_out: Iterable[str]) -> None:
     """Usage errors of options that do not go together; a preview keeps some out."""
-    from flexdt.clients.reconstruction.volume_files import SUFFIXES, ending
+    from flexdt.library.reconstruction.volume_files import SUFFIXES, ending
 
     algorithm = given.get("algorithm", "fdk")
     corrects = {"material", "scatter-correction"} & given.keys()
@@ -174,11 +174,11 @@ def scan_of(
     folder: Path, texts: bool, report: Report | None, geometry: Path | None = None
 ) -> DataSet:
     """The data set, with the motion and the panel of a report, or the geometry of a file."""
-    from flexdt.clients.datasets.dataset import load_dataset
+    from flexdt.library.reading.folders import load_dataset
 
     data = load_dataset(folder, ignore_document=texts)
     if geometry is not None:
-        from flexdt.clients.datasets.exchange import load_geometry, with_geometry
+        from flexdt.library.datasets.exchange import load_geometry, with_geometry
 
         data = with_geometry(data, load_geometry(geometry))
     if report is None:
@@ -193,7 +193,7 @@ def scan_of(
 
 
 def _workers(scheduler: str | None, slurm: Path | None) -> AbstractContextManager[Executor] | None:
-    from flexdt.clients.extras import extension
+    from flexdt.library.extras import extension
 
     if scheduler is None and slurm is None:
         return None
@@ -299,8 +299,8 @@ def export(
     """
     if correction is not None and not corrected:
         raise typer.BadParameter("--correction and --nominal exclude each other")
-    from flexdt.clients.datasets.exchange import export_dataset
     from flexdt.clients.launch.random_truth import read
+    from flexdt.library.datasets.exchange import export_dataset
     from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 
     report = None if correction is None else read_report(correction)
@@ -353,7 +353,7 @@ def import_(
     given = said(like, shape, pixel, views)
     from dataclasses import replace
 
-    from flexdt.clients.datasets.exchange import import_geometry, save_geometry
+    from flexdt.library.datasets.exchange import import_geometry, save_geometry
 
     geometry = import_geometry(file, format, given, rows_up=rows == "up")
     if real and geometry.real is not None:
@@ -384,8 +384,8 @@ def said(
         pitch = options.numbers(pixel, "pixel pitch", "MM or U,V", 1, 2)
     if pitch is not None and min(pitch) <= 0.0:
         raise typer.BadParameter(f"pixel pitch {pixel!r} must be above 0")
-    from flexdt.clients.datasets.dataset import load_dataset
-    from flexdt.clients.datasets.exchange import Given
+    from flexdt.library.datasets.exchange import Given
+    from flexdt.library.reading.folders import load_dataset
 
     known = Given() if like is None else Given.of(load_dataset(like))
     return Given(

@@ -8,12 +8,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flexdt import machines
 from flexdt.clients.cli import options
 from flexdt.clients.cli.boundary import INVALID, REFUSED, USAGE
 from flexdt.clients.cli.console import note, say
 from flexdt.clients.cli.options import Answer, argument, option
-from flexdt.clients.failure import CommandError
+from flexdt.library import machines
+from flexdt.library.failure import CommandError
 
 if TYPE_CHECKING:
     from flexdt.clients.following.session import FollowSession, FramesBeside
@@ -72,7 +72,7 @@ def follow(
         if sample is None or not frames.is_dir():
             raise CommandError("--frames needs --sample, and a folder that is there", USAGE)
         beside = (frames, FramesBeside(follower, as_phantom(sample), out))
-    from flexdt.clients.extras import package
+    from flexdt.library.extras import package
 
     zmq = package("zmq", "flexdt follow", "gateway")
     from flexdt.clients.following.listening import endpoint
@@ -109,8 +109,8 @@ def _unread(session: FollowSession) -> str:
 def _follower(
     machine: str | None, profile: str | None, script: Path | None, sample: str | None
 ) -> Follower:
+    from flexdt.library.scripts import collisions, size_of
     from flexdt.phantoms.samples import as_phantom
-    from flexdt.scripts import collisions, size_of
     from flexdt.twin.following.follower import Follower
     from flexdt.twin.script import parse_script
 

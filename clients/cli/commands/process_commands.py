@@ -1,8 +1,8 @@
 """`flexdt up`, its aliases `twin`, `projector`, `viewer` and `gateway`, `doctor` and `demo`.
 
 The servers are programs of their own (`python -m flexdt.server...`); this process turns into one,
-so signals and exit codes are the server's. Their options come from `flexdt.process_settings`: the
-settings file's first, then those of the command line.
+so signals and exit codes are the server's. Their options come from
+`flexdt.runtime.process_settings`: the settings file's first, then those of the command line.
 
 `demo` does the main job from end to end with such processes. Each stage does its real work through
 the public client and the files, as a user would, and stops the demonstration with a readable error
@@ -26,7 +26,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
-from flexdt import long_work
 from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
 from flexdt.clients.cli.commands.calibrate_commands import (
     parameter_rows,
@@ -37,14 +36,15 @@ from flexdt.clients.cli.commands.scan_commands import follow
 from flexdt.clients.cli.console import duration, note, say, size, table
 from flexdt.clients.cli.options import Answer, option
 from flexdt.clients.cli.settings_file import TABLES, chosen, settings_of
-from flexdt.clients.failure import CommandError
 from flexdt.clients.launch import random_truth as hidden
-from flexdt.process_settings import UpSettings, has_parameters, parameters, words
+from flexdt.library.failure import CommandError
+from flexdt.runtime.process_settings import UpSettings, has_parameters, parameters, words
+from flexdt.twin import long_work
 
 if TYPE_CHECKING:
-    from flexdt.clients.calibration.calibrate import Outcome
     from flexdt.clients.client.client import TwinClient
-    from flexdt.clients.datasets.data_set import DataSet
+    from flexdt.library.calibration.calibrate import Outcome
+    from flexdt.library.data_set import DataSet
 
 MODULES: Final = {
     "up": "flexdt.clients.launch.up",
@@ -121,7 +121,7 @@ def _check(given: Mapping[str, Any]) -> None:
     if given.get("projector") is not None and given["projector_port"] is not None:
         raise typer.BadParameter("give --projector or --projector-port, not both")
     if given.get("machine") is not None:  # found before any process starts
-        from flexdt.machines import machine
+        from flexdt.library.machines import machine
 
         machine(given["machine"])
 
@@ -262,7 +262,7 @@ def run_demo(
 def _scanned(client: TwinClient, data: Path, tell: Tell) -> tuple[DataSet, float]:
     """Run the example script on the twin and read the data set back with the ordinary reader; it
     must be whole. Returns it and the wall time of the scan [s]."""
-    from flexdt.clients.datasets.dataset import load_dataset
+    from flexdt.library.reading.folders import load_dataset
 
     client.set_sample(SAMPLE)
     script = (resources.files("flexdt.clients") / "data" / SCRIPT).read_bytes()
@@ -292,9 +292,9 @@ def _scanned(client: TwinClient, data: Path, tell: Tell) -> tuple[DataSet, float
     return dataset, seconds
 
 
-def _calibrated(dataset: DataSet, tell: Tell) -> Outcome:
+def _calibrated(dataset: DataSet, tell: Tell) -> Outcome[DataSet]:
     """Calibrate from the data set alone."""
-    from flexdt.clients.calibration.calibrate import calibrate_datasets
+    from flexdt.library.calibration.calibrate import calibrate_datasets
 
     begun = time.monotonic()
     outcome = calibrate_datasets([dataset], SAMPLE)
@@ -309,9 +309,11 @@ def _calibrated(dataset: DataSet, tell: Tell) -> Outcome:
     return outcome
 
 
-def _previewed(dataset: DataSet, outcome: Outcome, out: Path, tell: Tell) -> dict[str, object]:
+def _previewed(
+    dataset: DataSet, outcome: Outcome[DataSet], out: Path, tell: Tell
+) -> dict[str, object]:
     """A small volume with the calibrated geometry."""
-    from flexdt.clients.reconstruction.reconstruct import preview
+    from flexdt.library.reconstruction.reconstruct import preview
 
     fit = outcome.calibration.fit
     assert fit is not None
@@ -321,9 +323,9 @@ def _previewed(dataset: DataSet, outcome: Outcome, out: Path, tell: Tell) -> dic
     return document
 
 
-def _compared(outcome: Outcome, truth: Mapping[str, float], tell: Tell) -> bool:
+def _compared(outcome: Outcome[DataSet], truth: Mapping[str, float], tell: Tell) -> bool:
     """Set the calibration beside the hidden truth; a miss is called a miss."""
-    from flexdt.clients.calibration.calibrate import inside_95
+    from flexdt.library.calibration.calibrate import inside_95
 
     rows = []
     for name, value, sigma, _, unit in parameter_rows(outcome.document):

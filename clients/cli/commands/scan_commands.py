@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
-from flexdt import machines, process_settings
 from flexdt.clients.cli import options
 from flexdt.clients.cli.boundary import (
     INTERRUPTED,
@@ -27,13 +26,15 @@ from flexdt.clients.cli.commands.scanner_commands import warn_of_exposure
 from flexdt.clients.cli.console import ProgressBar, duration, note, size, table, warn
 from flexdt.clients.cli.options import Answer, Twin, argument, option
 from flexdt.clients.cli.settings_file import ScriptNewSettings, chosen
-from flexdt.clients.failure import CommandError
+from flexdt.library import machines
+from flexdt.library.failure import CommandError
+from flexdt.runtime import process_settings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from flexdt.clients.client.client import TwinClient
-    from flexdt.clients.expose import Forecast, Measured, Transmission
+    from flexdt.library.expose import Forecast, Measured, Transmission
     from flexdt.protocol.state_model import JobStatus
     from flexdt.twin.machine.description import Machine
     from flexdt.twin.script import CheckReport, ScriptProblem
@@ -63,8 +64,8 @@ def check(
     if against is not None:
         yield from compare(script, against, machine, html)
         return
+    from flexdt.library.scripts import collisions, size_of
     from flexdt.phantoms.samples import as_phantom
-    from flexdt.scripts import collisions, size_of
     from flexdt.twin.script import check_script, html_report
     from flexdt.twin.script.problems import in_order
 
@@ -309,7 +310,7 @@ def new(
         power: Set the tube's power.
         mode: Set the camera's mode.
     """
-    from flexdt.scripts import collisions
+    from flexdt.library.scripts import collisions
     from flexdt.twin.machine.camera import Roi
     from flexdt.twin.script import check_script
     from flexdt.twin.script.compose import ScanRequest, compose_script
@@ -466,8 +467,8 @@ def expose(
         sdd: Set the distance from source to panel.
         detail: See this detail; void:MM for less of the sample.
     """
-    from flexdt.clients import expose as of
-    from flexdt.clients.datasets.dataset import load_dataset
+    from flexdt.library import expose as of
+    from flexdt.library.reading.folders import load_dataset
     from flexdt.twin.machine.camera import Roi
 
     if dataset is not None:

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
-from flexdt import process_settings
 from flexdt.clients.cli import options
 from flexdt.clients.cli.boundary import REFUSED
 from flexdt.clients.cli.console import duration, note, table, warn
 from flexdt.clients.cli.options import Answer, Twin, argument, option
-from flexdt.clients.failure import CommandError
+from flexdt.library.failure import CommandError
+from flexdt.runtime import process_settings
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -353,7 +353,7 @@ def snap(
     rows, cols = image.shape
     yield f"{file}: {cols} x {rows} {image.dtype}"
     if taken.marks is not None:
-        from flexdt.clients.datasets.pictures import legend
+        from flexdt.library.datasets.pictures import legend
 
         yield from legend(taken.marks)
 
@@ -380,7 +380,7 @@ def save(
         OSError: the file cannot be written.
     """
     if file.suffix.lower() == ".png":
-        from flexdt.clients.datasets.pictures import png
+        from flexdt.library.datasets.pictures import png
 
         try:
             encoded = png(image, dark_is_dense=dark_is_dense, marks=marks)

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from flexdt import DataSet
-from flexdt.clients.datasets.exchange import geometry_of
+from flexdt.library.datasets.exchange import geometry_of
 from flexdt.twin.exchange import SAME_MM, ExchangeError, require_panel
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, UNITS, Offsets

@@ -21,8 +21,8 @@ from typing import Any, Final
 import numpy as np
 
 from flexdt import DataSet
-from flexdt.clients.datasets.exchange import text_of
 from flexdt.extending import tiff_bytes
+from flexdt.library.datasets.exchange import text_of
 from flexdt.phantoms import Material
 from flexdt.phantoms.channels import Channel, scatter_object
 from flexdt.phantoms.files.mesh_files import read_mesh

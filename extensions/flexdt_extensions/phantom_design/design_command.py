@@ -47,8 +47,8 @@ def design(
     profile: ProfileName = None,
 ) -> Answer:
     """Choose bead places that determine the geometry best, and say how to build it."""
-    from flexdt.machines import machine as find_machine
-    from flexdt.machines import profile as find_profile
+    from flexdt.library.machines import machine as find_machine
+    from flexdt.library.machines import profile as find_profile
     from flexdt.twin.calibration import SIX
     from flexdt_extensions.phantom_design import phantom_design as work
     from flexdt_extensions.phantom_design.information_table import PlannedScans

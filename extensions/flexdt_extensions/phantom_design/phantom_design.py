@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.clients.figures import COLOURS, DPI, blank, page, require_plots, svg, table
 from flexdt.extending import CommandError
+from flexdt.library.figures import COLOURS, DPI, blank, page, require_plots, svg, table
 from flexdt.phantoms import Phantom, cuboid_with_beads, spiral_positions
 from flexdt.phantoms.bricks import Brickwork, lego_phantom
 from flexdt.twin.calibration import BeadModel

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from flexdt.clients.figures import require_plots
+from flexdt.library.figures import require_plots
 from flexdt.phantoms import Phantom, cuboid_with_beads, load_phantom, loop_positions, material
 from flexdt.twin.calibration import SIX, BeadModel, bead_model, build_problem, estimate_geometry
 from flexdt.twin.calibration.detect.detection import Detections

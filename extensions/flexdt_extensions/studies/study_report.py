@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.clients.figures import Series, axes_of, blank, cell_text, page, plot, svg, table
 from flexdt.extending import write_whole
+from flexdt.library.figures import Series, axes_of, blank, cell_text, page, plot, svg, table
 from flexdt.twin.geometry.offsets import UNITS
 from flexdt_extensions.studies.experiment_4 import ENOUGH
 from flexdt_extensions.studies.runs import Run, grid

@@ -21,7 +21,7 @@ import pytest
 
 import flexdt as fx
 from flexdt.clients.cli.command_tree import run
-from flexdt.clients.failure import CommandError
+from flexdt.library.failure import CommandError
 from flexdt.twin.physics.exposure import expose, ideal_response
 from flexdt.twin.projection import project_scene
 from flexdt_extensions.batch.batch_plan import Plan, parse, parse_plan, read_plan

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flexdt.clients.failure import CommandError
+from flexdt.library.failure import CommandError
 from flexdt.twin.errors import LimitError, TwinError
 from flexdt_extensions.batch.batch_plan import Plan, parse_plan
 from flexdt_extensions.batch.batch_run import Store, run_batch

@@ -33,8 +33,8 @@ from ophyd_async.core import (
 )
 
 from flexdt.clients import TwinClient
-from flexdt.clients.datasets.dataset import load_dataset
 from flexdt.clients.launch.processes import Servers
+from flexdt.library.reading.folders import load_dataset
 from flexdt.protocol import RpcError
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.camera import Roi

@@ -17,9 +17,9 @@ import zarr
 
 import flexdt as fx
 from flexdt.clients.cli.command_tree import run
-from flexdt.clients.datasets.dataset import load_dataset
-from flexdt.clients.reconstruction.reconstruct import VolumeRequest as Request
-from flexdt.clients.reconstruction.reconstruct import reconstruct_dataset
+from flexdt.library.reading.folders import load_dataset
+from flexdt.library.reconstruction.reconstruct import VolumeRequest as Request
+from flexdt.library.reconstruction.reconstruct import reconstruct_dataset
 from flexdt.twin.errors import LimitError, TwinError
 from flexdt_extensions.fdk_on_workers import as_made, levels, slabs
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from prior_coverage import PIXEL, SDD, SHAPE, pixels, radiographs
 
-from flexdt.analysis import calibrate as calibrate_marks
+from flexdt.library.analysis import calibrate as calibrate_marks
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.background import Lag

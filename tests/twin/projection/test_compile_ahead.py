@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from flexdt import progress_lines
-from flexdt.runtime import compile_ahead
+from flexdt.runtime import compile_ahead, progress_lines
 from flexdt.twin.projection.kernels import compiling
 from flexdt.twin.projection.kernels.siddon_kernels import clip
 

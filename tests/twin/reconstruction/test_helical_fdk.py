@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import flexdt as fx
-from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_dataset
+from flexdt.library.reconstruction.reconstruct import VolumeRequest, reconstruct_dataset
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Grid, project_scene

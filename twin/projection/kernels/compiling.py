@@ -31,7 +31,7 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.extending import intrinsic
 
-from flexdt import long_work
+from flexdt.twin import long_work
 
 LOG = logging.getLogger("flexdt.kernels")
 """To standard error, unless the program has set up logging."""

@@ -6,8 +6,8 @@ from __future__ import annotations
 from os import PathLike
 from pathlib import Path
 
-from flexdt.machines import machine as find_machine
-from flexdt.machines import profile as find_profile
+from flexdt.library.machines import machine as find_machine
+from flexdt.library.machines import profile as find_profile
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.samples import as_phantom
 from flexdt.twin.collision.convex_solids import convex_pieces

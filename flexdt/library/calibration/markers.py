@@ -21,9 +21,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.clients.datasets.data_set import DataSet
+from flexdt.library.datasets.image_set import Images, ImageSet
 from flexdt.phantoms import Phantom
-from flexdt.runtime.files.dataset_folder import Frame, read_text
+from flexdt.runtime.files.dataset_folder import read_text
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections, SpotFinder
 from flexdt.twin.calibration.diagnose import error
@@ -34,7 +34,6 @@ from flexdt.twin.calibration.frame_source import Frames, FrameSpots, FrameState,
 from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
 from flexdt.twin.calibration.unknown_markers import ANYWHERE_MM, Index, centred, link, triangulate
 from flexdt.twin.errors import TwinError
-from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.geometry.poses import Poses
@@ -206,23 +205,7 @@ def _gathered(marks: Iterable[tuple[str, Mark]], views: int) -> Markers:
     return Markers(names, tracks, sigmas)
 
 
-def markers_alone(geometry: ConeVec, name: str) -> DataSet:
-    """A data set without images: geometry for markers.
-
-    Raises:
-        TwinError: the geometry does not state the detector's size.
-    """
-    if geometry.shape is None:
-        raise TwinError(
-            f"{name}: the geometry does not state the detector's rows and columns; write one that "
-            "does with flexdt import, or give the frames too"
-        )
-    shape = (geometry.shape[1], geometry.shape[2])
-    frames = tuple(Frame(i, f"view {i}", None, False, shape) for i in range(len(geometry)))
-    return DataSet(name, frames, shape, geometry.with_shape(shape))
-
-
-def seen_alone(data: DataSet, markers: Markers) -> tuple[list[DataSet], Markers]:
+def seen_alone(data: Images, markers: Markers) -> tuple[list[Images], Markers]:
     """Data set and markers of those frames in which any was marked.
 
     Raises:
@@ -247,7 +230,7 @@ def spots_of(markers: Markers, shape: tuple[int, int]) -> tuple[list[FrameSpots]
 
 
 def calibrate_known(
-    data: DataSet, markers: Markers, phantom: Phantom, request: CalibrationRequest
+    data: ImageSet, markers: Markers, phantom: Phantom, request: CalibrationRequest
 ) -> Calibration:
     """Calibrate from the marked beads of a phantom; marker "3" is its bead 3, counted from 0.
 
@@ -270,7 +253,7 @@ def calibrate_known(
 
 
 def calibrate_unknown(
-    data: DataSet,
+    data: ImageSet,
     images: Frames | None,
     markers: Markers | None,
     request: CalibrationRequest,
@@ -361,7 +344,7 @@ def calibrate_unknown(
     return found, {"markers": _described(found, names, index), "scale": said}
 
 
-def _turning_back(found: Calibration, data: DataSet, markers: Markers | None) -> Calibration:
+def _turning_back(found: Calibration, data: ImageSet, markers: Markers | None) -> Calibration:
     """Refused where markers stand still, or where they fit twice as well if the stage turns back.
     (Without perspective both ways of turning would fit, with each marker as far behind as before
     the axis.)
@@ -392,7 +375,7 @@ def _turning_back(found: Calibration, data: DataSet, markers: Markers | None) ->
 
 
 def _calibrated(
-    data: DataSet,
+    data: ImageSet,
     looks: Sequence[FrameSpots],
     index: Index,
     model: BeadModel | Phantom,

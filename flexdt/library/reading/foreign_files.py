@@ -12,11 +12,7 @@ the lowest, column 0 the left one as seen from the source; the stage turns antic
 image to higher columns and rows; counts are not divided by the reference, an image of the open
 beam, and nothing is left to subtract from either.
 
-NeXus's NXtomo (application definition 2.0) holds raw counts with image keys, in HDF5. It knows a
-rotation angle and little else of a cone beam, so the rows of cone_vec stand beside it, in a group
-that readers of NXtomo pass over. It is written, too; so are xarray's objects.
-
-Data sets of images that are named one by one are `DataSet`s like any other.
+NXtomo has a module of its own.
 """
 
 from __future__ import annotations
@@ -31,84 +27,17 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.clients.datasets.data_set import Arrays, DataSet, references
-from flexdt.clients.extras import package
-from flexdt.clients.whole_files import whole_file
-from flexdt.runtime.files.dataset_folder import Folder, list_folder, opened, read_image
-from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
+from flexdt.library.data_set import DataSet
+from flexdt.library.datasets.image_set import Arrays
+from flexdt.library.extras import package
+from flexdt.library.reading.listed_images import by_numbers, listed
+from flexdt.library.reading.nxtomo_reading import read_nxtomo
+from flexdt.runtime.files.dataset_folder import list_folder, opened
+from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.errors import TwinError
-from flexdt.twin.exchange.number_tables import VECTOR_NAMES
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.projection.volume import Volume
-from flexdt.twin.signatures import File
 
-NO_DARK: Final = "no dark image"
-
-
-def by_numbers(name: str) -> list[tuple[int, str]]:
-    """Order of names in which 10 comes after 9."""
-    parts = re.split(r"(\d+)", name)
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
-
-
-def listed(
-    content: Folder,
-    geometry: ConeVec,
-    names: Sequence[str],
-    darks: Sequence[str],
-    flats: Sequence[str],
-    name: str = "",
-    shapes: Sequence[tuple[int, int]] = (),
-    reasons: Sequence[str] = (),
-    warnings: Sequence[str] = (),
-    **known: Any,
-) -> DataSet:
-    """The data set of images named one by one.
-
-    Args:
-        content: where they are.
-        geometry: one view for each projection.
-        names, darks, flats: of the images.
-        name: of the data set; default: the folder's.
-        shapes: (rows, cols) of each projection; default: all as the first that is there.
-        reasons: why it is not complete.
-        warnings: what is doubtful.
-        known: further members of `DataSet`.
-
-    Raises:
-        DatasetError: none is there, or the geometry has another number of views or another shape.
-    """
-    if not shapes:
-        there = [n for n in names if n in content.names]
-        if not there:
-            raise DatasetMissingError(
-                f"{content.path}: no projections ({', '.join(names[:1]) or 'none is listed'} ...)",
-                {"path": str(content.path), "missing": list(names[:100])},
-            )
-        if len(names) != len(geometry):
-            said = f"{content.path}: {len(names)} projections and {len(geometry)} views"
-            raise DatasetFormatError.instead(said, len(geometry), len(names))
-        rows, cols = read_image(content.path / there[0]).shape
-        geometry = geometry.with_shape(geometry.of_shape((rows, cols)))
-        shapes = [(rows, cols)] * len(names)
-    reasons = [reason for reason in (*reasons, content.lost((*darks, *flats, *names))) if reason]
-    return DataSet(
-        name or content.path.name,
-        content.frames(names, shapes),
-        shapes[0],
-        geometry,
-        folder=content.path,
-        darks=content.paths(darks),
-        flats=content.paths(flats),
-        complete=not reasons,
-        reason="; ".join(reasons),
-        warnings=(*warnings, *([] if darks else [f"{NO_DARK} (di000000.tif): zero is taken"])),
-        **known,
-    )
-
-
-PROJECTION, FLAT, DARK = 0, 1, 2
 NXTOMO: Final = (".nx", ".nxs", ".h5", ".hdf5")
 KINDS: Final = {3: "u1", 5: "<u2", 10: "<f4"}
 """Xradia's numbers of types of pixels."""
@@ -124,7 +53,7 @@ def open_file(path: Path, geometry: ConeVec | None) -> DataSet:
     Raises:
         DatasetError: another kind of file, or one that lacks what is needed; says what.
     """
-    readers = {".xtekct": _nikon, ".txrm": _zeiss, **dict.fromkeys(NXTOMO, _nxtomo)}
+    readers = {".xtekct": _nikon, ".txrm": _zeiss, **dict.fromkeys(NXTOMO, read_nxtomo)}
     if path.suffix.lower() in readers:
         return readers[path.suffix.lower()](path, geometry)
     raise DatasetFormatError(
@@ -309,142 +238,3 @@ def _geometry(file: _Streams, views: int, rows: int) -> tuple[ConeVec, list[str]
     o, p = np.zeros(views), np.full(views, pixel)
     place = np.stack([o, -near, o, right, far, up, p, o, o, o, o, p], axis=-1).reshape(-1, 4, 3)
     return ConeVec((place @ _about_z(-angles)).reshape(-1, 12)), doubts
-
-
-def _nxtomo(path: Path, geometry: ConeVec | None) -> DataSet:
-    h5py = package("h5py", "NXtomo")
-    try:
-        with h5py.File(path) as file:
-            found: list[Any] = []
-            file.visititems(
-                lambda _, item: found.append(item) if "image_key" in getattr(item, "keys", set)()
-                and "data" in item else None
-            )  # fmt: skip
-            if not found:
-                raise DatasetFormatError(
-                    f"{path}: no group has data and image_key; allowed: NXtomo", {"path": str(path)}
-                )
-            images, keys = found[0]["data"][:], found[0]["image_key"][:]
-            rows = [item[:] for name, item in file.items() if name == "cone_vec"] or [
-                entry["flexdt/cone_vec"][:] for entry in file.values() if "flexdt/cone_vec" in entry
-            ]
-    except OSError as error:
-        raise DatasetFormatError(f"{path} is no HDF5 file: {error}", {"path": str(path)}) from None
-    if geometry is None:
-        if not rows:
-            raise DatasetFormatError(
-                f"{path}: NXtomo says no geometry of a cone beam; give it: geometry=ConeVec",
-                {"missing": "geometry"},
-            )
-        geometry = ConeVec(rows[0])
-    several = [images[keys == key] if (keys == key).any() else None for key in (DARK, FLAT)]
-    lost = int((keys == 3).sum())
-    data = DataSet.from_arrays(
-        images[keys == PROJECTION], geometry, dark=several[0], flat=several[1], name=path.stem
-    )
-    doubts = [f"{lost} images are marked as invalid and left out"] if lost else []
-    return replace(data, warnings=(*data.warnings, *doubts))
-
-
-def to_xarray(data: DataSet) -> Any:
-    """See `DataSet.to_xarray`."""
-    xarray = package("xarray", "to_xarray")
-    rows = data.geometry.rows
-    return xarray.DataArray(
-        data.line_integrals(),
-        dims=("view", "row", "column"),
-        name="line_integrals",
-        coords={
-            "angle": ("view", data.angles_deg, {"units": "deg"}),
-            **{n: ("view", c, {"units": "mm"}) for n, c in zip(VECTOR_NAMES, rows.T, strict=True)},
-            "file": ("view", [frame.file for frame in data.frames]),
-        },
-        attrs={"title": data.name, "units": "1"},
-    )
-
-
-def volume_to_xarray(volume: Volume) -> Any:
-    """See `Volume.to_xarray`."""
-    xarray = package("xarray", "to_xarray")
-    places = zip("xyz", volume.centers(), strict=True)
-    coords = {axis: (axis, values, {"units": "mm"}) for axis, values in places}
-    attrs = {"units": "1/mm"}
-    return xarray.DataArray(volume.data, coords, tuple("zyx"), "attenuation", attrs)
-
-
-KEYS: Final = {"di": DARK, "io": FLAT}
-"""Image keys of what the scanner calls so."""
-
-
-def save_nxtomo(data: DataSet, file: File) -> None:
-    """See `DataSet.to_nxtomo`."""
-    h5py = package("h5py", "to_nxtomo")
-    if any(frame.shape != data.shape for frame in data.frames):
-        raise DatasetFormatError(
-            f"{data.where}: projections of several shapes; NXtomo has one", {"path": data.where}
-        )
-    with whole_file(Path(file)) as part, h5py.File(part, "w") as out:
-        _write(data, out)
-
-
-def _write(data: DataSet, out: Any) -> None:
-    geometry = data.geometry
-    before = references(data)
-    count = len(before) + len(data)
-    angles = data.angles_deg
-    out.attrs.update(NX_class="NXroot", default="entry")
-    entry = _group(out, "entry", "NXentry")
-    entry.attrs["default"] = "data"
-    entry["definition"] = "NXtomo"
-    entry["title"] = data.name
-    if data.document is not None:
-        entry["start_time"] = data.document.started.isoformat()
-
-    instrument = _group(entry, "instrument", "NXinstrument")
-    source = _group(instrument, "source", "NXsource")
-    source["type"], source["probe"] = "Fixed Tube X-ray", "x-ray"
-    detector = _group(instrument, "detector", "NXdetector")
-    images = detector.create_dataset("data", (count, *data.shape), "u2")
-    keys = [*(KEYS[name[:2]] for name, _ in before), *[PROJECTION] * len(data)]
-    detector["image_key"] = np.array(keys, dtype=np.int32)
-    for i, (_, image) in enumerate(before):
-        images[i] = image
-    for i in range(len(data)):
-        images[len(before) + i] = data.counts(i)
-    to_source = float(np.linalg.norm(geometry.source[0]))
-    axis_column, axis_row = geometry.project_points(np.zeros((1, 3)), data.shape)[0, 0]
-    lengths = {
-        "x_pixel_size": float(np.linalg.norm(geometry.u[0])),
-        "y_pixel_size": float(np.linalg.norm(geometry.v[0])),
-        "distance": abs(float(geometry.source_detector_distance[0])) - to_source,
-    }
-    for name, value in lengths.items():
-        _measured(detector, name, value, "mm")
-    _measured(source, "distance", -to_source, "mm")
-    _measured(detector, "x_rotation_axis_pixel_position", axis_column, "px")
-    _measured(detector, "y_rotation_axis_pixel_position", axis_row, "px")
-
-    sample = _group(entry, "sample", "NXsample")
-    sample["name"] = data.name if data.document is None else data.document.sample.name or data.name
-    turned = np.concatenate([np.full(len(before), angles[0]), angles])
-    _measured(sample, "rotation_angle", turned, "deg")
-
-    shown = _group(entry, "data", "NXdata")
-    shown.attrs["signal"] = "data"
-    shown["data"] = images
-    shown["image_key"] = detector["image_key"]
-    shown["rotation_angle"] = sample["rotation_angle"]
-
-    own = _group(entry, "flexdt", "NXcollection")
-    _measured(own, "cone_vec", geometry.rows, "mm")
-
-
-def _group(parent: Any, name: str, kind: str) -> Any:
-    group = parent.create_group(name)
-    group.attrs["NX_class"] = kind
-    return group
-
-
-def _measured(group: Any, name: str, value: Any, unit: str) -> None:
-    group[name] = np.asarray(value, dtype=np.float64)
-    group[name].attrs["units"] = unit

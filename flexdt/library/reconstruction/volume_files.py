@@ -20,8 +20,8 @@ from typing import IO, TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.clients.datasets.pictures import png
-from flexdt.clients.extras import extension, package
+from flexdt.library.datasets.pictures import png
+from flexdt.library.extras import extension, package
 from flexdt.twin.errors import LimitError
 from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.signatures import File

@@ -11,19 +11,14 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from flexdt.clients.calibration.align_dataset import Aligned, align_dataset
-from flexdt.clients.calibration.calibrate import Outcome, calibrate_datasets
-from flexdt.clients.calibration.markers import Scale, markers_alone
-from flexdt.clients.datasets.data_set import DataSet
-from flexdt.clients.datasets.dataset import load_dataset, read_tiffs
-from flexdt.clients.datasets.exchange import with_geometry
-from flexdt.clients.reconstruction.reconstruct import VolumeRequest, reconstruct_volume
+from flexdt.library.calibration.align_dataset import Aligned
+from flexdt.library.calibration.calibrate import Outcome, calibrate_datasets, calibration_request
+from flexdt.library.data_set import DataSet
+from flexdt.library.datasets.exchange import with_geometry
+from flexdt.library.reading.folders import load_dataset, read_tiffs
+from flexdt.library.reading.listed_images import markers_alone
 from flexdt.phantoms import Phantom
-from flexdt.twin.calibration.fit.problem import SIX
-from flexdt.twin.calibration.pipeline import CalibrationRequest
-from flexdt.twin.calibration.unknown_markers import UNKNOWN
 from flexdt.twin.errors import TwinError
-from flexdt.twin.exchange.geometry import ScanGeometry
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.physics.tube import Tube
@@ -46,7 +41,7 @@ def calibrate(
     scale: str | None = None,
     radius: float | None = None,
     per_frame: Sequence[str] = (),
-) -> Outcome:
+) -> Outcome[DataSet]:
     """Estimate the geometry of scans of a bead phantom, or of markers of unknown positions.
 
     Args:
@@ -93,14 +88,10 @@ def calibrate(
     else:
         several = [data] if isinstance(data, DataSet | str | PathLike) else list(data)
         sets = [_opened(d) if geometry is None else _posed(d, geometry) for d in several]
-    chosen = (("dO_x",) if phantom == UNKNOWN else SIX) if free is None else tuple(free)
-    begin = Offsets.from_edge(start or {})
-    moving = tuple(per_frame)
-    request = CalibrationRequest(free=chosen, priors=priors or {}, start=begin, per_frame=moving)
+    request = calibration_request(phantom, free, priors, start, per_frame)
     return calibrate_datasets(
-        sets, phantom, request, markers=markers, radius_px=radius,
-        scale=None if scale is None else Scale.of(scale),
-    )  # fmt: skip
+        sets, phantom, request, markers=markers, scale=scale, radius_px=radius
+    )
 
 
 @public
@@ -159,21 +150,27 @@ def reconstruct(
         >>> import flexdt as fx
         >>> volume = fx.reconstruct("my-scans/lego", "fdk", voxel=0.2)  # doctest: +SKIP
     """
-    names = [scatter_correction] if isinstance(scatter_correction, str) else scatter_correction
-    request = VolumeRequest(
-        algorithm=algorithm, voxel_mm=voxel, shape=shape, binning=binning, every=every,
-        iterations=iterations, window=window, center_mm=center, weight=weight, tube=tube,
-        material=material if material is None or isinstance(material, str) else tuple(material),
-        scatter_correction=None if names is None else tuple(names),
-    )  # fmt: skip
-    tell = None if progress is None else lambda done, whole: progress(done / whole)
-    return reconstruct_volume(
-        _opened(data), request, parameters=parameters, progress=tell, errors=errors
+    return _opened(data).reconstruct(
+        algorithm,
+        voxel=voxel,
+        shape=shape,
+        center=center,
+        binning=binning,
+        every=every,
+        iterations=iterations,
+        weight=weight,
+        window=window,
+        material=material,
+        scatter_correction=scatter_correction,
+        tube=tube,
+        parameters=parameters,
+        progress=progress,
+        errors=errors,
     )
 
 
 @public
-def align(data: Data, *, per_frame: bool = False) -> Aligned:
+def align(data: Data, *, per_frame: bool = False) -> Aligned[DataSet]:
     """Find axis and source plane of an ordinary scan without a phantom.
 
     Args:
@@ -195,13 +192,13 @@ def align(data: Data, *, per_frame: bool = False) -> Aligned:
         >>> found = fx.align(data)  # doctest: +SKIP
         >>> volume = data.with_correction(found.correction).reconstruct("fdk")  # doctest: +SKIP
     """
-    return align_dataset(_opened(data), per_frame)
+    return _opened(data).align(per_frame=per_frame)
 
 
 def _posed(data: Data, geometry: ConeVec) -> DataSet:
     """A data set with another nominal geometry, or a folder of anybody's images with theirs."""
     if isinstance(data, DataSet):
-        return with_geometry(data, ScanGeometry(geometry, geometry.detector_shape))
+        return with_geometry(data, geometry)
     return read_tiffs(data, geometry)
 
 

@@ -6,4 +6,5 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 
 during: Callable[[str], AbstractContextManager[object]] = nullcontext
-"""Called with what is done, and entered while it is; `flexdt.progress_lines` puts its own here."""
+"""Context manager that reports the work named by its argument; `flexdt.runtime.progress_lines`
+replaces it."""

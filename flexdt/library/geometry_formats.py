@@ -1,6 +1,6 @@
 """Geometry from and to files and other programs' objects: what the methods of `ConeVec` call.
 
-The formats are in `flexdt.twin.exchange`, their files in `flexdt.clients.datasets.exchange`.
+The formats are in `flexdt.twin.exchange`, their files in `flexdt.library.datasets.exchange`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from flexdt.clients.datasets.exchange import (
+from flexdt.library.datasets.exchange import (
     ENDINGS,
     FORMATS,
     Given,

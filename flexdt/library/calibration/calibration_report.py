@@ -1,20 +1,11 @@
-"""Reports of a calibration: HTML pages, tracks of the beads, and `flexdt compare`.
-
-`flexdt compare`: do virtual projections match the radiographs of a data set? (thesis 4.10) The twin
-is posed from the data set's texts and projects the phantom. The projections are compared with the
-radiographs before and after the correction that calibration finds, as residuals of the beads in
-pixels and as difference images. A correction that is not identifiable is an error.
-"""
+"""Reports of a calibration: an HTML page, and the tracks of its beads."""
 
 from __future__ import annotations
 
 import html
 import json
 import math
-import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,18 +13,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import fdtri
 
-from flexdt.clients.calibration.calibrate import Outcome, calibrate_datasets, digits
-from flexdt.clients.datasets.data_set import DataSet
-from flexdt.clients.datasets.dataset import load_dataset
-from flexdt.clients.figures import Series, arrows, ellipse_plot, image_under, page, plot, table
-from flexdt.clients.whole_files import write_whole
-from flexdt.phantoms import Phantom
-from flexdt.phantoms.channels import line_integrals
+from flexdt.library.calibration.calibrate import Outcome, digits
+from flexdt.library.datasets.image_set import ImageSet
+from flexdt.library.figures import Series, arrows, ellipse_plot, image_under, page, plot, table
+from flexdt.runtime.files.whole_files import write_whole
 from flexdt.twin.calibration.fit.certificate import Certificate
-from flexdt.twin.calibration.fit.fit import FitResult, require_identifiable
+from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.problem import from_printed_reading, values_in
-from flexdt.twin.errors import TwinError
-from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 
 HEAD = ("parameter", "value", "sigma", "of it from the images", "prior", "95 % from", "to", "unit")
@@ -44,7 +31,7 @@ MAP_FRAMES = 180
 second, third... is drawn."""
 
 
-def write_report(outcome: Outcome, path: Path) -> None:
+def write_report(outcome: Outcome[ImageSet], path: Path) -> None:
     """Write the report as HTML, or the document as JSON if the name ends in .json."""
     if path.suffix.lower() == ".json":
         text = json.dumps(outcome.document, indent=1) + "\n"
@@ -53,7 +40,7 @@ def write_report(outcome: Outcome, path: Path) -> None:
     write_whole(path, text)
 
 
-def report(outcome: Outcome) -> str:
+def report(outcome: Outcome[ImageSet]) -> str:
     """The whole page."""
     document: Any = outcome.document
     result, names = outcome.calibration, ", ".join(d.name for d in outcome.datasets)
@@ -148,7 +135,7 @@ def _ellipses(c: Certificate) -> list[str]:
     return out
 
 
-def _pictures(outcome: Outcome, fit: FitResult) -> list[str]:
+def _pictures(outcome: Outcome[ImageSet], fit: FitResult) -> list[str]:
     c = fit.certificate
     beads = range(c.used.shape[1])
     frames = np.arange(len(c.used))
@@ -204,7 +191,9 @@ def _pictures(outcome: Outcome, fit: FitResult) -> list[str]:
     return [*body, "<h3>By bead</h3>", table_of_beads]
 
 
-def _maps(outcome: Outcome, fit: FitResult, residuals: npt.NDArray[np.float64]) -> list[str]:
+def _maps(
+    outcome: Outcome[ImageSet], fit: FitResult, residuals: npt.NDArray[np.float64]
+) -> list[str]:
     """Residuals over the detector, one map a scan, enlarged so that a typical one can be seen."""
     places = fit.problem.pixels
     rms = fit.certificate.rms_px
@@ -240,7 +229,7 @@ def predictions(fit: FitResult, geometry: Sequence[Offsets]) -> FloatArray:
     return problem.residuals(x, np.ones_like(problem.seen))[0]
 
 
-def tracks_document(outcome: Outcome) -> dict[str, object]:
+def tracks_document(outcome: Outcome[ImageSet]) -> dict[str, object]:
     """Measured and predicted bead positions of every frame, (column, row) in pixels.
 
     `before` is the correction in force during the scan, or the nominal geometry; `after` the
@@ -279,7 +268,7 @@ def tracks_document(outcome: Outcome) -> dict[str, object]:
     return document
 
 
-def write_tracks(outcome: Outcome, path: Path) -> None:
+def write_tracks(outcome: Outcome[ImageSet], path: Path) -> None:
     """Write `tracks_document` as JSON, under its final name only when it is whole."""
     write_whole(path, json.dumps(tracks_document(outcome)) + "\n")
 
@@ -296,159 +285,6 @@ def _seen_rms(residual: FloatArray) -> float | None:
     return _rms(residual) if np.isfinite(residual).any() else None
 
 
-TOLERANCE_PX: Final = 0.5
-"""Default of the largest allowed rms residual of the beads after correction."""
-SHOWN: Final = 4
-"""Frames of which difference images are made."""
-
-
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """A data set beside the twin.
-
-    Attributes:
-        document: the JSON of `flexdt compare`.
-        outcome: the calibration behind it.
-        frames: indices of the frames shown.
-        seen: (m, rows, cols) their line integrals.
-        before, after: (m, rows, cols) seen minus virtual, nominal and corrected.
-        residuals: (n, k, 2) measured minus virtual bead positions [px], nominal and corrected.
-    """
-
-    document: dict[str, Any]
-    outcome: Outcome
-    frames: tuple[int, ...]
-    seen: Float32Array
-    before: Float32Array
-    after: Float32Array
-    residuals: tuple[FloatArray, FloatArray]
-
-    @property
-    def within(self) -> bool:
-        """The residual after correction is within the tolerance."""
-        return bool(self.document["within"])
-
-
-def compare_folder(
-    folder: str | PathLike[str],
-    phantom: str | Phantom,
-    tolerance_px: float = TOLERANCE_PX,
-    *,
-    shown: int = SHOWN,
-) -> Comparison:
-    """Compare a data set with the twin.
-
-    Args:
-        folder: the data set; TIFFs and the two settings texts are enough.
-        phantom: what was scanned, by value, name or file.
-        tolerance_px: largest allowed rms residual of the beads after correction, per coordinate.
-        shown: frames of which difference images are made.
-
-    Raises:
-        DatasetError: no data set.
-        NotIdentifiableError: the data do not determine a correction.
-        TwinError: they contradict the phantom or the angles; says what was found.
-    """
-    begun = time.perf_counter()
-    dataset = load_dataset(folder)
-    outcome = calibrate_datasets([dataset], phantom)
-    result = outcome.calibration
-    if result.errors or result.fit is None:
-        texts = "; ".join(f.text for f in result.errors)
-        raise TwinError(f"{folder}: {texts}", {"problems": outcome.document["problems"]})
-    require_identifiable(result.fit)
-    corrected = result.fit.parameters
-    before, after = (bead_residuals(outcome, p) for p in (NOMINAL, corrected))
-    present = dataset.present
-    chosen = tuple(present[i] for i in np.linspace(0, len(present) - 1, shown).round().astype(int))
-    seen = dataset.stack(chosen)
-    first = seen - virtual(outcome.phantom, dataset, chosen, NOMINAL)
-    second = seen - virtual(outcome.phantom, dataset, chosen, corrected)
-    rms = _rms(after)
-    document: dict[str, Any] = {
-        "within": bool(rms <= tolerance_px),
-        "tolerance_px": tolerance_px,
-        "before": _figures(before, first),
-        "after": _figures(after, second),
-        "frames": len(dataset),
-        "shown": list(chosen),
-        "correction": corrected.to_edge(),
-        "calibration": outcome.document,
-        "seconds": round(time.perf_counter() - begun, 3),
-    }
-    in_force = dataset.correction
-    if in_force is not None:
-        third = bead_residuals(outcome, in_force.parameters)
-        document["in_force"] = {"name": in_force.name, **_figures(third, None)}
-    return Comparison(document, outcome, chosen, seen, first, second, (before, after))
-
-
-def bead_residuals(outcome: Outcome, parameters: Offsets) -> FloatArray:
-    """Measured minus virtual bead positions of the first data set, (n, k, 2) [px], nan unseen."""
-    fit = outcome.calibration.fit
-    assert fit is not None
-    return fit.problem.pixels - predictions(fit, [parameters] * len(fit.problem.base))
-
-
-def virtual(
-    phantom: Phantom, dataset: DataSet, frames: tuple[int, ...], parameters: Offsets
-) -> Float32Array:
-    """The twin's line integrals of some frames, (m, rows, cols)."""
-    cone = dataset.poses[np.array(frames)].cone_vec(parameters)
-    return line_integrals(phantom, cone, dataset.shape)
-
-
 def _rms(residual: FloatArray) -> float:
     """Per coordinate [px]."""
     return float(np.sqrt(np.nanmean(residual**2)))
-
-
-def _figures(residual: FloatArray, images: Float32Array | None) -> dict[str, float | None]:
-    length = np.linalg.norm(residual, axis=2)
-    return {
-        "rms_px": _rms(residual),
-        "max_px": float(np.nanmax(length)),
-        "image_rms": None if images is None else float(np.sqrt(np.mean(images.astype("f8") ** 2))),
-    }
-
-
-def write_comparison(comparison: Comparison, out: Path) -> None:
-    """Write report.html, compare.json and the difference images (float32 TIFF) into a folder."""
-    import tifffile
-
-    out.mkdir(parents=True, exist_ok=True)
-    for k, frame in enumerate(comparison.frames):
-        for name, stack in (("before", comparison.before), ("after", comparison.after)):
-            tifffile.imwrite(out / f"difference_{frame:06d}_{name}.tif", stack[k])
-    document = comparison.document
-    (out / "compare.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    rows = [
-        [name, *(document[name][k] for k in ("rms_px", "max_px", "image_rms"))]
-        for name in ("before", "after", "in_force")
-        if name in document
-    ]
-    before, after = (
-        np.sqrt(np.nanmean(residual**2, axis=(1, 2))) for residual in comparison.residuals
-    )
-    frames = np.arange(len(before))
-    body = [
-        f"<h1>{comparison.outcome.datasets[0].name} beside the twin</h1>",
-        f"<p>Tolerance {document['tolerance_px']} px: "
-        f"<span class='{'good' if comparison.within else 'bad'}'>"
-        f"{'within' if comparison.within else 'exceeded'}</span> after correction.</p>",
-        table(["", "rms (px)", "worst bead (px)", "rms of the difference image"], rows),
-        plot(
-            [Series("before", frames, before), Series("after", frames, after)],
-            title="Residual of the beads by frame", x_label="frame", y_label="rms (px)",
-        ),
-    ]  # fmt: skip
-    shown = {
-        "radiograph": comparison.seen,
-        "difference before": comparison.before,
-        "difference after": comparison.after,
-    }
-    for k, frame in enumerate(comparison.frames):
-        for name, stack in shown.items():
-            picture = image_under(stack[k], [], title=f"{name}, frame {frame}", width=300)
-            body.append(f"<figure>{picture}</figure>")
-    (out / "report.html").write_text(page("flexdt compare", body), encoding="utf-8")

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from flexdt import long_work
+from flexdt.twin import long_work
 
 SILENT_S = 2.0
 _last = [0.0, 0.0]

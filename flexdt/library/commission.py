@@ -19,11 +19,10 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from flexdt import machines
-from flexdt.clients import figures
-from flexdt.clients.calibration.align_dataset import align_dataset
-from flexdt.clients.datasets.dataset import load_dataset, read_settings
-from flexdt.clients.failure import CommandError
+from flexdt.library import figures, machines
+from flexdt.library.calibration.align_dataset import align_dataset
+from flexdt.library.failure import CommandError
+from flexdt.library.reading.folders import load_dataset, read_settings
 from flexdt.runtime.files.dataset_folder import list_folder, read_image, read_text
 from flexdt.twin import commissioning as tells
 from flexdt.twin.commissioning import PastScan, Question

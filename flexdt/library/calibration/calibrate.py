@@ -2,10 +2,6 @@
 
 The functions return plain values in the JSON shapes of docs/calibration.md, and the full outcome.
 
-Rows of a data set whose pixels are not square are taken anew, so that its pixels are square. Spots
-of balls are then nearly round, as detection and the second look expect. Columns stay what they are,
-and with them the column of the rotation axis.
-
 A verdict says what a calibration may be used for, in a sentence; next come the commands that would
 tell more.
 """
@@ -15,21 +11,18 @@ from __future__ import annotations
 import math
 import shlex
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
-from functools import cached_property
 from itertools import groupby
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Final, Generic
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
-from flexdt import long_work
-from flexdt.clients.calibration.markers import (
+from flexdt.library.calibration.dataset_frames import DatasetFrames
+from flexdt.library.calibration.markers import (
     Mark,
     Scale,
     calibrate_known,
@@ -37,168 +30,27 @@ from flexdt.clients.calibration.markers import (
     read_markers,
     seen_alone,
 )
-from flexdt.clients.datasets.data_set import Counts, DataSet
+from flexdt.library.calibration.square_pixels import squared
+from flexdt.library.datasets.image_set import Images, Images_co, ImageSet
 from flexdt.phantoms import Phantom, load_phantom
 from flexdt.phantoms.files.phantom_files import read_phantom_file
+from flexdt.twin import long_work
 from flexdt.twin.calibration.detect.detection import SpotFinder
-from flexdt.twin.calibration.detect.windows import Windows, overlap
 from flexdt.twin.calibration.diagnose import Finding, Severity
 from flexdt.twin.calibration.fit.certificate import Estimate
 from flexdt.twin.calibration.fit.fit import image_quantities
 from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.fit.problem import SIX, from_printed_reading
-from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, look_at, nothing
 from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate
 from flexdt.twin.calibration.unknown_markers import UNKNOWN
-from flexdt.twin.dataset.dataset_errors import DatasetError
-from flexdt.twin.dataset.normalise import MIN_COUNTS
 from flexdt.twin.errors import TwinError, UnknownNameError
-from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import NAMES, Offsets
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.scanner.state import NamedCorrection
 
-UNEQUAL = 1e-3
-"""Relative difference of the pixel's sides from which rows are taken anew."""
-
-
-def squared(data: DataSet) -> DataSet:
-    """`data`, or where its pixels are not square the same with rows as far apart as its columns."""
-    poses = data.poses
-    ratio = float(np.median(np.linalg.norm(poses.v, axis=1) / np.linalg.norm(poses.u, axis=1)))
-    if abs(ratio - 1.0) < UNEQUAL:
-        return data
-    rows, cols = data.shape
-    shape = max(1, int(rows * ratio)), cols
-    table = np.array(data.cone_vec.rows)
-    table[:, 9:] /= ratio
-    said = (
-        f"the pixels are {np.linalg.norm(poses.u[0]):.4g} x {np.linalg.norm(poses.v[0]):.4g} mm; "
-        f"calibration takes their {rows} rows as {shape[0]} of the columns' pitch"
-    )
-    own: dict[str, Any] = {f.name: getattr(data, f.name) for f in fields(data)}
-    own |= {
-        "shape": shape,
-        "cone_vec": ConeVec(table).with_shape(shape),
-        "nominal": replace(poses, v=poses.v / ratio),
-        "warnings": (*data.warnings, said),
-    }
-    return _Square(**own, original=data, ratio=ratio)
-
-
-@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class _Square(DataSet):
-    """The images of `original` with rows `ratio` times as close."""
-
-    original: DataSet
-    ratio: float
-
-    def counts(self, index: int | None = None) -> Counts:
-        if index is None:
-            return super().counts()
-        return np.rint(self._taken(self.original.counts(index))).clip(0, 65535).astype(np.uint16)
-
-    @cached_property
-    def dark(self) -> Float32Array:
-        return self._taken(self.original.dark)
-
-    @cached_property
-    def flat(self) -> Float32Array:
-        return self._taken(self.original.flat)
-
-    def _taken(self, image: Counts | Float32Array) -> Float32Array:
-        """Means over the new rows, in the middle of the old ones, of a spline with their sums."""
-        rows, cols = image.shape
-        total = np.concatenate([np.zeros((1, cols)), np.cumsum(image, axis=0, dtype=np.float64)])
-        edges = (np.arange(self.shape[0] + 1) - self.shape[0] / 2) / self.ratio + rows / 2
-        up_to = CubicSpline(np.arange(rows + 1), total)(edges.clip(0, rows))
-        return np.asarray(np.diff(up_to, axis=0) * self.ratio, dtype=np.float32)
-
-
-# A data set's images as calibration needs them: detected and cut into windows by a few threads.
-#
-# Counts stay in memory while they fit the budget, so that the second measurement does not read the
-# files again.
-
-THREADS: Final = 2
-KEEP_BYTES: Final = 1 << 30
-"""Counts kept in memory at most."""
-_T = TypeVar("_T")
-
-
-class DatasetFrames:
-    """The projections of a data set; see `flexdt.twin.calibration.frame_source.Frames`."""
-
-    def __init__(self, dataset: DataSet) -> None:
-        self._dataset = dataset
-        rows, cols = dataset.shape
-        self._keep = 2 * rows * cols * len(dataset) <= KEEP_BYTES
-        self._kept: dict[int, Counts] = {}
-        self._unreadable: dict[int, str] = {}
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(rows, cols)."""
-        return self._dataset.shape
-
-    def __len__(self) -> int:
-        return len(self._dataset)
-
-    def look(self, detector: SpotFinder) -> list[FrameSpots]:
-        """Detect the beads of every frame."""
-        normalise = self._dataset.normalisation
-
-        def one(index: int) -> FrameSpots:
-            counts = self._counts(index)
-            if counts is None:
-                why = self._unreadable.get(index, "")
-                return FrameSpots(nothing(self.shape), FrameState.MISSING, why)
-            return look_at(normalise(counts), detector)
-
-        return self._each(one)
-
-    def windows(self, plan: Windows) -> Float32Array:
-        """Cut the windows of every frame; only their pixels are normalised."""
-        normalise = self._dataset.normalisation
-        log_open = np.where(normalise.dead, np.float32(np.nan), normalise.log_open)
-        n, k = plan.corner.shape[:2]
-        out = np.full((n, k, plan.side, plan.side), np.nan, dtype=np.float32)
-
-        def one(index: int) -> None:
-            counts = self._counts(index)
-            if counts is None:
-                return
-            for bead in range(k):
-                inside, there = overlap(plan, index, bead)
-                signal = np.maximum(counts[there] - normalise.dark[there], np.float32(MIN_COUNTS))
-                out[index, bead][inside] = log_open[there] - np.log(signal)
-
-        self._each(one)
-        return out
-
-    def _counts(self, index: int) -> Counts | None:
-        """Counts of one frame, None if its file is missing or unreadable."""
-        if index in self._kept:
-            return self._kept[index]
-        if not self._dataset.frames[index].present:
-            return None
-        try:
-            counts = self._dataset.counts(index)
-        except DatasetError as error:
-            self._unreadable[index] = error.message
-            return None
-        if self._keep:
-            self._kept[index] = counts
-        return counts
-
-    def _each(self, work: Callable[[int], _T]) -> list[_T]:
-        with ThreadPoolExecutor(THREADS) as pool:
-            return list(pool.map(work, range(len(self))))
-
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Outcome:
+class Outcome(Generic[Images_co]):
     """A calibration of data sets.
 
     Attributes:
@@ -210,7 +62,7 @@ class Outcome:
 
     calibration: Calibration
     document: dict[str, object]
-    datasets: tuple[DataSet, ...]
+    datasets: tuple[Images_co, ...]
     phantom: Phantom
 
     def __repr__(self) -> str:
@@ -231,7 +83,7 @@ class Outcome:
         return found
 
     @property
-    def parts(self) -> Iterator[tuple[DataSet, slice]]:
+    def parts(self) -> Iterator[tuple[Images_co, slice]]:
         """Each data set, with where its frames stand among those of all."""
         first = 0
         for dataset in self.datasets:
@@ -264,15 +116,32 @@ class Outcome:
         )
 
 
+def calibration_request(
+    phantom: str | Phantom,
+    free: Sequence[str] | None,
+    priors: Mapping[str, float] | None,
+    start: Mapping[str, float] | None,
+    per_frame: Sequence[str],
+) -> CalibrationRequest:
+    """Fill in the defaults of what a user asks of a calibration; see `flexdt.calibrate`."""
+    default = ("dO_x",) if phantom == UNKNOWN else SIX
+    return CalibrationRequest(
+        free=default if free is None else tuple(free),
+        priors=priors or {},
+        start=Offsets.from_edge(start or {}),
+        per_frame=tuple(per_frame),
+    )
+
+
 def calibrate_datasets(
-    datasets: Sequence[DataSet],
+    datasets: Sequence[Images],
     phantom: str | Phantom,
     request: CalibrationRequest | None = None,
     *,
     markers: str | PathLike[str] | Sequence[Mark] | None = None,
-    scale: Scale | None = None,
+    scale: Scale | str | None = None,
     radius_px: float | None = None,
-) -> Outcome:
+) -> Outcome[Images]:
     """Calibrate from data sets; TIFFs and the two settings texts are enough for one.
 
     Args:
@@ -282,7 +151,7 @@ def calibrate_datasets(
         request: what to estimate; None is the thesis's six parameters, or dO_x for unknown markers.
         markers: where they are seen in one data set, or the file that says it (see
             `read_markers`); None: they are detected in the images.
-        scale: a known distance of two unknown markers.
+        scale: a known distance of two unknown markers, or its text (see `Scale.of`).
         radius_px: of their spots; None: any from 1.5 px up.
 
     Raises:
@@ -290,6 +159,8 @@ def calibrate_datasets(
             markers does not hold.
     """
     start = time.perf_counter()
+    if isinstance(scale, str):
+        scale = Scale.of(scale)
     if not datasets:
         raise TwinError("no data sets; allowed: one or more", {"asked": 0, "allowed": 1})
     unknown = phantom == UNKNOWN
@@ -348,7 +219,7 @@ def calibrate_datasets(
     return Outcome(result, document, tuple(datasets), target)
 
 
-def saturation(dataset: DataSet) -> Finding | None:
+def saturation(dataset: ImageSet) -> Finding | None:
     """A finding if the open beam fills the detector: what is thin then looks like nothing.
 
     Calibration survives it (beads are dark), but the body that is subtracted is not what was seen.
@@ -462,7 +333,7 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
     return document
 
 
-def inside_95(outcome: Outcome, truth: Mapping[str, float]) -> bool:
+def inside_95(outcome: Outcome[ImageSet], truth: Mapping[str, float]) -> bool:
     """Whether a truth (edge units) lies in the joint 95 % ellipsoid of the estimated parameters.
 
     Offsets the truth does not mention are at their nominal value; alpha is compared modulo a

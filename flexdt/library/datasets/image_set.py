@@ -1,18 +1,17 @@
-"""A data set as a value: frames read on demand or held in memory, line integrals, geometry.
+"""The images of a scan as a value: frames read on demand or held in memory, with their geometry.
 
-`flexdt.clients.datasets.dataset` reads one from a folder, `from_arrays` makes one of arrays. What
-is done with it (calibration, reconstruction, files of other kinds, figures) is in other modules,
-which are loaded when a method asks for them.
+`ImageSet` is what calibration, alignment, reconstruction and the writers of files take. Users meet
+it as `DataSet` (`flexdt.library.data_set`), which adds a method for each of these.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import index as whole
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, overload
+from typing import Any, Final, Protocol, Self, TypeVar, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -30,36 +29,42 @@ from flexdt.twin.geometry.panel import Panel
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.scanner.state import NamedCorrection
-from flexdt.twin.signatures import File, lazy_backend, public
-
-if TYPE_CHECKING:
-    from flexdt.clients.calibration.align_dataset import Aligned
-    from flexdt.clients.calibration.calibrate import Outcome
-    from flexdt.phantoms import Phantom
-    from flexdt.twin.physics.tube import Tube
-    from flexdt.twin.projection import Volume
+from flexdt.twin.signatures import public
 
 Counts = npt.NDArray[np.uint16]
 OPEN_COUNTS: Final = 60_000.0
+Images = TypeVar("Images", bound="ImageSet")
+"""An image set of the kind that was given, such as a `DataSet`."""
+Images_co = TypeVar("Images_co", bound="ImageSet", covariant=True)
+"""The same in results."""
+
+
+class CountsReader(Protocol):
+    """Images that are made when they are read: an array of (n, rows, cols) as far as indexing."""
+
+    @overload
+    def __getitem__(self, index: int) -> Counts: ...
+    @overload
+    def __getitem__(self, index: npt.NDArray[np.int64]) -> CountsReader: ...
 
 
 @dataclass(frozen=True, eq=False)
 class Arrays:
-    """Images in memory.
+    """Images in memory, or made on demand.
 
     Attributes:
         counts: uint16 (n, rows, cols); None where they are files.
         darks, flats: (k, rows, cols), or None where there are none.
     """
 
-    counts: Counts | None
+    counts: Counts | CountsReader | None
     darks: npt.NDArray[Any] | None = None
     flats: npt.NDArray[Any] | None = None
 
 
 @public
 @dataclass(frozen=True, eq=False, repr=False)
-class DataSet:
+class ImageSet:
     """The projections of a scan with dark and flat images and geometry.
 
     Iteration and `data[i]` give line integrals, one projection after the other; `data[2:10]` is the
@@ -86,6 +91,7 @@ class DataSet:
         truth: of a simulated data set, what lies behind it.
 
     Example:
+        >>> import numpy as np
         >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
         >>> data = DataSet.from_arrays(np.full((3, 4, 5), 500), scan, flat=np.full((4, 5), 1000))
         >>> data
@@ -126,7 +132,7 @@ class DataSet:
         name: str = "arrays",
         warnings: Sequence[str] = (),
         truth: Any = None,
-    ) -> DataSet:
+    ) -> Self:
         """A data set in memory.
 
         Args:
@@ -145,6 +151,7 @@ class DataSet:
             DatasetFormatError: shapes that do not fit, or values that are no counts.
 
         Example:
+            >>> import numpy as np
             >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
             >>> DataSet.from_arrays(np.full((3, 4, 5), 500), scan, name="mine")
             <DataSet 'mine': 3 projections of 4 x 5, complete, 1 warning>
@@ -193,10 +200,10 @@ class DataSet:
     @overload
     def __getitem__(self, index: int) -> Float32Array: ...
     @overload
-    def __getitem__(self, index: slice | Sequence[int] | npt.NDArray[Any]) -> DataSet: ...
+    def __getitem__(self, index: slice | Sequence[int] | npt.NDArray[Any]) -> Self: ...
     def __getitem__(
         self, index: int | slice | Sequence[int] | npt.NDArray[Any]
-    ) -> Float32Array | DataSet:
+    ) -> Float32Array | Self:
         """Line integrals of one projection, or the data set of several."""
         if not isinstance(index, slice) and np.ndim(index) == 0:
             return self.line_integrals(whole(index))  # type: ignore[arg-type]
@@ -262,6 +269,7 @@ class DataSet:
             parameters: offsets to add; default: the correction in force, or none.
 
         Example:
+            >>> import numpy as np
             >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
             >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
             >>> data = DataSet.from_arrays(counts, scan, flat=flat)
@@ -274,11 +282,12 @@ class DataSet:
             parameters = NOMINAL if self.correction is None else self.correction.parameters
         return self.poses.cone_vec(parameters)
 
-    def with_correction(self, correction: NamedCorrection | Offsets | None) -> DataSet:
+    def with_correction(self, correction: NamedCorrection | Offsets | None) -> Self:
         """The same data set with another correction in force, such as `calibrate(...).correction`;
         None for the nominal geometry.
 
         Example:
+            >>> import numpy as np
             >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
             >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
             >>> data = DataSet.from_arrays(counts, scan, flat=flat)
@@ -294,13 +303,14 @@ class DataSet:
         """The panel's distortion and lag that the correction in force undoes in line integrals."""
         return None if self.correction is None else self.correction.panel
 
-    def with_motion(self, motion: Motion) -> DataSet:
+    def with_motion(self, motion: Motion) -> Self:
         """The same data set with a motion of scanner or sample in its geometry.
 
         Raises:
             TwinError: the motion has another number of frames.
 
         Example:
+            >>> import numpy as np
             >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
             >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
             >>> data = DataSet.from_arrays(counts, scan, flat=flat)
@@ -325,6 +335,7 @@ class DataSet:
             DatasetFormatError: it is not an image of this data set.
 
         Example:
+            >>> import numpy as np
             >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
             >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
             >>> data = DataSet.from_arrays(counts, scan, flat=flat)
@@ -390,6 +401,7 @@ class DataSet:
             DatasetError: as `counts` and `flat`.
 
         Example:
+            >>> import numpy as np
             >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
             >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
             >>> data = DataSet.from_arrays(counts, scan, flat=flat)
@@ -411,6 +423,7 @@ class DataSet:
         """Line integrals of several projections (default: all that are there), (n, rows, cols).
 
         Example:
+            >>> import numpy as np
             >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
             >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
             >>> data = DataSet.from_arrays(counts, scan, flat=flat)
@@ -423,13 +436,14 @@ class DataSet:
             out[k] = self.line_integrals(index)
         return out
 
-    def require_complete(self) -> DataSet:
+    def require_complete(self) -> Self:
         """This data set if it is complete.
 
         Raises:
             DatasetMissingError: says what is missing.
 
         Example:
+            >>> import numpy as np
             >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
             >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
             >>> data = DataSet.from_arrays(counts, scan, flat=flat)
@@ -442,158 +456,6 @@ class DataSet:
                 {"path": self.where, "missing": list(self.missing[:100])},
             )
         return self
-
-    def calibrate(
-        self,
-        phantom: str | Phantom,
-        *,
-        free: Sequence[str] | None = None,
-        priors: Mapping[str, float] | None = None,
-        start: Mapping[str, float] | None = None,
-        geometry: ConeVec | File | None = None,
-        markers: Any = None,
-        scale: str | None = None,
-        radius: float | None = None,
-        per_frame: Sequence[str] = (),
-    ) -> Outcome:
-        """Estimate the geometry from the beads of a phantom; see `flexdt.calibrate`.
-
-        `data.with_correction(data.calibrate("lego").correction)` is the corrected data set.
-        """
-        found: Outcome = lazy_backend("analysis").calibrate(
-            self, phantom, free=free, priors=priors, start=start, geometry=geometry,
-            markers=markers, scale=scale, radius=radius, per_frame=per_frame,
-        )  # fmt: skip
-        return found
-
-    def align(self, *, per_frame: bool = False) -> Aligned:
-        """Estimate the geometry without a phantom; see `flexdt.align`.
-
-        `data.with_correction(data.align().correction)` is the corrected data set.
-        """
-        found: Aligned = lazy_backend("analysis").align(self, per_frame=per_frame)
-        return found
-
-    def reconstruct(
-        self,
-        algorithm: str = "fdk",
-        *,
-        voxel: float | None = None,
-        shape: tuple[int, int, int] | None = None,
-        center: tuple[float, float, float] | None = None,
-        binning: int = 1,
-        every: int = 1,
-        iterations: int | None = None,
-        weight: float | None = None,
-        window: str = "ram-lak",
-        material: str | Sequence[str] | None = None,
-        scatter_correction: str | Sequence[str] | None = None,
-        tube: Tube | None = None,
-        parameters: Offsets | None = None,
-        progress: Callable[[float], None] | None = None,
-        errors: bool = True,
-    ) -> Volume:
-        """Reconstruct into a volume in memory; see `flexdt.reconstruct` for the options.
-
-        Example:
-            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
-            >>> counts, flat = np.full((3, 4, 5), 1000), np.full((4, 5), 1000)
-            >>> counts[:, 1:3, 2] = 500
-            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
-            >>> data.reconstruct("fdk", voxel=1.0)
-            <Volume: 2 x 3 x 3 voxels (z, y, x) of 1 mm about (0, 0, 0) mm>
-        """
-        found: Volume = lazy_backend("analysis").reconstruct(
-            self, algorithm, voxel=voxel, shape=shape, center=center, binning=binning, every=every,
-            iterations=iterations, weight=weight, window=window, material=material,
-            scatter_correction=scatter_correction, tube=tube, parameters=parameters,
-            progress=progress, errors=errors,
-        )  # fmt: skip
-        return found
-
-    def save(self, folder: File) -> None:
-        """Write a folder that `flexdt.open` reads: di000000.tif, io000000.tif, scan_000000.tif ...
-        (uint16) and the geometry.
-
-        geometry.json holds the geometry with the correction in force, warnings and the largest
-        count of the panel. A data set with flexdt.json
-        keeps that instead, as long as it has all of its projections; texts are copied. A data set
-        in memory gets the scanner's two texts, `scan settings.txt` and `data settings XRE.txt`,
-        where they can say its geometry: a circle in the plane z = 0 with equal steps and an upright
-        panel of square pixels. Dark and flat images in memory that are no whole numbers are
-        rounded.
-
-        Args:
-            folder: made if it is not there; it must be empty.
-
-        Raises:
-            DatasetExistsError: something is there.
-            OSError: it cannot be written.
-
-        Example:
-            >>> import tempfile
-            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
-            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
-            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
-            >>> with tempfile.TemporaryDirectory() as folder:
-            ...     data.save(folder)
-            ...     sorted(file.name for file in Path(folder).iterdir())[:3]
-            ['data settings XRE.txt', 'geometry.json', 'io000000.tif']
-        """
-        lazy_backend("clients.datasets.dataset").save_data_set(self, folder)
-
-    def to_nxtomo(self, file: File) -> None:
-        """Write NeXus's NXtomo (HDF5), which needs h5py (the extra `io`).
-
-        Raises:
-            TwinError: h5py is not installed.
-            OSError: the file cannot be written.
-
-        Example:
-            >>> import tempfile
-            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
-            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
-            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
-            >>> with tempfile.TemporaryDirectory() as folder:
-            ...     data.to_nxtomo(f"{folder}/scan.nx")
-            ...     Path(folder, "scan.nx").exists()
-            True
-        """
-        lazy_backend("clients.datasets.foreign_files").save_nxtomo(self, file)
-
-    def to_xarray(self) -> Any:
-        """Line integrals as an xarray DataArray (view, row, column), which needs xarray.
-
-        Raises:
-            TwinError: xarray is not installed.
-
-        Example:
-            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
-            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
-            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
-            >>> data.to_xarray().dims
-            ('view', 'row', 'column')
-        """
-        return lazy_backend("clients.datasets.foreign_files").to_xarray(self)
-
-    def plot(self, index: int = 0, axes: Any = None) -> Any:
-        """Show one projection's line integrals; needs matplotlib (the extra `plots`).
-
-        Args:
-            index: of the projection.
-            axes: matplotlib's axes to draw into; None makes a figure.
-
-        Returns:
-            The axes.
-
-        Example:
-            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
-            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
-            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
-            >>> data.plot(0).get_title()
-            'arrays: scan_000000.tif'
-        """
-        return lazy_backend("plots").plot_projection(self, index, axes)
 
 
 def _counts_of(integrals: npt.NDArray[Any]) -> tuple[Counts, float, list[str]]:
@@ -632,7 +494,7 @@ def _several(
     return values
 
 
-def references(data: DataSet) -> list[tuple[str, Counts]]:
+def references(data: ImageSet) -> list[tuple[str, Counts]]:
     """Dark and flat images with their names; means that are no whole numbers are rounded."""
     if data.arrays is None:
         return [(path.name, read_image(path)) for path in (*data.darks, *data.flats)]

@@ -6,14 +6,14 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import Final
+from typing import Final, Generic
 
 import numpy as np
 from scipy.ndimage import shift
 
-from flexdt import long_work
-from flexdt.clients.datasets.data_set import DataSet
-from flexdt.clients.expose import image_doubts
+from flexdt.library.datasets.image_doubts import image_doubts
+from flexdt.library.datasets.image_set import Images, Images_co, ImageSet
+from flexdt.twin import long_work
 from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.without_phantom.align import STANDS, Alignment, align_turn
 from flexdt.twin.errors import NotIdentifiableError
@@ -27,7 +27,7 @@ MOST: Final = 0.1
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Aligned:
+class Aligned(Generic[Images_co]):
     """What a scan without a phantom tells of its geometry.
 
     Attributes:
@@ -38,7 +38,7 @@ class Aligned:
 
     alignment: Alignment
     document: dict[str, object]
-    dataset: DataSet
+    dataset: Images_co
 
     def __repr__(self) -> str:
         told = [
@@ -83,7 +83,7 @@ class Aligned:
         )
 
 
-def align_dataset(data: DataSet, per_frame: bool = False) -> Aligned:
+def align_dataset(data: Images, per_frame: bool = False) -> Aligned[Images]:
     """Estimate the geometry of a scan without a phantom.
 
     Args:
@@ -125,7 +125,7 @@ def align_dataset(data: DataSet, per_frame: bool = False) -> Aligned:
     return Aligned(found, document, data)
 
 
-def _at_rest(data: DataSet) -> tuple[Callable[[int], Float32Array], Poses]:
+def _at_rest(data: ImageSet) -> tuple[Callable[[int], Float32Array], Poses]:
     """Line integrals and poses, the images moved instead of a panel that steps about a little."""
     poses = data.poses
     aside = poses.detector - poses.detector.mean(axis=0)

@@ -16,10 +16,10 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.clients.datasets.data_set import DataSet
-from flexdt.clients.expose import image_doubts
-from flexdt.clients.extras import extension
-from flexdt.machines import machine as machine_of
+from flexdt.library.data_set import DataSet
+from flexdt.library.datasets.image_doubts import image_doubts
+from flexdt.library.extras import extension
+from flexdt.library.machines import machine as machine_of
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import (
     Channel,

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from flexdt.clients.datasets.data_set import DataSet
-from flexdt.clients.figures import require_plots
+from flexdt.library.datasets.image_set import ImageSet
+from flexdt.library.figures import require_plots
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection.volume import Volume
@@ -45,7 +45,7 @@ def plot_geometry(cone_vec: ConeVec, axes: Any = None) -> Any:
     return axes
 
 
-def plot_projection(data: DataSet, index: int, axes: Any = None) -> Any:
+def plot_projection(data: ImageSet, index: int, axes: Any = None) -> Any:
     """Line integrals of one projection, as the source sees it."""
     axes = _pyplot().figure().add_subplot() if axes is None else axes
     shown = axes.imshow(data.line_integrals(index), cmap="gray")

@@ -1,0 +1,1 @@
+"""The library: what a program does with data sets, geometries, scripts and simulated scans."""

@@ -1,0 +1,95 @@
+"""Resample images of oblong pixels to square ones.
+
+Spots of balls are then nearly round, as detection and the second measurement expect. Columns stay
+as they are, and with them the column of the rotation axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import overload
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import CubicSpline
+
+from flexdt.library.datasets.image_set import Arrays, Counts, Images, ImageSet
+from flexdt.twin.dataset.dataset_errors import DatasetMissingError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
+
+UNEQUAL = 1e-3
+"""Relative difference of the pixel's sides from which rows are taken anew."""
+
+
+def squared(data: Images) -> Images:
+    """`data`, or where its pixels are not square the same with rows as far apart as its columns."""
+    poses = data.poses
+    ratio = float(np.median(np.linalg.norm(poses.v, axis=1) / np.linalg.norm(poses.u, axis=1)))
+    if abs(ratio - 1.0) < UNEQUAL:
+        return data
+    rows, cols = data.shape
+    shape = max(1, int(rows * ratio)), cols
+    table = np.array(data.cone_vec.rows)
+    table[:, 9:] /= ratio
+    said = (
+        f"the pixels are {np.linalg.norm(poses.u[0]):.4g} x {np.linalg.norm(poses.v[0]):.4g} mm; "
+        f"calibration takes their {rows} rows as {shape[0]} of the columns' pitch"
+    )
+    images = ResampledRows(data, shape[0], ratio)
+    return replace(
+        data,
+        shape=shape,
+        cone_vec=ConeVec(table).with_shape(shape),
+        nominal=replace(poses, v=poses.v / ratio),
+        arrays=Arrays(images, images.of(data.dark)[None], images.flats()),
+        warnings=(*data.warnings, said),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ResampledRows:
+    """Counts of images whose rows are taken anew, `ratio` times as close.
+
+    Attributes:
+        original: the images.
+        rows: of the new images.
+        ratio: old distance of rows over the new one.
+    """
+
+    original: ImageSet
+    rows: int
+    ratio: float
+
+    @overload
+    def __getitem__(self, index: int) -> Counts: ...
+    @overload
+    def __getitem__(self, index: npt.NDArray[np.int64]) -> ResampledRows: ...
+    def __getitem__(self, index: int | npt.NDArray[np.int64]) -> Counts | ResampledRows:
+        """Resample one image, or select several."""
+        if isinstance(index, np.ndarray) and index.ndim:
+            return replace(self, original=self.original[index])
+        counts = self.of(self.original.counts(int(index)))
+        return np.rint(counts).clip(0, np.iinfo(np.uint16).max).astype(np.uint16)
+
+    def flats(self) -> Float32Array | None:
+        """Resample the mean flat image, (1, rows, cols); None where there is none."""
+        try:
+            return self.of(self.original.flat)[None]
+        except DatasetMissingError:
+            return None
+
+    def of(self, image: Counts | Float32Array) -> Float32Array:
+        """Average an image over the new rows, centred on the old ones.
+
+        Args:
+            image: (old rows, cols).
+
+        Returns:
+            (rows, cols): means of the spline that has the sums of the old rows.
+        """
+        rows, cols = image.shape
+        total = np.concatenate([np.zeros((1, cols)), np.cumsum(image, axis=0, dtype=np.float64)])
+        edges = (np.arange(self.rows + 1) - self.rows / 2) / self.ratio + rows / 2
+        up_to = CubicSpline(np.arange(rows + 1), total)(edges.clip(0, rows))
+        return np.asarray(np.diff(up_to, axis=0) * self.ratio, dtype=np.float32)

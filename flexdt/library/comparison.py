@@ -1,0 +1,183 @@
+"""Compare a data set with the twin's own projections: `flexdt compare` (thesis 4.10).
+
+The twin is posed from the data set's texts and projects the phantom. The projections are compared
+with the radiographs before and after the correction that calibration finds, as residuals of the
+beads in pixels and as difference images. A correction that is not identifiable is an error.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from flexdt.library.calibration.calibrate import Outcome, calibrate_datasets
+from flexdt.library.calibration.calibration_report import _rms, predictions
+from flexdt.library.datasets.image_set import ImageSet
+from flexdt.library.figures import Series, image_under, page, plot, table
+from flexdt.library.reading.folders import load_dataset
+from flexdt.phantoms import Phantom
+from flexdt.phantoms.channels import line_integrals
+from flexdt.twin.calibration.fit.fit import require_identifiable
+from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+
+TOLERANCE_PX: Final = 0.5
+"""Default of the largest allowed rms residual of the beads after correction."""
+
+
+SHOWN: Final = 4
+"""Frames of which difference images are made."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A data set beside the twin.
+
+    Attributes:
+        document: the JSON of `flexdt compare`.
+        outcome: the calibration behind it.
+        frames: indices of the frames shown.
+        seen: (m, rows, cols) their line integrals.
+        before, after: (m, rows, cols) seen minus virtual, nominal and corrected.
+        residuals: (n, k, 2) measured minus virtual bead positions [px], nominal and corrected.
+    """
+
+    document: dict[str, Any]
+    outcome: Outcome[ImageSet]
+    frames: tuple[int, ...]
+    seen: Float32Array
+    before: Float32Array
+    after: Float32Array
+    residuals: tuple[FloatArray, FloatArray]
+
+    @property
+    def within(self) -> bool:
+        """The residual after correction is within the tolerance."""
+        return bool(self.document["within"])
+
+
+def compare_folder(
+    folder: str | PathLike[str],
+    phantom: str | Phantom,
+    tolerance_px: float = TOLERANCE_PX,
+    *,
+    shown: int = SHOWN,
+) -> Comparison:
+    """Compare a data set with the twin.
+
+    Args:
+        folder: the data set; TIFFs and the two settings texts are enough.
+        phantom: what was scanned, by value, name or file.
+        tolerance_px: largest allowed rms residual of the beads after correction, per coordinate.
+        shown: frames of which difference images are made.
+
+    Raises:
+        DatasetError: no data set.
+        NotIdentifiableError: the data do not determine a correction.
+        TwinError: they contradict the phantom or the angles; says what was found.
+    """
+    begun = time.perf_counter()
+    dataset = load_dataset(folder)
+    outcome = calibrate_datasets([dataset], phantom)
+    result = outcome.calibration
+    if result.errors or result.fit is None:
+        texts = "; ".join(f.text for f in result.errors)
+        raise TwinError(f"{folder}: {texts}", {"problems": outcome.document["problems"]})
+    require_identifiable(result.fit)
+    corrected = result.fit.parameters
+    before, after = (bead_residuals(outcome, p) for p in (NOMINAL, corrected))
+    present = dataset.present
+    chosen = tuple(present[i] for i in np.linspace(0, len(present) - 1, shown).round().astype(int))
+    seen = dataset.stack(chosen)
+    first = seen - virtual(outcome.phantom, dataset, chosen, NOMINAL)
+    second = seen - virtual(outcome.phantom, dataset, chosen, corrected)
+    rms = _rms(after)
+    document: dict[str, Any] = {
+        "within": bool(rms <= tolerance_px),
+        "tolerance_px": tolerance_px,
+        "before": _figures(before, first),
+        "after": _figures(after, second),
+        "frames": len(dataset),
+        "shown": list(chosen),
+        "correction": corrected.to_edge(),
+        "calibration": outcome.document,
+        "seconds": round(time.perf_counter() - begun, 3),
+    }
+    in_force = dataset.correction
+    if in_force is not None:
+        third = bead_residuals(outcome, in_force.parameters)
+        document["in_force"] = {"name": in_force.name, **_figures(third, None)}
+    return Comparison(document, outcome, chosen, seen, first, second, (before, after))
+
+
+def bead_residuals(outcome: Outcome[ImageSet], parameters: Offsets) -> FloatArray:
+    """Measured minus virtual bead positions of the first data set, (n, k, 2) [px], nan unseen."""
+    fit = outcome.calibration.fit
+    assert fit is not None
+    return fit.problem.pixels - predictions(fit, [parameters] * len(fit.problem.base))
+
+
+def virtual(
+    phantom: Phantom, dataset: ImageSet, frames: tuple[int, ...], parameters: Offsets
+) -> Float32Array:
+    """The twin's line integrals of some frames, (m, rows, cols)."""
+    cone = dataset.poses[np.array(frames)].cone_vec(parameters)
+    return line_integrals(phantom, cone, dataset.shape)
+
+
+def _figures(residual: FloatArray, images: Float32Array | None) -> dict[str, float | None]:
+    length = np.linalg.norm(residual, axis=2)
+    return {
+        "rms_px": _rms(residual),
+        "max_px": float(np.nanmax(length)),
+        "image_rms": None if images is None else float(np.sqrt(np.mean(images.astype("f8") ** 2))),
+    }
+
+
+def write_comparison(comparison: Comparison, out: Path) -> None:
+    """Write report.html, compare.json and the difference images (float32 TIFF) into a folder."""
+    import tifffile
+
+    out.mkdir(parents=True, exist_ok=True)
+    for k, frame in enumerate(comparison.frames):
+        for name, stack in (("before", comparison.before), ("after", comparison.after)):
+            tifffile.imwrite(out / f"difference_{frame:06d}_{name}.tif", stack[k])
+    document = comparison.document
+    (out / "compare.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    rows = [
+        [name, *(document[name][k] for k in ("rms_px", "max_px", "image_rms"))]
+        for name in ("before", "after", "in_force")
+        if name in document
+    ]
+    before, after = (
+        np.sqrt(np.nanmean(residual**2, axis=(1, 2))) for residual in comparison.residuals
+    )
+    frames = np.arange(len(before))
+    body = [
+        f"<h1>{comparison.outcome.datasets[0].name} beside the twin</h1>",
+        f"<p>Tolerance {document['tolerance_px']} px: "
+        f"<span class='{'good' if comparison.within else 'bad'}'>"
+        f"{'within' if comparison.within else 'exceeded'}</span> after correction.</p>",
+        table(["", "rms (px)", "worst bead (px)", "rms of the difference image"], rows),
+        plot(
+            [Series("before", frames, before), Series("after", frames, after)],
+            title="Residual of the beads by frame", x_label="frame", y_label="rms (px)",
+        ),
+    ]  # fmt: skip
+    shown = {
+        "radiograph": comparison.seen,
+        "difference before": comparison.before,
+        "difference after": comparison.after,
+    }
+    for k, frame in enumerate(comparison.frames):
+        for name, stack in shown.items():
+            picture = image_under(stack[k], [], title=f"{name}, frame {frame}", width=300)
+            body.append(f"<figure>{picture}</figure>")
+    (out / "report.html").write_text(page("flexdt compare", body), encoding="utf-8")

@@ -1,0 +1,249 @@
+"""`DataSet`: the images of a scan with a method for each thing that users do with them.
+
+The value itself is `ImageSet`. Each method calls the module that does the work, imported when the
+method is first called: detection, kernels and figures are heavy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from flexdt.library.datasets.exchange import with_geometry
+from flexdt.library.datasets.image_set import ImageSet
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.signatures import File, public
+
+if TYPE_CHECKING:
+    from flexdt.library.calibration.align_dataset import Aligned
+    from flexdt.library.calibration.calibrate import Outcome
+    from flexdt.phantoms import Phantom
+    from flexdt.twin.physics.tube import Tube
+    from flexdt.twin.projection import Volume
+
+
+@public
+class DataSet(ImageSet):
+    """The projections of a scan with dark and flat images and geometry.
+
+    Iteration and `data[i]` give line integrals, one projection after the other; `data[2:10]` is the
+    data set of those projections.
+
+    Attributes:
+        name: the scan's.
+        frames: all projections the scan should have, in order; `present` says which are there.
+        shape: image (rows, cols) of the first projection.
+        cone_vec: nominal, uncorrected geometry of `frames`: what the file says, or the texts give.
+        correction: in force during the scan, or given since: in `geometry`, not in `cone_vec`.
+        folder: where it lies, None in memory.
+        darks, flats: paths of the dark and flat images that are there.
+        arrays: the images, where they are in memory.
+        nominal: nominal poses of `frames`; None where `cone_vec` is all that is known.
+        positions: motor -> (n,) positions of `frames` [mm, deg], script's sign.
+        machine, profile: what the poses come from; None for an unknown scanner.
+        settings: the scanner's text, None if there is none.
+        document: flexdt.json, None if there is none.
+        complete: whether the scan says it finished and no file is missing.
+        reason: why it is not complete.
+        warnings: what is doubtful.
+        full_scale: largest count of the panel; None where it is not known.
+        truth: of a simulated data set, what lies behind it.
+
+    Example:
+        >>> import numpy as np
+        >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+        >>> data = DataSet.from_arrays(np.full((3, 4, 5), 500), scan, flat=np.full((4, 5), 1000))
+        >>> data
+        <DataSet 'arrays': 3 projections of 4 x 5, complete, 1 warning>
+        >>> round(float(data[0][0, 0]), 4), len(data[1:])
+        (0.6931, 2)
+    """
+
+    def calibrate(
+        self,
+        phantom: str | Phantom,
+        *,
+        free: Sequence[str] | None = None,
+        priors: Mapping[str, float] | None = None,
+        start: Mapping[str, float] | None = None,
+        geometry: ConeVec | File | None = None,
+        markers: Any = None,
+        scale: str | None = None,
+        radius: float | None = None,
+        per_frame: Sequence[str] = (),
+    ) -> Outcome[DataSet]:
+        """Estimate the geometry from the beads of a phantom; see `flexdt.calibrate`.
+
+        `data.with_correction(data.calibrate("lego").correction)` is the corrected data set.
+        """
+        from flexdt.library.calibration.calibrate import calibrate_datasets, calibration_request
+
+        posed = self if geometry is None else with_geometry(self, geometry)
+        request = calibration_request(phantom, free, priors, start, per_frame)
+        return calibrate_datasets(
+            [posed], phantom, request, markers=markers, scale=scale, radius_px=radius
+        )
+
+    def align(self, *, per_frame: bool = False) -> Aligned[DataSet]:
+        """Estimate the geometry without a phantom; see `flexdt.align`.
+
+        `data.with_correction(data.align().correction)` is the corrected data set.
+        """
+        from flexdt.library.calibration.align_dataset import align_dataset
+
+        return align_dataset(self, per_frame)
+
+    def reconstruct(
+        self,
+        algorithm: str = "fdk",
+        *,
+        voxel: float | None = None,
+        shape: tuple[int, int, int] | None = None,
+        center: tuple[float, float, float] | None = None,
+        binning: int = 1,
+        every: int = 1,
+        iterations: int | None = None,
+        weight: float | None = None,
+        window: str = "ram-lak",
+        material: str | Sequence[str] | None = None,
+        scatter_correction: str | Sequence[str] | None = None,
+        tube: Tube | None = None,
+        parameters: Offsets | None = None,
+        progress: Callable[[float], None] | None = None,
+        errors: bool = True,
+    ) -> Volume:
+        """Reconstruct into a volume in memory; see `flexdt.reconstruct` for the options.
+
+        Example:
+            >>> import numpy as np
+            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+            >>> counts, flat = np.full((3, 4, 5), 1000), np.full((4, 5), 1000)
+            >>> counts[:, 1:3, 2] = 500
+            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
+            >>> data.reconstruct("fdk", voxel=1.0)
+            <Volume: 2 x 3 x 3 voxels (z, y, x) of 1 mm about (0, 0, 0) mm>
+        """
+        from flexdt.library.reconstruction.reconstruct import VolumeRequest, reconstruct_volume
+
+        request = VolumeRequest(
+            algorithm=algorithm,
+            voxel_mm=voxel,
+            shape=shape,
+            binning=binning,
+            every=every,
+            iterations=iterations,
+            window=window,
+            center_mm=center,
+            weight=weight,
+            tube=tube,
+            material=_names(material) if not isinstance(material, str) else material,
+            scatter_correction=_names(scatter_correction),
+        )
+        tell = None if progress is None else lambda done, whole: progress(done / whole)
+        return reconstruct_volume(
+            self, request, parameters=parameters, progress=tell, errors=errors
+        )
+
+    def save(self, folder: File) -> None:
+        """Write a folder that `flexdt.open` reads: di000000.tif, io000000.tif, scan_000000.tif ...
+        (uint16) and the geometry.
+
+        geometry.json holds the geometry with the correction in force, warnings and the largest
+        count of the panel. A data set with flexdt.json
+        keeps that instead, as long as it has all of its projections; texts are copied. A data set
+        in memory gets the scanner's two texts, `scan settings.txt` and `data settings XRE.txt`,
+        where they can say its geometry: a circle in the plane z = 0 with equal steps and an upright
+        panel of square pixels. Dark and flat images in memory that are no whole numbers are
+        rounded.
+
+        Args:
+            folder: made if it is not there; it must be empty.
+
+        Raises:
+            DatasetExistsError: something is there.
+            OSError: it cannot be written.
+
+        Example:
+            >>> import os, tempfile
+            >>> import numpy as np
+            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
+            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     data.save(folder)
+            ...     sorted(os.listdir(folder))[:3]
+            ['data settings XRE.txt', 'geometry.json', 'io000000.tif']
+        """
+        from flexdt.library.datasets.saving import save_data_set
+
+        save_data_set(self, folder)
+
+    def to_nxtomo(self, file: File) -> None:
+        """Write NeXus's NXtomo (HDF5), which needs h5py (the extra `io`).
+
+        Raises:
+            TwinError: h5py is not installed.
+            OSError: the file cannot be written.
+
+        Example:
+            >>> import os, tempfile
+            >>> import numpy as np
+            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
+            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     data.to_nxtomo(f"{folder}/scan.nx")
+            ...     os.path.exists(f"{folder}/scan.nx")
+            True
+        """
+        from flexdt.library.datasets.nxtomo_writing import save_nxtomo
+
+        save_nxtomo(self, file)
+
+    def to_xarray(self) -> Any:
+        """Line integrals as an xarray DataArray (view, row, column), which needs xarray.
+
+        Raises:
+            TwinError: xarray is not installed.
+
+        Example:
+            >>> import numpy as np
+            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
+            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
+            >>> data.to_xarray().dims
+            ('view', 'row', 'column')
+        """
+        from flexdt.library.xarray_forms import images_to_xarray
+
+        return images_to_xarray(self)
+
+    def plot(self, index: int = 0, axes: Any = None) -> Any:
+        """Show one projection's line integrals; needs matplotlib (the extra `plots`).
+
+        Args:
+            index: of the projection.
+            axes: matplotlib's axes to draw into; None makes a figure.
+
+        Returns:
+            The axes.
+
+        Example:
+            >>> import numpy as np
+            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+            >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
+            >>> data = DataSet.from_arrays(counts, scan, flat=flat)
+            >>> data.plot(0).get_title()
+            'arrays: scan_000000.tif'
+        """
+        from flexdt.library.plots import plot_projection
+
+        return plot_projection(self, index, axes)
+
+
+def _names(materials: str | Sequence[str] | None) -> tuple[str, ...] | None:
+    """The names of several materials, or of one."""
+    if materials is None:
+        return None
+    return (materials,) if isinstance(materials, str) else tuple(materials)

@@ -1,0 +1,98 @@
+"""Write NeXus's NXtomo (application definition 2.0).
+
+It holds raw counts with image keys, in HDF5. It knows a rotation angle and little else of a cone
+beam, so the rows of cone_vec stand beside it, in a group that readers of NXtomo pass over.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from flexdt.library.datasets.image_set import ImageSet, references
+from flexdt.library.extras import package
+from flexdt.runtime.files.whole_files import whole_file
+from flexdt.twin.dataset.dataset_errors import DatasetFormatError
+from flexdt.twin.signatures import File
+
+PROJECTION, FLAT, DARK = 0, 1, 2
+"""Image keys of NXtomo."""
+INVALID: Final = 3
+KEYS: Final = {"di": DARK, "io": FLAT}
+"""Image keys of what the scanner calls so."""
+
+
+def save_nxtomo(data: ImageSet, file: File) -> None:
+    """See `DataSet.to_nxtomo`."""
+    h5py = package("h5py", "to_nxtomo")
+    if any(frame.shape != data.shape for frame in data.frames):
+        raise DatasetFormatError(
+            f"{data.where}: projections of several shapes; NXtomo has one", {"path": data.where}
+        )
+    with whole_file(Path(file)) as part, h5py.File(part, "w") as out:
+        _write(data, out)
+
+
+def _write(data: ImageSet, out: Any) -> None:
+    geometry = data.geometry
+    before = references(data)
+    count = len(before) + len(data)
+    angles = data.angles_deg
+    out.attrs.update(NX_class="NXroot", default="entry")
+    entry = _group(out, "entry", "NXentry")
+    entry.attrs["default"] = "data"
+    entry["definition"] = "NXtomo"
+    entry["title"] = data.name
+    if data.document is not None:
+        entry["start_time"] = data.document.started.isoformat()
+
+    instrument = _group(entry, "instrument", "NXinstrument")
+    source = _group(instrument, "source", "NXsource")
+    source["type"], source["probe"] = "Fixed Tube X-ray", "x-ray"
+    detector = _group(instrument, "detector", "NXdetector")
+    images = detector.create_dataset("data", (count, *data.shape), "u2")
+    keys = [*(KEYS[name[:2]] for name, _ in before), *[PROJECTION] * len(data)]
+    detector["image_key"] = np.array(keys, dtype=np.int32)
+    for i, (_, image) in enumerate(before):
+        images[i] = image
+    for i in range(len(data)):
+        images[len(before) + i] = data.counts(i)
+    to_source = float(np.linalg.norm(geometry.source[0]))
+    axis_column, axis_row = geometry.project_points(np.zeros((1, 3)), data.shape)[0, 0]
+    lengths = {
+        "x_pixel_size": float(np.linalg.norm(geometry.u[0])),
+        "y_pixel_size": float(np.linalg.norm(geometry.v[0])),
+        "distance": abs(float(geometry.source_detector_distance[0])) - to_source,
+    }
+    for name, value in lengths.items():
+        _measured(detector, name, value, "mm")
+    _measured(source, "distance", -to_source, "mm")
+    _measured(detector, "x_rotation_axis_pixel_position", axis_column, "px")
+    _measured(detector, "y_rotation_axis_pixel_position", axis_row, "px")
+
+    sample = _group(entry, "sample", "NXsample")
+    sample["name"] = data.name if data.document is None else data.document.sample.name or data.name
+    turned = np.concatenate([np.full(len(before), angles[0]), angles])
+    _measured(sample, "rotation_angle", turned, "deg")
+
+    shown = _group(entry, "data", "NXdata")
+    shown.attrs["signal"] = "data"
+    shown["data"] = images
+    shown["image_key"] = detector["image_key"]
+    shown["rotation_angle"] = sample["rotation_angle"]
+
+    own = _group(entry, "flexdt", "NXcollection")
+    _measured(own, "cone_vec", geometry.rows, "mm")
+
+
+def _group(parent: Any, name: str, kind: str) -> Any:
+    group = parent.create_group(name)
+    group.attrs["NX_class"] = kind
+    return group
+
+
+def _measured(group: Any, name: str, value: Any, unit: str) -> None:
+    group[name] = np.asarray(value, dtype=np.float64)
+    group[name].attrs["units"] = unit

@@ -1,0 +1,114 @@
+"""A data set written as a folder that `flexdt.open` reads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from flexdt.library.datasets.image_set import ImageSet, references
+from flexdt.runtime.files.dataset_folder import tiff_bytes
+from flexdt.runtime.files.directory import Directory
+from flexdt.twin.dataset.dataset_errors import (
+    DOCUMENT,
+    GEOMETRY,
+    SCAN_SETTINGS,
+    SCRIPT,
+    XRE_SETTINGS,
+    DatasetExistsError,
+)
+from flexdt.twin.dataset.flexdt_json import CorrectionEntry
+from flexdt.twin.dataset.rebuild import MATCH_MM
+from flexdt.twin.dataset.scan_settings import (
+    ScanSettings,
+    figures_of,
+    format_scan_settings,
+    poses_of,
+)
+from flexdt.twin.dataset.xre import format_settings
+from flexdt.twin.errors import GeometryError
+from flexdt.twin.exchange.geometry import ScanGeometry
+from flexdt.twin.exchange.number_tables import geometry_text
+from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.signatures import File
+
+
+def save_data_set(data: ImageSet, folder: File) -> None:
+    """See `DataSet.save`."""
+    path = Path(folder)
+    path.mkdir(parents=True, exist_ok=True)
+    if any(path.iterdir()):
+        raise DatasetExistsError(
+            f"{path} is not empty; allowed: a new or an empty folder", {"path": str(path)}
+        )
+    with Directory(path, sync=False) as out:
+        for name, image in references(data):
+            out.put(name, tiff_bytes(image))
+        for i in data.present:
+            out.put(data.frames[i].file, tiff_bytes(data.counts(i)))
+        for name in (SCAN_SETTINGS, XRE_SETTINGS, SCRIPT):
+            if data.folder is not None and (data.folder / name).is_file():
+                out.put(name, (data.folder / name).read_bytes())
+        stated = stated_settings(data) if data.folder is None else None
+        if stated is not None:
+            out.put(SCAN_SETTINGS, format_scan_settings(stated).encode())
+            out.put(XRE_SETTINGS, format_settings(stated).encode())
+        out.put(*_geometry(data))
+
+
+def stated_settings(data: ImageSet) -> ScanSettings | None:
+    """What the scanner's texts say of a data set in memory.
+
+    Returns:
+        None where they cannot say its geometry: they know one circle in the plane of the sample's
+        reference point, with equal steps and an upright panel of square pixels.
+    """
+    geometry, shape = data.geometry, data.shape
+    try:
+        poses = Poses.from_cone_vec(geometry)
+    except GeometryError:
+        return None
+    even = np.linspace(poses.angle[0], poses.angle[-1], len(poses.angle))
+    figures = figures_of(poses[:1], shape)
+    said = poses_of(figures, shape, even).cone_vec().rows
+    # The pitches are small: at the panel's edge they count by half its pixels.
+    weights = np.repeat([1.0, 1.0, shape[1] / 2.0, shape[0] / 2.0], 3)
+    if np.abs((said - geometry.rows) * weights).max() > MATCH_MM:
+        return None
+    exposure, camera = (getattr(data.truth, name, None) for name in ("exposure", "camera"))
+    before = [name[:2] for name, _ in references(data)]
+    start, last = np.degrees(even[[0, -1]]).tolist()
+    return ScanSettings(
+        scan_id=data.name,
+        **figures.stated,
+        sample_name=data.name,
+        software="flexdt",
+        kV=None if exposure is None else exposure.kV,
+        power_W=None if exposure is None else exposure.power_W,
+        exposure_ms=None if camera is None else camera.exposure_ms,
+        averages=None if camera is None else float(camera.averages),
+        scan_type="step scan",
+        projections=len(data),
+        start_angle_deg=start,
+        last_angle_deg=last,
+        pre_flats=before.count("io"),
+        post_flats=0,
+        darks=before.count("di"),
+    )
+
+
+def _geometry(data: ImageSet) -> tuple[str, bytes]:
+    """The file that says the geometry: the document as it was, or the geometry by itself."""
+    files = tuple(frame.file for frame in data.frames)
+    document = data.document
+    moved = data.nominal is not None and not np.allclose(
+        data.nominal.cone_vec().rows, data.cone_vec.rows, rtol=0.0, atol=1e-6
+    )
+    if document is None or moved or document.files("projection") != files:
+        geometry = ScanGeometry(
+            data.geometry, data.shape, name=data.name, files=files, notes=data.warnings,
+            full_scale=data.full_scale,
+        )  # fmt: skip
+        return GEOMETRY, geometry_text(geometry).encode()
+    entry = CorrectionEntry.of(data.correction)
+    return DOCUMENT, document.model_copy(update={"correction": entry}).to_json().encode()

@@ -1,0 +1,224 @@
+"""Figures as SVG text, drawn with matplotlib, and the HTML pages and tables that hold them.
+
+matplotlib comes with the extra `plots`; it is imported when the first figure is drawn.
+"""
+
+from __future__ import annotations
+
+import html
+import io
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import cycle
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.library.extras import package
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLOURS = ("#1b6ca8", "#c8553d", "#3a7d44", "#8e5ea2", "#b58900", "#17889b", "#9b2226", "#5f6c7b")
+Floats = npt.NDArray[np.float64]
+DPI = 72.0
+"""Sizes below are in pixels, which at 72 dpi are also matplotlib's points."""
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """Points of one name; joined by a line, or dots only."""
+
+    name: str
+    x: npt.ArrayLike
+    y: npt.ArrayLike
+    line: bool = True
+
+
+def require_plots() -> None:
+    """Check that figures can be drawn, before the work whose result they are to show.
+
+    Raises:
+        TwinError: matplotlib is not installed.
+    """
+    package("matplotlib", "a figure", "plots")
+
+
+def blank(width: float, height: float) -> Figure:
+    """An empty figure [px] that belongs to no window."""
+    require_plots()
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width / DPI, height / DPI), dpi=DPI, layout="constrained")
+
+
+def svg(figure: Figure) -> str:
+    """A figure as an SVG element, to be put into a page or a file of its own."""
+    import matplotlib as mpl
+
+    text = io.StringIO()
+    # Text stays text, so that a page can be searched; every point that is given is drawn; and
+    # the same figure gives the same ids.
+    settings = {"svg.fonttype": "none", "path.simplify": False, "svg.hashsalt": "flexdt"}
+    with mpl.rc_context(settings):  # type: ignore[arg-type]
+        figure.savefig(text, format="svg", metadata={"Date": None})
+    whole = text.getvalue()
+    return whole[whole.index("<svg") :]
+
+
+def plot(
+    series: Sequence[Series],
+    *,
+    title: str,
+    x_label: str,
+    y_label: str,
+    width: int = 730,
+    height: int = 260,
+    flip_y: bool = False,
+    equal: bool = False,
+) -> str:
+    """Lines and dots over two axes, as an SVG element.
+
+    Args:
+        series: what is drawn; points that are not finite are left out.
+        title, x_label, y_label: texts.
+        width, height: of the whole figure [px].
+        flip_y: y grows downwards, as rows of an image do.
+        equal: one unit is as long in x as in y.
+    """
+    figure = blank(width, height)
+    axes = axes_of(figure, title, x_label, y_label)
+    for s, colour in zip(series, cycle(COLOURS), strict=False):
+        style = {"lw": 1.2} if s.line else {"ls": "", "marker": ".", "ms": 3.2}
+        x, y = np.asarray(s.x, dtype=np.float64), np.asarray(s.y, dtype=np.float64)
+        axes.plot(x, y, color=colour, label=s.name, **style)
+    if flip_y:
+        axes.invert_yaxis()
+    if equal:
+        axes.set_aspect("equal", adjustable="datalim")
+    _legend(figure, series)
+    return svg(figure)
+
+
+def arrows(
+    groups: Sequence[tuple[str, Floats, Floats]],
+    size: tuple[int, int],
+    *,
+    title: str,
+    factor: float,
+) -> str:
+    """Vectors over an image plane, row 0 at the top, each with a dot where it begins.
+
+    Args:
+        groups: name, places (m, 2) as (column, row) [px], and vectors (m, 2) alike; nan: none.
+        size: of the plane, (rows, cols).
+        title: of the figure.
+        factor: by which vectors are enlarged.
+    """
+    rows, cols = size
+    figure = blank(730, 60 + 570 * rows / cols)
+    axes = axes_of(figure, title, "column (px)", "row (px)")
+    axes.set(xlim=(0, cols), ylim=(rows, 0), aspect="equal")
+    for (name, places, vectors), colour in zip(groups, cycle(COLOURS), strict=False):
+        keep = np.isfinite(places).all(axis=1) & np.isfinite(vectors).all(axis=1)
+        start, stop = places[keep], places[keep] + factor * vectors[keep]
+        # One line for all vectors of a group, interrupted by nan after each.
+        ends = np.stack([start, stop, np.full_like(start, np.nan)], axis=1).reshape(-1, 2)
+        gid = re.sub(r"\W+", "-", f"{title} {name}")
+        axes.plot(*ends.T, color=colour, lw=1.0, clip_on=False, gid=gid)
+        axes.plot(*start.T, ".", color=colour, ms=2.2, label=name, gid=f"{gid}-places")
+    _legend(figure, groups)
+    return svg(figure)
+
+
+def ellipse_plot(covariance: npt.ArrayLike, names: tuple[str, str], scale: float) -> str:
+    """The ellipse of a 2 x 2 covariance at `scale` standard deviations, about zero."""
+    values, vectors = np.linalg.eigh(np.asarray(covariance, dtype=np.float64))
+    t = np.linspace(0, 2 * math.pi, 90)
+    ring = vectors @ (
+        scale * np.sqrt(np.maximum(values, 0.0))[:, None] * np.stack([np.cos(t), np.sin(t)])
+    )
+    return plot(
+        [Series("", *ring)], title=f"{names[1]} against {names[0]}", x_label=names[0],
+        y_label=names[1], width=270, height=210,
+    )  # fmt: skip
+
+
+def image_under(
+    values: npt.ArrayLike, points: Sequence[Series], *, title: str, width: int = 730
+) -> str:
+    """A grey image (rows, cols) with points over it; their x and y are its columns and rows."""
+    data = np.asarray(values, dtype=np.float64)
+    figure = blank(width, 26 + (width - 90 * bool(points)) * data.shape[0] / data.shape[1])
+    axes = axes_of(figure, title, "", "")
+    low, high = np.percentile(data, [0.5, 99.7])
+    axes.imshow(data, cmap="gray_r", vmin=low, vmax=high)
+    axes.set_axis_off()
+    for s, colour in zip(points, cycle(COLOURS), strict=False):
+        axes.plot(s.x, s.y, ".", color=colour, ms=2.6, label=s.name)
+    _legend(figure, points)
+    return svg(figure)
+
+
+def axes_of(figure: Figure, title: str, x_label: str, y_label: str) -> Axes:
+    """Axes that fill a figure, titled."""
+    axes = figure.add_subplot()
+    axes.set_title(title, size=10, weight="bold", loc="left")
+    axes.set_xlabel(x_label, size=9)
+    axes.set_ylabel(y_label, size=9)
+    axes.tick_params(labelsize=8)
+    return axes
+
+
+def _legend(figure: Figure, series: Sequence[Series | tuple[str, Floats, Floats]]) -> None:
+    if any(s.name if isinstance(s, Series) else s[0] for s in series):
+        figure.legend(loc="outside right upper", fontsize=8, frameon=False)
+
+
+PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>{title}</title>
+<style>
+body {{ font-family: system-ui, sans-serif; margin: 2rem auto; max-width: 62rem; color: #1f2933; }}
+table {{ border-collapse: collapse; margin: 1rem 0; }}
+td, th {{ border: 1px solid #cbd2d9; padding: .25rem .6rem; text-align: right; font-size: .85rem; }}
+th {{ background: #f0f3f6; }} td:first-child, th:first-child {{ text-align: left; }}
+.bad {{ color: #9b2226; font-weight: 600; }} .good {{ color: #2d6a4f; font-weight: 600; }}
+figure {{ display: inline-block; margin: .5rem 1rem .5rem 0; }}
+svg {{ max-width: 100%; height: auto; }}
+</style></head><body>
+{body}
+</body></html>
+"""
+
+
+def page(title: str, body: Sequence[str]) -> str:
+    """A whole HTML page that needs no other file."""
+    return PAGE.format(title=html.escape(title), body="\n".join(body))
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """An HTML table; cells are escaped."""
+    lines = [
+        "".join(f"<{tag}>{html.escape(cell_text(cell))}</{tag}>" for cell in row)
+        for tag, row in [("th", head), *(("td", row) for row in rows)]
+    ]
+    return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
+
+
+def cell_text(value: object) -> str:
+    """A table cell: numbers short, None as a dash."""
+    match value:
+        case None:
+            return "-"
+        case bool():
+            return "yes" if value else "no"
+        case float() if not math.isfinite(value):
+            return "-"
+        case float():
+            return f"{value:.2g}" if 0 < abs(value) < 0.01 or abs(value) >= 1e4 else f"{value:.4g}"
+        case _:
+            return str(value)

@@ -1,0 +1,96 @@
+"""`--machine` and `--profile` to their values: a shipped name, or a TOML file."""
+
+from __future__ import annotations
+
+from os import PathLike, fspath
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from flexdt.twin.machine.description import Machine, Profile
+
+DEFAULT_MACHINE = "flexray"
+
+
+def machine(word: str | PathLike[str] | None = None) -> Machine:
+    """A machine by shipped name or by file; None is the FleX-ray.
+
+    Args:
+        word: `flexray` or another shipped name, or the path of a TOML file.
+
+    Raises:
+        MachineFileError: the file does not hold.
+        UnknownNameError: neither a file nor a shipped name.
+
+    Example:
+        >>> flexray = machine("flexray")
+        >>> flexray.detector.camera.shape, flexray.axes["rot_obj"].unit
+        ((760, 956), 'deg')
+    """
+    from flexdt.twin.machine.description import builtin_machine
+
+    name = DEFAULT_MACHINE if word is None else fspath(word)
+    if is_file(name):
+        return parsed(Path(name).read_text(encoding="utf-8"), name)
+    return builtin_machine(name)
+
+
+def parsed(text: str, file: str) -> Machine:
+    """A machine from the text of its file, and from the meshes of its parts, which lie beside it.
+
+    Raises:
+        MachineFileError: the text or a mesh does not hold; file, part, what is allowed.
+    """
+    from flexdt.phantoms.files.mesh_files import read_part
+    from flexdt.twin.collision.convex_solids import outer_hull
+    from flexdt.twin.machine.description import Vector3, parse_machine
+
+    def corners(name: str) -> list[Vector3]:
+        around = outer_hull(read_part(Path(file).parent / name).vertices)
+        return [(x, y, z) for x, y, z in around.vertices.tolist()]
+
+    return parse_machine(text, file, corners)
+
+
+def profile(
+    word: Profile | str | PathLike[str] | None, of: Machine, file: str | None = None
+) -> Profile:
+    """A calibration profile by shipped name or by file; None is the machine's default.
+
+    Args:
+        word: what was asked for, or the profile itself.
+        of: the machine.
+        file: what was asked for as the machine, for the error.
+
+    Raises:
+        MachineFileError: the file does not hold, or is for another machine.
+        UnknownNameError: neither a file nor a shipped name.
+    """
+    from flexdt.twin.errors import MachineFileError
+    from flexdt.twin.machine.description import (
+        Profile,
+        builtin_profile,
+        default_profile,
+        parse_profile,
+    )
+
+    name = of.default_profile if word is None else str(word)
+    if isinstance(word, Profile):
+        found = word
+    elif is_file(name):
+        found = parse_profile(Path(name).read_text(encoding="utf-8"), name)
+    elif word is None:
+        found = default_profile(of, file or DEFAULT_MACHINE)
+    else:
+        found = builtin_profile(name)
+    if found.machine != of.name:
+        raise MachineFileError(
+            f"profile {found.name!r} is for machine {found.machine!r}, not {of.name!r}",
+            {"asked": found.name, "machine": of.name},
+        )
+    return found
+
+
+def is_file(word: str) -> bool:
+    """Whether a word names a file instead of something that ships."""
+    return word.endswith(".toml") or "/" in word or "\\" in word or Path(word).is_file()

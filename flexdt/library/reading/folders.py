@@ -1,0 +1,325 @@
+"""Data sets in folders: which frames there are, their geometry, completeness; and saved ones.
+
+Works on folders that this package wrote and on a scanner's own (TIFFs and the two settings texts
+alone). Errors are typed and name the file; what leaves the rest usable is a warning in `warnings`.
+Missing frames are listed, and reading one is an error.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Callable, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.library.data_set import DataSet
+from flexdt.library.reading.foreign_files import open_file
+from flexdt.library.reading.listed_images import NO_DARK, by_numbers, listed
+from flexdt.runtime.files.dataset_folder import (
+    Folder,
+    list_folder,
+    read_image,
+    read_text,
+    read_values,
+)
+from flexdt.twin.dataset.dataset_errors import (
+    DOCUMENT,
+    GEOMETRY,
+    SCAN_SETTINGS,
+    XRE_SETTINGS,
+    DatasetError,
+    DatasetFormatError,
+    DatasetMissingError,
+)
+from flexdt.twin.dataset.flexdt_json import parse_document
+from flexdt.twin.dataset.rebuild import rebuild
+from flexdt.twin.dataset.scan_settings import (
+    ScanSettings,
+    parse_scan_settings,
+)
+from flexdt.twin.dataset.xre import parse_xre
+from flexdt.twin.errors import TwinError
+from flexdt.twin.exchange.number_tables import read_geometry_text
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.machine.description import (
+    Machine,
+    Profile,
+    builtin_machine,
+    builtin_machines,
+    builtin_profile,
+    builtin_profiles,
+)
+from flexdt.twin.signatures import public
+
+AGREE_MM: Final = 1e-6
+"""How far the cone_vec of a file may lie from what its motor positions give [mm]."""
+MAX_SETTINGS_BYTES: Final = 16 << 20
+"""Of a settings text; a larger file is none."""
+
+
+@public
+def load_dataset(
+    folder: str | PathLike[str],
+    *,
+    machine: Machine | None = None,
+    profile: Profile | None = None,
+    ignore_document: bool = False,
+    geometry: ConeVec | None = None,
+) -> DataSet:
+    """Open a data set.
+
+    Args:
+        folder: a folder of TIFFs with flexdt.json, or with a scanner's settings texts; Nikon's
+            .xtekct file beside its TIFFs; Zeiss's .txrm; or an NXtomo file.
+        machine: the scanner, for texts that do not say one that ships with the package.
+        profile: zero offsets to use; default: those of the file, or the profile that reproduces
+            the printed figures.
+        ignore_document: use the texts alone even if flexdt.json is there.
+        geometry: one view for each projection, in place of a file's, or where an NXtomo or .txrm
+            file does not say it.
+
+    Raises:
+        DatasetError: what is wrong, with its path.
+
+    Example:
+        >>> data = load_dataset("my-scans/lego")  # doctest: +SKIP
+        >>> len(data), data.shape  # doctest: +SKIP
+    """
+    if Path(folder).is_file():
+        return open_file(Path(folder), geometry)
+    content = list_folder(Path(folder))
+    if content.document is not None and not ignore_document:
+        return _from_document(content, machine, profile)
+    if content.geometry is not None and not ignore_document:
+        return _from_geometry(content)
+    return _from_texts(content, machine, profile)
+
+
+@public
+def read_tiffs(
+    folder: str | PathLike[str],
+    geometry: ConeVec | npt.ArrayLike | str | PathLike[str],
+    *,
+    frames: str = "*.tif*",
+    dark: str = "di*",
+    flat: str = "io*",
+) -> DataSet:
+    """Anybody's frames: TIFF images in a folder, and a geometry for them.
+
+    Images are counts (uint16), or floats: counts too if there is a flat image, else line integrals.
+    Floats are kept in memory as counts of an open beam of 60000, or down to 20000 where pixels are
+    brighter than it; a warning says how many are beyond what that holds.
+
+    Args:
+        folder: where the images are.
+        geometry: one view for each projection, in the order of their names, where 10 comes after
+            9; or a file that `ConeVec.load` reads.
+        frames, dark, flat: patterns of the names of projections, dark and flat images. What is
+            dark or flat is no projection.
+
+    Raises:
+        DatasetError: no images, or another number or shape of them than the geometry has.
+
+    Example:
+        >>> import pathlib, tempfile, tifffile
+        >>> folder = pathlib.Path(tempfile.mkdtemp())
+        >>> for i in range(3):
+        ...     tifffile.imwrite(folder / f"proj{i}.tif", np.full((4, 5), 500, np.uint16))
+        >>> tifffile.imwrite(folder / "white.tif", np.full((4, 5), 1000, np.uint16))
+        >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, pixel=1)
+        >>> data = read_tiffs(folder, scan, flat="white*")
+        >>> data.geometry.shape, round(float(data[0][0, 0]), 4)
+        ((3, 4, 5), 0.6931)
+    """
+    content = list_folder(Path(folder))
+    names = sorted(content.names, key=by_numbers)
+    darks, flats = (fnmatch.filter(names, pattern) for pattern in (dark, flat))
+    others = {*darks, *flats}
+    chosen = [n for n in fnmatch.filter(names, frames) if n not in others]
+    if not chosen:
+        taken = f": dark={dark!r} and flat={flat!r} took {', '.join(sorted(others)[:3])}"
+        raise DatasetMissingError(
+            f"{content.path}: no projections match {frames!r}{taken if others else ''}",
+            {"path": str(content.path), "missing": [frames]},
+        )
+    first = read_values(content.path / chosen[0])
+    if isinstance(geometry, str | PathLike):
+        geometry = ConeVec.load(geometry, shape=first.shape)
+    cone = geometry if isinstance(geometry, ConeVec) else ConeVec(np.asarray(geometry))
+    if first.dtype != np.uint16:
+        return _of_floats(content.path, cone, chosen, darks, flats)
+    return listed(content, cone, chosen, darks, flats)
+
+
+def _of_floats(
+    folder: Path,
+    geometry: ConeVec,
+    names: Sequence[str],
+    darks: Sequence[str],
+    flats: Sequence[str],
+) -> DataSet:
+    """The data set of float images, in memory."""
+    shape = read_values(folder / names[0]).shape
+    values = [read_values(folder / n, shape) for n in names]
+    images = np.stack(values).astype(np.float32)
+    if not np.isfinite(images).all():
+        bad = names[int(np.flatnonzero(~np.isfinite(images).all(axis=(1, 2)))[0])]
+        raise DatasetFormatError(
+            f"{folder / bad} has pixels that are no numbers; allowed: finite", {"path": bad}
+        )
+    if flats:
+        dark = np.mean([read_values(folder / n) for n in darks], axis=0) if darks else 0.0
+        flat = np.mean([read_values(folder / n) for n in flats], axis=0)
+        images = (images - dark) / np.maximum(flat - dark, 1e-6 * flat.max())
+        images = -np.log(np.maximum(images, np.finfo(np.float32).tiny))
+    return DataSet.from_arrays(images, geometry, name=folder.name)
+
+
+def _from_document(content: Folder, machine: Machine | None, profile: Profile | None) -> DataSet:
+    path = content.path / DOCUMENT
+    doc = parse_document(read_text(path), str(path))
+    own = machine is None and profile is None
+    machine = doc.machine_of(str(path)) if machine is None else machine
+    profile = doc.profile_of(str(path)) if profile is None else profile
+    try:
+        found = doc.poses(machine, profile)
+        shapes = doc.shapes("projection")
+    except TwinError as error:
+        raise DatasetFormatError(
+            f"{path}: {error.message}", {"path": str(path), **error.data}
+        ) from None
+    files = doc.files("projection")
+    if not files:
+        raise DatasetMissingError(f"{path} lists no projections", {"path": str(path)})
+    cone_vec = doc.cone_vec() if own else found.cone_vec()
+    warnings: list[str] = []
+    settings = read_settings(content, warnings)
+    if np.abs(found.cone_vec().rows - cone_vec.rows).max() > AGREE_MM:
+        warnings.append(f"{path}: cone_vec does not follow from its motor positions")
+    return listed(
+        content,
+        cone_vec,
+        files,
+        doc.files("dark"),
+        doc.files("flat"),
+        doc.name,
+        shapes,
+        [] if doc.complete else [doc.reason or "the scan did not finish"],
+        warnings,
+        correction=doc.correction_in_force(),
+        nominal=found,
+        positions=doc.positions(),
+        machine=machine,
+        profile=profile,
+        settings=settings,
+        document=doc,
+        full_scale=(1 << machine.detector.bits) - 1,
+    )
+
+
+def _from_geometry(content: Folder) -> DataSet:
+    """What `DataSet.save` wrote for a scan without a machine: images and their geometry."""
+    path = content.path / GEOMETRY
+    geometry = read_geometry_text(read_text(path), str(path))
+    names = geometry.files or [content.projection_name(i) for i in range(len(geometry))]
+    notes = [note for note in geometry.notes if not note.startswith(NO_DARK)]
+    cone = geometry.cone_vec.with_shape(geometry.shape)
+    return listed(content, cone, names, content.darks, content.flats, geometry.name,
+                  warnings=notes, full_scale=geometry.full_scale)  # fmt: skip
+
+
+def _from_texts(content: Folder, machine: Machine | None, profile: Profile | None) -> DataSet:
+    if not content.projections:
+        raise DatasetMissingError(
+            f"{content.path}: no projections (scan_000000.tif ...)",
+            {"path": str(content.path), "missing": ["scan_000000.tif"]},
+        )
+    warnings: list[str] = []
+    settings = read_settings(content, warnings)
+    if settings is None:
+        raise DatasetMissingError(
+            f"{content.path}: none of {DOCUMENT}, {SCAN_SETTINGS!r} and {XRE_SETTINGS!r} is there, "
+            "so the geometry is unknown",
+            {"path": str(content.path), "missing": [DOCUMENT, SCAN_SETTINGS, XRE_SETTINGS]},
+        )
+    _require_one_circle(content)
+    count = max(content.last_index + 1, settings.projections or 0)
+    first = next(iter(content.projections.values()))
+    rows, cols = read_image(content.path / first).shape
+    shape = (rows, cols)
+    machines = [machine] if machine else [builtin_machine(n) for n in builtin_machines()]
+    profiles = [profile] if profile else [builtin_profile(n) for n in builtin_profiles()]
+    said_in = str(content.path / SCAN_SETTINGS)
+    rebuilt = rebuild(settings, count, shape, machines, profiles, file=said_in)
+    names = [content.projection_name(i) for i in range(count)]
+    if settings.projections is not None and count > settings.projections:
+        warnings.append(
+            f"{count} projections are there, the text says {settings.projections}; angles follow "
+            "the text"
+        )
+    return listed(
+        content,
+        rebuilt.poses.cone_vec(),
+        names,
+        content.darks,
+        content.flats,
+        settings.scan_id or "",
+        [shape] * count,
+        ["the text says SCRIPT CANCELLED!"] if settings.cancelled else [],
+        [*warnings, *rebuilt.notes],
+        nominal=rebuilt.poses,
+        positions=rebuilt.positions,
+        machine=rebuilt.machine,
+        profile=rebuilt.profile,
+        settings=settings,
+        full_scale=None if rebuilt.machine is None else (1 << rebuilt.machine.detector.bits) - 1,
+    )
+
+
+def read_settings(content: Folder, warnings: list[str]) -> ScanSettings | None:
+    """The settings of the scanner's text, or of its second text where the first is of no use."""
+    readers: Sequence[tuple[str | None, Callable[[str, str], ScanSettings]]] = (
+        (content.scan_settings, parse_scan_settings),
+        (content.xre_settings, lambda text, name: parse_xre(text, name).settings),
+    )
+    errors: list[DatasetError] = []
+    for file, parse in readers:
+        if file is None:
+            continue
+        path = content.path / file
+        try:
+            settings = parse(read_text(path, MAX_SETTINGS_BYTES), str(path))
+        except DatasetError as error:
+            errors.append(error)
+        else:
+            warnings += [f"{e.message}; {XRE_SETTINGS!r} is used instead" for e in errors]
+            return settings
+    if errors and content.document is None:
+        raise errors[0]
+    warnings += [e.message for e in errors]
+    return None
+
+
+def _require_one_circle(content: Folder) -> None:
+    """The texts state one pose; a tiled or helical scan needs flexdt.json.
+
+    Raises:
+        DatasetFormatError: the texts themselves say that there is more than one section.
+    """
+    if content.xre_settings is None:
+        return
+    path = content.path / content.xre_settings
+    try:
+        one = parse_xre(read_text(path, MAX_SETTINGS_BYTES), str(path)).one_circle
+    except DatasetError:
+        return
+    if not one:
+        raise DatasetFormatError(
+            f"{path} says that the scan has several sections (tiled, helical, repeated): the texts "
+            f"state the pose of one only; {DOCUMENT} is needed",
+            {"path": str(path), "missing": [DOCUMENT]},
+        )

@@ -1,0 +1,1 @@
+"""Volumes from data sets, and volume files."""
