@@ -218,7 +218,8 @@ def slab_kernel(transposed):
             last = min(int(math.floor(leave + MARGIN)) + 1, na)  # noqa: RUF046
             quick = int(math.ceil(enter + MARGIN))  # noqa: RUF046
             slow = int(math.floor(leave - MARGIN))  # noqa: RUF046
-        first, last = least(narrow(first)), most(narrow(last))
+        # Lanes with different axes a have different numbers of slabs, and each keeps to its own.
+        first, last = least(narrow(first)), min(most(narrow(last)), narrow(na))
         quick, slow = most(narrow(quick)), least(narrow(slow))
         hop_a, hop_b, hop_z = narrow(hop_a), narrow(hop_b), narrow(hop_z)
         total = ZERO
