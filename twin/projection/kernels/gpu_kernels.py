@@ -70,8 +70,7 @@ NEVER = 1 << 30
 LANES = 0xFFFFFFFF
 
 if config.ENABLE_CUDASIM:
-    # What the simulator lacks. There, a lane votes alone: votes decide which of two loops walks a
-    # slab, not what comes out.
+    # What the simulator lacks. A lane there exchanges with itself, unless a test lets lanes meet.
 
     times, plus = operator.mul, operator.add
 
@@ -90,7 +89,8 @@ if config.ENABLE_CUDASIM:
     def place(i):  # noqa: D103
         return int(i) % 2**32
 
-    least = most = int
+    def exchange(i, step):  # noqa: D103
+        return i
 
 else:
     from numba.cuda import libdevice
@@ -106,18 +106,25 @@ else:
         return moved - MAGIC, libdevice.float_as_int(moved)
 
     @cuda.jit(device=True, inline=True)
-    def least(i):
-        """The smallest i of a warp."""
-        for step in (16, 8, 4, 2, 1):
-            i = min(i, cuda.shfl_xor_sync(LANES, i, step))
-        return i
+    def exchange(i, step):
+        """Return the i of the lane whose number differs in the bit `step`."""
+        return cuda.shfl_xor_sync(LANES, i, step)
 
-    @cuda.jit(device=True, inline=True)
-    def most(i):
-        """The largest i of a warp."""
-        for step in (16, 8, 4, 2, 1):
-            i = max(i, cuda.shfl_xor_sync(LANES, i, step))
-        return i
+
+@cuda.jit(device=True, inline=True)
+def least(i):
+    """The smallest i of a warp."""
+    for step in (16, 8, 4, 2, 1):
+        i = min(i, exchange(i, step))
+    return i
+
+
+@cuda.jit(device=True, inline=True)
+def most(i):
+    """The largest i of a warp."""
+    for step in (16, 8, 4, 2, 1):
+        i = max(i, exchange(i, step))
+    return i
 
 
 @cuda.jit(device=True, inline=True)
