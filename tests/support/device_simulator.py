@@ -95,7 +95,9 @@ def as_on_a_device(block: tuple[int, int] = (32, 4)) -> None:
         caller = sys._getframe(1)
         place = caller.f_code, caller.f_lineno
         if place not in self._allocations:
-            self._allocations[place] = CheckedArray(FakeCUDAArray(allocate_local(self, shape, kind)))
+            self._allocations[place] = CheckedArray(
+                FakeCUDAArray(allocate_local(self, shape, kind))
+            )
         return self._allocations[place]
 
     def called(self: Any, *arguments: Any) -> Any:
