@@ -69,7 +69,7 @@ class Found:
     Attributes:
         kind: of the case.
         by_slabs: views that the slab walk took.
-        forward, adjoint: worst error, of the maximum.
+        forward, adjoint: worst error, of the maximum (of 1 where no ray meets the volume).
         outside: whether a cell outside the volume was touched.
         same: whether the deterministic adjoint gave equal bytes twice (True if not asked).
         seconds: of both kernels with their copies.
@@ -144,7 +144,7 @@ def drawn_view(draw: Draw, kind: str, radius: float, shape: tuple[int, int]) -> 
     if kind == "source inside":
         away = radius * draw.uniform(0, 0.5)
     if kind == "pixels inside":
-        behind = radius * draw.uniform(-0.5, 0.5)
+        behind = radius * draw.uniform(0, 0.5)
     roll, pitch, yaw = draw.uniform(-0.05, 0.05, 3)
     if kind in ("rolled", "diagonal"):
         roll = draw.choice([-1, 1]) * draw.uniform(wide / 2, wide)
@@ -216,8 +216,8 @@ def measure(case: Case, *, twice: bool) -> Found:
     return Found(
         case.kind,
         int(gpu.by_slabs(box, rays, case.shape).sum()),
-        float(np.abs(images - exact).max() / exact.max()),
-        float(np.abs(layout_data(layout) - back).max() / back.max()),
+        float(np.abs(images - exact).max() / (exact.max() or 1.0)),
+        float(np.abs(layout_data(layout) - back).max() / (back.max() or 1.0)),
         bool(touched.any() or np.isnan(images).any() or not used.any()),
         not twice or spread(True).tobytes() == spread(True).tobytes(),
         seconds,
@@ -289,6 +289,7 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--most", type=int, default=12, help="voxels along an axis")
+    parser.add_argument("--budget-s", type=float, default=math.inf, help="begin no case after")
     parser.add_argument("--device", action="store_true", help="a device, not the simulator")
     parser.add_argument("--out", type=Path, help="write the document here, too")
     options = parser.parse_args()
@@ -311,6 +312,7 @@ def main() -> int:
         options.most,
         lambda line: print(line, file=sys.stderr),
         twice=options.device,
+        budget_s=options.budget_s,
     )
     document["device"] = gpu.availability().reason if options.device else "simulator"
     text = json.dumps(document, indent=1)

@@ -40,8 +40,9 @@ thread of the processor (measured: about 7 views beside 16 threads)."""
 WORTH_BYTES = 64 * 2**20
 """A smaller volume is not moved for single views: the processor takes no longer for one than a call
 of the device does (an H200 beside 16 threads: C1, 76 MB, 1.95 and 1.8 ms)."""
-SIDE = 2**17
-"""Voxels along an axis: more have no room in the fixed point of the slab walk."""
+SIDE = 2**14
+"""Voxels along an axis: in longer boxes single precision does not place where a ray enters and
+leaves within the margin of the slab walk."""
 NEAR = 1e-9
 """A box this near to the source or the detector's plane, of their distance, is not clear of it."""
 LINEAR = 256
