@@ -167,7 +167,7 @@ def test_words_to_replace_are_counted_in_docstrings_and_comments_alone() -> None
     source = (
         '"""What is left is told to who asks.\n\n>>> what is left\n"""\n'
         "# It stands here, what if.  # noqa\n"
-        'TEXT = "what is said"  # fmt: skip\n'
+        'TEXT = "what is said"  # type: ignore[what]\n'
     )
     found = {m.name: len(m.findings) for m in prose.measure(tree(twin__a=source))[1:]}
     assert found == {'"what" as a noun': 1, "told, say, ask": 2, "stands, lies": 1}
