@@ -11,12 +11,13 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = (
     "flexdt/library", "protocol", "twin", "phantoms", "runtime", "server", "clients", "examples",
-    "tests", "docker", "docs", ".ci", ".github", "extensions",
+    "tests", "docker", "docs", ".ci", ".github", "extensions", "changes",
 )  # fmt: skip
-# The changelog names what there was at the time.
+# The changelog and its history name what there was at the time.
 PROSE = sorted(
     {*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md"), *ROOT.glob("protocol/*.md")}
     - {ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("_*/**/*.md")}
+    - {*(ROOT / "docs" / "history").glob("*.md")}
 )
 # Not files of the repository: a secret that its reader makes, and what `make docs` makes.
 ELSEWHERE = re.compile(r"docker/token\b|docs/_build\b")
