@@ -98,13 +98,15 @@ page: $(TEST_STAMP)
 	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'browser and not night' tests/viewer \
 	  --junitxml=build/durations/page.xml
 
-# Every seed and every case: hours in all. Nothing waits for it.
+# Every seed and every case: hours in all, weekly on a runner. Nothing waits for it. CAMPAIGNS takes a part of it.
+CAMPAIGNS := tests extensions/tests
 campaigns: $(TEST_STAMP)
-	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m night tests extensions/tests \
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m night $(CAMPAIGNS) \
 	  --junitxml=build/durations/campaigns.xml
 
 # What failed in the last of these, once more and one after the other.
 failed: lint typecheck $(TEST_STAMP)
+	@echo "Failed in the last run:"; $(BIN)/python .ci/last_failed.py || echo "  nothing that pytest knows of"
 	$(BIN)/pytest --last-failed --last-failed-no-failures none
 
 # What follows from the table of methods, and the page from its TypeScript.

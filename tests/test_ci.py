@@ -1,0 +1,173 @@
+"""Continuous integration: what the workflows run, and what `.ci/run` says of a test that fails."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+WORKFLOWS = ROOT / ".github" / "workflows"
+PARTS = ["test", "test-extensions", "studies", "page"]
+
+
+def workflow(name: str) -> dict[Any, Any]:
+    loaded = yaml.safe_load((WORKFLOWS / name).read_text())
+    assert isinstance(loaded, dict)
+    return loaded
+
+
+def commands(job: dict[str, Any]) -> list[str]:
+    return [step["run"] for step in job["steps"] if "run" in step]
+
+
+def targets() -> set[str]:
+    return set(re.findall(r"^([a-z][a-z -]*):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+
+
+def test_each_part_of_ci_is_a_job() -> None:
+    loaded = workflow("tests.yml")
+    assert {"push", "pull_request"} <= set(loaded[True])  # YAML 1.1 reads `on` as true
+    job = loaded["jobs"]["linux"]
+    assert job["strategy"]["matrix"]["part"] == PARTS
+    assert job["strategy"]["fail-fast"] is False
+    assert ".ci/run ${{ matrix.part }}" in commands(job)
+    assert set(PARTS) <= targets()
+
+
+def test_browsers_run_where_debian_has_chromium() -> None:
+    """On Ubuntu apt installs a stub that asks for a snap."""
+    for path in sorted(WORKFLOWS.glob("*.yml")):
+        for name, job in workflow(path.name)["jobs"].items():
+            text = json.dumps(job)
+            if "chromium" in text or "page" in json.dumps(job.get("strategy")):
+                assert re.fullmatch(r"python:3\.\d+-bookworm", job.get("container", "")), name
+
+
+def test_campaigns_and_resolutions_run_weekly() -> None:
+    loaded = workflow("weekly.yml")
+    (entry,) = loaded[True]["schedule"]
+    minute, hour, day, month, weekday = entry["cron"].split()
+    assert minute.isdecimal()
+    assert hour.isdecimal()
+    assert (day, month) == ("*", "*")
+    assert weekday in "0123456"
+    jobs = loaded["jobs"]
+    assert 'make campaigns CAMPAIGNS="${{ matrix.tests }}"' in commands(jobs["campaigns"])
+    kinds = {row["resolution"] for row in jobs["resolutions"]["strategy"]["matrix"]["include"]}
+    assert kinds == {"lowest", "newest"}
+    assert "make ${{ matrix.resolution }} PYTHON=python" in commands(jobs["resolutions"])
+
+
+def test_every_campaign_is_in_a_weekly_job() -> None:
+    matrix = workflow("weekly.yml")["jobs"]["campaigns"]["strategy"]["matrix"]["tests"]
+    places = [ROOT / name for row in matrix for name in row.split()]
+    assert [place for place in places if not place.exists()] == []
+    mark = re.compile(
+        r"^@pytest\.mark\.(?:campaign|night)|pytest\.mark\.(?:campaign|night)\b", re.M
+    )
+    marked = [
+        path
+        for folder in ("tests", "extensions/tests")
+        for path in (ROOT / folder).rglob("test_*.py")
+        if path != Path(__file__).resolve() and mark.search(path.read_text())
+    ]
+    assert len(marked) > 40
+    left = [p for p in marked if not any(p.is_relative_to(place) for place in places)]
+    assert [path.relative_to(ROOT).as_posix() for path in left] == []
+
+
+MAKE = """#!/bin/sh
+echo "make $*" >> calls
+case "$*" in
+  "-j2 {failing}") exit 2 ;;
+  failed) exit {second} ;;
+esac
+"""
+"""Stands in for make: one part fails, and the tests that failed do again or not; apt-get does nothing."""
+
+
+def run_ci(
+    folder: Path, *parts: str, failing: str = "", second: int = 0, failed: tuple[str, ...] = ()
+) -> tuple[subprocess.CompletedProcess[str], list[str]]:
+    """Run a copy of `.ci/run` with a make of our own; its outcome, and the calls of make."""
+    (folder / ".ci").mkdir()
+    for name in ("run", "last_failed.py"):
+        (folder / ".ci" / name).write_bytes((ROOT / ".ci" / name).read_bytes())
+    (folder / "bin").mkdir()
+    (folder / "bin" / "make").write_text(MAKE.format(failing=failing, second=second))
+    (folder / "bin" / "apt-get").write_text("#!/bin/sh\n")
+    for program in (folder / "bin").iterdir():
+        program.chmod(0o755)
+    cache = folder / ".pytest_cache" / "v" / "cache"
+    cache.mkdir(parents=True)
+    if failed:
+        (cache / "lastfailed").write_text(json.dumps(dict.fromkeys(failed, True)))
+    done = subprocess.run(
+        ["bash", folder / ".ci" / "run", *parts],
+        env={
+            **os.environ,
+            "PATH": f"{folder / 'bin'}:{os.environ['PATH']}",
+            "GITHUB_STEP_SUMMARY": str(folder / "summary"),
+        },
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    calls = folder / "calls"
+    return done, calls.read_text().splitlines() if calls.exists() else []
+
+
+FAILED = ("tests/a/test_a.py::test_one[x]", "tests/b/test_b.py::test_two")
+
+
+def test_a_run_without_failures_makes_each_part_once(tmp_path: Path) -> None:
+    done, calls = run_ci(tmp_path, *PARTS[:3])
+    assert done.returncode == 0
+    assert calls == [f"make -j2 {part}" for part in PARTS[:3]]
+    assert "FAILED" not in done.stdout
+    assert "FLAKY" not in done.stdout
+
+
+def test_tests_that_pass_at_the_second_run_are_named_before_and_after_it(tmp_path: Path) -> None:
+    done, calls = run_ci(tmp_path, "test", "studies", failing="test", failed=FAILED)
+    assert done.returncode == 0
+    assert calls == ["make -j2 test", "make failed", "make -j2 studies"]
+    before, _, after = done.stdout.partition("FLAKY")
+    assert "make test: FAILED AT FIRST" in before
+    for name in FAILED:
+        assert name in before
+        assert name in after
+    assert (tmp_path / "summary").read_text().count(FAILED[0]) == 2
+
+
+def test_tests_that_fail_twice_end_the_run(tmp_path: Path) -> None:
+    done, calls = run_ci(tmp_path, "test", "studies", failing="test", second=1, failed=FAILED)
+    assert done.returncode == 1
+    assert calls == ["make -j2 test", "make failed"]
+    assert FAILED[1] in done.stdout
+    assert "FLAKY" not in done.stdout
+
+
+def test_a_failure_that_is_no_tests_is_not_repeated(tmp_path: Path) -> None:
+    done, calls = run_ci(tmp_path, "test", failing="test")
+    assert done.returncode == 1
+    assert calls == ["make -j2 test"]
+    assert "no test did" in done.stderr
+
+
+@pytest.mark.parametrize("part", ["slow", "tes", "--help"])
+def test_an_unknown_part_is_refused_with_those_there_are(part: str, tmp_path: Path) -> None:
+    done, calls = run_ci(tmp_path, part)
+    assert (done.returncode, calls) == (2, [])
+    assert all(name in done.stderr for name in (*PARTS, part))
+
+
+def test_without_a_part_all_are_run(tmp_path: Path) -> None:
+    done, calls = run_ci(tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert calls == [f"make -j2 {part}" for part in PARTS]
