@@ -90,7 +90,7 @@ case "$*" in
   failed) exit {second} ;;
 esac
 """
-"""Stands in for make: one part fails, and the tests that failed do again or not; apt-get does nothing."""
+"""Stands in for make: one part fails, and the tests that failed do again or not."""
 
 
 def run_ci(
