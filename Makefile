@@ -6,6 +6,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 COMPILED := $(VENV)/.compiled
 TEST_STAMP := $(VENV)/.installed-test
+COLLECTED := build/.collected
 LINTED := build/.linted
 TYPED := build/.typed
 WEB := clients/viewer/web
@@ -72,11 +73,17 @@ $(TYPED): $(SOURCES) | install $(TEST_STAMP)
 kernels: $(TEST_STAMP) $(COMPILED)
 	$(BIN)/python tests/support/compile_kernels.py
 
+# Bytecode of the tests and of all that they import: written once, not by each worker of the first run
+# at the same time. An error of collection is shown by the tests themselves.
+$(COLLECTED): $(TEST_STAMP)
+	@$(BIN)/pytest --collect-only -qq > /dev/null || true
+	@mkdir -p $(@D) && touch $@
+
 quick: lint typecheck
 	$(BIN)/pytest -q -n 2 --dist loadfile -m 'not slow' $(QUICK)
 
 # Three workers on two cores: they wait for processes, clocks and disks a quarter of their time.
-test: lint typecheck kernels $(WEB_STAMP)
+test: lint typecheck kernels $(COLLECTED) $(WEB_STAMP)
 	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'not slow and not browser' \
 	  --junitxml=build/durations/test.xml
 

@@ -100,6 +100,6 @@ def test_commits_given_as_examples_exist() -> None:
     if git("rev-parse", "--is-shallow-repository").stdout.strip() != "false":
         pytest.skip("needs the whole history of a git clone")
     hashes = re.findall(r"`([0-9a-f]{7})`", (ROOT / "CONTRIBUTING.md").read_text())
-    assert len(hashes) == 5
+    assert len(hashes) == 6
     for commit in hashes:
         assert git("cat-file", "-e", f"{commit}^{{commit}}").returncode == 0, commit
