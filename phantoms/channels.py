@@ -19,8 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexdt.phantoms.materials import Material, material, materials
+from flexdt.phantoms.mesh_booleans import united
 from flexdt.phantoms.phantom import Phantom
-from flexdt.phantoms.pieces import Surface, united
+from flexdt.phantoms.pieces import Surface
 from flexdt.phantoms.voxelise import as_volume, voxelise
 from flexdt.twin.errors import GeometryError, UnknownNameError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -36,6 +37,8 @@ SAME = 1e-6
 """Relative difference of attenuations that count as equal."""
 STAND_IN = "water"
 """For what has an attenuation but no composition."""
+SUB_COLUMNS = 8
+"""Samples of solids and meshes along x and y in each voxel; along z their ends are exact."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,10 +194,6 @@ def _amounts(solid: Solid, known: dict[str, Material]) -> list[tuple[str, float]
 
 def _scaled(volume: Volume, made_of: Material) -> Volume:
     return volume.like(volume.data / np.float32(made_of.mu_per_mm))
-
-
-SUB_COLUMNS = 8
-"""Samples of solids and meshes along x and y in each voxel; along z their ends are exact."""
 
 
 def scatter_object(parts: Sequence[Channel], size_mm: Vector, voxels: int) -> Object:

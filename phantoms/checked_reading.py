@@ -34,6 +34,16 @@ Reader = Callable[[object, str], Any]
 NONE: Final[Mapping[str, Reader]] = {}
 IT: Final = "it"
 """The key path of a field that pydantic has named already."""
+MAX_SOLIDS: Final = 100_000
+_KINDS: Final[Mapping[str, type[analytic.Shape]]] = {
+    "sphere": analytic.Sphere,
+    "box": analytic.Box,
+    "cylinder": analytic.Cylinder,
+    "ellipsoid": analytic.Ellipsoid,
+    "convex": analytic.ConvexPolyhedron,
+}
+_KIND_OF: Final[Mapping[type[analytic.Shape], str]] = {cls: kind for kind, cls in _KINDS.items()}
+_OPTIONAL: Final = ("axis", "axes")
 
 
 class PhantomError(TwinError):
@@ -181,17 +191,6 @@ def _three(value: object, where: str, read: Callable[[object, str], float]) -> a
     return (numbers[0], numbers[1], numbers[2])
 
 
-MAX_SOLIDS: Final = 100_000
-
-_KINDS: Final[Mapping[str, type[analytic.Shape]]] = {
-    "sphere": analytic.Sphere,
-    "box": analytic.Box,
-    "cylinder": analytic.Cylinder,
-    "ellipsoid": analytic.Ellipsoid,
-    "convex": analytic.ConvexPolyhedron,
-}
-_KIND_OF: Final[Mapping[type[analytic.Shape], str]] = {cls: kind for kind, cls in _KINDS.items()}
-
 _READERS: Final[Mapping[str, Reader]] = {
     "center": vector,
     "size": lengths,
@@ -204,8 +203,6 @@ _READERS: Final[Mapping[str, Reader]] = {
     "offsets": lambda value, where: each(value, where, number),
 }
 """How each field of a shape is read."""
-
-_OPTIONAL: Final = ("axis", "axes")
 
 
 def scene_to_dict(scene: analytic.Scene) -> dict[str, object]:

@@ -39,10 +39,12 @@ from flexdt.twin.physics.tube import Filter, tube_of, voltages
 from flexdt.twin.projection import project_body
 from flexdt.twin.projection.analytic_solids import Vector
 from flexdt.twin.scanner.state import CameraChange, changed_camera
-from flexdt.twin.script.compose import Kind, ScanRequest, compose_script
-from flexdt.twin.script.plan import ScanPlan, StartState
+from flexdt.twin.script.compose import compose_script
+from flexdt.twin.script.plan import ScanPlan
+from flexdt.twin.script.plan_values import StartState
 from flexdt.twin.script.planner import plan_script
 from flexdt.twin.script.problems import ScriptProblem
+from flexdt.twin.script.scan_request import Kind, ScanRequest
 from flexdt.twin.signatures import public
 
 VIEWS: Final = 8

@@ -20,24 +20,17 @@ from pydantic import PlainSerializer, PlainValidator, ValidationError
 
 from flexdt.phantoms import checked_reading as reading
 from flexdt.phantoms.checked_reading import PhantomError, scene_from_dict, scene_to_dict
-from flexdt.phantoms.pieces import (
-    Surface,
-    SurfacePart,
-    Voxels,
-    boxes,
-    cut,
-    freeze,
-    joined,
-    parts_of,
-)
+from flexdt.phantoms.mesh_booleans import cut
+from flexdt.phantoms.pieces import Surface, Voxels, boxes, freeze
+from flexdt.phantoms.solid_meshes import SurfacePart, joined, parts_of
+from flexdt.phantoms.voxelise import as_volume, voxelise
 from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.projection import Volume
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.values import ArrayValue, adapter_of, told
 
 if TYPE_CHECKING:
     import trimesh
-
-    from flexdt.twin.projection import Volume
 
 SCHEMA = 1
 """Version of the document `to_dict` makes."""
@@ -127,7 +120,7 @@ class Phantom(ArrayValue):
 
     def parts(self) -> tuple[SurfacePart, ...]:
         """The scene side piece by piece: one closed mesh for each solid, with its material."""
-        return parts_of(self)
+        return parts_of(self.scene, self.surfaces, self.voxels, self.beads)
 
     def mesh(self, *, around: bool = False) -> trimesh.Trimesh:
         """The scene side: all surfaces as one mesh, holes turned inside out [mm, object frame].
@@ -138,7 +131,8 @@ class Phantom(ArrayValue):
             around: for collisions: the polyhedra of round solids hold them, instead of lying
                 inside them.
         """
-        return joined(parts_of(self, around=around))
+        pieces = self.scene, self.surfaces, self.voxels
+        return joined(parts_of(*pieces, self.beads, around=around))
 
     def volume(self, voxel_mm: float | None = None, *, oversample: int = 2) -> Volume:
         """The X-ray side as voxels, computed anew at every call.
@@ -151,8 +145,6 @@ class Phantom(ArrayValue):
         Returns:
             Volume of attenuation [1/mm], data [z, y, x], about the origin.
         """
-        from flexdt.phantoms.voxelise import as_volume, voxelise
-
         if self.voxels is not None:
             if not self.is_voxels:
                 raise PhantomError(f"{self.name}: voxels cannot be put together with other parts")

@@ -48,6 +48,15 @@ _ELLIPSOIDS: Final = (
     (0.1, (0.0230, 0.023, 0.020), (0.0, -0.606, 0.0), 0.0),
     (0.1, (0.0230, 0.046, 0.020), (0.06, -0.605, 0.0), 0.0),
 )
+_CUBOID: Final = re.compile(r"([a-z]+)-([1-9][0-9]{0,3})")
+FILLED: Final = 1e-3
+"""How far the filled part of a voxel may lie outside 0 to 1."""
+TEXTS: Final = (".toml", ".json")
+FORMS: Final = (
+    "a phantom or its name, the path of a file (TOML, JSON, " + ", ".join(FORMATS).upper() + "), a "
+    "Volume, an array [z, y, x] with voxel_mm, a mesh with vertices and faces, a Scene or Solid, a "
+    "dictionary as in a scene file, (any of these, material), or a list of them"
+)
 
 
 @public
@@ -83,7 +92,6 @@ _MAKERS: Final[Mapping[str, Callable[[], Phantom]]] = {
     "shepp-logan": shepp_logan,
     "chiral": chiral_phantom,
 }
-_CUBOID: Final = re.compile(r"([a-z]+)-([1-9][0-9]{0,3})")
 
 
 def phantom_names() -> tuple[str, ...]:
@@ -128,16 +136,6 @@ def load_phantom(name: str) -> Phantom:
         f"no phantom called {name!r}; there are", name, phantom_names(),
         ", and cuboids with K beads such as normal-3",
     )  # fmt: skip
-
-
-FILLED: Final = 1e-3
-"""How far the filled part of a voxel may lie outside 0 to 1."""
-TEXTS: Final = (".toml", ".json")
-FORMS: Final = (
-    "a phantom or its name, the path of a file (TOML, JSON, " + ", ".join(FORMATS).upper() + "), a "
-    "Volume, an array [z, y, x] with voxel_mm, a mesh with vertices and faces, a Scene or Solid, a "
-    "dictionary as in a scene file, (any of these, material), or a list of them"
-)
 
 
 def as_phantom(

@@ -36,6 +36,8 @@ CHECKED_ALONG: Final = 96
 """Voxels along the longest side in which `require_replaced` looks."""
 ABSENT: Final = 0.25
 """Part of a voxel that may be replaced without being there."""
+MAX_SENT_SOLIDS: Final = 500
+"""Each becomes up to 1280 triangles where shapes are drawn and checked for collisions."""
 
 
 def read_phantom_file(path: Path) -> Phantom:
@@ -230,10 +232,6 @@ def _spiral(value: object, where: str) -> tuple[int, float, str]:
     if given["beads"] != int(given["beads"]):
         raise reading.wrong(given["beads"], f"{where}.beads", "a whole number")
     return int(given["beads"]), given.get("radius_mm", 2.0), given.get("material", "steel")
-
-
-MAX_SENT_SOLIDS: Final = 500
-"""Each becomes up to 1280 triangles where shapes are drawn and checked for collisions."""
 
 
 def sent_scene(text: bytes, *, name: str) -> Phantom:

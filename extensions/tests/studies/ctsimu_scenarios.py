@@ -38,7 +38,8 @@ import tifffile
 import trimesh
 from scipy.optimize import linprog, minimize_scalar
 
-from flexdt.phantoms.pieces import Surface, cut
+from flexdt.phantoms.mesh_booleans import cut
+from flexdt.phantoms.pieces import Surface
 from flexdt.twin.attenuation.substances import Substance, tables
 from flexdt.twin.errors import TwinError
 from flexdt.twin.physics.detector import deposited
