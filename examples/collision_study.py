@@ -42,8 +42,9 @@ from flexdt.twin.collision.stages import Body
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.motion import profiles as motion
 from flexdt.twin.motion.profiles import Trajectory
-from flexdt.twin.script.compose import ScanRequest, compose_script
+from flexdt.twin.script.compose import compose_script
 from flexdt.twin.script.dry_run import check_script
+from flexdt.twin.script.scan_request import ScanRequest
 
 AXES = ("ax", "ay", "az", "a_turn", "bx", "by", "bz", "b_turn")
 KINDS = ("translation", "rotation", "both", "several axes")

@@ -33,7 +33,8 @@ from flexdt.library.reconstruction.volume_files import read_volume
 from flexdt.phantoms import lego_phantom
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.projection import Volume
-from flexdt.twin.script.compose import ScanRequest, compose_script
+from flexdt.twin.script.compose import compose_script
+from flexdt.twin.script.scan_request import ScanRequest
 
 SIZE_MM = (49.8, 16.0, 24.0)
 """z, y, x."""

@@ -65,8 +65,9 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.physics.tube import tube_of, tube_spectrum
 from flexdt.twin.scanner.state import readout_of
-from flexdt.twin.script.compose import Kind as KindOfScan
-from flexdt.twin.script.compose import ScanRequest, compose_script
+from flexdt.twin.script.compose import compose_script
+from flexdt.twin.script.scan_request import Kind as KindOfScan
+from flexdt.twin.script.scan_request import ScanRequest
 
 Kind = Literal["line_integral", "counts"]
 View = Literal["iso", "beam", "side", "free"]

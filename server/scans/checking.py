@@ -30,9 +30,17 @@ from flexdt.twin.collision.obstacle_path import free_moves
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import Machine, Profile
-from flexdt.twin.script import ScanPlan, ScriptProblem, StartState, dry_run, plan_poses
+from flexdt.twin.script import (
+    CheckReport,
+    Clearance,
+    ScanPlan,
+    ScriptProblem,
+    StartState,
+    dry_run,
+    plan_poses,
+)
 from flexdt.twin.script.parse import LIGHT_BYTES, is_light
-from flexdt.twin.script.plan import SampleSize
+from flexdt.twin.script.plan_values import SampleSize
 
 AT_ONCE: Final = 2
 """Checks in worker processes at a time; others wait."""
@@ -76,7 +84,7 @@ class CheckInput:
             return is_light(script)
         return len(self.wish.poses.text) <= LIGHT_BYTES
 
-    def report(self, bytes_at_most: int | None = None) -> dry_run.CheckReport:
+    def report(self, bytes_at_most: int | None = None) -> CheckReport:
         """Do it; blocks.
 
         Raises:
@@ -223,7 +231,7 @@ def _encoded(matter: CheckInput, codec: Codec) -> list[bytes]:
 def _bounded(sweep: dry_run.CollisionCheck, most: int | None) -> dry_run.CollisionCheck:
     def bounded(
         plan: ScanPlan, machine: Machine, profile: Profile, size: SampleSize | None
-    ) -> dry_run.Clearance:
+    ) -> Clearance:
         size_of = sum(STEP_BYTES + len(s.what) + len(s.assumed_from) for s in plan.steps)
         if most is not None and size_of > most:
             raise too_large("a report", f"more than {size_of}", most)
@@ -232,7 +240,7 @@ def _bounded(sweep: dry_run.CollisionCheck, most: int | None) -> dry_run.Collisi
     return bounded
 
 
-def require_sound(report: dry_run.CheckReport) -> None:
+def require_sound(report: CheckReport) -> None:
     """Raise unless the plan may run.
 
     Raises:

@@ -33,7 +33,8 @@ from flexdt.twin.machine.description import (
 )
 from flexdt.twin.machine.kinematics import poses
 from flexdt.twin.script import parse_script, plan_script
-from flexdt.twin.script.compose import Kind, ScanRequest, compose_script
+from flexdt.twin.script.compose import compose_script
+from flexdt.twin.script.scan_request import Kind, ScanRequest
 
 TRUTH = {
     "dO_x": 0.8123456, "dO_y": -0.5234567, "dO_z": 1.5345678, "alpha": 12.0456789,

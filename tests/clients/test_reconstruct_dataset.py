@@ -39,7 +39,8 @@ from flexdt.twin.physics.tube import Filter, TubeModel
 from flexdt.twin.projection import Volume
 from flexdt.twin.scanner.state import NamedCorrection, Sample
 from flexdt.twin.script import parse_script, plan_script
-from flexdt.twin.script.compose import ScanRequest, compose_script
+from flexdt.twin.script.compose import compose_script
+from flexdt.twin.script.scan_request import ScanRequest
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)

@@ -19,7 +19,8 @@ from flexdt.server.imaging.radiography import BEST, predict
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.scanner.state import changed_camera
-from flexdt.twin.script.compose import ScanRequest, compose_script
+from flexdt.twin.script.compose import compose_script
+from flexdt.twin.script.scan_request import ScanRequest
 
 ROD = {"kind": "cylinder", "center": [0, 0, 0], "radius": 12.0, "height": 60, "material": "pmma"}
 

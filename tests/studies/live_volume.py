@@ -21,7 +21,8 @@ from pathlib import Path
 import flexdt as fx
 from flexdt.runtime.workers import ENVIRONMENT
 from flexdt.twin.machine.description import builtin_machine, profile_of
-from flexdt.twin.script.compose import ScanRequest, compose_script
+from flexdt.twin.script.compose import compose_script
+from flexdt.twin.script.scan_request import ScanRequest
 
 
 def measured(twin: fx.TwinClient, data: Path, side: int, frames: int) -> str:

@@ -19,7 +19,8 @@ from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import Machine, builtin_machine, profile_of
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import ScanPlan, parse_script, plan_script
-from flexdt.twin.script.compose import ScanRequest, compose_script
+from flexdt.twin.script.compose import compose_script
+from flexdt.twin.script.scan_request import ScanRequest
 
 
 def bead_scan(root: Path, truth: Mapping[str, float], frames: int) -> Path:

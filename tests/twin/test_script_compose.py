@@ -24,7 +24,8 @@ from flexdt.twin.machine.description import (
 )
 from flexdt.twin.machine.kinematics import poses
 from flexdt.twin.script import ScanPlan, check_script, parse_script, plan_script
-from flexdt.twin.script.compose import KINDS, Kind, ScanPosition, ScanRequest, compose_script
+from flexdt.twin.script.compose import compose_script
+from flexdt.twin.script.scan_request import KINDS, Kind, ScanPosition, ScanRequest
 
 MACHINE = builtin_machine()
 PROFILE = builtin_profile(MACHINE.default_profile)

@@ -16,7 +16,8 @@ from flexdt.library.reading.folders import load_dataset
 from flexdt.phantoms import load_phantom
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import builtin_machine, profile_of
-from flexdt.twin.script.compose import ScanRequest, compose_script
+from flexdt.twin.script.compose import compose_script
+from flexdt.twin.script.scan_request import ScanRequest
 from tests.viewer.looking import begun, film, point_at
 
 pytestmark = pytest.mark.browser

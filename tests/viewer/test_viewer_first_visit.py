@@ -21,7 +21,8 @@ import trimesh
 
 from flexdt.phantoms import load_phantom
 from flexdt.twin.machine.description import builtin_machine, profile_of
-from flexdt.twin.script.compose import ScanRequest, compose_script
+from flexdt.twin.script.compose import compose_script
+from flexdt.twin.script.scan_request import ScanRequest
 from tests.viewer.looking import drawn, picture, point_at, settled, until
 
 pytestmark = pytest.mark.browser

@@ -42,7 +42,8 @@ from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.projection import Volume
 from flexdt.twin.script import parse_script, plan_script
-from flexdt.twin.script.compose import ScanRequest, compose_script
+from flexdt.twin.script.compose import compose_script
+from flexdt.twin.script.scan_request import ScanRequest
 
 VIEWS, SIDE, MU, RADIUS = 61, 48, 0.03, 9.0
 MACHINE = builtin_machine()

@@ -387,7 +387,8 @@ def test_a_handle_is_at_its_stage_when_the_drag_is_over() -> None:
 
 
 def test_orbit_of_a_turn_is_a_circle_about_the_axis() -> None:
-    from flexdt.twin.script.compose import ScanRequest, compose_script
+    from flexdt.twin.script.compose import compose_script
+    from flexdt.twin.script.scan_request import ScanRequest
 
     text = compose_script(ScanRequest(frames=90), MACHINE, PROFILE)
     planned = plan_text(text, MACHINE, PROFILE, None)

@@ -1,13 +1,17 @@
 """Acquila scan scripts: text to typed commands to a plan, each step plain data."""
 
+from flexdt.twin.script.check_findings import Clearance, Collision
 from flexdt.twin.script.commands import Script, Wait
-from flexdt.twin.script.compose import ScanRequest, compose_script
-from flexdt.twin.script.dry_run import CheckReport, Clearance, Collision, check_plan, check_script
+from flexdt.twin.script.compose import compose_script
+from flexdt.twin.script.dry_run import check_plan, check_script
 from flexdt.twin.script.dry_run_report import html_report
 from flexdt.twin.script.parse import parse_script, read_script
-from flexdt.twin.script.plan import Exposure, PlanStep, SampleSize, ScanPlan, StartState
-from flexdt.twin.script.planner import plan_poses, plan_script
+from flexdt.twin.script.plan import CheckReport, ScanPlan
+from flexdt.twin.script.plan_values import Exposure, PlanStep, SampleSize, StartState
+from flexdt.twin.script.planner import plan_script
+from flexdt.twin.script.pose_plan import plan_poses
 from flexdt.twin.script.problems import ScriptError, ScriptProblem
+from flexdt.twin.script.scan_request import ScanRequest
 
 __all__ = [
     "CheckReport",

@@ -2,21 +2,19 @@
 
 The text has the scanner's own form (TAB separated, seven columns, CRLF) and follows the smooth-scan
 rule: image i of n is taken at i * 360 / (n - 1) after the trigger, and the run-up holds the
-acceleration and four images. Motor targets follow from the machine's linear map and the profile's
-offsets, so source, detector and sample come out centred. Where no motor moves source or detector,
-the sample moves instead. A motor that moves two of these things can set one of them only. The
-result is checked by planning it.
+acceleration and four images. `motor_targets` brings source, detector and sample to
+the beam's middle. Where no motor moves source or detector, the sample moves instead. The result is
+checked by planning it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import product
-from typing import Final, Literal
+from typing import Final
 
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import (
@@ -25,75 +23,19 @@ from flexdt.twin.geometry.conventions import (
     FloatArray,
     turn_detector,
 )
-from flexdt.twin.machine.camera import CameraSettings, Roi
+from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Axis, Machine, Profile, check_target
-from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.scanner.state import CameraChange, TubeSettings, changed_camera, changed_tube
+from flexdt.twin.script.motor_targets import QUANTITIES, MotorTargets, beside_beam
 from flexdt.twin.script.planned_images import MARGIN_IMAGES, run_up
-
-Kind = Literal["fly", "step", "tiled", "helical", "calibration"]
-
-KINDS: Final[tuple[Kind, ...]] = ("fly", "step", "tiled", "helical", "calibration")
-FREE_MM: Final = 60.0
-"""How far beyond the field of view the sample goes for the flat field (assumed: any sample)."""
-
-REFERENCES: Final = 10
-"""Images averaged for a dark and a flat: their noise is then little beside a projection's."""
+from flexdt.twin.script.scan_request import ScanPosition, ScanRequest
 
 MAX_FRAMES: Final = 100_000
 _ROUNDED_MM: Final = 1e-4
 """What scripts with six decimals may miss of a quantity."""
-
-
-@dataclass(frozen=True)
-class ScanPosition:
-    """The sample's position in one scan of a calibration series: SOD and lateral offset [mm]."""
-
-    sod_mm: float
-    lateral_mm: float = 0.0
-
-
-@dataclass(frozen=True)
-class ScanRequest:
-    """The scan to compose a script for, in the edge's units.
-
-    Attributes:
-        kind: fly (one smooth turn), step (stop for every image), tiled (fly scans with the detector
-            side by side), helical (several turns while source and detector rise), calibration (one
-            fly scan for each of `placements`).
-        sod_mm, sdd_mm: source-object and source-detector distance; None is 600 and 1059 where the
-            machine gets there, else its home, or its only one.
-        frames: images of one fly scan, of the whole for step and helical.
-        exposure_ms, averages: of one image; None is 100 ms, or as near as the camera gets.
-        height_mm: of source and detector centre above the origin; None is the sample's, or as for
-            sod_mm.
-        turns, rise_mm: of a helical scan, in total.
-        tiles: side by side, for tiled; neighbours share a tenth of the columns.
-        placements: for calibration; None is SOD 600 and 800, or what the machine has room for.
-        mode, roi: camera; None is the machine's.
-        kV, power_W: tube; None is the machine's.
-        darks, flats: averages of the dark and of the flat image.
-        folder: the scanner's output path; the twin keeps only the file names.
-    """
-
-    kind: Kind = "fly"
-    sod_mm: float | None = None
-    sdd_mm: float | None = None
-    frames: int = 361
-    exposure_ms: float | None = None
-    averages: int = 1
-    height_mm: float | None = None
-    turns: float = 3.0
-    rise_mm: float = 20.0
-    tiles: int = 2
-    placements: tuple[ScanPosition, ...] | None = None
-    mode: str | None = None
-    roi: Roi | None = None
-    kV: float | None = None
-    power_W: float | None = None
-    darks: int = REFERENCES
-    flats: int = REFERENCES
-    folder: str = "E:\\flexdt\\scan"
+BESIDE: Final = 0.1
+"""How far beside the beam may stand what no motor moves, as part of the field of view: zero offsets
+are of that kind, a machine built otherwise is not (assumed)."""
 
 
 def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> str:
@@ -115,7 +57,7 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
     change: CameraChange = {"mode": request.mode, "roi": request.roi, "exposure_ms": exposure}
     changed_camera(panel, panel.camera, change)
     changed_tube(tube, TubeSettings(tube.kV, tube.power_W), request.kV, request.power_W)
-    attempts = list(_usual(request, _Places(machine, profile)))
+    attempts = list(_usual(request, MotorTargets(machine, profile)))
     for sod, sdd, height in attempts:
         placed = (ScanPosition(sod),) if request.placements is None else request.placements
         full = _Request(**{**vars(request), "sod_mm": sod, "sdd_mm": sdd, "height_mm": height,
@@ -139,7 +81,7 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
     return "".join(f"{row}\r\n" for row in writer.rows())
 
 
-def _usual(request: ScanRequest, places: _Places) -> Iterator[tuple[float, float, float]]:
+def _usual(request: ScanRequest, places: MotorTargets) -> Iterator[tuple[float, float, float]]:
     """SOD, SDD and height as asked for, else as is usual, else as at home, to be tried in turn."""
 
     def tried(asked: float | None, *usual: float) -> Iterable[float]:
@@ -165,154 +107,8 @@ class _Request(ScanRequest):
     placements: tuple[ScanPosition, ...] = ()
 
 
-_QUANTITIES: Final = {
-    "object_y": "the source-object distance",
-    "detector_y": "the source-detector distance",
-    "source_z": "the height of the beam",
-    "object_x": "the sample sideways",
-    "detector_x": "the detector sideways",
-    "detector_z": "the height of the detector",
-    "source_x": "the source sideways",
-    "object_z": "the height of the sample",
-}
-"""What motors set, the most important first."""
-BESIDE: Final = 0.1
-"""How far beside the beam may stand what no motor moves, as part of the field of view: zero offsets
-are of that kind, a machine built otherwise is not (assumed)."""
-
-
 @dataclass(frozen=True)
-class _Places:
-    """Where the motors of a machine bring its stages."""
-
-    machine: Machine
-    profile: Profile
-
-    def has(self, *quantities: str) -> bool:
-        """Whether motors move all of these."""
-        return all(self.machine.geometry.get(quantity) for quantity in quantities)
-
-    def constant(self, quantity: str) -> float:
-        """What a quantity is without its motors [mm]."""
-        p = self.profile
-        offsets = {"source_z": p.src_ort, "detector_x": p.det_tan, "detector_y": p.c_det,
-                   "object_x": p.axs_tan, "object_y": p.c_obj,
-                   "object_z": self.machine.sample_height_mm}  # fmt: skip
-        return offsets.get(quantity, 0.0) + self.machine.fixed.get(quantity, 0.0)
-
-    def at_home(self, quantity: str) -> float:
-        """What a quantity is with every motor at home [mm]."""
-        return round(self.value(quantity, {}), 6)
-
-    def value(self, quantity: str, positions: Mapping[str, float]) -> float:
-        """What a quantity is where motors stand at `positions`, the others at home [mm]."""
-        factors = self.machine.geometry.get(quantity, {})
-        moved = (f * positions.get(n, self.machine.axis(n).home) for n, f in factors.items())
-        return self.constant(quantity) + sum(moved)
-
-    @cached_property
-    def drivers(self) -> dict[str, str]:
-        """Quantity -> the motor that sets it: the one of its motors that moves it most.
-
-        No motor sets two quantities. The other motors of a quantity stay at home.
-        """
-        out: dict[str, str] = {}
-        for quantity in _QUANTITIES:
-            factors = self.machine.geometry.get(quantity, {})
-            free = [motor for motor in factors if motor not in out.values()]
-            if quantity == "object_z" and self.has("source_z"):
-                continue  # the beam goes to the sample
-            if free:
-                out[quantity] = max(free, key=lambda motor: abs(factors[motor]))
-        return out
-
-    def solved(self, wanted: Mapping[str, float]) -> dict[str, float]:
-        """Motors of quantities -> where `drivers` bring them to what is `wanted` [mm], or home."""
-        geometry = self.machine.geometry
-        moved = (motor for quantity in wanted for motor in geometry.get(quantity, {}))
-        out = {motor: self.machine.axis(motor).home for motor in moved}
-        for quantity, asked in wanted.items():
-            if motor := self.drivers.get(quantity):
-                rest = self.value(quantity, {motor: 0.0})
-                out[motor] = round((asked - rest) / geometry[quantity][motor], 6)
-        return out
-
-    def driver(self, quantity: str) -> str:
-        """The motor that sets a quantity.
-
-        Raises:
-            LimitError: no motor is left for it.
-        """
-        if quantity not in self.drivers:
-            what = f"has no motor of its own for {_QUANTITIES[quantity]}"
-            raise self.lacking(what, missing=quantity)
-        return self.drivers[quantity]
-
-    def need(self, what: str, quantity: str) -> None:
-        """Check that motors move a quantity.
-
-        Raises:
-            LimitError: what cannot be done, and which quantity no motor moves.
-        """
-        if not self.has(quantity):
-            none = f"has no motor for {_QUANTITIES[quantity]}, which {what} needs"
-            raise self.lacking(none, asked=what, missing=quantity)
-
-    def lacking(self, what: str, **data: object) -> LimitError:
-        """The error that says what this machine lacks."""
-        return LimitError(f"{self.machine.name} {what}", data)
-
-    @property
-    def aside(self) -> tuple[str, ...]:
-        """The quantity by which the sample leaves the beam."""
-        return tuple(q for q in ("object_x", "object_z") if q in self.drivers)[:1]
-
-
-def beside_beam(
-    machine: Machine,
-    profile: Profile,
-    camera: CameraSettings,
-    positions: Mapping[str, float],
-    radius_mm: float = 0.0,
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Where the sample's stage goes from `positions` so that the beam is free, as far as it can.
-
-    Args:
-        machine: whose motors these are.
-        profile: zero offsets.
-        camera: decides how wide the beam is that reaches the image.
-        positions: motors [mm, deg]; those left out stand at home.
-        radius_mm: of the sample, if known.
-
-    Returns:
-        Motor -> target, to either side of the beam, the freer one first.
-
-    Raises:
-        LimitError: no motor takes the sample out of the beam.
-    """
-    places = _Places(machine, profile)
-    if not places.aside:
-        what = "has no motor that takes the sample out of the beam, so no flat image can be taken"
-        raise places.lacking(what, asked="a flat field", missing=["object_x", "object_z"])
-    [quantity] = places.aside
-    name = places.drivers[quantity]
-    axis, factor = machine.axis(name), machine.geometry[quantity][name]
-    p = motor_poses(machine, profile, camera, positions)
-    k = 0 if quantity == "object_x" else 1
-    beam, sample = (p.detector - p.source)[0], (p.axis - p.source)[0]
-    share = float(sample[1] / beam[1])
-    off = float((share * beam - sample)[2 * k])
-    middle = positions.get(name, axis.home) + off / factor
-    size = camera.shape[1 - k] * camera.pixels_mm(machine.detector.pixels)[k]
-    away = (abs(share) * size / 2 + FREE_MM + radius_mm) / abs(factor)
-    least, most = math.ceil(axis.lower * 1e6) / 1e6, math.floor(axis.upper * 1e6) / 1e6
-    upper, lower = ({name: round(min(max(middle + way, least), most), 6)} for way in (away, -away))
-    freer = middle - axis.lower > axis.upper - middle
-    return (lower, upper) if freer else (upper, lower)
-
-
-@dataclass(frozen=True)
-class _Writer(_Places):
+class _Writer(MotorTargets):
     request: _Request
 
     def rows(self) -> Iterator[str]:
@@ -535,7 +331,7 @@ class _Writer(_Places):
                 continue
             self.need(f"{asked:g} mm ({only:g} mm is all there is)", quantity)
             what = (
-                f"has no motor of its own for {_QUANTITIES[quantity]}: {asked:g} mm were asked for"
+                f"has no motor of its own for {QUANTITIES[quantity]}: {asked:g} mm were asked for"
             )
             it_is = f"{what}, it is {only:g} mm"
             raise self.lacking(it_is, asked=asked, allowed=only, missing=quantity)

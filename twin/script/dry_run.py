@@ -7,188 +7,23 @@ through a function passed as an argument, collisions and clearances.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.script import commands as c
+from flexdt.twin.script.beam_view import View, views
+from flexdt.twin.script.check_findings import Clearance, Dose, Optics
 from flexdt.twin.script.parse import Source, content, read_script
-from flexdt.twin.script.plan import Range, SampleSize, ScanPlan, StartState, step_range, total_range
-from flexdt.twin.script.planner import View, plan_script, views
-from flexdt.twin.script.problems import ScriptProblem, WithProblems, in_order
-
-Trace = tuple[tuple[float, float], ...]
-
-
-@dataclass(frozen=True)
-class Collision:
-    """A contact on the way: which line moves, when, what touches what.
-
-    `last_free` is where every axis stands at the last moment that is still free.
-    """
-
-    line: int
-    time_s: float
-    pair: tuple[str, str]
-    last_free: Mapping[str, float]
-
-    def to_dict(self) -> dict[str, object]:
-        """The JSON form of `flexdt check`."""
-        return {**vars(self), "pair": list(self.pair), "last_free": dict(self.last_free)}
-
-
-@dataclass(frozen=True)
-class Clearance:
-    """What a collision check found over a whole plan.
-
-    `min_clearance_mm` of a plan with collisions is that at which the worst of them begins: how far
-    parts overlap then is not measured. `trace` are (time [s], smallest clearance [mm]) points for a
-    plot, in time order.
-    """
-
-    collisions: tuple[Collision, ...] = ()
-    min_clearance_mm: float | None = None
-    min_clearance_pair: tuple[str, str] | None = None
-    trace: Trace = ()
-
-
-_OF_STEP = ("line", "start_s", "duration_s", "holds_s", "assumed_s", "assumed_from", "what")
-HOME_ASSUMED = "the machine's home, assumed"
-EMPTY, EMPTY_ASSUMED = "none", "empty stage assumed"
+from flexdt.twin.script.plan import CheckReport, ScanPlan
+from flexdt.twin.script.plan_values import SampleSize, StartState
+from flexdt.twin.script.planner import plan_script
+from flexdt.twin.script.problems import ScriptProblem, in_order
 
 CollisionCheck = Callable[[ScanPlan, Machine, Profile, SampleSize | None], Clearance]
 """Reports the collisions of a plan; the function holds the scene and the sample's body."""
-
-
-@dataclass(frozen=True)
-class Optics:
-    """What the projections of one camera setting see [mm, um]; ranges are (least, greatest).
-
-    Attributes:
-        field_mm: width and height of the field of view at the rotation axis.
-        turn_field_mm: diameter of the cylinder seen whole over a full rotation.
-        truncation: None without a sample's size; else columns (and rows, if the height is known)
-            of its projection that fall beyond left, right, top, bottom, at worst over the rotation.
-    """
-
-    lines: tuple[int, int]
-    shape: tuple[int, int]
-    pixel_mm: float
-    sod_mm: tuple[float, float]
-    sdd_mm: tuple[float, float]
-    magnification: tuple[float, float]
-    voxel_um: tuple[float, float]
-    field_mm: tuple[float, float]
-    turn_field_mm: float
-    truncation: Mapping[str, float] | None
-
-    @property
-    def truncated(self) -> bool:
-        """Whether the sample is cut off anywhere."""
-        return self.truncation is not None and any(x > 0 for x in self.truncation.values())
-
-    def to_dict(self) -> dict[str, object]:
-        """JSON form."""
-        names = {"field_mm": "field_of_view_mm", "turn_field_mm": "full_turn_diameter_mm",
-                 "truncation": "truncation_px"}  # fmt: skip
-        told = {n: list(v) if isinstance(v, tuple) else v for n, v in vars(self).items()}
-        told["rows"], told["cols"] = told.pop("shape")
-        return {names.get(name, name): value for name, value in told.items()}
-
-
-@dataclass(frozen=True)
-class Dose:
-    """What matters for dose: beam time, charge on the target, time that makes images.
-
-    `charge_mAs` is power over voltage times beam time. It says nothing about dose in a sample:
-    spectrum, filter and distance are not in it.
-    """
-
-    beam_on_s: float
-    charge_mAs: float
-    exposing_s: float
-
-
-@dataclass(frozen=True)
-class CheckReport(WithProblems):
-    """The whole report; `to_dict` is the document of `flexdt check --json`."""
-
-    plan: ScanPlan
-    problems: tuple[ScriptProblem, ...]
-    clearance: Clearance | None
-    optics: tuple[Optics, ...]
-    dose: Dose
-    text: str = field(default="", repr=False)
-    start_known: bool = True
-    """Whether the start was given; otherwise the machine's home positions are assumed."""
-
-    def __repr__(self) -> str:
-        """One line."""
-        hits = len(self.clearance.collisions) if self.clearance else 0
-        return (
-            f"<CheckReport: {'ok' if self.ok else 'not ok'}, {hits} collisions, of {self.plan!r}>"
-        )
-
-    @property
-    def ok(self) -> bool:
-        """No error and no collision; warnings do not count."""
-        return not self.errors  # a collision is one
-
-    @property
-    def start(self) -> str:
-        """Where the motors stand before, in words."""
-        at = ", ".join(f"{name}={x:g}" for name, x in self.plan.start.positions.items())
-        return at if self.start_known else f"{HOME_ASSUMED}: {at}"
-
-    @property
-    def sample(self) -> str:
-        """What stands on the stage, in words."""
-        size = self.plan.sample
-        if size is None:
-            return EMPTY if self.start_known else f"{EMPTY} ({EMPTY_ASSUMED})"
-        high = f", {size.height_mm:g} mm high" if size.height_mm else ""
-        return f"{size.diameter_mm:g} mm across{high} ({size.source})"
-
-    def to_dict(self) -> dict[str, object]:
-        """The JSON document."""
-        plan, clearance = self.plan, self.clearance
-        size, found = plan.sample, clearance or Clearance()
-        return {
-            "ok": self.ok,
-            "machine": plan.machine.name,
-            "profile": plan.profile.name,
-            "problems": [p.to_dict() for p in self.problems],
-            "steps": [
-                {n: getattr(s, n) for n in _OF_STEP} | _range(step_range(s, plan.machine.timing))
-                for s in plan.steps
-            ],
-            "duration_s": plan.duration_s,
-            **_range(total_range(plan.steps, plan.duration_s, plan.machine.timing)),
-            "computed_s": plan.computed_s,
-            "assumed_s": plan.assumed_s,
-            "timing_source": plan.machine.timing.source,
-            "frames": plan.frames,
-            "images": sum(len(g.files) for g in plan.groups),
-            "bytes": plan.bytes,
-            "collisions": [x.to_dict() for x in found.collisions],
-            "collisions_checked": clearance is not None,
-            "min_clearance_mm": found.min_clearance_mm,
-            "min_clearance_pair": found.min_clearance_pair and list(found.min_clearance_pair),
-            "clearance": [list(p) for p in found.trace],
-            "optics": [o.to_dict() for o in self.optics],
-            "dose": dict(vars(self.dose)),
-            "start": {"known": self.start_known, "positions": dict(plan.start.positions)},
-            "summary": {"sample": self.sample, "start": self.start},
-            "sample": size and {**vars(size), "height_mm": size.height_mm or None},
-        }
-
-
-def _range(found: Range | None) -> dict[str, float | None]:
-    low, high = found or (None, None)
-    return {"p5_s": low, "p95_s": high}
 
 
 def check_script(

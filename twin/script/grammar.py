@@ -29,6 +29,17 @@ _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _RESERVED = re.compile(r"(?:mag|rot|tra|ver).*|.*(?:obj|tube|det)", re.IGNORECASE | re.DOTALL)
 
 WAITS: Final[Mapping[str, c.Wait]] = {w.value.lower(): w for w in c.Wait}
+Read = Callable[[str, str], dict[str, object]]
+_UNSAFE = re.compile(r"[\x00-\x1f\x7f<>:\"|?*\ud800-\udfff]")
+_DEVICE = re.compile(r"(?:con|prn|aux|nul|com\d|lpt\d)(?:\..*)?", re.IGNORECASE)
+_SUFFIX = re.compile(r".*\.tiff?", re.IGNORECASE | re.DOTALL)
+_DARK = re.compile(r"di[_-]?\d*(?:\.tiff?)?", re.IGNORECASE)
+_FLAT = re.compile(r"io[_-]?\d*(?:\.tiff?)?", re.IGNORECASE)
+MAX_NAME = 120
+_GOES_ON: Final[Mapping[c.Wait, str]] = {
+    c.Wait.NO_WAIT: ", goes on at once",
+    c.Wait.RCV: ", goes on when received",
+}
 
 
 class ArgumentError(ValueError):
@@ -37,9 +48,6 @@ class ArgumentError(ValueError):
     def __init__(self, message: str, code: str = "value", index: int = 0) -> None:
         super().__init__(message)
         self.code, self.index = code, index
-
-
-Read = Callable[[str, str], dict[str, object]]
 
 
 @dataclass(frozen=True)
@@ -243,14 +251,6 @@ def match(component: str, words: list[str]) -> tuple[Spec, int] | None:
     return None
 
 
-_UNSAFE = re.compile(r"[\x00-\x1f\x7f<>:\"|?*\ud800-\udfff]")
-_DEVICE = re.compile(r"(?:con|prn|aux|nul|com\d|lpt\d)(?:\..*)?", re.IGNORECASE)
-_SUFFIX = re.compile(r".*\.tiff?", re.IGNORECASE | re.DOTALL)
-_DARK = re.compile(r"di[_-]?\d*(?:\.tiff?)?", re.IGNORECASE)
-_FLAT = re.compile(r"io[_-]?\d*(?:\.tiff?)?", re.IGNORECASE)
-MAX_NAME = 120
-
-
 def bare_name(path: str) -> str:
     r"""The last part of `path` (after \ or /) with unsafe characters as `_`; may be empty."""
     name = re.split(r"[\\/]", path)[-1]
@@ -277,12 +277,6 @@ def kind_of(name: str) -> ImageKind:
     if _DARK.fullmatch(name):
         return "dark"
     return "flat" if _FLAT.fullmatch(name) else "projection"
-
-
-_GOES_ON: Final[Mapping[c.Wait, str]] = {
-    c.Wait.NO_WAIT: ", goes on at once",
-    c.Wait.RCV: ", goes on when received",
-}
 
 
 def _move_line(k: c.MoveAbsolute) -> str:

@@ -43,6 +43,10 @@ _WORD = re.compile(r"\S+")
 _BLANK = " \t\ufeff\x1a"
 _MAX_JOINED = 64
 """Lines that one binary argument may span; a real one is about a hundred bytes."""
+_COMMENT_MARKS = ("#", "//", ";")
+_CUSTOM_NAME = re.compile(r"[A-Za-z][\w$.-]*", re.ASCII)
+Source = str | bytes | PathLike
+"""A script's text or bytes, or the path of its file."""
 
 
 @dataclass(frozen=True)
@@ -188,14 +192,6 @@ def _field(piece: str, start: int, *, keep: bool = False) -> Field:
 def is_light(script: bytes) -> bool:
     """Whether planning a script takes so little time that any thread may do it at once."""
     return len(script) <= LIGHT_BYTES and _HEAVY.search(script) is None
-
-
-_COMMENT_MARKS = ("#", "//", ";")
-_CUSTOM_NAME = re.compile(r"[A-Za-z][\w$.-]*", re.ASCII)
-
-
-Source = str | bytes | PathLike
-"""A script's text or bytes, or the path of its file."""
 
 
 def parse_script(text: Source) -> c.Script:

@@ -1,21 +1,17 @@
-"""The plan of a scan as plain frozen data: steps, motion, images, all on a clock that starts at 0.
+"""The plan of a scan, and the report about it, as plain frozen data.
 
-A `ScanPlan` describes a script before it runs: the position of each axis at any time, and the time,
-pose, settings and file of every image. Images of a sequence are columns of arrays and become
-`Exposure` values only on request.
-
-`step_range` and `total_range` say between which times a step or a scan takes, nine of ten times,
-by what a machine's logs tell.
+A `ScanPlan` describes a script before it runs, on a clock that starts at 0: the position of each
+axis at any time, and the time, pose, settings and file of every image. Images of a sequence are
+columns of arrays and become `Exposure` values only on request. A `CheckReport` is what
+`ScanPlan.check` returns: problems, collisions and clearances, what the beam sees, dose.
 """
 
 from __future__ import annotations
 
-import math
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,185 +20,26 @@ from flexdt.twin.backends import backend
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.poses import Poses
-from flexdt.twin.machine.camera import CameraSettings
-from flexdt.twin.machine.description import Machine, Profile, Timing
+from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.motion.profiles import AxisPath, Trajectory
-from flexdt.twin.scanner.state import StagePlacement
-from flexdt.twin.script.commands import AnyCommand, ImageKind
+from flexdt.twin.script.check_findings import Clearance, Dose, Optics
+from flexdt.twin.script.plan_values import (
+    BeamOn,
+    Exposure,
+    ExposureGroup,
+    PlanStep,
+    SampleSize,
+    Settings,
+    StartState,
+)
 from flexdt.twin.script.problems import ScriptProblem, WithProblems
-from flexdt.twin.values import Array, ArrayValue, JsonValue
+from flexdt.twin.script.time_ranges import Range, step_range, total_range
+from flexdt.twin.values import ArrayValue, JsonValue
 
-if TYPE_CHECKING:
-    from flexdt.twin.script.dry_run import CheckReport
-
-
-@dataclass(frozen=True)
-class StartState:
-    """The scanner before the script [mm, deg, per second; kV, W]."""
-
-    positions: Mapping[str, float]
-    speeds: Mapping[str, float]
-    accelerations: Mapping[str, float]
-    camera: CameraSettings
-    kV: float
-    power_W: float
-    xrays_on: bool | None = False
-    """None: nobody knows. They count as off, and switching them off takes its time."""
-
-    @classmethod
-    def of(cls, machine: Machine) -> StartState:
-        """The machine's homes and defaults; whether X-rays are on is not known."""
-        return cls(
-            {n: a.home for n, a in machine.axes.items()},
-            {n: a.speed for n, a in machine.axes.items()},
-            {n: a.acceleration for n, a in machine.axes.items()},
-            machine.detector.camera,
-            machine.tube.kV,
-            machine.tube.power_W,
-            None,
-        )
-
-
-@dataclass(frozen=True)
-class PlanStep:
-    """One command on the plan's clock.
-
-    Attributes:
-        index: place in `ScanPlan.steps`.
-        line: line of the script.
-        start_s: when the command starts to take effect.
-        duration_s: how long it takes; a move goes on after the script did when it does not wait.
-        holds_s: how long the script waits for it; the next step starts then.
-        assumed_s: the part of `holds_s` from the machine's timing and not from moves, pauses and
-            exposures.
-        assumed_from: where that part comes from.
-        what: one readable line.
-        command: the typed command.
-        kind: the machine's time that it is (`Timing`).
-    """
-
-    index: int
-    line: int
-    start_s: float
-    duration_s: float
-    holds_s: float
-    assumed_s: float
-    assumed_from: str
-    what: str
-    command: AnyCommand
-    kind: str = "command"
-
-    @property
-    def computed_s(self) -> float:
-        """The part of `holds_s` that follows from moves, pauses and exposures."""
-        return self.holds_s - self.assumed_s
-
-
-@dataclass(frozen=True)
-class Exposure:
-    """One image: what is set and where every axis stands at its nominal moment `start_s`.
-
-    `file` is a bare file name (no folder), None for a preview, which is not saved. `step` indexes
-    `ScanPlan.steps`: the command that takes the image. `index` counts all images of the plan.
-    """
-
-    index: int
-    kind: ImageKind
-    file: str | None
-    start_s: float
-    exposure_ms: float
-    averages: int
-    xrays_on: bool
-    kV: float
-    power_W: float
-    camera: CameraSettings
-    positions: Mapping[str, float]
-    step: int
-    line: int
-    moving: bool
-    """Whether an axis moves during this image (fly scan)."""
-
-    @property
-    def duration_s(self) -> float:
-        """Exposure times averages."""
-        return self.exposure_ms * self.averages / 1000.0
-
-
-@dataclass(frozen=True, eq=False)
-class ExposureGroup(ArrayValue):
-    """The images of one command: n of one kind with one setting.
-
-    Attributes:
-        files: n bare file names, or empty for a preview.
-        starts: (n,) nominal moments [s].
-        exact: axes whose positions are known by rule, (n,) each; others follow the trajectories.
-        moving: whether an axis moves meanwhile.
-    """
-
-    kind: ImageKind
-    files: tuple[str, ...]
-    starts: Array
-    camera: CameraSettings
-    xrays_on: bool
-    kV: float
-    power_W: float
-    step: int
-    line: int
-    moving: bool = False
-    exact: Mapping[str, Array] = field(default_factory=dict)
-
-    def __len__(self) -> int:
-        return len(self.starts)
-
-    @property
-    def bytes(self) -> int:
-        """Pixel bytes of the images that are saved (uint16)."""
-        rows, cols = self.camera.shape
-        return 2 * rows * cols * len(self.files)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Settings(StartState):
-    """The scanner at the moment of `write settings file`, and when that was."""
-
-    time_s: float
-    step: int
-
-
-@dataclass(frozen=True)
-class BeamOn:
-    """An interval in which X-rays are on with one setting [s, kV, W]."""
-
-    start_s: float
-    end_s: float
-    kV: float
-    power_W: float
-
-
-@dataclass(frozen=True)
-class SampleSize:
-    """A cylinder about the rotation axis that contains the sample [mm]; height 0 is unknown.
-
-    It is centred at the sample's reference height.
-    """
-
-    diameter_mm: float
-    height_mm: float = 0.0
-    source: str = "given"
-
-    @classmethod
-    def around(
-        cls, size_mm: Sequence[float], source: str = "given", offset: StagePlacement | None = None
-    ) -> SampleSize:
-        """The cylinder that contains a box of `size_mm` (x, y, z) at `offset`, at every angle."""
-        at = StagePlacement() if offset is None else offset
-        x, y, z = size_mm
-        radius = 0.5 * math.hypot(x, y)
-        if at.rx or at.ry:
-            radius = 0.5 * math.hypot(x, y, z)
-            z = 2.0 * radius
-        return cls(2.0 * (radius + math.hypot(at.x, at.y)), z + 2.0 * abs(at.z), source)
+_OF_STEP = ("line", "start_s", "duration_s", "holds_s", "assumed_s", "assumed_from", "what")
+HOME_ASSUMED = "the machine's home, assumed"
+EMPTY, EMPTY_ASSUMED = "none", "empty stage assumed"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -382,54 +219,80 @@ def saved_images(plan: ScanPlan) -> Iterator[tuple[ExposureGroup, dict[str, Floa
             yield group, {n: v[rows] for n, v in plan.image_positions.items()}
 
 
-Range = tuple[float, float]
+@dataclass(frozen=True)
+class CheckReport(WithProblems):
+    """The whole report; `to_dict` is the document of `flexdt check --json`."""
 
+    plan: ScanPlan
+    problems: tuple[ScriptProblem, ...]
+    clearance: Clearance | None
+    optics: tuple[Optics, ...]
+    dose: Dose
+    text: str = field(default="", repr=False)
+    start_known: bool = True
+    """Whether the start was given; otherwise the machine's home positions are assumed."""
 
-class _OfKind(Protocol):
+    def __repr__(self) -> str:
+        """One line."""
+        hits = len(self.clearance.collisions) if self.clearance else 0
+        return (
+            f"<CheckReport: {'ok' if self.ok else 'not ok'}, {hits} collisions, of {self.plan!r}>"
+        )
+
     @property
-    def kind(self) -> str: ...
+    def ok(self) -> bool:
+        """No error and no collision; warnings do not count."""
+        return not self.errors  # a collision is one
+
+    @property
+    def start(self) -> str:
+        """Where the motors stand before, in words."""
+        at = ", ".join(f"{name}={x:g}" for name, x in self.plan.start.positions.items())
+        return at if self.start_known else f"{HOME_ASSUMED}: {at}"
+
+    @property
+    def sample(self) -> str:
+        """What stands on the stage, in words."""
+        size = self.plan.sample
+        if size is None:
+            return EMPTY if self.start_known else f"{EMPTY} ({EMPTY_ASSUMED})"
+        high = f", {size.height_mm:g} mm high" if size.height_mm else ""
+        return f"{size.diameter_mm:g} mm across{high} ({size.source})"
+
+    def to_dict(self) -> dict[str, object]:
+        """The JSON document."""
+        plan, clearance = self.plan, self.clearance
+        size, found = plan.sample, clearance or Clearance()
+        return {
+            "ok": self.ok,
+            "machine": plan.machine.name,
+            "profile": plan.profile.name,
+            "problems": [p.to_dict() for p in self.problems],
+            "steps": [
+                {n: getattr(s, n) for n in _OF_STEP} | _range(step_range(s, plan.machine.timing))
+                for s in plan.steps
+            ],
+            "duration_s": plan.duration_s,
+            **_range(total_range(plan.steps, plan.duration_s, plan.machine.timing)),
+            "computed_s": plan.computed_s,
+            "assumed_s": plan.assumed_s,
+            "timing_source": plan.machine.timing.source,
+            "frames": plan.frames,
+            "images": sum(len(g.files) for g in plan.groups),
+            "bytes": plan.bytes,
+            "collisions": [x.to_dict() for x in found.collisions],
+            "collisions_checked": clearance is not None,
+            "min_clearance_mm": found.min_clearance_mm,
+            "min_clearance_pair": found.min_clearance_pair and list(found.min_clearance_pair),
+            "clearance": [list(p) for p in found.trace],
+            "optics": [o.to_dict() for o in self.optics],
+            "dose": dict(vars(self.dose)),
+            "start": {"known": self.start_known, "positions": dict(plan.start.positions)},
+            "summary": {"sample": self.sample, "start": self.start},
+            "sample": size and {**vars(size), "height_mm": size.height_mm or None},
+        }
 
 
-def step_range(step: PlanStep, timing: Timing) -> Range | None:
-    """(5 %, 95 %) of how long the script waits for a step [s].
-
-    None where no time of the machine is measured. A time that is only assumed, on a machine whose
-    other times are measured, is taken as anything from nothing to twice itself.
-    """
-    if not timing.spread:
-        return None
-    below, above = _margins(step.kind, timing)
-    return max(0.0, step.holds_s - below), step.holds_s + above
-
-
-def total_range(steps: Iterable[_OfKind], duration_s: float, timing: Timing) -> Range | None:
-    """(5 %, 95 %) of a scan's duration [s], or None as for `step_range`.
-
-    Steps are independent of each other, but what a kind's median is wrong by, from n times, all
-    its steps have in common: the variance of one step's error is (1 + 1/n) of the command's own,
-    that of N steps N + N^2 / n. The drift of all times is common to all steps and added to that,
-    as systematic errors are.
-
-    Args:
-        steps: of a plan, or lines of a log.
-        duration_s: predicted.
-        timing: of the machine.
-    """
-    if not timing.spread:
-        return None
-    squares, common = [0.0, 0.0], 0.0
-    for kind, count in Counter(step.kind for step in steps).items():
-        n = timing.spread[kind].n if kind in timing.spread else 1
-        common += count * timing.drift * timing.seconds(kind)
-        for i, margin in enumerate(_margins(kind, timing)):
-            squares[i] += (count + count**2 / n) / (1.0 + 1.0 / n) * margin**2
-    below, above = (math.sqrt(square) + common for square in squares)
-    return max(0.0, duration_s - below), duration_s + above
-
-
-def _margins(kind: str, timing: Timing) -> Range:
-    middle = timing.seconds(kind)
-    spread = timing.spread.get(kind)
-    if spread is None:
-        return middle, middle
-    return middle - spread.p5_s, spread.p95_s - middle
+def _range(found: Range | None) -> dict[str, float | None]:
+    low, high = found or (None, None)
+    return {"p5_s": low, "p95_s": high}

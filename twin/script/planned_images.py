@@ -23,7 +23,7 @@ from flexdt.twin.script import commands as c
 from flexdt.twin.script import planned_scanner as planned
 from flexdt.twin.script.commands import ImageKind
 from flexdt.twin.script.grammar import image_name, kind_of, sequence_names, shorten
-from flexdt.twin.script.plan import ExposureGroup
+from flexdt.twin.script.plan_values import ExposureGroup
 from flexdt.twin.script.problems import Findings
 
 MARGIN_IMAGES: Final = 4.0
@@ -31,6 +31,10 @@ MARGIN_IMAGES: Final = 4.0
 FULL_TURN: Final = 360.0
 MAX_STEPS: Final = 1_000_000
 """More than this is no inference but a mistake."""
+_TIME_EPS = 1e-9
+_POSITION_EPS = 1e-7
+_MISMATCH_STEPS = 0.05
+"""Steps by which stated frames may miss a whole turn before it is worth a warning."""
 
 
 def run_up(speed: float, acceleration: float, period_s: float) -> float:
@@ -114,12 +118,6 @@ def _averages(
     if averages < 1 or abs(ratio - averages) > 0.02 * averages:
         return None
     return averages, f"{ratio:.5g} from {how}"
-
-
-_TIME_EPS = 1e-9
-_POSITION_EPS = 1e-7
-_MISMATCH_STEPS = 0.05
-"""Steps by which stated frames may miss a whole turn before it is worth a warning."""
 
 
 class ImageCollector:

@@ -20,7 +20,7 @@ from flexdt.twin.scanner.state import CameraChange, TubeSettings, changed_camera
 from flexdt.twin.script import commands as c
 from flexdt.twin.script import planned_scanner as planned
 from flexdt.twin.script.grammar import describe, is_reserved, own_name
-from flexdt.twin.script.plan import PlanStep, SampleSize, Settings, StartState
+from flexdt.twin.script.plan_values import PlanStep, SampleSize, Settings, StartState
 from flexdt.twin.script.planned_images import ImageCollector
 from flexdt.twin.script.problems import Findings
 
@@ -32,6 +32,7 @@ from flexdt.twin.script.problems import Findings
 # itself does not use the argument.
 
 _MAX_DIAMETER_MM = 10_000.0
+_CAMERA: Final = (c.CameraSetting, c.TakeImage, c.SaveImage, c.TakeSequence)
 
 
 def sample_size(data: bytes) -> SampleSize | None:
@@ -293,7 +294,6 @@ class Simulation:
         return time
 
 
-_CAMERA: Final = (c.CameraSetting, c.TakeImage, c.SaveImage, c.TakeSequence)
 _Effect = Callable[[Simulation, Any], planned.Span]
 
 _EFFECTS: Final[Mapping[type[c.Command], _Effect]] = {

@@ -161,7 +161,7 @@ def tell(problems: Sequence[ScriptProblem], file: str) -> None:
 def show(report: CheckReport, file: str) -> Answer:
     """The plan and the figures of a check."""
     from flexdt.twin.script.dry_run_report import between, summary
-    from flexdt.twin.script.plan import step_range
+    from flexdt.twin.script.time_ranges import step_range
 
     timing = report.plan.machine.timing
     steps = [
@@ -313,7 +313,8 @@ def new(
     from flexdt.library.scripts import collisions
     from flexdt.twin.machine.camera import Roi
     from flexdt.twin.script import check_script
-    from flexdt.twin.script.compose import ScanRequest, compose_script
+    from flexdt.twin.script.compose import compose_script
+    from flexdt.twin.script.scan_request import ScanRequest
 
     own = _own(kind, position=position, tiles=tiles, turns=turns, rise=rise)
     scanner = machines.machine(machine)
@@ -363,7 +364,7 @@ def _own(kind: Kind, **given: Any) -> dict[str, Any]:
         if kinds[name] != kind:
             raise typer.BadParameter(f"--{name} is for --kind {kinds[name]}, not {kind}")
     if "position" in own:
-        from flexdt.twin.script.compose import ScanPosition
+        from flexdt.twin.script.scan_request import ScanPosition
 
         own["placements"] = tuple(
             ScanPosition(*options.position(word)) for word in own.pop("position")

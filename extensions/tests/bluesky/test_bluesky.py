@@ -39,7 +39,8 @@ from flexdt.protocol import RpcError
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
-from flexdt.twin.script.compose import ScanRequest, compose_script
+from flexdt.twin.script.compose import compose_script
+from flexdt.twin.script.scan_request import ScanRequest
 from flexdt_extensions.bluesky import FlyScan, LimitsExceeded, TwinLab
 from flexdt_extensions.bluesky.flyer import fly_scan
 

@@ -40,7 +40,7 @@ from ophyd_async.core import StaticPathProvider, UUIDFilenameProvider, init_devi
 from flexdt.clients import TwinClient
 from flexdt.clients.launch.processes import Servers
 from flexdt.twin.machine.camera import Roi
-from flexdt.twin.script.compose import ScanRequest
+from flexdt.twin.script.scan_request import ScanRequest
 from flexdt_extensions.bluesky import FlyScan, TwinLab
 from flexdt_extensions.bluesky.flyer import checkpoint_before_close, fly_scan
 

@@ -1,0 +1,184 @@
+"""What the beam sees of the sample in the images of a plan, and warnings about it.
+
+Poses come from the nominal geometry. The sample is a cylinder about the rotation axis, or only the
+axis where its size is unknown, so a report about truncation is about the cylinder that holds the
+sample at every angle of a full rotation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.machine.kinematics import motor_poses
+from flexdt.twin.script.commands import ImageKind
+from flexdt.twin.script.plan import ScanPlan
+from flexdt.twin.script.problems import ScriptProblem
+
+BoolArray = npt.NDArray[np.bool_]
+
+_PROBES = 33
+"""Images of one sequence that are looked at; the way between them is smooth."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Images of one camera setting and kind, and the sample's projection in them [pixels].
+
+    Attributes:
+        left, right: columns of the projection's edges, (n,); equal where the size is unknown.
+        top, bottom: rows, (n,); NaN where the height is unknown.
+        axis: column of the rotation axis, (n,).
+    """
+
+    kind: ImageKind
+    camera: CameraSettings
+    lines: tuple[int, ...]
+    poses: Poses
+    left: FloatArray
+    right: FloatArray
+    top: FloatArray
+    bottom: FloatArray
+    axis: FloatArray
+
+    @property
+    def outside(self) -> BoolArray:
+        """Whether no part of the sample is projected onto the image, (n,) bool."""
+        rows, cols = self.camera.shape
+        middle = _project(self.poses, self.poses.axis, (rows, cols))[:, 1]
+        top, bottom = (np.where(np.isnan(y), middle, y) for y in (self.top, self.bottom))
+        return np.asarray(
+            (self.right < -0.5) | (self.left > cols - 0.5) | (bottom < -0.5) | (top > rows - 0.5)
+        )
+
+    @property
+    def cut_columns(self) -> FloatArray:
+        """Columns of the projection beyond the left and the right edge, (n, 2)."""
+        return _beyond(self.left, self.right, self.camera.shape[1])
+
+    @property
+    def cut_rows(self) -> FloatArray:
+        """Rows of the projection beyond the top and the bottom edge, (n, 2); NaN if unknown."""
+        return _beyond(self.top, self.bottom, self.camera.shape[0])
+
+
+def _beyond(low: FloatArray, high: FloatArray, size: int) -> FloatArray:
+    return np.maximum(np.stack([-0.5 - low, high - (size - 0.5)], axis=1), 0.0)
+
+
+def views(plan: ScanPlan) -> Iterator[View]:
+    """The saved images of `plan` by camera setting and kind; long sequences are sampled."""
+    batches: dict[tuple[CameraSettings, ImageKind], tuple[list[int], list[int]]] = {}
+    first = 0
+    for g in plan.groups:
+        if g.files and min(g.camera.shape) > 0:
+            camera = replace(g.camera, frames=1, averages=1, exposure_ms=1.0)
+            index, lines = batches.setdefault((camera, g.kind), ([], []))
+            count = min(len(g), _PROBES) if g.moving else 1
+            probes = np.linspace(0, len(g) - 1, count).round().astype(int).tolist()
+            index += [first + i for i in probes]
+            lines += [g.line] * len(probes)
+        first += len(g)
+    for (camera, kind), (index, lines) in batches.items():
+        positions = {n: x[index] for n, x in plan.image_positions.items()}
+        yield _view(plan, camera, kind, tuple(lines), positions)
+
+
+def beam_problems(plan: ScanPlan) -> tuple[ScriptProblem, ...]:
+    """Warnings: the sample outside the beam in projections, or inside it in flats."""
+    found: list[ScriptProblem] = []
+    for view in views(plan):
+        outside = view.outside
+        if view.kind == "projection" and outside.any():
+            found.append(_aggregate(view, outside, "sample_out_of_beam", _outside_text(view)))
+        if view.kind == "flat" and not outside.all():
+            found.append(_aggregate(view, ~outside, "sample_in_flat", _inside_text(view)))
+    return tuple(found)
+
+
+def _aggregate(view: View, bad: BoolArray, code: str, text: str) -> ScriptProblem:
+    lines = sorted({line for line, b in zip(view.lines, bad.tolist(), strict=True) if b})
+    more = f" (and at {len(lines) - 1} more lines)" if len(lines) > 1 else ""
+    return ScriptProblem("warning", code, lines[0], 1, text + more)
+
+
+def _outside_text(view: View) -> str:
+    i = int(np.argmax(view.outside))
+    rows, cols = view.camera.shape
+    side, sides = "above or below", f"rows 0 to {rows - 1}"
+    if view.right[i] < -0.5 or view.left[i] > cols - 0.5:
+        side, sides = "left" if view.right[i] < -0.5 else "right", f"columns 0 to {cols - 1}"
+        side += " of"
+    return (
+        f"the sample is out of the beam: the shadow of its axis lies at column {view.axis[i]:.0f}, "
+        f"{side} the image's {sides}; projections show no sample"
+    )
+
+
+def _inside_text(view: View) -> str:
+    i = int(np.argmin(view.outside))
+    if view.left[i] == view.right[i]:
+        where = f"the shadow of its axis lies at column {view.axis[i]:.0f}"
+    else:
+        where = f"its shadow spans columns {view.left[i]:.0f} to {view.right[i]:.0f}"
+    return f"the sample is in the beam in a flat image: {where} of 0 to {view.camera.shape[1] - 1}"
+
+
+def _view(
+    plan: ScanPlan,
+    camera: CameraSettings,
+    kind: ImageKind,
+    lines: tuple[int, ...],
+    positions: dict[str, FloatArray],
+) -> View:
+    p = motor_poses(plan.machine, plan.profile, camera, positions)
+    shape = camera.shape
+    axis = _project(p, p.axis, shape)[:, 0]
+    left = right = axis
+    top = bottom = np.full(len(p), np.nan)
+    size = plan.sample
+    if size is not None:
+        radius, half = size.diameter_mm / 2, size.height_mm / 2
+        edges = [_project(p, q, shape)[:, 0] for q in _tangents(p, radius)]
+        left, right = np.minimum(*edges), np.maximum(*edges)
+        if half > 0.0:
+            rows = [_project(p, q, shape)[:, 1] for q in _rims(p, radius, half)]
+            top, bottom = np.min(rows, axis=0), np.max(rows, axis=0)
+    return View(kind, camera, lines, p, left, right, top, bottom, axis)
+
+
+def _tangents(p: Poses, radius: float) -> list[FloatArray]:
+    """Points where the rays that just touch the cylinder do so, at the source's height."""
+    to_source = p.source - p.axis
+    flat = to_source[:, :2]
+    distance = np.linalg.norm(flat, axis=1, keepdims=True)
+    toward = flat / distance
+    sine = np.minimum(radius / distance, 1.0)
+    cosine = np.sqrt(1.0 - sine**2)
+    across = np.stack([-toward[:, 1], toward[:, 0]], axis=1)
+    aside = [radius * (sine * toward + sign * cosine * across) for sign in (1.0, -1.0)]
+    return [np.column_stack([p.axis[:, :2] + xy, p.source[:, 2]]) for xy in aside]
+
+
+def _rims(p: Poses, radius: float, half_height: float) -> list[FloatArray]:
+    """Nearest and farthest points of the cylinder's two rims."""
+    along = (p.source - p.axis)[:, :2]
+    along = along / np.linalg.norm(along, axis=1, keepdims=True)
+    return [
+        p.axis + np.column_stack([depth * along, np.full(len(along), height)])
+        for depth in (radius, -radius)
+        for height in (half_height, -half_height)
+    ]
+
+
+def _project(p: Poses, points: FloatArray, shape: tuple[int, int]) -> FloatArray:
+    """One world point for each pose to (n, 2) pixels."""
+    moved = ConeVec.from_vectors(p.source - points, p.detector - points, p.u, p.v)
+    return moved.project_points(np.zeros((1, 3)), shape)[:, 0, :]

@@ -1,0 +1,89 @@
+"""What the dry run of a script finds: collisions, clearance, what projections see, dose."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+Trace = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class Collision:
+    """A contact on the way: which line moves, when, what touches what.
+
+    `last_free` is where every axis stands at the last moment that is still free.
+    """
+
+    line: int
+    time_s: float
+    pair: tuple[str, str]
+    last_free: Mapping[str, float]
+
+    def to_dict(self) -> dict[str, object]:
+        """The JSON form of `flexdt check`."""
+        return {**vars(self), "pair": list(self.pair), "last_free": dict(self.last_free)}
+
+
+@dataclass(frozen=True)
+class Clearance:
+    """What a collision check found over a whole plan.
+
+    `min_clearance_mm` of a plan with collisions is that at which the worst of them begins: how far
+    parts overlap then is not measured. `trace` are (time [s], smallest clearance [mm]) points for a
+    plot, in time order.
+    """
+
+    collisions: tuple[Collision, ...] = ()
+    min_clearance_mm: float | None = None
+    min_clearance_pair: tuple[str, str] | None = None
+    trace: Trace = ()
+
+
+@dataclass(frozen=True)
+class Optics:
+    """What the projections of one camera setting see [mm, um]; ranges are (least, greatest).
+
+    Attributes:
+        field_mm: width and height of the field of view at the rotation axis.
+        turn_field_mm: diameter of the cylinder seen whole over a full rotation.
+        truncation: None without a sample's size; else columns (and rows, if the height is known)
+            of its projection that fall beyond left, right, top, bottom, at worst over the rotation.
+    """
+
+    lines: tuple[int, int]
+    shape: tuple[int, int]
+    pixel_mm: float
+    sod_mm: tuple[float, float]
+    sdd_mm: tuple[float, float]
+    magnification: tuple[float, float]
+    voxel_um: tuple[float, float]
+    field_mm: tuple[float, float]
+    turn_field_mm: float
+    truncation: Mapping[str, float] | None
+
+    @property
+    def truncated(self) -> bool:
+        """Whether the sample is cut off anywhere."""
+        return self.truncation is not None and any(x > 0 for x in self.truncation.values())
+
+    def to_dict(self) -> dict[str, object]:
+        """JSON form."""
+        names = {"field_mm": "field_of_view_mm", "turn_field_mm": "full_turn_diameter_mm",
+                 "truncation": "truncation_px"}  # fmt: skip
+        told = {n: list(v) if isinstance(v, tuple) else v for n, v in vars(self).items()}
+        told["rows"], told["cols"] = told.pop("shape")
+        return {names.get(name, name): value for name, value in told.items()}
+
+
+@dataclass(frozen=True)
+class Dose:
+    """What matters for dose: beam time, charge on the target, time that makes images.
+
+    `charge_mAs` is power over voltage times beam time. It says nothing about dose in a sample:
+    spectrum, filter and distance are not in it.
+    """
+
+    beam_on_s: float
+    charge_mAs: float
+    exposing_s: float

@@ -1,0 +1,164 @@
+"""Where a machine's motors bring source, sample and detector, and out of the beam.
+
+Targets follow from the machine's linear map and the profile's offsets. A motor that moves two of
+these things can set one of them only.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+from flexdt.twin.errors import LimitError
+from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.machine.kinematics import motor_poses
+
+FREE_MM: Final = 60.0
+"""How far beyond the field of view the sample goes for the flat field (assumed: any sample)."""
+
+
+QUANTITIES: Final = {
+    "object_y": "the source-object distance",
+    "detector_y": "the source-detector distance",
+    "source_z": "the height of the beam",
+    "object_x": "the sample sideways",
+    "detector_x": "the detector sideways",
+    "detector_z": "the height of the detector",
+    "source_x": "the source sideways",
+    "object_z": "the height of the sample",
+}
+"""What motors set, the most important first."""
+
+
+@dataclass(frozen=True)
+class MotorTargets:
+    """Where the motors of a machine bring its stages."""
+
+    machine: Machine
+    profile: Profile
+
+    def has(self, *quantities: str) -> bool:
+        """Whether motors move all of these."""
+        return all(self.machine.geometry.get(quantity) for quantity in quantities)
+
+    def constant(self, quantity: str) -> float:
+        """What a quantity is without its motors [mm]."""
+        p = self.profile
+        offsets = {"source_z": p.src_ort, "detector_x": p.det_tan, "detector_y": p.c_det,
+                   "object_x": p.axs_tan, "object_y": p.c_obj,
+                   "object_z": self.machine.sample_height_mm}  # fmt: skip
+        return offsets.get(quantity, 0.0) + self.machine.fixed.get(quantity, 0.0)
+
+    def at_home(self, quantity: str) -> float:
+        """What a quantity is with every motor at home [mm]."""
+        return round(self.value(quantity, {}), 6)
+
+    def value(self, quantity: str, positions: Mapping[str, float]) -> float:
+        """What a quantity is where motors stand at `positions`, the others at home [mm]."""
+        factors = self.machine.geometry.get(quantity, {})
+        moved = (f * positions.get(n, self.machine.axis(n).home) for n, f in factors.items())
+        return self.constant(quantity) + sum(moved)
+
+    @cached_property
+    def drivers(self) -> dict[str, str]:
+        """Quantity -> the motor that sets it: the one of its motors that moves it most.
+
+        No motor sets two quantities. The other motors of a quantity stay at home.
+        """
+        out: dict[str, str] = {}
+        for quantity in QUANTITIES:
+            factors = self.machine.geometry.get(quantity, {})
+            free = [motor for motor in factors if motor not in out.values()]
+            if quantity == "object_z" and self.has("source_z"):
+                continue  # the beam goes to the sample
+            if free:
+                out[quantity] = max(free, key=lambda motor: abs(factors[motor]))
+        return out
+
+    def solved(self, wanted: Mapping[str, float]) -> dict[str, float]:
+        """Motors of quantities -> where `drivers` bring them to what is `wanted` [mm], or home."""
+        geometry = self.machine.geometry
+        moved = (motor for quantity in wanted for motor in geometry.get(quantity, {}))
+        out = {motor: self.machine.axis(motor).home for motor in moved}
+        for quantity, asked in wanted.items():
+            if motor := self.drivers.get(quantity):
+                rest = self.value(quantity, {motor: 0.0})
+                out[motor] = round((asked - rest) / geometry[quantity][motor], 6)
+        return out
+
+    def driver(self, quantity: str) -> str:
+        """The motor that sets a quantity.
+
+        Raises:
+            LimitError: no motor is left for it.
+        """
+        if quantity not in self.drivers:
+            what = f"has no motor of its own for {QUANTITIES[quantity]}"
+            raise self.lacking(what, missing=quantity)
+        return self.drivers[quantity]
+
+    def need(self, what: str, quantity: str) -> None:
+        """Check that motors move a quantity.
+
+        Raises:
+            LimitError: what cannot be done, and which quantity no motor moves.
+        """
+        if not self.has(quantity):
+            none = f"has no motor for {QUANTITIES[quantity]}, which {what} needs"
+            raise self.lacking(none, asked=what, missing=quantity)
+
+    def lacking(self, what: str, **data: object) -> LimitError:
+        """The error that says what this machine lacks."""
+        return LimitError(f"{self.machine.name} {what}", data)
+
+    @property
+    def aside(self) -> tuple[str, ...]:
+        """The quantity by which the sample leaves the beam."""
+        return tuple(q for q in ("object_x", "object_z") if q in self.drivers)[:1]
+
+
+def beside_beam(
+    machine: Machine,
+    profile: Profile,
+    camera: CameraSettings,
+    positions: Mapping[str, float],
+    radius_mm: float = 0.0,
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Where the sample's stage goes from `positions` so that the beam is free, as far as it can.
+
+    Args:
+        machine: whose motors these are.
+        profile: zero offsets.
+        camera: decides how wide the beam is that reaches the image.
+        positions: motors [mm, deg]; those left out stand at home.
+        radius_mm: of the sample, if known.
+
+    Returns:
+        Motor -> target, to either side of the beam, the freer one first.
+
+    Raises:
+        LimitError: no motor takes the sample out of the beam.
+    """
+    places = MotorTargets(machine, profile)
+    if not places.aside:
+        what = "has no motor that takes the sample out of the beam, so no flat image can be taken"
+        raise places.lacking(what, asked="a flat field", missing=["object_x", "object_z"])
+    [quantity] = places.aside
+    name = places.drivers[quantity]
+    axis, factor = machine.axis(name), machine.geometry[quantity][name]
+    p = motor_poses(machine, profile, camera, positions)
+    k = 0 if quantity == "object_x" else 1
+    beam, sample = (p.detector - p.source)[0], (p.axis - p.source)[0]
+    share = float(sample[1] / beam[1])
+    off = float((share * beam - sample)[2 * k])
+    middle = positions.get(name, axis.home) + off / factor
+    size = camera.shape[1 - k] * camera.pixels_mm(machine.detector.pixels)[k]
+    away = (abs(share) * size / 2 + FREE_MM + radius_mm) / abs(factor)
+    least, most = math.ceil(axis.lower * 1e6) / 1e6, math.floor(axis.upper * 1e6) / 1e6
+    upper, lower = ({name: round(min(max(middle + way, least), most), 6)} for way in (away, -away))
+    freer = middle - axis.lower > axis.upper - middle
+    return (lower, upper) if freer else (upper, lower)

@@ -1,0 +1,147 @@
+"""Streamed poses to a plan: the script with the same steps, dark and flat included."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Final
+
+from flexdt.twin.machine.description import (
+    Machine,
+    Profile,
+    unknown_axis,
+)
+from flexdt.twin.script import commands as c
+from flexdt.twin.script.motor_targets import beside_beam
+from flexdt.twin.script.plan import ScanPlan
+from flexdt.twin.script.plan_values import SampleSize, StartState
+from flexdt.twin.script.planned_scanner import Motors, clamp
+from flexdt.twin.script.planner import plan_script
+from flexdt.twin.script.problems import ScriptProblem, in_order
+from flexdt.twin.script.scan_request import REFERENCES
+
+Pose = Mapping[str, float]
+Route = Callable[[Pose, Pose], Sequence[Pose] | None]
+"""Where the motors stand and where they go, to moves one after the other; None: no free path."""
+_NO_FLAT: Final = (
+    "no flat image is taken, as `flat` is false; without one the data set cannot be reconstructed"
+)
+_NO_PATH: Final = (
+    "no free path takes the sample out of the beam for the flat image; give `flat` a pose where it "
+    "is outside, or false to leave the flat image out"
+)
+
+
+def plan_poses(
+    poses: Sequence[Pose],
+    machine: Machine,
+    profile: Profile,
+    exposure_ms: float | None = None,
+    *,
+    start: StartState | None = None,
+    sample: SampleSize | None = None,
+    flat: bool | Pose = True,
+    route: Route | None = None,
+) -> ScanPlan:
+    """Plan streamed poses (thesis 4.6.2): dark and flat, then one projection a pose.
+
+    The axes of a pose start together and all arrive before its image. The flat is taken at the
+    first pose, but with the sample beside the beam; X-rays stay on from then on. Dark and flat
+    average as many images as those of a composed script. The settings file is written at the first
+    pose. Line i + 1 of problems and steps is pose i; line 0 is what comes before.
+
+    Args:
+        poses: axis -> position [mm, deg]; axes left out stay where they are.
+        machine: whose axes these are.
+        profile: zero offsets.
+        exposure_ms: of every image; None keeps the camera's current exposure.
+        start: the scanner before; the machine's homes if None.
+        sample: its size, if known.
+        flat: where the sample is out of the beam; True finds it, False takes no flat.
+        route: finds a free path to the flat and from there to the first pose; None: the direct one.
+
+    Raises:
+        UnknownNameError: a pose names an axis that the machine does not have.
+        LimitError: no motor takes the sample out of the beam.
+
+    Example:
+        >>> from flexdt.twin.machine.description import builtin_machine, builtin_profile
+        >>> machine = builtin_machine("flexray")
+        >>> profile = builtin_profile(machine.default_profile)
+        >>> plan_poses([{"rot_obj": 0.0}, {"rot_obj": 90.0}], machine, profile, 100.0)
+        <ScanPlan on flexray: 25 steps, 2 projections, 21.5 s, 0 errors, 0 warnings>
+    """
+    asked: Pose = flat if isinstance(flat, Mapping) else {}
+    for axis in (name for pose in (*poses, asked) for name in pose):
+        if not machine.has(axis):
+            raise unknown_axis(axis, machine)
+    begin = StartState.of(machine) if start is None else start
+    camera = begin.camera
+    exposure = camera.exposure_ms if exposure_ms is None else exposure_ms
+    commands: list[c.Command] = [
+        c.SetMode(mode=camera.mode),
+        c.SetRoi(roi=camera.roi),
+        c.SetExposure(exposure_ms=exposure),
+        c.SetFrames(frames=1),
+        c.SetVoltage(kV=begin.kV),
+        c.SetPower(power_W=begin.power_W),
+    ]
+    told: list[ScriptProblem] = []
+    back: Sequence[Pose] = ()
+    references = [*_image("di000000.tif"), c.XrayOn(), c.WaitXrayReady()]
+    if flat is False or not poses:
+        told = [ScriptProblem("warning", "no_flat", 0, 1, _NO_FLAT)]
+    else:
+        first = _arrival(begin.positions, poses[0], machine, begin)
+        if flat is True:
+            radius = 0.0 if sample is None else sample.diameter_mm / 2
+            sides = beside_beam(machine, profile, camera, first, radius)
+            places = [{**first, **side} for side in sides]
+        else:
+            places = [_arrival(begin.positions, asked, machine, begin)]
+        ways = ((place, _legs(begin.positions, place, route)) for place in places)
+        place, out = next((way for way in ways if way[1] is not None), (places[0], None))
+        if out is None:
+            told = [ScriptProblem("warning", "flat_path", 0, 1, _NO_PATH)]
+            out = _legs(begin.positions, place) or ()
+        back = _legs(place, first, route) or _legs(place, first) or ()
+        for leg in (*out, asked):
+            commands += _moves(leg)
+        references += _image("io000000.tif")
+    commands += [c.XrayOff(), c.SetAverages(averages=REFERENCES), *references]
+    commands.append(c.SetAverages(averages=camera.averages))
+    for i, pose in enumerate(poses):
+        line = i + 1
+        for leg in (*back, pose) if i == 0 else (pose,):
+            commands += _moves(leg, line)
+        if i == 0:
+            commands.append(c.WriteSettingsFile(line=line))
+        commands += _image(f"scan_{i:06d}.tif", line)
+    commands.append(c.XrayOff(line=len(poses)))
+    plan = plan_script(c.Script.of(commands), machine, profile, start=begin, sample=sample)
+    return replace(plan, problems=in_order((*told, *plan.problems)))
+
+
+def _image(file: str, line: int = 0) -> list[c.Command]:
+    return [c.TakeImage(line=line), c.SaveImage(path=file, line=line)]
+
+
+def _moves(pose: Pose, line: int = 0) -> list[c.Command]:
+    """Moves that start together; asking each again waits until all have arrived."""
+    moves = [c.MoveAbsolute(component=a, target=float(v), line=line) for a, v in pose.items()]
+    return [*(replace(k, wait=c.Wait.NO_WAIT) for k in moves if len(moves) > 1), *moves]
+
+
+def _arrival(positions: Pose, pose: Pose, machine: Machine, start: StartState) -> dict[str, float]:
+    """Where all motors stand at a pose that is reached from `positions`, within their travel."""
+    motors = Motors(machine, replace(start, positions=positions))
+    out = dict(positions)
+    for axis, value in pose.items():
+        out |= clamp(machine, motors.targets(axis, value, 0.0), axis)
+    return out
+
+
+def _legs(start: Pose, end: Pose, route: Route | None = None) -> Sequence[Pose] | None:
+    """The moves from one place to another: `route`'s, or all motors at once."""
+    goal = {axis: value for axis, value in end.items() if value != start[axis]}
+    return ([goal] if goal else []) if route is None else route(start, goal)
