@@ -25,16 +25,11 @@ from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine, Profile, builtin_machine, profile_of
 from flexdt.twin.machine.kinematics import motor_poses
-from flexdt.twin.physics.chain import (
-    Chain,
-    air_kerma_mGy,
-    contrast_to_noise,
-    flux_of,
-    pixel_reading,
-    radiographs,
-)
+from flexdt.twin.physics.chain import Chain, flux_of, radiographs
 from flexdt.twin.physics.detector import detector_of
 from flexdt.twin.physics.exposure import FEW_COUNTS, NOTICED, ExposureSettings
+from flexdt.twin.physics.image_quality import air_kerma_mGy, contrast_to_noise, pixel_reading
+from flexdt.twin.physics.readout import expected_counts, saturating_counts
 from flexdt.twin.physics.tube import Filter, tube_of, voltages
 from flexdt.twin.projection import project_body
 from flexdt.twin.projection.analytic_solids import Vector
@@ -283,7 +278,7 @@ def expose(
         time = lit.exposure_ms * averages
         whole = replace(lit, kV=voltage, exposure_ms=time, averages=1)
         bright = pixel_reading(layers[layer], camera, whole, ray.brightest).signal
-        reads = max(1, math.ceil(bright / (BRIGHTEST * (panel.full_scale - panel.offset_counts))))
+        reads = max(1, math.ceil(bright / (BRIGHTEST * saturating_counts(panel))))
         return replace(whole, exposure_ms=time / reads, averages=reads)
 
     kVs = tried if len(tried) > 1 else np.arange(10.0 * math.ceil(low / 10), high + 1, 10.0)
@@ -345,9 +340,8 @@ def _views(
     images = radiographs(chain, paths, cone.rows, [lit] * len(cone))
     through = np.exp(-np.stack([image.integrals for image in images]))
     signal = np.stack([image.expected.mean_e for image in images if image.expected])
-    panel = chain.panel
-    signal /= panel.gain(camera)
-    saturated = float((signal >= panel.full_scale - panel.offset_counts).mean())
+    signal = expected_counts(chain.panel, camera, signal)
+    saturated = float((signal >= saturating_counts(chain.panel)).mean())
     return paths, through, saturated, float((signal < FEW_COUNTS).mean())
 
 

@@ -22,7 +22,8 @@ from image_quality import edge_mtf
 
 import flexdt as fx
 from flexdt.twin.attenuation.substances import Substance, tables
-from flexdt.twin.physics.detector import FULL_WELL_E, Detector, deposited
+from flexdt.twin.physics.detector import FULL_WELL_E, Detector
+from flexdt.twin.physics.scintillator import deposited
 from flexdt.twin.physics.tube import Filter, TubeModel, tube_spectrum
 
 KV, POWER_W, TIME_MS, FAR_MM = 90.0, 50.0, 100.0, 1059.0

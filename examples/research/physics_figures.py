@@ -13,10 +13,11 @@ from image_quality import edge_mtf, photon_transfer, region
 from flexdt.phantoms import material
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import CameraSettings, Roi
-from flexdt.twin.physics.chain import Chain, expected_signal, read_out, weights_of
+from flexdt.twin.physics.chain import Chain, expected_signal, weights_of
 from flexdt.twin.physics.detector import Detector
 from flexdt.twin.physics.effective import effective_beam
 from flexdt.twin.physics.exposure import ExposureSettings, frame_rng
+from flexdt.twin.physics.readout import read_out
 from flexdt.twin.projection import project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 from flexdt.twin.reconstruction import Grid, fdk, sirt

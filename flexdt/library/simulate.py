@@ -35,22 +35,19 @@ from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.plausibility import geometry_doubts
 from flexdt.twin.machine.camera import CameraSettings, PixelGrid, Roi
 from flexdt.twin.machine.description import Machine
+from flexdt.twin.physics.blur import spot_blur_px
 from flexdt.twin.physics.chain import (
     Chain,
-    Expected,
     Radiograph,
-    check_rays,
     expected_signal,
     flux_of,
     radiographs,
-    read_out,
-    spot_blur_px,
-    spot_views,
-    within_pixels,
     without_spot,
 )
 from flexdt.twin.physics.detector import EXPOSURES_MS, Detector, detector_of
 from flexdt.twin.physics.exposure import Counts, ExposureSettings, frame_rng
+from flexdt.twin.physics.readout import Expected, read_out
+from flexdt.twin.physics.sampled_views import check_rays, spot_views, within_pixels
 from flexdt.twin.physics.scatter import (
     Beam,
     ScanScatter,

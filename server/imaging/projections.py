@@ -35,7 +35,7 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings, PixelGrid
-from flexdt.twin.physics.chain import spot_views
+from flexdt.twin.physics.sampled_views import spot_views
 from flexdt.twin.physics.scatter import Object
 from flexdt.twin.projection import Body, TriangleMesh
 from flexdt.twin.projection.analytic_solids import Scene

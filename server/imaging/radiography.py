@@ -36,17 +36,10 @@ from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.physics import exposure as ideal
 from flexdt.twin.physics import scatter as mc
-from flexdt.twin.physics.chain import (
-    Chain,
-    Expected,
-    Radiograph,
-    Scattered,
-    radiographs,
-    read_out,
-    without_spot,
-)
+from flexdt.twin.physics.chain import Chain, Radiograph, Scattered, radiographs, without_spot
 from flexdt.twin.physics.detector import Detector, detector_of
 from flexdt.twin.physics.exposure import ExposureSettings
+from flexdt.twin.physics.readout import Expected, expected_counts, read_out
 from flexdt.twin.physics.tube import TubeModel, tube_of, voltages
 from flexdt.twin.scanner.state import Sample
 
@@ -227,12 +220,17 @@ class Radiography:
         """Count without signal."""
         return self.model.dark_counts if self.physics == "ideal" else self.panel.offset_counts
 
+    @property
+    def saturating(self) -> float:
+        """Counts above dark from which a pixel is saturated."""
+        return self.full_scale - self.offset
+
     def signal(
         self, radiograph: Radiograph, camera: CameraSettings, exposure: ExposureSettings
     ) -> Float32Array:
         """Expected counts above dark as though X-rays were on, not clipped, (rows, cols)."""
         if radiograph.expected is not None:
-            return radiograph.expected.mean_e / np.float32(self.panel.gain(camera))
+            return expected_counts(self.panel, camera, radiograph.expected.mean_e)
         lit = replace(exposure, xrays_on=True)
         return np.exp(-radiograph.shown) * np.float32(ideal.open_beam(self.model, lit))
 
@@ -285,7 +283,7 @@ def marks_of(
     """
     lines = radiograph.shown
     signal = radiography.signal(radiograph, camera, exposure)
-    marks = np.where(signal >= radiography.full_scale - radiography.offset, SATURATED, 0)
+    marks = np.where(signal >= radiography.saturating, SATURATED, 0)
     marks += np.where(signal < ideal.FEW_COUNTS, STARVED, 0)
     edge = np.ones(lines.shape, np.bool_)
     edge[1:-1, 1:-1] = False
@@ -317,7 +315,7 @@ def flags_of(
     """
     lines = radiograph.shown
     signal = radiography.signal(radiograph, camera, exposure)[::EVERY, ::EVERY]
-    top = radiography.full_scale - radiography.offset
+    top = radiography.saturating
     # The signal of an open beam, as a logarithm. Two digits: with more, poly would tell distances.
     beam = float(np.median(lines[::EVERY, ::EVERY] + np.log(np.maximum(signal, 1e-30))))
     edges = {"left": lines[:, 0], "right": lines[:, -1], "top": lines[0], "bottom": lines[-1]}

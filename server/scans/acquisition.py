@@ -26,8 +26,9 @@ import numpy.typing as npt
 from flexdt.server.imaging.radiography import FORGOTTEN_S, Before, Radiography
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.kinematics import motor_poses
-from flexdt.twin.physics.chain import Radiograph, trapped_after
+from flexdt.twin.physics.chain import Radiograph
 from flexdt.twin.physics.exposure import ExposureSettings, frame_rng
+from flexdt.twin.physics.readout import trapped_after
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import Exposure, ScanPlan
 

@@ -13,7 +13,7 @@ import flexdt as fx
 from flexdt.clients.cli.command_tree import run
 from flexdt.library.expose import exposure_of
 from flexdt.twin.attenuation.substances import tables
-from flexdt.twin.physics.chain import AIR, compton_share, mass_energy_transfer
+from flexdt.twin.physics.image_quality import AIR, compton_share, mass_energy_transfer
 
 
 def rod(radius: float, material: str = "pmma") -> dict[str, Any]:

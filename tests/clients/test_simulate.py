@@ -31,9 +31,10 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.machine.kinematics import poses
-from flexdt.twin.physics.detector import Detector, deposited
+from flexdt.twin.physics.detector import Detector
 from flexdt.twin.physics.exposure import ExposureSettings, frame_rng
 from flexdt.twin.physics.scatter import ScatterSettings
+from flexdt.twin.physics.scintillator import deposited
 from flexdt.twin.physics.tube import Filter, Tube
 from flexdt.twin.projection import Volume
 from flexdt.twin.scanner.state import Sample

@@ -22,9 +22,9 @@ from flexdt.twin.dataset.flexdt_json import parse_document
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile, parse_machine
 from flexdt.twin.machine.kinematics import poses
-from flexdt.twin.physics.chain import Expected, read_out
 from flexdt.twin.physics.detector import detector_of
 from flexdt.twin.physics.exposure import ExposureSettings
+from flexdt.twin.physics.readout import Expected, read_out
 from flexdt.twin.script import ScanPlan
 
 SCAN = fx.ConeVec.circular(sod=60, sdd=100, angles=16, shape=(16, 16), pixel=1.0)

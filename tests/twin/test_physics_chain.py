@@ -15,22 +15,12 @@ from image_quality import edge_mtf, photon_transfer, region
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import LimitError, TwinError
 from flexdt.twin.machine.camera import CameraSettings, PixelGrid, Roi
-from flexdt.twin.physics.chain import (
-    Chain,
-    Expected,
-    blurred,
-    expected_signal,
-    flux_of,
-    kernel,
-    noise_kernel,
-    radiographs,
-    read_out,
-    spot_blur_px,
-    weights_of,
-)
+from flexdt.twin.physics.blur import blurred, kernel, noise_kernel, spot_blur_px
+from flexdt.twin.physics.chain import Chain, expected_signal, flux_of, radiographs, weights_of
 from flexdt.twin.physics.detector import Detector, pattern
 from flexdt.twin.physics.effective import effective_beam
 from flexdt.twin.physics.exposure import ExposureSettings, frame_rng
+from flexdt.twin.physics.readout import Expected, read_out
 from flexdt.twin.physics.tube import tube_spectrum
 
 ABS = Substance.of("abs", "C15H17N", 1.05)

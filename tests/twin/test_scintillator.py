@@ -7,7 +7,7 @@ import pytest
 
 from flexdt.twin.attenuation.scattering import cross_sections
 from flexdt.twin.attenuation.substances import Substance, tables
-from flexdt.twin.physics.detector import K_SHELL, deposited
+from flexdt.twin.physics.scintillator import K_SHELL, deposited
 from flexdt.twin.physics.tube import Filter
 
 CSI = Substance.of("CsI", "CsI", 4.51)

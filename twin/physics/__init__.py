@@ -1,18 +1,8 @@
 """From path lengths to counts, as the scanner makes them: tube, materials, panel, image quality."""
 
-from flexdt.twin.physics.chain import (
-    FWHM,
-    Chain,
-    blurred,
-    check_rays,
-    expected_signal,
-    flux_of,
-    read_out,
-    spot_blur_px,
-    weights_of,
-    within_pixels,
-)
-from flexdt.twin.physics.detector import Detector, deposited, detector_of
+from flexdt.twin.physics.blur import FWHM, blurred, spot_blur_px
+from flexdt.twin.physics.chain import Chain, expected_signal, flux_of, weights_of
+from flexdt.twin.physics.detector import Detector, detector_of
 from flexdt.twin.physics.effective import EffectiveBeam, effective_beam
 from flexdt.twin.physics.exposure import (
     Counts,
@@ -22,7 +12,10 @@ from flexdt.twin.physics.exposure import (
     ideal_response,
     open_beam,
 )
+from flexdt.twin.physics.readout import read_out
+from flexdt.twin.physics.sampled_views import check_rays, within_pixels
 from flexdt.twin.physics.scatter import Beam, ScanScatter, ScatterSettings, scan_scatter
+from flexdt.twin.physics.scintillator import deposited
 from flexdt.twin.physics.tube import (
     Filter,
     Spectrum,

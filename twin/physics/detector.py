@@ -2,12 +2,6 @@
 
 A pixel collects electrons in proportion to the energy its scintillator absorbs. `Detector` holds
 the figures, and says of each default whether it is measured, from the literature or assumed.
-
-`deposited` is what a scintillator of any material keeps of a photon's energy. Photons interact
-along a straight line. A photoelectric one leaves its energy, less that of a K photon that escapes;
-a Compton one leaves that of the electron, and of the scattered photon if it is absorbed on its way
-out. K photons and scattered ones go into all directions alike and interact once more or escape
-through front or back. Coherent scattering is left out: it goes forward and takes no energy.
 """
 
 from __future__ import annotations
@@ -15,100 +9,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.attenuation.scattering import ELECTRON_KEV, cross_sections
 from flexdt.twin.attenuation.substances import Substance, tables
 from flexdt.twin.errors import LimitError, require_within
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.machine.camera import CameraSettings, PixelGrid, Roi
 from flexdt.twin.machine.description import DetectorSpec
+from flexdt.twin.physics.scintillator import deposited
 from flexdt.twin.physics.tube import Filter
 from flexdt.twin.signatures import public
-
-K_SHELL: Final = {
-    "I": (33.169, 0.817, 0.884, (28.5, 32.4)),
-    "Cs": (35.985, 0.813, 0.898, (30.85, 35.1)),
-    "Gd": (50.239, 0.795, 0.935, (42.75, 48.8)),
-}
-"""Edge [keV], part of the absorption above it (the edge's jump in the tables), fluorescence yield
-(Krause, J. Phys. Chem. Ref. Data 8 (1979) 307), energies of K-alpha and K-beta [keV]. Of other
-elements no fluorescence escapes here."""
-ALPHA: Final = 0.81
-"""Part of K-alpha among K photons."""
-SLICES: Final = 60
-
-
-class Deposited(NamedTuple):
-    """What a layer keeps of a photon, by energy of the tables.
-
-    Attributes:
-        mean: (e,) part of the energy that is kept on average; photons that pass keep nothing there.
-        square: (e,) mean square of that part; mean^2 / square is Swank's factor of the deposit.
-    """
-
-    mean: FloatArray
-    square: FloatArray
-
-
-@lru_cache(maxsize=64)
-def deposited(screen: Filter) -> Deposited:
-    """Part of a photon's energy that a layer keeps.
-
-    Example:
-        >>> csi = Filter(Substance.of("CsI", "CsI", 4.51), 0.2)
-        >>> part = deposited(csi).mean
-        >>> [round(float(part[np.searchsorted(tables().energy_keV, keV)]), 2) for keV in (30, 60)]
-        [0.52, 0.41]
-    """
-    from scipy.special import expn
-
-    substance, thick = screen.substance, screen.thickness_mm
-    if thick <= 0.0:
-        return Deposited(*np.zeros((2, len(tables().energy_keV))))
-    sections, energy = cross_sections((substance,)), tables().energy_keV
-    total, compton = sections.total[0], sections.incoherent[0]
-    stopping = total - sections.coherent[0]
-    photo = stopping - compton
-    stopped = -np.expm1(-stopping * thick)
-    share = (np.arange(SLICES) + 0.5) / SLICES  # slices in which as many photons are stopped
-    depth = -np.log1p(-share * stopped[:, None]) / stopping[:, None]  # (e, slice)
-    here = np.broadcast_to((stopped / stopping / SLICES)[:, None], depth.shape)
-
-    def escaping(mu: FloatArray) -> FloatArray:
-        """Of what starts evenly into all directions, (e, slice)."""
-        return np.asarray(
-            (expn(2, mu[..., None] * depth) + expn(2, mu[..., None] * (thick - depth))) / 2.0
-        )
-
-    kept = photo * energy * here.sum(axis=1)
-    square = kept * energy
-    for symbol, part in substance.fractions:
-        edge, jump, fluorescence, lines = K_SHELL.get(symbol, (np.inf, 0.0, 0.0, (0.0, 0.0)))
-        alone = Substance(symbol, ((symbol, 1.0),), part * substance.density_g_cm3)
-        amount = jump * fluorescence * photo * alone.attenuation() / total * (energy > edge)
-        for line, often in zip(lines, (ALPHA, 1.0 - ALPHA), strict=True):
-            lost = escaping(np.interp([line], energy, stopping))
-            escapes = amount * often * (here * lost).sum(axis=1)
-            kept -= escapes * line
-            square -= escapes * line * (2.0 * energy - line)
-    cosine, weight = np.polynomial.legendre.leggauss(12)
-    k = 1.0 / (1.0 + energy[:, None] / ELECTRON_KEV * (1.0 - cosine))
-    ring = k**2 * (k + 1.0 / k - 1.0 + cosine**2) * weight  # Klein and Nishina
-    ring /= ring.sum(axis=1)[:, None]
-    for j in range(len(cosine)):
-        lost = (here * escaping(np.interp(energy * k[:, j], energy, photo))).sum(axis=1)
-        met = compton * energy * ring[:, j]
-        kept += met * (here.sum(axis=1) - k[:, j] * lost)
-        square += met * energy * (here.sum(axis=1) - k[:, j] * (2.0 - k[:, j]) * lost)
-    made = Deposited(kept / energy, square / energy**2)
-    for array in made:
-        array.flags.writeable = False
-    return made
-
 
 FULL_WELL_E = 1.6e6, 0.5e6
 """Of a pixel in modes ending in High and Low: Konstantinidis et al., NIM A 689 (2012) 12, the same
@@ -123,6 +36,17 @@ EXPOSURES_MS = 1e-6, 1e7
 """Of one read-out [ms]."""
 USUAL_MS = 100.0
 """Exposure of a `Detector` that states none, where no tube says how bright its images are [ms]."""
+_OPTIONAL = {"pixel_mm", "exposure_ms", "electrons_per_count", "dark_e_per_s"}
+_BOUNDS = {
+    "pixel_mm": (1e-6, 100.0), "exposure_ms": EXPOSURES_MS, "averages": (1, 1_000_000),
+    "bits": (1, 16), "electrons_per_count": (1e-18, 1e18), "electrons_per_keV": (1e-6, 1e6),
+    "scintillator_mm": (1e-6, 100.0), "packing": (1e-3, 1.0), "swank": (1e-3, 1.0),
+    "read_noise_e": (0.0, 1e9), "offset_counts": (0.0, 65535.0), "dark_e_per_s": (0.0, 1e18),
+    "blur_mm": (0.0, 10.0), "gain_sigma": (0.0, 1.0), "offset_sigma_counts": (0.0, 65535.0),
+    "dead_fraction": (0.0, 1.0), "serial": (0, 2**63 - 1), "lag_fraction": (0.0, 1.0),
+    "lag_s": (1e-6, 1e7), "long_lag_fraction": (0.0, 1.0), "long_lag_s": (1e-6, 1e7),
+}  # fmt: skip
+"""Least and most of each figure."""
 
 
 @public
@@ -388,19 +312,6 @@ class Detector:
         charge = energy * self.electrons_per_keV
         mean = part * charge
         return mean, square * charge**2 / self.swank + mean
-
-
-_OPTIONAL = {"pixel_mm", "exposure_ms", "electrons_per_count", "dark_e_per_s"}
-_BOUNDS = {
-    "pixel_mm": (1e-6, 100.0), "exposure_ms": EXPOSURES_MS, "averages": (1, 1_000_000),
-    "bits": (1, 16), "electrons_per_count": (1e-18, 1e18), "electrons_per_keV": (1e-6, 1e6),
-    "scintillator_mm": (1e-6, 100.0), "packing": (1e-3, 1.0), "swank": (1e-3, 1.0),
-    "read_noise_e": (0.0, 1e9), "offset_counts": (0.0, 65535.0), "dark_e_per_s": (0.0, 1e18),
-    "blur_mm": (0.0, 10.0), "gain_sigma": (0.0, 1.0), "offset_sigma_counts": (0.0, 65535.0),
-    "dead_fraction": (0.0, 1.0), "serial": (0, 2**63 - 1), "lag_fraction": (0.0, 1.0),
-    "lag_s": (1e-6, 1e7), "long_lag_fraction": (0.0, 1.0), "long_lag_s": (1e-6, 1e7),
-}  # fmt: skip
-"""Least and most of each figure."""
 
 
 def _is_low(camera: CameraSettings) -> bool:

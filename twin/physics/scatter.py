@@ -36,6 +36,13 @@ LATER_FAN: Final = 2
 """Interactions after the first send their signal to every second node, half of all."""
 
 Scatter = Literal["off", "mc"]
+_BOUNDS = {
+    "error": (1e-4, 1.0),
+    "nodes": (16, 100_000),
+    "voxels": (1, 1 << 24),
+    "step_deg": (0.0, 90.0),
+    "seed": (0, 2**63 - 1),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,15 +75,6 @@ class ScatterSettings:
     def __post_init__(self) -> None:
         for name, (low, high) in _BOUNDS.items():
             require_within(f"scatter: {name}", getattr(self, name), low, high)
-
-
-_BOUNDS = {
-    "error": (1e-4, 1.0),
-    "nodes": (16, 100_000),
-    "voxels": (1, 1 << 24),
-    "step_deg": (0.0, 90.0),
-    "seed": (0, 2**63 - 1),
-}
 
 
 @dataclass(frozen=True, eq=False)

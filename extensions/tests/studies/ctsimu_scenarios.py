@@ -42,7 +42,7 @@ from flexdt.phantoms.mesh_booleans import cut
 from flexdt.phantoms.pieces import Surface
 from flexdt.twin.attenuation.substances import Substance, tables
 from flexdt.twin.errors import TwinError
-from flexdt.twin.physics.detector import deposited
+from flexdt.twin.physics.scintillator import deposited
 from flexdt.twin.physics.tube import ALUMINIUM, Filter, TubeModel, tube_spectrum
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt_extensions.ctsimu.scenario import ScenarioImages

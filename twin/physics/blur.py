@@ -1,0 +1,94 @@
+"""Blur of images and of their noise: the scintillator's light, the focal spot.
+
+The blur has the requested variance, however narrow it is. From 0.7 pixels on its kernel is a
+Gaussian at the pixels' centres, whose modulation is a Gaussian's up to the Nyquist frequency.
+Samples of a narrower one would lose variance: there it is the discrete Gaussian exp(-t) I_n(t),
+whose modulation is exp(-2 t sin^2(pi f)) and so more than a Gaussian's at high frequencies.
+
+Noise of the X-rays is blurred as light is that spreads before pixels collect it: its spectrum is
+that of light and aperture together, folded back at the Nyquist frequency.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+
+from flexdt.twin.errors import LimitError
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+
+FWHM = 2.3548200450309493
+"""Full width at half maximum of a Gaussian of standard deviation 1."""
+SAMPLED = 0.7
+"""Standard deviation from which samples of a Gaussian have its variance [pixels]."""
+NARROWEST = 0.02
+"""Standard deviation below which nothing is done [pixels]."""
+WIDEST = 1000.0
+"""Standard deviation of a blur at most [pixels]."""
+FREQUENCIES, FOLDS = 512, 20
+"""Samples of a noise spectrum at least, and spectra on either side that are folded into it."""
+
+
+def kernel(sigma_px: float) -> Float32Array:
+    """Weights of the blur, (2 r + 1,), adding up to 1."""
+    from scipy.special import ive
+
+    t = sigma_px * sigma_px
+    reach = max(1, int(np.ceil(4.0 * sigma_px + 1.0)))
+    n = np.arange(-reach, reach + 1)
+    weights = np.exp(n * n / (-2.0 * t)) if sigma_px >= SAMPLED else ive(np.abs(n), t)
+    return np.asarray(weights / weights.sum(), dtype=np.float32)
+
+
+@lru_cache(maxsize=16)
+def noise_kernel(sigma_px: float) -> Float32Array:
+    """Weights that give white noise of the pixels' photons the spectrum it has where light spreads
+    with `sigma_px` before pixels collect it, (2 r + 1,); see `noise_spectrum`."""
+    reach = int(np.ceil(4.0 * sigma_px + 3.0))
+    frequency = np.fft.fftfreq(max(FREQUENCIES, 4 * reach)).astype(np.float64)
+    modulation = np.sqrt(noise_spectrum(frequency, sigma_px))
+    weights = np.fft.ifft(modulation).real
+    return np.asarray(weights[np.arange(-reach, reach + 1)], dtype=np.float32)
+
+
+def noise_spectrum(frequency: FloatArray, sigma_px: float) -> FloatArray:
+    """Noise power of a flat image by frequency [cycles a pixel], 1 at none: light's and aperture's
+    modulation squared, with all that is folded back."""
+    f = frequency[..., None] + np.arange(-FOLDS, FOLDS + 1)
+    return np.asarray((np.sinc(f) ** 2 * np.exp(-((2.0 * np.pi * f * sigma_px) ** 2))).sum(axis=-1))
+
+
+def blurred(
+    image: Float32Array,
+    sigma_px: float,
+    across_px: float | None = None,
+    *,
+    weights: Callable[[float], Float32Array] = kernel,
+) -> Float32Array:
+    """`image` (rows, cols) blurred along its rows and, by default alike, across them; edges go on
+    as their last pixel."""
+    across = sigma_px if across_px is None else across_px
+    if not (widest := max(sigma_px, across)) <= WIDEST:
+        said = f"a blur of {widest:.3g} pixels (standard deviation)"
+        cure = "a smaller focal spot, less power, less magnification or larger pixels"
+        raise LimitError.instead(said, widest, f"{WIDEST:g}, by {cure}")
+    if widest < NARROWEST:
+        return image
+    import cv2
+
+    u, v = weights(sigma_px), weights(across)
+    out = cv2.sepFilter2D(image, cv2.CV_32F, u, v, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(out, dtype=np.float32)
+
+
+def spot_blur_px(view: FloatArray, spot_mm: float, towards_mm: float = 0.0) -> float:
+    """Standard deviation of the focal spot's image at the magnification of what stands on the
+    rotation axis, or `towards_mm` nearer to the source [pixels]."""
+    source, centre, u, v = view[0:3], view[3:6], view[6:9], view[9:12]
+    normal = np.cross(u, v)
+    to_axis, to_panel = float(-source @ normal), float((centre - source) @ normal)
+    near = to_axis - towards_mm * float(np.linalg.norm(normal))
+    magnification = to_panel / (max(near, 1e-3 * to_axis) or 1e-300)
+    return max(0.0, magnification - 1.0) * spot_mm / FWHM / float(np.linalg.norm(u))

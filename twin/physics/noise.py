@@ -1,0 +1,147 @@
+"""The noise of a saved image, term by term: one model for images that are drawn and for forecasts.
+
+Each of `NOISE` says how it is drawn, and what variance that has. `readout.read_out` draws all of
+them, `pixel_variance` adds their variances up. A term that is added to `NOISE` is thus in images
+and in forecasts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.physics.blur import NARROWEST, blurred, noise_kernel
+from flexdt.twin.physics.detector import Detector
+from flexdt.twin.physics.exposure import FEW
+
+ROUNDING: Final = 1.0 / 12.0
+"""Variance of rounding to whole counts [counts^2]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Exposed:
+    """What the panel holds before an image is read out.
+
+    Attributes:
+        mean_e: float32 (rows, cols), electrons of one read-out.
+        variance_e: float32 (rows, cols), what X-rays add to their variance in one read-out.
+        averages: read-outs that are averaged into the image.
+        panel: the detector.
+        camera: its mode.
+    """
+
+    mean_e: Float32Array
+    variance_e: Float32Array
+    averages: int
+    panel: Detector
+    camera: CameraSettings
+
+
+@dataclass(frozen=True)
+class NoiseTerm:
+    """One source of noise.
+
+    Attributes:
+        name: of the source.
+        spreads: whether the scintillator's light spreads it over neighbours; otherwise it is white.
+        draw: makes the noise of a saved image before it spreads, float32 (rows, cols) [electrons].
+        variance_e2: gives a pixel's variance in one read-out before it spreads [electrons^2], from
+            panel, camera mode and the variance that X-rays have [electrons^2]; averaging divides
+            it by the number of read-outs.
+    """
+
+    name: str
+    spreads: bool
+    draw: Callable[[Exposed, np.random.Generator], Float32Array]
+    variance_e2: Callable[[Detector, CameraSettings, float], float]
+
+
+def draw_quanta(exposed: Exposed, rng: np.random.Generator) -> Float32Array:
+    """Draw what the charge has more than its mean, of variance / averages.
+
+    Gaussian where many quanta come; where few do, whole quanta of the size that gives the variance.
+    """
+    mean, variance, averages = exposed.mean_e, exposed.variance_e, exposed.averages
+    out = rng.standard_normal(mean.shape, dtype=np.float32)
+    out *= np.sqrt(variance * np.float32(1.0 / averages))
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        quanta = mean * mean * np.float32(averages) / variance
+    few = np.flatnonzero((quanta < FEW).ravel() & (quanta > 0.0).ravel())
+    if len(few):
+        each = mean.ravel()[few] / quanta.ravel()[few]
+        out.ravel()[few] = (rng.poisson(quanta.ravel()[few]) - quanta.ravel()[few]) * each
+    return np.asarray(out)
+
+
+def draw_electronics(exposed: Exposed, rng: np.random.Generator) -> Float32Array:
+    """Draw the read noise of `averages` read-outs."""
+    sigma = exposed.panel.read_noise(exposed.camera)
+    shape = exposed.mean_e.shape
+    return np.float32(sigma / np.sqrt(exposed.averages)) * rng.standard_normal(
+        shape, dtype=np.float32
+    )
+
+
+def quantum_variance(panel: Detector, camera: CameraSettings, xrays_e2: float) -> float:
+    """Give the variance that X-rays have [electrons^2]."""
+    return xrays_e2
+
+
+def electronic_variance(panel: Detector, camera: CameraSettings, xrays_e2: float) -> float:
+    """Give the variance of the read noise [electrons^2]."""
+    return panel.read_noise(camera) ** 2
+
+
+NOISE: tuple[NoiseTerm, ...] = (
+    NoiseTerm("quanta", True, draw_quanta, quantum_variance),
+    NoiseTerm("electronics", False, draw_electronics, electronic_variance),
+)
+"""Every source of noise. Random numbers are drawn in this order, for those that spread first."""
+
+
+def drawn(exposed: Exposed, rng: np.random.Generator, *, spreads: bool) -> Iterator[Float32Array]:
+    """Draw the noise of each term that spreads, spread as it is, or of each that does not.
+
+    Yields:
+        Electrons of a saved image, float32 (rows, cols), one array a term.
+    """
+    for term in NOISE:
+        if term.spreads != spreads:
+            continue
+        noise = term.draw(exposed, rng)
+        if spreads:
+            blur = exposed.panel.blur_px(exposed.camera)
+            noise = blurred(noise, *blur, weights=noise_kernel)
+        yield noise
+
+
+def pixel_variance(
+    panel: Detector, camera: CameraSettings, averages: int, xrays_e2: float
+) -> float:
+    """Add up the variance of a pixel of a saved image in surroundings that are like it [counts^2].
+
+    Args:
+        panel: the detector.
+        camera: its mode says how pixels are binned and read.
+        averages: read-outs that are averaged into the image.
+        xrays_e2: variance that X-rays have in one read-out before light spreads [electrons^2].
+    """
+    kept = _kept_by_blur(panel.blur_px(camera))
+    electrons = 0.0
+    for term in NOISE:
+        own = term.variance_e2(panel, camera, xrays_e2)
+        electrons += own * kept if term.spreads else own
+    return electrons / averages / panel.gain(camera) ** 2 + ROUNDING
+
+
+def _kept_by_blur(sigmas_px: tuple[float, float]) -> float:
+    """Give the part of a flat image's white noise that a pixel keeps where light spreads."""
+    if max(sigmas_px) < NARROWEST:
+        return 1.0
+    return math.prod(float((noise_kernel(s).astype(np.float64) ** 2).sum()) for s in sigmas_px)

@@ -1,0 +1,56 @@
+"""Views from several points of the focal spot, and through several points of each pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flexdt.twin.errors import LimitError
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.physics.blur import FWHM
+
+MOST_RAYS = 16
+"""Along each side of a pixel."""
+
+
+def spot_views(rows: FloatArray, spot_mm: float, points: int) -> FloatArray:
+    """Views (n, 12) from so many points of a Gaussian focal spot, (n * points, 12): their mean has
+    the spot's blur at every depth. A spiral, so that no two points lie behind one another.
+
+    Args:
+        rows: cone_vec rows.
+        spot_mm: full width at half maximum.
+        points: from each view, at least 3.
+    """
+    k = (np.arange(points) + points // 2) % points  # the innermost in the middle
+    turn = np.pi * (3.0 - np.sqrt(5.0)) * k
+    radius = np.sqrt(-2.0 * np.log1p(-(k + 0.5) / points))
+    places = radius * np.array([np.cos(turn), np.sin(turn)])
+    places -= places.mean(axis=1, keepdims=True)
+    places = np.linalg.solve(np.linalg.cholesky(np.cov(places, bias=True)), places)
+    edges = rows[:, 6:].reshape(-1, 2, 3)
+    edges = edges / np.linalg.norm(edges, axis=2, keepdims=True) * (spot_mm / FWHM)
+    out = np.repeat(rows[:, None], points, axis=1)
+    out[:, :, :3] += np.einsum("ak,nax->nkx", places, edges)
+    return out.reshape(-1, 12)
+
+
+def check_rays(rays: int) -> None:
+    """Check a number of rays along each side of a pixel.
+
+    Raises:
+        LimitError: says what is allowed.
+    """
+    if not isinstance(rays, int | np.integer) or rays not in range(1, MOST_RAYS + 1):
+        allowed = f"1 to {MOST_RAYS} along each side of a pixel"
+        raise LimitError.instead(f"rays is {rays}", rays, allowed)
+
+
+def within_pixels(rows: FloatArray, rays: int) -> FloatArray:
+    """Views through a point in each of rays x rays parts of the pixels of each view, (n * rays^2,
+    12): no two in one row or column, so that edges along them come out in rays^2 steps."""
+    j, i = np.divmod(np.arange(rays**2)[:, None], rays)
+    across = (i + (j + 0.5) / rays) / rays - 0.5
+    down = (j + (rays - i - 0.5) / rays) / rays - 0.5
+    out = np.repeat(rows[:, None], rays**2, axis=1)
+    out[:, :, 3:6] += across * rows[:, None, 6:9] + down * rows[:, None, 9:12]
+    return out.reshape(-1, 12)
