@@ -20,7 +20,7 @@ import numpy as np
 
 from flexdt.twin.calibration.fit.fit import axis_in_image
 from flexdt.twin.calibration.fit.priors import prior_widths
-from flexdt.twin.calibration.without_phantom.align import Alignment
+from flexdt.twin.calibration.without_phantom.alignment import Alignment
 from flexdt.twin.dataset import rebuild, scan_settings
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray

@@ -17,7 +17,7 @@ import pytest
 
 import flexdt as fx
 from flexdt.clients.cli.command_tree import run
-from flexdt.twin.calibration.without_phantom.turn import averaged_rows, find_gap
+from flexdt.twin.calibration.without_phantom.tile_gap import averaged_rows, find_gap
 from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.geometry.panel import Panel

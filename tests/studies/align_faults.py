@@ -45,7 +45,7 @@ from align_targets import (
 )
 
 import flexdt as fx
-from flexdt.twin.calibration.without_phantom import align
+from flexdt.twin.calibration.without_phantom import turn_planes
 from flexdt.twin.errors import NotIdentifiableError
 
 Rng = np.random.Generator
@@ -646,7 +646,7 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="one line for each scan as well")
     o = parser.parse_args(words)
     if o.column:
-        align.find_height = untold  # type: ignore[assignment]
+        turn_planes.find_height = untold  # type: ignore[assignment]
     rng, runs = np.random.default_rng(o.seed), []
     names = sorted(o.only.split(",") if o.only else FAULTS)
     for k in range(o.count):

@@ -15,7 +15,9 @@ from flexdt.library.datasets.image_doubts import image_doubts
 from flexdt.library.datasets.image_set import Images, Images_co, ImageSet
 from flexdt.twin import long_work
 from flexdt.twin.calibration.fit.priors import prior_widths
-from flexdt.twin.calibration.without_phantom.align import STANDS, Alignment, align_turn
+from flexdt.twin.calibration.without_phantom.align import align_turn
+from flexdt.twin.calibration.without_phantom.alignment import Alignment
+from flexdt.twin.calibration.without_phantom.circular_scan import STANDS
 from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import NOMINAL

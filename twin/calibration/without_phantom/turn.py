@@ -3,35 +3,23 @@
 Over a full turn the mean projection is that of a body of revolution. What would spoil it is looked
 for here: frames that are repeated, gaps between angles, and a step between neighbours, which after
 a drift is the one between the last frame and the first; what slips during the scan leaves both.
-
-A gap between two tiles of the panel is looked for in some of the frames. What lies in it is
-missing: beyond it everything appears nearer by its width, and the columns beside it differ as
-columns do that are further apart. How much columns differ with their distance is seen in the frames
-themselves, everywhere else. Where edges of the turning object pass a border, the differences of
-neighbouring columns about it are compared with what they would be with a gap of each width: the
-likelihood of normal differences, each row of each frame at its own scale. The outline of the object
-looks like a gap, too, where its edges turn back, but it does so on both sides of the axis: the gain
-at a border's mirror image is subtracted twice. A gap is in all frames, and a few that fit well
-prove nothing: what frames scatter by is subtracted as well. What stays the same in all frames
-(rings, a wrong flat field) is left out, and so are borders near columns that show nothing.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import PchipInterpolator
-from scipy.ndimage import gaussian_filter, maximum_filter1d, median_filter
+from scipy.ndimage import gaussian_filter, median_filter
 
+from flexdt.twin.calibration.without_phantom.tile_gap import FRAMES, averaged_rows
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
-from flexdt.twin.geometry.panel import Border, Panel
 
 Image = Callable[[int], Float32Array]
 
@@ -285,132 +273,3 @@ def _far(n: int, place: int) -> npt.NDArray[np.bool_]:
     """(n,) places on the circle that are no near neighbours of one."""
     apart = np.abs(np.arange(n) - place)
     return np.asarray(np.minimum(apart, n - apart) > 2)
-
-
-SIDE: Final = 4
-"""Columns on each side of a border that are looked at."""
-WIDTHS: Final = np.arange(0.0, 4.01, 0.1)
-"""Widths of gaps that are tried [px]."""
-ROWS, FRAMES = 48, 96
-"""Rows that a frame is averaged to, and frames that are looked at, where there are more."""
-EDGES: Final = 0.05
-"""Part of all places that is compared, those with most change: edges. Noise says nothing."""
-EVIDENCE, STANDS_OUT = 24.0, 5.0
-"""Gain in log likelihood from which on there is a gap, and times the gain at any other border. Of
-93 drawn scans without a gap one had both, of 69 with one of 0.5 to 2 px 65 (`align_faults.py`)."""
-
-
-class Gap(NamedTuple):
-    """Between two tiles: the first column beyond it, and how wide it is, with sigma [px]."""
-
-    column: int
-    width: float
-    sigma: float
-
-    def panel(self, shape: tuple[int, int], undone: Panel | None = None) -> Panel:
-        """The panel of images (rows, cols) with this gap, beside what is undone in them already."""
-        one = undone or Panel.flat(shape)
-        at = np.array([self.column - 0.5, (shape[0] - 1) / 2])
-        border = Border(0, float((at + one.shift(at))[0]))
-        model = replace(one.model, borders=(*one.model.borders, border))
-        return replace(one, model=model, coefficients=(*one.coefficients, -self.width, 0.0))
-
-
-def averaged_rows(image: Float32Array) -> Float32Array:
-    """A frame with about ROWS rows, if it has more."""
-    return binned_mean(image, (-(-len(image) // ROWS), 1))
-
-
-def find_gap(
-    frames: Sequence[Float32Array], axis: float, closed: Sequence[float] = ()
-) -> Gap | None:
-    """The gap that stands out, if there is one.
-
-    Args:
-        frames: line integrals of `averaged_rows`, some of a turn.
-        axis: column of the axis, to a pixel or two.
-        closed: columns of borders beside which the images are filled in.
-
-    Raises:
-        NotIdentifiableError: two stand out.
-    """
-    stack = np.asarray(frames, dtype=np.float64)
-    if stack.shape[2] < 8 * SIDE:
-        return None
-    table = (stack - stack.mean(axis=0)).reshape(-1, stack.shape[2])
-    spread = table.std(axis=0)
-    dead = spread < 0.1 * median_filter(spread, 4 * SIDE + 1)
-    for at in closed:
-        dead |= np.abs(np.arange(len(dead)) - at) < SIDE
-    steps = np.diff(table, axis=1)
-    around = np.lib.stride_tricks.sliding_window_view(steps, 2 * SIDE - 1, axis=1)
-    power = np.square(around).sum(axis=2)
-    power[:, np.lib.stride_tricks.sliding_window_view(dead, 2 * SIDE).any(axis=1)] = 0.0
-    row, border = np.nonzero(power > np.quantile(power, 1.0 - EDGES))
-    if not len(row):
-        return None
-    edges = around[row, border] / np.sqrt(power[row, border])[:, None]
-    places, of_frame = power.shape[1], row // stack.shape[1]
-    gains = _gains(edges, of_frame * places + border, (len(stack), places))
-    place = np.arange(places)
-    mirror = np.rint(2 * axis - place - 2 * SIDE + 1).astype(np.intp)
-    known = (mirror >= 0) & (mirror < len(place)) & (np.abs(mirror - place) > SIDE + 2)
-    gain = gains.max(axis=0)
-    gain = gain - np.where(known, 2.0 * maximum_filter1d(gain, 5)[np.where(known, mirror, 0)], 0.0)
-    best = int(gain.argmax())
-    others = np.where(np.abs(place - best) > SIDE, gain, 0.0)
-    second = int(others.argmax())
-    if gain[best] < max(EVIDENCE, STANDS_OUT * others[second]):
-        third = float(others[np.abs(place - second) > SIDE].max())
-        if others[second] < max(EVIDENCE, STANDS_OUT * third):
-            return None
-        both = sorted((best + SIDE, second + SIDE))
-        raise NotIdentifiableError(
-            f"from columns {both[0]} and {both[1]} on everything appears nearer, as behind two "
-            "gaps between tiles of the panel, of which one can be found; calibrate with a phantom, "
-            "and give that correction"
-        )
-    width = float(WIDTHS[gains[:, best].argmax()])
-    # Sharper edges than the usual ones look like a wider gap: drawn ones are off by half of that.
-    return Gap(best + SIDE, width, 0.2 + 0.3 * width)
-
-
-def _gains(edges: FloatArray, place: npt.NDArray[np.intp], shape: tuple[int, int]) -> FloatArray:
-    """What gaps of all widths gain at each border over none, less what frames scatter by, (w, b).
-
-    Args:
-        edges: differences of neighbouring columns, (k, 2 SIDE - 1).
-        place: of each in a table of frames and borders, (k,).
-        shape: of that table.
-    """
-    of_distance = _differences(edges)
-    without, out = _likelihood(edges, of_distance, 0.0), []
-    for width in WIDTHS.tolist():
-        gain = _likelihood(edges, of_distance, width) - without
-        of_frames = np.bincount(place, gain, math.prod(shape)).reshape(shape)
-        out.append(of_frames.sum(axis=0) - np.sqrt(np.square(of_frames).sum(axis=0)))
-    return np.array(out)
-
-
-def _differences(edges: FloatArray) -> PchipInterpolator:
-    """Mean squares of the difference of two columns by their distance, 1 and more [px]."""
-    place = np.cumsum(np.pad(edges, ((0, 0), (1, 0))), axis=1)
-    far = np.arange(1, 2 * SIDE)
-    apart = np.array([np.square(place[:, h:] - place[:, :-h]).mean() for h in far.tolist()])
-    more = np.arange(1, math.ceil(WIDTHS[-1]) + 1)
-    return PchipInterpolator(
-        np.append(far, far[-1] + more), np.append(apart, apart[-1] + (apart[-1] - apart[-2]) * more)
-    )
-
-
-def _likelihood(edges: FloatArray, of_distance: PchipInterpolator, width: float) -> FloatArray:
-    """Logarithm of the likelihood of each row (k, 2 SIDE - 1) of differences of neighbours about a
-    gap of a width, at its own scale, (k,)."""
-    at = np.arange(2 * SIDE) + width * (np.arange(2 * SIDE) >= SIDE)
-    distance = np.abs(at[:, None] - at)
-    squares = np.where(distance > 0.0, of_distance(np.maximum(distance, 1.0)), 0.0)
-    variance, ways = np.linalg.eigh(-0.5 * np.diff(np.diff(squares, axis=0), axis=1))
-    variance = np.maximum(variance, 1e-3 * variance[-1])
-    white = edges @ (ways / np.sqrt(variance))
-    spread = np.log(np.square(white).sum(axis=1)) * (SIDE - 0.5)
-    return np.asarray(-spread - float(np.log(variance).sum()) / 2)

@@ -1,0 +1,138 @@
+"""Shifts of single frames: those that make planes through two sources agree.
+
+How far every frame shows the object aside and down follows from one linear system: each pair of
+views adds as many equations for the shifts of its two frames as it sees planes. What a shift of the
+object does too, a shift common to all frames and one that turns once with the stage, is not told
+from the geometry and left out. The shifts' noise is that of an image made of noise alone, which
+goes the same way. From it and the shifts' own scatter follows how large they are at all, and what
+is left of each where noise dominates.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from flexdt.twin.calibration.without_phantom.plane_pairs import PlanePairs, without
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+
+SHIFT_ROUNDS: Final = 3
+PULLED: Final = 1e-6
+"""Weight that keeps shifts near 0 in directions of which the images say nothing."""
+EVIDENCE: Final = 6.0
+"""Gain in log likelihood from which on frames are said to move, as in `fitted_motion`."""
+WIDER: Final = 1.5
+"""Errors are taken to be so many times what disagreements and noise make of them (assumed)."""
+LARGER: Final = 5.0
+"""Squares of shifts must be so many times those of their errors (assumed)."""
+LEAST_TOLD: Final = 0.1
+"""Share of the slopes' squares that is the object's is taken to be this at least."""
+
+
+class Shifts(NamedTuple):
+    """Of the object in the binned frames, to the right and down, (n, 2) each [px]."""
+
+    values: FloatArray
+    sigmas: FloatArray
+    evidence: tuple[float, float]
+
+
+def find_shifts(
+    pairs: PlanePairs, at: FloatArray, angle: FloatArray, random: np.random.Generator
+) -> Shifts:
+    """Shifts of all frames.
+
+    Args:
+        pairs: the frames' pairs.
+        at: arguments of their geometry.
+        angle: of the stage in each frame, (n,) [rad].
+        random: for the image of noise.
+    """
+    n = len(angle)
+    modes = np.column_stack([np.ones(n), np.cos(angle), np.sin(angle)])
+    free = np.eye(n) - modes @ np.linalg.pinv(modes)
+    values = np.zeros((n, 2))
+    for _ in range(SHIFT_ROUNDS):
+        system = _System(pairs, at, values)
+        values = free @ (values - system.solve(system.rest))
+    system = _System(pairs, at, values)
+    image = pairs.noise(random)
+    noise = system.of(image)
+    # Slopes that are noise in part make the equations stiffer than what there is to be seen.
+    told = np.maximum(1.0 - system.share(image), LEAST_TOLD)
+    scatter = (free @ system.solve(noise)).var(axis=0) / np.square(told)
+    # What planes disagree by beyond noise (sampling, beam hardening) is in the shifts as well.
+    # A face along the beam is sampled alike in all pairs of a frame: more than they tell.
+    scatter *= WIDER**2 * max(1.0, system.power(system.rest) / system.power(noise))
+    found = values.var(axis=0)
+    sigmas, evidence = np.zeros((n, 2)), []
+    for i, (s, v) in enumerate(zip(scatter.tolist(), found.tolist(), strict=True)):
+        gain = n / 2 * (v / s - 1.0 - math.log(v / s)) if v > s else 0.0
+        evidence.append(gain)
+        share = 1.0 - s / v if gain > EVIDENCE and v > LARGER * s else 0.0
+        values[:, i] *= share
+        sigmas[:, i] = math.sqrt(share * s) if share else math.nan
+    return Shifts(values, sigmas, (evidence[0], evidence[1]))
+
+
+class _System:
+    """Equations for changes of shifts, at given ones."""
+
+    def __init__(self, pairs: PlanePairs, at: FloatArray, shifts: FloatArray) -> None:
+        self.pairs, self.at = pairs, at
+        self.views = pairs.rows(at).copy()
+        u, v = self.views[:, 6:9], self.views[:, 9:12]
+        self.views[:, 3:6] -= shifts[:, :1] * u + shifts[:, 1:] * v
+        found, self.ones = pairs.integrals(at, self.views)
+        self.rest = self._difference(found)
+        self.slopes = self._slopes(pairs.sums)
+        usual = np.add.reduceat(np.square(self.rest).sum(axis=1), pairs.starts) / pairs.sizes
+        self.weight = np.repeat(1.0 / np.maximum(usual, 1e-300), pairs.sizes)
+        self.places = (2 * pairs.pairs[:, :, None] + [0, 1]).reshape(-1, 4)
+        n = 2 * len(shifts)
+        self.normal = np.zeros((n, n))
+        blocks = np.einsum("qak,qbk,q->qab", self.slopes, self.slopes, self.weight, optimize=True)
+        np.add.at(self.normal, (self.places[:, :, None], self.places[:, None]), blocks)
+        self.normal[np.diag_indices(n)] += PULLED * np.trace(self.normal) / n + 1e-300
+
+    def _difference(self, found: FloatArray) -> FloatArray:
+        return without(self.ones, found[:, 0] - found[:, 1], self.pairs.valid)
+
+    def _slopes(self, sums: Float32Array) -> FloatArray:
+        """Change of the differences with both shifts of the first view, then of the second,
+        (q, 4, k)."""
+        parts = []
+        for first in (6, 9):
+            ends = []
+            for sign in (0.5, -0.5):
+                moved = self.views.copy()
+                moved[:, 3:6] -= sign * moved[:, first : first + 3]
+                ends.append(self.pairs.integrals(self.at, moved, sums)[0])
+            change = ends[0] - ends[1]
+            parts.append([without(self.ones, s * change[:, i], self.pairs.valid)
+                          for i, s in ((0, 1.0), (1, -1.0))])  # fmt: skip
+        return np.stack([parts[a][side] for side in (0, 1) for a in (0, 1)], axis=1)
+
+    def share(self, noise: Float32Array) -> FloatArray:
+        """What noise adds to the squares of the slopes for either shift, of all there is, (2,)."""
+        own, all_ = (
+            np.einsum("qak,qak,q->a", slopes, slopes, self.weight).reshape(2, 2).sum(axis=0)
+            for slopes in (self._slopes(noise), self.slopes)
+        )
+        return np.asarray(own / np.maximum(all_, 1e-300))
+
+    def of(self, sums: Float32Array) -> FloatArray:
+        """Differences (q, k) in other images, laid out as `PlanePairs.sums`."""
+        return self._difference(self.pairs.integrals(self.at, self.views, sums)[0])
+
+    def solve(self, rest: FloatArray) -> FloatArray:
+        """Shifts (n, 2) that would leave such differences (q, k)."""
+        right = np.zeros(len(self.normal))
+        np.add.at(right, self.places, np.einsum("qak,qk,q->qa", self.slopes, rest, self.weight))
+        return np.asarray(np.linalg.solve(self.normal, right).reshape(-1, 2))
+
+    def power(self, rest: FloatArray) -> float:
+        """Weighted sum of squares."""
+        return float((self.weight[:, None] * np.square(rest)).sum())

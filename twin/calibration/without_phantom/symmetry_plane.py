@@ -1,0 +1,346 @@
+"""The plane of symmetry of a circular scan, from its mean over a turn or from opposite rays.
+
+First the column about which the images are most symmetric, then all parameters of the plane, and
+what their uncertainty is where the images, a gap between tiles and steps of the images are known.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration.without_phantom.alignment import refuse_if
+from flexdt.twin.calibration.without_phantom.circular_scan import (
+    OF_TURN,
+    CircularScan,
+    about_axis,
+)
+from flexdt.twin.calibration.without_phantom.mirror_symmetry import (
+    REACH,
+    Symmetry,
+    find_symmetry,
+    first_column,
+)
+from flexdt.twin.calibration.without_phantom.opposite_rays import OppositeRays
+from flexdt.twin.calibration.without_phantom.tile_gap import Gap, find_gap
+from flexdt.twin.calibration.without_phantom.turn import Turn, read_turn
+from flexdt.twin.errors import NotIdentifiableError
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.panel import Panel
+
+BAND: Final = 12
+"""Rows above and below the source's plane that are read for opposite rays."""
+MOST_VIEWS: Final = 1440
+"""Of more views every second, third and so on is used for opposite rays."""
+LEAST_RATIO: Final = 1.5
+"""How much less symmetric the mean must be about any other column (ratio of squares; assumed)."""
+MOST_ASYMMETRY: Final = 0.05
+"""Of the mean's structure, what may be neither symmetric nor noise (assumed)."""
+MOST_COLUMN: Final = 2.0
+"""Largest sigma of the column that is offered [px]."""
+MOST_ROLL: Final = 0.5
+"""Largest sigma of the roll that is offered [deg]."""
+FLOOR_PX: Final = 0.01
+"""Added to the column's sigma: what beam hardening and lag do to the mean (assumed) [px]."""
+FLOOR_DEG: Final = 0.001
+"""The same for the roll [deg]."""
+
+
+@dataclass(frozen=True, eq=False)
+class FirstColumn:
+    """The column about which the images are most symmetric, and where the fit of the plane begins.
+
+    Attributes:
+        turn: the frames of a full turn; None without one.
+        rays: rays that two views see from opposite ends; None with a full turn.
+        values: parameters in the order of `circular_scan.FREE`, (k,).
+        scales: change of each that moves the image's ends by about a pixel, (k,).
+        priors: standard deviation of each, inf for none, (k,).
+        column: most symmetric column [px].
+        ratio: how much less symmetric the images are about any other column.
+        preface: what errors begin with: why there is no full turn, or which gap there is.
+    """
+
+    turn: Turn | None
+    rays: OppositeRays | None
+    values: FloatArray
+    scales: FloatArray
+    priors: FloatArray
+    column: float
+    ratio: float
+    preface: str
+
+
+@dataclass(frozen=True, eq=False)
+class SymmetryPlane:
+    """The plane of symmetry, with what else the images show of the scan.
+
+    Attributes:
+        scan: the scan; its images have the gap closed.
+        turn: the frames of a full turn, the gap closed; None without one.
+        values: parameters in the order of `circular_scan.FREE`, (k,).
+        covariance: of them, with the priors, (k, k).
+        images_rad: standard deviations of roll and yaw by the images alone, (2,).
+        priors_rad: the same before the images, (2,).
+        told: whether the images tell roll and yaw, (2,).
+        column_sigma_px: standard deviation of the column.
+        gap: between two tiles of the panel.
+        panel: the distortion that was undone, the gap in it.
+    """
+
+    scan: CircularScan
+    turn: Turn | None
+    values: FloatArray
+    covariance: FloatArray
+    images_rad: FloatArray
+    priors_rad: FloatArray
+    told: npt.NDArray[np.bool_]
+    column_sigma_px: float
+    gap: Gap | None
+    panel: Panel | None
+
+    @property
+    def sigmas_deg(self) -> tuple[float, float]:
+        """Standard deviations of roll and yaw."""
+        roll, yaw = np.degrees(np.sqrt(np.diag(self.covariance)[1:3])).tolist()
+        return roll, yaw
+
+
+def find_plane(
+    scan: CircularScan, panel: Panel | None, random: np.random.Generator
+) -> SymmetryPlane:
+    """Find the plane of symmetry.
+
+    Args:
+        scan: its images, without distortion.
+        panel: the distortion that is undone in them.
+        random: for images of noise.
+
+    Raises:
+        NotIdentifiableError: the images are symmetric about no plane, about several, or hardly.
+    """
+    first = _first_column(scan, random)
+    _require_one_column(scan, first)
+    gap = _gap(first, panel)
+    if gap is not None:
+        first = _with_gap(first, gap)
+    found = _fit(scan, first, gap)
+    _require_symmetric(found, first.preface)
+    plane = _plane(scan, first, found, gap, panel)
+    _require_precise(plane, first.preface)
+    return plane
+
+
+def _first_column(scan: CircularScan, random: np.random.Generator) -> FirstColumn:
+    """Search for the axis in the mean over a full turn, without one in opposite rays."""
+    try:
+        turn = read_turn(scan.image, scan.base.angle_scale * scan.poses.angle, scan.present)
+    except NotIdentifiableError as error:
+        why = error
+    else:
+        return _first_in_turn(scan, turn)
+    try:
+        return _first_in_rays(scan, f"{why.message}; ", random)
+    except NotIdentifiableError as error:
+        raise NotIdentifiableError(f"{why.message}; {error.message}") from error
+
+
+def _first_in_turn(scan: CircularScan, turn: Turn) -> FirstColumn:
+    nominal = scan.column(scan.start)
+    values, scales = scan.start[:OF_TURN], scan.scales[:OF_TURN]
+    column, ratio = first_column(turn.mean, nominal)
+    values[0] += (column - nominal) / scan.slopes(values, scales)[0]
+    priors = np.array([math.inf, math.inf, scan.yaw_prior_rad])
+    return FirstColumn(turn, None, values, scales, priors, column, ratio, "")
+
+
+def _first_in_rays(scan: CircularScan, no_turn: str, random: np.random.Generator) -> FirstColumn:
+    scales, given = scan.scales, scan.priors
+    scales[1] = 2 / scan.shape[1]
+    priors = np.array(
+        [
+            math.inf,
+            math.radians(given["det_roll"]),
+            scan.yaw_prior_rad,
+            given["dD_z"],
+            given["dD_y"],
+        ]
+    )
+    rays = _opposite_rays(scan, scan.start, scales, priors, random)
+    values, ratio = rays.first()
+    return FirstColumn(None, rays, values, scales, priors, scan.column(values), ratio, no_turn)
+
+
+def _require_one_column(scan: CircularScan, first: FirstColumn) -> None:
+    """Check that the images are symmetric about one column.
+
+    Raises:
+        NotIdentifiableError: about none within reach, or about another one as well.
+    """
+    reach = REACH * scan.shape[1]
+    refuse_if(
+        first.ratio == 0.0,
+        f"{first.preface}the images are symmetric about no column within {reach:.0f} px of the "
+        f"nominal one ({scan.column(scan.start):.1f}): the axis is elsewhere, or too much of the "
+        "object is out of view",
+    )
+    refuse_if(
+        first.ratio < LEAST_RATIO,
+        f"{first.preface}the images are about as symmetric about another column as about "
+        f"{first.column:.1f} (ratio {first.ratio:.2f}; at least {LEAST_RATIO:g})",
+    )
+
+
+def _gap(first: FirstColumn, panel: Panel | None) -> Gap | None:
+    """Look for a gap between two tiles that is not undone already."""
+    if first.turn is None:
+        return None
+    borders = panel.model.borders if panel else ()
+    return find_gap(first.turn.samples, first.column, [b.at for b in borders if b.axis == 0])
+
+
+def _with_gap(first: FirstColumn, gap: Gap) -> FirstColumn:
+    """Make the width of a gap the last parameter."""
+    return replace(
+        first,
+        values=np.append(first.values, gap.width),
+        scales=np.append(first.scales, 1.0),
+        priors=np.append(first.priors, gap.sigma),
+        preface=f"{gap.text}; ",
+    )
+
+
+def _fit(scan: CircularScan, first: FirstColumn, gap: Gap | None) -> Symmetry:
+    """Fit all parameters of the plane."""
+    if first.turn is None:
+        assert first.rays is not None
+        return first.rays.find(first.values)
+    border = gap.column if gap else None
+    return find_symmetry(first.turn, scan.view, first.values, first.scales, first.priors, border)
+
+
+def _require_symmetric(found: Symmetry, preface: str) -> None:
+    """Check that a plane was found, and that the images are symmetric about it.
+
+    Raises:
+        NotIdentifiableError: they are not.
+    """
+    refuse_if(
+        not found.converged,
+        f"{preface}no plane of symmetry is found: too little structure for the noise, or too few "
+        "columns on both sides of the axis",
+    )
+    refuse_if(
+        found.asymmetry > MOST_ASYMMETRY,
+        f"{preface}{100 * found.asymmetry:.1f} % of the mean, or of opposite rays, is not "
+        f"symmetric (at most {100 * MOST_ASYMMETRY:g} %): something does not turn with the stage, "
+        "or the angles or the object change during the scan",
+    )
+
+
+def _plane(
+    scan: CircularScan,
+    first: FirstColumn,
+    found: Symmetry,
+    gap: Gap | None,
+    panel: Panel | None,
+) -> SymmetryPlane:
+    """Put together what was found, with the uncertainty that the fit does not contain."""
+    turn, scales = first.turn, first.scales
+    values, covariance = found.values.copy(), found.covariance.copy()
+    if gap is not None and turn is not None:
+        gap = gap._replace(width=float(values[-1]), sigma=float(np.sqrt(covariance[-1, -1])))
+        values, covariance = values[:OF_TURN], covariance[:OF_TURN, :OF_TURN]
+        scales = scales[:OF_TURN]
+        scan, turn = _closed(scan, turn, gap)
+        panel = gap.panel(scan.shape, panel)
+    told, beside = found.images[1:3] < first.priors[1:3] / 2, 0.0
+    if first.rays is not None:
+        told[:], beside = False, _beside_rows(scan, first.rays, first.priors[1])
+        _keep_roll(values, covariance, scan.base.det_roll, first.priors[1])
+    step = (0.0, 0.0) if turn is None else turn.step_px
+    covariance[0, 0] += (math.hypot(FLOOR_PX, step[0] / 2, beside) * scales[0]) ** 2
+    covariance[1, 1] += math.radians(FLOOR_DEG) ** 2 + (step[0] / scan.shape[0]) ** 2
+    slopes = scan.slopes(values, scales)
+    sigma = math.sqrt(slopes @ covariance @ slopes)
+    return SymmetryPlane(
+        scan, turn, values, covariance, found.images[1:3], first.priors[1:3], told, sigma, gap,
+        panel,
+    )  # fmt: skip
+
+
+def _closed(scan: CircularScan, turn: Turn, gap: Gap) -> tuple[CircularScan, Turn]:
+    """Close a gap in the images and in their mean."""
+    own, image = gap.panel(scan.shape), scan.image
+    mean = own.undistorted(turn.mean.astype(np.float32)).astype(float)
+    closed = replace(scan, image=lambda i: own.undistorted(image(i)))
+    return closed, replace(turn, mean=mean)
+
+
+def _beside_rows(scan: CircularScan, rays: OppositeRays, roll_rad: float) -> float:
+    """Give how far the roll moves the axis in the panel's middle row, if others were read [px]."""
+    read = rays.frames.shape[1]
+    return float(roll_rad * (rays.top - (scan.shape[0] - read) / 2) * (read > 1))
+
+
+def _keep_roll(
+    values: FloatArray, covariance: FloatArray, roll_rad: float, sigma_rad: float
+) -> None:
+    """Put the roll in force in place of what few rows say of it, which was up to six sigma off."""
+    values[1], covariance[1], covariance[:, 1] = roll_rad, 0.0, 0.0
+    covariance[1, 1] = sigma_rad**2
+
+
+def _require_precise(plane: SymmetryPlane, preface: str) -> None:
+    """Check the uncertainty of column and roll.
+
+    Raises:
+        NotIdentifiableError: it is too large.
+    """
+    sigma, (roll, _) = plane.column_sigma_px, plane.sigmas_deg
+    refuse_if(
+        sigma > MOST_COLUMN or (bool(plane.told[0]) and roll > MOST_ROLL),
+        f"{preface}the column would be known to {sigma:.2g} px and the roll to {roll:.2g} deg; "
+        f"allowed: {MOST_COLUMN:g} px and {MOST_ROLL:g} deg (more views or light help)",
+    )
+
+
+def _opposite_rays(
+    scan: CircularScan,
+    start: FloatArray,
+    scales: FloatArray,
+    known: FloatArray,
+    random: np.random.Generator,
+) -> OppositeRays:
+    """Collect the rays near the plane of the source that two views see from opposite ends.
+
+    Raises:
+        NotIdentifiableError: there are hardly any.
+    """
+    rows, cols = scan.shape
+    angle = scan.offsets(start).angle_scale * scan.poses.angle[list(scan.present)] % (2 * np.pi)
+    order = np.array(scan.present)[np.argsort(angle, kind="stable")][
+        :: -(-len(scan.present) // MOST_VIEWS)
+    ]
+    some = scan.poses[order]
+    first = about_axis(some[:1], scan.offsets(start))
+    row = first.project_points([[0.0, 0.0, float(first.source[0, 2])]], scan.shape)[0, 0, 1]
+    lean = 2 * float(some.sdd[0]) / (cols * float(np.linalg.norm(some.u[0])))
+    refuse_if(
+        not -lean < row < rows - 1 + lean,
+        f"the source turns in the plane of row {row:.0f}: rays to rows 0 to {rows - 1} lean too "
+        f"much to be those of opposite views; allowed are regions within {lean:.0f} rows of it",
+    )
+    top, end = np.clip(np.round(row) + (-BAND, BAND + 1), (0, 1), (rows - 1, rows)).astype(int)
+    stack = np.stack([scan.image(i)[top:end] for i in order.tolist()])
+    if end - top <= 2 * BAND:
+        stack = stack.mean(axis=1, keepdims=True)
+
+    def views(values: FloatArray) -> FloatArray:
+        return np.asarray(about_axis(some, scan.offsets(values)).rows)
+
+    return OppositeRays(stack, int(top), scan.shape, views, start, scales, known, random)
