@@ -7,8 +7,9 @@ import pytest
 
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import bead_model
-from flexdt.twin.calibration.detect.background import evened, fading, survey
+from flexdt.twin.calibration.detect.background import survey
 from flexdt.twin.calibration.detect.detection import Detections, detect_beads
+from flexdt.twin.calibration.detect.fading import evened, fading
 from flexdt.twin.calibration.detect.refine import measure_beads
 from flexdt.twin.calibration.detect.windows import crop, lattice, plan_windows
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, without_repeats

@@ -14,7 +14,7 @@ from prior_coverage import PIXEL, SDD, SHAPE, pixels, radiographs
 from flexdt.library.analysis import calibrate as calibrate_marks
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import BeadModel
-from flexdt.twin.calibration.detect.background import Lag
+from flexdt.twin.calibration.camera_lag import Lag
 from flexdt.twin.calibration.detect.detection import detect_beads
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import Calibration, CalibrationRequest, Scan, calibrate

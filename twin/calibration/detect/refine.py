@@ -18,16 +18,10 @@ import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect import spot_kernels as kernels
-from flexdt.twin.calibration.detect.background import (
-    NO_BODY,
-    Background,
-    SeenBody,
-    evened,
-    fading,
-    see_body,
-    survey,
-)
+from flexdt.twin.calibration.detect.background import Background, survey
 from flexdt.twin.calibration.detect.detection import BLUR_PX, CAP, MISFIT, covariances_of
+from flexdt.twin.calibration.detect.fading import evened, fading
+from flexdt.twin.calibration.detect.seen_body import NO_BODY, SeenBody, see_body
 from flexdt.twin.calibration.detect.windows import (
     Windows,
     blurred_windows,

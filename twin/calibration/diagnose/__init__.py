@@ -35,3 +35,8 @@ def error(code: str, text: str) -> Finding:
 def warning(code: str, text: str) -> Finding:
     """A finding with which the numbers may be used."""
     return Finding(code, Severity.WARNING, text)
+
+
+def listed(finding: Finding | None) -> list[Finding]:
+    """Make a list of one finding, or of none."""
+    return [] if finding is None else [finding]

@@ -36,7 +36,7 @@ CUTS = 48
 """Places in each direction at which a border is tried."""
 
 Refit = Callable[..., FitResult]
-"""Fit again with something else free: options of `pipeline._refit`."""
+"""Fit again with something else free: options of `fits_of_scans.refit_scans`."""
 
 
 def evidence(fit: FitResult, noise: float) -> float:

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from scipy.special import chdtri
 
-from flexdt.twin.calibration.detect.background import Lag
+from flexdt.twin.calibration.camera_lag import Lag
 from flexdt.twin.calibration.detect.refine import Refined
 from flexdt.twin.calibration.diagnose import Finding, error, warning
 from flexdt.twin.calibration.diagnose.distortion import Refit, better_panel, distorted

@@ -1,0 +1,43 @@
+"""Whether the sizes of the spots are those of the phantom's beads."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flexdt.twin.calibration.bead_model import spot_radii
+from flexdt.twin.calibration.diagnose import Finding, listed
+from flexdt.twin.calibration.diagnose.fitted import judge_first_size, judge_size
+from flexdt.twin.calibration.fit.fit import FitResult
+from flexdt.twin.calibration.outcome import Calibration
+from flexdt.twin.calibration.request import CalibrationRequest
+
+OTHER_BEADS = 1.0 / 6.0
+"""Deviation of the first radii from which beads are others."""
+BLURRED_FIRST = 0.4
+"""The same if blur is to be measured yet: what is blurred is wider."""
+
+
+def judge_first_sizes(
+    state: Calibration, request: CalibrationRequest, fit: FitResult
+) -> list[Finding]:
+    """Judge the sizes of the first measurement."""
+    out = []
+    allowed = BLURRED_FIRST if request.second_look else OTHER_BEADS
+    sized = zip(state.scans, state.identifications, state.looks, strict=True)
+    for g, (scan, found, looks) in enumerate(sized):
+        radii = spot_radii(state.model, scan.poses.cone_vec(fit.group_parameters[g]))
+        out += listed(judge_first_size(found, looks, radii, allowed))
+    return out
+
+
+def judge_sizes(state: Calibration, fit: FitResult) -> list[Finding]:
+    """Judge the sizes of the second measurement; of the first where the second could not tell."""
+    out = []
+    for g, scan in enumerate(state.scans):
+        radii = spot_radii(state.model, scan.poses.cone_vec(fit.group_parameters[g]))
+        if np.isfinite(state.measured[g].size):
+            out += listed(judge_size(state.measured[g], float(np.median(radii))))
+        else:
+            first = state.identifications[g], state.looks[g], radii
+            out += listed(judge_first_size(*first, OTHER_BEADS))
+    return out

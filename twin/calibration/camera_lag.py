@@ -1,0 +1,119 @@
+"""Lag of the camera: a bead that is shown once more, faintly, where it stood one frame ago.
+
+Where it will stand in the next frame there is nothing yet: what both places show in common (the
+body, the panel) is no lag.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration.detect.windows import (
+    Windows,
+    distances2,
+)
+from flexdt.twin.calibration.frame_source import Frames
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+
+SURE = 5.0
+"""Sigmas from which lag is taken out. The beads must agree: what turns with the object, ahead of
+one bead or behind it, looks like lag of that bead alone."""
+SEEN_AT_LEAST = 0.002
+"""Lag below which it is left: a ghost so faint moves no shadow by a thousandth of its width."""
+LEAST_LIGHT = 0.005
+"""Part of the open beam that is left at least where lag is taken out of a shadow."""
+LAG_SAMPLE = 48
+"""Frames that are looked at, about."""
+FEWEST_BEADS = 3
+"""Beads from which lag is estimated at least."""
+
+
+@dataclass(frozen=True)
+class Lag:
+    """Part of a frame that the next one shows, and its standard deviation."""
+
+    part: float = 0.0
+    sigma: float = math.inf
+
+    @property
+    def seen(self) -> bool:
+        """It is there beyond doubt."""
+        return self.part > max(SURE * self.sigma, SEEN_AT_LEAST)
+
+
+def lag_of(images: Float32Array, frames: Frames, plan: Windows) -> Lag:
+    """Lag of a scan, from places that no bead of the frame itself is near.
+
+    Args:
+        images: (n, k, side, side) windows of the plan, line integrals.
+        frames: of the scan, in the order in which they were taken.
+        plan: windows round the beads of each frame.
+    """
+    light = np.exp(-images)
+    sums, some = [], slice(None, None, max(1, len(light) // LAG_SAMPLE))
+    for step in (1, -1):
+        there = _rolled(plan, step)
+        shadow = np.roll(light, step, axis=0)
+        shadow[0 if step == 1 else -1] = np.nan  # the first has none before it
+        shown, near = np.exp(-frames.windows(there)[some]), _near(there.corner[some], plan, some)
+        sums.append(_products(shown, np.where(near, np.nan, shadow[some])))
+    (with_before, before), (with_after, after) = sums
+    if min(np.count_nonzero(before), np.count_nonzero(after)) < FEWEST_BEADS:
+        return Lag()
+    one, other = (float(p.sum() / q.sum()) for p, q in ((with_before, before), (with_after, after)))
+    apart = (with_before - one * before) / before.sum() - (with_after - other * after) / after.sum()
+    part = max(one - other, 0.0)
+    return Lag(part / (1.0 + part), math.sqrt(float((apart**2).sum())))
+
+
+def without_lag(frames: Frames, plan: Windows, lag: Lag) -> Float32Array:
+    """The windows of every frame, (n, k, side, side), less what is of the frame before; what that
+    one shows of its own predecessor is taken out first. Frames without one stay as they are."""
+    light = np.full((*plan.corner.shape[:2], plan.side, plan.side), np.nan)
+    for back in (2, 1, 0):
+        shown = np.exp(-np.roll(frames.windows(_rolled(plan, -back)), back, axis=0))
+        shown[:back] = np.nan
+        rest = np.maximum((shown - lag.part * light) / (1.0 - lag.part), LEAST_LIGHT)
+        light = np.where(np.isfinite(rest), rest, shown)
+    return np.asarray(-np.log(light), dtype=np.float32)
+
+
+def _rolled(plan: Windows, step: int) -> Windows:
+    """The plan with the places of the frame `step` before in each frame."""
+    names = ("corner", "predicted", "radii", "stretch", "share", "crowded", "whole")
+    return replace(plan, **{n: np.roll(getattr(plan, n), step, axis=0) for n in names})
+
+
+def _near(corner: npt.NDArray[np.int64], plan: Windows, some: slice) -> npt.NDArray[np.bool_]:
+    """Pixels of windows (n, k, side, side) near to which a bead of that frame stands."""
+    reach = (1.12 * plan.radii * plan.stretch[..., 2] + 3.0)[some]
+    out = np.zeros((*corner.shape[:2], plan.side, plan.side), dtype=bool)
+    for bead in range(reach.shape[1]):
+        d2 = distances2(corner, plan.side, plan.predicted[some, bead, None])
+        out |= d2 <= (reach[:, bead] ** 2)[:, None, None, None]
+    return out
+
+
+def _products(light: Float32Array, shadow: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Of each bead the products, summed over its windows, of its shadow in another frame with what
+    the images show at its place there, and with itself, (k,) each."""
+    use = np.isfinite(light) & np.isfinite(shadow)
+    one, other = (_bent(values, use) for values in (shadow, light))
+    return (one * other).sum(axis=(0, 2, 3)), (one * one).sum(axis=(0, 2, 3))
+
+
+def _bent(light: npt.NDArray[Any], use: npt.NDArray[np.bool_]) -> FloatArray:
+    """The windows less a paraboloid through what is used of each (the body); 0 elsewhere."""
+    x = np.linspace(-1.0, 1.0, light.shape[-1])
+    right, down = np.broadcast_arrays(x[None, :], x[:, None])
+    terms = np.stack([right**0, right, down, right**2, right * down, down**2])
+    normal = np.einsum("nkrc,arc,brc->nkab", use, terms, terms) + 1e-9 * np.eye(len(terms))
+    values = np.where(use, light, 0.0)
+    push = np.einsum("nkrc,arc->nka", values, terms)
+    smooth = np.einsum("nka,arc->nkrc", np.linalg.solve(normal, push[..., None])[..., 0], terms)
+    return np.where(use, values - smooth, 0.0)

@@ -1,0 +1,86 @@
+"""How the contrast of beads falls with what lies behind them, and how that is undone.
+
+Scattered light and a beam of several energies make a bead fainter where more lies behind it, so the
+side of a spot behind which there is less counts for more, and all centroids are off in the
+direction in which the body becomes thinner. `fading` reads from the beads themselves how their
+contrast falls, and `evened` undoes it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+
+OUTLIER = 4.5
+"""Contrasts that are off by so many times what half of them are (three standard deviations) are not
+those of that bead."""
+MEANS = 10
+"""Rounds in which the means of frames and beads are taken off in turns; few are missing."""
+
+
+def fading(contrast: FloatArray, behind: FloatArray, seen: npt.NDArray[np.bool_]) -> float:
+    """How contrast changes with the line integral behind a bead, as a share of it.
+
+    Each bead is compared with itself in other frames, and each frame's mean is taken off, so beads
+    of several sizes and a beam that drifts say nothing. What noise may have made of it is taken off
+    (James and Stein), so that of no slope nothing is left. Contrast C falls by at most as much as
+    what lies behind grows, if a ball lets nothing but scattered light through; where scattered
+    light is not even it grows with the line integral, by exp(C) - 1 times as much. What is beyond
+    these is an error of the level, which is in the contrast as well.
+
+    Args:
+        contrast: of each bead in each frame, (n, k).
+        behind: line integrals behind their middles, (n, k).
+        seen: which of them are measured, (n, k).
+    """
+    logarithm = np.log(np.where(seen, contrast, 1.0))
+    use = seen
+    for _ in range(3):
+        change, more = (_against_own_means(a, use) for a in (logarithm, behind))
+        free = int(use.sum()) - int(use.any(axis=0).sum()) - int(use.any(axis=1).sum())
+        power = float(np.square(more).sum())
+        if free < 1 or power <= 0.0:
+            return 0.0
+        slope = float((change * more).sum()) / power
+        left = np.abs(_against_own_means(logarithm - slope * behind, seen))
+        use = seen & (left <= OUTLIER * float(np.median(left[seen])))
+    variance = max(float(np.square(change).sum()) - slope**2 * power, 0.0) / free / power
+    slope *= max(1.0 - variance / max(slope**2, 1e-30), 0.0)
+    usual = float(np.median(contrast[use]))
+    return min(max(slope, -1.0 / usual), math.expm1(usual) / usual)
+
+
+def _against_own_means(values: FloatArray, seen: npt.NDArray[np.bool_]) -> FloatArray:
+    """Values (n, k) less what their frame and their bead have in common, 0 where not seen."""
+    out = np.where(seen, values, 0.0)
+    for _ in range(MEANS):
+        for axis in (0, 1):
+            count = np.maximum(seen.sum(axis=axis, keepdims=True), 1)
+            out = np.where(seen, out - out.sum(axis=axis, keepdims=True) / count, 0.0)
+    return np.asarray(out)
+
+
+def evened(
+    flat: Float32Array, plane: FloatArray, body: Float32Array | None, slope: float
+) -> Float32Array:
+    """Windows (m, side, side) with each bead as it would be were there as much behind all of it as
+    there is behind its middle.
+
+    Args:
+        flat: line integrals without the phantom's body.
+        plane: as `Background` has it.
+        body: line integrals of the body, or None.
+        slope: of the contrast, as `fading` has it.
+    """
+    at = (np.arange(flat.shape[1]) - (flat.shape[1] - 1) / 2).astype(np.float32)
+    value, right, down = plane.astype(np.float32).T[:, :, None, None]
+    more = right * at + down * at[:, None]
+    level = value + more
+    if body is not None:
+        middle = flat.shape[1] // 2
+        more = more + body - body[:, middle, middle][:, None, None]
+    return np.asarray(level + (flat - level) * np.exp(np.float32(-slope) * more))

@@ -1,0 +1,129 @@
+"""Fits to what was measured in the scans, with what a request leaves free."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from flexdt.twin.calibration.diagnose.fixed_parameters import (
+    loosened,
+)
+from flexdt.twin.calibration.fit.fit import FitResult, Solver, estimate_geometry
+from flexdt.twin.calibration.fit.fitted_motion import (
+    MotionFit,
+    aware,
+)
+from flexdt.twin.calibration.fit.problem import (
+    SIX,
+)
+from flexdt.twin.calibration.outcome import Calibration
+from flexdt.twin.calibration.request import CalibrationRequest, priors_of
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.geometry.panel import PanelModel
+from flexdt.twin.geometry.poses import Poses
+
+MEASURED = Solver(floor_px=0.3)
+"""Positions of a second measurement are never taken to be better than a third of their sigma: in
+images without noise, what is off by a thousandth of a pixel is no outlier."""
+AS_GOOD = 1.2
+"""A fit whose residuals are at most so many times as large explains the data as well."""
+
+
+def fit_with_loose_priors(
+    state: Calibration, request: CalibrationRequest, wide: FitResult
+) -> FitResult:
+    """Fit with loosened priors, to compare them with.
+
+    Beads that were freed because of the residuals stay free only if loose priors do not explain
+    the residuals as well.
+    """
+    wide_priors = loosened({**request.priors, **priors_of(state.scans, request)})
+    loose = replace(request, priors=wide_priors, bound=math.inf)
+    out = refit_scans(state, loose, wide)
+    freed = wide.bead_prior_mm if request.bead_tolerance_mm is None else 0.0
+    if freed > 0 and out.certificate.rms_px > AS_GOOD * wide.certificate.rms_px:
+        out = refit_scans(state, loose, wide, bead_tolerance_mm=freed)
+    return out
+
+
+def _start(state: Calibration, request: CalibrationRequest) -> list[Offsets]:
+    """Start each scan at what the identification found, as far as it is free."""
+    out = []
+    for found in state.identifications:
+        values = {n: getattr(found.parameters, n) for n in SIX if n in request.free}
+        out.append(replace(request.start, **values))
+    shared = [n for n in request.free if n not in request.per_scan]
+    return [replace(p, **{n: getattr(out[0], n) for n in shared}) for p in out]
+
+
+def fit_scans(
+    state: Calibration,
+    request: CalibrationRequest,
+    start: Sequence[Offsets] | None = None,
+    bead_tolerance_mm: float | None = None,
+    panel: PanelModel | None = None,
+) -> FitResult:
+    """Fit to the best positions there are: of the second measurement, else of the first."""
+    tolerance = request.bead_tolerance_mm if bead_tolerance_mm is None else bead_tolerance_mm
+    seen = state.measured or state.identifications
+    # Spots that were found by us in the first measurement count alike.
+    weighed = bool(state.measured) or all(scan.index is not None for scan in state.scans)
+    frames = [len(scan.poses) for scan in state.scans]
+    sizes = np.array([scan.frames.shape for scan in state.scans], dtype=np.float64)
+    fit = estimate_geometry(
+        np.concatenate([s.tracks for s in seen]),
+        state.model,
+        Poses.concatenate([s.poses for s in state.scans]),
+        request.free,
+        shape=np.repeat(sizes, frames, axis=0),
+        covariances=np.concatenate([s.covariances for s in seen]) if weighed else None,
+        groups=np.repeat(np.arange(len(frames)), frames),
+        per_group=request.per_scan,
+        free_beads=tolerance is not None and tolerance > 0,
+        bead_tolerance_mm=tolerance,
+        start=_start(state, request) if start is None else start,
+        reading=request.reading,
+        sampling_px=max((m.sampling_px for m in state.measured), default=0.0),
+        solver=MEASURED if weighed else None,
+        priors=priors_of(state.scans, request),
+        prior_centre=request.start,
+        bound=request.bound,
+        centre=np.concatenate([s.bias for s in seen]),
+        panel=panel,
+    )
+    return fit if state.motion is None else aware(fit, state.motion)
+
+
+def refit_scans(
+    state: Calibration,
+    request: CalibrationRequest,
+    fit: FitResult,
+    *,
+    extra: tuple[str, ...] = (),
+    motion: MotionFit | None = None,
+    bead_tolerance_mm: float | None = None,
+    start: Sequence[Offsets] | None = None,
+    panel: PanelModel | None = None,
+) -> FitResult:
+    """Fit once more with something else free: more parameters, the beads, the panel's distortion.
+
+    Args:
+        state: the scans, and what was measured in them.
+        request: what is free otherwise.
+        fit: the last one; the distortion that it found stays.
+        extra: parameters that are free as well.
+        motion: of the scans; None: as in `state`.
+        bead_tolerance_mm: prior of the beads' places; None: the request's.
+        start: offsets of each scan; None: those of the last fit.
+        panel: distortion to estimate; None: the last fit's.
+    """
+    if motion is not None:
+        scans = zip(state.scans, motion.motions, strict=True)
+        moved = tuple(replace(s, poses=m.applied(s.poses)) for s, m in scans)
+        state = replace(state, scans=moved)
+    begin = fit.group_parameters if start is None else start
+    freed = replace(request, free=tuple(dict.fromkeys((*request.free, *extra))))
+    return fit_scans(state, freed, begin, bead_tolerance_mm, panel or fit.problem.panel)

@@ -1,0 +1,202 @@
+"""Whether what a calibration does not estimate is where the data have it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from flexdt.twin.calibration.diagnose import Finding, listed
+from flexdt.twin.calibration.diagnose.fitted import (
+    OF_RESIDUALS,
+    explain_residuals,
+)
+from flexdt.twin.calibration.diagnose.fixed_parameters import (
+    DOUBT_SIGMAS,
+    doubtful,
+    held_distance,
+    judge_exact,
+    judge_held,
+    judge_priors,
+    loosened,
+    narrow_priors,
+)
+from flexdt.twin.calibration.fit.certificate import widened
+from flexdt.twin.calibration.fit.fit import FitResult
+from flexdt.twin.calibration.fit.priors import ASSUMED, FIXED
+from flexdt.twin.calibration.fit.problem import (
+    SIX,
+    from_printed_reading,
+    to_printed_reading,
+)
+from flexdt.twin.calibration.fits_of_scans import fit_with_loose_priors, refit_scans
+from flexdt.twin.calibration.outcome import Calibration
+from flexdt.twin.calibration.request import (
+    ANYWHERE,
+    CalibrationRequest,
+    priors_of,
+    stated_priors,
+    with_free,
+)
+from flexdt.twin.geometry.offsets import NAMES
+
+OF_FRAME = ("dO_y", "alpha", "tau_x", "tau_z")
+"""With beads that may be anywhere, these only say in which frame of the object they are."""
+
+
+def explain(
+    state: Calibration, request: CalibrationRequest, fit: FitResult
+) -> tuple[FitResult, list[Finding]]:
+    """Explain the residuals of a fit; where beads or the panel do, fit with those free."""
+    return explain_residuals(
+        fit,
+        free_beads=request.bead_tolerance_mm is not None,
+        refit=lambda **changes: refit_scans(state, request, fit, **changes),
+        loose=lambda: fit_with_loose_priors(state, request, fit),
+        sigmas_known=bool(state.measured),
+        misfit_px=request.misfit_px,
+    )
+
+
+def check_fixed(
+    state: Calibration,
+    asked: CalibrationRequest,
+    free: CalibrationRequest,
+    free_fit: FitResult,
+    explained: list[Finding],
+) -> tuple[FitResult, list[Finding]]:
+    """Fit what was asked for, if what that fixes is where the data have it.
+
+    All six main parameters are free first; where the data cannot tell six apart, each is freed by
+    itself. Then the priors of what else may be off are compared with what the images say of them,
+    and widened where they are a little too narrow.
+
+    Args:
+        state: the scans, and what was measured in them.
+        asked: the user's request.
+        free: the same with all six main parameters free, where the data tell them apart.
+        free_fit: its fit.
+        explained: what explains the residuals of that.
+
+    Returns:
+        The fit with those parameters fixed that are to be, and the findings that go with it.
+    """
+    fixed = _fixed_values(state, asked)
+    fit = free_fit
+    if set(free.free) - set(asked.free):
+        fit = _fit_with_fixed(state, asked, free_fit)
+    contradicted = _contradicted(state, asked, fit, fixed, (free_fit, explained))
+    if contradicted is not None:
+        return fit, contradicted
+    usual, exact = _with_usual_priors(state, asked)
+    loose_fit = fit_with_loose_priors(state, usual, fit)
+    verdict = judge_priors(loose_fit, exact)
+    errors = {f.code for f in explained if f.forbids}
+    if verdict.finding is not None and errors <= OF_RESIDUALS | {"misfit"}:
+        return fit, [*_left_by_priors(state, usual, loose_fit, explained), verdict.finding]
+    found = []
+    if verdict.factor > 1.0:
+        found.append(narrow_priors(verdict))
+        given = {**asked.priors, **priors_of(state.scans, asked)}
+        asked = replace(asked, priors=loosened(given, verdict.factor))
+    if found or fit is not free_fit:
+        fit, explained = explain(state, asked, _fit_with_fixed(state, asked, fit))
+    fit = _doubted(fit, free_fit, fixed)
+    if exact:
+        found += listed(judge_exact(fit, refit_scans(state, usual, fit), exact))
+
+    def without(name: str) -> FitResult:
+        alone = replace(asked, priors={**asked.priors, name: ANYWHERE}, bound=math.inf)
+        return refit_scans(state, alone, fit)
+
+    return doubtful(fit, verdict, without), [*explained, *found]
+
+
+def _centre(asked: CalibrationRequest) -> dict[str, float]:
+    """Give where the priors of a request are centred, in edge units."""
+    return from_printed_reading(asked.start, asked.reading).to_edge()
+
+
+def _fixed_values(state: Calibration, asked: CalibrationRequest) -> dict[str, float]:
+    """Give the main parameters that are fixed, and the values that they are fixed at."""
+    centre, known = _centre(asked), priors_of(state.scans, asked)
+    return {n: centre[n] for n in SIX if n not in asked.free and n not in known}
+
+
+def _contradicted(
+    state: Calibration,
+    asked: CalibrationRequest,
+    fit: FitResult,
+    fixed: Mapping[str, float],
+    free: tuple[FitResult, list[Finding]],
+) -> list[Finding] | None:
+    """Give the findings if the data contradict what is fixed, else None.
+
+    Args:
+        state: the scans, and what was measured in them.
+        asked: the user's request.
+        fit: its fit.
+        fixed: main parameters that it fixes, edge units.
+        free: the fit with more parameters free, and what explains its residuals.
+    """
+    trials = [free]
+    if not set(fixed) <= set(free[0].values):
+        trials = []
+        for name in fixed:
+            single = with_free(asked, (name,))
+            trials.append(explain(state, single, refit_scans(state, single, fit)))
+    for freed, found in trials:
+        off = judge_held(freed, fixed)
+        if off is not None:
+            return [*found, off]
+    return None
+
+
+def _with_usual_priors(
+    state: Calibration, asked: CalibrationRequest
+) -> tuple[CalibrationRequest, dict[str, float]]:
+    """Give what is stated as exact its usual prior.
+
+    Returns:
+        The request with those priors, and the values that were exact, edge units.
+    """
+    stated = stated_priors(state.scans, asked)
+    defined = OF_FRAME if (asked.bead_tolerance_mm or 0.0) >= ANYWHERE else ()
+    usual = {**FIXED, **ASSUMED}
+    widths = {n: w for n, w in usual.items() if stated.get(n) == 0 and n not in defined}
+    centre = _centre(asked)
+    request = replace(asked, priors={**asked.priors, **widths})
+    return request, {n: centre[n] for n in widths}
+
+
+def _left_by_priors(
+    state: Calibration,
+    usual: CalibrationRequest,
+    loose_fit: FitResult,
+    explained: Sequence[Finding],
+) -> list[Finding]:
+    """Give the findings that are left where priors are off: those of the fit with wider ones."""
+    priors = loosened({**usual.priors, **priors_of(state.scans, usual)})
+    left = explain(state, replace(usual, priors=priors), loose_fit)[1]
+    moved = [f for f in explained if f.code == "bead_tolerance" and loose_fit.bead_prior_mm]
+    return [*(f for f in left if f.code != "misfit"), *moved]
+
+
+def _doubted(fit: FitResult, free_fit: FitResult, fixed: Mapping[str, float]) -> FitResult:
+    """Widen the intervals by what the fixed parameters would change, where the data doubt them."""
+    if max(held_distance(free_fit, fixed).values(), default=0.0) <= DOUBT_SIGMAS:
+        return fit
+    doubt = {n: free_fit.values.get(n, v) - v for n, v in fit.values.items()}
+    return replace(fit, certificate=widened(fit.certificate, doubt))
+
+
+def _fit_with_fixed(state: Calibration, request: CalibrationRequest, fit: FitResult) -> FitResult:
+    """Fit from the geometry of another fit, what `request` fixes put back to where it is fixed."""
+    fixed = from_printed_reading(request.start, request.reading)
+    known = {*request.free, *priors_of(state.scans, request)}
+    values = {n: getattr(fixed, n) for n in NAMES if n not in known}
+    start = []
+    for offsets in fit.group_parameters:
+        put_back = replace(from_printed_reading(offsets, request.reading), **values)
+        start.append(to_printed_reading(put_back, request.reading))
+    return refit_scans(state, request, fit, start=start)

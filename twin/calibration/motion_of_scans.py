@@ -1,0 +1,83 @@
+"""Motion during the scans: found, put into their poses, and judged by the last fit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from flexdt.twin.calibration.diagnose import Finding, error, warning
+from flexdt.twin.calibration.fit.fit import FitResult
+from flexdt.twin.calibration.fit.fitted_motion import (
+    MotionFit,
+    estimate_motion,
+    follow_motion,
+)
+from flexdt.twin.calibration.fits_of_scans import refit_scans
+from flexdt.twin.calibration.outcome import Calibration
+from flexdt.twin.calibration.request import CalibrationRequest
+
+
+def fit_with_motion(
+    state: Calibration, request: CalibrationRequest, fit: FitResult
+) -> tuple[Calibration, FitResult]:
+    """Put the motion of the scans into their poses, and fit to them."""
+    still = [s.poses for s in state.scans]
+    if state.motions:
+        still = [m.applied(p, -1.0) for p, m in zip(still, state.motions, strict=True)]
+
+    def moved(motion: MotionFit) -> Calibration:
+        scans = tuple(
+            replace(s, poses=m.applied(p))
+            for s, p, m in zip(state.scans, still, motion.motions, strict=True)
+        )
+        return replace(state, scans=scans, motion=motion)
+
+    fit, found = follow_motion(
+        fit,
+        request.per_frame,
+        lambda motion: refit_scans(moved(motion), request, fit),
+        state.motion,
+    )
+    return moved(found), fit
+
+
+def settle_motion(
+    state: Calibration, request: CalibrationRequest, fit: FitResult
+) -> tuple[Calibration, list[Finding]]:
+    """Widen the sigmas of the motion by what the last fit would make of it."""
+    held = state.motion
+    assert held is not None
+    again = estimate_motion(fit, request.per_frame, held, search=False)
+    off = [b.values - a.values for a, b in zip(held.motions, again.motions, strict=True)]
+    motions = tuple(
+        replace(a, sigma=np.hypot(b.sigma, d))
+        for a, b, d in zip(held.motions, again.motions, off, strict=True)
+    )
+    worst = max(
+        float(np.nan_to_num(np.abs(d) / np.maximum(b.sigma, 1e-300)).max(initial=0.0))
+        for b, d in zip(again.motions, off, strict=True)
+    )
+    out = []
+    if worst > 1.0:
+        out.append(
+            warning(
+                "motion_unsettled",
+                f"the motion differs by up to {worst:.1f} sigma from what the last fit would make "
+                "of it; its sigmas contain that",
+            )
+        )
+    wide = [
+        f"{n} to {e.sigma:.2g} {e.unit}"
+        for n, e in fit.certificate.estimates.items()
+        if fit.identifiable and e.asked and e.unit != "1" and e.sigma > request.bound
+    ]
+    if wide:
+        out.append(
+            error(
+                "motion_hides",
+                f"as {', '.join(request.per_frame)} may differ from frame to frame, "
+                f"{', '.join(wide)} is all that can be said; allowed: {request.bound:g}",
+            )
+        )
+    return replace(state, motion=replace(held, motions=motions)), out

@@ -1,0 +1,88 @@
+"""The outcome of a calibration, and what is known so far while one is under way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.camera_lag import Lag
+from flexdt.twin.calibration.detect.refine import Refined
+from flexdt.twin.calibration.diagnose import Finding
+from flexdt.twin.calibration.fit.fit import FitResult
+from flexdt.twin.calibration.fit.fitted_motion import (
+    MotionFit,
+)
+from flexdt.twin.calibration.frame_source import (
+    FrameSpots,
+    Scan,
+)
+from flexdt.twin.calibration.identify import Identification
+from flexdt.twin.geometry.motion import Motion
+from flexdt.twin.geometry.panel import Panel
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The outcome, or as much of it as there is.
+
+    Attributes:
+        fit: the last fit made, with its certificate; None if it never came to one.
+        identifications: of each scan, as far as it came.
+        findings: what is wrong with the data, worst first.
+        looks: detections and state of every frame of each scan.
+        measured: positions of the second measurement of each scan; empty without one.
+        scans: what was calibrated, with the motion found in their poses.
+        model: the phantom's beads.
+        motion: what was found to move; None if it was not asked for.
+        lags: of the camera in each scan, taken out of what was measured.
+    """
+
+    fit: FitResult | None
+    identifications: tuple[Identification, ...]
+    findings: tuple[Finding, ...]
+    looks: tuple[tuple[FrameSpots, ...], ...]
+    measured: tuple[Refined, ...]
+    scans: tuple[Scan, ...]
+    model: BeadModel
+    motion: MotionFit | None = None
+    lags: tuple[Lag, ...] = ()
+
+    @property
+    def motions(self) -> tuple[Motion, ...]:
+        """The motion of each scan; empty if it was not asked for."""
+        return () if self.motion is None else self.motion.motions
+
+    @property
+    def panel(self) -> Panel | None:
+        """Distortion and lag of the panel, where either was found."""
+        panel = None if self.fit is None else self.fit.panel
+        if not (seen := [lag.part for lag in self.lags if lag.seen]):
+            return panel
+        return replace(panel or Panel.flat(self.scans[0].frames.shape), lag=float(np.mean(seen)))
+
+    @property
+    def errors(self) -> tuple[Finding, ...]:
+        """Findings that forbid using the numbers."""
+        return tuple(f for f in self.findings if f.forbids)
+
+    @property
+    def identifiable(self) -> bool:
+        """There is a fit, it determines every parameter, and nothing forbids using it."""
+        return self.fit is not None and self.fit.identifiable and not self.errors
+
+    def with_findings(self, *more: Finding) -> Calibration:
+        """Add findings."""
+        return replace(self, findings=worst_first([*self.findings, *more]))
+
+    @property
+    def detections(self) -> int:
+        """Spots found in all frames."""
+        return sum(len(look.detections) for looks in self.looks for look in looks)
+
+
+def worst_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Sort findings: those that forbid using the numbers come first."""
+    return tuple(sorted(findings, key=lambda f: not f.forbids))

@@ -1,0 +1,107 @@
+"""What a calibration estimates and how, and the priors that follow for the scans."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from flexdt.twin.calibration.diagnose.fitted import (
+    MISFIT_PX,
+)
+from flexdt.twin.calibration.fit.priors import FIXED, require_widths
+from flexdt.twin.calibration.fit.problem import (
+    SIX,
+    Reading,
+    require_names,
+    require_tolerance,
+)
+from flexdt.twin.calibration.fit.weak_directions import BOUND
+from flexdt.twin.calibration.frame_source import (
+    Scan,
+)
+from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.motion import require_movable
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+
+ANYWHERE = 1e3
+"""A prior [mm, deg] so wide that the images alone say where its parameter is."""
+
+
+@dataclass(frozen=True)
+class CalibrationRequest:
+    """What to estimate and how.
+
+    Attributes:
+        free: parameters to estimate.
+        per_scan: those with a value of their own in every scan.
+        reading: of eq. 5.4.
+        start: offsets to begin with, and the centre of every prior; what is neither free nor has a
+            prior stays there.
+        bead_tolerance_mm: > 0: bead positions are unknowns with this prior. 0: they are where the
+            phantom says. None: unknowns only if the residuals ask for it.
+        second_look: measure again where the first fit predicts the beads.
+        priors: standard deviations [mm, deg, 1] in place of the scans' own; 0 is exactly known. The
+            scans' apply to what is not free, these to anything.
+        bound: sigma [mm, deg] beyond which the result is not identifiable.
+        known_sizes: the beads' radii are known; else they were taken from the spots.
+        misfit_px: residual above which a fit is not to be used unless explained.
+        per_frame: those that may also differ from frame to frame, see `fit.fitted_motion`.
+
+    Raises:
+        UnknownNameError: a name that is no parameter, or cannot differ from frame to frame.
+        TwinError: nothing is free, the tolerance or a prior is none, one of `per_scan` is not free,
+            or something is free that is exactly known.
+    """
+
+    free: tuple[str, ...] = SIX
+    per_scan: tuple[str, ...] = ()
+    reading: Reading = Reading.AXIS_AT_O_PLUS_TAU
+    start: Offsets = NOMINAL
+    bead_tolerance_mm: float | None = None
+    second_look: bool = True
+    priors: Mapping[str, float] = field(default_factory=dict)
+    bound: float = BOUND
+    known_sizes: bool = True
+    misfit_px: float = MISFIT_PX
+    per_frame: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "per_frame", tuple(dict.fromkeys(require_movable(self.per_frame))))
+        require_names((*self.free, *self.per_scan))
+        if not self.free:
+            raise TwinError("no parameter is free: there is nothing to estimate", {"asked": []})
+        for name in self.per_scan:
+            if name not in self.free:
+                raise TwinError(
+                    f"{name} is to have a value in each scan but is not free; free are "
+                    + ", ".join(self.free),
+                    {"asked": name, "allowed": list(self.free)},
+                )
+        if self.bead_tolerance_mm is not None:
+            require_tolerance(self.bead_tolerance_mm)
+        for name, width in require_widths(self.priors).items():
+            if width == 0 and name in self.free:
+                raise TwinError(f"{name} is free, and its prior is 0: exactly known; choose one")
+        if not self.bound > 0:
+            raise TwinError(f"bound {self.bound:g}; allowed: a sigma above 0 [mm, deg]")
+
+
+def priors_of(scans: Sequence[Scan], request: CalibrationRequest) -> dict[str, float]:
+    """Give every prior of the fit [mm, deg, 1]."""
+    return {n: w for n, w in stated_priors(scans, request).items() if w > 0}
+
+
+def stated_priors(scans: Sequence[Scan], request: CalibrationRequest) -> dict[str, float]:
+    """Give the request's priors, and the widest of the scans' for what is not free; 0: exact."""
+    out: dict[str, float] = {n: w for n, w in FIXED.items() if n not in request.free}
+    for scan in scans:
+        for name, width in scan.priors.items():
+            if name not in request.free:
+                out[name] = max(out.get(name, 0.0), width)
+    return out | {n: w for n, w in request.priors.items() if w > 0 or n not in request.free}
+
+
+def with_free(request: CalibrationRequest, names: Sequence[str]) -> CalibrationRequest:
+    """Free more parameters, without their priors."""
+    priors = {n: w for n, w in request.priors.items() if n in request.free or n not in names}
+    return replace(request, free=tuple(dict.fromkeys((*request.free, *names))), priors=priors)

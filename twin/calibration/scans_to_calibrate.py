@@ -1,0 +1,85 @@
+"""Checks of the scans before anything is measured in them, and what spots to look for."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.detect.detection import SpotFinder
+from flexdt.twin.calibration.frame_source import (
+    FrameSpots,
+    Scan,
+)
+from flexdt.twin.errors import GeometryError, TwinError
+from flexdt.twin.geometry.poses import Poses
+
+
+def detector_for(model: BeadModel, poses: Poses) -> SpotFinder:
+    """Make a detector for the sizes the beads' spots can have at a rough geometry."""
+    low = float(model.bead_radius_mm.min() * poses.pixels_per_mm.min())
+    high = float(model.bead_radius_mm.max() * poses.pixels_per_mm.max())
+    sizes = model.bead_radius_mm
+    same = math.inf if sizes.max() > 1.2 * sizes.min() else 1.6
+    return SpotFinder(radius_px=(0.65 * low, 1.5 * high), same=same)
+
+
+def require_scans(scans: Sequence[Scan]) -> None:
+    """Check that every scan has frames, each with a pose, as seen from the source.
+
+    Raises:
+        TwinError: names the scan.
+        GeometryError: rows are counted upwards, or columns from right to left.
+    """
+    for scan in scans:
+        if len(scan.poses) != len(scan.frames) or len(scan.frames) == 0:
+            raise TwinError(
+                f"{scan.name}: {len(scan.frames)} frames and {len(scan.poses)} poses; allowed: as "
+                "many of both, at least one"
+            )
+        require_seen_from_source(scan)
+
+
+def require_seen_from_source(scan: Scan) -> None:
+    """Check that rows are counted downwards, and columns from left to right.
+
+    Raises:
+        GeometryError: they are not.
+    """
+    p = scan.poses
+    beam = ((p.detector - p.source) * np.cross(p.u, p.v)).sum(axis=1)
+    for wrong, what, way in (
+        (p.v[:, 2] > 0.0, "rows upwards (v points up)", "top to bottom"),
+        (beam < 0.0, "columns from right to left, seen from the source", "left to right"),
+    ):
+        if wrong.any():
+            raise GeometryError(
+                f"{scan.name}: the geometry counts {what} in view {int(np.argmax(wrong))}; "
+                "allowed: row 0 on top, column 0 on the left. Negate this vector, and flip the "
+                f"images {way} if they are counted so, too (docs/exchange.md, rows up or down)",
+                {"asked": what, "allowed": "row 0 on top, column 0 on the left"},
+            )
+
+
+def require_different(scans: Sequence[Scan], looks: Sequence[Sequence[FrameSpots]]) -> None:
+    """Check that no image is given twice, which would count as twice the evidence.
+
+    No two images have the same noise, so none has all its spots where another has them, to the
+    last digit.
+
+    Raises:
+        TwinError: names two scans that share images.
+    """
+    known: dict[bytes, int] = {}
+    for j, some in enumerate(looks):
+        shadows = [look.detections.centers.tobytes() for look in some if len(look.detections)]
+        for i, again in Counter(known[s] for s in shadows if s in known).items():
+            raise TwinError(
+                f"scans {i + 1} and {j + 1} ({scans[i].name}, {scans[j].name}) hold the same "
+                f"images ({again} of {len(some)} frames); give each image once",
+                {"asked": [scans[i].name, scans[j].name], "frames": again},
+            )
+        known |= dict.fromkeys(shadows, j)

@@ -1,0 +1,90 @@
+"""The second measurement: in windows where the fit expects the beads, then fitted again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.camera_lag import lag_of, without_lag
+from flexdt.twin.calibration.detect.refine import FEW_WINDOWS, contrast_of, measure_beads
+from flexdt.twin.calibration.detect.windows import Windows, mended, plan_windows
+from flexdt.twin.calibration.fit.fit import FitResult
+from flexdt.twin.calibration.fits_of_scans import fit_scans
+from flexdt.twin.calibration.frame_source import (
+    FrameState,
+)
+from flexdt.twin.calibration.outcome import Calibration
+from flexdt.twin.calibration.request import CalibrationRequest
+from flexdt.twin.projection.analytic_solids import Scene
+
+CLOSE_PX = 0.02
+"""A measurement is repeated if the fit moved a prediction by more."""
+FAR_PX = 0.5
+"""The same for a draft."""
+MOST_ROUNDS = 4
+
+
+def measure_again(
+    state: Calibration, request: CalibrationRequest, fit: FitResult, solids: Scene | None
+) -> tuple[Calibration, FitResult, int]:
+    """Measure in windows and fit again; once more if the first fit was far off.
+
+    With few frames the first fit is rough, so that a draft comes before the measurement.
+
+    Args:
+        state: the scans, and which spot is which bead.
+        request: what is free.
+        fit: to the first measurement.
+        solids: the phantom's, to subtract its body; None if it has none.
+
+    Returns:
+        The state with what was measured, the fit to it, and the iterations of all fits.
+    """
+    iterations = 0
+    windows = sum(len(s.frames) for s in state.scans) * len(state.model)
+    draft = windows <= FEW_WINDOWS
+    for _ in range(MOST_ROUNDS):
+        state, plans = _measured(state, fit, solids, draft)
+        fit = fit_scans(state, request, fit.group_parameters)
+        iterations += fit.iterations
+        moved = _moved_px(state, fit, plans)
+        if moved < CLOSE_PX and not draft:
+            break
+        draft = draft and moved > FAR_PX
+    return state, fit, iterations
+
+
+def _measured(
+    state: Calibration, fit: FitResult, solids: Scene | None, draft: bool
+) -> tuple[Calibration, list[Windows]]:
+    """Measure the beads of every scan where a fit expects them; the lag in the first round only."""
+    measured, lags, plans = [], [], []
+    model = BeadModel(fit.beads, state.model.bead_radius_mm)
+    for g, scan in enumerate(state.scans):
+        cone = scan.poses.cone_vec(fit.group_parameters[g])
+        plan = plan_windows(model, cone, scan.frames.shape)
+        contrast = contrast_of([look.detections.contrast for look in state.looks[g]])
+        images = scan.frames.windows(plan)
+        lag = state.lags[g] if state.measured else lag_of(images, scan.frames, plan)
+        if lag.seen:
+            images = without_lag(scan.frames, plan, lag)
+        images[[look.state is not FrameState.USABLE for look in state.looks[g]]] = np.nan
+        images = mended(images, plan)
+        measured.append(measure_beads(images, plan, cone, model, contrast, solids, draft=draft))
+        lags.append(lag)
+        plans.append(plan)
+    return replace(state, measured=tuple(measured), lags=tuple(lags)), plans
+
+
+def _moved_px(state: Calibration, fit: FitResult, plans: Sequence[Windows]) -> float:
+    """Give how far a fit moved the bead that it moved most from where it was measured."""
+    worst = 0.0
+    for g, (scan, plan) in enumerate(zip(state.scans, plans, strict=True)):
+        cone = scan.poses.cone_vec(fit.group_parameters[g])
+        now = cone.project_points(fit.beads, scan.frames.shape)
+        shift = np.linalg.norm(now - plan.predicted, axis=2)[plan.share > 0.5]
+        worst = max(worst, float(shift.max()) if shift.size else 0.0)
+    return worst
