@@ -27,15 +27,10 @@ from scipy.spatial.transform import Rotation
 
 from flexdt.phantoms import load_phantom
 from flexdt.twin.collision.collision_scene import CollisionScene, build_scene, scene_of
-from flexdt.twin.collision.convex_solids import (
-    ConvexSolid,
-    Polytope,
-    UprightCylinder,
-    box,
-    convex_pieces,
-    hull,
-)
-from flexdt.twin.collision.guard import PathSearch, SceneGuard, SweepResult
+from flexdt.twin.collision.convex_pieces import convex_pieces
+from flexdt.twin.collision.convex_solids import ConvexSolid, Polytope, UprightCylinder, box, hull
+from flexdt.twin.collision.first_contact import PathSearch, SweepResult
+from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.collision.relative import Limits
 from flexdt.twin.collision.stages import Body

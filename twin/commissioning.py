@@ -21,7 +21,7 @@ import numpy as np
 from flexdt.twin.calibration.fit.fit import axis_in_image
 from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.without_phantom.alignment import Alignment
-from flexdt.twin.dataset import rebuild, scan_settings
+from flexdt.twin.dataset import rebuild, scan_settings, stated_geometry
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL
@@ -128,7 +128,7 @@ def standing(scan: PastScan, machine: Machine) -> PastScan:
     sod, sdd = float(built.poses.sod[0]), float(built.poses.sdd[0])
     far = zero.model_copy(update={"c_obj": f.sod_mm - sod, "c_det": f.sdd_mm - sdd})
     at = motor_poses(machine, far, camera, built.positions)
-    own = scan_settings.figures_of(at, camera.shape)
+    own = stated_geometry.figures_of(at, camera.shape)
     across = [(g.cor_px - g.hc_px) * own.pixel_mm * g.sod_mm / g.sdd_mm for g in (f, own)]
     found = {
         "det_tan": (own.hc_px - f.hc_px) * own.pixel_mm,

@@ -18,6 +18,8 @@ from pydantic import PlainSerializer, PlainValidator, TypeAdapter, ValidationErr
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 
+_ADAPTERS: dict[type[Any], TypeAdapter[Any]] = {}
+
 
 def _read_array(value: object) -> FloatArray:
     return np.array(value, dtype=np.float64)
@@ -81,9 +83,6 @@ def told(name: str, error: ValidationError) -> tuple[str, dict[str, object]]:
 def message_of(problem: Mapping[str, Any]) -> str:
     """What one of pydantic's problems says, without the words it puts before errors of ours."""
     return str(problem["msg"]).removeprefix("Value error, ")
-
-
-_ADAPTERS: dict[type[Any], TypeAdapter[Any]] = {}
 
 
 def adapter_of(cls: type[Any]) -> TypeAdapter[Any]:

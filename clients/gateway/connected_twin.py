@@ -37,7 +37,8 @@ from flexdt.protocol.rpc_errors import RpcError
 from flexdt.protocol.state_model import AxisState, JobStatus, State
 from flexdt.runtime.files.dataset_folder import free_name, put_texts, read_document, tiff_bytes
 from flexdt.runtime.files.directory import Directory, open_data
-from flexdt.twin.dataset.dataset_errors import SCRIPT, DatasetError
+from flexdt.twin.dataset.dataset_errors import DatasetError
+from flexdt.twin.dataset.file_names import SCRIPT
 from flexdt.twin.dataset.flexdt_json import FrameBlock, FrameEntry, FrameKind, ScanRecord
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.camera import CameraSettings, Roi

@@ -59,7 +59,7 @@ from flexdt.protocol.methods.job_messages import ScriptText
 from flexdt.protocol.rpc_errors import busy, link_down
 from flexdt.protocol.state_model import State
 from flexdt.runtime.wire_errors import explain
-from flexdt.twin.dataset.dataset_errors import plain_name
+from flexdt.twin.dataset.file_names import plain_name
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import Roi

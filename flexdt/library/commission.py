@@ -27,10 +27,10 @@ from flexdt.runtime.files.dataset_folder import list_folder, read_image, read_te
 from flexdt.twin import commissioning as tells
 from flexdt.twin.commissioning import PastScan, Question
 from flexdt.twin.dataset import rebuild
-from flexdt.twin.dataset.xre import parse_xre
+from flexdt.twin.dataset.xre_reading import parse_xre
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine import description as d
-from flexdt.twin.machine.machine_files import fitted_text
+from flexdt.twin.machine.fitted_machine import fitted_text
 from flexdt.twin.script.executed_log import Executed
 from flexdt.twin.script.grammar import own_name
 from flexdt.twin.script.log_fit import Fit, fit_machine

@@ -42,7 +42,7 @@ def parsed(text: str, file: str) -> Machine:
         MachineFileError: the text or a mesh does not hold; file, part, what is allowed.
     """
     from flexdt.phantoms.files.mesh_files import read_part
-    from flexdt.twin.collision.convex_solids import outer_hull
+    from flexdt.twin.collision.outer_hull import outer_hull
     from flexdt.twin.machine.description import Vector3, parse_machine
 
     def corners(name: str) -> list[Vector3]:

@@ -10,7 +10,7 @@ from flexdt.library.machines import machine as find_machine
 from flexdt.library.machines import profile as find_profile
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.samples import as_phantom
-from flexdt.twin.collision.convex_solids import convex_pieces
+from flexdt.twin.collision.convex_pieces import convex_pieces
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.script import (

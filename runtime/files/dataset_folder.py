@@ -23,8 +23,15 @@ import numpy.typing as npt
 
 from flexdt.runtime.files.directory import Directory
 from flexdt.twin.dataset import dataset_errors as ds
+from flexdt.twin.dataset.file_names import (
+    DOCUMENT,
+    GEOMETRY,
+    SCAN_SETTINGS,
+    XRE_SETTINGS,
+    plain_name,
+)
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, ScanRecord, parse_document
-from flexdt.twin.dataset.scan_settings import format_scan_settings
+from flexdt.twin.dataset.scan_settings_text import format_scan_settings
 from flexdt.twin.dataset.xre import format_xre
 from flexdt.twin.geometry.conventions import Float32Array
 
@@ -57,22 +64,22 @@ class Folder:
     @property
     def document(self) -> str | None:
         """Name of flexdt.json, if it is there."""
-        return ds.DOCUMENT if ds.DOCUMENT in self.names else None
+        return DOCUMENT if DOCUMENT in self.names else None
 
     @property
     def geometry(self) -> str | None:
         """Name of geometry.json, if it is there."""
-        return ds.GEOMETRY if ds.GEOMETRY in self.names else None
+        return GEOMETRY if GEOMETRY in self.names else None
 
     @property
     def scan_settings(self) -> str | None:
         """Name of `scan settings.txt`, any case, if it is there."""
-        return self._find(ds.SCAN_SETTINGS)
+        return self._find(SCAN_SETTINGS)
 
     @property
     def xre_settings(self) -> str | None:
         """Name of `data settings XRE.txt`, any case, if it is there."""
-        return self._find(ds.XRE_SETTINGS)
+        return self._find(XRE_SETTINGS)
 
     @cached_property
     def darks(self) -> tuple[str, ...]:
@@ -207,9 +214,9 @@ def read_text(path: Path, most: int = MAX_TEXT_BYTES) -> str:
 
 def put_texts(files: Directory, record: ScanRecord) -> None:
     """Write what describes a data set: the scanner's two texts, then flexdt.json."""
-    files.put(ds.SCAN_SETTINGS, format_scan_settings(record).encode("utf-8"))
-    files.put(ds.XRE_SETTINGS, format_xre(record).encode("utf-8"))
-    files.put(ds.DOCUMENT, DatasetDocument.of(record).to_json().encode("utf-8"))
+    files.put(SCAN_SETTINGS, format_scan_settings(record).encode("utf-8"))
+    files.put(XRE_SETTINGS, format_xre(record).encode("utf-8"))
+    files.put(DOCUMENT, DatasetDocument.of(record).to_json().encode("utf-8"))
 
 
 def read_document(folder: Directory) -> DatasetDocument:
@@ -219,9 +226,9 @@ def read_document(folder: Directory) -> DatasetDocument:
         FileNotFoundError: there is none.
         DatasetFormatError: it cannot be read, or is no such document.
     """
-    path = folder.path / ds.DOCUMENT
+    path = folder.path / DOCUMENT
     try:
-        text = folder.read(ds.DOCUMENT).decode()
+        text = folder.read(DOCUMENT).decode()
     except FileNotFoundError:
         raise
     except (OSError, UnicodeDecodeError) as error:
@@ -359,7 +366,7 @@ def free_name(root: Directory, wish: str) -> str:
     Raises:
         DatasetNameError: `wish` is not plain.
     """
-    ds.plain_name(wish, "data set")
+    plain_name(wish, "data set")
     candidates: Iterable[str] = (wish if n == 1 else f"{wish}-{n}" for n in range(1, 1_000_000))
     return next(n for n in candidates if root.stat(n) is None)
 

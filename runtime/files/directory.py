@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 from flexdt.twin.dataset import dataset_errors as ds
+from flexdt.twin.dataset.file_names import plain_name
 
 TEMPORARY: Final = ".part-"
 """Prefix of temporary names; no plain name starts with a dot, so they never collide."""
@@ -156,7 +157,7 @@ class Directory:
             DatasetWriteError: any other refusal of the system.
         """
         if not name.startswith(BEFORE):
-            ds.plain_name(name)
+            plain_name(name)
         try:
             with self._opened() as fd:
                 self._store(fd, name, memoryview(data).cast("B"))

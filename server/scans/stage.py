@@ -24,7 +24,8 @@ from flexdt.protocol.rpc_errors import too_large
 from flexdt.server.scans.twin_clock import TwinClock
 from flexdt.server.storage.stored_samples import ReceivedSample, SampleStore
 from flexdt.twin.collision.collision_scene import CollisionScene, build_scene
-from flexdt.twin.collision.convex_solids import Polytope, convex_pieces
+from flexdt.twin.collision.convex_pieces import convex_pieces
+from flexdt.twin.collision.convex_solids import Polytope
 from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.obstacle_path import free_moves
 from flexdt.twin.errors import CollisionError, SafetyError, TwinError

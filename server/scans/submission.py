@@ -32,6 +32,7 @@ from flexdt.server.scans.twin_clock import SpeedUp
 from flexdt.server.storage.dataset_writer import RESERVE_BYTES, DatasetWriter
 from flexdt.server.storage.memory import Memory, StateStore, with_job
 from flexdt.twin.dataset import dataset_errors as ds
+from flexdt.twin.dataset.file_names import DOCUMENT, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS, plain_name
 from flexdt.twin.dataset.flexdt_json import NoiseRecord, SampleRecord, ScanRecord
 from flexdt.twin.geometry.cone_vec import check_cone_vec
 from flexdt.twin.scanner.scanner import ScannerTwin
@@ -293,7 +294,7 @@ class Submissions:
             RpcError: -32602, the name is taken by something that cannot be resumed.
         """
         refused = partial(name_conflict, name)
-        ds.plain_name(name, "data set")
+        plain_name(name, "data set")
         if name in RESERVED:
             raise refused("it is reserved")
         folder = self.root.folder(name)
@@ -309,7 +310,11 @@ class Submissions:
                 there = {e.name for e in entries if not e.name.startswith(".")}
             # A server killed while it made the folder leaves no document, and no image either.
             complete = False
-            if ds.DOCUMENT in there or there - {ds.SCRIPT, ds.SCAN_SETTINGS, ds.XRE_SETTINGS}:
+            if DOCUMENT in there or there - {
+                SCRIPT,
+                SCAN_SETTINGS,
+                XRE_SETTINGS,
+            }:
                 complete = read_document(folder).complete
         except FileNotFoundError:
             raise refused("there is something that no scan of this twin has begun") from None

@@ -14,7 +14,8 @@ from flexdt.protocol.methods import calibration_messages as p
 from flexdt.runtime.files.dataset_folder import read_text
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.wire_errors import from_root
-from flexdt.twin.dataset.dataset_errors import DatasetMissingError, plain_name
+from flexdt.twin.dataset.dataset_errors import DatasetMissingError
+from flexdt.twin.dataset.file_names import plain_name
 
 SECONDS: Final = float(p.FIT_LIMITS["seconds"])
 MEMORY_BYTES: Final = int(p.FIT_LIMITS["memory_bytes"])

@@ -21,6 +21,7 @@ import tifffile
 from flexdt.runtime.files.dataset_folder import put_texts, read_document, tiff_bytes
 from flexdt.runtime.files.directory import Directory, Write, free_bytes, write_some
 from flexdt.twin.dataset import dataset_errors as ds
+from flexdt.twin.dataset.file_names import DOCUMENT, SCRIPT, plain_name
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, ScanRecord
 
 RESERVE_BYTES: Final = 16 << 20
@@ -57,9 +58,9 @@ class DatasetWriter:
         write: Write = write_some,
     ) -> None:
         for file in record.files:
-            ds.plain_name(file)
+            plain_name(file)
         self.record = replace(record, complete=False, reason=record.reason or INTERRUPTED)
-        self._files = root.folder(ds.plain_name(record.name, "data set"), sync=sync, write=write)
+        self._files = root.folder(plain_name(record.name, "data set"), sync=sync, write=write)
         self._files.make()
         self._files.held()
         self.folder = self._files.path
@@ -69,7 +70,7 @@ class DatasetWriter:
             self._present = self._begin(resume)
             self._check_room()
             if script is not None:
-                self._files.put(ds.SCRIPT, script)
+                self._files.put(SCRIPT, script)
             put_texts(self._files, self.record)
         except BaseException:
             self._files.close()
@@ -99,7 +100,7 @@ class DatasetWriter:
             DatasetWriteError: not an image of this scan, or the system cannot write.
             DiskFullError: no room; nothing of the file is left behind.
         """
-        ds.plain_name(name)
+        plain_name(name)
         expected = self._shapes.get(name)
         if expected is None:
             raise ds.DatasetWriteError(
@@ -147,7 +148,7 @@ class DatasetWriter:
                 f"{self.folder} holds {len(there)} files already; allowed: another name, or resume",
                 {"path": str(self.folder), "files": len(there)},
             )
-        if ds.DOCUMENT in there:
+        if DOCUMENT in there:
             self._check_same()
         self._files.sweep()
         found = there & set(self.record.files)
@@ -168,7 +169,7 @@ class DatasetWriter:
             return False
 
     def _check_same(self) -> None:
-        path = self.folder / ds.DOCUMENT
+        path = self.folder / DOCUMENT
         try:
             found = read_document(self._files)
         except (ds.DatasetError, OSError) as error:

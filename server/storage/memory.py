@@ -40,7 +40,8 @@ from flexdt.protocol.state_model import JobPhase
 from flexdt.runtime.files import own_documents as own
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.log import log
-from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetWriteError, plain_name
+from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetWriteError
+from flexdt.twin.dataset.file_names import plain_name
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.offsets import Offsets, require_plausible
 from flexdt.twin.machine.camera import Roi

@@ -33,6 +33,7 @@ from flexdt.runtime.wire_errors import from_root
 from flexdt.runtime.workers import Workers
 from flexdt.server.storage import dataset_fits
 from flexdt.twin.dataset import dataset_errors as ds
+from flexdt.twin.dataset.file_names import DOCUMENT, SCRIPT, plain_name
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, FrameEntry, FrameKind, parse_document
 from flexdt.twin.dataset.normalise import LineIntegrals, binned_mean
 from flexdt.twin.errors import LimitError, TwinError
@@ -190,10 +191,10 @@ class _Scan:
 
 def _place(root: Directory, name: str) -> tuple[Path, tuple[object, ...]]:
     """A data set's folder, and a key that changes with its files and its document."""
-    about = root.stat(ds.plain_name(name, "data set"))
+    about = root.stat(plain_name(name, "data set"))
     if about is None or not stat.S_ISDIR(about.st_mode):
         raise ds.DatasetMissingError(f"no data set {name!r} in the data directory", {"asked": name})
-    parts = [s for s in (about, root.folder(name).stat(ds.DOCUMENT)) if s is not None]
+    parts = [s for s in (about, root.folder(name).stat(DOCUMENT)) if s is not None]
     return root.path / name, (name, *((s.st_ino, s.st_mtime_ns, s.st_size) for s in parts))
 
 
@@ -201,9 +202,9 @@ def _scan(folder: files.Folder, most: int) -> _Scan:
     try:
         if folder.document is None:
             raise ds.DatasetMissingError(
-                f"there is no {ds.DOCUMENT}: poses and settings are not known"
+                f"there is no {DOCUMENT}: poses and settings are not known"
             )
-        document = parse_document(files.read_text(folder.path / ds.DOCUMENT, most), ds.DOCUMENT)
+        document = parse_document(files.read_text(folder.path / DOCUMENT, most), DOCUMENT)
         return _Scan(folder, tuple(document.frames), document)
     except ds.DatasetError as error:
         if not folder.projections:
@@ -227,7 +228,7 @@ def _scan(folder: files.Folder, most: int) -> _Scan:
         )
         for frame, row in zip(texts.frames, texts.cone_vec.rows.tolist(), strict=True)
     ]  # fmt: skip
-    return _Scan(folder, tuple(bare), None, texts, f"there is no {ds.DOCUMENT}: its texts are read")
+    return _Scan(folder, tuple(bare), None, texts, f"there is no {DOCUMENT}: its texts are read")
 
 
 def _texts(folder: files.Folder) -> Any:
@@ -306,7 +307,7 @@ def _list(
         for entry in entries:
             try:
                 if entry.is_dir(follow_symlinks=False) and not entry.name.startswith("."):
-                    ds.plain_name(entry.name)
+                    plain_name(entry.name)
                     folders.append((entry.stat(follow_symlinks=False).st_mtime, entry.name))
             except ds.DatasetNameError:
                 left_out += 1
@@ -430,9 +431,9 @@ def _same(scan: _Scan, around: TwinContext) -> bool:
 
 
 def _script(folder: files.Folder) -> str:
-    if ds.SCRIPT not in folder.names:
+    if SCRIPT not in folder.names:
         raise ds.DatasetMissingError(f"{folder.path.name}: no script lies with this data set")
-    with files.opened(folder.path / ds.SCRIPT) as file:
+    with files.opened(folder.path / SCRIPT) as file:
         if (size := os.fstat(file.fileno()).st_size) > MAX_SCRIPT:
             raise too_large("the script of a data set", size, MAX_SCRIPT)
         return file.read().decode("utf-8", "replace")
@@ -466,7 +467,7 @@ def _mean(path: Path, key: tuple[object, ...]) -> float:
 def _clearances(scan: _Scan, at: tuple[int, ...]) -> tuple[list[float | None], str]:
     from flexdt.twin.collision.collision_scene import build_scene
     from flexdt.twin.collision.convex_solids import UprightCylinder
-    from flexdt.twin.collision.guard import clearance
+    from flexdt.twin.collision.first_contact import clearance
 
     document = scan.document
     assert document is not None

@@ -37,7 +37,8 @@ from flexdt.server.storage.stored_samples import ReceivedSample, SampleStore, sa
 from flexdt.server.twin import live as views
 from flexdt.server.twin.hub import Hub
 from flexdt.server.twin.live import LiveView, Shot, StateFeed
-from flexdt.twin.collision.guard import NearestPair, SceneGuard, clearance
+from flexdt.twin.collision.first_contact import NearestPair, clearance
+from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.errors import GeometryError, SafetyError
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.description import Machine, Profile

@@ -28,7 +28,7 @@ from flexdt.server.imaging.radiography import Radiography, flags_of
 from flexdt.server.scans.twin_clock import TwinClock
 from flexdt.server.storage.memory import correction_fields
 from flexdt.server.twin.hub import Hub, ImageWish
-from flexdt.twin.collision.guard import NearestPair
+from flexdt.twin.collision.first_contact import NearestPair
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec

@@ -11,7 +11,7 @@ import typer
 
 from flexdt.clients.cli.command_tree import run
 from flexdt.library import machines
-from flexdt.twin.collision.guard import check_home
+from flexdt.twin.collision.home_check import check_home
 from flexdt.twin.errors import GeometryError, MachineFileError
 from flexdt.twin.machine.description import Profile, parse_machine
 from flexdt.twin.scanner.scanner import ScannerTwin

@@ -14,7 +14,7 @@ import numpy.typing as npt
 import pytest
 
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, ScanRecord, parse_document
-from flexdt.twin.dataset.scan_settings import format_scan_settings
+from flexdt.twin.dataset.scan_settings_text import format_scan_settings
 from flexdt.twin.dataset.xre import format_xre
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.script import plan_script

@@ -19,17 +19,11 @@ from hypothesis import strategies as st
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, SampleRecord, ScanRecord
 from flexdt.twin.dataset.rebuild import angles_deg, rebuild
-from flexdt.twin.dataset.scan_settings import (
-    Figures,
-    MotorLine,
-    ScanSettings,
-    figures_of,
-    format_scan_settings,
-    parse_scan_settings,
-    poses_of,
-    settings_of,
-)
-from flexdt.twin.dataset.xre import format_sections, format_xre, parse_xre
+from flexdt.twin.dataset.scan_settings import MotorLine, ScanSettings, settings_of
+from flexdt.twin.dataset.scan_settings_text import format_scan_settings, parse_scan_settings
+from flexdt.twin.dataset.stated_geometry import Figures, figures_of, poses_of
+from flexdt.twin.dataset.xre import format_sections, format_xre
+from flexdt.twin.dataset.xre_reading import parse_xre
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.machine.description import (
     builtin_machine,

@@ -33,8 +33,8 @@ from flexdt.twin.dataset.dataset_errors import (
     DatasetNameError,
     DatasetWriteError,
     DiskFullError,
-    plain_name,
 )
+from flexdt.twin.dataset.file_names import plain_name
 from flexdt.twin.dataset.flexdt_json import NoiseRecord, ScanRecord, parse_document
 
 Image = npt.NDArray[np.uint16]

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from flexdt.twin.collision.collision_scene import CollisionScene
-from flexdt.twin.collision.guard import PathSearch, SweepResult
+from flexdt.twin.collision.first_contact import PathSearch, SweepResult
 from flexdt.twin.motion.profiles import Trajectory
 
 

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from flexdt.twin.machine.description import builtin_machine
 from flexdt.twin.motion import profiles as motion
-from flexdt.twin.motion.drives import PATH_ERROR, Drive, braked_along, braked_apart
+from flexdt.twin.motion.braking import PATH_ERROR, braked_along, braked_apart
+from flexdt.twin.motion.drives import Drive
 from flexdt.twin.motion.profiles import Piece, Trajectory
 
 M = builtin_machine()

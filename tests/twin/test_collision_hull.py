@@ -10,10 +10,10 @@ import pytest
 import trimesh
 from scipy.optimize import linprog, nnls
 
-from flexdt.twin.collision import convex_solids as hulls
+from flexdt.twin.collision import outer_hull as hulls
 from flexdt.twin.collision.collision_scene import build_scene
-from flexdt.twin.collision.convex_solids import outer_hull
-from flexdt.twin.collision.guard import clearance
+from flexdt.twin.collision.first_contact import clearance
+from flexdt.twin.collision.outer_hull import outer_hull
 from flexdt.twin.errors import MachineFileError, TwinError
 from flexdt.twin.machine.description import (
     MAX_POINTS,

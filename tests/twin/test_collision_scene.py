@@ -15,7 +15,7 @@ from swept import sweep
 
 from flexdt.twin.collision.collision_scene import CollisionScene, PairStack, build_scene, scene_of
 from flexdt.twin.collision.convex_solids import UprightCylinder, box
-from flexdt.twin.collision.guard import clearance, touching
+from flexdt.twin.collision.first_contact import clearance, touching
 from flexdt.twin.collision.relative import Limits
 from flexdt.twin.collision.stages import Body
 from flexdt.twin.geometry.conventions import FloatArray

@@ -17,22 +17,14 @@ from scipy.spatial import ConvexHull
 from swept import sweep
 
 from flexdt.twin.collision.collision_scene import CollisionScene, build_scene, scene_of
-from flexdt.twin.collision.convex_solids import (
-    ConvexSolid,
-    Polytope,
-    UprightCylinder,
-    box,
-    hull,
-    separation_of,
-)
-from flexdt.twin.collision.guard import (
-    SceneGuard,
+from flexdt.twin.collision.convex_solids import ConvexSolid, Polytope, UprightCylinder, box, hull
+from flexdt.twin.collision.first_contact import (
     SweepResult,
-    _Overlap,
     clearance,
     clearance_trace,
     first_contact,
 )
+from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.relative import (
     Limits,
     Moment,
@@ -43,6 +35,8 @@ from flexdt.twin.collision.relative import (
     refine_pair,
     sweep_pair,
 )
+from flexdt.twin.collision.retreat import _Overlap
+from flexdt.twin.collision.separation import separation_of
 from flexdt.twin.collision.stages import Body
 from flexdt.twin.geometry.conventions import FloatArray, rotation_about
 from flexdt.twin.machine.description import builtin_machine, builtin_profile

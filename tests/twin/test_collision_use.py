@@ -13,8 +13,10 @@ from swept import sweep
 
 from flexdt.phantoms import load_phantom
 from flexdt.twin.collision.collision_scene import build_scene
-from flexdt.twin.collision.convex_solids import Mesh, _clip, box, convex_pieces
-from flexdt.twin.collision.guard import SceneGuard, clearance, touching
+from flexdt.twin.collision.convex_pieces import Mesh, _clip, convex_pieces
+from flexdt.twin.collision.convex_solids import box
+from flexdt.twin.collision.first_contact import clearance, touching
+from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.obstacle_path import _Planner, free_moves
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.errors import CollisionError, GeometryError, SafetyError

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from flexdt.twin.collision.collision_scene import CollisionScene, build_scene
 from flexdt.twin.collision.convex_solids import Polytope, box, hull
-from flexdt.twin.collision.guard import SceneGuard, clearance
+from flexdt.twin.collision.first_contact import clearance
+from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.errors import CollisionError, SafetyError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import Offsets

@@ -18,7 +18,8 @@ from flexdt.twin.machine.description import (
     profile_of,
 )
 from flexdt.twin.motion import profiles as motion
-from flexdt.twin.motion.drives import Drive, braked_apart, home, plan_jog, plan_move
+from flexdt.twin.motion.braking import braked_apart
+from flexdt.twin.motion.drives import Drive, home, plan_jog, plan_move
 from flexdt.twin.motion.profiles import at_rest
 from flexdt.twin.scanner.scanner import ScannerTwin
 

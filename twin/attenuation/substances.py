@@ -21,6 +21,12 @@ import numpy as np
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.geometry.conventions import FloatArray
 
+_TOKEN = re.compile(r"([A-Z][a-z]?|\(|\))(\d+(?:\.\d+)?)?")
+HIGHEST_DENSITY = 25.0
+"""Denser than any element [g/cm3]."""
+STEEP = -2.7
+"""Exponent of an element's attenuation over energy where absorption outweighs scattering."""
+
 
 @dataclass(frozen=True, eq=False)
 class Tables:
@@ -80,13 +86,6 @@ def stored_arrays(file: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     for array in arrays.values():
         array.flags.writeable = False
     return arrays, json.loads(str(arrays.pop("provenance")))
-
-
-_TOKEN = re.compile(r"([A-Z][a-z]?|\(|\))(\d+(?:\.\d+)?)?")
-HIGHEST_DENSITY = 25.0
-"""Denser than any element [g/cm3]."""
-STEEP = -2.7
-"""Exponent of an element's attenuation over energy where absorption outweighs scattering."""
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,9 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.collision.convex_solids import ConvexSolid, separation_of
+from flexdt.twin.collision.convex_solids import ConvexSolid
 from flexdt.twin.collision.relative import Limits, Path, Separate, path_of
+from flexdt.twin.collision.separation import separation_of
 from flexdt.twin.collision.stages import Body, sample_bodies, stage_bodies
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from flexdt.twin.collision.collision_scene import CollisionScene
-from flexdt.twin.collision.guard import first_contact, touching
+from flexdt.twin.collision.first_contact import first_contact, touching
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.motion import profiles as motion
 from flexdt.twin.scanner.safety import Contact

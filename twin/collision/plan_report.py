@@ -14,7 +14,7 @@ import numpy as np
 
 from flexdt.twin.collision.collision_scene import CollisionScene, build_scene
 from flexdt.twin.collision.convex_solids import ConvexSolid, UprightCylinder
-from flexdt.twin.collision.guard import PathSearch, clearance_trace
+from flexdt.twin.collision.first_contact import PathSearch, clearance_trace
 from flexdt.twin.collision.relative import START, Moment, Path, path_of, sweep_pair
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets

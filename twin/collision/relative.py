@@ -29,7 +29,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.collision.convex_solids import Separation
+from flexdt.twin.collision.separation import Separation
 from flexdt.twin.collision.stages import Body
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.motion.profiles import AxisPath
@@ -43,6 +43,10 @@ STEPS_OF_TIME = 8.0
 """How many of the smallest steps of a time count as its rounding."""
 ROUNDING = 1e-9
 """Shortest time that counts as a segment of its own where a motor turns round [s]."""
+Separate = Callable[[FloatArray, FloatArray | None, FloatArray | None], Separation]
+"""The certified clearance of two solids: from b's origin to a's, orientations of a and b."""
+Kept = slice | npt.NDArray[np.intp]
+"""Which segments of a path matter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,10 +164,6 @@ def _turning_times(table: AxisPath) -> FloatArray:
     return np.asarray(at[at < ends - ROUNDING])
 
 
-Separate = Callable[[FloatArray, FloatArray | None, FloatArray | None], Separation]
-"""The certified clearance of two solids: from b's origin to a's, orientations of a and b."""
-
-
 @dataclass(frozen=True, slots=True)
 class Moment:
     """A time within segment `segment` of a relative motion: `dt` seconds after its start."""
@@ -173,8 +173,6 @@ class Moment:
 
 
 START = Moment(0, 0.0)
-Kept = slice | npt.NDArray[np.intp]
-"""Which segments of a path matter."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,6 +39,7 @@ DOWN = np.array([0.0, 0.0, -1.0])
 """The stage's axis, so that growing angles turn clockwise seen from above."""
 TINY = 1e-300
 """Keeps a quotient finite."""
+_COORDINATES = ("x", "y", "z")
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,9 +134,6 @@ class Body:
         along, across, cross = self._rodrigues
         turned: FloatArray = along + math.cos(angle) * across + math.sin(angle) * cross
         return turned
-
-
-_COORDINATES = ("x", "y", "z")
 
 
 def stage_bodies(machine: Machine, profile: Profile, parameters: Offsets = NOMINAL) -> list[Body]:

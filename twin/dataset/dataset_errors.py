@@ -1,17 +1,9 @@
 """What can be wrong with a data set, one type for each thing a caller may want to handle.
 
 Every message says which file, what was found and what is allowed; `data["path"]` names the file.
-
-Names of data sets and of the files in them are one plain component, nothing else. A name from a
-script, a client or a foreign document may contain drives, shares, parents, NUL or device names.
-Such a name is an error and is never repaired, because a guess could overwrite something. (Paths in
-scripts are reduced to bare names when they are planned.)
 """
 
 from __future__ import annotations
-
-import re
-from typing import Final
 
 from flexdt.twin.errors import TwinError
 
@@ -42,51 +34,3 @@ class DiskFullError(DatasetWriteError):
 
 class DatasetExistsError(DatasetWriteError):
     """A data set of that name is there already."""
-
-
-MAX_NAME: Final = 128
-
-SCAN_SETTINGS: Final = "scan settings.txt"
-XRE_SETTINGS: Final = "data settings XRE.txt"
-SCRIPT: Final = "script.txt"
-DOCUMENT: Final = "flexdt.json"
-GEOMETRY: Final = "geometry.json"
-
-_FORBIDDEN: Final = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|\ud800-\udfff]')
-_DEVICE: Final = re.compile(r"(?:con|prn|aux|nul|com[0-9]|lpt[0-9])(?:\..*)?", re.IGNORECASE)
-
-
-def plain_name(name: str, what: str = "file") -> str:
-    """Return `name` if it is one plain path component.
-
-    Args:
-        name: as it came.
-        what: what is named, for the message.
-
-    Raises:
-        DatasetNameError: says what is wrong and what is allowed.
-    """
-    reason = _reason(name)
-    if reason is not None:
-        raise DatasetNameError(
-            f"{what} name {name[:80]!r} {reason}; allowed: a plain name of at most {MAX_NAME} "
-            'characters, without / \\ : * ? " < > | and control characters, not starting with a '
-            "dot or ending with a dot or space",
-            {"asked": name[:200], "reason": reason},
-        )
-    return name
-
-
-def _reason(name: str) -> str | None:
-    if not name:
-        return "is empty"
-    if len(name) > MAX_NAME or len(name.encode("utf-8", "surrogatepass")) > 255:
-        return f"is {len(name)} characters long"
-    found = _FORBIDDEN.search(name)
-    if found is not None:
-        return f"contains {found.group()!r}"
-    if name.startswith(".") or name != name.strip() or name.endswith("."):
-        return "starts with a dot or ends with a dot or space"
-    if _DEVICE.fullmatch(name):
-        return "is a device of Windows"
-    return None

@@ -22,12 +22,8 @@ from typing import Annotated, Any, ClassVar, Final, Literal, TypeVar
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from flexdt.twin.dataset.dataset_errors import (
-    DOCUMENT,
-    DatasetFormatError,
-    DatasetNameError,
-    plain_name,
-)
+from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetNameError
+from flexdt.twin.dataset.file_names import DOCUMENT, plain_name
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.poses import Poses
@@ -45,6 +41,9 @@ SAME = 1e-4
 FINITE = ConfigDict(allow_inf_nan=False)
 """In flexdt.json, where pydantic reads these values, numbers are finite."""
 FrameKind = Literal["dark", "flat", "projection"]
+SCHEMA: Final = 1
+_M = TypeVar("_M", bound=BaseModel)
+Row = Annotated[list[float], Field(min_length=12, max_length=12)]
 
 
 @dataclass(frozen=True)
@@ -290,10 +289,6 @@ def _flat_axis(machine: Machine, blocks: Sequence[FrameBlock]) -> str:
     return best if best and moved[best] > 1.0 else ""
 
 
-SCHEMA: Final = 1
-_M = TypeVar("_M", bound=BaseModel)
-
-
 def _plain(name: str) -> str:
     try:
         return plain_name(name)
@@ -302,7 +297,6 @@ def _plain(name: str) -> str:
 
 
 PlainName = Annotated[str, AfterValidator(_plain)]
-Row = Annotated[list[float], Field(min_length=12, max_length=12)]
 
 
 class _Model(BaseModel):

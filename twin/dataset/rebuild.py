@@ -14,7 +14,8 @@ from typing import Final
 import numpy as np
 
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
-from flexdt.twin.dataset.scan_settings import Figures, ScanSettings, figures_of, poses_of
+from flexdt.twin.dataset.scan_settings import ScanSettings
+from flexdt.twin.dataset.stated_geometry import Figures, figures_of, poses_of
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.poses import Poses

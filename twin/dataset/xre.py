@@ -1,38 +1,33 @@
-"""`data settings XRE.txt`: sections of `key = value`, written and read as the scanner does.
+"""`data settings XRE.txt`: sections of `key = value`, written as the scanner does.
 
-Texts and figures of other programs stand in quotes, switches are TRUE and FALSE. Reading returns
-sections of plain texts; `XreSettings.settings` extracts the values that `scan settings.txt` would
-hold. Unknown keys are kept without interpretation.
+Texts and figures of other programs stand in quotes, switches are TRUE and FALSE. `xre_reading`
+reads it.
 """
 
 from __future__ import annotations
 
-import re
 import string
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import resources
 from typing import Any, Final
 
 import numpy as np
 
-from flexdt.twin.dataset.dataset_errors import XRE_SETTINGS, DatasetFormatError
 from flexdt.twin.dataset.flexdt_json import ScanRecord
-from flexdt.twin.dataset.scan_settings import (
-    ENTRIES,
-    EOL,
-    MotorLine,
-    ScanSettings,
-    clean,
-    parse_number,
-    parse_roi,
-    settings_of,
-)
+from flexdt.twin.dataset.scan_settings import ENTRIES, ScanSettings, settings_of
+from flexdt.twin.dataset.scan_settings_text import EOL, clean
 from flexdt.twin.geometry.conventions import BEAM, RIGHT, UP, FloatArray, stage_rotation
 
 Value = str | bool | int | float
 Sections = Mapping[str, Mapping[str, Value]]
+# `[POIs]` are places in the scanner's world, as it prints them. That world has x across, y along
+# the beam and z up, with the origin at the focal spot's foot: the same directions as here. A
+# detector's entry is its top left corner with pixels per mm along rows and columns. Hardware that
+# the twin does not model has no entry.
+_NOWHERE: Final = (0.0, 0.0, 0.0)
+_TALL_MM: Final = 2000.0
+"""Height of the sample where the scanner was told none."""
 
 
 def format_xre(record: ScanRecord) -> str:
@@ -121,15 +116,6 @@ def _utc(moment: datetime) -> str:
     return f"{utc:%Y-%m-%d %H:%M:%S}.{utc.microsecond:06d}0 UTC"
 
 
-# `[POIs]` are places in the scanner's world, as it prints them. That world has x across, y along
-# the beam and z up, with the origin at the focal spot's foot: the same directions as here. A
-# detector's entry is its top left corner with pixels per mm along rows and columns. Hardware that
-# the twin does not model has no entry.
-_NOWHERE: Final = (0.0, 0.0, 0.0)
-_TALL_MM: Final = 2000.0
-"""Height of the sample where the scanner was told none."""
-
-
 def points_of_interest(record: ScanRecord) -> Mapping[str, str]:
     """Name -> entry: axis, piercing point, image, sample, source at the settings file's moment."""
     pose = record.settings_pose()
@@ -195,107 +181,6 @@ def _triple(vector: Sequence[float] | FloatArray) -> str:
     return f"[{';'.join('0' if text in ('-0', '') else text for text in texts)}]"
 
 
-@dataclass(frozen=True)
-class XreSettings:
-    """The file's content: section -> key -> text without quotes."""
-
-    sections: Mapping[str, Mapping[str, str]]
-
-    def text(self, section: str, key: str) -> str | None:
-        """A value's text, any case of section and key; None where it is absent or empty."""
-        return next((v for k, v in self._entries(section) if k.lower() == key.lower() and v), None)
-
-    def number(self, section: str, key: str) -> float | None:
-        """A value as a number; None where it is absent.
-
-        Raises:
-            DatasetFormatError: it is there and is no number.
-        """
-        text = self.text(section, key)
-        if text is None:
-            return None
-        try:
-            return parse_number(text)
-        except ValueError:
-            raise _wrong(section, key, text, "a number") from None
-
-    @property
-    def settings(self) -> ScanSettings:
-        """What `scan settings.txt` would say, as far as this file says it.
-
-        Raises:
-            DatasetFormatError: a figure is no number.
-        """
-        roi = self.text("Camera settings", "ROI")
-        motors = {
-            name: MotorLine(value)
-            for name, _ in self._entries("motor positions")
-            if (value := self.number("motor positions", name)) is not None
-        }
-        succeeded = self.text("Scan info", "Succeeded")
-        values: dict[str, Any] = {}
-        for field, entry in ENTRIES.items():
-            if entry.xre is not None and entry.kind == "text":
-                values[field] = self.text(*entry.xre)
-            elif entry.xre is not None:
-                number = self.number(*entry.xre)
-                whole = entry.kind == "count"
-                values[field] = round(number) if whole and number is not None else number
-        smooth = (self.text("Acquisition settings", "Rotation mode") or "").lower() == "smooth"
-        try:
-            values["roi"] = None if roi is None else parse_roi(roi)
-        except ValueError:
-            raise _wrong("Camera settings", "ROI", str(roi), "four whole numbers") from None
-        return ScanSettings(
-            **values,
-            motors=motors,
-            cancelled=succeeded is not None and succeeded.upper() == "FALSE",
-            scan_type="smooth scan" if smooth else None,
-        )
-
-    @property
-    def one_circle(self) -> bool:
-        """Whether one pose and one angle rule describe the whole scan (True if it does not say)."""
-        sections = self.number("Acquisition settings", "nr of sections")
-        return sections is None or sections <= 1.0
-
-    def _entries(self, section: str) -> list[tuple[str, str]]:
-        return [
-            entry
-            for name, entries in self.sections.items()
-            if name.lower() == section.lower()
-            for entry in entries.items()
-        ]
-
-
-def _wrong(section: str, key: str, text: str, allowed: str) -> DatasetFormatError:
-    said = f"{XRE_SETTINGS}: [{section}] {key} is {text[:80]!r}"
-    where = {"path": XRE_SETTINGS, "section": section, "key": key}
-    return DatasetFormatError.instead(said, text[:200], allowed, **where)
-
-
-def parse_xre(text: str, file: str = XRE_SETTINGS) -> XreSettings:
-    """Read `data settings XRE.txt`; of a key given twice in a section the first counts.
-
-    Raises:
-        DatasetFormatError: there is no `[section]` in it.
-    """
-    sections: dict[str, dict[str, str]] = {}
-    current: dict[str, str] | None = None
-    for raw in text.splitlines():
-        line = raw.strip()
-        header = re.fullmatch(r"\[([^\]]+)\]", line)
-        if header is not None:
-            current = sections.setdefault(header[1].strip(), {})
-            continue
-        found = re.fullmatch(r"([^=:]+?)\s*[=:]\s*(.*)", line)
-        if current is not None and found is not None:
-            current.setdefault(found[1], _unquoted(found[2]))
-    if not sections:
-        raise DatasetFormatError(f"{file} holds no [section]", {"path": file})
-    return XreSettings(sections)
-
-
 def _written(value: Value) -> str:
     match value:
         case bool():
@@ -307,10 +192,3 @@ def _written(value: Value) -> str:
         case str():
             escaped = clean(value).replace("\\", "\\\\").replace('"', '\\"')
             return f'"{escaped}"'
-
-
-def _unquoted(text: str) -> str:
-    value = text.strip()
-    if len(value) >= 2 and value[0] == '"' and value[-1] == '"':
-        return re.sub(r'\\([\\"])', r"\1", value[1:-1])
-    return value.rstrip(";").strip()

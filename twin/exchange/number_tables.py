@@ -25,6 +25,11 @@ from flexdt.twin.geometry.poses import Poses
 VECTOR_NAMES: Final = tuple(f"{part}_{axis}" for part in ("source", "detector", "u", "v")
                             for axis in "xyz")  # fmt: skip
 TOMOSIPO_NAMES: Final = ("shape", "src_pos", "det_pos", "det_v", "det_u")
+_SHAPE = re.compile(r"^\s*#\s*detector rows (\d+), columns (\d+)\s*$", re.MULTILINE)
+KIND: Final = "flexdt geometry"
+SCHEMA: Final = 1
+Rows = list[Annotated[list[float], Field(min_length=12, max_length=12)]]
+Texts = Annotated[tuple[str, ...], Field(strict=False)]
 
 
 def vectors_text(geometry: ScanGeometry) -> str:
@@ -71,9 +76,6 @@ def csv_text(geometry: ScanGeometry) -> str:
     for i, row in enumerate(geometry.cone_vec.rows.tolist()):
         write.writerow((i, files[i], repr(angles[i]), *map(repr, row)))
     return out.getvalue()
-
-
-_SHAPE = re.compile(r"^\s*#\s*detector rows (\d+), columns (\d+)\s*$", re.MULTILINE)
 
 
 def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
@@ -188,12 +190,6 @@ def _numbers(words: Sequence[str], file: str, line: int) -> list[float]:
 
 def _real(array: npt.NDArray[np.generic]) -> bool:
     return np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)
-
-
-KIND: Final = "flexdt geometry"
-SCHEMA: Final = 1
-Rows = list[Annotated[list[float], Field(min_length=12, max_length=12)]]
-Texts = Annotated[tuple[str, ...], Field(strict=False)]
 
 
 class _Panel(BaseModel):

@@ -37,6 +37,8 @@ FULL_TURN = 360.0
 SPELT_OUT = 2
 """Views up to which a printed geometry shows every number."""
 Shape2 = tuple[int, int]
+SAME = 1e-6
+"""Deviation of |u| and |v|, relative, and of the right angle that `check_cone_vec` lets pass."""
 
 
 @public
@@ -761,10 +763,6 @@ def check_spread(cone_vec: ConeVec) -> ConeVec:
             {"row": i, "check": "degenerate", "asked": cone_vec.rows[i].tolist()},
         )
     return cone_vec
-
-
-SAME = 1e-6
-"""Deviation of |u| and |v|, relative, and of the right angle that `check_cone_vec` lets pass."""
 
 
 def check_cone_vec(cone_vec: ConeVec, pixel_mm: float | tuple[float, float]) -> ConeVec:

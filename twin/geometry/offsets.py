@@ -16,6 +16,10 @@ from typing import Final
 
 from flexdt.twin.errors import GeometryError, UnknownNameError
 
+_IN_DEG: Final = ("alpha", "det_roll", "det_pitch", "det_yaw", "axis_tilt_x", "axis_tilt_z")
+MOST_TILT_DEG: Final = 45.0
+ANGLE_SCALES: Final = (0.5, 2.0)
+
 
 @dataclass(frozen=True)
 class Offsets:
@@ -57,8 +61,6 @@ class Offsets:
         return {f.name: to_edge(f.name, getattr(self, f.name)) for f in fields(self)}
 
 
-_IN_DEG: Final = ("alpha", "det_roll", "det_pitch", "det_yaw", "axis_tilt_x", "axis_tilt_z")
-
 UNITS: Final[Mapping[str, str]] = {
     f.name: "deg" if f.name in _IN_DEG else "1" if f.name == "angle_scale" else "mm"
     for f in fields(Offsets)
@@ -69,9 +71,6 @@ NAMES: Final[tuple[str, ...]] = tuple(UNITS)
 
 NOMINAL: Final = Offsets()
 """No offset at all."""
-
-MOST_TILT_DEG: Final = 45.0
-ANGLE_SCALES: Final = (0.5, 2.0)
 
 
 def require_plausible(parameters: Offsets, reach_mm: float) -> None:

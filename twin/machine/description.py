@@ -43,6 +43,53 @@ from flexdt.twin.values import message_of
 
 Positive = Annotated[float, Field(gt=0, le=1e6)]
 Length = Annotated[float, Field(ge=-1e6, le=1e6)]
+Binning = Annotated[int, Field(ge=1, le=64)]
+Factor = Annotated[float, Field(ge=-1e6, le=1e6)]
+Pace = Annotated[float, Field(ge=1e-6, le=1e6)]
+Vector3 = tuple[Length, Length, Length]
+_M = TypeVar("_M", bound=BaseModel)
+QUANTITIES = ("source_x", "source_z", "object_x", "object_y", "object_z", "detector_x",
+              "detector_y", "detector_z", "angle", "mount_x", "mount_y")  # fmt: skip
+"""What motors move, world frame: object_y is the SOD, detector_y the SDD, angle the stage's.
+mount_x and mount_y are those of a stage on the turntable: they turn with the sample and are along
+the world's x and y at angle 0."""
+_COMPONENTS_OF_SCRIPTS = ("camera", "tube", "scanner")
+"""Words of scripts that no axis may be called."""
+OUTSIDE = (
+    "not modelled (docs/limits.md): source and detector that turn about the sample (C-arms, "
+    "gantries), stages that tilt, curved panels, parallel beams"
+)
+SAMPLE: Final = "sample"
+"""Name of the sample's pieces in pairs of bodies; no component may be called so."""
+_AREA_SLACK_MM: Final = 0.5
+"""By how much the panel's body may be smaller than the active area on each side: the FleX-ray's
+table has whole millimetres."""
+MAX_POINTS: Final = 256
+"""Most corners of a convex part."""
+MAX_TIME_S: Final = 1e6
+"""No command takes longer [s]."""
+ZERO: Final = "zero"
+"""Name of the profile without offsets."""
+_HELD: Final = {
+    "tube": "the focal spot, which is its 0, 0, 0",
+    "sample_holder": "the rotation axis, which is its x = y = 0",
+    "sample_mount": "the rotation axis, which is its x = y = 0",
+    "panel": "the active area, whose centre is its 0, 0, 0",
+}
+Corners = Callable[[str], Sequence[Vector3]]
+"""Reads a mesh file by the name that a machine file gives it: corners of a convex body around the
+mesh [mm, its own frame], at most `MAX_POINTS`."""
+Raw = dict[str, Any]
+_ONE: Final = "a machine has one tube and one flat panel, [tube] and [detector]"
+_LIMITS: Final = {
+    "beam": "the beam is a cone from one focal spot; parallel and fan beams are not modelled",
+    "tube": _ONE,
+    "source": _ONE,
+    "detector": _ONE,
+    "shape": "curved panels and line detectors are not modelled",
+    "unit": 'linear axes are in mm, axes with kind = "rotation" in deg',
+    "kind": "axes slide or turn about the vertical; what tilts is not modelled",
+}
 
 
 def _one_word(name: str) -> str:
@@ -53,31 +100,6 @@ def _one_word(name: str) -> str:
 
 Name = Annotated[str, AfterValidator(_one_word)]
 """Scripts separate their columns by tabs, and people theirs by spaces."""
-Binning = Annotated[int, Field(ge=1, le=64)]
-Factor = Annotated[float, Field(ge=-1e6, le=1e6)]
-Pace = Annotated[float, Field(ge=1e-6, le=1e6)]
-Vector3 = tuple[Length, Length, Length]
-_M = TypeVar("_M", bound=BaseModel)
-
-QUANTITIES = ("source_x", "source_z", "object_x", "object_y", "object_z", "detector_x",
-              "detector_y", "detector_z", "angle", "mount_x", "mount_y")  # fmt: skip
-"""What motors move, world frame: object_y is the SOD, detector_y the SDD, angle the stage's.
-mount_x and mount_y are those of a stage on the turntable: they turn with the sample and are along
-the world's x and y at angle 0."""
-
-_COMPONENTS_OF_SCRIPTS = ("camera", "tube", "scanner")
-"""Words of scripts that no axis may be called."""
-
-OUTSIDE = (
-    "not modelled (docs/limits.md): source and detector that turn about the sample (C-arms, "
-    "gantries), stages that tilt, curved panels, parallel beams"
-)
-
-SAMPLE: Final = "sample"
-"""Name of the sample's pieces in pairs of bodies; no component may be called so."""
-_AREA_SLACK_MM: Final = 0.5
-"""By how much the panel's body may be smaller than the active area on each side: the FleX-ray's
-table has whole millimetres."""
 
 
 class _Frozen(BaseModel):
@@ -279,10 +301,6 @@ class TubeSpec(_Frozen):
         return self
 
 
-MAX_POINTS: Final = 256
-"""Most corners of a convex part."""
-
-
 def _box_around(points: Iterable[Vector3]) -> tuple[Vector3, Vector3]:
     """Edges and centre of the upright box around points."""
     (x, x_), (y, y_), (z, z_) = ((min(c), max(c)) for c in zip(*points, strict=True))
@@ -333,10 +351,6 @@ class Component(_Frozen):
         if self.points_mm and _box_around(self.points_mm) != (self.size_mm, self.center_mm):
             raise _refused("size_mm", self.size_mm, "those of the box around points_mm")
         return self
-
-
-MAX_TIME_S: Final = 1e6
-"""No command takes longer [s]."""
 
 
 class Spread(_Frozen):
@@ -432,10 +446,6 @@ Priors = Annotated[dict[str, Annotated[float, Field(ge=0)]], AfterValidator(_kno
 0 is exactly known, and what is left out is as `flexdt.twin.calibration.fit.priors` assumes."""
 
 
-ZERO: Final = "zero"
-"""Name of the profile without offsets."""
-
-
 class Profile(_Frozen):
     """Dated zero offsets from motor readings to geometry [mm, deg]; never edited, only added."""
 
@@ -451,14 +461,6 @@ class Profile(_Frozen):
     det_roll_deg: float = 0.0
     priors: Priors = Field(default_factory=dict)
     """Standard deviations of what these offsets leave, where they differ from the machine's."""
-
-
-_HELD: Final = {
-    "tube": "the focal spot, which is its 0, 0, 0",
-    "sample_holder": "the rotation axis, which is its x = y = 0",
-    "sample_mount": "the rotation axis, which is its x = y = 0",
-    "panel": "the active area, whose centre is its 0, 0, 0",
-}
 
 
 class Machine(_Frozen):
@@ -700,11 +702,6 @@ def check_target(machine: Machine, axis: str, value: float) -> float:
     return value
 
 
-Corners = Callable[[str], Sequence[Vector3]]
-"""Reads a mesh file by the name that a machine file gives it: corners of a convex body around the
-mesh [mm, its own frame], at most `MAX_POINTS`."""
-
-
 def parse_machine(text: str, file: str = "<machine>", corners: Corners | None = None) -> Machine:
     """Read a machine description.
 
@@ -819,9 +816,6 @@ def _data(kind: str, name: str) -> str:
         raise UnknownNameError.among(what, name, _names(kind))
     path = resources.files("flexdt.twin") / "data" / kind / f"{name}.toml"
     return path.read_text(encoding="utf-8")
-
-
-Raw = dict[str, Any]
 
 
 def _meshed(own: Raw, corners: Corners | None) -> Raw:
@@ -964,18 +958,6 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
             lines.append(f"{file}: {path}: {said} (value: {value!r})")
             data.append({"path": path, "message": said, "value": repr(value)})
         raise MachineFileError("\n".join(lines), {"file": file, "problems": data}) from None
-
-
-_ONE: Final = "a machine has one tube and one flat panel, [tube] and [detector]"
-_LIMITS: Final = {
-    "beam": "the beam is a cone from one focal spot; parallel and fan beams are not modelled",
-    "tube": _ONE,
-    "source": _ONE,
-    "detector": _ONE,
-    "shape": "curved panels and line detectors are not modelled",
-    "unit": 'linear axes are in mm, axes with kind = "rotation" in deg',
-    "kind": "axes slide or turn about the vertical; what tilts is not modelled",
-}
 
 
 def _limit(path: str) -> str:

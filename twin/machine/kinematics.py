@@ -28,6 +28,20 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine, Profile, check_target, unknown_axis
 
+_NAMES: Final = {
+    "object_y": "SOD",
+    "detector_y": "SDD",
+    "source_x": "source to the right",
+    "source_z": "source up",
+    "object_x": "sample to the right",
+    "object_z": "sample up",
+    "detector_x": "detector to the right",
+    "detector_z": "detector up",
+    "angle": "turntable",
+    "mount_x": "stage on the turntable, x",
+    "mount_y": "stage on the turntable, y",
+}
+
 
 def poses(
     machine: Machine,
@@ -164,21 +178,6 @@ def resolve_targets(
             ) from None
         out.update(shares)
     return out
-
-
-_NAMES: Final = {
-    "object_y": "SOD",
-    "detector_y": "SDD",
-    "source_x": "source to the right",
-    "source_z": "source up",
-    "object_x": "sample to the right",
-    "object_z": "sample up",
-    "detector_x": "detector to the right",
-    "detector_z": "detector up",
-    "angle": "turntable",
-    "mount_x": "stage on the turntable, x",
-    "mount_y": "stage on the turntable, y",
-}
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,14 @@ from flexdt.twin.projection.operators import (
 )
 from flexdt.twin.projection.volume import Volume, blank_layout, bring_over
 
+LEVEL = ConeVec.from_vectors((0, -10, 0), (0, 10, 0), (1, 0, 0), (0, 0, -1))
+END_ON = ConeVec.from_vectors((0, 0, -10), (0, 0, 10), (1, 0, 0), (0, 1, 0))
+IntArray = npt.NDArray[np.int64]
+ASIDE = (1.37e-7, 0.73e-7)
+"""Rays are aimed this much [columns, rows] beside the pixel's centre. Made objects have corners
+exactly on pixel centres; there, rounding alone would decide which triangles a ray meets.
+"""
+
 
 def project_scene(
     scene: Scene,
@@ -174,23 +182,11 @@ def warm_up_back() -> None:
         bring_over(layout_data(target), target.flat, target.stride_x, target.stride_y, adding=True)
 
 
-LEVEL = ConeVec.from_vectors((0, -10, 0), (0, 10, 0), (1, 0, 0), (0, 0, -1))
-END_ON = ConeVec.from_vectors((0, 0, -10), (0, 0, 10), (1, 0, 0), (0, 1, 0))
-
-
 def _tiny_volumes() -> tuple[Volume, Volume]:
     """In C order, and with z contiguous."""
     data = np.ones((4, 3, 2), np.float32)
     turned = np.ascontiguousarray(data.transpose(1, 2, 0)).transpose(2, 0, 1)
     return Volume(data, 0.5), Volume(turned, 0.5)
-
-
-IntArray = npt.NDArray[np.int64]
-
-ASIDE = (1.37e-7, 0.73e-7)
-"""Rays are aimed this much [columns, rows] beside the pixel's centre. Made objects have corners
-exactly on pixel centres; there, rounding alone would decide which triangles a ray meets.
-"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,6 +27,9 @@ from flexdt.twin.geometry.conventions import FloatArray
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+IntArray = npt.NDArray[np.int64]
+UNIT_TOLERANCE = 1e-6
+"""How far directions may be from orthonormal."""
 
 
 @dataclass(frozen=True)
@@ -90,11 +93,6 @@ class Scene:
     """Solids whose line integrals add up."""
 
     solids: tuple[Solid, ...]
-
-
-IntArray = npt.NDArray[np.int64]
-UNIT_TOLERANCE = 1e-6
-"""How far directions may be from orthonormal."""
 
 
 @dataclass(frozen=True, eq=False)

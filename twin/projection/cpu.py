@@ -22,6 +22,8 @@ from flexdt.twin.projection.volume import LANES
 
 ROOM = 64 << 20
 """Bytes of transposed images at a time (one image, if that is more)."""
+TILE = 8
+"""Detector columns a job of single rays."""
 
 
 def runs(views: FloatArray, shape: tuple[int, int]) -> Iterator[tuple[slice, bool]]:
@@ -37,10 +39,6 @@ def runs(views: FloatArray, shape: tuple[int, int]) -> Iterator[tuple[slice, boo
         step = most if turned else end - begin
         for at in range(begin, end, step):
             yield slice(at, min(at + step, end)), turned
-
-
-TILE = 8
-"""Detector columns a job of single rays."""
 
 
 def project(box: Box, views: FloatArray, out: Float32Array, *, fans: bool = True) -> None:

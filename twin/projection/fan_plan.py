@@ -42,6 +42,9 @@ EXCHANGED = [0, 1, 2, 3, 4, 5, 9, 10, 11, 6, 7, 8]
 """A view (source, first pixel minus source, u, v) with u and v exchanged."""
 LEVEL = 1e-12
 """Detector columns whose ends are nearer than this [voxels] in x and y are parallel to z."""
+WIDE = 8.0
+"""Least width of a unit where it enters the volume [voxels]: a fan reaches at most two voxel
+columns beyond its own lines, its neighbour but one likewise."""
 
 
 def lying(views: FloatArray, shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
@@ -218,11 +221,6 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 def _widths(gap: FloatArray, rows: int) -> FloatArray:
     """Largest |a + b r| over the rows."""
     return np.maximum(np.abs(gap[:, 0]), np.abs(gap[:, 0] + gap[:, 1] * (rows - 1)))
-
-
-WIDE = 8.0
-"""Least width of a unit where it enters the volume [voxels]: a fan reaches at most two voxel
-columns beyond its own lines, its neighbour but one likewise."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,6 +41,8 @@ if TYPE_CHECKING:
 
 HOST = 1
 """DLPack's number for the processor's memory."""
+SMALLEST_TOLERANCE = 1e-5
+"""Of a norm: images and voxels are single precision."""
 
 
 def on_host(function: Callable[[npt.NDArray[Any]], Float32Array]) -> Callable[[Any], Any]:
@@ -67,10 +69,6 @@ def _library(x: Any) -> Any:
     if hasattr(x, "__array_namespace__"):
         return x.__array_namespace__()
     return sys.modules[type(x).__module__.partition(".")[0]]
-
-
-SMALLEST_TOLERANCE = 1e-5
-"""Of a norm: images and voxels are single precision."""
 
 
 @public

@@ -62,6 +62,7 @@ fitted to drawn geometries, each timed all four ways (`tests/studies/walks.py`),
 only their ratios count."""
 PREFERRED = 0.75
 """Another axis takes less than this share of the time, or is not worth another layout."""
+Shape2 = tuple[int, int]
 
 
 def in_order(geometry: ConeVec, order: Order) -> ConeVec:
@@ -130,9 +131,6 @@ def level_axes(
         times[:, i] = np.where(facing, fanned, np.inf)
     times[:, 1:NO_FANS] /= PREFERRED
     return np.asarray(np.argmin(times, axis=1))
-
-
-Shape2 = tuple[int, int]
 
 
 @public

@@ -38,6 +38,10 @@ UNSEEN: Final = (
     "; this holds if the object goes on beyond the panel's sides as it is within them: a denser "
     "shell out there makes every value too low, and no image shows it"
 )
+Vector3 = tuple[float, float, float]
+IntArray = npt.NDArray[np.int32]
+LANES = 16
+"""Voxel columns start at multiples of this many floats: one cache line, one wide register."""
 
 
 @dataclass(frozen=True)
@@ -67,13 +71,6 @@ class Accuracy:
     def warnings(self) -> list[str]:
         """A warning where a tenth of the places may be off by more than some per cent."""
         return [f"values may be off: {self}"] * (self.most > WARNED)
-
-
-Vector3 = tuple[float, float, float]
-IntArray = npt.NDArray[np.int32]
-
-LANES = 16
-"""Voxel columns start at multiples of this many floats: one cache line, one wide register."""
 
 
 @dataclass(frozen=True, eq=False)

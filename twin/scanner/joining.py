@@ -21,9 +21,7 @@ from typing import Literal
 from flexdt.twin.errors import CollisionError, SafetyError
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.motion import profiles as motion
-from flexdt.twin.motion.drives import (
-    SAME_PLACE,
-    Drive,
+from flexdt.twin.motion.braking import (
     Most,
     braked_along,
     braked_apart,
@@ -31,6 +29,7 @@ from flexdt.twin.motion.drives import (
     greatest,
     programme_time_at_rest,
 )
+from flexdt.twin.motion.drives import SAME_PLACE, Drive
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.scanner.safety import Contact, Guard, floor, would_touch
 from flexdt.twin.scanner.state import NamedCorrection, Sample
@@ -49,6 +48,8 @@ WORTH_S = 0.02
 """A stop that is quicker by less than this is not looked for [s]."""
 
 Trajectories = Mapping[str, Trajectory]
+MANY_LEGS = 500
+"""A programme of more trajectories than these is too long to be swept at a takeover."""
 
 
 @dataclass(frozen=True)
@@ -393,10 +394,6 @@ class CertifiedProgramme:
 
     prepared: UnsweptProgramme
     contact: Contact | None
-
-
-MANY_LEGS = 500
-"""A programme of more trajectories than these is too long to be swept at a takeover."""
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,8 @@ from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses, resolve_targets, virtual_reading
 from flexdt.twin.motion import drives as plan
 from flexdt.twin.motion import profiles as motion
-from flexdt.twin.motion.drives import Drive, coasting
+from flexdt.twin.motion.braking import coasting
+from flexdt.twin.motion.drives import Drive
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.scanner import safety as rules
 from flexdt.twin.scanner.joining import (

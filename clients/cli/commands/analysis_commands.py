@@ -57,7 +57,7 @@ def show(name: NameOrFile) -> Answer:
 
 def check(name: NameOrFile) -> Answer:
     """Check a machine file: every value, its zero offsets, and whether it can stand at home."""
-    from flexdt.twin.collision.guard import check_home
+    from flexdt.twin.collision.home_check import check_home
 
     found = machines.machine(name)
     check_home(found, machines.profile(None, found, name), name)
@@ -98,10 +98,10 @@ def new(
         limit: Set an axis's travel so.
         without: Leave out this axis.
     """
-    from flexdt.twin.collision.guard import check_home
+    from flexdt.twin.collision.home_check import check_home
     from flexdt.twin.machine.description import builtin_machine, builtin_machines, parse_machine
     from flexdt.twin.machine.kinematics import place
-    from flexdt.twin.machine.machine_files import Answers, new_machine_text
+    from flexdt.twin.machine.new_machine import Answers, new_machine_text
 
     def asked(question: str, given: str | None, usual: str) -> str | None:
         if given is not None or not sys.stdin.isatty():
@@ -172,7 +172,7 @@ def fit(
         base: Take what the logs do not tell from this machine.
     """
     from flexdt.twin.machine.description import builtin_machine_text
-    from flexdt.twin.machine.machine_files import fitted_text
+    from flexdt.twin.machine.fitted_machine import fitted_text
     from flexdt.twin.script.log_fit import fit_machine, unlike
 
     machine = machines.machine(base)

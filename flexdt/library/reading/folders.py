@@ -26,22 +26,13 @@ from flexdt.runtime.files.dataset_folder import (
     read_text,
     read_values,
 )
-from flexdt.twin.dataset.dataset_errors import (
-    DOCUMENT,
-    GEOMETRY,
-    SCAN_SETTINGS,
-    XRE_SETTINGS,
-    DatasetError,
-    DatasetFormatError,
-    DatasetMissingError,
-)
+from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetFormatError, DatasetMissingError
+from flexdt.twin.dataset.file_names import DOCUMENT, GEOMETRY, SCAN_SETTINGS, XRE_SETTINGS
 from flexdt.twin.dataset.flexdt_json import parse_document
 from flexdt.twin.dataset.rebuild import rebuild
-from flexdt.twin.dataset.scan_settings import (
-    ScanSettings,
-    parse_scan_settings,
-)
-from flexdt.twin.dataset.xre import parse_xre
+from flexdt.twin.dataset.scan_settings import ScanSettings
+from flexdt.twin.dataset.scan_settings_text import parse_scan_settings
+from flexdt.twin.dataset.xre_reading import parse_xre
 from flexdt.twin.errors import TwinError
 from flexdt.twin.exchange.number_tables import read_geometry_text
 from flexdt.twin.geometry.cone_vec import ConeVec

@@ -14,7 +14,7 @@ import pytest
 
 from flexdt.clients.following.session import heard
 from flexdt.phantoms import load_phantom
-from flexdt.twin.collision.convex_solids import convex_pieces
+from flexdt.twin.collision.convex_pieces import convex_pieces
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Alarm, Mirror

@@ -33,6 +33,9 @@ MISFIT = 0.3
 """Largest misfit of a fitted ball, as a share of its spot's contrast."""
 BLUR_PX = 0.7
 """Assumed blur (focal spot, scintillator) where a ball is fitted to part of a spot."""
+_Candidate = tuple[float, float, float]
+"""Column, row, radius [px], as in the kernels' results."""
+_Found = TypeVar("_Found", _Candidate, FloatArray)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,11 +146,6 @@ def coarser(image: Float32Array, factor: int) -> Float32Array:
         return np.zeros((rows, cols), dtype=np.float32)
     part = image[: rows * factor, : cols * factor]
     return np.asarray(cv2.resize(part, (cols, rows), interpolation=cv2.INTER_AREA))
-
-
-_Candidate = tuple[float, float, float]
-"""Column, row, radius [px], as in the kernels' results."""
-_Found = TypeVar("_Found", _Candidate, FloatArray)
 
 
 def _candidates(

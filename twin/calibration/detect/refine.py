@@ -19,275 +19,37 @@ import numpy.typing as npt
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect import spot_kernels as kernels
 from flexdt.twin.calibration.detect.background import Background, survey
-from flexdt.twin.calibration.detect.detection import BLUR_PX, CAP, MISFIT, covariances_of
+from flexdt.twin.calibration.detect.detection import BLUR_PX, MISFIT, covariances_of
 from flexdt.twin.calibration.detect.fading import evened, fading
+from flexdt.twin.calibration.detect.patches import (
+    Patches,
+    centroids,
+    contrasts,
+    fits,
+    ring_noise,
+    take,
+    usable,
+)
 from flexdt.twin.calibration.detect.seen_body import NO_BODY, SeenBody, see_body
+from flexdt.twin.calibration.detect.sharpness import (
+    BODY_BLUR_PX,
+    SAMPLE,
+    Sharp,
+    balls_of,
+    rest_of_blur,
+    seen_sharpness,
+    sharpness,
+)
 from flexdt.twin.calibration.detect.windows import (
     Windows,
     blurred_windows,
     edged,
-    free_of_others,
     render_windows,
     without_beads,
 )
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
-from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
-
-# Windows in the form that the compiled kernels take, and the kernels applied to all of them.
-
-
-@dataclass(frozen=True, eq=False)
-class Patches:
-    """Windows as the kernels want them, (m = n k, ...): what is expected where.
-
-    Attributes:
-        flat: (m, side, side) line integrals minus the body.
-        offsets: (m, 2) expected place in the window.
-        radii, stretch, peaks: (m,), (m, 3), (m,) expected spots.
-        windows: where they were cut.
-        entire: indices of whole, lone spots.
-    """
-
-    flat: Float32Array
-    offsets: FloatArray
-    radii: FloatArray
-    stretch: FloatArray
-    peaks: FloatArray
-    windows: Windows
-    entire: npt.NDArray[np.intp]
-
-
-def centroids(
-    patches: Patches, index: npt.NDArray[np.intp], least: FloatArray | None = None
-) -> FloatArray:
-    """`measure` in some windows; zeros elsewhere. least: (m,) noise to weigh pixels for."""
-    results = np.zeros((len(patches.flat), kernels.RESULTS))
-    least = np.zeros(len(results)) if least is None else least
-    for i in index:
-        x, y = patches.offsets[i]
-        kernels.measure(patches.flat[i], x, y, patches.radii[i], CAP, least[i], results[i])
-    return results
-
-
-def fits(
-    patches: Patches,
-    index: npt.NDArray[np.intp],
-    blur: tuple[float, float],
-    free_radius: bool,
-    masks: npt.NDArray[np.uint8],
-) -> FloatArray:
-    """`fit_ball` in some windows; zeros elsewhere. blur: with the veil; masks: usable pixels of
-    those windows."""
-    results = np.zeros((len(patches.flat), kernels.RESULTS))
-    whole = patches.windows.whole.ravel()
-    for i, mask in zip(index, masks, strict=True):
-        kernels.fit_ball(
-            patches.flat[i], mask, *patches.offsets[i], patches.radii[i], patches.stretch[i],
-            patches.peaks[i], *blur, whole[i], free_radius, results[i],
-        )  # fmt: skip
-    return results
-
-
-def ring_noise(results: FloatArray, entire: npt.NDArray[np.intp]) -> float:
-    """Typical noise of the line integrals round whole spots; 0 without any."""
-    good = results[entire, kernels.OK] > 0
-    return float(np.median(results[entire[good], kernels.NOISE])) if good.any() else 0.0
-
-
-def take(
-    results: FloatArray,
-    fits: FloatArray,
-    fitted: npt.NDArray[np.intp],
-    whole: npt.NDArray[np.bool_],
-) -> npt.NDArray[np.intp]:
-    """Put fits into `results`: all of the partial spots', the good ones of the whole.
-
-    Returns:
-        Those that were put, in the order of `fitted`.
-    """
-    good = (fits[fitted, kernels.OK] > 0) & (fits[fitted, kernels.NOISE] < MISFIT)
-    part = fitted[~whole[fitted]]
-    results[part] = fits[part]
-    # Radius, peak and likeness stay those of the centroid: they judge the spot.
-    lone = fitted[whole[fitted] & good]
-    for place in (
-        kernels.X, kernels.Y, kernels.VAR_X, kernels.COV_XY, kernels.VAR_Y, kernels.BIAS
-    ):  # fmt: skip
-        results[lone, place] = fits[lone, place]
-    return np.asarray(fitted[~whole[fitted] | good])
-
-
-def contrasts(results: FloatArray, patches: Patches) -> FloatArray:
-    """Contrast of each bead, (m,): the median over its whole spots, else as expected, scaled as
-    the others' are."""
-    shape = patches.windows.whole.shape
-    seen = np.where(results[:, kernels.OK] > 0, results[:, kernels.PEAK], np.nan).reshape(shape)
-    given = patches.peaks.reshape(shape)[0]
-    out = np.full(len(given), np.nan)
-    for bead in range(len(out)):
-        values = seen[:, bead][np.isfinite(seen[:, bead])]
-        if len(values) >= 3:
-            out[bead] = np.median(values)
-    known = np.isfinite(out)
-    ratio = float(np.median(out[known] / given[known])) if known.any() else 1.0
-    out[~known] = given[~known] * ratio
-    return np.broadcast_to(out, shape).ravel().copy()
-
-
-def usable(patches: Patches, index: npt.NDArray[np.intp]) -> npt.NDArray[np.uint8]:
-    """Usable pixels of some windows: inside the image and free of other beads' spots."""
-    masks = np.isfinite(patches.flat[index]).astype(np.uint8)
-    windows = patches.windows
-    k = windows.corner.shape[1]
-    for i, position in enumerate(index.tolist()):
-        frame, bead = divmod(position, k)
-        if windows.crowded[frame, bead]:
-            masks[i] &= free_of_others(windows, frame, bead)
-    return masks
-
-
-# Blur of the images and apparent size of the beads, estimated from the spots themselves.
-#
-# The profile that is fitted is an approximation, so the estimate is corrected by the same estimate
-# from rendered beads. Without whole spots the assumed values are returned, marked as not seen.
-
-SAMPLE = 24
-"""Spots from which blur and size are estimated, about."""
-BLURS = (0.12, 0.25, 0.45, 0.7, 1.1, 1.7, 2.5, 3.6)
-"""Blurs that are tried [px]."""
-VEILS = (0.0, 0.1, 0.2, 0.3, 0.45, 0.6)
-"""Veils that are tried."""
-CHECK_FINE = 3
-"""Rays along a pixel's side where that estimate is checked on rendered beads."""
-BODY_BLUR_PX = 0.18
-"""Blur of the images below which the rendered body is subtracted as it is."""
-
-
-def balls_of(model: BeadModel, contrast: FloatArray, size: float = 1.0) -> Scene:
-    """The beads alone, as balls with the contrast (k,) and the size they are seen with."""
-    return Scene(
-        tuple(
-            Solid(Sphere((x, y, z), r * size), "bead", max(peak, 1e-3) / (2.0 * r * size))
-            for (x, y, z), r, peak in zip(
-                model.beads.tolist(), model.bead_radius_mm.tolist(), contrast.tolist(), strict=True
-            )
-        )
-    )
-
-
-def rest_of_blur(blur: float, fine: int) -> float:
-    """Blur left to apply when fine x fine rays of a pixel have been averaged already."""
-    return math.sqrt(max(blur**2 - (1.0 - 1.0 / fine**4) / 12.0, 0.01))
-
-
-@dataclass(frozen=True)
-class Sharp:
-    """Blur of the images [px] and size of the beads.
-
-    Attributes:
-        blur, scale: blur and factor from expected to apparent radius with which a fit leaves least.
-        veil: part of the light about a bead that it does not take away, with which it leaves least.
-        seen: they were seen, not assumed.
-        true: the blur with which rendered beads look the same.
-        size: likewise the factor on the beads' radii.
-    """
-
-    blur: float
-    scale: float
-    veil: float
-    seen: bool
-    true: float
-    size: float
-
-
-def seen_sharpness(
-    sharp: Sharp, patches: Patches, sample: npt.NDArray[np.intp], cone: ConeVec, model: BeadModel
-) -> Sharp:
-    """Blur and size corrected by what the same estimate makes of rendered beads: the fit's profile
-    is an approximation, and where a spot is cut by the edge its radius decides its place."""
-    if not sharp.seen or sharp.blur < BODY_BLUR_PX:
-        return sharp
-    k = patches.windows.corner.shape[1]
-    frames, beads = np.divmod(sample, k)
-    few = patches.windows.pick(frames, beads)
-    balls = balls_of(model, patches.peaks[:k])
-    rays = render_windows(balls, cone[frames], few, CHECK_FINE)
-    seen = blurred_windows(rays, rest_of_blur(sharp.blur, CHECK_FINE))
-    side = few.side
-    rendered = replace(
-        patches, flat=seen.reshape(-1, side, side), offsets=patches.offsets[sample],
-        radii=patches.radii[sample], stretch=patches.stretch[sample], peaks=patches.peaks[sample],
-        windows=few,
-    )  # fmt: skip
-    found = sharpness(rendered, np.arange(len(sample)), sharp.blur)
-    if not found.seen:
-        return sharp
-    true = 2.0 * sharp.blur - found.blur
-    if not abs(true - sharp.blur) < 0.2 * sharp.blur:
-        return sharp
-    return replace(sharp, true=true, size=sharp.scale / found.scale)
-
-
-_Tried = tuple[FloatArray, FloatArray, FloatArray]
-"""Blurs that were tried with one veil, the misfits of the fits and the sizes they found."""
-
-
-def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sharp:
-    """Blur, veil and apparent size from some whole spots, by the fit that leaves least.
-
-    A bead that is not as made shows here too; a spot cut by the edge has its centre where its
-    radius puts it. Without whole spots: the assumed blur, and the expected size.
-    """
-    if len(sample) < 3:
-        return Sharp(blur, 1.0, 0.0, False, blur, 1.0)
-    masks, blurs = usable(patches, sample), np.array(BLURS)
-
-    def tried(veil: float, blurs: FloatArray) -> _Tried:
-        """Blurs from the least on, until one leaves much more than the one before."""
-        misfit, scale = np.full(len(blurs), np.inf), np.ones(len(blurs))
-        for i, trial in enumerate(blurs.tolist()):
-            results = fits(patches, sample, (trial, veil), True, masks)
-            good = sample[results[sample, kernels.OK] > 0]
-            if len(good) >= 3:
-                misfit[i] = float(np.median(results[good, kernels.NOISE]))
-                scale[i] = float(np.median(results[good, kernels.RADIUS] / patches.radii[good]))
-            if i > 0 and misfit[i] > 1.5 * misfit[i - 1]:
-                break
-        return blurs, misfit, scale
-
-    def near(last: _Tried) -> FloatArray:
-        """The blurs next to the one that leaves least."""
-        i = int(np.searchsorted(blurs, last[0][int(last[1].argmin())]))
-        return blurs[max(i - 1, 0) : i + 2]
-
-    found = [tried(VEILS[0], blurs)]
-    if not math.isfinite(found[0][1].min()):
-        return Sharp(blur, 1.0, 0.0, False, blur, 1.0)
-    # A veil changes the blur that fits by little, so its neighbours are tried.
-    for trial in VEILS[1:]:
-        found.append(tried(trial, near(found[-1])))
-        if not found[-1][1].min() < found[-2][1].min():
-            break
-    least = np.array([misfit.min() for _, misfit, _ in found])
-    veil, last = _lowest(np.array(VEILS[: len(found)]), least), found[int(least.argmin())]
-    if veil > 0.0:
-        last = tried(veil, near(last))
-    best = _lowest(last[0], last[1])
-    apparent = float(np.interp(best, last[0], last[2]))
-    return Sharp(best, apparent, veil, True, best, apparent)
-
-
-def _lowest(tried: FloatArray, misfit: FloatArray) -> float:
-    """Where a misfit is least: a hyperbola about the right place, so its square is a parabola."""
-    i = int(np.argmin(misfit))
-    near = slice(i - 1, i + 2)
-    if 0 < i < len(tried) - 1 and np.isfinite(misfit[near]).all():
-        a, b, _ = np.polyfit(tried[near], np.square(misfit[near]), 2)
-        if a > 0:
-            return float(np.clip(-b / (2.0 * a), tried[i - 1], tried[i + 1]))
-    return float(tried[i])
-
+from flexdt.twin.projection.analytic_solids import Scene
 
 MISS_PX = 4.0
 """A measurement further than this from its prediction is not that bead."""

@@ -47,6 +47,16 @@ BODY = 0.5
 hardening alone stays below."""
 BODY_MM = 0.3
 """Shift of the body from its description from which that is said [mm]."""
+PLAUSIBLE_SHARE = 0.12
+"""Largest offset along the beam, as a share of SOD, that a mount may cause. A phantom that is
+scaled together with its beads looks like the right one at another distance, so that this offset is
+its only sign."""
+OF_MOTION: Final = frozenset(("drift", "vibration", "angles_wrong"))
+"""What is called so may be followed from frame to frame."""
+EXPLAINED_PX: Final = 0.2
+"""Residual that may remain of a motion that is named."""
+MOST_FRAMES: Final = 720
+"""Scans of more frames are not looked at: four motions at once take seconds there."""
 
 
 def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Finding | None:
@@ -91,12 +101,6 @@ def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Findi
         f"in {len(bad)} of {n} frames ({listed}) the shadows are not where the others put "
         "them" + ("" if many else "; those frames are not used"),
     )
-
-
-PLAUSIBLE_SHARE = 0.12
-"""Largest offset along the beam, as a share of SOD, that a mount may cause. A phantom that is
-scaled together with its beads looks like the right one at another distance, so that this offset is
-its only sign."""
 
 
 def judge_offsets(fit: FitResult) -> Finding | None:
@@ -356,14 +360,6 @@ def _beads(fit: FitResult, refit: Refit) -> tuple[FitResult, Finding] | None:
         f"the beads lie {1000 * float(moved.max()):.0f} um off their model at most; their "
         f"positions were fitted too (prior {1000 * tolerance:.0f} um): wider intervals",
     )
-
-
-OF_MOTION: Final = frozenset(("drift", "vibration", "angles_wrong"))
-"""What is called so may be followed from frame to frame."""
-EXPLAINED_PX: Final = 0.2
-"""Residual that may remain of a motion that is named."""
-MOST_FRAMES: Final = 720
-"""Scans of more frames are not looked at: four motions at once take seconds there."""
 
 
 def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding | None:

@@ -58,6 +58,18 @@ RAYLEIGH_MEDIAN = 1.1774100225154747
 """Median length of a 2-vector with independent unit normal parts."""
 LEAST_PIVOT = 1e-15
 """Of the scaled normal equations: what is less is rounding."""
+LEAST_NOISE = 1e-4
+"""Exact data are weighed as if their whitened residuals had this spread: a prior then still keeps
+what the data say nothing about, and counts when the rank is judged."""
+IN_IMAGES: Final[Mapping[str, str]] = {
+    "axis_column": "px",
+    "axis_angle": "deg",
+    "magnification": "1",
+}
+"""axis_column: where the image of the rotation axis crosses the detector's middle row. axis_angle:
+of that image against the detector's columns, positive where its upper end leans to the right.
+magnification: of a short line parallel to the detector's rows, on the axis at the object's
+reference height."""
 
 
 @dataclass(frozen=True)
@@ -249,11 +261,6 @@ def cost_at(problem: FitProblem, x: FloatArray, use: npt.NDArray[np.bool_]) -> f
     except TwinError:
         return math.inf
     return float(0.5 * np.sum(norms[use] ** 2))
-
-
-LEAST_NOISE = 1e-4
-"""Exact data are weighed as if their whitened residuals had this spread: a prior then still keeps
-what the data say nothing about, and counts when the rank is judged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -501,17 +508,6 @@ def _solved(problem: FitProblem, solver: Solver | None) -> tuple[Solution, float
             break
         noise = fresh
     return solution, noise
-
-
-IN_IMAGES: Final[Mapping[str, str]] = {
-    "axis_column": "px",
-    "axis_angle": "deg",
-    "magnification": "1",
-}
-"""axis_column: where the image of the rotation axis crosses the detector's middle row. axis_angle:
-of that image against the detector's columns, positive where its upper end leans to the right.
-magnification: of a short line parallel to the detector's rows, on the axis at the object's
-reference height."""
 
 
 def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:

@@ -46,6 +46,11 @@ MOST_PASSES: Final = 6
 EVIDENCE: Final = 6.0
 """Gain in log likelihood from which a parameter counts as moving: white noise has it in less than
 one of a thousand fits (55 pairs of width and smoothness are tried)."""
+_Answer = tuple[FloatArray, FloatArray, FloatArray, float]
+"""Deviations (n, p) with sigmas, what they add to the covariance of the fit's columns, and the
+factor by which they take up its degrees of freedom."""
+_Choice = tuple[tuple[float, float] | None, ...]
+"""Width and smoothness of each parameter; None: it does not move."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,13 +193,6 @@ def derivative(
     still = replace(problem, base=params, layout=alone, panel=None)
     moved = replace(still, model=replace(problem.model, beads=beads))
     return np.asarray(moved.jacobian(moved.start, use).sum(axis=1))
-
-
-_Answer = tuple[FloatArray, FloatArray, FloatArray, float]
-"""Deviations (n, p) with sigmas, what they add to the covariance of the fit's columns, and the
-factor by which they take up its degrees of freedom."""
-_Choice = tuple[tuple[float, float] | None, ...]
-"""Width and smoothness of each parameter; None: it does not move."""
 
 
 class _Mixed:

@@ -29,6 +29,8 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 
+_Plan = tuple[BeadModel, Poses, FloatArray]
+
 
 @dataclass(frozen=True)
 class Suggestion:
@@ -192,9 +194,6 @@ def visible_beads(
 
 def _worst(sigmas: dict[str, float]) -> float:
     return max((s / tolerance_of(n) for n, s in sigmas.items()), default=0.0)
-
-
-_Plan = tuple[BeadModel, Poses, FloatArray]
 
 
 def _changes(model: BeadModel, poses: Poses, sizes: FloatArray) -> dict[str, _Plan]:

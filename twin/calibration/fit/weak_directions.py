@@ -24,6 +24,10 @@ angle_scale it is 5 deg in a turn."""
 
 SHOWN = 3
 """So many columns are named beside the first."""
+_OBJECT = {"dO_x", "dO_y", "dO_z"}
+_DETECTOR = {"dD_x", "dD_y", "dD_z"}
+_SOURCE = {"dS_x", "dS_y"}
+_TAU = {"tau_x", "tau_z"}
 
 
 @dataclass(frozen=True)
@@ -71,12 +75,6 @@ def unit_of(column: str) -> str:
 def tolerance_of(column: str) -> float:
     """Standard deviation above which this column counts as weak, edge unit."""
     return TOLERANCE[unit_of(column)]
-
-
-_OBJECT = {"dO_x", "dO_y", "dO_z"}
-_DETECTOR = {"dD_x", "dD_y", "dD_z"}
-_SOURCE = {"dS_x", "dS_y"}
-_TAU = {"tau_x", "tau_z"}
 
 
 def advise(names: Sequence[str], beads: int) -> str:

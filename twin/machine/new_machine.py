@@ -1,106 +1,15 @@
-"""A machine file with the axes and times of a fit, everything else as in the file it began with.
-
-A short machine file from a few answers; it begins with a machine that ships.
-"""
+"""A short machine file from a few answers; it begins with a machine that ships."""
 
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from pydantic import BaseModel
+from flexdt.twin.errors import LimitError
+from flexdt.twin.machine.description import Machine, parse_machine
+from flexdt.twin.machine.fitted_machine import Range
 
-from flexdt.twin.errors import LimitError, MachineFileError
-from flexdt.twin.machine.description import Axis, Machine, Timing, parse_machine
-
-_HEADER = re.compile(r"\s*\[([^\[\]]+)\]\s*(?:#.*)?")
-_ANY_HEADER = re.compile(r"\s*\[")
-
-
-def fitted_text(
-    text: str,
-    machine: Machine,
-    axes: Collection[str],
-    parse: Callable[[str, str], Machine] = parse_machine,
-) -> str:
-    """The machine file `text` with the timing and some axes of `machine`, comments kept.
-
-    Args:
-        text: TOML of the machine that was fitted.
-        machine: the fitted one.
-        axes: names of the axes that are replaced.
-        parse: reads a machine file's text, with its meshes if it has any.
-
-    Raises:
-        MachineFileError: the file does not write its axes and times as tables.
-    """
-    blocks = {f"axes.{name}": _axis_table(name, machine.axes[name]) for name in axes}
-    made = _replaced(text, {**blocks, "timing": _timing_table(machine.timing)})
-    if parse(made, "fitted machine") != machine:
-        what = "the base machine's file must write axes as tables [axes.NAME] and times as [timing]"
-        raise MachineFileError(what, {"allowed": ["[axes.NAME]", "[timing]"]})
-    return made
-
-
-def _replaced(text: str, blocks: Mapping[str, str]) -> str:
-    """`text` with whole tables replaced; a comment stays unless it stands right before one."""
-    left = dict(blocks)
-    out: list[str] = []
-    held: list[str] = []
-    skipping = False
-    for line in text.splitlines():
-        if not line.strip() or line.lstrip().startswith("#"):
-            held.append(line)
-            continue
-        if _ANY_HEADER.match(line):
-            header = _HEADER.fullmatch(line)
-            name = "" if header is None else header[1].strip()
-            skipping = name in blocks or name.startswith("timing.")
-            if skipping:
-                while held and held[-1].strip():
-                    held.pop()
-            out += held
-            if name in left:
-                out += left.pop(name).splitlines()
-        elif not skipping:
-            out += held
-        held = []
-        if not skipping:
-            out.append(line)
-    return "\n".join([*out, *held, *("\n" + block for block in left.values())]) + "\n"
-
-
-def _axis_table(name: str, axis: Axis) -> str:
-    return "\n".join([f"[axes.{name}]", *_keys(axis)])
-
-
-def _timing_table(timing: Timing) -> str:
-    lines = ["[timing]"]
-    for line in _keys(timing, {"spread"}):
-        kind = line.split("_s = ")[0]
-        found = timing.spread.get(kind)
-        measured = found is not None or kind.startswith("drift")
-        told = "" if kind.startswith("source") else "measured, log" if measured else "assumed"
-        lines.append(line + (f"  # {told}" if told else ""))
-    lines += ["", "[timing.spread]"]
-    for kind, spread in timing.spread.items():
-        inner = ", ".join(f"{key} = {value!r}" for key, value in spread.model_dump().items())
-        lines.append(f"{kind} = {{ {inner} }}")
-    return "\n".join(lines)
-
-
-def _keys(model: BaseModel, beside: set[str] | None = None) -> list[str]:
-    values = model.model_dump(exclude_defaults=True, exclude=beside)
-    return [
-        f"{key} = {json.dumps(value, ensure_ascii=False)}"
-        for key, value in values.items()
-        if value is not None
-    ]
-
-
-Range = tuple[float, float]
 _BESIDE_MM = 60.0
 """How much larger a panel's housing is than what it sees (assumed)."""
 _RAIL_AXIS = "D"

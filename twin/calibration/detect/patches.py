@@ -1,0 +1,128 @@
+"""Windows in the form that the compiled kernels take, and the kernels applied to all of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration.detect import spot_kernels as kernels
+from flexdt.twin.calibration.detect.detection import CAP, MISFIT
+from flexdt.twin.calibration.detect.windows import (
+    Windows,
+    free_of_others,
+)
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+
+# Windows in the form that the compiled kernels take, and the kernels applied to all of them.
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """Windows as the kernels want them, (m = n k, ...): what is expected where.
+
+    Attributes:
+        flat: (m, side, side) line integrals minus the body.
+        offsets: (m, 2) expected place in the window.
+        radii, stretch, peaks: (m,), (m, 3), (m,) expected spots.
+        windows: where they were cut.
+        entire: indices of whole, lone spots.
+    """
+
+    flat: Float32Array
+    offsets: FloatArray
+    radii: FloatArray
+    stretch: FloatArray
+    peaks: FloatArray
+    windows: Windows
+    entire: npt.NDArray[np.intp]
+
+
+def centroids(
+    patches: Patches, index: npt.NDArray[np.intp], least: FloatArray | None = None
+) -> FloatArray:
+    """`measure` in some windows; zeros elsewhere. least: (m,) noise to weigh pixels for."""
+    results = np.zeros((len(patches.flat), kernels.RESULTS))
+    least = np.zeros(len(results)) if least is None else least
+    for i in index:
+        x, y = patches.offsets[i]
+        kernels.measure(patches.flat[i], x, y, patches.radii[i], CAP, least[i], results[i])
+    return results
+
+
+def fits(
+    patches: Patches,
+    index: npt.NDArray[np.intp],
+    blur: tuple[float, float],
+    free_radius: bool,
+    masks: npt.NDArray[np.uint8],
+) -> FloatArray:
+    """`fit_ball` in some windows; zeros elsewhere. blur: with the veil; masks: usable pixels of
+    those windows."""
+    results = np.zeros((len(patches.flat), kernels.RESULTS))
+    whole = patches.windows.whole.ravel()
+    for i, mask in zip(index, masks, strict=True):
+        kernels.fit_ball(
+            patches.flat[i], mask, *patches.offsets[i], patches.radii[i], patches.stretch[i],
+            patches.peaks[i], *blur, whole[i], free_radius, results[i],
+        )  # fmt: skip
+    return results
+
+
+def ring_noise(results: FloatArray, entire: npt.NDArray[np.intp]) -> float:
+    """Typical noise of the line integrals round whole spots; 0 without any."""
+    good = results[entire, kernels.OK] > 0
+    return float(np.median(results[entire[good], kernels.NOISE])) if good.any() else 0.0
+
+
+def take(
+    results: FloatArray,
+    fits: FloatArray,
+    fitted: npt.NDArray[np.intp],
+    whole: npt.NDArray[np.bool_],
+) -> npt.NDArray[np.intp]:
+    """Put fits into `results`: all of the partial spots', the good ones of the whole.
+
+    Returns:
+        Those that were put, in the order of `fitted`.
+    """
+    good = (fits[fitted, kernels.OK] > 0) & (fits[fitted, kernels.NOISE] < MISFIT)
+    part = fitted[~whole[fitted]]
+    results[part] = fits[part]
+    # Radius, peak and likeness stay those of the centroid: they judge the spot.
+    lone = fitted[whole[fitted] & good]
+    for place in (
+        kernels.X, kernels.Y, kernels.VAR_X, kernels.COV_XY, kernels.VAR_Y, kernels.BIAS
+    ):  # fmt: skip
+        results[lone, place] = fits[lone, place]
+    return np.asarray(fitted[~whole[fitted] | good])
+
+
+def contrasts(results: FloatArray, patches: Patches) -> FloatArray:
+    """Contrast of each bead, (m,): the median over its whole spots, else as expected, scaled as
+    the others' are."""
+    shape = patches.windows.whole.shape
+    seen = np.where(results[:, kernels.OK] > 0, results[:, kernels.PEAK], np.nan).reshape(shape)
+    given = patches.peaks.reshape(shape)[0]
+    out = np.full(len(given), np.nan)
+    for bead in range(len(out)):
+        values = seen[:, bead][np.isfinite(seen[:, bead])]
+        if len(values) >= 3:
+            out[bead] = np.median(values)
+    known = np.isfinite(out)
+    ratio = float(np.median(out[known] / given[known])) if known.any() else 1.0
+    out[~known] = given[~known] * ratio
+    return np.broadcast_to(out, shape).ravel().copy()
+
+
+def usable(patches: Patches, index: npt.NDArray[np.intp]) -> npt.NDArray[np.uint8]:
+    """Usable pixels of some windows: inside the image and free of other beads' spots."""
+    masks = np.isfinite(patches.flat[index]).astype(np.uint8)
+    windows = patches.windows
+    k = windows.corner.shape[1]
+    for i, position in enumerate(index.tolist()):
+        frame, bead = divmod(position, k)
+        if windows.crowded[frame, bead]:
+            masks[i] &= free_of_others(windows, frame, bead)
+    return masks

@@ -1,0 +1,163 @@
+"""Blur of the images and apparent size of the beads, estimated from the spots themselves.
+
+The profile that is fitted is an approximation, so the estimate is corrected by the same estimate
+from rendered beads. Without whole spots the assumed values are returned, marked as not seen.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.detect import spot_kernels as kernels
+from flexdt.twin.calibration.detect.patches import Patches, fits, usable
+from flexdt.twin.calibration.detect.windows import (
+    blurred_windows,
+    render_windows,
+)
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
+
+# Blur of the images and apparent size of the beads, estimated from the spots themselves.
+#
+# The profile that is fitted is an approximation, so the estimate is corrected by the same estimate
+# from rendered beads. Without whole spots the assumed values are returned, marked as not seen.
+
+SAMPLE = 24
+"""Spots from which blur and size are estimated, about."""
+BLURS = (0.12, 0.25, 0.45, 0.7, 1.1, 1.7, 2.5, 3.6)
+"""Blurs that are tried [px]."""
+VEILS = (0.0, 0.1, 0.2, 0.3, 0.45, 0.6)
+"""Veils that are tried."""
+CHECK_FINE = 3
+"""Rays along a pixel's side where that estimate is checked on rendered beads."""
+BODY_BLUR_PX = 0.18
+"""Blur of the images below which the rendered body is subtracted as it is."""
+_Tried = tuple[FloatArray, FloatArray, FloatArray]
+"""Blurs that were tried with one veil, the misfits of the fits and the sizes they found."""
+
+
+def balls_of(model: BeadModel, contrast: FloatArray, size: float = 1.0) -> Scene:
+    """The beads alone, as balls with the contrast (k,) and the size they are seen with."""
+    return Scene(
+        tuple(
+            Solid(Sphere((x, y, z), r * size), "bead", max(peak, 1e-3) / (2.0 * r * size))
+            for (x, y, z), r, peak in zip(
+                model.beads.tolist(), model.bead_radius_mm.tolist(), contrast.tolist(), strict=True
+            )
+        )
+    )
+
+
+def rest_of_blur(blur: float, fine: int) -> float:
+    """Blur left to apply when fine x fine rays of a pixel have been averaged already."""
+    return math.sqrt(max(blur**2 - (1.0 - 1.0 / fine**4) / 12.0, 0.01))
+
+
+@dataclass(frozen=True)
+class Sharp:
+    """Blur of the images [px] and size of the beads.
+
+    Attributes:
+        blur, scale: blur and factor from expected to apparent radius with which a fit leaves least.
+        veil: part of the light about a bead that it does not take away, with which it leaves least.
+        seen: they were seen, not assumed.
+        true: the blur with which rendered beads look the same.
+        size: likewise the factor on the beads' radii.
+    """
+
+    blur: float
+    scale: float
+    veil: float
+    seen: bool
+    true: float
+    size: float
+
+
+def seen_sharpness(
+    sharp: Sharp, patches: Patches, sample: npt.NDArray[np.intp], cone: ConeVec, model: BeadModel
+) -> Sharp:
+    """Blur and size corrected by what the same estimate makes of rendered beads: the fit's profile
+    is an approximation, and where a spot is cut by the edge its radius decides its place."""
+    if not sharp.seen or sharp.blur < BODY_BLUR_PX:
+        return sharp
+    k = patches.windows.corner.shape[1]
+    frames, beads = np.divmod(sample, k)
+    few = patches.windows.pick(frames, beads)
+    balls = balls_of(model, patches.peaks[:k])
+    rays = render_windows(balls, cone[frames], few, CHECK_FINE)
+    seen = blurred_windows(rays, rest_of_blur(sharp.blur, CHECK_FINE))
+    side = few.side
+    rendered = replace(
+        patches, flat=seen.reshape(-1, side, side), offsets=patches.offsets[sample],
+        radii=patches.radii[sample], stretch=patches.stretch[sample], peaks=patches.peaks[sample],
+        windows=few,
+    )  # fmt: skip
+    found = sharpness(rendered, np.arange(len(sample)), sharp.blur)
+    if not found.seen:
+        return sharp
+    true = 2.0 * sharp.blur - found.blur
+    if not abs(true - sharp.blur) < 0.2 * sharp.blur:
+        return sharp
+    return replace(sharp, true=true, size=sharp.scale / found.scale)
+
+
+def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sharp:
+    """Blur, veil and apparent size from some whole spots, by the fit that leaves least.
+
+    A bead that is not as made shows here too; a spot cut by the edge has its centre where its
+    radius puts it. Without whole spots: the assumed blur, and the expected size.
+    """
+    if len(sample) < 3:
+        return Sharp(blur, 1.0, 0.0, False, blur, 1.0)
+    masks, blurs = usable(patches, sample), np.array(BLURS)
+
+    def tried(veil: float, blurs: FloatArray) -> _Tried:
+        """Blurs from the least on, until one leaves much more than the one before."""
+        misfit, scale = np.full(len(blurs), np.inf), np.ones(len(blurs))
+        for i, trial in enumerate(blurs.tolist()):
+            results = fits(patches, sample, (trial, veil), True, masks)
+            good = sample[results[sample, kernels.OK] > 0]
+            if len(good) >= 3:
+                misfit[i] = float(np.median(results[good, kernels.NOISE]))
+                scale[i] = float(np.median(results[good, kernels.RADIUS] / patches.radii[good]))
+            if i > 0 and misfit[i] > 1.5 * misfit[i - 1]:
+                break
+        return blurs, misfit, scale
+
+    def near(last: _Tried) -> FloatArray:
+        """The blurs next to the one that leaves least."""
+        i = int(np.searchsorted(blurs, last[0][int(last[1].argmin())]))
+        return blurs[max(i - 1, 0) : i + 2]
+
+    found = [tried(VEILS[0], blurs)]
+    if not math.isfinite(found[0][1].min()):
+        return Sharp(blur, 1.0, 0.0, False, blur, 1.0)
+    # A veil changes the blur that fits by little, so its neighbours are tried.
+    for trial in VEILS[1:]:
+        found.append(tried(trial, near(found[-1])))
+        if not found[-1][1].min() < found[-2][1].min():
+            break
+    least = np.array([misfit.min() for _, misfit, _ in found])
+    veil, last = _lowest(np.array(VEILS[: len(found)]), least), found[int(least.argmin())]
+    if veil > 0.0:
+        last = tried(veil, near(last))
+    best = _lowest(last[0], last[1])
+    apparent = float(np.interp(best, last[0], last[2]))
+    return Sharp(best, apparent, veil, True, best, apparent)
+
+
+def _lowest(tried: FloatArray, misfit: FloatArray) -> float:
+    """Where a misfit is least: a hyperbola about the right place, so its square is a parabola."""
+    i = int(np.argmin(misfit))
+    near = slice(i - 1, i + 2)
+    if 0 < i < len(tried) - 1 and np.isfinite(misfit[near]).all():
+        a, b, _ = np.polyfit(tried[near], np.square(misfit[near]), 2)
+        if a > 0:
+            return float(np.clip(-b / (2.0 * a), tried[i - 1], tried[i + 1]))
+    return float(tried[i])

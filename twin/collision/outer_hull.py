@@ -1,0 +1,85 @@
+"""A convex body of few corners around many points, for parts whose meshes have thousands.
+
+It is cut out of the points' box by planes on which the points' own hull lies, where it stands out
+most first; so it contains the hull, a pose that is free with it is free, and flat faces stay flat.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.collision.convex_solids import Polytope, hull
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.machine.description import MAX_POINTS
+
+MAX_PLANES: Final = 2000
+"""Of the points' hull that are looked at; any of them are right."""
+CLOSE_MM: Final = 0.01
+"""What stands out less is not cut off."""
+AT_ONCE: Final = 8
+"""Planes that cut corners off at a time."""
+LIFT: Final = 1e-9
+"""By what part of its size the body is larger, so that rounding leaves no point outside."""
+
+
+def outer_hull(points: npt.ArrayLike) -> Polytope:
+    """A convex body that contains points and has at most `MAX_POINTS` corners.
+
+    Args:
+        points: (k, 3) [mm].
+
+    Example:
+        >>> ball = np.random.default_rng(1).normal(size=(3000, 3))
+        >>> ball *= 50.0 / np.linalg.norm(ball, axis=1, keepdims=True)
+        >>> around = outer_hull(ball)
+        >>> len(around.vertices) <= 256, float(around.bounds()[1].max()) < 50.1
+        (True, True)
+    """
+    exact = hull(points)
+    if len(exact.vertices) <= MAX_POINTS:
+        return exact
+    planes = _planes(exact)
+    low, high = exact.bounds()
+    lift = LIFT * float((high - low).max())
+    inside = exact.vertices.mean(axis=0)
+    chosen = [np.concatenate([s * e, [-float((s * exact.vertices @ e).max()) - lift]])
+              for e in np.eye(3) for s in (-1.0, 1.0)]  # fmt: skip
+    corners = _corners(chosen, inside)
+    while True:
+        out = corners @ planes[:, :3].T + planes[:, 3]
+        far, taken = out.max(axis=1), list[int]()
+        while far.max() > CLOSE_MM and len(taken) < AT_ONCE:
+            taken.append(int(np.argmax(out[np.argmax(far)])))
+            far[out[:, taken[-1]] > 0.0] = 0.0  # what a plane cuts off needs no second one
+        chosen += list(planes[taken] - [0.0, 0.0, 0.0, lift])
+        cut = _corners(chosen, inside)
+        if not taken or len(cut) > MAX_POINTS:
+            return hull(corners)
+        corners = cut
+
+
+def _planes(solid: Polytope) -> FloatArray:
+    """Outward planes (m, 4) of its largest faces: n . x + d <= 0 inside."""
+    a, b, c = np.moveaxis(solid.vertices[solid.faces], 1, 0)
+    normals = np.cross(b - a, c - a)
+    areas = np.linalg.norm(normals, axis=1)
+    normals = normals[areas > 0.0] / areas[areas > 0.0, None]
+    heights = np.einsum("ij,ij->i", normals, a[areas > 0.0])
+    _, first, same = np.unique(
+        np.column_stack([normals, heights]).round(6), axis=0, return_index=True, return_inverse=True
+    )
+    large = np.argsort(np.bincount(same.ravel(), areas[areas > 0.0]))[-MAX_PLANES:]
+    normals = normals[first[large]]
+    reach = (normals @ solid.vertices.T).max(axis=1)  # a face's own height, but for rounding
+    return np.column_stack([normals, -reach])
+
+
+def _corners(planes: list[FloatArray], inside: FloatArray) -> FloatArray:
+    from scipy.spatial import HalfspaceIntersection
+
+    found = HalfspaceIntersection(np.array(planes), inside).intersections
+    _, first = np.unique(found.round(6), axis=0, return_index=True)
+    return np.asarray(found[first])

@@ -1,0 +1,225 @@
+"""Bodies that overlap already (after a restart) may only come apart: a retreat.
+
+A sweep cannot measure how deep two bodies overlap, so every motion that begins in an overlap would
+be a contact, a retreat included. Here such a pair is judged by its separation: the gap between the
+two bodies across a direction, the widest of all directions, negative for an overlap. Where the
+motion begins it is exact, from the faces of the bodies' Minkowski difference; later the same
+directions are looked at, standing and turning with either body, which can only make the separation
+seem less than it is. As long as it keeps to its floor the motion is a retreat, and from the moment
+the pair is free the usual margin applies to it again. All other pairs keep the margin throughout.
+
+Both moments are found by conservative advancement, so that none is stepped over: the separation is
+looked at again where it may have fallen to the floor, the distance where it may have grown to what
+counts as free.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from flexdt.twin.collision.collision_scene import CollisionScene
+from flexdt.twin.collision.convex_solids import ConvexSolid, Polytope, UprightCylinder
+from flexdt.twin.collision.first_contact import Pair, bodies_touching, first_contact
+from flexdt.twin.collision.relative import (
+    START,
+    Limits,
+    Moment,
+    Path,
+    RelativeMotion,
+    Separate,
+)
+from flexdt.twin.collision.separation import Separation
+from flexdt.twin.collision.stages import Body
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.scanner.safety import ROUNDING_MM, Contact, floor
+
+GRAZING_MM = 1e-3
+"""Pairs this near are judged as overlapping ones: their direction is rounding in a sweep."""
+STANDING = 1e-12
+"""What rounding makes of an orientation that has not changed."""
+MANY = 100
+"""Corners of a body beyond which not all of their directions are looked at (a mesh has thousands,
+and the directions of a pair grow with the product): some, and the best one, refined."""
+REFINEMENTS = 40
+"""Halvings of the step in which the direction of a round body's least overlap is looked for."""
+
+
+def leaving(scene: CollisionScene, path: Path) -> Contact | None:
+    """The first contact of a motion that begins with bodies overlapping, or None.
+
+    Args:
+        scene: what may touch what.
+        path: the motion.
+    """
+    stuck = [pair for pair, gap in bodies_touching(scene, path.q[0]) if gap <= GRAZING_MM]
+    others = first_contact(_without(scene, stuck), path)
+    found = [c for pair in stuck if (c := _of_pair(scene, path, pair)) is not None]
+    contacts = [*found, *([] if others is None else [others])]
+    return min(contacts, key=lambda contact: contact.time, default=None)
+
+
+def _of_pair(scene: CollisionScene, path: Path, pair: Pair) -> Contact | None:
+    """What stops one overlapping pair: coming closer, or touching again once free."""
+    a, b = (scene.bodies[i] for i in pair)
+    motion, overlap = RelativeMotion(a, b, path), _Overlap.at(a, b, path.q[0])
+    deeper = _deeper(motion, overlap, scene.limits.margin)
+    until = math.inf if deeper is None else motion.time(deeper[1])
+    free = _free_from(motion, scene.separation(pair), scene.limits, until)
+    if free is not None:
+        alone = replace(scene, pairs=(pair,), distant=())
+        return first_contact(alone, path.after(free))
+    if deeper is None:
+        return None
+    last = motion.time(deeper[0])
+    here = path.positions(last)
+    return Contact(scene.names(pair), until, here, here, last, 0.0, free_before=False)
+
+
+def _deeper(
+    motion: RelativeMotion, overlap: _Overlap, margin: float
+) -> tuple[Moment, Moment] | None:
+    """When the separation comes down to its floor, after the last look before; None for never."""
+    look = motion.look(START, overlap.separate)
+    level = floor(look.gap, margin)
+    while (at := motion.next_at(look, level)) is not None:
+        before, look = look.at, motion.look(at, overlap.separate)
+        if look.gap <= level + 0.5 * ROUNDING_MM:
+            return before, at
+    return None
+
+
+def _free_from(
+    motion: RelativeMotion, separate: Separate, limits: Limits, until: float
+) -> float | None:
+    """When the two are clear of the margin by twice the tolerance, before `until`; else None [s].
+
+    Where they are not clear by one tolerance, the other one has yet to be travelled, so that every
+    look is that far from the one before.
+    """
+    at: Moment | None = START
+    while at is not None and motion.time(at) < until:
+        gap = motion.look(at, separate).gap
+        if gap > limits.margin + limits.tolerance:
+            return motion.time(at)
+        at = motion.after_travel(at, limits.margin + 2.0 * limits.tolerance - gap)
+    return None
+
+
+def _without(scene: CollisionScene, pairs: list[Pair]) -> CollisionScene:
+    left_out = set(pairs)
+    return replace(
+        scene,
+        pairs=tuple(p for p in scene.pairs if p not in left_out),
+        distant=tuple(p for p in scene.distant if p not in left_out),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Overlap:
+    """Two bodies that overlap at the beginning, and the directions across which they may part.
+
+    Attributes:
+        bodies: the two.
+        turned: their orientations at the beginning, (3, 3) each.
+        directions: (k, 3) unit directions in the world then, from the second to the first.
+    """
+
+    bodies: tuple[Body, Body]
+    turned: tuple[FloatArray, FloatArray]
+    directions: FloatArray
+
+    @classmethod
+    def at(cls, a: Body, b: Body, q: FloatArray) -> _Overlap:
+        """The overlap with the motors at `q` (axes,)."""
+        from scipy.spatial import ConvexHull
+
+        (turn_a, at_a), (turn_b, at_b) = _pose(a, q), _pose(b, q)
+        corners_a = _corners(a.solid) @ turn_a.T + (at_a - at_b)
+        corners_b = _corners(b.solid) @ turn_b.T
+        between = (corners_a[:, None] - corners_b[None]).reshape(-1, 3)
+        outward = np.unique(ConvexHull(between).equations[:, :3].round(9), axis=0)
+        outward /= np.linalg.norm(outward, axis=1)[:, None]
+        overlap = cls((a, b), (turn_a, turn_b), -outward)
+        return replace(overlap, directions=np.vstack([overlap.directions, overlap._refined(q)]))
+
+    @cached_property
+    def _reach(self) -> tuple[FloatArray, FloatArray]:
+        """(k,) each: how far either body reaches across the directions that turn with it [mm]."""
+        first, second = (self._reach_of(i, self.directions, self.turned) for i in (0, 1))
+        return first, second
+
+    def _reach_of(
+        self, i: int, directions: FloatArray, turned: tuple[FloatArray, FloatArray]
+    ) -> FloatArray:
+        towards = directions if i else -directions
+        return self.bodies[i].solid.support(towards @ turned[i])
+
+    def separate(
+        self, offset: FloatArray, turn_a: FloatArray | None, turn_b: FloatArray | None
+    ) -> Separation:
+        """Width of the widest slab between them [mm] and its direction, as `relative.Separate`.
+
+        The width is negative for an overlap, and never too large. Looked at are directions that
+        turn with either body. How far that body reaches across them does not change, so that one
+        of many corners costs no more than another.
+        """
+        turned = (np.eye(3) if turn_a is None else turn_a, np.eye(3) if turn_b is None else turn_b)
+        off = (np.abs(now - then).max() for now, then in zip(turned, self.turned, strict=True))
+        turns = max(off) > STANDING
+        widest, across = -math.inf, self.directions[0]
+        for i in (0, 1) if turns else (0,):
+            if turns and _many(self.bodies[1 - i].solid):
+                continue
+            now = self.directions @ (turned[i] @ self.turned[i].T).T
+            other = self._reach_of(1 - i, now, turned) if turns else self._reach[1 - i]
+            gaps = now @ offset - self._reach[i] - other
+            best = int(np.argmax(gaps))
+            if gaps[best] > widest:
+                widest, across = float(gaps[best]), now[best]
+        return widest, across
+
+    def separation(self, q: FloatArray) -> float:
+        """That width with the motors at `q` (axes,) [mm]."""
+        (turn_a, at_a), (turn_b, at_b) = (_pose(body, q) for body in self.bodies)
+        return self.separate(at_a - at_b, turn_a, turn_b)[0]
+
+    def _refined(self, q: FloatArray) -> FloatArray:
+        """(1, 3): the direction of the widest gap, where no faces tell it exactly."""
+        (_, at_a), (_, at_b) = (_pose(body, q) for body in self.bodies)
+
+        def gaps(directions: FloatArray) -> FloatArray:
+            reach = self._reach_of(0, directions, self.turned)
+            return directions @ (at_a - at_b) - reach - self._reach_of(1, directions, self.turned)
+
+        best = self.directions[int(np.argmax(gaps(self.directions)))]
+        step = 0.1
+        for _ in range(REFINEMENTS):
+            around = np.vstack([best, best + step * np.eye(3), best - step * np.eye(3)])
+            around /= np.linalg.norm(around, axis=1)[:, None]
+            widest = int(np.argmax(gaps(around)))
+            best = around[widest]
+            step *= 0.7 if widest == 0 else 1.0
+        return np.asarray(best[None])
+
+
+def _pose(body: Body, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    turn = body.rotation(float(q @ body.turns)) if body.spins else np.eye(3)
+    return turn, q @ body.slides + body.origin
+
+
+def _many(solid: ConvexSolid) -> bool:
+    return isinstance(solid, Polytope) and len(solid.vertices) > MANY
+
+
+def _corners(solid: ConvexSolid) -> FloatArray:
+    """(k, 3): corners of a body, of one with very many only some."""
+    if _many(solid):
+        ways = np.random.default_rng(0).normal(size=(MANY, 3))
+        return np.unique(solid.farthest(ways), axis=0)
+    upright = solid.prism() if isinstance(solid, UprightCylinder) else solid
+    assert isinstance(upright, Polytope)
+    return upright.vertices

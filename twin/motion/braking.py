@@ -1,0 +1,290 @@
+"""How motors come to rest: along the path they are on together, or each motor by itself.
+
+A programme of several motors is free only as a whole: a motor that brakes by itself while another
+drives on leaves the path that was swept. `braked_along` therefore slows the programme's own time,
+p(s(t)) with ds/dt from 1 down to 0, so that every position passed was swept before. `braked_apart`
+stops every motor as soon as that motor can; it leaves the path and has to be swept.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+from flexdt.twin.machine.description import Machine
+from flexdt.twin.motion import profiles as motion
+from flexdt.twin.motion.drives import SAME_PLACE, Drive, Drives
+from flexdt.twin.motion.profiles import ROUNDING, Piece, Trajectory
+
+PATH_ERROR = 1e-5
+"""How far the pieces of constant acceleration may stray from the path that is slowed [mm, deg].
+
+A thousandth of the tolerance of a sweep, so that what was swept stays certified."""
+AT_REST = 1e-9
+"""Programme time that passes at less than this rate stands still."""
+STILL = 1e-6
+"""A velocity that is rounding [mm/s, deg/s]."""
+LEAST_S = 1e-7
+"""Programme time is not cut finer than this [s]."""
+SHORT_S = 1e-4
+"""Over less than this one piece of constant acceleration strays by less than rounding [s]."""
+IN_STEP = 1e-9
+"""Relative difference of two velocities that is rounding: such motors run in step."""
+
+Most = Mapping[str, float] | None
+"""Motor -> acceleration that braking may use; None: what the motion in force was planned with."""
+
+
+@dataclass(frozen=True)
+class _Cell:
+    """Programme time over a span of real time: s = s0 + rate t - slowing t^2 / 2.
+
+    Attributes:
+        start: real time [s].
+        programme: programme time at the start [s].
+        rate: ds/dt at the start, in (0, 1].
+        slowing: -d2s/dt2 >= 0 [1/s].
+        length: real seconds.
+    """
+
+    start: float
+    programme: float
+    rate: float
+    slowing: float
+    length: float
+
+    @property
+    def advance(self) -> float:
+        """Programme seconds that it covers."""
+        return self.length * (self.rate - 0.5 * self.slowing * self.length)
+
+
+def braked_along(drives: Drives, now: float, most: Most = None) -> dict[str, Trajectory]:
+    """Trajectories that slow everything under way to rest on the path it is on.
+
+    The motors keep their common path and pass it ever more slowly. While a motor brakes with all
+    it may use, the programme's time cannot slow, so that this may take longer than stopping each
+    motor by itself.
+
+    Args:
+        drives: every motor with all that it is to follow.
+        now: from when on [s].
+        most: motor -> greatest acceleration, not below the one in force [mm/s2, deg/s2].
+
+    Returns:
+        Motor -> trajectory, of those that had anything left to do. Positions stray from the path
+        by at most `PATH_ERROR`.
+    """
+    due = {name: drive for name, drive in drives.items() if drive.end > now}
+    cells = _cells(due, now, most)
+    return {name: _along(drive, cells, now) for name, drive in due.items()}
+
+
+def braked_apart(
+    machine: Machine, drives: Drives, now: float, most: Most = None
+) -> dict[str, Trajectory]:
+    """Trajectories that stop every motor as soon as it can; motors of one virtual axis in step.
+
+    Args:
+        machine: says which motors belong together.
+        drives: every motor with all that it is to follow.
+        now: from when on [s].
+        most: as for `braked_along`.
+
+    Returns:
+        Motor -> trajectory, of those that had anything left to do.
+    """
+    velocity = {name: drive.at(now).velocity(now) for name, drive in drives.items()}
+    seconds = {
+        name: abs(v) / greatest(name, drives[name].at(now), now, most) if v else 0.0
+        for name, v in velocity.items()
+    }
+    for together in _coupled(machine, velocity):
+        slowest = max(seconds[name] for name in together)
+        seconds.update(dict.fromkeys(together, slowest))
+    out = {}
+    for name, drive in drives.items():
+        if drive.end > now:
+            current, takes = drive.at(now), seconds[name]
+            rest = motion.at_rest(current.position(now), now)
+            if takes > 0.0:
+                acceleration = abs(velocity[name]) / takes
+                rest = motion.stop(current.position(now), velocity[name], acceleration, now)
+            # It was braking anyway: where it was bound is where it ends, exactly (and not a
+            # rounding error beyond its limit).
+            near = abs(rest.target - current.target) < SAME_PLACE
+            out[name] = replace(rest, target=current.target) if near else rest
+    return out
+
+
+def coasting(
+    machine: Machine, drives: Drives, now: float, decelerations: Mapping[str, float]
+) -> dict[str, Trajectory]:
+    """Trajectories of motors without power: each slows by friction, or ends at its hard stop.
+
+    Args:
+        machine: travel limits.
+        drives: every motor with all that it is to follow.
+        now: when power is cut [s].
+        decelerations: motor -> by how much it slows [mm/s2, deg/s2].
+    """
+    out = {}
+    for name, drive in drives.items():
+        if drive.end <= now:
+            continue
+        current, axis = drive.at(now), machine.axes[name]
+        free = motion.stop(current.position(now), current.velocity(now), decelerations[name], now)
+        end = min(max(free.target, axis.lower), axis.upper)
+        met = None if end == free.target else free.time_at(end)
+        if met is not None:
+            pieces = tuple(p for p in free.pieces if p.start < met)
+            pieces = pieces or motion.at_rest(end, now).pieces
+            free = Trajectory(pieces, max(met, now), end)
+        out[name] = free
+    return out
+
+
+def programme_time_at_rest(drives: Drives, at: float, most: Most) -> float:
+    """The programme's own time [s] at which a stop along its path, begun at `at`, has ended."""
+    due = {name: drive for name, drive in drives.items() if drive.end > at}
+    cells = _cells(due, at, most)
+    return cells[-1].programme + cells[-1].advance if cells else at
+
+
+def braked_at(
+    drives: Drives, at: float, trajectories: Mapping[str, Trajectory], most: Most
+) -> dict[str, Drive]:
+    """`drives` that follow `trajectories`, and are braked along their path from `at` on."""
+    following = {**drives, **{n: drives[n].following(t) for n, t in trajectories.items()}}
+    braked = braked_along(following, at, most)
+    return {
+        name: drive.following(motion.rejoined(drive.ahead(at), at, braked[name]))
+        if name in braked
+        else drive
+        for name, drive in following.items()
+    }
+
+
+def _coupled(machine: Machine, velocity: Mapping[str, float]) -> Iterable[list[str]]:
+    """Motors of a virtual axis that run in step now, so that they have to stop in step."""
+    for virtual in machine.virtual_axes.values():
+        rates = [velocity.get(name, 0.0) / share for name, share in virtual.moves.items()]
+        fastest = max(map(abs, rates))
+        if fastest > 0.0 and max(rates) - min(rates) <= IN_STEP * fastest:
+            yield list(virtual.moves)
+
+
+def greatest(name: str, leg: Trajectory, time: float, most: Most) -> float:
+    """The acceleration that a motor may brake with while it follows `leg` [mm/s2, deg/s2]."""
+    planned = leg.acceleration(time)
+    return planned if most is None else max(planned, most[name])
+
+
+def _cells(drives: Drives, now: float, most: Most) -> list[_Cell]:
+    """The law of programme time that brings all motors to rest soonest, within the limits."""
+    cells: list[_Cell] = []
+    s, rate, time = now, 1.0, now
+    while rate > 0.0 and drives:
+        states = [_state(name, drive, s, most) for name, drive in drives.items()]
+        if max(abs(state.velocity) for state in states) < STILL:
+            break
+        until = min(state.until for state in states)
+        ahead = until - s
+        if ahead <= ROUNDING:  # a knot that rounding has put a hair ahead
+            step = max(ROUNDING, 4.0 * math.ulp(s))
+            s, time = s + step, time + step
+            continue
+        roughly = min(state.slowing(rate, 0.0) for state in states)
+        # Where a motor accelerates, constant acceleration is an approximation over a short time;
+        # it strays by 3 |a| rate slowing length^3 / 324.
+        jerk = max(3.0 * abs(state.acceleration) * rate * roughly for state in states)
+        if jerk > 0.0:
+            longest = min((324.0 * PATH_ERROR / jerk) ** (1.0 / 3.0), rate / roughly)
+            shorter = longest * (rate - 0.5 * roughly * longest)
+            ahead = min(ahead, max(shorter, LEAST_S))
+        slowing = min(state.slowing(rate, ahead) for state in states)
+        left = rate * rate - 2.0 * slowing * ahead
+        ends = left < AT_REST * AT_REST
+        following = 0.0 if ends else math.sqrt(left)
+        length = rate / slowing if ends else 2.0 * ahead / (rate + following)
+        cell = _Cell(time, s, rate, slowing, length)
+        cells.append(cell)
+        s = until if ahead == until - s else s + cell.advance
+        rate, time = following, time + length
+    return cells
+
+
+@dataclass(frozen=True)
+class _State:
+    """One motor at a moment of programme time, until its acceleration changes."""
+
+    velocity: float
+    acceleration: float
+    most: float
+    until: float
+
+    def slowing(self, rate: float, ahead: float) -> float:
+        """How much programme time may slow over the next `ahead` programme seconds [1/s]."""
+        speed, a = abs(self.velocity), abs(self.acceleration)
+        if self.velocity * self.acceleration < 0.0:  # it brakes: both are greatest at the start
+            return max(0.0, self.most - a * rate * rate) / speed
+        fastest = speed + a * ahead
+        if fastest == 0.0:
+            return math.inf
+        # Its own speeding up works against the slowing; least so at the end.
+        first = (self.most + a * rate * rate) / fastest
+        slowest = max(0.0, rate * rate - 2.0 * first * ahead)
+        return (self.most + a * slowest) / fastest
+
+
+def _state(name: str, drive: Drive, s: float, most: Most) -> _State:
+    leg = drive.at(s)
+    velocity, acceleration, until = leg.law(s)
+    return _State(
+        velocity, acceleration, greatest(name, leg, s, most), min(until, drive.next_start(s))
+    )
+
+
+def _along(drive: Drive, cells: list[_Cell], now: float) -> Trajectory:
+    """One motor's way through the cells."""
+    pieces: list[Piece] = []
+    end, target = now, drive.at(now).position(now)
+    for cell in cells:
+        leg = drive.at(cell.programme)
+        velocity, acceleration, _ = leg.law(cell.programme)
+        if velocity == 0.0 and acceleration == 0.0:
+            if pieces and (pieces[-1].velocity != 0.0 or pieces[-1].acceleration != 0.0):
+                pieces.append(Piece(end, target, 0.0, 0.0))
+            continue
+        ds, left = cell.advance, cell.rate - cell.slowing * cell.length
+        x = leg.position(cell.programme)
+        v = velocity * cell.rate
+        gone = ds * (velocity + 0.5 * acceleration * ds)
+        reached = x + gone
+        arrives = (velocity + acceleration * ds) * max(0.0, left)
+        if not pieces and cell.start > now:
+            pieces.append(Piece(now, x, 0.0, 0.0))
+        if cell.slowing == 0.0 or acceleration == 0.0:
+            rate = acceleration * cell.rate**2 - velocity * cell.slowing
+            pieces.append(Piece(cell.start, x, v, rate))
+        elif cell.length < SHORT_S:
+            pieces.append(Piece(cell.start, x, v, (arrives - v) / cell.length))
+        else:
+            # Two halves of constant acceleration that meet position and velocity at both ends.
+            length, half = cell.length, 0.5 * cell.length
+            # Not `reached - x`: its rounding, over a short length twice, would put motors that run
+            # in step out of it.
+            gained, moved = arrives - v, gone - v * length
+            first = 4.0 * moved / length**2 - gained / length
+            second = 3.0 * gained / length - 4.0 * moved / length**2
+            pieces.append(Piece(cell.start, x, v, first))
+            middle = x + half * (v + 0.5 * first * half)
+            pieces.append(Piece(cell.start + half, middle, v + first * half, second))
+        end, target = cell.start + cell.length, reached
+    while pieces and pieces[-1].velocity == 0.0 and pieces[-1].acceleration == 0.0:
+        pieces.pop()
+    if not pieces or end == now:
+        return motion.at_rest(target, now)
+    final = drive.at(now).target
+    return Trajectory(tuple(pieces), end, final if abs(target - final) < SAME_PLACE else target)
