@@ -45,9 +45,11 @@ if _typing.TYPE_CHECKING:
     open = load_dataset
     __version__: str
 
+from flexdt.runtime import process_threads as _process_threads
 from flexdt.runtime import progress_lines as _progress_lines
 
 _progress_lines.watch()
+_process_threads.watch()
 
 _HOMES: _typing.Final = {
     "AsyncTwinClient": "flexdt.clients",

@@ -10,6 +10,10 @@ numba optimises and assembles each function that it compiles, with all that it c
 part of each function that calls it: a kernel four calls deep in a parallel loop eight times. Here
 only an entry point (`parallel`, `serial`) is, at the end, with all that was linked into it; results
 are the same to the last bit, and compiling takes less than half the time.
+
+Each parallel loop looks at `kernel_threads.ALONE` first: where it is set, the loop runs in the
+calling thread and numba's threading layer is not called. That is so in a forked child, which has
+none of its parent's threads. The look is part of the compiled code: one kernel serves both.
 """
 
 from __future__ import annotations
@@ -17,21 +21,23 @@ from __future__ import annotations
 import ctypes
 import inspect
 import logging
+import sys
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from types import ModuleType
 from typing import Any
 
-from llvmlite import ir
+from llvmlite import binding, ir
 from numba import njit, types
 from numba.core import cgutils
+from numba.core.caching import FunctionCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.extending import intrinsic
 
-from flexdt.twin import long_work
+from flexdt.twin import kernel_threads, long_work
 
 LOG = logging.getLogger("flexdt.kernels")
 """To standard error, unless the program has set up logging."""
@@ -39,8 +45,55 @@ SLOW = "flexdt: compiling %s (once on this machine; some seconds, and perhaps ot
 """What a process says when it first compiles, instead of loading from the disk cache."""
 
 
+LAYER = "numba_parallel_for"
+"""What numba's parallel loops call; its threading layer has it."""
+ALONE = "flexdt_alone"
+"""`kernel_threads.ALONE` for the linker."""
+binding.add_symbol(ALONE, ctypes.addressof(kernel_threads.ALONE))
+
+
+def _choose(module: ir.Module) -> None:
+    """Have a module's parallel loops call the threading layer only where `ALONE` is 0."""
+    layer = module.globals.get(LAYER)
+    if layer is None:
+        return
+    calls = [
+        each
+        for function in module.functions
+        for block in function.blocks
+        for each in block.instructions
+        if isinstance(each, ir.CallInstr) and each.callee is layer
+    ]
+    chosen = ir.Function(module, layer.function_type, "flexdt_parallel_for")
+    chosen.linkage = "internal"
+    for call in calls:
+        call.replace_callee(chosen)
+    builder = ir.IRBuilder(chosen.append_basic_block())
+    alone = ir.GlobalVariable(module, ir.IntType(64), ALONE)
+    here = builder.icmp_signed("!=", builder.load(alone), ir.IntType(64)(0))
+    with builder.if_else(here) as (then, otherwise):
+        with then:
+            # A loop's body takes all iterations that its dimensions say, one after the other.
+            loop, args, sizes, steps, data = chosen.args[:5]
+            word = ir.IntType(64 if "i64" in str(chosen.args[5].type) else 32).as_pointer()
+            kinds = [args.type.as_pointer(), word, word, data.type]
+            body = ir.FunctionType(ir.VoidType(), kinds).as_pointer()
+            given = zip((args, sizes, steps, data), kinds, strict=True)
+            builder.call(
+                builder.bitcast(loop, body), [builder.bitcast(each, kind) for each, kind in given]
+            )
+        with otherwise:
+            builder.call(layer, chosen.args)
+    builder.ret_void()
+
+
 class _LinkedLibrary(JITCodeLibrary):  # type: ignore[misc]
     """Code to be linked into that of callers, as it is."""
+
+    def add_ir_module(self, ir_module: ir.Module) -> None:
+        """Add a module as numba does, with `_choose`."""
+        _choose(ir_module)
+        super().add_ir_module(ir_module)
 
     def _optimize_final_module(self) -> None:
         pass
@@ -94,12 +147,27 @@ class _EntryPoint(_Linked):
             return super()._compile_core()
 
 
+class _Cache(FunctionCache):  # type: ignore[misc]
+    """numba's disk cache, whose code is loaded only if this module compiled it as it is now."""
+
+    def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, ...]:
+        return (*super()._index_key(signature, codegen), COMPILING)
+
+
+def _entry_point(function: Callable[..., Any] | None = None, **options: Any) -> Any:
+    """Compile a function that Python calls, and keep its code on disk."""
+    if function is None:
+        return partial(_entry_point, **options)
+    made = njit(function, cache=True, nogil=True, pipeline_class=_EntryPoint, **options)
+    if isinstance(made._cache, FunctionCache):
+        made._cache.__class__ = _Cache
+    return made
+
+
 # Only entry points go to the disk cache: a cached inner function would not notice that a function
 # it calls has changed. They call no other entry points.
-parallel = partial(
-    njit, cache=True, error_model="numpy", parallel=True, nogil=True, pipeline_class=_EntryPoint
-)
-serial = partial(njit, cache=True, nogil=True, pipeline_class=_EntryPoint)
+parallel = partial(_entry_point, error_model="numpy", parallel=True)
+serial = _entry_point
 linked = partial(njit, pipeline_class=_Linked, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 maker = partial(linked, error_model="numpy")
 # No reference counting: in loops of 100 ns it would cost as much as the work. Such functions may
@@ -118,6 +186,10 @@ def sources(*modules: ModuleType) -> int:
     """
     text = "".join(inspect.getsource(module) for module in modules)
     return zlib.crc32(text.encode())
+
+
+COMPILING = sources(sys.modules[__name__])
+"""This module's own number."""
 
 
 def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
@@ -151,3 +223,53 @@ def fetch_next(typingctx: Any, counter: Any) -> Any:
         return builder.atomic_rmw("add", address, word(1), "monotonic")
 
     return types.int64(counter), codegen
+
+
+@intrinsic
+def count_one(typingctx: Any, counters: Any, index: Any) -> Any:
+    """count_one(counters, index): add one to counters[index], an int64, atomically, after all that
+    this thread has written.
+    """
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        address = _address(context, builder, signature.args[0], *args)
+        builder.atomic_rmw("add", address, ir.IntType(64)(1), "release")
+        return context.get_dummy_value()
+
+    return types.void(counters, index), codegen
+
+
+@intrinsic
+def _look(typingctx: Any, counters: Any, index: Any) -> Any:
+    """_look(counters, index): counters[index] now, and all that was written before it counted."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        address = _address(context, builder, signature.args[0], *args)
+        return builder.load_atomic(address, "acquire", 8)
+
+    return types.int64(counters, index), codegen
+
+
+_sleep, _SLEEP = (
+    (ctypes.WinDLL("kernel32").Sleep, 1)  # type: ignore[attr-defined]
+    if sys.platform == "win32"
+    else (ctypes.CDLL(None).usleep, 50)
+)
+"""The system's sleep, and the shortest useful: 1 ms of Windows, 50 microseconds elsewhere."""
+SLEEP = "flexdt_sleep"
+binding.add_symbol(SLEEP, ctypes.cast(_sleep, ctypes.c_void_p).value)
+_rest = types.ExternalFunction(SLEEP, types.int32(types.uint32))
+LOOKS = 2000
+"""Looks before a thread sleeps: some 20 microseconds, the time that sleeping takes."""
+
+
+@kernel
+def wait_until(counters, index, count):
+    """Return when counters[index] has reached count, asleep if that takes long: on a busy machine
+    the thread that is waited for may need this thread's core.
+    """
+    looks = 0
+    while _look(counters, index) < count:
+        looks += 1
+        if looks > LOOKS:
+            _rest(_SLEEP)

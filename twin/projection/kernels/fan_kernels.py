@@ -18,7 +18,15 @@ from flexdt.twin.projection.kernels import (
     fan_walk_kernels,
     siddon_kernels,
 )
-from flexdt.twin.projection.kernels.compiling import fetch_next, inline, kernel, parallel, sources
+from flexdt.twin.projection.kernels.compiling import (
+    count_one,
+    fetch_next,
+    inline,
+    kernel,
+    parallel,
+    sources,
+    wait_until,
+)
 from flexdt.twin.projection.kernels.fan_rays_kernels import (
     collect,
     columns_of,
@@ -150,38 +158,49 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
         each a range of units that have no voxel column in common; units (m, 2): ranges of jobs;
         slices (s, 2): ranges of z; shadows (s, n, 4) of each; marks (s, 2 nx ny): see
         `siddon_kernels.open_column`.
+
+        All turns are one parallel loop: a worker that is free takes the next item, a unit and a
+        slice, and begins when every item of the turn before is done. Items are taken in order, so
+        one that is waited for is being worked on.
         """
         _ = key
         views, lines, jobs, room, widest = fans
         rows = values.shape[1]
-        for turn in range(len(turns)):
-            begin = turns[turn, 0]
-            count = (turns[turn, 1] - begin) * len(slices)
-            counter = np.zeros(1, np.int64)
-            for _ in prange(min(workers, count)):
-                found, rays = make_found(room), make_rays(room)
-                work = make_work(max(box.nx, box.ny), box.nz)
-                starts, ends = np.empty(rows, np.int64), np.empty(rows, np.int64)
-                buffer = np.empty(rows * widest, np.float32)
-                g = np.empty(12)
-                item = fetch_next(counter)
-                while item < count:
-                    part, unit = item % len(slices), begin + item // len(slices)
-                    low, high = slices[part]
-                    # The slice as a box of its own: its first voxel is z = 0 of the piece.
-                    piece = Box(
-                        box.flat, marks[part], box.base + low, box.hop_x, box.hop_y,
-                        box.nx, box.ny, high - low, box.size_x, box.size_y, box.size_z,
+        counter = np.zeros(1, np.int64)
+        done = np.zeros(len(turns), np.int64)
+        for _ in prange(workers):
+            found, rays = make_found(room), make_rays(room)
+            work = make_work(max(box.nx, box.ny), box.nz)
+            starts, ends = np.empty(rows, np.int64), np.empty(rows, np.int64)
+            buffer = np.empty(rows * widest, np.float32)
+            g = np.empty(12)
+            turn = first_item = before = 0
+            item = fetch_next(counter)
+            while turn < len(turns):
+                count = (turns[turn, 1] - turns[turn, 0]) * len(slices)
+                if item >= first_item + count:
+                    first_item, before, turn = first_item + count, count, turn + 1
+                    continue
+                if turn > 0:
+                    wait_until(done, turn - 1, before)
+                at = item - first_item
+                part, unit = at % len(slices), turns[turn, 0] + at // len(slices)
+                low, high = slices[part]
+                # The slice as a box of its own: its first voxel is z = 0 of the piece.
+                piece = Box(
+                    box.flat, marks[part], box.base + low, box.hop_x, box.hop_y,
+                    box.nx, box.ny, high - low, box.size_x, box.size_y, box.size_z,
+                )  # fmt: skip
+                for job in range(units[unit, 0], units[unit, 1]):
+                    view, first, last = jobs[job]
+                    g[:] = views[view]
+                    g[2] -= low  # the source, seen from the piece
+                    work_on(
+                        piece, g, lines, first, last, shadows[part, view], values[view],
+                        starts, ends, found, rays, work, buffer, True,
                     )  # fmt: skip
-                    for job in range(units[unit, 0], units[unit, 1]):
-                        view, first, last = jobs[job]
-                        g[:] = views[view]
-                        g[2] -= low  # the source, seen from the piece
-                        work_on(
-                            piece, g, lines, first, last, shadows[part, view], values[view],
-                            starts, ends, found, rays, work, buffer, True,
-                        )  # fmt: skip
-                    item = fetch_next(counter)
+                count_one(done, turn)
+                item = fetch_next(counter)
 
     return project_fans, spread_fans
 

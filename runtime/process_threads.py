@@ -1,0 +1,59 @@
+"""Kernel threads in a process: they sleep while they wait, and a forked child computes alone.
+
+GNU OpenMP reads its environment once, when it is loaded. By default its threads spin at the end of
+each parallel loop; beside other programs they take the cores from the thread that they wait for.
+
+A fork copies the calling thread alone. GNU OpenMP ends a process that starts a parallel loop after
+a fork of a process that had started one, so parallel loops of such a child run in its own thread.
+Processes started by `spawn` or `forkserver` use all cores.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import Final
+
+from flexdt.twin import kernel_threads
+
+OPENMP: Final = "libgomp.so.1"
+"""GNU OpenMP as numba's layer names it."""
+SLEEPING: Final[Mapping[str, str]] = {"OMP_WAIT_POLICY": "passive"}
+"""What OpenMP reads when it is loaded: waiting threads sleep."""
+CHOSEN_BY: Final = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
+"""Variables of the environment by which users choose how OpenMP's threads wait."""
+LAYER: Final = "numba.np.ufunc.parallel"
+
+
+def load_sleeping() -> None:
+    """Load OpenMP with threads that sleep while they wait, unless the user chose or it is loaded.
+
+    The environment is then as it was: other libraries and child processes keep their defaults.
+    """
+    if any(name in os.environ for name in CHOSEN_BY):
+        return
+    os.environ.update(SLEEPING)
+    try:
+        with suppress(OSError):
+            ctypes.CDLL(OPENMP)
+    finally:
+        for name in SLEEPING:
+            del os.environ[name]
+
+
+def _in_child() -> None:
+    """Compute in one thread, if the parent had kernel threads."""
+    layer = sys.modules.get(LAYER)
+    if layer is not None and layer._is_initialized:
+        kernel_threads.ALONE.value = 1
+
+
+def watch() -> None:
+    """Decide for this process and its forked children."""
+    if sys.platform == "linux":
+        load_sleeping()
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=_in_child)
