@@ -13,9 +13,9 @@ from flexdt.twin.dataset.dataset_errors import DatasetExistsError
 from flexdt.twin.dataset.file_names import DOCUMENT, GEOMETRY, SCAN_SETTINGS, SCRIPT, XRE_SETTINGS
 from flexdt.twin.dataset.flexdt_json import CorrectionEntry
 from flexdt.twin.dataset.rebuild import MATCH_MM
-from flexdt.twin.dataset.scan_settings import ScanSettings, figures_of
+from flexdt.twin.dataset.scan_settings import ScanSettings
 from flexdt.twin.dataset.scan_settings_text import format_scan_settings
-from flexdt.twin.dataset.stated_geometry import poses_of
+from flexdt.twin.dataset.stated_geometry import figures_of, poses_of
 from flexdt.twin.dataset.xre import format_settings
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.exchange.geometry import ScanGeometry
