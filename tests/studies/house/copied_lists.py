@@ -33,7 +33,7 @@ def measure(modules: Sequence[Module]) -> list[Measure]:
 
 def _lists(module: Module) -> Iterator[tuple[list[str], int]]:
     """Yield words and line of tuples, lists, sets, keys of dictionaries, and `Literal` types."""
-    for node in ast.walk(module.tree):
+    for node in module.nodes:
         if isinstance(node, ast.Tuple | ast.List | ast.Set):
             elements: Sequence[ast.expr | None] = node.elts
         elif isinstance(node, ast.Dict):

@@ -5,8 +5,6 @@ from __future__ import annotations
 import ast
 from collections.abc import Callable, Iterator, Sequence
 
-from code_lines import code_lines
-
 from house.sources import Measure, Module
 
 LONG_LINE = 90
@@ -15,7 +13,7 @@ LONG_LINE = 90
 
 def measure(modules: Sequence[Module]) -> list[Measure]:
     """Return rates of dense constructions per 1000 code lines."""
-    thousands = sum(code_lines(module.text) for module in modules) / 1000 or 1.0
+    thousands = sum(module.lines_of_code for module in modules) / 1000 or 1.0
     counts = {
         "stacked assignments": _nodes(modules, _is_stacked),
         "conditional expressions": _nodes(modules, _is_conditional),
@@ -43,7 +41,7 @@ def _is_conditional(node: ast.AST) -> bool:
 
 def _nodes(modules: Sequence[Module], wanted: Callable[[ast.AST], bool]) -> Iterator[str]:
     for module in modules:
-        for node in ast.walk(module.tree):
+        for node in module.nodes:
             if wanted(node):
                 yield f"{module.path}:{getattr(node, 'lineno', 0)} {ast.unparse(node)[:80]}"
 

@@ -27,7 +27,7 @@ def measure(modules: Sequence[Module]) -> list[Measure]:
 
 
 def _calls(module: Module) -> Iterator[str]:
-    for node in ast.walk(module.tree):
+    for node in module.nodes:
         if not isinstance(node, ast.Call) or not node.args:
             continue
         called = node.func.attr if isinstance(node.func, ast.Attribute) else node.func
@@ -44,8 +44,8 @@ def _is_foreign(argument: ast.expr) -> bool:
 
 
 def _texts(module: Module, wanted: Callable[[str], object]) -> Iterator[str]:
-    documentation = {id(node.value) for node in ast.walk(module.tree) if isinstance(node, ast.Expr)}
-    for node in ast.walk(module.tree):
+    documentation = {id(node.value) for node in module.nodes if isinstance(node, ast.Expr)}
+    for node in module.nodes:
         if (
             isinstance(node, ast.Constant)
             and isinstance(node.value, str)

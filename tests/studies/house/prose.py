@@ -61,7 +61,7 @@ def _rates(modules: Sequence[Module]) -> list[Measure]:
 
 def passages(module: Module) -> Iterator[tuple[str, str]]:
     """Yield place and text of each docstring, without its examples, and of each comment."""
-    for node in ast.walk(module.tree):
+    for node in module.nodes:
         if (
             isinstance(node, ast.Expr)
             and isinstance(node.value, ast.Constant)
@@ -77,7 +77,7 @@ def passages(module: Module) -> Iterator[tuple[str, str]]:
 
 def _functions(module: Module) -> Iterator[Function]:
     """Yield functions, but for properties, whose docstrings are noun phrases."""
-    for node in ast.walk(module.tree):
+    for node in module.nodes:
         if isinstance(node, Function):
             marks = {ast.unparse(mark).rpartition(".")[2] for mark in node.decorator_list}
             if not marks & {"property", "cached_property", "setter"}:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from code_lines import code_lines
-
 from house.sources import Measure, Module
 
 
@@ -14,7 +12,7 @@ def measure(modules: Sequence[Module]) -> list[Measure]:
     """Return the code lines of each folder, then the modules and code lines of all."""
     lines: Counter[str] = Counter()
     for module in modules:
-        lines[module.room] += code_lines(module.text)
+        lines[module.room] += module.lines_of_code
     rooms = [Measure(room, lines[room], "lines") for room in sorted(lines)]
     return [
         *rooms,

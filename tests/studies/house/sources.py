@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from code_lines import code_lines
+
 PACKAGE = "flexdt"
 CORE = ("flexdt", "protocol", "twin", "phantoms", "runtime", "server", "clients")
 SKIPPED_FOLDERS = {"node_modules", "__pycache__"}
@@ -30,6 +32,16 @@ class Module:
     def tree(self) -> ast.Module:
         """Parse the source once."""
         return ast.parse(self.text)
+
+    @cached_property
+    def nodes(self) -> tuple[ast.AST, ...]:
+        """Walk the syntax tree once."""
+        return tuple(ast.walk(self.tree))
+
+    @cached_property
+    def lines_of_code(self) -> int:
+        """Number of lines without blanks, comments and docstrings."""
+        return code_lines(self.text)
 
     @property
     def name(self) -> str:
