@@ -56,7 +56,7 @@ class DeviceArray(NDArrayOperatorsMixin):
         layout = blank_layout(volume)
         layout_data(layout)[...] = volume.data
         layout = replace(layout, flat=gpu.demand(lambda: gpu.upload(layout.flat)))
-        return cls.of_volume(DeviceVolume(layout, volume.shape, volume.voxel_xyz, volume.center_mm))
+        return cls.of_volume(DeviceVolume(layout, volume.shape, volume.voxel_mm, volume.center_mm))
 
     @property
     def images(self) -> Any:

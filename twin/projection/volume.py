@@ -278,7 +278,7 @@ class Volume:
             )
         layout = self.layout
         there = replace(layout, flat=gpu.demand(layout.device_copy.uploaded))
-        return DeviceVolume(there, self.shape, self.voxel_xyz, self.center_mm)
+        return DeviceVolume(there, self.shape, self.voxel_mm, self.center_mm)
 
     def plot(self, axes: Any = None, what: str = "data") -> Any:
         """Show the layer in the middle; needs matplotlib (the extra `plots`).
@@ -382,9 +382,7 @@ class Volume:
     @property
     def voxel_xyz(self) -> Vector3:
         """Voxel size (x, y, z) [mm]."""
-        if isinstance(self.voxel_mm, (int, float)):
-            return _vector((self.voxel_mm,) * 3, "voxel_mm")
-        return _vector(self.voxel_mm, "voxel_mm")
+        return edges_xyz(self.voxel_mm)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -509,13 +507,13 @@ class DeviceVolume:
     Attributes:
         layout: where each voxel is in `layout.flat`, a flat array on the device.
         shape: (nz, ny, nx).
-        voxel_xyz: edge lengths (x, y, z) [mm].
+        voxel_mm: as of the `Volume` whose grid it has.
         center_mm: (x, y, z) [mm].
     """
 
     layout: Layout
     shape: tuple[int, int, int]
-    voxel_xyz: Vector3
+    voxel_mm: float | Vector3
     center_mm: Vector3
 
     @classmethod
@@ -525,7 +523,7 @@ class DeviceVolume:
 
         layout = blank_layout(like)
         there = replace(layout, flat=gpu.demand(lambda: gpu.zeros(layout.flat.size)))
-        return cls(there, like.shape, like.voxel_xyz, like.center_mm)
+        return cls(there, like.shape, like.voxel_mm, like.center_mm)
 
     @classmethod
     def sharing(cls, like: Volume, flat: Any, strides: tuple[int, int]) -> DeviceVolume:
@@ -533,7 +531,12 @@ class DeviceVolume:
         x * strides[1] + z].
         """
         layout = replace(blank_layout(like), flat=flat, stride_y=strides[0], stride_x=strides[1])
-        return cls(layout, like.shape, like.voxel_xyz, like.center_mm)
+        return cls(layout, like.shape, like.voxel_mm, like.center_mm)
+
+    @property
+    def voxel_xyz(self) -> Vector3:
+        """Edge lengths (x, y, z) [mm]."""
+        return edges_xyz(self.voxel_mm)
 
     @property
     def strides(self) -> tuple[int, int, int]:
@@ -560,7 +563,7 @@ class DeviceVolume:
 
         flat = gpu.demand(lambda: self.layout.flat.copy_to_host())  # type: ignore[attr-defined]
         data = np.lib.stride_tricks.as_strided(flat, self.shape, self.strides)
-        return Volume(data, self.voxel_xyz, self.center_mm)
+        return Volume(data, self.voxel_mm, self.center_mm)
 
 
 @public
@@ -679,6 +682,13 @@ def _flat_alias(data: Float32Array, count: int) -> Float32Array:
     write is compiled for plain arrays only. Projection never writes into a volume.
     """
     return np.asarray(_Memory(data, count))
+
+
+def edges_xyz(voxel_mm: float | Vector3) -> Vector3:
+    """Edge lengths (x, y, z) [mm] of voxels given by these, or by one for all three."""
+    if isinstance(voxel_mm, (int, float)):
+        return _vector((voxel_mm,) * 3, "voxel_mm")
+    return _vector(voxel_mm, "voxel_mm")
 
 
 def _vector(value: object, name: str) -> Vector3:

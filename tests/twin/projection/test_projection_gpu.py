@@ -251,6 +251,12 @@ assert seen["up"] == [table, table] and seen["down"] == [], seen
 other = forward(found, geometry, shape)
 assert np.abs(forward(spread, geometry, shape).copy_to_host() - other).max() < 3e-6 * other.max()
 
+# A grid keeps its form: one number for the voxel's edge stays one, three stay three.
+for edge in (0.5, (0.5, 0.5, 0.5), (0.4, 0.5, 0.6)):
+    one = Volume(data, edge)
+    assert one.to("cuda").to("cpu").voxel_mm == one.voxel_mm == edge
+    assert back(images, geometry, one).to("cpu").voxel_mm == edge
+
 # Voxels come home as they went, also those outside the occupied box; none at all project to zeros.
 assert np.array_equal(there.to("cpu").data, data)
 empty = Volume(np.zeros((2, 2, 2)), 1.0).to("cuda")
