@@ -226,7 +226,8 @@ def _cgls(
         if norm == 0.0:
             break
         image = problem.project(direction)
-        size = np.float32(norm / dot(image, image))
+        # Exact along any direction: once rounding has spoilt the gradients, steps stay small.
+        size = np.float32(dot(rest, image) / dot(image, image))
         x = x + size * direction
         rest -= size * image
         gradient = problem.spread(rest)

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from flexdt.twin.errors import GeometryError, LimitError
-from flexdt.twin.projection import Volume, forward
+from flexdt.twin.projection import Volume, forward, gpu
 from flexdt.twin.reconstruction import Grid, cgls, em, fdk, sart, sirt, tv
+from flexdt.twin.reconstruction.linear_system import LinearSystem
 from tests.twin.reconstruction.scans import MU, ball, circle, measure
 
 SCAN = circle(45, pixel=1.4)
@@ -52,8 +53,11 @@ def test_cgls_solves_least_squares():
     matrix = np.array(columns, np.float64).T
     data = np.random.default_rng(1).normal(size=(7, 9, 9)).astype(np.float32)
     wanted = np.linalg.lstsq(matrix, data.ravel().astype(float), rcond=None)[0]
+    # Far more iterations than unknowns, and a residual as large as the data: rounding of gradients
+    # must not add up. 27 sums of some 60 lengths, each rounded by 2^-24, times a condition of 3.4.
+    rounding = 60 * 2.0**-24 * np.linalg.cond(matrix)
     got = cgls(data, scan, like, iterations=60).data.ravel()
-    np.testing.assert_allclose(got, wanted, atol=1e-3 * np.abs(wanted).max())
+    np.testing.assert_allclose(got, wanted, rtol=0, atol=rounding * np.abs(wanted).max())
     # SIRT by its own definition, with the explicit matrix
     with np.errstate(divide="ignore"):
         r, c = 1 / matrix.sum(axis=1), 1 / matrix.sum(axis=0)
@@ -64,6 +68,28 @@ def test_cgls_solves_least_squares():
     np.testing.assert_allclose(
         sirt(data, scan, like, iterations=6).data.ravel(), x, atol=1e-3 * np.abs(x).max()
     )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_cgls_stays_at_least_squares_however_the_transpose_rounds(seed, monkeypatch):
+    """As on a device, whose sums differ at every call: far beyond convergence, nothing grows."""
+    draw = np.random.default_rng(seed)
+    like, scan = Grid((3, 3, 3), 4.0).blank(), circle(7, pixel=3.0)
+    unit = np.eye(27, dtype=np.float32).reshape(27, 3, 3, 3)
+    matrix = np.array([forward(Volume(u, 4.0), scan, (9, 9)).ravel() for u in unit], float).T
+    data = draw.normal(size=(7, 9, 9)).astype(np.float32)
+    wanted = np.linalg.lstsq(matrix, data.ravel().astype(float), rcond=None)[0]
+
+    def spread(system, y, views=None):
+        sums = matrix.T @ y.ravel()
+        off = 4 * 2.0**-24 * draw.uniform(-1, 1, 27) * (matrix.T @ np.abs(y.ravel()))
+        return (sums + off).astype(np.float32).reshape(3, 3, 3)
+
+    monkeypatch.setattr(LinearSystem, "spread", spread)
+    monkeypatch.setattr(gpu, "availability", lambda: gpu.Availability(False, "not asked"))
+    got = cgls(data, scan, like, iterations=60).data.ravel()
+    rounding = 60 * 2.0**-24 * np.linalg.cond(matrix)
+    np.testing.assert_allclose(got, wanted, rtol=0, atol=rounding * np.abs(wanted).max())
 
 
 @pytest.mark.slow
