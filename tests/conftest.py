@@ -2,6 +2,7 @@
 
 from suite import (
     data_dir,
+    on_processor,
     pytest_collection_modifyitems,
     pytest_runtest_makereport,
     pytest_runtest_setup,
@@ -12,6 +13,7 @@ from suite import (
 
 __all__ = [
     "data_dir",
+    "on_processor",
     "pytest_collection_modifyitems",
     "pytest_runtest_makereport",
     "pytest_runtest_setup",

@@ -12,6 +12,8 @@ from flexdt.clients.cli import main
 from flexdt.phantoms.materials import material, stated_keV
 from flexdt.twin.reconstruction import Polychromatic, sirt
 
+pytestmark = pytest.mark.usefixtures("on_processor")
+
 SCAN = fx.ConeVec.circular(sod=100, sdd=200, angles=10, shape=(4, 12), pixel=1.0)
 GRID = fx.Grid((3, 8, 8), 0.75)
 WORDS = ("pmma", "steel")

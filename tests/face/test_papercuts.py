@@ -30,6 +30,7 @@ from flexdt.twin.script import ScanPlan
 SCAN = fx.ConeVec.circular(sod=60, sdd=100, angles=16, shape=(16, 16), pixel=1.0)
 
 
+@pytest.mark.usefixtures("on_processor")
 def test_fdk_and_iterative_algorithms_take_a_grid() -> None:
     volume = fx.Volume(np.ones((6, 6, 6)), 0.5)
     images = fx.forward(volume, SCAN)
@@ -219,6 +220,7 @@ def test_line_integrals_in_memory_are_a_data_set() -> None:
         fx.DataSet.from_arrays(np.where(integrals > 2.0, np.nan, integrals), SCAN)
 
 
+@pytest.mark.usefixtures("on_processor")
 def test_scipy_takes_an_operator_as_it_is() -> None:
     linalg = pytest.importorskip("scipy.sparse.linalg")
     operator = fx.Operator(SCAN, fx.Grid((5, 6, 7), 0.5))

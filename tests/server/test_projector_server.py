@@ -34,6 +34,8 @@ from flexdt.twin.projection.analytic_solids import (
 from tests.support.device_simulator import run_simulated
 from tests.support.projector_user import ProjectorUser
 
+pytestmark = pytest.mark.usefixtures("on_processor")
+
 SHAPE = (30, 40)
 RNG = np.random.default_rng(5)
 VOLUME = Volume(RNG.random((12, 10, 8), dtype=np.float32), (0.5, 0.6, 0.7), (0.1, -0.2, 0.3))

@@ -144,6 +144,18 @@ def shared_servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SharedS
         yield SharedServers(running, data, scene)
 
 
+@pytest.fixture
+def on_processor() -> Iterator[None]:
+    """Keep projections off a CUDA device: for tests that compare the processor's bytes.
+
+    A device rounds otherwise, and its transpose adds in another order at every call.
+    """
+    from flexdt.twin.projection import gpu
+
+    with gpu.switched_off():
+        yield
+
+
 @pytest.fixture(scope="session")
 def rays() -> Iterator[Any]:
     """A projector for twins that a module starts itself; twins leave nothing in it."""

@@ -86,6 +86,7 @@ def test_torch_gradients_of_the_transpose(torch, siddon, operator, scan):
         assert float(rows.grad[index]) == pytest.approx(wanted, rel=1e-3, abs=1e-5 * scale)
 
 
+@pytest.mark.usefixtures("on_processor")
 def test_torch_batches_types_and_errors(torch, operator, scan):
     rng = np.random.default_rng(3)
     x = rng.normal(size=(2, 3, *LIKE.shape)).astype(np.float32)

@@ -172,6 +172,7 @@ def test_rays_travel_in_fans_whatever_the_roll(tilt, circle) -> None:
                 assert turned == (abs(np.sin(np.radians(degrees))) > np.sqrt(0.5)), degrees
 
 
+@pytest.mark.usefixtures("on_processor")
 def test_views_on_either_side_in_one_call_equal_single_calls(circle, monkeypatch) -> None:
     volume = Volume(random((31, 23, 18)), 0.1)
     parts = [
@@ -253,6 +254,7 @@ def test_fans_cover_every_pixel_once(name, circle) -> None:
     assert (covered == 1).all()
 
 
+@pytest.mark.usefixtures("on_processor")
 def test_a_thousand_views_in_one_call_equal_single_calls(circle) -> None:
     volume = Volume(random((9, 10, 11)), 0.1)
     geometry = circle(1000, 20.0, 40.0, 0.2, roll=0.01, start=0.001)
@@ -262,6 +264,7 @@ def test_a_thousand_views_in_one_call_equal_single_calls(circle) -> None:
 
 
 @pytest.mark.skipif(numba.get_num_threads() < 2, reason="one core: there is no other number")
+@pytest.mark.usefixtures("on_processor")
 def test_result_does_not_depend_on_the_number_of_threads(circle) -> None:
     volume, geometry = build("60 degree cone, tilted", circle)
     before = numba.get_num_threads()

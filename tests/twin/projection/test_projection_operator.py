@@ -118,6 +118,7 @@ class Foreign:
         return Foreign(np.from_dlpack(array))
 
 
+@pytest.mark.usefixtures("on_processor")
 def test_arrays_of_other_libraries_come_back_as_such(operator):
     x = np.random.default_rng(4).normal(size=(2, 3, 4)).astype(np.float32)
     image = operator @ Foreign(x)

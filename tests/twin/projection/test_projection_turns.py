@@ -15,6 +15,8 @@ from flexdt.twin.projection.kernels import fan_kernels
 from flexdt.twin.projection.operators import box_of, voxel_rays
 from flexdt.twin.projection.volume import blank_layout
 
+pytestmark = pytest.mark.usefixtures("on_processor")
+
 SHAPE = (9, 170)
 GRID = Volume(np.zeros((6, 90, 110), np.float32), (0.1, 0.12, 0.1))
 GEOMETRIES = {
