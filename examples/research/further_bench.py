@@ -245,7 +245,8 @@ def through_server() -> list[Entry]:
 
 
 async def _through(host: str, port: int) -> list[Entry]:
-    from flexdt.server.imaging.projector_pool import ProjectorClient, ProjectorPool
+    from flexdt.server.imaging.projector_client import ProjectorClient
+    from flexdt.server.imaging.projector_pool import ProjectorPool
 
     volume, view = noise(C1_SHAPE), circle(1, BINNED)
     out = np.empty((1, *BINNED), np.float32)

@@ -43,6 +43,8 @@ from flexdt.twin.scanner.state import Sample, StagePlacement
 
 LARGEST = 1e6
 """Above any value of a truth file [mm, deg]; NaN and infinities are not below it."""
+VERSIONS: Final = 2
+"""Of a sample that the projector keeps."""
 
 
 class TrueGeometry:
@@ -105,10 +107,6 @@ def load_truth(path: Path, data: Path) -> TrueGeometry:
     except TwinError as error:
         raise MachineFileError(f"{path}: {error.message}", {"file": str(path)}) from None
     return TrueGeometry(parameters)
-
-
-VERSIONS: Final = 2
-"""Of a sample that the projector keeps."""
 
 
 class Projector(Protocol):

@@ -5,9 +5,6 @@ more of them. One that is lost rests for a while, and its requests go to others,
 it has rested. One that takes much longer than it is known for is not given up, but a second one is
 asked as well, and the first answer counts: all projectors of one kind give the same bytes. When the
 pool's patience ends, it raises `ProjectorUnavailable`.
-
-`ProjectorClient` has one projector's methods. It connects when it is asked for something, and sends
-a volume when it is first asked for it, and again to a server that has restarted or lost it.
 """
 
 from __future__ import annotations
@@ -15,176 +12,17 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-import ssl as tls
-from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass
-from typing import Any, Final, TypeVar
+from collections.abc import Coroutine, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
 
-import numpy as np
-import numpy.typing as npt
-
-from flexdt.phantoms.checked_reading import scene_to_dict
-from flexdt.protocol import Code, RpcError, hello_params, image, parse_result
-from flexdt.protocol.projector import Health
+from flexdt.protocol import Code, RpcError
 from flexdt.runtime.log import Sparing, log
 from flexdt.runtime.wire_errors import ProjectorUnavailable
-from flexdt.server.projector.wire import LinkLost, ProjectorLink
+from flexdt.server.imaging.projector_client import ProjectorClient
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.projection import Body, TriangleMesh
-from flexdt.twin.projection.analytic_solids import Scene
-
-_T = TypeVar("_T")
-
-CHUNK: Final = 8 * 2**20
-"""Bytes of a volume in one message."""
-
-
-@dataclass(eq=False, repr=False)
-class ProjectorClient:
-    """A connection to a projector server that is made anew when it is lost.
-
-    Attributes:
-        host, port: of the server.
-        token: where it wants one.
-        ssl: a client's TLS context.
-    """
-
-    host: str = "127.0.0.1"
-    port: int = 55001
-    _: KW_ONLY
-    token: str | None = None
-    ssl: tls.SSLContext | None = None
-
-    def __post_init__(self) -> None:
-        self._sent: dict[str, Body] = {}
-        self._instance: object = None
-        self._channel: ProjectorLink | None = None
-        self._connecting, self._sending = asyncio.Lock(), asyncio.Lock()
-        self._closed = False
-
-    @property
-    def connected(self) -> bool:
-        """Whether there is a connection at this moment."""
-        return self._channel is not None and not self._channel.lost
-
-    async def close(self) -> None:
-        """End the connection; open requests fail."""
-        self._closed = True
-        if self._channel is not None:
-            self._channel.close()
-
-    async def give(self, name: str, body: Body) -> None:
-        """Make sure that the server has `body` under `name`.
-
-        Raises:
-            RpcError: -32008, above the server's memory limit; -32602, a mesh that does not close.
-            ProjectorUnavailable: the server does not answer.
-        """
-        async with self._sending:
-            await self._ask("volume.put", lambda channel: self._give(channel, name, body))
-
-    async def _give(self, channel: ProjectorLink, name: str, body: Body) -> None:
-        if self._sent.get(name) is not body:
-            await _send(channel, name, body)
-            self._sent[name] = body
-
-    async def remove(self, name: str) -> None:
-        """Have the server forget what it was given under `name`."""
-        if self._sent.pop(name, None) is not None:
-            await self.ask("volume.remove", {"name": name})
-
-    async def project(
-        self, name: str, body: Body | None, cone_vec: ConeVec, shape: tuple[int, int]
-    ) -> npt.NDArray[np.float32]:
-        """Line integrals.
-
-        Args:
-            name, body: what is projected; None if it is there already.
-            cone_vec: n views, object frame.
-            shape: detector (rows, cols).
-
-        Returns:
-            float32 (n, rows, cols), read-only.
-
-        Raises:
-            RpcError: invalid parameters, or an unknown volume.
-            ProjectorUnavailable: the server does not answer.
-        """
-        params: dict[str, object] = {
-            "volume": name, "cone_vec": image.encode(cone_vec.rows), "detector": list(shape),
-        }  # fmt: skip
-        whole = (len(cone_vec), *shape)
-        if body is not None:
-            await self.give(name, body)
-        try:
-            return await self._ask("project", lambda c: c.ask_array("project", params, whole))
-        except RpcError as error:
-            there = error.data.get("allowed") if isinstance(error.data, Mapping) else None
-            if body is None or not isinstance(there, list) or name in there:
-                raise
-        self._sent.pop(name, None)  # another client has removed it
-        await self.give(name, body)
-        return await self._ask("project", lambda c: c.ask_array("project", params, whole))
-
-    async def health(self) -> Health:
-        """The server's version, load and memory."""
-        return parse_result(Health, await self.ask("health", {}))
-
-    async def ask(self, method: str, params: Mapping[str, object]) -> object:
-        """The result of any method; raises as `project`."""
-        return await self._ask(method, lambda channel: channel.ask(method, params))
-
-    async def _ask(self, method: str, work: Callable[[ProjectorLink], Awaitable[_T]]) -> _T:
-        async with self._connecting:
-            if self._channel is None or self._channel.lost:
-                self._channel = await self._connect()
-            channel = self._channel
-        try:
-            return await work(channel)
-        except LinkLost:
-            raise ProjectorUnavailable(
-                f"the projector at {self.host}:{self.port} went away during {method}"
-            ) from None
-
-    async def _connect(self) -> ProjectorLink:
-        if self._closed:
-            raise ProjectorUnavailable("the projector client is closed")
-        try:
-            channel = await ProjectorLink.connect(self.host, self.port, self.ssl)
-            try:
-                answer = await channel.ask("session.hello", hello_params("flexdt twin", self.token))
-            except BaseException:
-                channel.close()
-                raise
-        except OSError as error:
-            why = getattr(error, "strerror", None) or str(error) or "no answer"
-            raise ProjectorUnavailable(f"no projector at {self.host}:{self.port} ({why})") from None
-        instance = answer.get("instance") if isinstance(answer, Mapping) else None
-        if instance != self._instance:
-            self._instance, self._sent = instance, {}
-        return channel
-
-
-async def _send(channel: ProjectorLink, name: str, value: Body) -> None:
-    """Send a volume or mesh in chunks, or a scene."""
-    if isinstance(value, Scene):
-        await channel.ask("volume.put", {"name": name, "scene": scene_to_dict(value)})
-        return
-    what: dict[str, object]
-    if isinstance(value, TriangleMesh):
-        what = {"mesh": {"vertices": len(value.vertices), "triangles": len(value.faces)}}
-        corners, faces = value.vertices.astype("<f8"), value.faces.astype("<i4")
-        flat = np.frombuffer(corners.tobytes() + faces.tobytes(), np.uint8)
-    else:
-        center = [float(c) for c in value.center_mm]
-        shape, voxel = list(value.shape), list(value.voxel_xyz)
-        what = {"grid": {"shape": shape, "voxel_mm": voxel, "center_mm": center}}
-        flat = np.ascontiguousarray(value.data, dtype="<f4").reshape(-1).view(np.uint8)
-    for start in range(0, flat.size, CHUNK):
-        data = flat[start : start + CHUNK].data.toreadonly()
-        await channel.ask("volume.put", {"name": name, **what, "start": start, "data": data})
-
+from flexdt.twin.projection import Body
 
 OPEN: Final = 2
 """Requests that a projector has at a time: one is computed while the other travels."""

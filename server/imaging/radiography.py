@@ -47,6 +47,16 @@ Physics = Literal["ideal", "mono", "poly"]
 SCATTER: Final = mc.ScatterSettings()
 FORGOTTEN_S: Final = 10.0
 """Time after which an earlier frame has left nothing on the panel."""
+Before = Sequence[tuple[Radiograph, float]]
+"""Earlier frames taken with X-rays on, and the time [s] from their ends to this frame's start."""
+BEST: Final = 10
+"""Settings that are proposed."""
+EVERY = 3
+"""Pixels are judged on a grid with this step, edges on all their pixels."""
+SHADOW = 0.05
+"""Line integral on an edge of the image from which the sample counts as cut off."""
+SATURATED, STARVED, CUT_OFF = 1, 2, 4
+"""What a pixel's mark is the sum of."""
 
 
 def with_spectra(machine: Machine, physics: Physics) -> Machine:
@@ -66,10 +76,6 @@ def with_spectra(machine: Machine, physics: Physics) -> Machine:
         raise LimitError.instead(said, tube.kV, f"{low:g} to {high:g} kV")
     held = tube.model_copy(update={"min_kV": low, "max_kV": high})
     return machine.model_copy(update={"tube": held})
-
-
-Before = Sequence[tuple[Radiograph, float]]
-"""Earlier frames taken with X-rays on, and the time [s] from their ends to this frame's start."""
 
 
 @dataclass(frozen=True)
@@ -256,16 +262,6 @@ class Radiography:
             if earlier.expected is not None
         ]
         return read_out(self.panel, expected, camera, exposure, rng, left, trapped)
-
-
-BEST: Final = 10
-"""Settings that are proposed."""
-EVERY = 3
-"""Pixels are judged on a grid with this step, edges on all their pixels."""
-SHADOW = 0.05
-"""Line integral on an edge of the image from which the sample counts as cut off."""
-SATURATED, STARVED, CUT_OFF = 1, 2, 4
-"""What a pixel's mark is the sum of."""
 
 
 def marks_of(

@@ -34,6 +34,7 @@ from flexdt.protocol.rpc_errors import ProtocolError, RpcError
 from flexdt.runtime.access import ConnectionLimits, check_bind
 from flexdt.runtime.log import Sparing
 from flexdt.runtime.process import ListeningServer, tune
+from flexdt.server.network import admission, deadlines, loop_turns, outbox
 from flexdt.server.network import shell_parts as parts
 
 READ_AHEAD = 512 << 10
@@ -72,9 +73,9 @@ class TcpServer(ListeningServer):
 
     def __post_init__(self) -> None:
         self.links: set[_Link] = set()
-        self.waiting, self.reserved = parts.Room(parts.WAITING), parts.Room(RESERVED)
+        self.waiting, self.reserved = admission.Room(admission.WAITING), admission.Room(RESERVED)
         self.lines = Sparing()
-        self.turns = parts.LoopTurns()
+        self.turns = loop_turns.LoopTurns()
         self.urgent = tuple(x.name.encode() for x in self.methods.values() if x.urgent)
         self._to_look_at: dict[_Link, None] = {}  # in the order in which they came
         self._look_due = False
@@ -109,7 +110,7 @@ class TcpServer(ListeningServer):
         """Stop listening, end every connection, wait until all are gone."""
         if self.server is not None:
             self.server.close()
-        links: list[parts.Guest] = [*self.links, *self.waiting.guests, *self.reserved.guests]
+        links: list[admission.Guest] = [*self.links, *self.waiting.guests, *self.reserved.guests]
         for link in links:
             link.end()
         await asyncio.gather(*(link.gone.wait() for link in links))
@@ -167,15 +168,15 @@ class _Link(asyncio.BufferedProtocol):
         self.estop_came = False  # and stands, maybe, among what has not been looked at
         self.ended = False
         self.broken = 0
-        self.token_check = parts.TokenCheck(
+        self.token_check = admission.TokenCheck(
             server.token, lambda: self.loop.call_soon(self.close, "wrong tokens"), server.lines
         )
         self.allowance = 0.0
         self.allowance_at = 0.0
-        self.out = parts.Outbox(self)
+        self.out = outbox.Outbox(self)
         self.worker: asyncio.Task[None] | None = None
         self.tasks: set[asyncio.Task[None]] = set()
-        self.deadlines = parts.Deadlines(
+        self.deadlines = deadlines.Deadlines(
             lambda what, seconds: self.abort(f"no {what} within {seconds:g} s")
         )
 
@@ -190,7 +191,7 @@ class _Link(asyncio.BufferedProtocol):
         self.name = f"{peer[0]}:{peer[1]}#{self.number}"
         self.transport.set_write_buffer_limits(high=64 * 1024)
         tune(self.transport.get_extra_info("socket"))
-        self.address = parts.neighbourhood(str(peer[0]))
+        self.address = admission.neighbourhood(str(peer[0]))
         if self.let_in:
             self._open()
         else:
@@ -246,8 +247,8 @@ class _Link(asyncio.BufferedProtocol):
                 return False  # it costs more than a look; it is urgent in its turn
             message = self.wire.decode(raw)
             lane, served = self._lane(message), len(self.tasks) + len(found)
-            if lane == parts.ORDINARY or served >= URGENT_AT_ONCE * (
-                4 if lane == parts.FIRST else 1
+            if lane == loop_turns.ORDINARY or served >= URGENT_AT_ONCE * (
+                4 if lane == loop_turns.FIRST else 1
             ):
                 return False
             found.append(message)
@@ -353,20 +354,22 @@ class _Link(asyncio.BufferedProtocol):
         name = ""
         match message:
             case m.Batch(items):
-                return min(map(self._lane, items), default=parts.ORDINARY)
+                return min(map(self._lane, items), default=loop_turns.ORDINARY)
             case parts.Frozen(method=method):
                 name = method
             case m.Request(method=method) | m.Notification(method=method):
                 name = method
         known = self.server.methods.get(name)
         if not self.let_in or known is None or not known.urgent:
-            return parts.ORDINARY
-        return parts.FIRST if name == ESTOP else parts.URGENT
+            return loop_turns.ORDINARY
+        return loop_turns.FIRST if name == ESTOP else loop_turns.URGENT
 
     async def _work(self) -> None:
         while True:
             while self.wire.whole:
-                await self.server.turns.take(self, parts.ORDINARY if self.let_in else parts.URGENT)
+                await self.server.turns.take(
+                    self, loop_turns.ORDINARY if self.let_in else loop_turns.URGENT
+                )
                 raw = self.wire.next_raw()
                 self._relax()
                 if isinstance(raw, m.Malformed) and raw.fatal:
@@ -441,7 +444,7 @@ class _Link(asyncio.BufferedProtocol):
             if waits:
                 await self._turn(item)
             waits = True
-            full = size > most and self._lane(item) == parts.ORDINARY
+            full = size > most and self._lane(item) == loop_turns.ORDINARY
             error = errors.too_large("the answers to a batch", f"more than {most}", most)
             answer = await self._answer(item, error if full else None)
             if answer is not None:

@@ -1,328 +1,36 @@
-"""The methods of the projector server, and what they work with: volumes, meshes and scenes by name.
+"""The methods of the projector server.
 
-`Context` has the compute thread, the volumes and the clients; jobs are started and results are sent
-from there, in one piece or in parts. Each method translates parameters, has the work done in the
-compute thread, and translates back. The connections are in `service`.
-
-Memory is counted as what a volume takes once it is projected: its voxels and the projector's own
-z-contiguous copy. Nothing is evicted: above the limit a put is an error.
+Each method translates parameters, has the work done in the compute thread, and translates back. The
+connections are in `service`.
 """
 
 from __future__ import annotations
 
-import asyncio
 import math
 import time
-import uuid
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cache
 from importlib.metadata import version
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
 from flexdt.phantoms.checked_reading import scene_from_dict
-from flexdt.protocol import MAX_FRAME, PROTOCOL, Correlation, Notification, Role, image
+from flexdt.protocol import MAX_FRAME, PROTOCOL, image
 from flexdt.protocol import projector as wire
 from flexdt.protocol.fields import Params
 from flexdt.protocol.messages import Id
 from flexdt.protocol.methods import openrpc_document
 from flexdt.protocol.methods.session_messages import Hello
-from flexdt.protocol.rpc_errors import RpcError, cancelled, invalid_params, superseded, too_large
-from flexdt.runtime.log import Sparing
-from flexdt.server.network.shell_parts import TokenCheck
+from flexdt.protocol.rpc_errors import cancelled, invalid_params, too_large
 from flexdt.server.projector.compute import (
-    ComputeJob,
-    ComputeThread,
-    Lane,
-    Step,
     projection_steps,
     views_a_block,
 )
-from flexdt.server.projector.wire import FrameLink
-from flexdt.twin.projection import Body, TriangleMesh, Volume, back
+from flexdt.server.projector.job_context import SPARE, Context, JobClient
+from flexdt.twin.projection import TriangleMesh, Volume, back
 from flexdt.twin.projection.operators import as_cone_vec
-
-LAYOUT_COPIES = 2
-"""A volume's voxels are kept twice: as they came and z-contiguous."""
-
-SOLID_BYTES = 1024
-"""Counted for each solid of a scene."""
-
-
-@dataclass
-class _Upload:
-    """Voxels or a mesh that are still coming, and their bytes."""
-
-    owner: object
-    what: wire.VoxelGrid | wire.MeshSize
-    data: np.ndarray[tuple[int], np.dtype[np.uint8]]
-    received: int = 0
-
-    def whole(self) -> Volume | TriangleMesh:
-        """What they are once all have come.
-
-        Raises:
-            GeometryError: a mesh that does not close.
-        """
-        if isinstance(self.what, wire.VoxelGrid):
-            voxels = self.data.view("<f4").reshape(self.what.shape)
-            return Volume(voxels, self.what.voxel_mm, self.what.center_mm)
-        corners = 24 * self.what.vertices
-        return TriangleMesh(
-            self.data[:corners].view("<f8").reshape(-1, 3),
-            self.data[corners:].view("<i4").reshape(-1, 3).astype(np.int64),
-        )
-
-
-class VolumeStore:
-    """The server's volumes, by name.
-
-    Args:
-        limit: bytes that all volumes together may take.
-    """
-
-    def __init__(self, limit: int) -> None:
-        self.limit = limit
-        self._held: dict[str, Body] = {}
-        self._uploads: dict[tuple[object, str], _Upload] = {}
-
-    def __len__(self) -> int:
-        return len(self._held)
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._held
-
-    @property
-    def used(self) -> int:
-        """Bytes taken by volumes and uploads."""
-        held = sum(memory_of(v) for v in self._held.values())
-        return held + sum(_needed(u.what) for u in self._uploads.values())
-
-    def get(self, name: str) -> Body:
-        """The volume called `name`.
-
-        Raises:
-            RpcError: -32602, listing the names.
-        """
-        if name not in self._held:
-            raise invalid_params(
-                f"no volume {name!r}; there are: {', '.join(sorted(self._held)) or 'none'}",
-                [{"path": "volume", "message": "unknown volume", "asked": name}],
-                sorted(self._held),
-            )
-        return self._held[name]
-
-    def put(self, name: str, value: Body) -> None:
-        """Store a whole volume, mesh or scene under `name`, in place of its namesake.
-
-        Raises:
-            RpcError: -32008, above the memory limit.
-        """
-        self.reserve(f"volume {name!r}", memory_of(value), name)
-        self._held[name] = value
-
-    def chunk(
-        self,
-        owner: object,
-        name: str,
-        what: wire.VoxelGrid | wire.MeshSize,
-        start: int,
-        data: memoryview,
-    ) -> tuple[int, Callable[[], Volume | TriangleMesh] | None]:
-        """Take a chunk of voxels or of a mesh.
-
-        Chunks come in order. The complete volume is not stored: `put` does that.
-
-        Returns:
-            Bytes received so far and, once all have come, what makes the volume or mesh of them.
-
-        Raises:
-            RpcError: -32008 above the memory limit; -32602, chunks that do not fit together.
-        """
-        total = what.nbytes
-        key = (owner, name)
-        if start == 0:
-            self._uploads.pop(key, None)
-            # The namesake stays in use until the new volume is whole, so both are counted.
-            self.reserve(f"volume {name!r}", _needed(what))
-            self._uploads[key] = _Upload(owner, what, np.empty(total, np.uint8))
-        upload = self._uploads.get(key)
-        if upload is None or upload.what != what or upload.received != start:
-            expected = 0 if upload is None else upload.received
-            raise _bad_chunk(name, start, expected)
-        end = start + data.nbytes
-        if end > total or (data.nbytes == 0 and total > 0):
-            raise _bad_chunk(name, end, total)
-        upload.data[start:end] = np.frombuffer(data, np.uint8)
-        upload.received = end
-        if end < total:
-            return end, None
-        del self._uploads[key]
-        return end, upload.whole
-
-    def remove(self, name: str) -> bool:
-        """Forget a volume; returns whether there was one."""
-        return self._held.pop(name, None) is not None
-
-    def forget(self, owner: object) -> None:
-        """Drop the unfinished uploads of a client that has gone."""
-        for key in [k for k in self._uploads if k[0] is owner]:
-            del self._uploads[key]
-
-    def describe(self) -> list[wire.VolumeInfo]:
-        """All volumes, by name."""
-        return [_info(name, self._held[name]) for name in sorted(self._held)]
-
-    def reserve(self, what: str, needed: int, replaced: str | None = None) -> None:
-        """Raise -32008 unless there is room for `needed` bytes more, in place of a volume's."""
-        old = self._held.get(replaced) if replaced is not None else None
-        used = self.used - (0 if old is None else memory_of(old))
-        if used + needed > self.limit:
-            error = too_large(what, needed, max(0, self.limit - used))
-            assert isinstance(error.data, dict)
-            error.data.update(memory_used=used, memory_limit=self.limit)
-            raise error
-
-
-def memory_of(value: Body) -> int:
-    """Bytes counted for a volume, mesh or scene."""
-    if isinstance(value, Volume):
-        return LAYOUT_COPIES * 4 * math.prod(value.shape)
-    if isinstance(value, TriangleMesh):
-        return value.vertices.nbytes + value.faces.nbytes
-    return SOLID_BYTES * max(1, len(value.solids))
-
-
-def _needed(what: wire.VoxelGrid | wire.MeshSize) -> int:
-    if isinstance(what, wire.VoxelGrid):
-        return LAYOUT_COPIES * what.nbytes
-    return 24 * (what.vertices + what.triangles) + what.nbytes
-
-
-def _bad_chunk(name: str, asked: int, allowed: int) -> RpcError:
-    return invalid_params(
-        f"volume {name!r}: a chunk at or up to byte {asked} does not fit; expected {allowed}",
-        [{"path": "start", "message": "chunks must come in order", "asked": asked}],
-        allowed,
-    )
-
-
-def _info(name: str, value: Body) -> wire.VolumeInfo:
-    if isinstance(value, TriangleMesh):
-        triangles = len(value.faces)
-        return wire.VolumeInfo(name=name, kind="mesh", bytes=memory_of(value), triangles=triangles)
-    if isinstance(value, Volume):
-        return wire.VolumeInfo(
-            name=name,
-            kind="voxels",
-            bytes=memory_of(value),
-            shape=list(value.shape),
-            voxel_mm=value.voxel_xyz,
-            center_mm=value.center_mm,
-        )
-    return wire.VolumeInfo(
-        name=name, kind="scene", bytes=memory_of(value), solids=len(value.solids)
-    )
-
-
-PART_BYTES: Final = 8 * 2**20
-"""Payload of a part of what does not fit into one frame."""
-SPARE: Final = 4096
-"""Room for everything but the payload in a frame."""
-
-
-class JobClient:
-    """One connection, its jobs and its requests that are under way."""
-
-    def __init__(self, link: FrameLink, token: str | None, lines: Sparing) -> None:
-        self.link, self.let_in = link, token is None
-        self.lanes = Lane(), Lane()
-        self.jobs: dict[Id, ComputeJob] = {}
-        self.calls: Correlation[None] = Correlation(Role.SERVER)
-        self.tasks: set[asyncio.Task[None]] = set()
-        self.pending_bytes = 0
-        self.token_check = TokenCheck(token, self._close_soon, lines)
-
-    def begin(self, id: Id, key: str | None = None) -> ComputeJob:
-        """The work of a request, known by its id until that is answered."""
-        job = self.jobs[id] = ComputeJob(self.lanes[key is not None], key)
-        return job
-
-    def _close_soon(self) -> None:
-        """End the connection once its last answer has gone out."""
-        asyncio.get_running_loop().call_later(0.1, self.link.transport.close)
-
-
-@dataclass(eq=False, repr=False)
-class Context:
-    """The projector's state.
-
-    Attributes:
-        compute: the thread that computes.
-        store: named volumes.
-        token: clients must bring it.
-        facts: backend and threads, for `health`.
-        clients: by connection.
-        instance: names this start of the server.
-        started: when it was [s], monotonic.
-        views: projected so far.
-        superseded: requests that newer ones have replaced.
-        lines: of the log about connections.
-    """
-
-    compute: ComputeThread
-    store: VolumeStore
-    token: str | None
-    facts: Mapping[str, object]
-    clients: dict[FrameLink, JobClient] = field(default_factory=dict)
-    instance: str = field(default_factory=lambda: uuid.uuid4().hex)
-    started: float = field(default_factory=time.monotonic)
-    views: int = 0
-    superseded: int = 0
-    lines: Sparing = field(default_factory=Sparing)
-
-    @property
-    def waiting(self) -> int:
-        """Requests whose work waits for its turn."""
-        return sum(job.waits for client in self.clients.values() for job in client.jobs.values())
-
-    async def run(self, client: JobClient, id: Id, step: Step) -> object:
-        """The value of the one step of a request."""
-        return await client.begin(id).run(self.compute, step)
-
-    def supersede(self, client: JobClient, key: str) -> None:
-        """End this client's interactive jobs of that key that have not been computed."""
-        for job in client.jobs.values():
-            if job.key == key and job.waits:
-                job.end(superseded(key))
-                self.superseded += 1
-
-    async def send_array(
-        self, client: JobClient, id: Id, array: npt.NDArray[np.generic]
-    ) -> dict[str, object]:
-        """An array as the result of a request; what does not fit has gone before, in parts."""
-        if array.nbytes + SPARE <= MAX_FRAME:
-            return image.encode(array)
-        parts = await self.send_parts(client, id, array, 0)
-        return {"dtype": array.dtype.name, "shape": list(array.shape), "parts": parts}
-
-    async def send_parts(
-        self, client: JobClient, id: Id, array: npt.NDArray[np.generic], start: int
-    ) -> int:
-        """Send an array as parts of a result, from its element `start` on; how many."""
-        flat = np.ascontiguousarray(array).reshape(-1)
-        step = PART_BYTES // flat.itemsize
-        parts = 0
-        for at in range(0, flat.size, step):
-            data = flat[at : at + step].view(np.uint8).data.toreadonly()
-            part = {"request": id, "start": start + at, "data": data}
-            await client.link.send(Notification("part", part))
-            parts += 1
-        return parts
-
 
 MAX_VIEW_BYTES: Final = 512 * 2**20
 

@@ -30,7 +30,9 @@ from flexdt.runtime.log import current, log
 from flexdt.runtime.process import ListeningServer
 from flexdt.server.network.shell_parts import Observe, answered, unobserved
 from flexdt.server.projector.compute import ComputeThread
-from flexdt.server.projector.projector_methods import ANSWERS, Context, JobClient, VolumeStore
+from flexdt.server.projector.job_context import Context, JobClient
+from flexdt.server.projector.projector_methods import ANSWERS
+from flexdt.server.projector.volume_store import VolumeStore
 from flexdt.server.projector.wire import FrameLink
 from flexdt.twin.errors import TwinError
 

@@ -32,7 +32,7 @@ from flexdt.protocol.projector import Array
 from flexdt.protocol.rpc_errors import ProtocolError, RpcError, parse_error, too_large
 from flexdt.runtime.log import current, log
 from flexdt.runtime.process import tune
-from flexdt.server.network.shell_parts import Deadlines
+from flexdt.server.network.deadlines import Deadlines
 
 SILENT_S: Final = 10.0
 """A projector that sends nothing for so long, while it is asked something, has gone."""

@@ -25,6 +25,11 @@ from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import StartState
 
 Poses = list[dict[str, float]]
+FOLDER = "jobs"
+SCHEMA = 2
+MAX_MOMENTS = 64
+_EXPOSURE: TypeAdapter[float | None] = TypeAdapter(float | None)
+_FLAT: TypeAdapter[bool | dict[str, float]] = TypeAdapter(bool | dict[str, float])
 
 
 @dataclass(frozen=True)
@@ -50,11 +55,6 @@ class PoseList:
         """As lists and dictionaries."""
         poses: Poses = json.loads(self.text)
         return poses
-
-
-FOLDER = "jobs"
-SCHEMA = 2
-MAX_MOMENTS = 64
 
 
 @dataclass(frozen=True)
@@ -112,8 +112,6 @@ class StartConditions:
 
 BEGINNING: Final = TypeAdapter(StartConditions)
 """Reads what `asdict` of a beginning made; raises ValueError if it did not."""
-_EXPOSURE: TypeAdapter[float | None] = TypeAdapter(float | None)
-_FLAT: TypeAdapter[bool | dict[str, float]] = TypeAdapter(bool | dict[str, float])
 
 
 @dataclass(frozen=True)

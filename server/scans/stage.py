@@ -41,6 +41,8 @@ KEPT = 8
 MAX_BYTES: Final = 64 << 20
 HEADER, FACE = 84, 50
 """Bytes of binary STL: before the faces, and of each."""
+_Content = tuple[Sample, str | None]
+"""A sample and what its upload held: another file may come under the same name."""
 
 
 class Stage:
@@ -133,10 +135,6 @@ class Stage:
 
     def _content(self, sample: Sample, upload: ReceivedSample | None) -> _Content:
         return sample, upload.shown if upload else self.revision(sample)
-
-
-_Content = tuple[Sample, str | None]
-"""A sample and what its upload held: another file may come under the same name."""
 
 
 def _pieces(phantom: Phantom, offset: StagePlacement) -> tuple[Polytope, ...]:

@@ -25,7 +25,8 @@ from flexdt.runtime.files.own_documents import used_bytes
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.scans.acquisition import Acquisition, FrameListener
 from flexdt.server.scans.checking import CheckInput, Checks
-from flexdt.server.scans.jobs import Job, JobInputs, Jobs, Prepare
+from flexdt.server.scans.jobs import Jobs
+from flexdt.server.scans.scan_job import Job, JobInputs, Prepare
 from flexdt.server.scans.scan_record import FOLDER, JobRecord, ScanSource, StartConditions
 from flexdt.server.scans.stage import Stage
 from flexdt.server.scans.twin_clock import SpeedUp

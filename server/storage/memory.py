@@ -8,141 +8,35 @@ scan are written as they change, at most a few times a second, and when the serv
 waits for no disk, but it is written at once, whatever was written a moment ago or failed. After a
 restart X-rays are off, motors are where they were last recorded, and interrupted scans are marked
 so and can be resumed. A damaged document is set aside, and the server starts without it.
-
-Corrections are dated, named and never edited, each a JSON file under DATA/corrections. Those in
-force, present and past, are part of the state: their names in the order in which they were applied.
-The last one is in force; None and an empty list mean nominal. A damaged file is set aside; if it
-was in force, no correction is.
-
-The scanner's part of it is `Scene` of `document_messages`, the document of scene.*; it is validated
-whole before any of it is applied.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-import math
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict
 from datetime import UTC, datetime
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 from annotated_types import Ge, Le
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from flexdt.protocol.fields import ShortText, SpeedUp
+from flexdt.protocol.fields import SpeedUp
 from flexdt.protocol.methods import document_messages as p
-from flexdt.protocol.rpc_errors import RpcError, invalid_params
+from flexdt.protocol.rpc_errors import RpcError
 from flexdt.protocol.state_model import JobPhase
 from flexdt.runtime.files import own_documents as own
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.log import log
+from flexdt.server.storage.scene_document import apply_settings, require_fit, sample_of, save_scene
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetWriteError
 from flexdt.twin.dataset.file_names import plain_name
-from flexdt.twin.errors import TwinError, UnknownNameError
-from flexdt.twin.geometry.offsets import Offsets, require_plausible
-from flexdt.twin.machine.camera import Roi
+from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import Machine
-from flexdt.twin.machine.kinematics import resolve_targets
 from flexdt.twin.scanner.scanner import ScannerTwin
-from flexdt.twin.scanner.state import NamedCorrection, Sample, StagePlacement
-
-
-def save_scene(
-    scanner: ScannerTwin, now: float, *, name: str = "", saved: str = "", version: str = ""
-) -> p.Scene:
-    """The scanner as a document; a motor under way is saved where it is bound."""
-    return p.Scene(
-        schema=1,
-        flexdt=version,
-        name=name,
-        saved=saved,
-        machine=scanner.machine.name,
-        profile=scanner.profile.name,
-        positions=scanner.targets(now),
-        speeds={axis: pace[0] for axis, pace in scanner.paces.items()},
-        accelerations={axis: pace[1] for axis, pace in scanner.paces.items()},
-        tube=p.TubePart(kV=scanner.tube.kV, power_W=scanner.tube.power_W, on=scanner.tube.on),
-        camera=p.CameraPart(**scanner.camera.stated),
-        sample=p.SamplePart(
-            name=scanner.sample.name,
-            material=scanner.sample.material,
-            offset=p.Placement(**asdict(scanner.sample.offset)),
-        ),
-        correction=None
-        if scanner.correction is None
-        else p.CorrectionPart(**correction_fields(scanner.correction)),
-    )
-
-
-def correction_fields(correction: NamedCorrection) -> dict[str, Any]:
-    """A correction as documents and the wire name its values, in mm and deg."""
-    return {
-        "name": correction.name,
-        "date": correction.date,
-        "parameters": correction.parameters.to_edge(),
-        "comment": correction.note,
-    }
-
-
-def correction_of(part: p.CorrectionPart) -> NamedCorrection:
-    """The correction of a document.
-
-    Raises:
-        UnknownNameError: a name that is not a parameter.
-    """
-    return NamedCorrection.from_edge(part.name, part.date, part.parameters, part.comment)
-
-
-def require_fit(scene: p.Scene, scanner: ScannerTwin) -> None:
-    """Check that a scene fits this scanner.
-
-    Raises:
-        RpcError: -32602, another machine's.
-        UnknownNameError, LimitError: an axis, position or setting this scanner does not have.
-        GeometryError: a correction that no scanner can have.
-    """
-    if scene.machine != scanner.machine.name:
-        raise invalid_params(
-            f"the scene is of machine {scene.machine!r}, this is {scanner.machine.name!r}",
-            [{"path": "machine", "message": "another machine", "asked": scene.machine}],
-            scanner.machine.name,
-        )
-    resolve_targets(scanner.machine, scene.positions, scene.positions)
-    trial = ScannerTwin(scanner.machine, scanner.profile)
-    apply_settings(scene, trial)
-    if scene.correction is not None:
-        trial.require_applicable(correction_of(scene.correction))
-
-
-def paces_of(scene: p.Scene, scanner: ScannerTwin) -> dict[str, tuple[float, float]]:
-    """Motor -> (speed, acceleration) with the scene's where it has them."""
-    return {
-        axis: (scene.speeds.get(axis, speed), scene.accelerations.get(axis, acceleration))
-        for axis, (speed, acceleration) in scanner.paces.items()
-    }
-
-
-def apply_settings(scene: p.Scene, scanner: ScannerTwin) -> None:
-    """Set tube, camera and paces as in the scene; X-rays are not switched."""
-    for axis, speed in scene.speeds.items():
-        scanner.set_axis(axis, speed=speed)
-    for axis, acceleration in scene.accelerations.items():
-        scanner.set_axis(axis, acceleration=acceleration)
-    scanner.set_tube(kV=scene.tube.kV, power_W=scene.tube.power_W)
-    camera = scene.camera.model_dump()
-    scanner.set_camera(**camera | {"roi": Roi(*scene.camera.roi)})
-
-
-def sample_of(scene: p.Scene) -> Sample:
-    """The scene's sample."""
-    return Sample(
-        scene.sample.name, StagePlacement(**scene.sample.offset.model_dump()), scene.sample.material
-    )
-
+from flexdt.twin.scanner.state import Sample
 
 FILE = "state.json"
 INTERVAL_S = 0.25
@@ -405,132 +299,3 @@ def _within(machine: Machine, positions: Mapping[str, float]) -> dict[str, float
     """Positions without the rounding errors of a motion seen in mid-flight."""
     axes = machine.axes
     return {name: min(max(x, axes[name].lower), axes[name].upper) for name, x in positions.items()}
-
-
-KEPT = 1000
-"""Corrections put in force that `revert` can go back through."""
-
-History = list[str | None]
-
-
-class CorrectionFile(p.CorrectionPart):
-    """A correction as a document."""
-
-    schema_version: Literal[1] = Field(alias="schema")
-    source: ShortText | None = None
-
-
-class Corrections:
-    """All corrections of one data directory.
-
-    Args:
-        folder: where they are kept; made when the first is stored.
-        history: names in the order in which they were put in force.
-    """
-
-    def __init__(self, folder: Directory, history: Sequence[str | None] = ()) -> None:
-        self._folder = folder
-        self._all: dict[str, NamedCorrection] = {}
-        self._sources: dict[str, str | None] = {}
-        for file in own.ours(folder):
-            without = "a correction cannot be read; without it"
-            found = own.read_or_set_aside(folder, file, _read, without)
-            if found is not None:
-                self.know(*found)
-        known = list(history)
-        self.lost: str | None = None
-        """The correction that was in force and is not there any more."""
-        if known and known[-1] is not None and known[-1] not in self._all:
-            self.lost = known[-1]
-            known.append(None)
-        self.history: History = [name for name in known if name is None or name in self._all]
-
-    def all(self) -> list[NamedCorrection]:
-        """Every correction, oldest first."""
-        return sorted(self._all.values(), key=lambda c: c.date)
-
-    def source(self, name: str) -> str | None:
-        """What the correction called `name` came from."""
-        return self._sources.get(name)
-
-    @property
-    def in_force(self) -> NamedCorrection | None:
-        """The correction in force."""
-        return self.last(self.history)
-
-    def last(self, history: History) -> NamedCorrection | None:
-        """The correction in force after `history`."""
-        name = history[-1] if history else None
-        return None if name is None else self._all[name]
-
-    def get(self, name: str) -> NamedCorrection:
-        """The correction called `name`.
-
-        Raises:
-            UnknownNameError: lists the names there are.
-        """
-        if name not in self._all:
-            none = "" if self._all else "none"
-            problem = f"no correction called {name!r}; there are"
-            raise UnknownNameError.among(problem, name, self._all, none)
-        return self._all[name]
-
-    def make(
-        self, values: Mapping[str, float], name: str | None, note: str, when: datetime | None = None
-    ) -> NamedCorrection:
-        """A new correction from edge values [mm, deg]; nothing is stored yet.
-
-        Raises:
-            UnknownNameError: a name that is not a parameter.
-            RpcError: -32602, the name is taken; corrections are never edited.
-        """
-        date = (when or datetime.now(UTC)).isoformat(timespec="milliseconds")
-        parameters = Offsets.from_edge(values)
-        chosen = name if name is not None else self._free_name(date)
-        if chosen in self._all and self._all[chosen].parameters != parameters:
-            raise invalid_params(
-                f"a correction called {chosen!r} exists and corrections are never edited",
-                [{"path": "name", "message": "taken", "asked": chosen}],
-                "another name",
-            )
-        return self._all.get(chosen) or NamedCorrection(chosen, date, parameters, note)
-
-    def after(self, correction: NamedCorrection | None) -> History:
-        """The history once `correction` is in force instead of the last."""
-        name = None if correction is None else correction.name
-        if name is None and self.in_force is None:
-            return self.history
-        return [*self.history, name][-KEPT:]
-
-    def store(self, changes: own.Changes, correction: NamedCorrection, source: str | None) -> None:
-        """Write a new correction; one that is known stays as it is.
-
-        Raises:
-            DatasetWriteError: the system cannot write.
-        """
-        if correction.name in self._all:
-            return
-        document = CorrectionFile(schema=1, source=source, **correction_fields(correction))
-        stamp = correction.date.split(".")[0].replace(":", "")
-        name = f"{stamp} {own.file_stem(correction.name)}.json"
-        changes.put_json(self._folder, name, document.model_dump(by_alias=True))
-
-    def know(self, correction: NamedCorrection, source: str | None) -> None:
-        """Add a correction, with what it came from, to those that there are."""
-        if correction.name not in self._all:
-            self._all[correction.name] = correction
-            self._sources[correction.name] = source
-
-    def _free_name(self, date: str) -> str:
-        base = f"correction-{date[:10]}"
-        taken = sum(name.startswith(base) for name in self._all)
-        while (name := f"{base}-{taken + 1}") in self._all:
-            taken += 1
-        return name
-
-
-def _read(data: bytes) -> tuple[NamedCorrection, str | None]:
-    document = CorrectionFile.model_validate(own.read_json(data))
-    correction = correction_of(document)
-    require_plausible(correction.parameters, math.inf)
-    return correction, document.source

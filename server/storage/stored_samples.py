@@ -1,14 +1,9 @@
 """Samples: shipped phantoms by name, and uploaded meshes, voxels and scenes.
 
-Uploads come in chunks, in order and bounded in size, and appear only when whole and readable. They
-are stored under DATA/samples and survive a restart: the bytes in a file named after their content,
-and beside it a description, which is written last. Names become file names by percent encoding, so
-no name can leave that folder. An upload whose files are damaged is set aside.
-
-Uploads in progress are on disk without a name, and bounded in number and total size. A client may
-begin uploads and never finish them, so nothing of them is held in memory. When a bound is reached
-the oldest is dropped, and its sender's next chunk gets an error that says so. The files have no
-name, so a killed server leaves none behind.
+Uploads appear only when whole and readable. They are stored under DATA/samples and survive a
+restart: the bytes in a file named after their content, and beside it a description, which is
+written last. Names become file names by percent encoding, so no name can leave that folder. An
+upload whose files are damaged is set aside.
 """
 
 from __future__ import annotations
@@ -16,208 +11,23 @@ from __future__ import annotations
 import asyncio
 import fnmatch
 import hashlib
-import json
-import logging
 import math
 import threading
 from collections.abc import Callable
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Annotated, BinaryIO, Literal
 
 import numpy as np
-from pydantic import Field, StringConstraints
 
 from flexdt import phantoms
 from flexdt.phantoms import Phantom, PhantomError
-from flexdt.phantoms.files.mesh_files import default_unit
-from flexdt.phantoms.files.phantom_files import sent_scene
-from flexdt.protocol.fields import Payload
-from flexdt.protocol.methods.scanner_messages import LengthUnit, SampleUpload
-from flexdt.protocol.rpc_errors import Code, RpcError, too_large
+from flexdt.protocol.rpc_errors import too_large
 from flexdt.runtime.files import own_documents as own
-from flexdt.runtime.files.directory import TEMPORARY, Directory, writing
-from flexdt.runtime.log import log
-from flexdt.runtime.worker import document
-from flexdt.runtime.workers import Worker
-from flexdt.twin.dataset.dataset_errors import DatasetWriteError
+from flexdt.runtime.files.directory import TEMPORARY, Directory
+from flexdt.server.storage.mesh_workers import mesh_apart, scene_apart
+from flexdt.server.storage.sample_uploads import MAX_UPLOAD_BYTES, Incoming, UploadHead
 from flexdt.twin.errors import LimitError, UnknownNameError
 
-MOST = 4
-"""Uploads under way at a time."""
-
-
-class UploadHead(SampleUpload):
-    """What an upload is: every chunk repeats it, and it lies beside the bytes as a document.
-
-    Attributes:
-        unit: of mesh coordinates.
-        revision: names the content, in the document; those of older servers have none.
-    """
-
-    schema_version: Literal[1] = Field(default=1, alias="schema")
-    data: Payload = b""
-    unit: LengthUnit = "mm"
-    revision: Annotated[str, StringConstraints(pattern="^[0-9a-f]{16}$")] | None = None
-
-    @classmethod
-    def of(cls, chunk: SampleUpload) -> UploadHead:
-        """Of the upload to which a chunk belongs."""
-        given = chunk.model_dump(exclude={"start", "data"})
-        return cls.model_validate(given | {"unit": chunk.unit or default_unit(chunk.format)})
-
-
-@dataclass
-class _Open:
-    head: UploadHead
-    file: BinaryIO
-    received: int = 0
-
-
-class Incoming:
-    """All uploads under way; any thread may call.
-
-    Args:
-        folder: on whose disk they are; made with the first.
-        limit: bytes of all of them together; more than the largest upload.
-    """
-
-    def __init__(self, folder: Directory, limit: int) -> None:
-        self._folder, self._limit = folder, limit
-        self._open: dict[str, _Open] = {}
-        self._lock = threading.Lock()
-
-    def receive(self, head: UploadHead, start: int, data: bytes) -> int:
-        """Take a chunk; returns the bytes received so far.
-
-        A chunk that has come before is passed over, so a client may send it again; a chunk at 0
-        of another file under the same name begins anew.
-
-        Raises:
-            LimitError: a gap before this chunk, or the upload was dropped for newer ones.
-            DatasetWriteError: the disk does not take it; the upload is given up.
-        """
-        with self._lock:
-            known = self._open.get(head.name)
-            if start == 0 and (known is None or known.head != head or known.received >= head.total):
-                known = self._begin(head)
-            if known is None or known.head != head or start > known.received:
-                received = 0 if known is None or known.head != head else known.received
-                raise self._gap(head.name, start, received)
-            new = data[known.received - start :]
-            self._make_room(head.name, len(new))
-            try:
-                with self._writing():
-                    left = memoryview(new)
-                    while left:
-                        left = left[known.file.write(left) :]
-            except DatasetWriteError:
-                self._close(head.name)
-                raise
-            known.received += len(new)
-            return known.received
-
-    def take(self, name: str) -> tuple[UploadHead, bytes]:
-        """An upload of which all bytes have come; it is under way no more.
-
-        Raises:
-            LimitError: it is not whole, because another one was begun under its name.
-        """
-        with self._lock:
-            known = self._open.get(name)
-            if known is None or known.received < known.head.total:
-                raise self._gap(name, 0, 0 if known is None else known.received)
-            try:
-                with self._writing():
-                    known.file.seek(0)
-                    return known.head, known.file.read()
-            finally:
-                self._close(name)
-
-    def _begin(self, head: UploadHead) -> _Open:
-        self._close(head.name)
-        while len(self._open) >= MOST:
-            self._drop()
-        self._folder.make()
-        with self._writing():
-            file = self._folder.nameless()
-        self._open[head.name] = made = _Open(head, file)
-        return made
-
-    def _make_room(self, name: str, more: int) -> None:
-        while sum(o.received for o in self._open.values()) + more > self._limit:
-            if all(other == name for other in self._open):
-                break  # the largest upload alone always fits
-            self._drop(but=name)
-
-    def _drop(self, but: str | None = None) -> None:
-        oldest = next(name for name in self._open if name != but)
-        log("an unfinished upload was dropped for newer ones", logging.WARNING, name=oldest,
-            received=self._open[oldest].received)  # fmt: skip
-        self._close(oldest)
-
-    def _close(self, name: str) -> None:
-        known = self._open.pop(name, None)
-        if known is not None:
-            known.file.close()
-
-    def _gap(self, name: str, start: int, received: int) -> LimitError:
-        return LimitError(
-            f"upload {name!r}: the chunk begins at {start}, but {received} bytes have come; "
-            f"chunks come in order, from 0, and {MOST} uploads and {self._limit} bytes are kept at "
-            "a time: one begun before may have been dropped for newer ones",
-            {"asked": start, "allowed": received},
-        )
-
-    def _writing(self) -> AbstractContextManager[None]:
-        path = self._folder.path
-        return writing(path, f"the upload cannot be kept in {path}")
-
-
-# Parsing of uploaded meshes and scenes in a process of their own (`worker`).
-#
-# A parser that loops, exhausts its memory or crashes does not affect the server, and the event loop
-# never waits for the parser's interpreter lock. Each upload has a fresh process that may write no
-# file, and its result is validated like any other document.
-
-TIMEOUT_S = 180.0
-MEMORY_BYTES = 3 << 30
-
-
-def mesh_apart(raw: bytes, *, unit: str, material: str, file_type: str, name: str) -> Phantom:
-    """`flexdt.phantoms.mesh_phantom` of a stranger's bytes; blocks, so call it from a thread.
-
-    Raises:
-        PhantomError: as there, unknown material, or reading it takes too much time or memory.
-    """
-    how = {"unit": unit, "material": material, "file_type": file_type, "name": name}
-    return _apart(phantoms.mesh_phantom, how, raw)
-
-
-def scene_apart(raw: bytes, *, name: str) -> Phantom:
-    """The phantom of a stranger's phantom or scene file (TOML or JSON), as `mesh_apart`.
-
-    Raises:
-        PhantomError: its content does not hold, it is larger than is allowed, names files or an
-            unknown material, or reading it takes too much time or memory.
-    """
-    return _apart(sent_scene, {"name": name}, raw)
-
-
-def _apart(read: Callable[..., Phantom], how: dict[str, str], raw: bytes) -> Phantom:
-    worker = Worker(MEMORY_BYTES)
-    try:
-        [text] = worker.ask(document, (read, how), [raw], TIMEOUT_S)
-    except RpcError as error:
-        prefix = f"{how['name']!r} cannot be read: " if error.code == Code.TOO_LARGE else ""
-        data = error.data if isinstance(error.data, dict) else None
-        raise PhantomError(prefix + error.message, data) from None
-    finally:
-        worker.kill()
-    return Phantom.from_dict(json.loads(text))
-
-
-MAX_UPLOAD_BYTES = 512 << 20
 KEPT = 8
 """Parsed samples kept; meshes may be large."""
 DEFAULT_MATERIAL = "abs"

@@ -27,14 +27,16 @@ from flexdt.runtime.files.own_documents import settle
 from flexdt.runtime.log import LEVELS, log
 from flexdt.server.imaging.projections import Imaging, Projector, TrueGeometry
 from flexdt.server.imaging.radiography import Physics, Radiography, predictors, with_spectra
-from flexdt.server.scans.jobs import Job, Jobs, fresh_seed
+from flexdt.server.scans.jobs import Jobs, fresh_seed
+from flexdt.server.scans.scan_job import Job
 from flexdt.server.scans.stage import ObstacleMoves, Shapes, Stage
 from flexdt.server.scans.submission import RESERVED, Submissions
 from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
+from flexdt.server.storage import corrections
 from flexdt.server.storage import memory as kept
 from flexdt.server.storage.past_scans import PastScans
 from flexdt.server.storage.stored_samples import ReceivedSample, SampleStore, sample_material
-from flexdt.server.twin import live as views
+from flexdt.server.twin import state_views
 from flexdt.server.twin.hub import Hub
 from flexdt.server.twin.live import LiveView, Shot, StateFeed
 from flexdt.twin.collision.first_contact import NearestPair, clearance
@@ -48,6 +50,14 @@ from flexdt.twin.scanner.safety import Guard
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import NamedCorrection, Sample, ScannerState, TubeSettings
 from flexdt.twin.script import Exposure
+
+LOG_KEPT = 50
+"""Entries of the topic `log` that a late subscriber gets."""
+FAILURES, FAILURES_S = 5, 60.0
+"""A service that has failed so often within so many real seconds cannot be kept going."""
+SERVICE_PAUSE_S = 0.1
+Level = Literal["debug", "info", "warning", "error"]
+
 
 # Who may move: one controller at a time, everyone may watch.
 #
@@ -118,14 +128,6 @@ class ControlLease:
         )
 
 
-LOG_KEPT = 50
-"""Entries of the topic `log` that a late subscriber gets."""
-FAILURES, FAILURES_S = 5, 60.0
-"""A service that has failed so often within so many real seconds cannot be kept going."""
-SERVICE_PAUSE_S = 0.1
-Level = Literal["debug", "info", "warning", "error"]
-
-
 class TwinServer:
     """One twin with all its services.
 
@@ -179,7 +181,7 @@ class TwinServer:
         self.predictors = predictors()
         self.remembered = kept.read_memory(root)
         known = [] if self.remembered is None else self.remembered.corrections
-        self.corrections = kept.Corrections(root.folder("corrections"), known)
+        self.corrections = corrections.Corrections(root.folder("corrections"), known)
         self._apply_last()
         self.stage_turn = asyncio.Lock()
         """Held while the stage is changed: such changes come one after the other."""
@@ -323,16 +325,16 @@ class TwinServer:
         return w.State(
             time=snapshot.time,
             axes={name: w.AxisState(**vars(axis)) for name, axis in snapshot.axes.items()},
-            tube=views.tube_view(snapshot.tube, snapshot.time),
-            camera=views.camera_view(snapshot.camera, self.machine),
+            tube=state_views.tube_view(snapshot.tube, snapshot.time),
+            camera=state_views.camera_view(snapshot.camera, self.machine),
             sample=self.sample_state(),
-            geometry=views.geometry_view(snapshot.readout),
-            safety=views.safety_view(
+            geometry=state_views.geometry_view(snapshot.readout),
+            safety=state_views.safety_view(
                 snapshot.safety, self._clearance(snapshot), self.machine.safety_margin_mm
             ),
             job=None if job is None else self.jobs.status(job),
             correction=self.correction_state(snapshot.correction),
-            clock=views.clock_view(self.clock),
+            clock=state_views.clock_view(self.clock),
             controller=self.control.holder,
             image=self.live.seen,
         )
@@ -361,7 +363,7 @@ class TwinServer:
     def correction_state(self, correction: NamedCorrection | None) -> w.Correction | None:
         """A correction and what it came from, for the wire."""
         source = None if correction is None else self.corrections.source(correction.name)
-        return views.correction_view(correction, source)
+        return state_views.correction_view(correction, source)
 
     # Changing -----------------------------------------------------------------------------------
 

@@ -37,7 +37,8 @@ async def run(options: TwinSettings) -> int:
 
     from flexdt.runtime.http_pages import Requests, served_pages
     from flexdt.server.imaging.projections import load_truth
-    from flexdt.server.imaging.projector_pool import ProjectorClient, ProjectorPool
+    from flexdt.server.imaging.projector_client import ProjectorClient
+    from flexdt.server.imaging.projector_pool import ProjectorPool
     from flexdt.server.network.tcp import serve
     from flexdt.server.scans.jobs import fresh_seed
     from flexdt.server.twin.application import TwinSession, twin_pages

@@ -13,7 +13,7 @@ from in_process import Lab, run
 from flexdt.protocol import METHODS, RpcError, parse_params
 from flexdt.protocol.fields import MAX_STEM
 from flexdt.runtime.files.directory import open_data
-from flexdt.server.storage.stored_samples import MOST, Incoming, UploadHead
+from flexdt.server.storage.sample_uploads import MOST, Incoming, UploadHead
 from flexdt.twin.errors import LimitError
 
 SCRIPT = "camera\tset exposure\t100\t\tACK\t\t"

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from flexdt.protocol import RpcError
-from flexdt.server.scans.jobs import JobInputs, Jobs
+from flexdt.server.scans.jobs import Jobs
+from flexdt.server.scans.scan_job import JobInputs
 from flexdt.server.scans.twin_clock import TwinClock
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile

@@ -28,8 +28,8 @@ from flexdt.runtime.access import (
 from flexdt.runtime.files.directory import open_data
 from flexdt.runtime.files.own_documents import used_bytes
 from flexdt.runtime.wire_errors import ProjectorUnavailable
-from flexdt.server.scans import jobs as job_module
-from flexdt.server.scans.jobs import Retry, transient
+from flexdt.server.scans import job_retries
+from flexdt.server.scans.job_retries import Retry, transient
 from flexdt.server.twin.core import ControlLease
 from flexdt.twin.dataset.dataset_errors import DiskFullError
 from flexdt.twin.errors import LimitError
@@ -157,7 +157,7 @@ def test_retries_wait_longer_each_time_and_forget_after_progress(
         await asyncio.sleep(0)
 
     own = {"create_task": asyncio.create_task, "get_running_loop": asyncio.get_running_loop}
-    monkeypatch.setattr(job_module, "asyncio", SimpleNamespace(sleep=sleep, **own))
+    monkeypatch.setattr(job_retries, "asyncio", SimpleNamespace(sleep=sleep, **own))
 
     async def body() -> None:
         retry = Retry(10.0, 50.0)
@@ -195,7 +195,7 @@ def test_a_full_disk_is_retried_when_there_is_room(
         looked[0] += 1
         return free[0]
 
-    monkeypatch.setattr(job_module, "free_bytes", free_bytes)
+    monkeypatch.setattr(job_retries, "free_bytes", free_bytes)
 
     async def body() -> None:
         retry, done = Retry(0.01), asyncio.Event()

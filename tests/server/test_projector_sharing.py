@@ -13,7 +13,8 @@ import pytest
 from flexdt.phantoms import Phantom, load_phantom, voxel_phantom
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.imaging.projections import Imaging, TrueGeometry, digest_of
-from flexdt.server.imaging.projector_pool import ProjectorClient, ProjectorPool
+from flexdt.server.imaging.projector_client import ProjectorClient
+from flexdt.server.imaging.projector_pool import ProjectorPool
 from flexdt.server.projector.service import ProjectorServer, serve_projector
 from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.twin.machine.camera import Roi

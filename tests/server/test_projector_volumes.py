@@ -7,7 +7,7 @@ import pytest
 
 from flexdt.protocol import RpcError
 from flexdt.protocol.projector import VoxelGrid
-from flexdt.server.projector.projector_methods import SOLID_BYTES, VolumeStore
+from flexdt.server.projector.volume_store import SOLID_BYTES, VolumeStore
 from flexdt.twin.projection import Volume
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 

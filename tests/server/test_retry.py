@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from flexdt.runtime.wire_errors import ProjectorUnavailable
-from flexdt.server.scans import jobs
-from flexdt.server.scans.jobs import Retry, transient
+from flexdt.server.scans import job_retries
+from flexdt.server.scans.job_retries import Retry, transient
 from flexdt.server.scans.runner import hopeless
 from flexdt.testing.in_process import SimulatedLoop
 from flexdt.twin.dataset.dataset_errors import DiskFullError
@@ -74,7 +74,7 @@ def test_a_full_disk_is_asked_again_after_the_same_pause_until_there_is_room(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     free = [100, 1000, 1001, None]
-    monkeypatch.setattr(jobs, "free_bytes", lambda folder: free.pop(0))
+    monkeypatch.setattr(job_retries, "free_bytes", lambda folder: free.pop(0))
     error = DiskFullError("full", {"path": str(tmp_path / "a.tif"), "bytes": 1000})
 
     async def main() -> None:

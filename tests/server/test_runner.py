@@ -10,7 +10,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from flexdt.server.scans.runner import JobAborted, ScanRunner, rejoin
+from flexdt.server.scans.rejoin_plan import rejoin
+from flexdt.server.scans.runner import JobAborted, ScanRunner
 from flexdt.server.scans.twin_clock import TwinClock
 from flexdt.testing.in_process import SimulatedLoop
 from flexdt.twin.errors import CollisionError, LimitError

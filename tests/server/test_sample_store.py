@@ -12,7 +12,8 @@ from stored_upload import completed
 from flexdt.phantoms import Phantom, load_phantom
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.storage import stored_samples as samples
-from flexdt.server.storage.stored_samples import EMPTY, KEPT, SampleStore, UploadHead
+from flexdt.server.storage.sample_uploads import UploadHead
+from flexdt.server.storage.stored_samples import EMPTY, KEPT, SampleStore
 from flexdt.twin.errors import LimitError
 
 TAKEN = [EMPTY, "lego", "normal", "normal-3", "tall-12", "shepp-logan"]

@@ -19,8 +19,9 @@ from flexdt.phantoms.files import phantom_files
 from flexdt.phantoms.samples import as_phantom
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.scans.stage import Stage
-from flexdt.server.storage import stored_samples as mesh_reading
-from flexdt.server.storage.stored_samples import SampleStore, UploadHead
+from flexdt.server.storage import mesh_workers
+from flexdt.server.storage.sample_uploads import UploadHead
+from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.twin.collision.convex_solids import Polytope
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
@@ -109,11 +110,11 @@ def test_a_size_that_is_said_too_small_does_not_hide_the_solids() -> None:
 def test_a_reader_that_takes_too_long_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     raw = json.dumps({"schema": 1, "solid": [BALL]}).encode()
     with monkeypatch.context() as hurried:
-        hurried.setattr(mesh_reading, "TIMEOUT_S", 0.0)
+        hurried.setattr(mesh_workers, "TIMEOUT_S", 0.0)
         with pytest.raises(PhantomError, match="'thing' cannot be read"):
-            mesh_reading.scene_apart(raw, name="thing")
+            mesh_workers.scene_apart(raw, name="thing")
     with pytest.raises(PhantomError, match="unknown material 'cheese'"):
-        mesh_reading.scene_apart(raw.replace(b"pmma", b"cheese"), name="thing")
+        mesh_workers.scene_apart(raw.replace(b"pmma", b"cheese"), name="thing")
 
 
 def test_the_pieces_on_the_stage_hold_every_round_solid(tmp_path: Path) -> None:

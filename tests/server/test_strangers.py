@@ -30,7 +30,8 @@ from flexdt.protocol.fields import Params
 from flexdt.runtime.access import ConnectionLimits
 from flexdt.runtime.log import JsonLines, Sparing
 from flexdt.server.network import tcp
-from flexdt.server.network.shell_parts import Peer, Room, neighbourhood
+from flexdt.server.network.admission import Room, neighbourhood
+from flexdt.server.network.shell_parts import Peer
 from flexdt.server.network.tcp import TcpServer, serve
 
 pytestmark = pytest.mark.slow
@@ -102,7 +103,7 @@ NEW = ("session.hello", "session.ping", "safety.estop")
 def test_new_clients_are_served_whatever_peers_without_the_token_do(
     seed: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(tcp.parts, "WAITING", 12)
+    monkeypatch.setattr(tcp.admission, "WAITING", 12)
     monkeypatch.setattr(tcp, "RESERVED", 3)
     rng = random.Random(seed)
 

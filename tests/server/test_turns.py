@@ -13,7 +13,8 @@ from flexdt.protocol import METHODS, Codec, Connection, Method, Request
 from flexdt.protocol.fields import Params
 from flexdt.runtime.access import ConnectionLimits
 from flexdt.server.network import tcp
-from flexdt.server.network.shell_parts import FIRST, ORDINARY, URGENT, LoopTurns, Peer
+from flexdt.server.network.loop_turns import FIRST, ORDINARY, URGENT, LoopTurns
+from flexdt.server.network.shell_parts import Peer
 from flexdt.server.network.tcp import READ_AHEAD, TcpServer, _Link
 
 

@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from flexdt.protocol import parse_result
 from flexdt.protocol.projector import Health, VolumeList
-from flexdt.server.imaging.projector_pool import ProjectorClient, ProjectorPool
+from flexdt.server.imaging.projector_client import ProjectorClient
+from flexdt.server.imaging.projector_pool import ProjectorPool
 
 
 @dataclass(frozen=True)

@@ -404,7 +404,7 @@ def test_orbit_of_a_turn_is_a_circle_about_the_axis() -> None:
 
 def _state() -> Any:
     from flexdt.protocol.state_model import State
-    from flexdt.server.twin.live import camera_view
+    from flexdt.server.twin.state_views import camera_view
 
     return State.model_construct(
         axes={}, camera=camera_view(CAMERA, MACHINE), correction=None, sample=SampleState(name=None)

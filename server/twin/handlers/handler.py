@@ -19,7 +19,9 @@ from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods.document_messages import Scene
 from flexdt.runtime.files.own_documents import Changes
 from flexdt.server.network.shell_parts import Peer
-from flexdt.server.storage.memory import History, Memory, apply_settings, as_of, paces_of
+from flexdt.server.storage.corrections import History
+from flexdt.server.storage.memory import Memory, as_of
+from flexdt.server.storage.scene_document import apply_settings, paces_of
 from flexdt.server.storage.stored_samples import ReceivedSample
 from flexdt.server.twin.core import TwinServer
 from flexdt.twin.scanner.scanner import ScannerTwin
@@ -31,6 +33,10 @@ _P = TypeVar("_P", bound=Params)
 _R = TypeVar("_R", bound=Result)
 A_TURN = 20
 """Items of a list that are looked at in one turn of the loop, well below a millisecond."""
+HANDLERS: dict[str, Handler] = {}
+"""Method name -> what answers it; filled as the modules of `handlers` are imported."""
+Answer: TypeAlias = _R | Encoded | Mapping[str, Any]
+"""A method's result: as its model, or as bytes or plain data that were made of it."""
 
 
 @dataclass
@@ -54,10 +60,6 @@ class Client:
 
 Handler = Callable[[TwinServer, Client, Any], object | Awaitable[object]]
 """(twin, client, parameters) -> result."""
-HANDLERS: dict[str, Handler] = {}
-"""Method name -> what answers it; filled as the modules of `handlers` are imported."""
-Answer: TypeAlias = _R | Encoded | Mapping[str, Any]
-"""A method's result: as its model, or as bytes or plain data that were made of it."""
 _Handler: TypeAlias = Callable[[TwinServer, Client, _P], Answer[_R] | Awaitable[Answer[_R]]]
 
 

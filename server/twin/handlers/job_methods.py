@@ -15,7 +15,7 @@ from flexdt.protocol.fields import Empty
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import job_messages as p
 from flexdt.protocol.rpc_errors import invalid_params, too_large
-from flexdt.server.scans.jobs import ENDED, Job
+from flexdt.server.scans.scan_job import ENDED, Job
 from flexdt.server.scans.scan_record import ScanSource
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers import handler as h

@@ -10,7 +10,7 @@ from flexdt.protocol import state_model as w
 from flexdt.protocol.fields import Empty
 from flexdt.protocol.methods import scanner_messages as p
 from flexdt.server.scans.stage import finished
-from flexdt.server.twin import live as views
+from flexdt.server.twin import state_views
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, answers, change_settings, ensure_idle
 from flexdt.twin.errors import SafetyError
@@ -113,7 +113,7 @@ def stop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
     twin.interrupt("stop")
     stopping = twin.scanner.stop(twin.clock.now())
     twin.changed()
-    return views.stopped_view(twin.state(), stopping, twin.clock.now())
+    return state_views.stopped_view(twin.state(), stopping, twin.clock.now())
 
 
 @answers(p.SAFETY_ESTOP)
@@ -126,7 +126,7 @@ def estop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
     twin.tell("warning", f"E-stop by {client.name}")
     twin.changed()
     twin.keeper.changed(at_once=not in_force)  # a flood of them is one write
-    return views.stopped_view(twin.state(), stopping, twin.clock.now())
+    return state_views.stopped_view(twin.state(), stopping, twin.clock.now())
 
 
 @answers(p.SAFETY_RESET)
@@ -142,7 +142,7 @@ def set_clock(twin: TwinServer, client: Client, params: p.ClockSet) -> w.ClockSt
     """How fast twin time runs."""
     twin.clock.set_speed_up(params.speed_up)
     twin.changed()
-    return views.clock_view(twin.clock)
+    return state_views.clock_view(twin.clock)
 
 
 @answers(p.TUBE_SET)
@@ -165,7 +165,7 @@ async def set_tube(twin: TwinServer, client: Client, params: p.TubeSet) -> w.Tub
         twin.changed()
     else:
         await change_settings(twin, change, ensure_idle(twin, client, "tube.set", "tube.set"))
-    return views.tube_view(twin.scanner.tube, twin.clock.now())
+    return state_views.tube_view(twin.scanner.tube, twin.clock.now())
 
 
 @answers(p.CAMERA_SET)
@@ -176,7 +176,7 @@ async def set_camera(twin: TwinServer, client: Client, params: p.CameraSet) -> w
         scanner.set_camera(**camera_change(params))
 
     await change_settings(twin, change, ensure_idle(twin, client, "camera.set", "camera.set"))
-    return views.camera_view(twin.scanner.camera, twin.machine)
+    return state_views.camera_view(twin.scanner.camera, twin.machine)
 
 
 def camera_change(params: p.CameraSet) -> CameraChange:

@@ -9,7 +9,8 @@ from flexdt.phantoms import Phantom, load_phantom, materials, phantom_names
 from flexdt.protocol.fields import Empty
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import scanner_messages as p
-from flexdt.server.storage.stored_samples import EMPTY, UploadHead
+from flexdt.server.storage.sample_uploads import UploadHead
+from flexdt.server.storage.stored_samples import EMPTY
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers import handler as h
 from flexdt.twin.errors import LimitError, UnknownNameError

@@ -13,12 +13,15 @@ from flexdt.protocol.fields import Empty, Nothing
 from flexdt.protocol.methods import document_messages as d
 from flexdt.protocol.methods import openrpc_document
 from flexdt.protocol.methods import session_messages as p
-from flexdt.server.scans.jobs import ENDED
-from flexdt.server.storage.memory import require_fit, sample_of, save_scene
+from flexdt.server.scans.scan_job import ENDED
+from flexdt.server.storage.scene_document import require_fit, sample_of, save_scene
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, answers, change_stage, ensure_idle
 from flexdt.server.twin.hub import ImageWish
 from flexdt.twin.errors import SafetyError
+
+document = cache(openrpc_document)
+"""Made once: it takes 0.1 s of the loop."""
 
 
 @answers(p.SESSION_HELLO)
@@ -141,7 +144,3 @@ async def load(twin: TwinServer, client: Client, params: d.SceneLoad) -> w.State
 def discover(twin: TwinServer, client: Client, params: Empty) -> dict[str, Any]:
     """The wire as an OpenRPC document."""
     return document()
-
-
-document = cache(openrpc_document)
-"""Made once: it takes 0.1 s of the loop."""

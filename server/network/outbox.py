@@ -1,0 +1,166 @@
+"""The send queue of a connection.
+
+Messages go straight to the transport while the client keeps up. Otherwise state-like events keep
+the newest value per slot and ordered ones a bounded queue. Sending never blocks; a caller that has
+to wait for a slow client awaits `room`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+from pydantic import BaseModel
+
+from flexdt.protocol import Connection, Prepared, RpcError
+from flexdt.protocol import messages as m
+from flexdt.protocol.rpc_errors import internal
+from flexdt.runtime.access import ConnectionLimits
+
+A_WRITE = 1 << 18
+"""Bytes given to the transport at a time, since it copies what it cannot send at once."""
+
+
+class SendTarget(Protocol):
+    """A connection as its send queue sees it."""
+
+    wire: Connection
+    limits: ConnectionLimits
+    transport: asyncio.Transport
+
+    def abort(self, reason: str) -> None:
+        """Abort the connection."""
+
+    def log(
+        self, event: str, level: int = logging.INFO, *, error: bool = False, **facts: object
+    ) -> None:
+        """Write a line about the connection."""
+
+
+class Outbox:
+    """The send queue: replies and ordered events in order, then the newest value of each slot."""
+
+    def __init__(self, link: SendTarget) -> None:
+        self.link = link
+        self.ready = asyncio.Event()
+        self.ready.set()
+        self.over = False
+        self.queue: deque[bytes] = deque()
+        self.unsent = 0
+        self.slots: dict[str, m.Message | Prepared] = {}
+
+    def reply(self, message: m.Response | m.Failure) -> None:
+        """Send or queue an answer."""
+        self.send(self.encode(message))
+
+    def send(self, body: Sequence[bytes]) -> None:
+        """Send or queue what `encode` has made, or several of them as a batch."""
+        wire = self.link.wire
+        try:
+            pieces = wire.framed(body)
+        except RpcError as error:  # `encode` has seen to it that this is a batch
+            pieces = wire.framed(wire.body(m.Failure(None, error)))
+        self._put_all(pieces)
+
+    def encode(self, message: m.Response | m.Failure) -> list[bytes]:
+        """The body of an answer, or of why it cannot be sent."""
+        wire = self.link.wire
+        try:
+            body = wire.body(message)
+            wire.framed(body)
+        except RpcError as error:
+            return wire.body(m.Failure(message.id, error))
+        except (ValueError, TypeError, OverflowError):
+            where = _not_finite(m.to_plain(message))
+            self.link.log("reply not sent", logging.ERROR, error=True, where=where)
+            return wire.body(m.Failure(message.id, internal()))
+        return body
+
+    def event(self, message: m.Message | Prepared, slot: str | None) -> None:
+        """Send an event now, or keep it: newest of its slot, or (None) in order."""
+        if self.over or self.link.transport.is_closing():
+            return
+        if slot is not None and not self.ready.is_set():
+            self.slots[slot] = message
+            return
+        if len(self.queue) >= self.link.limits.max_events:
+            self.over = True
+            self.link.abort(f"{len(self.queue)} events unread")
+            return
+        self._put_event(message)
+
+    def _put_event(self, message: m.Message | Prepared) -> None:
+        try:
+            self._put_all(self.link.wire.pieces(message))
+        except (RpcError, ValueError, TypeError, OverflowError):
+            self.link.log("event not sent", logging.ERROR, error=True)
+
+    def _put_all(self, pieces: Sequence[bytes]) -> None:
+        if sum(map(len, pieces)) <= A_WRITE:
+            self._put(b"".join(pieces))
+            return
+        for piece in pieces:
+            for at in range(0, len(piece), A_WRITE):
+                self._put(piece[at : at + A_WRITE])
+
+    def _put(self, data: bytes) -> None:
+        if self.over or self.link.transport.is_closing():
+            return  # asyncio would complain of every write to a connection that is gone
+        if self.ready.is_set():
+            self.link.transport.write(data)
+        else:
+            self.queue.append(data)
+            self.unsent += len(data)
+
+    def pause(self) -> None:
+        """The transport is full."""
+        self.ready.clear()
+
+    def resume(self) -> None:
+        """The transport takes more."""
+        self.ready.set()
+        while self.queue and self.ready.is_set():
+            data = self.queue.popleft()
+            self.unsent -= len(data)
+            if not self.link.transport.is_closing():
+                self.link.transport.write(data)
+        while self.slots and self.ready.is_set():
+            slot = next(iter(self.slots))
+            self._put_event(self.slots.pop(slot))
+
+    async def room(self) -> None:
+        """Wait until the client has taken enough of its replies."""
+        while self.unsent > self.link.limits.max_unsent and not self.over:
+            await self.ready.wait()
+
+    async def flushed(self) -> None:
+        """Wait until all has been handed to the transport."""
+        while (self.queue or self.slots) and not self.over:
+            await self.ready.wait()
+
+    def lost(self) -> None:
+        """Drop the queue: the connection has ended."""
+        self.over = True
+        self.queue.clear()
+        self.slots.clear()
+        self.ready.set()
+
+
+def _not_finite(value: object, path: str = "$") -> str | None:
+    """Path of the first number that JSON cannot represent, for the log."""
+    match value:
+        case float():
+            return None if math.isfinite(value) else f"{path}: {value}"
+        case BaseModel():
+            return _not_finite(value.model_dump(), path)
+        case Mapping():
+            inner = [(f"{path}.{key}", v) for key, v in value.items()]
+        case list() | tuple():
+            inner = [(f"{path}[{i}]", v) for i, v in enumerate(value)]
+        case _:
+            return None
+    return next((found for p, v in inner if (found := _not_finite(v, p))), None)

@@ -1,0 +1,125 @@
+"""What the projector's methods work with: the compute thread, the volumes and the clients.
+
+Jobs are started and results are sent from here, in one piece or in parts.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.protocol import MAX_FRAME, Correlation, Notification, Role, image
+from flexdt.protocol.messages import Id
+from flexdt.protocol.rpc_errors import superseded
+from flexdt.runtime.log import Sparing
+from flexdt.server.network.admission import TokenCheck
+from flexdt.server.projector.compute import (
+    ComputeJob,
+    ComputeThread,
+    Lane,
+    Step,
+)
+from flexdt.server.projector.volume_store import VolumeStore
+from flexdt.server.projector.wire import FrameLink
+
+PART_BYTES: Final = 8 * 2**20
+"""Payload of a part of what does not fit into one frame."""
+SPARE: Final = 4096
+"""Room for everything but the payload in a frame."""
+
+
+class JobClient:
+    """One connection, its jobs and its requests that are under way."""
+
+    def __init__(self, link: FrameLink, token: str | None, lines: Sparing) -> None:
+        self.link, self.let_in = link, token is None
+        self.lanes = Lane(), Lane()
+        self.jobs: dict[Id, ComputeJob] = {}
+        self.calls: Correlation[None] = Correlation(Role.SERVER)
+        self.tasks: set[asyncio.Task[None]] = set()
+        self.pending_bytes = 0
+        self.token_check = TokenCheck(token, self._close_soon, lines)
+
+    def begin(self, id: Id, key: str | None = None) -> ComputeJob:
+        """The work of a request, known by its id until that is answered."""
+        job = self.jobs[id] = ComputeJob(self.lanes[key is not None], key)
+        return job
+
+    def _close_soon(self) -> None:
+        """End the connection once its last answer has gone out."""
+        asyncio.get_running_loop().call_later(0.1, self.link.transport.close)
+
+
+@dataclass(eq=False, repr=False)
+class Context:
+    """The projector's state.
+
+    Attributes:
+        compute: the thread that computes.
+        store: named volumes.
+        token: clients must bring it.
+        facts: backend and threads, for `health`.
+        clients: by connection.
+        instance: names this start of the server.
+        started: when it was [s], monotonic.
+        views: projected so far.
+        superseded: requests that newer ones have replaced.
+        lines: of the log about connections.
+    """
+
+    compute: ComputeThread
+    store: VolumeStore
+    token: str | None
+    facts: Mapping[str, object]
+    clients: dict[FrameLink, JobClient] = field(default_factory=dict)
+    instance: str = field(default_factory=lambda: uuid.uuid4().hex)
+    started: float = field(default_factory=time.monotonic)
+    views: int = 0
+    superseded: int = 0
+    lines: Sparing = field(default_factory=Sparing)
+
+    @property
+    def waiting(self) -> int:
+        """Requests whose work waits for its turn."""
+        return sum(job.waits for client in self.clients.values() for job in client.jobs.values())
+
+    async def run(self, client: JobClient, id: Id, step: Step) -> object:
+        """The value of the one step of a request."""
+        return await client.begin(id).run(self.compute, step)
+
+    def supersede(self, client: JobClient, key: str) -> None:
+        """End this client's interactive jobs of that key that have not been computed."""
+        for job in client.jobs.values():
+            if job.key == key and job.waits:
+                job.end(superseded(key))
+                self.superseded += 1
+
+    async def send_array(
+        self, client: JobClient, id: Id, array: npt.NDArray[np.generic]
+    ) -> dict[str, object]:
+        """An array as the result of a request; what does not fit has gone before, in parts."""
+        if array.nbytes + SPARE <= MAX_FRAME:
+            return image.encode(array)
+        parts = await self.send_parts(client, id, array, 0)
+        return {"dtype": array.dtype.name, "shape": list(array.shape), "parts": parts}
+
+    async def send_parts(
+        self, client: JobClient, id: Id, array: npt.NDArray[np.generic], start: int
+    ) -> int:
+        """Send an array as parts of a result, from its element `start` on; how many."""
+        flat = np.ascontiguousarray(array).reshape(-1)
+        step = PART_BYTES // flat.itemsize
+        parts = 0
+        for at in range(0, flat.size, step):
+            data = flat[at : at + step].view(np.uint8).data.toreadonly()
+            part = {"request": id, "start": start + at, "data": data}
+            await client.link.send(Notification("part", part))
+            parts += 1
+        return parts

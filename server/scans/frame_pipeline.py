@@ -1,0 +1,112 @@
+"""Frames on their way from a scan to its files: bounded, batched, and each done exactly once.
+
+A scan puts frames in; a few workers take what is waiting, in batches of one kind, and hand each
+batch to `produce`. Under real-time pace every frame goes at once, at full speed batches fill up;
+the result does not depend on it. When `produce` fails the worker keeps its batch and waits to be
+told to try again, so nothing is lost and nothing is done twice.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Awaitable, Callable, Hashable, Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+
+@dataclass(eq=False, repr=False)
+class FramePipeline(Generic[T]):
+    """A bounded queue of frames and the workers that empty it.
+
+    Attributes:
+        produce: makes and stores a batch; raises what `failed` is to hear.
+        failed: called with the exception when a batch could not be made.
+        kind: frames of different kinds never share a batch.
+        batch: most frames a batch.
+        workers: batches in the making at a time.
+        room: most frames waiting.
+    """
+
+    produce: Callable[[Sequence[T]], Awaitable[None]]
+    failed: Callable[[Exception], None]
+    kind: Callable[[T], Hashable]
+    batch: int = 4
+    workers: int = 2
+    room: int = 16
+
+    def __post_init__(self) -> None:
+        self._waiting: deque[T] = deque()
+        self._busy = 0
+        self._changed = asyncio.Condition()
+        self._go = asyncio.Event()
+        self._go.set()
+        self._tasks: list[asyncio.Task[None]] = []
+
+    def open(self) -> None:
+        """Start the workers; before that, frames only wait."""
+        self._tasks = [asyncio.create_task(self._work()) for _ in range(self.workers)]
+
+    @property
+    def full(self) -> bool:
+        """Whether no frame can be put now."""
+        return len(self._waiting) >= self.room
+
+    @property
+    def idle(self) -> bool:
+        """Whether every frame put in has been made."""
+        return not self._waiting and self._busy == 0
+
+    async def put(self, frame: T) -> None:
+        """Add a frame; waits for room."""
+        async with self._changed:
+            await self._changed.wait_for(lambda: not self.full)
+            self._waiting.append(frame)
+            self._changed.notify_all()
+
+    async def drained(self) -> None:
+        """Wait until every frame put in has been made."""
+        async with self._changed:
+            await self._changed.wait_for(lambda: self.idle)
+
+    def retry(self) -> None:
+        """Let the workers that failed try their batches again."""
+        self._go.set()
+
+    async def close(self) -> None:
+        """Stop the workers; frames that are not made are dropped."""
+        for worker in self._tasks:
+            worker.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    async def _work(self) -> None:
+        while True:
+            async with self._changed:
+                await self._changed.wait_for(lambda: bool(self._waiting))
+                batch = self._take()
+                self._busy += 1
+                self._changed.notify_all()
+            await self._until_made(batch)
+            async with self._changed:
+                self._busy -= 1
+                self._changed.notify_all()
+
+    def _take(self) -> list[T]:
+        batch = [self._waiting.popleft()]
+        kind = self.kind(batch[0])
+        while self._waiting and len(batch) < self.batch and self.kind(self._waiting[0]) == kind:
+            batch.append(self._waiting.popleft())
+        return batch
+
+    async def _until_made(self, batch: Sequence[T]) -> None:
+        while True:
+            try:
+                await self.produce(batch)
+            except Exception as error:
+                self._go.clear()
+                self.failed(error)
+                await self._go.wait()
+            else:
+                return

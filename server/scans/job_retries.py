@@ -1,0 +1,84 @@
+"""A job that a full disk or an absent projector has paused goes on by itself, with back-off.
+
+Each attempt waits twice as long as the one before, up to half a minute; for a disk also until there
+is room for what could not be written. Whoever pauses, steps or moves by hand takes over: then only
+`job.resume` goes on. What a person has to decide is not retried.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from flexdt.runtime.files.directory import free_bytes
+from flexdt.runtime.wire_errors import ProjectorUnavailable
+from flexdt.twin.dataset.dataset_errors import DiskFullError
+
+FIRST_S, LONGEST_S = 1.0, 30.0
+"""Between attempts, the first and the longest [real s]."""
+
+
+def transient(error: Exception | None) -> bool:
+    """Whether waiting may help."""
+    return isinstance(error, (DiskFullError, ProjectorUnavailable))
+
+
+class Retry:
+    """The next attempt of the job that runs; one at a time.
+
+    Args:
+        first_s, longest_s: pauses between attempts [real s].
+    """
+
+    def __init__(self, first_s: float = FIRST_S, longest_s: float = LONGEST_S) -> None:
+        self._first, self._longest = first_s, longest_s
+        self._attempts = 0
+        self._task: asyncio.Task[None] | None = None
+        self._at = 0.0
+
+    @property
+    def waits_s(self) -> float | None:
+        """Seconds until the next attempt, None when there will be none by itself."""
+        if self._task is None or self._task.done():
+            return None
+        return max(0.0, self._at - asyncio.get_running_loop().time())
+
+    def schedule(self, error: Exception, go: Callable[[], None]) -> None:
+        """Call `go` after a while; a call that is pending already is kept."""
+        if self.waits_s is None:
+            pause = min(self._longest, self._first * 2.0**self._attempts)
+            self._attempts += 1
+            self._at = asyncio.get_running_loop().time() + pause
+            self._task = asyncio.create_task(self._wait(error, go, pause))
+
+    def progressed(self) -> None:
+        """Work was done: the next trouble begins with the shortest pause again."""
+        if self.waits_s is None:
+            self._attempts = 0
+
+    def cancel(self) -> None:
+        """Somebody takes over, or the job has ended."""
+        if self._task is not None:
+            self._task.cancel()
+            self._task = None
+        self._attempts = 0
+
+    async def _wait(self, error: Exception, go: Callable[[], None], pause: float) -> None:
+        while True:
+            await asyncio.sleep(pause)
+            if not isinstance(error, DiskFullError) or _has_room(error):
+                break
+            self._at = asyncio.get_running_loop().time() + pause
+        self._task = None
+        go()
+
+
+def _has_room(error: DiskFullError) -> bool:
+    """Whether what could not be written would fit now, where the system tells."""
+    data = error.data if isinstance(error.data, Mapping) else {}
+    path, need = data.get("path"), data.get("bytes")
+    if not isinstance(path, str) or not isinstance(need, int):
+        return True
+    free = free_bytes(Path(path).parent)
+    return free is None or free > need

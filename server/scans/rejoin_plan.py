@@ -1,0 +1,84 @@
+"""How a scanner gets back onto a plan: the pose to return to, and the programme from there on.
+
+A plan may be left while an axis moves (a fly scan). To rejoin it at plan time tau, each moving axis
+goes back to where its run-up would begin, speeds up, and passes the plan's position with the plan's
+velocity at one moment common to all; from there the plan's own trajectories continue. All of it is
+plain calculation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from flexdt.twin.motion import profiles as motion
+from flexdt.twin.motion.profiles import Piece, Trajectory
+from flexdt.twin.script import ScanPlan
+
+# How a scanner gets back onto a plan: the pose to return to, and the programme from there on.
+#
+# A plan may be left while an axis moves (a fly scan). To rejoin it at plan time tau, each moving
+# axis goes back to where its run-up would begin, speeds up, and passes the plan's position with the
+# plan's velocity at one moment common to all; from there the plan's own trajectories continue. All
+# of it is plain calculation.
+
+
+@dataclass(frozen=True)
+class Rejoin:
+    """What it takes to be on `plan` at plan time `tau`.
+
+    Attributes:
+        start: axis -> position at rest from which to begin [mm, deg].
+        run_up_s: from that rest to being on the plan.
+    """
+
+    plan: ScanPlan
+    tau: float
+    start: Mapping[str, float]
+    run_up_s: float
+    _motion: Mapping[str, tuple[float, float, float]]
+
+    def programme(self) -> dict[str, tuple[Trajectory, ...]]:
+        """Trajectories on a clock that shows 0 when a scanner at rest at `start` sets off."""
+        join = self.run_up_s
+        out = {}
+        for axis, (position, velocity, acceleration) in self._motion.items():
+            run_up: tuple[Trajectory, ...] = ()
+            if velocity != 0.0:
+                begin = join - abs(velocity) / acceleration
+                rate = acceleration if velocity > 0 else -acceleration
+                piece = Piece(begin, self.start[axis], 0.0, rate)
+                run_up = (Trajectory((piece,), join, position),)
+            rest = _remaining(self.plan.trajectories.get(axis, ()), self.tau)
+            if run_up or rest:
+                out[axis] = run_up + tuple(t.shifted(join - self.tau) for t in rest)
+        return out
+
+
+def rejoin(plan: ScanPlan, tau: float, accelerations: Mapping[str, float]) -> Rejoin:
+    """How to be on `plan` at plan time `tau` [s].
+
+    Args:
+        plan: the scan.
+        tau: when, on the plan's clock.
+        accelerations: of each axis's run-up.
+    """
+    start, moving, run_up = {}, {}, 0.0
+    for axis, path in plan.paths.items():
+        position, velocity = float(path.positions(tau)), float(path.velocities(tau))
+        acceleration = accelerations[axis]
+        start[axis] = position - velocity * abs(velocity) / (2.0 * acceleration)
+        moving[axis] = (position, velocity, acceleration)
+        run_up = max(run_up, abs(velocity) / acceleration)
+    return Rejoin(plan, tau, start, run_up, moving)
+
+
+def _remaining(
+    trajectories: tuple[tuple[float, Trajectory], ...], tau: float
+) -> tuple[Trajectory, ...]:
+    """What is still to come of one axis's trajectories, the one in force at `tau` cut."""
+    begun = [t for time, t in trajectories if time <= tau]
+    later = tuple(t for time, t in trajectories if time > tau)
+    if not begun or tau >= begun[-1].end:
+        return later
+    return (motion.continued(begun[-1], tau), *later)

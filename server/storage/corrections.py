@@ -1,0 +1,153 @@
+"""Corrections: dated, named and never edited, each a JSON file under DATA/corrections.
+
+Those in force, present and past, are part of the state: their names in the order in which they were
+applied. The last one is in force; None and an empty list mean nominal. A damaged file is set aside;
+if it was in force, no correction is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Literal
+
+from pydantic import Field
+
+from flexdt.protocol.fields import ShortText
+from flexdt.protocol.methods import document_messages as p
+from flexdt.protocol.rpc_errors import invalid_params
+from flexdt.runtime.files import own_documents as own
+from flexdt.runtime.files.directory import Directory
+from flexdt.server.storage.scene_document import correction_fields, correction_of
+from flexdt.twin.errors import UnknownNameError
+from flexdt.twin.geometry.offsets import Offsets, require_plausible
+from flexdt.twin.scanner.state import NamedCorrection
+
+KEPT = 1000
+"""Corrections put in force that `revert` can go back through."""
+
+History = list[str | None]
+
+
+class CorrectionFile(p.CorrectionPart):
+    """A correction as a document."""
+
+    schema_version: Literal[1] = Field(alias="schema")
+    source: ShortText | None = None
+
+
+class Corrections:
+    """All corrections of one data directory.
+
+    Args:
+        folder: where they are kept; made when the first is stored.
+        history: names in the order in which they were put in force.
+    """
+
+    def __init__(self, folder: Directory, history: Sequence[str | None] = ()) -> None:
+        self._folder = folder
+        self._all: dict[str, NamedCorrection] = {}
+        self._sources: dict[str, str | None] = {}
+        for file in own.ours(folder):
+            without = "a correction cannot be read; without it"
+            found = own.read_or_set_aside(folder, file, _read, without)
+            if found is not None:
+                self.know(*found)
+        known = list(history)
+        self.lost: str | None = None
+        """The correction that was in force and is not there any more."""
+        if known and known[-1] is not None and known[-1] not in self._all:
+            self.lost = known[-1]
+            known.append(None)
+        self.history: History = [name for name in known if name is None or name in self._all]
+
+    def all(self) -> list[NamedCorrection]:
+        """Every correction, oldest first."""
+        return sorted(self._all.values(), key=lambda c: c.date)
+
+    def source(self, name: str) -> str | None:
+        """What the correction called `name` came from."""
+        return self._sources.get(name)
+
+    @property
+    def in_force(self) -> NamedCorrection | None:
+        """The correction in force."""
+        return self.last(self.history)
+
+    def last(self, history: History) -> NamedCorrection | None:
+        """The correction in force after `history`."""
+        name = history[-1] if history else None
+        return None if name is None else self._all[name]
+
+    def get(self, name: str) -> NamedCorrection:
+        """The correction called `name`.
+
+        Raises:
+            UnknownNameError: lists the names there are.
+        """
+        if name not in self._all:
+            none = "" if self._all else "none"
+            problem = f"no correction called {name!r}; there are"
+            raise UnknownNameError.among(problem, name, self._all, none)
+        return self._all[name]
+
+    def make(
+        self, values: Mapping[str, float], name: str | None, note: str, when: datetime | None = None
+    ) -> NamedCorrection:
+        """A new correction from edge values [mm, deg]; nothing is stored yet.
+
+        Raises:
+            UnknownNameError: a name that is not a parameter.
+            RpcError: -32602, the name is taken; corrections are never edited.
+        """
+        date = (when or datetime.now(UTC)).isoformat(timespec="milliseconds")
+        parameters = Offsets.from_edge(values)
+        chosen = name if name is not None else self._free_name(date)
+        if chosen in self._all and self._all[chosen].parameters != parameters:
+            raise invalid_params(
+                f"a correction called {chosen!r} exists and corrections are never edited",
+                [{"path": "name", "message": "taken", "asked": chosen}],
+                "another name",
+            )
+        return self._all.get(chosen) or NamedCorrection(chosen, date, parameters, note)
+
+    def after(self, correction: NamedCorrection | None) -> History:
+        """The history once `correction` is in force instead of the last."""
+        name = None if correction is None else correction.name
+        if name is None and self.in_force is None:
+            return self.history
+        return [*self.history, name][-KEPT:]
+
+    def store(self, changes: own.Changes, correction: NamedCorrection, source: str | None) -> None:
+        """Write a new correction; one that is known stays as it is.
+
+        Raises:
+            DatasetWriteError: the system cannot write.
+        """
+        if correction.name in self._all:
+            return
+        document = CorrectionFile(schema=1, source=source, **correction_fields(correction))
+        stamp = correction.date.split(".")[0].replace(":", "")
+        name = f"{stamp} {own.file_stem(correction.name)}.json"
+        changes.put_json(self._folder, name, document.model_dump(by_alias=True))
+
+    def know(self, correction: NamedCorrection, source: str | None) -> None:
+        """Add a correction, with what it came from, to those that there are."""
+        if correction.name not in self._all:
+            self._all[correction.name] = correction
+            self._sources[correction.name] = source
+
+    def _free_name(self, date: str) -> str:
+        base = f"correction-{date[:10]}"
+        taken = sum(name.startswith(base) for name in self._all)
+        while (name := f"{base}-{taken + 1}") in self._all:
+            taken += 1
+        return name
+
+
+def _read(data: bytes) -> tuple[NamedCorrection, str | None]:
+    document = CorrectionFile.model_validate(own.read_json(data))
+    correction = correction_of(document)
+    require_plausible(correction.parameters, math.inf)
+    return correction, document.source

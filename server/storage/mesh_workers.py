@@ -1,0 +1,55 @@
+"""Meshes and scenes read in a process apart, with limits."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+
+from flexdt import phantoms
+from flexdt.phantoms import Phantom, PhantomError
+from flexdt.phantoms.files.phantom_files import sent_scene
+from flexdt.protocol.rpc_errors import Code, RpcError
+from flexdt.runtime.worker import document
+from flexdt.runtime.workers import Worker
+
+# Parsing of uploaded meshes and scenes in a process of their own (`worker`).
+#
+# A parser that loops, exhausts its memory or crashes does not affect the server, and the event loop
+# never waits for the parser's interpreter lock. Each upload has a fresh process that may write no
+# file, and its result is validated like any other document.
+
+TIMEOUT_S = 180.0
+MEMORY_BYTES = 3 << 30
+
+
+def mesh_apart(raw: bytes, *, unit: str, material: str, file_type: str, name: str) -> Phantom:
+    """`flexdt.phantoms.mesh_phantom` of a stranger's bytes; blocks, so call it from a thread.
+
+    Raises:
+        PhantomError: as there, unknown material, or reading it takes too much time or memory.
+    """
+    how = {"unit": unit, "material": material, "file_type": file_type, "name": name}
+    return _apart(phantoms.mesh_phantom, how, raw)
+
+
+def scene_apart(raw: bytes, *, name: str) -> Phantom:
+    """The phantom of a stranger's phantom or scene file (TOML or JSON), as `mesh_apart`.
+
+    Raises:
+        PhantomError: its content does not hold, it is larger than is allowed, names files or an
+            unknown material, or reading it takes too much time or memory.
+    """
+    return _apart(sent_scene, {"name": name}, raw)
+
+
+def _apart(read: Callable[..., Phantom], how: dict[str, str], raw: bytes) -> Phantom:
+    worker = Worker(MEMORY_BYTES)
+    try:
+        [text] = worker.ask(document, (read, how), [raw], TIMEOUT_S)
+    except RpcError as error:
+        prefix = f"{how['name']!r} cannot be read: " if error.code == Code.TOO_LARGE else ""
+        data = error.data if isinstance(error.data, dict) else None
+        raise PhantomError(prefix + error.message, data) from None
+    finally:
+        worker.kill()
+    return Phantom.from_dict(json.loads(text))

@@ -1,0 +1,156 @@
+"""Uploads of samples in progress.
+
+They come in chunks, in order, are on disk without a name, and bounded in number and total size. A
+client may begin uploads and never finish them, so nothing of them is held in memory. When a bound
+is reached the oldest is dropped, and its sender's next chunk gets an error that says so. The files
+have no name, so a killed server leaves none behind.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Annotated, BinaryIO, Literal
+
+from pydantic import Field, StringConstraints
+
+from flexdt.phantoms.files.mesh_files import default_unit
+from flexdt.protocol.fields import Payload
+from flexdt.protocol.methods.scanner_messages import LengthUnit, SampleUpload
+from flexdt.runtime.files.directory import Directory, writing
+from flexdt.runtime.log import log
+from flexdt.twin.dataset.dataset_errors import DatasetWriteError
+from flexdt.twin.errors import LimitError
+
+MOST = 4
+"""Uploads under way at a time."""
+MAX_UPLOAD_BYTES = 512 << 20
+
+
+class UploadHead(SampleUpload):
+    """What an upload is: every chunk repeats it, and it lies beside the bytes as a document.
+
+    Attributes:
+        unit: of mesh coordinates.
+        revision: names the content, in the document; those of older servers have none.
+    """
+
+    schema_version: Literal[1] = Field(default=1, alias="schema")
+    data: Payload = b""
+    unit: LengthUnit = "mm"
+    revision: Annotated[str, StringConstraints(pattern="^[0-9a-f]{16}$")] | None = None
+
+    @classmethod
+    def of(cls, chunk: SampleUpload) -> UploadHead:
+        """Of the upload to which a chunk belongs."""
+        given = chunk.model_dump(exclude={"start", "data"})
+        return cls.model_validate(given | {"unit": chunk.unit or default_unit(chunk.format)})
+
+
+@dataclass
+class _Open:
+    head: UploadHead
+    file: BinaryIO
+    received: int = 0
+
+
+class Incoming:
+    """All uploads under way; any thread may call.
+
+    Args:
+        folder: on whose disk they are; made with the first.
+        limit: bytes of all of them together; more than the largest upload.
+    """
+
+    def __init__(self, folder: Directory, limit: int) -> None:
+        self._folder, self._limit = folder, limit
+        self._open: dict[str, _Open] = {}
+        self._lock = threading.Lock()
+
+    def receive(self, head: UploadHead, start: int, data: bytes) -> int:
+        """Take a chunk; returns the bytes received so far.
+
+        A chunk that has come before is passed over, so a client may send it again; a chunk at 0
+        of another file under the same name begins anew.
+
+        Raises:
+            LimitError: a gap before this chunk, or the upload was dropped for newer ones.
+            DatasetWriteError: the disk does not take it; the upload is given up.
+        """
+        with self._lock:
+            known = self._open.get(head.name)
+            if start == 0 and (known is None or known.head != head or known.received >= head.total):
+                known = self._begin(head)
+            if known is None or known.head != head or start > known.received:
+                received = 0 if known is None or known.head != head else known.received
+                raise self._gap(head.name, start, received)
+            new = data[known.received - start :]
+            self._make_room(head.name, len(new))
+            try:
+                with self._writing():
+                    left = memoryview(new)
+                    while left:
+                        left = left[known.file.write(left) :]
+            except DatasetWriteError:
+                self._close(head.name)
+                raise
+            known.received += len(new)
+            return known.received
+
+    def take(self, name: str) -> tuple[UploadHead, bytes]:
+        """An upload of which all bytes have come; it is under way no more.
+
+        Raises:
+            LimitError: it is not whole, because another one was begun under its name.
+        """
+        with self._lock:
+            known = self._open.get(name)
+            if known is None or known.received < known.head.total:
+                raise self._gap(name, 0, 0 if known is None else known.received)
+            try:
+                with self._writing():
+                    known.file.seek(0)
+                    return known.head, known.file.read()
+            finally:
+                self._close(name)
+
+    def _begin(self, head: UploadHead) -> _Open:
+        self._close(head.name)
+        while len(self._open) >= MOST:
+            self._drop()
+        self._folder.make()
+        with self._writing():
+            file = self._folder.nameless()
+        self._open[head.name] = made = _Open(head, file)
+        return made
+
+    def _make_room(self, name: str, more: int) -> None:
+        while sum(o.received for o in self._open.values()) + more > self._limit:
+            if all(other == name for other in self._open):
+                break  # the largest upload alone always fits
+            self._drop(but=name)
+
+    def _drop(self, but: str | None = None) -> None:
+        oldest = next(name for name in self._open if name != but)
+        log("an unfinished upload was dropped for newer ones", logging.WARNING, name=oldest,
+            received=self._open[oldest].received)  # fmt: skip
+        self._close(oldest)
+
+    def _close(self, name: str) -> None:
+        known = self._open.pop(name, None)
+        if known is not None:
+            known.file.close()
+
+    def _gap(self, name: str, start: int, received: int) -> LimitError:
+        return LimitError(
+            f"upload {name!r}: the chunk begins at {start}, but {received} bytes have come; "
+            f"chunks come in order, from 0, and {MOST} uploads and {self._limit} bytes are kept at "
+            "a time: one begun before may have been dropped for newer ones",
+            {"asked": start, "allowed": received},
+        )
+
+    def _writing(self) -> AbstractContextManager[None]:
+        path = self._folder.path
+        return writing(path, f"the upload cannot be kept in {path}")

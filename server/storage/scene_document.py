@@ -1,0 +1,109 @@
+"""The scanner's part of what a twin server keeps: `Scene` of `document_messages`.
+
+It is the document of scene.*; it is validated whole before any of it is applied.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from flexdt.protocol.methods import document_messages as p
+from flexdt.protocol.rpc_errors import invalid_params
+from flexdt.twin.machine.camera import Roi
+from flexdt.twin.machine.kinematics import resolve_targets
+from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.scanner.state import NamedCorrection, Sample, StagePlacement
+
+
+def save_scene(
+    scanner: ScannerTwin, now: float, *, name: str = "", saved: str = "", version: str = ""
+) -> p.Scene:
+    """The scanner as a document; a motor under way is saved where it is bound."""
+    return p.Scene(
+        schema=1,
+        flexdt=version,
+        name=name,
+        saved=saved,
+        machine=scanner.machine.name,
+        profile=scanner.profile.name,
+        positions=scanner.targets(now),
+        speeds={axis: pace[0] for axis, pace in scanner.paces.items()},
+        accelerations={axis: pace[1] for axis, pace in scanner.paces.items()},
+        tube=p.TubePart(kV=scanner.tube.kV, power_W=scanner.tube.power_W, on=scanner.tube.on),
+        camera=p.CameraPart(**scanner.camera.stated),
+        sample=p.SamplePart(
+            name=scanner.sample.name,
+            material=scanner.sample.material,
+            offset=p.Placement(**asdict(scanner.sample.offset)),
+        ),
+        correction=None
+        if scanner.correction is None
+        else p.CorrectionPart(**correction_fields(scanner.correction)),
+    )
+
+
+def correction_fields(correction: NamedCorrection) -> dict[str, Any]:
+    """A correction as documents and the wire name its values, in mm and deg."""
+    return {
+        "name": correction.name,
+        "date": correction.date,
+        "parameters": correction.parameters.to_edge(),
+        "comment": correction.note,
+    }
+
+
+def correction_of(part: p.CorrectionPart) -> NamedCorrection:
+    """The correction of a document.
+
+    Raises:
+        UnknownNameError: a name that is not a parameter.
+    """
+    return NamedCorrection.from_edge(part.name, part.date, part.parameters, part.comment)
+
+
+def require_fit(scene: p.Scene, scanner: ScannerTwin) -> None:
+    """Check that a scene fits this scanner.
+
+    Raises:
+        RpcError: -32602, another machine's.
+        UnknownNameError, LimitError: an axis, position or setting this scanner does not have.
+        GeometryError: a correction that no scanner can have.
+    """
+    if scene.machine != scanner.machine.name:
+        raise invalid_params(
+            f"the scene is of machine {scene.machine!r}, this is {scanner.machine.name!r}",
+            [{"path": "machine", "message": "another machine", "asked": scene.machine}],
+            scanner.machine.name,
+        )
+    resolve_targets(scanner.machine, scene.positions, scene.positions)
+    trial = ScannerTwin(scanner.machine, scanner.profile)
+    apply_settings(scene, trial)
+    if scene.correction is not None:
+        trial.require_applicable(correction_of(scene.correction))
+
+
+def paces_of(scene: p.Scene, scanner: ScannerTwin) -> dict[str, tuple[float, float]]:
+    """Motor -> (speed, acceleration) with the scene's where it has them."""
+    return {
+        axis: (scene.speeds.get(axis, speed), scene.accelerations.get(axis, acceleration))
+        for axis, (speed, acceleration) in scanner.paces.items()
+    }
+
+
+def apply_settings(scene: p.Scene, scanner: ScannerTwin) -> None:
+    """Set tube, camera and paces as in the scene; X-rays are not switched."""
+    for axis, speed in scene.speeds.items():
+        scanner.set_axis(axis, speed=speed)
+    for axis, acceleration in scene.accelerations.items():
+        scanner.set_axis(axis, acceleration=acceleration)
+    scanner.set_tube(kV=scene.tube.kV, power_W=scene.tube.power_W)
+    camera = scene.camera.model_dump()
+    scanner.set_camera(**camera | {"roi": Roi(*scene.camera.roi)})
+
+
+def sample_of(scene: p.Scene) -> Sample:
+    """The scene's sample."""
+    return Sample(
+        scene.sample.name, StagePlacement(**scene.sample.offset.model_dump()), scene.sample.material
+    )

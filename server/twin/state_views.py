@@ -1,0 +1,93 @@
+"""The twin's values as the wire's models: one function each, units as the protocol has them."""
+
+from __future__ import annotations
+
+import math
+
+from flexdt.protocol import state_model as w
+from flexdt.server.scans.twin_clock import TwinClock
+from flexdt.server.storage.scene_document import correction_fields
+from flexdt.twin.collision.first_contact import NearestPair
+from flexdt.twin.errors import GeometryError
+from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.machine.description import Machine
+from flexdt.twin.scanner.joining import StopMotion
+from flexdt.twin.scanner.state import NamedCorrection, Readout, Safety, TubeSettings
+
+SAFETY_NAMES = {"ready": "ok", "blocked": "aborted", "estopped": "estop"}
+"""The twin's safety states as the wire names them."""
+
+
+def tube_view(tube: TubeSettings, now: float) -> w.TubeState:
+    """The tube at `now`."""
+    return w.TubeState(
+        on=tube.on,
+        kV=tube.kV,
+        power_W=tube.power_W,
+        ready=tube.ready(now),
+        ready_in_s=tube.ready_in_s(now),
+    )
+
+
+def camera_view(camera: CameraSettings, machine: Machine) -> w.CameraState:
+    """The camera."""
+    return w.CameraState(**camera.facts(machine.detector.pixels))
+
+
+def geometry_view(readout: Readout | None) -> w.GeometryState:
+    """Derived geometry.
+
+    Raises:
+        GeometryError: the pose is none a scanner can have.
+    """
+    if readout is None:
+        raise GeometryError(
+            "the rotation axis or the detector is not in front of the source", {"check": "sod"}
+        )
+    return w.GeometryState(**vars(readout))
+
+
+def safety_view(safety: Safety, clearance: NearestPair | None, margin_mm: float) -> w.SafetyState:
+    """The safety state, and how close things are now: nearer than `margin_mm` is a warning."""
+    near = None if clearance is None or not math.isfinite(clearance.mm) else clearance
+    warnings = []
+    if near is not None and near.pair is not None and near.mm < margin_mm:
+        warnings = [f"{' and '.join(near.pair)} are within the margin, {near.mm:.2f} mm apart"]
+    return w.SafetyState(
+        state=SAFETY_NAMES[safety.state],
+        estop=safety.state == "estopped",
+        message=safety.reason,
+        stop=safety.stop,
+        stopped_by=safety.stopped_by or None,
+        blocked_attempts=safety.blocked_attempts,
+        clearance_mm=None if near is None else near.mm,
+        pair=None if near is None or near.pair is None else list(near.pair),
+        warnings=warnings,
+    )
+
+
+def correction_view(correction: NamedCorrection | None, source: str | None) -> w.Correction | None:
+    """A correction, in mm and deg."""
+    if correction is None:
+        return None
+    return w.Correction(**correction_fields(correction), source=source)
+
+
+def clock_view(clock: TwinClock) -> w.ClockState:
+    """The clock."""
+    return w.ClockState(
+        time_s=clock.now(), speed_up=clock.speed_up, real_time_factor=clock.real_time_factor
+    )
+
+
+def stopped_view(state: w.State, stopping: StopMotion, now: float) -> w.Stopped:
+    """The state after a stop, and how the motors come to rest."""
+    hit = stopping.would_hit
+    how = w.Stopping(
+        path=stopping.path,
+        duration_s=stopping.duration_s,
+        distances=dict(stopping.distances),
+        would_hit=None if hit is None else list(hit.pair),
+        would_hit_in_s=None if hit is None else max(0.0, hit.time - now),
+    )
+    return w.Stopped(**dict(state), stopping=how)
