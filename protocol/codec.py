@@ -26,6 +26,7 @@ LARGE = 1 << 16
 A_PIECE = 3 << 16
 """Bytes of such a piece; a multiple of three, as base64 wants."""
 _MARK = secrets.token_hex(16)
+_TO_VISIT = (dict, list, msgpack.Timestamp)
 
 
 class Codec(Enum):
@@ -137,9 +138,6 @@ def write_msgpack(document: object) -> bytes:
     """
     packed: bytes = msgpack.packb(document, use_bin_type=True, default=_plain)
     return packed
-
-
-_TO_VISIT = (dict, list, msgpack.Timestamp)
 
 
 def _check_depth(document: object) -> None:

@@ -41,6 +41,11 @@ Id = str | int | float | None
 """A request's id: text or number; None only where the request's own id could not be read."""
 
 Params = Mapping[str, object] | list[object] | None
+_KINDS: Mapping[type, str] = {
+    dict: "an object", list: "a list", str: "text", bool: "a truth value",
+    int: "a number", float: "a number", type(None): "null", bytes: "bytes",
+}  # fmt: skip
+_W = TypeVar("_W")
 
 
 @dataclass(frozen=True)
@@ -222,19 +227,10 @@ def _valid_id(id: object) -> bool:
     return id is None or isinstance(id, str) or type(id) is int
 
 
-_KINDS: Mapping[type, str] = {
-    dict: "an object", list: "a list", str: "text", bool: "a truth value",
-    int: "a number", float: "a number", type(None): "null", bytes: "bytes",
-}  # fmt: skip
-
-
 def _kind(value: object) -> str:
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     return _KINDS.get(type(value), type(value).__name__)
-
-
-_W = TypeVar("_W")
 
 
 class Role(Enum):

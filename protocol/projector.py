@@ -18,6 +18,7 @@ from pydantic.json_schema import WithJsonSchema
 
 from flexdt.protocol import fields as f
 from flexdt.protocol import image
+from flexdt.protocol.field_checks import require_extent
 from flexdt.protocol.method import AnyMethod, Method, read
 from flexdt.protocol.methods.document_messages import Discovery
 from flexdt.protocol.methods.scanner_messages import Bytes
@@ -29,6 +30,14 @@ MAX_CORNERS: Final = 1 << 27
 """Vertices, or triangles, of a mesh."""
 MAX_MM: Final = 1e7
 """Farthest that anything is from the origin; also the longest u and v."""
+Coordinate = Annotated[float, Ge(-MAX_MM), Le(MAX_MM)]
+_ROW = Annotated[list[Coordinate], Len(12, 12)]
+_ROWS_SCHEMA: Final = TypeAdapter(Annotated[list[_ROW], Len(1, MAX_VIEWS)]).json_schema()
+_IMAGE_SCHEMA: Final = {"type": "object", "required": ["dtype", "shape", "data"]}
+Detector = Annotated[tuple[f.Side, f.Side], Field(strict=False)]
+"""(rows, columns)."""
+Place = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
+"""(x, y, z) [mm]."""
 
 
 def _rows(value: object) -> object:
@@ -71,11 +80,6 @@ def _buffer(value: object) -> object:
         raise ValueError(error.message) from None
 
 
-Coordinate = Annotated[float, Ge(-MAX_MM), Le(MAX_MM)]
-_ROW = Annotated[list[Coordinate], Len(12, 12)]
-_ROWS_SCHEMA: Final = TypeAdapter(Annotated[list[_ROW], Len(1, MAX_VIEWS)]).json_schema()
-_IMAGE_SCHEMA: Final = {"type": "object", "required": ["dtype", "shape", "data"]}
-
 ConeVecs = Annotated[
     InstanceOf[np.ndarray],
     BeforeValidator(_rows),
@@ -93,12 +97,6 @@ Buffer = Annotated[
 ]
 """Bytes, not copied."""
 
-Detector = Annotated[tuple[f.Side, f.Side], Field(strict=False)]
-"""(rows, columns)."""
-
-Place = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
-"""(x, y, z) [mm]."""
-
 
 class VoxelGrid(f.Params):
     """Voxels without values."""
@@ -114,7 +112,7 @@ class VoxelGrid(f.Params):
 
     @model_validator(mode="after")
     def _extent(self) -> VoxelGrid:
-        f.require_extent(self.shape, self.voxel_mm)
+        require_extent(self.shape, self.voxel_mm)
         return self
 
 

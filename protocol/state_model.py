@@ -11,6 +11,8 @@ from pydantic import Field
 
 from flexdt.protocol.fields import NonNegative, Pair, Positive, Result, Roi, Shape2, SpeedUp, Triple
 
+JobPhase = Literal["queued", "running", "paused", "done", "failed", "aborted", "incomplete"]
+
 
 class AxisState(Result):
     """One axis, in the script's sign; mm or deg, per second."""
@@ -139,9 +141,6 @@ class ClockState(Result):
     """asked for: twin seconds per real second, or max"""
     real_time_factor: float | None = None
     """achieved, over the last seconds"""
-
-
-JobPhase = Literal["queued", "running", "paused", "done", "failed", "aborted", "incomplete"]
 
 
 class JobStatus(Result):

@@ -38,6 +38,7 @@ from flexdt.clients.viewer.scenes.world import FREE, LAYERS, motors
 from flexdt.clients.viewer.viewer import PageMethod, Viewer
 from flexdt.protocol import Code, Method, RpcError, parse_params
 from flexdt.protocol import image as wire_image
+from flexdt.protocol.field_checks import few
 from flexdt.protocol.fields import (
     AxisName,
     Deviation,
@@ -48,7 +49,6 @@ from flexdt.protocol.fields import (
     Power,
     ShortText,
     Voltage,
-    few,
 )
 from flexdt.protocol.methods.calibration_messages import (
     CalibrationAlign,

@@ -9,11 +9,16 @@ from annotated_types import Ge, Le, Len, MaxLen, MinLen
 from pydantic import Field, JsonValue
 
 from flexdt.protocol import fields as f
+from flexdt.protocol.field_checks import few
 from flexdt.protocol.fields import ImageValue, Params, Result, Shape2, ShortText
 from flexdt.protocol.method import command, read
 from flexdt.protocol.state_model import Correction
 
 DataSetName = Annotated[ShortText, Len(1, 255)]
+ImageKind = Literal["dark", "flat", "projection"]
+Parameters = Annotated[list[f.AxisName], MaxLen(17)]
+FIT_LIMITS: Final[Mapping[str, float]] = {"seconds": 300, "memory_bytes": 6 << 30}
+"""What a calibration from images may cost."""
 
 
 class DatasetList(Params):
@@ -52,9 +57,6 @@ class DatasetFrame(Params):
     kind: Literal["line_integral", "counts"] = "counts"
     binning: Annotated[int, Ge(1), Le(64)] = 1
     """mean over so many pixels a side"""
-
-
-ImageKind = Literal["dark", "flat", "projection"]
 
 
 class DatasetInfo(Result):
@@ -153,13 +155,10 @@ DATASET_GET = read("dataset.get", DatasetGet, DatasetResult,
 DATASET_FRAME = read("dataset.frame", DatasetFrame, DatasetFrameResult, "an image of a data set")
 
 
-Parameters = Annotated[list[f.AxisName], MaxLen(17)]
-
-
 class CalibrationApply(f.Params):
     """A correction to put in force; it replaces the last."""
 
-    parameters: Annotated[dict[f.AxisName, f.Deviation], MaxLen(64), f.few(64)]
+    parameters: Annotated[dict[f.AxisName, f.Deviation], MaxLen(64), few(64)]
     """name -> value [mm or deg], true minus nominal"""
     name: f.Name | None = None
     comment: f.Comment = ""
@@ -195,7 +194,7 @@ class CalibrationFit(f.Params):
     knows where they are, in one data set"""
     free: Annotated[Parameters, MinLen(1)] | None = None
     """what is estimated; default: dO_x, dO_y, dO_z, alpha, tau_*, of unknown markers dO_x"""
-    priors: Annotated[dict[f.AxisName, f.NonNegative], MaxLen(17), f.few(17)] = Field(
+    priors: Annotated[dict[f.AxisName, f.NonNegative], MaxLen(17), few(17)] = Field(
         default_factory=dict
     )
     """name -> standard deviation [mm or deg]; 0: exactly known"""
@@ -294,9 +293,6 @@ class CorrectionListResult(f.Result):
     corrections: list[Correction]
     current: str | None = None
 
-
-FIT_LIMITS: Final[Mapping[str, float]] = {"seconds": 300, "memory_bytes": 6 << 30}
-"""What a calibration from images may cost."""
 
 CALIBRATION_APPLY = command("calibration.apply", CalibrationApply, CorrectionResult,
                             "put a correction in force")  # fmt: skip

@@ -12,6 +12,7 @@ from annotated_types import Ge, Le, MaxLen
 from pydantic import ConfigDict, Field, JsonValue
 
 from flexdt.protocol import fields as f
+from flexdt.protocol.field_checks import few
 from flexdt.protocol.method import by_hand, read
 from flexdt.protocol.state_model import State
 
@@ -19,7 +20,7 @@ Averages = Annotated[int, Ge(1), Le(100_000)]
 Frames = Annotated[int, Ge(1), Le(1_000_000)]
 Kept = Annotated[float, Ge(-2e9), Le(2e9)]
 """A `Deviation` that has been to radians and back."""
-Paces = Annotated[dict[f.AxisName, f.Pace], MaxLen(64), f.few(64)]
+Paces = Annotated[dict[f.AxisName, f.Pace], MaxLen(64), few(64)]
 
 
 class Placement(f.Params):
@@ -64,7 +65,7 @@ class CorrectionPart(f.Params):
 
     name: f.Name
     date: f.ShortText
-    parameters: Annotated[dict[f.AxisName, Kept], MaxLen(64), f.few(64)]
+    parameters: Annotated[dict[f.AxisName, Kept], MaxLen(64), few(64)]
     comment: f.Comment = ""
 
 
@@ -77,7 +78,7 @@ class Scene(f.Params):
     saved: f.ShortText = ""
     machine: f.ShortText
     profile: f.ShortText
-    positions: Annotated[dict[f.AxisName, f.Position], MaxLen(64), f.few(64)]
+    positions: Annotated[dict[f.AxisName, f.Position], MaxLen(64), few(64)]
     speeds: Paces = Field(default_factory=dict)
     accelerations: Paces = Field(default_factory=dict)
     tube: TubePart

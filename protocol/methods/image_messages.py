@@ -15,6 +15,8 @@ from flexdt.protocol.methods.scanner_messages import CameraSet, TubeSet
 from flexdt.protocol.state_model import GeometryResult, ImageFlags
 
 LayerText = Annotated[f.ShortText, MaxLen(100)]
+PREDICTION_LIMITS: Final[Mapping[str, float]] = {"seconds": 60, "memory_bytes": 4 << 30}
+"""What a prediction of image quality may cost."""
 
 
 class ProjectionGet(f.Params):
@@ -136,9 +138,6 @@ class ExposurePrediction(f.Result):
     assumed: list[str]
     """what is not known of the sample"""
 
-
-PREDICTION_LIMITS: Final[Mapping[str, float]] = {"seconds": 60, "memory_bytes": 4 << 30}
-"""What a prediction of image quality may cost."""
 
 PROJECTION_GET = read("projection.get", ProjectionGet, Projection,
                       "an image at the current pose, or another")  # fmt: skip

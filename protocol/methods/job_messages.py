@@ -26,6 +26,13 @@ Seed = Annotated[
 ]
 
 ScriptText = Annotated[str, MaxLen(8 * 2**20)]
+CHECK_LIMITS: Final[Mapping[str, float]] = {
+    "seconds": 120,
+    "memory_bytes": 4 << 30,
+    "report_bytes_json": MAX_ANSWER[Codec.JSON],
+    "report_bytes_msgpack": MAX_ANSWER[Codec.MSGPACK],
+}
+"""What parsing, planning and sweeping a script or poses may cost."""
 
 
 class ScriptInput(f.Params):
@@ -131,14 +138,6 @@ class JobListResult(f.Result):
 
     jobs: list[JobStatus]
 
-
-CHECK_LIMITS: Final[Mapping[str, float]] = {
-    "seconds": 120,
-    "memory_bytes": 4 << 30,
-    "report_bytes_json": MAX_ANSWER[Codec.JSON],
-    "report_bytes_msgpack": MAX_ANSWER[Codec.MSGPACK],
-}
-"""What parsing, planning and sweeping a script or poses may cost."""
 
 SCRIPT_CHECK = read("script.check", ScriptInput, CheckResult,
                     "parse, plan and check a script", limits=CHECK_LIMITS, bulky=True)  # fmt: skip

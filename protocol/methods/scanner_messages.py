@@ -8,6 +8,7 @@ from annotated_types import Ge, Gt, Le
 from pydantic import Field, model_validator
 
 from flexdt.protocol import fields as f
+from flexdt.protocol.field_checks import require_extent
 from flexdt.protocol.fields import Exposure, Params, Power, RoiAsked, ShortText, SpeedUp, Voltage
 from flexdt.protocol.method import Method, by_hand, command, read
 from flexdt.protocol.methods.document_messages import Averages, Frames, Placement
@@ -19,6 +20,12 @@ from flexdt.protocol.state_model import (
     Stopped,
     TubeState,
 )
+
+Bytes = Annotated[int, Ge(0), Le(2**53)]
+"""A place in, or a size of, something sent in parts [bytes]."""
+MESH_CHUNK = 4 << 20
+"""Bytes of a mesh in one answer: below a frame, also as base64."""
+LengthUnit = Literal["um", "mm", "cm", "m", "inch"]
 
 
 class Move(f.Params):
@@ -122,15 +129,6 @@ CAMERA_SET = by_hand("camera.set", CameraSet, CameraState,
                      "set exposure, mode, ROI, averages, frames")  # fmt: skip
 
 
-Bytes = Annotated[int, Ge(0), Le(2**53)]
-"""A place in, or a size of, something sent in parts [bytes]."""
-
-MESH_CHUNK = 4 << 20
-"""Bytes of a mesh in one answer: below a frame, also as base64."""
-
-LengthUnit = Literal["um", "mm", "cm", "m", "inch"]
-
-
 class SampleSet(f.Params):
     """Which sample stands on the stage: a shipped phantom's name, or an uploaded file's."""
 
@@ -189,7 +187,7 @@ class SampleUpload(f.Params):
         if self.kind == "voxels" and (self.shape is None or self.voxel_mm is None):
             raise ValueError("voxels need shape and voxel_mm")
         if self.shape is not None and self.voxel_mm is not None:
-            f.require_extent(self.shape, self.voxel_mm)
+            require_extent(self.shape, self.voxel_mm)
         return self
 
 

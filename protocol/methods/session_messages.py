@@ -8,7 +8,8 @@ from annotated_types import Ge, Le, Len, MaxLen
 from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic.json_schema import WithJsonSchema
 
-from flexdt.protocol.fields import Empty, Nothing, Params, Result, ShortText, TopicName, line
+from flexdt.protocol.field_checks import line
+from flexdt.protocol.fields import Empty, Nothing, Params, Result, ShortText, TopicName
 from flexdt.protocol.method import Method, read
 from flexdt.protocol.state_model import State
 

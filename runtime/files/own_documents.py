@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import TypeVar
 
-from flexdt.protocol.fields import MAX_STEM, encoded
+from flexdt.protocol.field_checks import MAX_STEM, encoded
 from flexdt.runtime.files.directory import BEFORE, LARGEST, Directory, writing
 from flexdt.runtime.log import log
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError

@@ -25,7 +25,7 @@ from flexdt.protocol import (
     parse_params,
     parse_result,
 )
-from flexdt.protocol.fields import require_extent
+from flexdt.protocol.field_checks import require_extent
 from flexdt.protocol.method import compatible
 from flexdt.protocol.methods import openrpc_document
 from flexdt.protocol.methods.scanner_messages import MoveResult, SampleUpload

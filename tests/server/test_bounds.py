@@ -11,7 +11,7 @@ import pytest
 from in_process import Lab, run
 
 from flexdt.protocol import METHODS, RpcError, parse_params
-from flexdt.protocol.fields import MAX_STEM
+from flexdt.protocol.field_checks import MAX_STEM
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.storage.sample_uploads import MOST, Incoming, UploadHead
 from flexdt.twin.errors import LimitError

@@ -1,0 +1,87 @@
+"""Checks that types of the wire's fields share; each raises ValueError with what is allowed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from urllib.parse import quote
+
+from pydantic import (
+    BeforeValidator,
+)
+
+from flexdt.protocol import image
+from flexdt.protocol.rpc_errors import RpcError
+
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+_BUT_LINES = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
+MAX_STEM = 100
+"""Bytes of a name, percent-encoded: it becomes a file's name, with a date before and a suffix."""
+MAX_SIDE_MM = 1e4
+"""Longest side of a grid of voxels [mm]."""
+
+
+def few(most: int) -> BeforeValidator:
+    """Make a validator that rejects an object of more than `most` members before it reads any."""
+
+    def check(value: object) -> object:
+        if isinstance(value, Mapping) and len(value) > most:
+            raise ValueError(f"{len(value)} members; at most {most} are allowed")
+        return value
+
+    return BeforeValidator(check)
+
+
+def payload(value: object) -> object:
+    """Read binary data: base64 text, or bytes."""
+    try:
+        return bytes(image.payload(value))
+    except RpcError as error:
+        raise ValueError(error.message) from None
+
+
+def no_truth(value: object) -> object:
+    """Check that a value is not true or false, which Python takes for numbers."""
+    if isinstance(value, bool):
+        raise ValueError("a number is needed, not true or false")
+    return value
+
+
+def encoded(name: str) -> str:
+    """Percent-encode `name` for use in a file's name; different names give different texts."""
+    return quote(name, safe=" ", errors="surrogatepass").replace(".", "%2E")
+
+
+def line(value: str) -> str:
+    """Check that a text has no control characters and line ends."""
+    if _CONTROL.search(value):
+        raise ValueError("control characters and line ends are not allowed")
+    return value
+
+
+def lines(value: str) -> str:
+    """Check that a text has no control characters but TAB and line ends."""
+    if _BUT_LINES.search(value):
+        raise ValueError("control characters but TAB and line ends are not allowed")
+    return value
+
+
+def plain_name(value: str) -> str:
+    """Check that a name can become a file's name."""
+    if "/" in value or "\\" in value or _CONTROL.search(value):
+        raise ValueError("a name may hold anything but /, \\ and control characters")
+    if (size := len(encoded(value))) > MAX_STEM:
+        raise ValueError(
+            f"too long: {size} bytes percent-encoded (what is no letter, digit, space, _, - or ~ "
+            f"takes 3 to 12), {MAX_STEM} allowed"
+        )
+    return value
+
+
+def require_extent(shape: tuple[int, ...], voxel_mm: tuple[float, ...]) -> None:
+    """Raise ValueError where a grid of `shape` (z, y, x) and `voxel_mm` (x, y, z) is too large."""
+    side = max(n * v for n, v in zip(reversed(shape), voxel_mm, strict=True))
+    if side > MAX_SIDE_MM:
+        raise ValueError(
+            f"shape and voxel_mm: a side of {side:g} mm; at most {MAX_SIDE_MM:g} mm are allowed"
+        )
