@@ -41,6 +41,7 @@ from flexdt.twin.projection.operators import (
     layout_data,
     voxel_rays,
 )
+from flexdt.twin.projection.portions import equal_portions
 from flexdt.twin.projection.volume import Volume, blank_layout, bring_over
 
 LEVEL = ConeVec.from_vectors((0, -10, 0), (0, 10, 0), (1, 0, 0), (0, 0, -1))
@@ -143,16 +144,21 @@ def _project(
     quadric = np.array([[one.curved, *one.matrix.ravel(), *one.center] for one in shapes], float)
     ends = np.cumsum([0, *(len(one.slabs) for one in shapes)])
     rays = geometry.rays(shape)
-    analytic_kernels.project_convex(
-        quadric,
-        np.concatenate([one.slabs for one in shapes]),
-        np.column_stack([ends[:-1], ends[1:]]),
-        shadows(shapes, rays, shape),
-        rays,
-        weight,
-        channel,
-        out,
-    )
+    slabs = np.concatenate([one.slabs for one in shapes])
+    slab_range = np.column_stack([ends[:-1], ends[1:]])
+    seen = shadows(shapes, rays, shape)
+    band = analytic_kernels.BAND
+    jobs = len(rays) * -(-shape[0] // band)
+    for first, last in equal_portions(jobs, CHORD_NS * band * shape[1] * len(shapes), threads()):
+        analytic_kernels.project_convex(
+            quadric, slabs, slab_range, seen, rays, weight, channel, out, first, last
+        )
+
+
+CHORD_NS = 20.0
+"""Estimated time of a solid at a pixel of its shadow."""
+TRIANGLE_NS = 20.0
+"""Estimated time of a triangle for each band of rows and, of small ones, for each of its pixels."""
 
 
 def warm_up() -> None:
@@ -273,14 +279,14 @@ def project_mesh(
     rays = geometry.rays(shape)
     rays[:, 3:6] += ASIDE[0] * geometry.u + ASIDE[1] * geometry.v
     basis = np.stack([geometry.u, geometry.v, rays[:, 3:6]], axis=2)
-    analytic_kernels.project_triangles(
-        mesh.vertices,
-        mesh.faces,
-        rays,
-        np.ascontiguousarray(np.linalg.inv(basis)),
-        threads(),
-        result,
-    )
+    inverses = np.ascontiguousarray(np.linalg.inv(basis))
+    band = analytic_kernels.MESH_BAND
+    jobs = len(rays) * -(-shape[0] // band)
+    job_ns = TRIANGLE_NS * (len(mesh.faces) + len(mesh.vertices) + band * shape[1])
+    for first, last in equal_portions(jobs, job_ns, threads()):
+        analytic_kernels.project_triangles(
+            mesh.vertices, mesh.faces, rays, inverses, threads(), result, first, last
+        )
     return result
 
 

@@ -18,6 +18,13 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.analytic_solids import corner_shadows
 from flexdt.twin.projection.fan_plan import IntArray, exchanged, lying, plan_fans, plan_turns
 from flexdt.twin.projection.kernels.fan_types import Box
+from flexdt.twin.projection.portions import (
+    equal_portions,
+    fan_job_ns,
+    portions,
+    ray_ns,
+    turn_portions,
+)
 from flexdt.twin.projection.volume import LANES
 
 ROOM = 64 << 20
@@ -50,25 +57,42 @@ def project(box: Box, views: FloatArray, out: Float32Array, *, fans: bool = True
         out: C-ordered float32.
         fans: False for rays that all travel alone.
     """
-    from flexdt.twin.projection.kernels import fan_kernels, siddon_kernels
+    from flexdt.twin.projection.kernels import fan_kernels
 
     shape = (out.shape[1], out.shape[2])
+    counts = (box.nx, box.ny, box.nz)
     if not fans:
-        siddon_kernels.project_rays(box, views, np.arange(len(views)), out, TILE)
+        _project_alone(box, views, np.arange(len(views)), out)
         return
     for some, turned in runs(views, shape):
         rays, images, seen = views[some], out[some], shape
         if turned:
             rays, seen = exchanged(rays), shape[::-1]
             images = np.empty((len(rays), *seen), np.float32)
-        plan = plan_fans(rays, (box.nx, box.ny, box.nz), seen)
+        plan, workers = plan_fans(rays, counts, seen), threads()
         if len(plan.jobs):
             shadows = box_shadows(box, rays, (0, box.nz), seen)
-            fan_kernels.project_fans(box, plan.fans(rays), shadows, threads(), images)
-        if len(plan.alone):
-            siddon_kernels.project_rays(box, rays, plan.alone, images, TILE)
+            times = fan_job_ns(plan.lines, plan.jobs, rays, counts, (seen[0], plan.widest))
+            for first, last in portions(times, workers):
+                part = plan.fans(rays, slice(first, last))
+                fan_kernels.project_fans(box, part, shadows, workers, images)
+        _project_alone(box, rays, plan.alone, images)
         if turned:
             out[some] = images.transpose(0, 2, 1)
+
+
+def _project_alone(box: Box, views: FloatArray, chosen: IntArray, out: Float32Array) -> None:
+    """Fill the chosen views of out with rays that all travel alone."""
+    from flexdt.twin.projection.kernels import siddon_kernels
+
+    jobs = len(chosen) * -(-out.shape[2] // TILE)
+    for first, last in equal_portions(jobs, tile_ns(box, out.shape[1]), threads()):
+        siddon_kernels.project_rays(box, views, chosen, out, TILE, first, last)
+
+
+def tile_ns(box: Box, rows: int) -> float:
+    """Estimated time of TILE detector columns of rays that travel alone."""
+    return TILE * rows * ray_ns((box.nx, box.ny, box.nz))
 
 
 def spread(
@@ -104,15 +128,21 @@ def _spread(box: Box, views: FloatArray, values: Float32Array, clean: bool, fans
     marks = np.full((len(slices), 2 * box.nx * box.ny), int(clean), np.int32)
     if len(plan.jobs):
         shadows = np.stack([box_shadows(box, views, (a, b), shape) for a, b in slices.tolist()])
-        fan_kernels.spread_fans(
-            box, plan.fans(views), turns.turns, turns.units, slices, shadows, marks, workers, values
-        )
+        times = fan_job_ns(plan.lines, plan.jobs, views, counts, (shape[0], plan.widest))
+        units = np.add.reduceat(times, turns.units[:, 0])
+        for some in turn_portions(turns.turns, units, workers):
+            fan_kernels.spread_fans(
+                box, plan.fans(views), some, turns.units, slices, shadows, marks, workers, values
+            )
     if not clean:
         fan_kernels.open_rest(box, slices, marks)
     if len(alone):
         slices = z_slices(box.nz, workers)
         marks = np.ones((len(slices), 2 * box.nx * box.ny), np.int32)
-        siddon_kernels.spread_rays(box, views, alone, values, slices, marks)
+        columns = len(alone) * shape[1]
+        # All threads meet every ray, each in its slice.
+        for first, last in equal_portions(columns, shape[0] * ray_ns(counts), 1):
+            siddon_kernels.spread_rays(box, views, alone, values, slices, marks, first, last)
 
 
 def z_slices(nz: int, count: int) -> IntArray:

@@ -87,9 +87,9 @@ class FanPlan:
     widest: int
     alone: IntArray
 
-    def fans(self, views: FloatArray) -> Fans:
-        """The plan of `views` (n, 12) as the kernels take it."""
-        return Fans(views, self.lines, self.jobs, self.room, self.widest)
+    def fans(self, views: FloatArray, some: slice = slice(None)) -> Fans:
+        """The plan of `views` (n, 12), or `some` of its jobs, as the kernels take it."""
+        return Fans(views, self.lines, self.jobs[some], self.room, self.widest)
 
 
 def plan_fans(views: FloatArray, counts: tuple[int, int, int], shape: tuple[int, int]) -> FanPlan:

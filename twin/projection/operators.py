@@ -36,6 +36,7 @@ from flexdt.twin.projection import cpu, fan_plan, gpu
 from flexdt.twin.projection.cpu import TILE
 from flexdt.twin.projection.fan_plan import FACING, SPREAD, WIDEST
 from flexdt.twin.projection.kernels.fan_types import Box
+from flexdt.twin.projection.portions import equal_portions
 from flexdt.twin.projection.volume import (
     DeviceVolume,
     Grid,
@@ -395,6 +396,10 @@ def check_out(out: Float32Array | None, shape: tuple[int, int, int]) -> Float32A
     return out
 
 
+JUMPS = 4.0
+"""Time of a ray whose derivatives are gathered, as a multiple of that of its integral."""
+
+
 def geometry_gradient(
     volume: Volume, cone_vec: ConeVec | npt.ArrayLike, weights: npt.ArrayLike
 ) -> FloatArray:
@@ -435,7 +440,10 @@ def geometry_gradient(
     layout = volume.layout
     if not layout.empty and n:
         views = voxel_rays(geometry, layout, (rows, cols))
-        siddon_kernels.gather(box_of(layout), views, values, TILE, parts)
+        box = box_of(layout)
+        job_ns = JUMPS * cpu.tile_ns(box, rows)
+        for first, last in equal_portions(len(parts), job_ns, cpu.threads()):
+            siddon_kernels.gather(box, views, values, TILE, parts, first, last)
     return np.asarray(parts.reshape(n, tiles, 12).sum(axis=1))
 
 
@@ -481,5 +489,8 @@ def geometry_change(
     if not layout.empty and len(geometry):
         views = voxel_rays(geometry, layout, shape)
         steps = np.ascontiguousarray(np.broadcast_to(moved, (len(geometry), 12)))
-        siddon_kernels.follow(box_of(layout), views, steps, TILE, result)
+        box, jobs = box_of(layout), len(geometry) * -(-shape[1] // TILE)
+        job_ns = JUMPS * cpu.tile_ns(box, shape[0])
+        for first, last in equal_portions(jobs, job_ns, cpu.threads()):
+            siddon_kernels.follow(box, views, steps, TILE, result, first, last)
     return result

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from flexdt.twin.backends import backend
 from flexdt.twin.errors import GeometryError, NotBuiltError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray, as_numbers
+from flexdt.twin.projection.portions import PASS_NS, equal_portions
 from flexdt.twin.signatures import File, public
 
 WARNED: Final = 0.03
@@ -472,7 +473,8 @@ class Volume:
             stride_y = nx * stride_x
             flat = aligned_zeros(ny * stride_y)
             bring_over(self.data, flat, stride_x, stride_y)
-        layout_kernels.occupied(flat, stride_x, stride_y, nz, first, last)
+        for y0, y1 in equal_portions(ny, PASS_NS * nz * nx, 1):
+            layout_kernels.occupied(flat, stride_x, stride_y, nz, first, last, y0, y1)
         filled = last > first
         if not filled.any():
             none, origin = np.zeros(0, np.int32), (0.0, 0.0, 0.0)
@@ -659,9 +661,10 @@ def bring_over(
     data = data.view()
     data.flags.writeable = False  # a kernel is compiled for each type of its arguments
     if data.strides[1] < data.strides[2]:  # blocks are of z and of what is contiguous in data
-        layout_kernels.transpose(data.transpose(0, 2, 1), flat, stride_y, stride_x, adding)
-    else:
-        layout_kernels.transpose(data, flat, stride_x, stride_y, adding)
+        data, stride_x, stride_y = data.transpose(0, 2, 1), stride_y, stride_x
+    nz, ny, nx = data.shape
+    for y0, y1 in equal_portions(ny, PASS_NS * nz * nx, 1):
+        layout_kernels.transpose(data, flat, stride_x, stride_y, adding, y0, y1)
 
 
 class _Memory:

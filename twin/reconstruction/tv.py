@@ -26,6 +26,7 @@ from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import Grid, Volume, gpu
 from flexdt.twin.projection.device_arrays import DeviceArray
 from flexdt.twin.projection.linear_operator import dot, norm_of
+from flexdt.twin.projection.portions import layer_portions
 from flexdt.twin.reconstruction.iterative import far_apart
 from flexdt.twin.reconstruction.linear_system import (
     DeviceProblem,
@@ -301,7 +302,8 @@ class Regular:
         from flexdt.twin.reconstruction import tv_kernels
 
         layers = np.empty(len(x))
-        tv_kernels.variation(x, self.scale, layers)
+        for first, last in layer_portions(x):
+            tv_kernels.variation(x, self.scale, layers, first, last)
         return float(layers.sum())
 
     def proximal(self, z: Any, theta: float) -> Any:
@@ -325,13 +327,17 @@ class Regular:
         """See `tv_kernels`; into x."""
         from flexdt.twin.reconstruction import tv_kernels
 
-        tv_kernels.primal_step(z, dual, theta, self.scale, self.lowest, self.allowed, x)
+        for first, last in layer_portions(x):
+            tv_kernels.primal_step(
+                z, dual, theta, self.scale, self.lowest, self.allowed, x, first, last
+            )
 
     def dual_step(self, x: Any, ahead: Any, rate: np.float32, further: np.float32) -> None:
         """See `tv_kernels`; changes `dual` and `ahead`."""
         from flexdt.twin.reconstruction import tv_kernels
 
-        tv_kernels.dual_step(x, ahead, self.dual, rate, further, self.scale)
+        for first, last in layer_portions(x):
+            tv_kernels.dual_step(x, ahead, self.dual, rate, further, self.scale, first, last)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,8 @@
 The variation is the sum over all voxels of the length of the vector of differences to the next
 voxel along z, y and x, each multiplied by `scale` (1 where voxels are cubes); behind the last voxel
 the difference is 0. Arrays are C-ordered [z, y, x], dual ones [axis, z, y, x]. Each job writes one
-layer and reads its neighbours from an array that no job writes. Arguments are not checked.
+layer, first <= z < last, and reads its neighbours from an array that no job writes. Arguments are
+not checked.
 """
 
 from __future__ import annotations
@@ -31,10 +32,10 @@ def differences(x, k, j, i, scale):
 
 
 @parallel
-def variation(x, scale, layers):
+def variation(x, scale, layers, first, last):
     """Total variation by layers (nz,) float64, which the caller adds up."""
-    nz, ny, nx = x.shape
-    for k in prange(nz):
+    ny, nx = x.shape[1:]
+    for k in prange(first, last):
         total = 0.0  # in double precision: millions of small lengths
         for j in range(ny):
             for i in range(nx):
@@ -44,13 +45,13 @@ def variation(x, scale, layers):
 
 
 @parallel
-def primal_step(z, dual, theta, scale, lowest, allowed, x):
+def primal_step(z, dual, theta, scale, lowest, allowed, x, first, last):
     """x = the allowed values next to z - theta D' dual, with the differences' transpose D'.
 
     lowest: values are not less; allowed: uint8 (nz, ny, nx), 0 where x must be 0.
     """
-    nz, ny, nx = x.shape
-    for k in prange(nz):
+    ny, nx = x.shape[1:]
+    for k in prange(first, last):
         for j in range(ny):
             for i in range(nx):
                 if allowed[k, j, i] == 0:
@@ -71,13 +72,13 @@ def primal_step(z, dual, theta, scale, lowest, allowed, x):
 
 
 @parallel
-def dual_step(x, ahead, dual, rate, momentum, scale):
+def dual_step(x, ahead, dual, rate, momentum, scale, first, last):
     """dual = ahead + rate D x, shortened to length 1 voxel by voxel; then ahead = dual + momentum
     times what dual has changed.
     """
-    nz, ny, nx = x.shape
+    ny, nx = x.shape[1:]
     one = np.float32(1)
-    for k in prange(nz):
+    for k in prange(first, last):
         for j in range(ny):
             for i in range(nx):
                 dz, dy, dx = differences(x, k, j, i, scale)

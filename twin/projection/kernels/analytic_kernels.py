@@ -92,15 +92,17 @@ def mapped(m, p, out):
 
 
 @parallel
-def project_convex(quadric, slabs, slab_range, shadow, rays, weight, channel, out):
+def project_convex(
+    quadric, slabs, slab_range, shadow, rays, weight, channel, out, first_job, last_job
+):
     """Fill out (channels, n, rows, cols) with weighted chord lengths.
 
     rays (n, 12) [mm]: source, first pixel centre minus source, u, v; shadow (n, k, 4) from
-    `analytic_solids.shadows`; weight, channel (k,) of each solid.
+    `analytic_solids.shadows`; weight, channel (k,) of each solid. A job: BAND rows of a view.
     """
-    channels, n, rows, cols = out.shape
+    channels, _, rows, cols = out.shape
     bands = (rows + BAND - 1) // BAND
-    for job in prange(n * bands):
+    for job in prange(first_job, last_job):
         view = job // bands
         row0 = (job - view * bands) * BAND
         row1 = min(rows, row0 + BAND)
@@ -268,20 +270,20 @@ def make_band(vertices, cols):
 
 
 @parallel
-def project_triangles(vertices, faces, rays, inverses, workers, out):
+def project_triangles(vertices, faces, rays, inverses, workers, out, first_job, last_job):
     """Fill out (n, rows, cols) with path lengths [mm].
 
     rays (n, 12) [mm]: source, first pixel minus source, u, v; inverses (n, 3, 3): of the matrix
-    with columns u, v, first pixel minus source.
+    with columns u, v, first pixel minus source. A job: MESH_BAND rows of a view.
     """
-    n, rows, cols = out.shape
+    rows, cols = out.shape[1:]
     bands = (rows + MESH_BAND - 1) // MESH_BAND
-    counter = np.zeros(1, np.int64)
+    counter = np.full(1, first_job, np.int64)
     for _ in prange(workers):
         sums, p, pixels, forms, flips, plane = make_band(len(vertices), cols)
         seen = -1
         job = fetch_next(counter)
-        while job < n * bands:
+        while job < last_job:
             view = job // bands
             row0 = job % bands * MESH_BAND
             row1 = min(rows, row0 + MESH_BAND)

@@ -154,11 +154,14 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         return (*super()._index_key(signature, codegen), COMPILING)
 
 
+ENTRY_POINT = {"cache": True, "nogil": True, "pipeline_class": _EntryPoint}
+
+
 def _entry_point(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     """Compile a function that Python calls, and keep its code on disk."""
     if function is None:
         return partial(_entry_point, **options)
-    made = njit(function, cache=True, nogil=True, pipeline_class=_EntryPoint, **options)
+    made = njit(function, **{**ENTRY_POINT, **options})
     if isinstance(made._cache, FunctionCache):
         made._cache.__class__ = _Cache
     return made

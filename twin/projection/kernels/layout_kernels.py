@@ -15,12 +15,12 @@ BLOCK = 32
 
 
 @parallel
-def transpose(data, flat, stride_x, stride_y, adding):
-    """flat[y * stride_y + x * stride_x + z] = data[z, y, x] (adding: +=), in blocks that fit the
-    first cache.
+def transpose(data, flat, stride_x, stride_y, adding, first_y, last_y):
+    """flat[y * stride_y + x * stride_x + z] = data[z, y, x] (adding: +=) for first_y <= y <
+    last_y, in blocks that fit the first cache.
     """
-    nz, ny, nx = data.shape
-    for y in prange(ny):
+    nz, _, nx = data.shape
+    for y in prange(first_y, last_y):
         for x0 in range(0, nx, BLOCK):
             x1 = min(nx, x0 + BLOCK)
             for z0 in range(0, nz, BLOCK):
@@ -35,10 +35,12 @@ def transpose(data, flat, stride_x, stride_y, adding):
 
 
 @parallel
-def occupied(flat, stride_x, stride_y, nz, first, last):
-    """Fill first, last (ny, nx): the range of z outside which a voxel column is zero."""
-    ny, nx = first.shape
-    for y in prange(ny):
+def occupied(flat, stride_x, stride_y, nz, first, last, first_y, last_y):
+    """Fill first, last (ny, nx) for first_y <= y < last_y: the range of z outside which a voxel
+    column is zero.
+    """
+    nx = first.shape[1]
+    for y in prange(first_y, last_y):
         for x in range(nx):
             column = flat[y * stride_y + x * stride_x : y * stride_y + x * stride_x + nz]
             # From both ends: most columns end within a few voxels of air.

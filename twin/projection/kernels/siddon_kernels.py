@@ -143,15 +143,15 @@ def walk_ray(box, g, r, c, value, transposed):
 
 
 @parallel
-def project_rays(box, views, chosen, out, tile):
+def project_rays(box, views, chosen, out, tile, first_job, last_job):
     """Fill the chosen views of out (n, rows, cols) with line integrals.
 
     views (n, 12): source, first pixel centre minus source, u, v in voxel units of the box; chosen:
-    indices of views; tile: columns a job.
+    indices of views; tile: columns a job; of each chosen view one job after the other.
     """
     rows, cols = out.shape[1:]
     tiles = (cols + tile - 1) // tile
-    for job in prange(len(chosen) * tiles):
+    for job in prange(first_job, last_job):
         view = chosen[job // tiles]
         first = job % tiles * tile
         for c in range(first, min(cols, first + tile)):
@@ -160,8 +160,9 @@ def project_rays(box, views, chosen, out, tile):
 
 
 @parallel
-def spread_rays(box, views, chosen, values, slices, marks):
-    """The transpose of `project_rays`: adds to box.flat. Each job owns a range of z, slices (s, 2),
+def spread_rays(box, views, chosen, values, slices, marks, first_column, last_column):
+    """The transpose of `project_rays` for columns of the chosen views, counted through: adds to
+    box.flat. Each job owns a range of z, slices (s, 2),
     and meets every ray, so that no two jobs write the same voxel; marks (s, 2 nx ny): see
     `open_column`.
     """
@@ -172,13 +173,14 @@ def spread_rays(box, views, chosen, values, slices, marks):
             box.flat, marks[job], box.base + z0, box.hop_x, box.hop_y, box.nx, box.ny, z1 - z0,
             box.size_x, box.size_y, box.size_z,
         )  # fmt: skip
-        for view in chosen:
-            g = views[view].copy()
+        g = np.empty(12)
+        for column in range(first_column, last_column):
+            view, c = chosen[column // cols], column % cols
+            g[:] = views[view]
             g[2] -= z0
-            for c in range(cols):
-                for r in range(rows):
-                    if values[view, r, c] != np.float32(0):
-                        walk_ray(piece, g, r, c, values[view, r, c], True)
+            for r in range(rows):
+                if values[view, r, c] != np.float32(0):
+                    walk_ray(piece, g, r, c, values[view, r, c], True)
 
 
 @inline
@@ -303,7 +305,7 @@ def ray_derivatives(box, g, r, c):
 
 
 @parallel
-def gather(box, views, weights, tile, parts):
+def gather(box, views, weights, tile, parts, first_job, last_job):
     """Sum over the pixels of weight times derivative, with respect to the twelve numbers of a view.
 
     A pixel's centre is D + (c - (cols - 1) / 2) u + (r - (rows - 1) / 2) v, so that what it gets
@@ -316,11 +318,12 @@ def gather(box, views, weights, tile, parts):
         views: (n, 12) source, first pixel minus source, u, v in voxel units of the box.
         weights: float32 (n, rows, cols).
         tile: columns a job.
-        parts: float64 zeros; row view * tiles + k belongs to the k-th tile of a view.
+        parts: float64 zeros; row view * tiles + k belongs to the k-th tile of a view, a job.
+        first_job, last_job: what is done.
     """
     _, rows, cols = weights.shape
     tiles = (cols + tile - 1) // tile
-    for job in prange(len(parts)):
+    for job in prange(first_job, last_job):
         view = job // tiles
         first = job % tiles * tile
         part = parts[job]
@@ -352,14 +355,14 @@ def gather(box, views, weights, tile, parts):
 
 
 @parallel
-def follow(box, views, change, tile, out):
+def follow(box, views, change, tile, out, first_job, last_job):
     """The transpose of `gather`: what a change (n, 12) [mm] of the views does to each pixel.
 
     Fills out (n, rows, cols); each job, `tile` columns of one view, has pixels of its own.
     """
-    n, rows, cols = out.shape
+    _, rows, cols = out.shape
     tiles = (cols + tile - 1) // tile
-    for job in prange(n * tiles):
+    for job in prange(first_job, last_job):
         view = job // tiles
         first = job % tiles * tile
         m = change[view]
