@@ -46,9 +46,17 @@ if _typing.TYPE_CHECKING:
     __version__: str
 
 from flexdt.runtime import process_threads as _process_threads
-from flexdt.runtime import progress_lines as _progress_lines
+from flexdt.twin import long_work as _long_work
 
-_progress_lines.watch()
+
+def _told(what: str) -> _typing.ContextManager[object]:
+    # Here, because logging and threads take a third of the import of flexdt.
+    from flexdt.runtime.progress_lines import told
+
+    return told(what)
+
+
+_long_work.during = _told
 _process_threads.watch()
 
 _HOMES: _typing.Final = {

@@ -8,8 +8,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from flexdt.twin import long_work
-
 SILENT_S = 2.0
 _last = [0.0, 0.0]
 """When the newest line was told and the newest work ended: one kernel compiles after another."""
@@ -35,8 +33,3 @@ def told(what: str) -> Iterator[None]:
     finally:
         done.set()
         _last[1] = time.monotonic()
-
-
-def watch() -> None:
-    """Tell of the twin's long work in this process."""
-    long_work.during = told

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from flexdt.clients.cli import main
+from flexdt.clients.cli.console_script import main
 
 if __name__ == "__main__":
     main()

@@ -260,6 +260,15 @@ def run(argv: Sequence[str]) -> int:
     Returns:
         The exit code.
     """
+    try:
+        return _run(argv)
+    except (KeyboardInterrupt, typer.Abort):
+        note("flexdt: interrupted")
+        return INTERRUPTED
+
+
+def _run(argv: Sequence[str]) -> int:
+    """`run`, but for Ctrl-C."""
     printable()
     if argv and argv[0] in RETIRED:
         note(
@@ -276,9 +285,8 @@ def run(argv: Sequence[str]) -> int:
         with command.make_context("flexdt", _spread(argv)) as context:
             command.invoke(context)
         return DONE
-    except (KeyboardInterrupt, typer.Abort):
-        note("flexdt: interrupted")
-        return INTERRUPTED
+    except typer.Abort:
+        raise
     except typer.Exit as leave:
         return leave.exit_code
     except BrokenPipeError:  # the help page's; results are `say`'s

@@ -1,6 +1,6 @@
 """`flexdt up`, its aliases `twin`, `projector`, `viewer` and `gateway`, `doctor` and `demo`.
 
-The servers are programs of their own (`python -m flexdt.server...`); this process turns into one,
+The servers are programs of their own (`python -m flexdt.server...`); this process becomes one,
 so signals and exit codes are the server's. Their options come from
 `flexdt.runtime.process_settings`: the settings file's first, then those of the command line.
 
@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import contextlib
 import inspect
-import os
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -22,7 +20,7 @@ from dataclasses import fields
 from datetime import datetime
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NoReturn
 
 import typer
 
@@ -126,11 +124,17 @@ def _check(given: Mapping[str, Any]) -> None:
         machine(given["machine"])
 
 
-def become(module: str, given: Mapping[str, object], more: Sequence[str] = ()) -> None:
-    """Replace this process by `python -m module` with the options `given` and `more` words."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os.execv(sys.executable, [sys.executable, "-P", "-m", module, *words(given), *more])
+def become(module: str, given: Mapping[str, object], more: Sequence[str] = ()) -> NoReturn:
+    """Be the process that `python -m module` is, with the options `given` and `more` words.
+
+    In this interpreter: a new one would not hear of Ctrl-C before it had loaded the module.
+
+    Raises:
+        typer.Exit: the process's exit code.
+    """
+    from importlib import import_module
+
+    raise typer.Exit(import_module(module).main([*words(given), *more]))
 
 
 MARKS = {"ok": "ok     ", "warning": "warning", "error": "ERROR  "}

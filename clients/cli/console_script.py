@@ -1,0 +1,95 @@
+"""The console script `flexdt`: Ctrl-C ends it within a second, whatever it does.
+
+From the start of `main` on SIGINT ends the process with exit code 130 and one line:
+
+- while a module is imported, at once: libraries do not expect an exception there, and some swallow
+  it;
+- where the main thread runs Python, as KeyboardInterrupt, which commands clean up after;
+- where the main thread has been in compiled code for `STUCK_S` (a kernel, the compiler), at once.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+
+INTERRUPTED = 130
+LINE = b"flexdt: interrupted\n"
+STUCK_S = 0.4
+"""From the signal's arrival to the end of a process whose main thread has not heard of it."""
+IMPORTING = "<frozen importlib._bootstrap>"
+
+_heard = 0
+"""Signals that the main thread has heard of."""
+
+
+def leave(*_: object) -> None:
+    """End the process now; what was printed stays."""
+    try:
+        os.write(2, LINE)
+    finally:
+        os._exit(INTERRUPTED)
+
+
+def _interrupt(number: int, frame: object) -> None:
+    """Handle SIGINT in the main thread."""
+    global _heard
+    _heard += 1
+    while frame is not None:
+        if frame.f_code.co_filename == IMPORTING:  # type: ignore[attr-defined]
+            leave()
+        frame = frame.f_back  # type: ignore[attr-defined]
+    raise KeyboardInterrupt
+
+
+def _watch() -> None:
+    """Have a thread end the process where the main thread does not hear of a signal."""
+    import threading
+
+    heard_of, arrives = os.pipe()
+    os.set_blocking(arrives, False)
+    signal.set_wakeup_fd(arrives, warn_on_full_buffer=False)
+    threading.Thread(target=_end_if_stuck, args=(heard_of,), name="interrupts", daemon=True).start()
+
+
+def _end_if_stuck(arrivals: int) -> None:
+    import time
+
+    while True:
+        before = _heard
+        if signal.SIGINT in os.read(arrivals, 1):
+            time.sleep(STUCK_S)
+            if _heard == before:
+                leave()
+
+
+def _not_lost(unraisable: object) -> None:
+    """Raise KeyboardInterrupt again where Python could not: in a finaliser or a callback from C."""
+    if unraisable.exc_type is KeyboardInterrupt:  # type: ignore[attr-defined]
+        signal.raise_signal(signal.SIGINT)
+    else:
+        sys.__unraisablehook__(unraisable)  # type: ignore[arg-type]
+
+
+def main() -> None:
+    """Run the command line of this process."""
+    if signal.getsignal(signal.SIGINT) != signal.default_int_handler:  # a shell's `&` ignores it
+        _command()
+        return
+    signal.signal(signal.SIGINT, _interrupt)
+    try:
+        if sys.platform != "win32":
+            _watch()
+        sys.unraisablehook = _not_lost
+        _command()
+    except KeyboardInterrupt:
+        leave()
+    finally:
+        signal.signal(signal.SIGINT, leave)
+
+
+def _command() -> None:
+    from flexdt.clients.cli import main as command
+
+    command()
