@@ -28,20 +28,29 @@ CHOSEN_BY: Final = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
 LAYER: Final = "numba.np.ufunc.parallel"
 
 
-def load_sleeping() -> None:
+def load_sleeping() -> str:
     """Load OpenMP with threads that sleep while they wait, unless the user chose or it is loaded.
 
     The environment is then as it was: other libraries and child processes keep their defaults.
+
+    Returns:
+        How its threads wait.
     """
-    if any(name in os.environ for name in CHOSEN_BY):
-        return
+    chosen = [f"{name}={os.environ[name]}" for name in CHOSEN_BY if name in os.environ]
+    if chosen:
+        return f"as {' '.join(chosen)} says"
+    with suppress(OSError):
+        ctypes.CDLL(OPENMP, mode=os.RTLD_NOLOAD | os.RTLD_NOW)
+        return "as OpenMP was loaded before flexdt"
     os.environ.update(SLEEPING)
     try:
-        with suppress(OSError):
-            ctypes.CDLL(OPENMP)
+        ctypes.CDLL(OPENMP)
+    except OSError:
+        return kernel_threads.waiting
     finally:
         for name in SLEEPING:
             del os.environ[name]
+    return "asleep"
 
 
 def _in_child() -> None:
@@ -54,6 +63,6 @@ def _in_child() -> None:
 def watch() -> None:
     """Decide for this process and its forked children."""
     if sys.platform == "linux":
-        load_sleeping()
+        kernel_threads.waiting = load_sleeping()
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(after_in_child=_in_child)

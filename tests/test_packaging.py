@@ -142,6 +142,7 @@ def test_the_wheel_holds_only_flexdt(wheel: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     assert {name.split("/")[0] for name in names} == {
         "flexdt",
+        "flexdt_command.py",  # the console script's first module
         next(n.split("/")[0] for n in names if n.endswith(".dist-info/METADATA")),
     }
     assert not [n for n in names if "__pycache__" in n or n.endswith((".nbi", ".nbc", ".ts"))]

@@ -1,10 +1,14 @@
 """The console script `flexdt`: Ctrl-C ends it within a second, whatever it does.
 
+Installed as the module `flexdt_command` beside the package (`src/flexdt_command.py` is a link to
+this file): an import of any module of the package imports the package itself first.
+
 From the start of `main` on SIGINT ends the process with exit code 130 and one line:
 
 - while a module is imported, at once: libraries do not expect an exception there, and some swallow
   it;
-- where the main thread runs Python, as KeyboardInterrupt, which commands clean up after;
+- where the main thread runs Python, as KeyboardInterrupt, which commands clean up after; at once
+  where nobody would get it, as in a finaliser;
 - where the main thread has been in compiled code for `STUCK_S` (a kernel, the compiler), at once.
 """
 
@@ -65,11 +69,10 @@ def _end_if_stuck(arrivals: int) -> None:
 
 
 def _not_lost(unraisable: object) -> None:
-    """Raise KeyboardInterrupt again where Python could not: in a finaliser or a callback from C."""
+    """End the process at a KeyboardInterrupt that nobody gets, as in a finaliser."""
     if unraisable.exc_type is KeyboardInterrupt:  # type: ignore[attr-defined]
-        signal.raise_signal(signal.SIGINT)
-    else:
-        sys.__unraisablehook__(unraisable)  # type: ignore[arg-type]
+        leave()
+    sys.__unraisablehook__(unraisable)  # type: ignore[arg-type]
 
 
 def main() -> None:

@@ -20,6 +20,7 @@ from typing import Final, Literal
 
 from flexdt.runtime.files.directory import memory_bytes
 from flexdt.runtime.files.whole_files import free_bytes, nearest_there
+from flexdt.twin import kernel_threads
 
 Verdict = Literal["ok", "warning", "error"]
 WORST_ERROR: Final = 1e-5
@@ -111,11 +112,14 @@ def kernels() -> CheckOutcome:
 
 
 def threads() -> CheckOutcome:
-    """Cores and numba's threads."""
+    """Cores, numba's threads, their layer, and how they wait for each other."""
     import numba
 
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     found = f"{usable} of {os.cpu_count()} cores usable, {numba.get_num_threads()} numba threads"
+    found += f", threading layer {numba.threading_layer()}"
+    if numba.threading_layer() == "omp":
+        found += f", waiting {kernel_threads.waiting}"
     if usable is not None and numba.get_num_threads() < usable:
         return CheckOutcome("threads", "warning", found, "NUMBA_NUM_THREADS is below the cores")
     return CheckOutcome("threads", "ok", found)

@@ -1,0 +1,1 @@
+../clients/cli/console_script.py
