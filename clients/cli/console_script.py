@@ -14,6 +14,7 @@ From the start of `main` on SIGINT ends the process with exit code 130 and one l
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
@@ -81,6 +82,9 @@ def main() -> None:
         _command()
         return
     signal.signal(signal.SIGINT, _interrupt)
+    # Registered first it is called last, when all is done: Python itself takes its handlers away
+    # before it has ended, and the signal would kill it.
+    atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
     try:
         if sys.platform != "win32":
             _watch()
