@@ -52,11 +52,14 @@ def _fit() -> None:
 
 
 def _reconstruction() -> None:
-    from flexdt.twin.reconstruction import fdk, fdk_kernels
+    from flexdt.twin.reconstruction import fdk, fdk_kernels, truncation_kernels
 
     scan = ConeVec.circular(sod=10, sdd=20, angles=8, shape=(4, 6), pixel=1.0)
     images = np.ones((8, 4, 6), np.float32)
-    fdk(images, scan, Grid((2, 3, 4), 0.5).blank())
+    fdk(images, scan, Grid((2, 3, 4), 0.5).blank())  # which go on beyond the panel's edges
+    one, six = np.ones((1, 1)), np.zeros(truncation_kernels.PARAMETERS)
+    ray = np.ones((1, 1, 2))
+    truncation_kernels.fit_prism(ray[0], ray, one, one, six - 1.0, six + 1.0, 1.0, six)
     fdk_kernels.warp(images, np.ones((8, 3, 3)), fdk_kernels.lanczos(), images.copy())
 
 

@@ -49,7 +49,8 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.projection import Volume, as_volume
-from flexdt.twin.reconstruction.fdk import OnProcessor, fdk_parts
+from flexdt.twin.reconstruction.backprojection import OnProcessor
+from flexdt.twin.reconstruction.fdk import fdk_parts
 from flexdt.twin.reconstruction.rectify import field_of_view
 from flexdt.twin.scanner.state import NamedCorrection
 

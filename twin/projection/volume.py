@@ -353,7 +353,7 @@ class Volume:
         """Standard deviation of the noise in each voxel, (nz, ny, nx) [1/mm], as the images show it
         (`reconstruct("fdk")`); None where it was not found. It is computed at each call.
         """
-        noise: Any = getattr(self, "_noise", None)  # of `noise.with_errors`
+        noise: Any = getattr(self, "_noise", None)  # of `volume_errors.with_errors`
         found: Float32Array | None = None if noise is None else noise.sigma(self)
         return found
 
@@ -362,7 +362,7 @@ class Volume:
         """Bound of what each voxel is off by beside the noise, (nz, ny, nx) [1/mm], NaN where no
         data cover it (`reconstruct("fdk")`); None where it was not found. Computed at each call.
         """
-        bias: Any = getattr(self, "_bias", None)  # of `noise.with_errors`
+        bias: Any = getattr(self, "_bias", None)  # of `volume_errors.with_errors`
         found: Float32Array | None = None if bias is None else bias.bound(self)
         return found
 
@@ -376,7 +376,7 @@ class Volume:
             >>> volume.accuracy  # doctest: +SKIP
             Accuracy(half=0.006, most=0.021, cause='cone', cut_off=False)
         """
-        bias: Any = getattr(self, "_bias", None)  # of `noise.with_errors`
+        bias: Any = getattr(self, "_bias", None)  # of `volume_errors.with_errors`
         found: Accuracy | None = None if bias is None else bias.accuracy(self)
         return found
 

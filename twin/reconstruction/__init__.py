@@ -7,7 +7,6 @@ from flexdt.twin.reconstruction.coverage import layer_warnings, lost_layers
 from flexdt.twin.reconstruction.fdk import fdk_parts
 from flexdt.twin.reconstruction.iterative import cgls, em, sart, sirt
 from flexdt.twin.reconstruction.linear_system import Step
-from flexdt.twin.reconstruction.noise import with_errors
 from flexdt.twin.reconstruction.rectify import field_of_view
 from flexdt.twin.reconstruction.scatter_correction import (
     Hardening,
@@ -18,6 +17,7 @@ from flexdt.twin.reconstruction.scatter_correction import (
 )
 from flexdt.twin.reconstruction.truncation import Truncation, truncation_of
 from flexdt.twin.reconstruction.tv import Minimised, minimise_tv, tv
+from flexdt.twin.reconstruction.volume_errors import with_errors
 
 __all__ = [
     "Accuracy",

@@ -25,8 +25,8 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.projection.volume import Accuracy
 from flexdt.twin.reconstruction.coarse_scan import CoarseScan
-from flexdt.twin.reconstruction.noise import interpolated
 from flexdt.twin.reconstruction.truncation import Truncation
+from flexdt.twin.reconstruction.volume_errors import interpolated
 
 SAFETY: Final = 3.0
 """The coarse volume has the flaws, too, and is smooth: of what they take away it shows a third."""

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.algorithms import PLAIN
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import Grid, Volume
@@ -18,11 +19,12 @@ from flexdt.twin.projection.operators import (
     require_line_integrals,
 )
 from flexdt.twin.projection.volume import Accuracy
+from flexdt.twin.reconstruction.backprojection import CHUNK, PIXELS
 from flexdt.twin.reconstruction.bias import Bias, bias_of
 from flexdt.twin.reconstruction.coverage import layer_warnings, lost_layers
-from flexdt.twin.reconstruction.fdk import CHUNK, PIXELS, Progress, fdk_parts
-from flexdt.twin.reconstruction.noise import with_errors
+from flexdt.twin.reconstruction.fdk import Progress, fdk_parts
 from flexdt.twin.reconstruction.truncation import truncation_of
+from flexdt.twin.reconstruction.volume_errors import with_errors
 from flexdt.twin.signatures import public
 
 
@@ -32,7 +34,7 @@ def fdk(
     cone_vec: ConeVec | npt.ArrayLike,
     like: Volume | Grid,
     *,
-    window: str = "ram-lak",
+    window: str = PLAIN,
     progress: Progress | None = None,
     errors: bool = True,
 ) -> Volume:
@@ -102,7 +104,7 @@ def checked_fdk(
     cone_vec: ConeVec,
     shape: tuple[int, int],
     like: Volume | Grid,
-    window: str = "ram-lak",
+    window: str = PLAIN,
     progress: Progress | None = None,
     *,
     errors: bool = True,

@@ -14,6 +14,8 @@ from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume, forward
+from flexdt.twin.reconstruction.backprojection import OnProcessor
+from flexdt.twin.reconstruction.fdk import fdk_parts
 from flexdt.twin.reconstruction.rectify import field_of_view, on_its_side, swapped, upright, window
 from flexdt.twin.reconstruction.trajectory import (
     Circle,
@@ -162,8 +164,6 @@ class CoarseScan:
         self, images: Float32Array, cone_vec: ConeVec, truncation: Truncation | None = None
     ) -> Float32Array:
         """The grid's values from some images, NaN where no data cover it."""
-        from flexdt.twin.reconstruction.fdk import OnProcessor, fdk_parts
-
         shape = (images.shape[1], images.shape[2])
         volume = fdk_parts(
             lambda: [images.copy()], cone_vec, shape, self.grid, truncation=truncation,

@@ -10,8 +10,8 @@ see it. On a grid of every few voxels, both cost little.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -19,11 +19,10 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.cpu import threads
 from flexdt.twin.projection.volume import Volume
 from flexdt.twin.reconstruction.coverage import first_and_steps
+from flexdt.twin.reconstruction.slabs import layers
 from flexdt.twin.reconstruction.trajectory import Circle
-
-if TYPE_CHECKING:
-    from flexdt.twin.reconstruction.bias import Bias
-    from flexdt.twin.reconstruction.fdk import Views
+from flexdt.twin.reconstruction.views import Views
+from flexdt.twin.reconstruction.volume_errors import interpolated
 
 NODES: Final = 32
 """Nodes of the coarse grid along the longest side, at most: noise changes smoothly."""
@@ -66,29 +65,22 @@ class Noise:
         return np.where(np.isnan(grid.data), np.float32(np.nan), out)
 
 
-def interpolated(nodes: Volume, grid: Volume) -> Float32Array:
-    """Values on a coarse grid, linearly between them, at the voxels of another, (nz, ny, nx)."""
-    from scipy.ndimage import map_coordinates
+@dataclass(frozen=True, eq=False)
+class NoiseOfSlabs:
+    """Noise of a volume that was made slab by slab.
 
-    at = [
-        np.interp(places, known, np.arange(len(known)))
-        for places, known in zip(grid.centers()[::-1], nodes.centers()[::-1], strict=True)
-    ]
-    out = np.empty(grid.shape, np.float32)
-    across = np.meshgrid(at[1], at[2], indexing="ij")
-    for layer, k in enumerate(at[0]):
-        map_coordinates(nodes.data, [np.full_like(across[0], k), *across], out[layer], order=1)
-    return out
-
-
-def with_errors(volume: Volume, noise: Noise | None = None, bias: Bias | None = None) -> Volume:
-    """The same volume with a `sigma` and a `bias_bound`, besides those it has. Volumes that are
-    made of it have none: they are no fields.
+    Attributes:
+        slabs: layers (first, last) of each.
+        noises: of each.
     """
-    found = replace(volume)
-    object.__setattr__(found, "_noise", noise or getattr(volume, "_noise", None))
-    object.__setattr__(found, "_bias", bias or getattr(volume, "_bias", None))
-    return found
+
+    slabs: tuple[tuple[int, int], ...]
+    noises: tuple[Noise, ...]
+
+    def sigma(self, grid: Volume) -> Float32Array:
+        """See `Noise`; of the whole grid."""
+        parts = zip(self.slabs, self.noises, strict=True)
+        return np.concatenate([noise.sigma(layers(grid, *slab)) for slab, noise in parts])
 
 
 class NoiseMeter:
@@ -98,11 +90,14 @@ class NoiseMeter:
         like: the volume's grid.
         circle: of the views.
         table: of all views, of `fdk_kernels.backproject`.
-        panel: the panel's columns among those of the images.
+
+    Attributes:
+        grid: coarse.
+        data: the alternating sum of the views on it, (ny, nx, nz).
     """
 
-    def __init__(self, like: Volume, circle: Circle, table: FloatArray, panel: slice) -> None:
-        self._circle, self._table, self._panel = circle, table, panel
+    def __init__(self, like: Volume, circle: Circle, table: FloatArray) -> None:
+        self._circle, self._table = circle, table
         rows_per_mm = float(table[:, 9].mean()) / circle.radius
         size = np.array(like.voxel_xyz)
         steps = np.maximum(2, -(-np.array(like.shape[::-1]) // NODES))
@@ -122,24 +117,27 @@ class NoiseMeter:
         self._done = 0
         self._response: FloatArray = np.zeros(0)
 
+    def note(self, views: Views) -> Float32Array:
+        """Note what views show and where; returns the sign of each in the alternating sum, (n,)."""
+        n = len(views.images)
+        signs = self._signs[self._done : self._done + n]
+        sums = np.tensordot(np.stack([np.ones(n, np.float32), signs]), views.needed, 1)
+        self._means = sums if self._means is None else self._means + sums
+        self._hits.append(self._seen_at(views))
+        self._response = views.response.astype(np.float64)
+        self._done += n
+        return signs
+
     def add(self, views: Views, columns: Float32Array) -> None:
         """Add views whose filtered columns are at hand, (n, cols, rows); the columns are lost."""
         from flexdt.twin.reconstruction import fdk_kernels
 
-        n, _, _, rows = views.sizes
-        signs = self._signs[self._done : self._done + n]
-        seen = np.arange(views.top, views.top + rows).clip(0, views.images.shape[1] - 1)
-        images = views.images[:, seen, self._panel]
-        sums = np.tensordot(np.stack([np.ones(n, np.float32), signs]), images, 1)
-        self._means = sums if self._means is None else self._means + sums
-        self._hits.append(self._seen_at(views))
-        self._response = views.response.astype(np.float64)
-        columns[:n] *= signs[:, None, None]
+        signs, rows = self.note(views), views.sizes[3]
+        columns[: len(signs)] *= signs[:, None, None]
         first, size = first_and_steps(self.grid)
         fdk_kernels.backproject(
             columns, rows, views.shares, views.table, *first, *size, self.data, threads()
         )
-        self._done += n
 
     def _points(self) -> tuple[FloatArray, FloatArray]:
         """Places on a spiral about the centre, radii (POINTS,) and (POINTS, 2) [mm]."""

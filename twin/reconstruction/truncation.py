@@ -30,8 +30,8 @@ from flexdt.twin.reconstruction.trajectory import (
 )
 
 SAMPLES = 48
-"""Views, and bins of columns, that the prism is fitted to, at most: 2304 rays for six numbers, in a
-tenth of a second. The outermost bin is also what is called an edge."""
+"""Views, and bins of columns, that the prism is fitted to, at most: 2304 rays for six numbers, in
+milliseconds. The outermost bin is also what is called an edge."""
 BANDS = 8
 """Bands of rows with a prism of their own: few enough to average noise, and an outline changes
 little within an eighth of the panel."""
@@ -80,6 +80,12 @@ class Prism:
             2.0 * np.sqrt(np.maximum(inside, 0.0)) / squared * np.hypot(*np.moveaxis(rays, -1, 0))
         )
         return np.asarray(self.attenuation * length)
+
+    @property
+    def numbers(self) -> FloatArray:
+        """What kernels need, (6,): centre, elements (0, 0), (1, 0), (1, 1), attenuation."""
+        (first, _), (low, second) = self.to_disc
+        return np.array([*self.centre, first, low, second, self.attenuation])
 
     def rim(self) -> FloatArray:
         """(72, 3) points around it [mm]."""
@@ -144,40 +150,74 @@ class Truncation:
             before, after = max(before, -float(at.min())), max(after, float(at.max()) - cols + 1)
         return int(min(before + 2.0, most)), int(min(after + 2.0, most))
 
-    def continue_rows(
-        self, images: Float32Array, cone_vec: ConeVec, first_row: int, panel: slice
-    ) -> None:
-        """Continue rows beyond the panel's edges, in place.
+    def continuation(
+        self, cone_vec: ConeVec, first_row: int, shape: tuple[int, int], panel: slice
+    ) -> Continuation:
+        """Say how the rows of some views go on beyond the panel's edges.
 
         Args:
-            images: (n, rows, columns) line integrals; those off the panel are set.
-            cone_vec: of these rows and columns, (n).
+            cone_vec: of widened images, (n).
             first_row: of the panel, which is the images' first.
+            shape: of the images (rows, columns).
             panel: the columns that are the panel's.
         """
-        rows, wide = images.shape[1:]
+        rows, wide = shape
+        at = first_row + np.arange(rows, dtype=np.float64)
+        band = np.clip(np.searchsorted(self.rows, at, "right") - 1, 0, len(self.rows) - 1)
+        above = np.minimum(band + 1, len(self.rows) - 1)
+        apart = self.rows[above] - self.rows[band]
+        share = np.where(apart > 0.0, (at - self.rows[band]) / np.where(apart > 0.0, apart, 1.0), 0)
         cols = panel.stop - panel.start
-        # How much each band counts in each row, linearly in between.
-        at, each = first_row + np.arange(rows), np.eye(len(self.rows))
-        share = np.column_stack([np.interp(at, self.rows, one) for one in each])
-        source, across, up = _rays(cone_vec, _centred(rows), _centred(wide))
-        longer = np.sqrt(1.0 + up[:, :, None] ** 2 / (across**2).sum(axis=-1)[:, None])
-        off = np.r_[0 : panel.start, panel.stop : wide]
-        edge = _edge(cols)
-        ends = np.r_[panel.start : panel.start + edge, panel.stop - edge : panel.stop]
-        used = np.r_[off, ends]
-        away = np.where(off < panel.start, panel.start - off, off - panel.stop + 1) - 0.5
-        fade = 0.5 + 0.5 * np.cos(np.pi * np.minimum(away / max(self.fade * cols, 1.0), 1.0))
-        fade = (share @ self.cut_off)[:, None] * fade
-        for i, image in enumerate(images):
-            flat = [
-                np.zeros(len(used)) if p is None else p.integrals(source[i], across[i, used])
-                for p in self.prisms
-            ]
-            model = share @ np.array(flat) * longer[i][:, used]
-            left = image[:, ends] - model[:, len(off) :]
-            low, high = (side.mean(axis=1, keepdims=True) for side in np.split(left, 2, axis=1))
-            image[:, off] = model[:, : len(off)] + np.where(off < panel.start, low, high) * fade
+        column = np.arange(wide)
+        away = np.maximum(panel.start - column, column - panel.stop + 1) - 0.5
+        part = np.minimum(away / max(self.fade * cols, 1.0), 1.0)
+        source, rays, _ = _rays(cone_vec, np.zeros(0), np.arange(2.0) - (wide - 1) / 2.0)
+        none = np.zeros(6)
+        return Continuation(
+            edge=_edge(cols),
+            plane=np.hstack([source[:, 0], rays[:, 0], rays[:, 1] - rays[:, 0]]),
+            prisms=np.array([none if p is None else p.numbers for p in self.prisms]),
+            band=band,
+            share=np.clip(share, 0.0, 1.0),
+            cut=np.interp(at, self.rows, self.cut_off.astype(np.float64)),
+            fade=0.5 + 0.5 * np.cos(np.pi * part),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Continuation:
+    """How the rows of some views go on beyond the panel's edges; see
+    `truncation_kernels.continue_rows`.
+
+    Attributes:
+        edge: columns at an edge whose mean goes on.
+        plane: (n, 6) source, ray to the first column and step between columns, x and y [mm].
+        prisms: (b, 6) numbers of each band's; zeros for none.
+        band, share: (rows,) lower band of each row, and how much the next one counts.
+        cut: (rows,) how much of what the prisms leave at the edges goes on.
+        fade: (columns,) part of it that is left in each column.
+    """
+
+    edge: int
+    plane: FloatArray
+    prisms: FloatArray
+    band: npt.NDArray[np.intp]
+    share: FloatArray
+    cut: FloatArray
+    fade: FloatArray
+
+    def of(self, which: slice | npt.NDArray[np.intp]) -> Continuation:
+        """Of some of the views."""
+        return replace(self, plane=self.plane[which])
+
+    @classmethod
+    def empty(cls, views: int, rows: int, wide: int) -> Continuation:
+        """Nothing beyond the edges."""
+        none = np.zeros(rows)
+        return cls(
+            0, np.zeros((views, 6)), np.zeros((1, 6)), none.astype(np.intp), none, none,
+            np.zeros(wide),
+        )  # fmt: skip
 
 
 def truncation_of(
@@ -320,7 +360,7 @@ def _fit(
         usual: a usual one of the object.
         near: of a neighbouring band.
     """
-    from scipy.optimize import least_squares
+    from flexdt.twin.reconstruction.truncation_kernels import fit_prism
 
     hit = seen > 0.1 * ACCURACY * usual  # of dead columns a prism elsewhere is right
     if not hit.any():
@@ -337,12 +377,14 @@ def _fit(
     def rest(x: FloatArray) -> FloatArray:
         return np.asarray(Prism.of(x, field).integrals(source, rays) - seen)
 
+    directions = rays / field
+    lengths = np.hypot(rays[..., 0], rays[..., 1])
+    begin = np.ascontiguousarray(source[:, 0] / field)
+
     def fit(start: npt.ArrayLike, scale: float) -> tuple[float, FloatArray]:
-        found = least_squares(
-            lambda x: rest(x).ravel(), np.clip(start, least, most), bounds=(least, most),
-            loss="cauchy", f_scale=scale, max_nfev=30,
-        )  # fmt: skip
-        return float(found.cost), np.asarray(found.x)
+        x = np.array(start, np.float64)
+        cost = fit_prism(begin, directions, lengths, seen, least, most, scale, x)
+        return cost, x
 
     starts = [
         [0.0, 0.0, -np.log(r), -np.log(r), 0.0, np.log(usual / (1.5 * r * field))]

@@ -18,6 +18,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from scipy.optimize import curve_fit
 from scipy.special import ndtr
 
+from flexdt.algorithms import WINDOWS
 from flexdt.twin.errors import GeometryError, UnknownNameError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
@@ -38,7 +39,7 @@ from flexdt.twin.reconstruction import (
     field_of_view,
     truncation_of,
 )
-from flexdt.twin.reconstruction.fdk import WINDOWS, filtered, ramp
+from flexdt.twin.reconstruction.filtering import filtered, ramp
 from flexdt.twin.reconstruction.rectify import (
     homography,
     is_upright,

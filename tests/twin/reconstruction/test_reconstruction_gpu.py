@@ -7,7 +7,7 @@ import pytest
 
 from flexdt.twin.projection import gpu
 from flexdt.twin.reconstruction import Grid, fdk
-from flexdt.twin.reconstruction.fdk import device_takes
+from flexdt.twin.reconstruction.backprojection import device_takes
 from tests.support.device_simulator import run_simulated
 from tests.twin.reconstruction.scans import ball, circle, measure
 
@@ -17,10 +17,13 @@ SIMULATED = """
 import numpy as np
 from flexdt.twin.projection import gpu
 from flexdt.twin.reconstruction import Grid, fdk
-from flexdt.twin.reconstruction.fdk import device_takes, fdk_parts
+from flexdt.twin.reconstruction.backprojection import device_takes
+from flexdt.twin.reconstruction.fdk import fdk_parts
+from flexdt.twin.reconstruction.truncation import Prism, Truncation
 from tests.twin.reconstruction.scans import ball, circle
 
 assert gpu.availability().present
+WIDER = Truncation(np.zeros(1), (Prism(np.zeros(2), np.eye(2) / 30, 0.01),), np.ones(1, bool))
 rng = np.random.default_rng(20261122)
 # Whole turns and short ones, displaced and tilted panels, rows and columns of any number; grids
 # that leave the panel above and below, and of more layers than a block of the kernel has.
@@ -40,23 +43,37 @@ for case in range(4):
         yield images[1:3]
         yield images[3:]
 
-    def made():
-        return fdk_parts(parts, scan, shape, like, window).data
+    def volume():
+        # The last one's rows go on beyond the panel's edges, by half a row and as long as a prism.
+        return fdk_parts(
+            parts, scan, shape, like, window, truncation=WIDER if case == 3 else None, errors=True
+        )
 
-    there = made()
+    def made():
+        return volume().data
+
+    found = volume()
+    there, noise = found.data, found.sigma
     if case == 1:  # a device that has room for a few layers at a time: the same, but for rounding
         least = 4 * (6 * 32 * shape[0] * shape[1] + 5 * 3 * 4)
         gpu.free_bytes = lambda: gpu.SPARE_BYTES + least
         assert not device_takes(like, shape)
         told = []
-        slabs = fdk_parts(parts, scan, shape, like, window, told.append).data
+        by_slabs = fdk_parts(parts, scan, shape, like, window, told.append, errors=True)
+        slabs = by_slabs.data
+        assert by_slabs.sigma.shape == slabs.shape
+        assert (np.isnan(by_slabs.sigma) == np.isnan(slabs)).all()
         assert np.nanmax(np.abs(slabs - there)) < 1e-6 * np.nanmax(np.abs(there))
         assert len(told) >= 2 * 3 and told[-1] == 1.0
         assert told == sorted(told)
         gpu.free_bytes = lambda: None
     with gpu.switched_off():
         assert not device_takes(like, shape)
-        here = made()
+        found = volume()
+        here = found.data
+        # The difference of two sums there, one sum of differences here.
+        rounding = 1e-4 * np.nanmax(found.sigma)
+        np.testing.assert_allclose(noise, found.sigma, rtol=1e-3, atol=rounding)
     seen = ~np.isnan(here)  # voxels that few views see, above or below the panel, are NaN
     assert seen.mean() > 0.05 and (not seen.all() or case > 0), case
     assert (seen == ~np.isnan(there)).all(), case
@@ -68,7 +85,7 @@ BY_SLABS = """
 import numpy as np
 from flexdt.twin.projection import gpu
 from flexdt.twin.reconstruction import Grid, fdk, gpu_reconstruction_kernels
-from flexdt.twin.reconstruction.fdk import OnDevice
+from flexdt.twin.reconstruction.backprojection import OnDevice
 from tests.twin.reconstruction.scans import ball, circle
 
 gpu_reconstruction_kernels.BLOCK = gpu_reconstruction_kernels.PLANE = (4, 2)
@@ -199,6 +216,7 @@ def test_device_agrees_with_the_processor(monkeypatch) -> None:
     images = ball(scan, (120, 130))
     assert device_takes(like, (120, 130))
     device = fdk(images, scan, like)
+    assert device.accuracy is not None
     monkeypatch.setattr(gpu, "availability", lambda: gpu.Availability(False, "switched off"))
     processor = fdk(images, scan, like)
     assert np.abs(device.data - processor.data).max() < 1e-4 * np.abs(processor.data).max()

@@ -1,0 +1,74 @@
+"""The ramp filter of filtered backprojection, as sampled in space, with the usual windows.
+
+Rows are padded so far that the convolution does not wrap.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flexdt.algorithms import PLAIN, WINDOWS
+from flexdt.twin.errors import UnknownNameError
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+
+
+def ramp(reach: int, pitch_mm: float, window: str = PLAIN) -> Float32Array:
+    """Compute the frequency response of the filter, times the pitch, (length / 2 + 1,) [1/mm].
+
+    Args:
+        reach: least distance between columns that do not act on each other; the number of columns
+            of a row, or less where not all filtered values are needed.
+        pitch_mm: between columns.
+        window: of `WINDOWS`.
+
+    Raises:
+        UnknownNameError: lists the windows.
+    """
+    if window not in WINDOWS:
+        raise UnknownNameError.among(f"unknown filter {window!r}; there are", window, WINDOWS)
+    length = _even_length(2 * reach)
+    n = np.minimum(np.arange(length), length - np.arange(length))
+    kernel = np.zeros(length)
+    odd = n % 2 == 1
+    kernel[odd] = -1.0 / (np.pi * n[odd] * pitch_mm) ** 2
+    kernel[0] = 0.25 / pitch_mm**2
+    response = np.fft.rfft(kernel).real * pitch_mm
+    shape = WINDOWS[window](np.linspace(0.0, 1.0, len(response)))
+    return np.asarray(response * shape, dtype=np.float32)
+
+
+def _even_length(least: int) -> int:
+    """The first even length from `least` on whose transform is fast."""
+    from scipy import fft
+
+    length = int(fft.next_fast_len(least, real=True))
+    while length % 2:
+        length = int(fft.next_fast_len(length + 1, real=True))
+    return length
+
+
+def padded_length(response: Float32Array) -> int:
+    """Columns of a padded row, of the filter's response."""
+    return 2 * (len(response) - 1)
+
+
+def filtered(rows: Float32Array, response: Float32Array) -> Float32Array:
+    """Convolve rows (..., cols), zero beyond their ends, with the filter of `response`.
+
+    Columns are right as far as `ramp` was told that they act on each other.
+    """
+    from scipy import fft
+
+    from flexdt.twin.reconstruction import fdk_kernels
+
+    cols, length = rows.shape[-1], padded_length(response)
+    spectrum = fft.rfft(rows, length, axis=-1, workers=-1)
+    fdk_kernels.respond(spectrum.view(np.float32).reshape(-1, len(response), 2), response)
+    back: Float32Array = fft.irfft(spectrum, length, axis=-1, workers=-1)[..., :cols]
+    return back
+
+
+def taps(response: Float32Array, wide: int, more: int) -> FloatArray:
+    """Compute the filter in space, by the distance in columns: (wide + more,)."""
+    values = np.fft.irfft(response.astype(np.float64), padded_length(response))[:wide]
+    return np.pad(values, (0, wide - len(values) + more))

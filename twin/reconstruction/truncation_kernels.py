@@ -1,0 +1,261 @@
+"""An elliptic prism: its path lengths beyond a panel's edges, and its fit to what views saw.
+
+Rows are continued on all cores, in one pass over the pixels, for the processor and for a device
+alike: of 360 views into 512^3 a device takes milliseconds a view, this a fraction of one, and what
+it writes is what has to be copied there anyway.
+
+The fit is Levenberg and Marquardt's, of six numbers, with normal equations of six rows that are
+solved here: BLAS would start a thread on each core for each step. Arguments are not checked.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import prange
+
+from flexdt.twin.projection.kernels.compiling import kernel, parallel, serial
+
+PARAMETERS = 6
+MOST_STEPS = 100
+"""Evaluations of a fit, at most: usually a dozen is enough."""
+GAIN = 1e-10
+"""Relative fall of the cost below which a fit has come to its end."""
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1.0, 1e-9, 1e9
+RIM = 1e-3
+"""Part of the longest chord, squared, below which its slope is taken as there: at the rim itself it
+is infinite."""
+
+
+@kernel
+def _chord(prism, source_x, source_y, x, y):
+    """Path length times attenuation through a prism, over the horizontal length of the ray (x, y).
+
+    prism: centre x, y; lower triangle (0, 0), (1, 0), (1, 1) to the unit disc; attenuation.
+    """
+    start_x = source_x - prism[0]
+    start_y = source_y - prism[1]
+    along_x = prism[2] * x
+    along_y = prism[3] * x + prism[4] * y
+    squared = along_x * along_x + along_y * along_y
+    apart = prism[2] * prism[4] * (start_x * y - start_y * x)
+    inside = squared - apart * apart
+    if inside <= 0.0:
+        return 0.0
+    return 2.0 * prism[5] * math.sqrt(inside) / squared
+
+
+@kernel
+def _edge_mean(line, before, first, last, lower, upper, share, across, high):
+    """Mean of a row less the prisms' path lengths, over columns first <= c < last of the panel.
+
+    line: the panel's row; before: columns before it among the widened ones.
+    """
+    total = 0.0
+    for c in range(first, last):
+        at = before + c
+        model = lower[at] + share * (upper[at] - lower[at])
+        total += line[c] - model * math.sqrt(across[at] + high)
+    return total / max(last - first, 1)
+
+
+@kernel
+def _continue_side(out, first, last, lower, upper, share, across, high, rest, fade):
+    """Fill columns first <= c < last of a row: the prisms, and the rest at the edge fading out."""
+    for c in range(first, last):
+        model = lower[c] + share * (upper[c] - lower[c])
+        out[c] = np.float32(model * math.sqrt(across[c] + high) + rest * fade[c])
+
+
+@parallel
+def continue_rows(
+    images, first, before, edge, plane, prisms, band, share, cut, fade, across, up, out
+):
+    """Widen rows beyond the panel's edges.
+
+    images: float32 (n, rows of the panel, cols).
+    first: row of the panel that is the first of `out`; rows beyond it repeat its outermost ones.
+    before: columns of `out` before the panel's first.
+    edge: columns at an edge whose mean goes on.
+    plane: (n, 6) source, ray to the first column of `out`, and step from column to column, x and y
+        [mm].
+    prisms: (k, 6) of `_chord`.
+    band, share: (rows,) lower band of each row, and how much the next one counts.
+    cut: (rows,) how much of what the prisms leave at the edges goes on.
+    fade: (wide,) part of it that is left in each column.
+    across, up: squares of the ray's horizontal and vertical parts, (n, wide) and (n, rows) [mm^2].
+    out: float32 (n, rows, wide).
+    """
+    n, rows, wide = out.shape
+    cols = images.shape[2]
+    after = before + cols
+    bands = len(prisms)
+    lengths = np.zeros((n, bands, wide), np.float64)
+    for job in prange(n * bands):
+        view = job // bands
+        k = job % bands
+        if prisms[k, 5] > 0.0:
+            g = plane[view]
+            for c in range(wide):
+                if c < before + edge or c >= after - edge:
+                    lengths[view, k, c] = _chord(
+                        prisms[k], g[0], g[1], g[2] + c * g[4], g[3] + c * g[5]
+                    )
+    for job in prange(n * rows):
+        view = job // rows
+        r = job % rows
+        line = images[view, min(max(first + r, 0), images.shape[1] - 1)]
+        lower = lengths[view, band[r]]
+        upper = lengths[view, min(band[r] + 1, bands - 1)]
+        flat = across[view]
+        high = up[view, r]
+        part, other = share[r], cols - edge
+        low = _edge_mean(line, before, 0, edge, lower, upper, part, flat, high)
+        top = _edge_mean(line, before, other, cols, lower, upper, part, flat, high)
+        row = out[view, r]
+        _continue_side(row, 0, before, lower, upper, part, flat, high, low * cut[r], fade)
+        for c in range(cols):
+            row[before + c] = line[c]
+        _continue_side(row, after, wide, lower, upper, part, flat, high, top * cut[r], fade)
+
+
+@kernel
+def _cost(x, source, rays, length, seen, scale):
+    """Half the sum of Cauchy's losses of a prism's deviations, over the square of their scale."""
+    e, f = math.exp(x[2]), math.exp(x[3])
+    attenuation = math.exp(x[5])
+    total = 0.0
+    for i in range(len(seen)):
+        px = source[i, 0] - x[0]
+        py = source[i, 1] - x[1]
+        for j in range(seen.shape[1]):
+            dx = rays[i, j, 0]
+            dy = rays[i, j, 1]
+            along = x[4] * dx + f * dy
+            squared = e * dx * e * dx + along * along
+            apart = e * f * (px * dy - py * dx)
+            inside = max(squared - apart * apart, 0.0)
+            value = 2.0 * attenuation * length[i, j] * math.sqrt(inside) / squared
+            rest = (value - seen[i, j]) / scale
+            total += math.log1p(rest * rest)
+    return 0.5 * total
+
+
+@kernel
+def _normal_equations(x, source, rays, length, seen, scale, slope, matrix, gradient):
+    """Curvature (6, 6) and gradient (6,) of `_cost`; slope: memory for six numbers."""
+    e, f = math.exp(x[2]), math.exp(x[3])
+    attenuation = math.exp(x[5])
+    matrix[:] = 0.0
+    gradient[:] = 0.0
+    for i in range(len(seen)):
+        px = source[i, 0] - x[0]
+        py = source[i, 1] - x[1]
+        for j in range(seen.shape[1]):
+            dx = rays[i, j, 0]
+            dy = rays[i, j, 1]
+            across = e * dx
+            along = x[4] * dx + f * dy
+            squared = across * across + along * along
+            apart = e * f * (px * dy - py * dx)
+            inside = squared - apart * apart
+            if inside <= 0.0:
+                continue
+            root = math.sqrt(inside)
+            unit = 2.0 * attenuation * length[i, j] / scale
+            value = unit * root / squared
+            rest = value - seen[i, j] / scale
+            pull = 1.0 / (1.0 + rest * rest)
+            steep = unit / (squared * math.sqrt(max(inside, RIM * squared)))
+            flat = value / squared
+            slope[0] = steep * apart * e * f * dy
+            slope[1] = -steep * apart * e * f * dx
+            change = 2.0 * across * across
+            slope[2] = steep * (0.5 * change - apart * apart) - flat * change
+            change = 2.0 * along * f * dy
+            slope[3] = steep * (0.5 * change - apart * apart) - flat * change
+            change = 2.0 * along * dx
+            slope[4] = steep * 0.5 * change - flat * change
+            slope[5] = value
+            for a in range(PARAMETERS):
+                gradient[a] += pull * rest * slope[a]
+                for b in range(a + 1):
+                    matrix[a, b] += pull * slope[a] * slope[b]
+
+
+@kernel
+def _solved(matrix, gradient, free, damping, factor, step):
+    """Damped step of the free parameters, by Cholesky's factor; False where there is none."""
+    for a in range(PARAMETERS):
+        step[a] = -gradient[a] if free[a] else 0.0
+        for b in range(a + 1):
+            value = matrix[a, b] if free[a] and free[b] else 0.0
+            if a == b:
+                value = value * (1.0 + damping) + 1e-12 if free[a] else 1.0
+            for k in range(b):
+                value -= factor[a, k] * factor[b, k]
+            if a > b:
+                factor[a, b] = value / factor[b, b]
+            elif value > 0.0:
+                factor[a, a] = math.sqrt(value)
+            else:
+                return False
+    for a in range(PARAMETERS):
+        for k in range(a):
+            step[a] -= factor[a, k] * step[k]
+        step[a] /= factor[a, a]
+    for a in range(PARAMETERS - 1, -1, -1):
+        for k in range(a + 1, PARAMETERS):
+            step[a] -= factor[k, a] * step[k]
+        step[a] /= factor[a, a]
+    return True
+
+
+@serial
+def fit_prism(source, rays, length, seen, least, most, scale, x):
+    """Fit a prism within bounds, in place; returns the cost (`_cost` times scale^2).
+
+    source: (n, 2); rays: (n, k, 2) in the plane, over the radius of the field of view.
+    length: (n, k) of these rays [mm].
+    seen: (n, k) line integrals in the plane.
+    least, most: (6,) bounds.
+    scale: deviation from which on rays count less.
+    x: (6,) of `Prism.of`; the first guess, then the result.
+    """
+    slope, gradient, step = np.empty(PARAMETERS), np.empty(PARAMETERS), np.empty(PARAMETERS)
+    matrix = np.empty((PARAMETERS, PARAMETERS))
+    factor = np.empty((PARAMETERS, PARAMETERS))
+    free, trial = np.empty(PARAMETERS, np.bool_), np.empty(PARAMETERS)
+    for a in range(PARAMETERS):
+        x[a] = min(max(x[a], least[a]), most[a])
+    cost = _cost(x, source, rays, length, seen, scale)
+    damping = FIRST_DAMPING
+    fresh = False
+    for _ in range(MOST_STEPS):
+        if not fresh:
+            _normal_equations(x, source, rays, length, seen, scale, slope, matrix, gradient)
+            fresh = True
+        for a in range(PARAMETERS):
+            outward = (x[a] <= least[a] and gradient[a] > 0.0) or (
+                x[a] >= most[a] and gradient[a] < 0.0
+            )
+            free[a] = not outward
+        other = math.inf
+        if _solved(matrix, gradient, free, damping, factor, step):
+            for a in range(PARAMETERS):
+                trial[a] = min(max(x[a] + step[a], least[a]), most[a])
+            other = _cost(trial, source, rays, length, seen, scale)
+        if other < cost:
+            gain = cost - other
+            x[:] = trial
+            cost = other
+            fresh = False
+            damping = max(0.2 * damping, LEAST_DAMPING)
+            if gain <= GAIN * cost:
+                break
+        else:
+            damping *= 5.0
+            if damping > MOST_DAMPING:
+                break
+    return cost * scale * scale

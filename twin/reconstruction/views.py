@@ -1,0 +1,105 @@
+"""Views on their way to a volume of FDK: images, weights, filter, and where voxels see them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.reconstruction.truncation import Continuation
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Some views on their way to a volume.
+
+    They are widened, multiplied by factors / length of the ray to the pixel, and filtered along
+    rows.
+
+    Attributes:
+        images: (n, rows of the panel, its cols).
+        top: the first row that is needed.
+        before: columns that go into the filter before the panel's first.
+        beyond: how rows go on there and behind the panel's last column.
+        factors: float64 (n, cols that go into the filter).
+        across, up: squares of the ray's horizontal and vertical parts, (n, cols) and (n, rows that
+            are needed) [mm^2].
+        response: of the filter.
+        kept: columns whose filtered values are needed.
+        shares, table: of `fdk_kernels.backproject`.
+        few: whether the panel has few rows.
+    """
+
+    images: Float32Array
+    top: int
+    before: int
+    beyond: Continuation
+    factors: FloatArray
+    across: FloatArray
+    up: FloatArray
+    response: Float32Array
+    kept: slice
+    shares: Float32Array
+    table: FloatArray
+    few: bool
+
+    @property
+    def sizes(self) -> tuple[int, int, int, int]:
+        """Views, columns before and after the filter, rows."""
+        n, wide = self.factors.shape
+        return n, wide, self.kept.stop - self.kept.start, self.up.shape[1]
+
+    @property
+    def wider(self) -> bool:
+        """Whether columns off the panel go into the filter."""
+        return bool(self.factors.shape[1] > self.images.shape[2])
+
+    @property
+    def needed(self) -> Float32Array:
+        """The images' rows that are needed; those off the panel repeat its outermost ones."""
+        count, rows = self.images.shape[1], self.up.shape[1]
+        last = self.top + rows
+        if self.top >= 0 and last <= count:
+            return self.images[:, self.top : last]
+        return self.images[:, np.arange(self.top, last).clip(0, count - 1)]
+
+    def of(self, which: slice | npt.NDArray[np.intp]) -> Views:
+        """Some of these views."""
+        return replace(
+            self, images=self.images[which], beyond=self.beyond.of(which),
+            factors=self.factors[which], across=self.across[which], up=self.up[which],
+            shares=self.shares[which], table=self.table[which],
+        )  # fmt: skip
+
+    def widen(self, out: Float32Array) -> None:
+        """Write the rows that are needed, continued beyond the panel's edges, (n, rows, cols)."""
+        from flexdt.twin.reconstruction import truncation_kernels
+
+        on = self.beyond
+        truncation_kernels.continue_rows(
+            np.ascontiguousarray(self.images), self.top, self.before, on.edge, on.plane, on.prisms,
+            on.band, on.share, on.cut, on.fade, self.across, self.up, out,
+        )  # fmt: skip
+
+
+def view_table(cone_vec: ConeVec, shape: tuple[int, int]) -> FloatArray:
+    """Compute what the kernel needs of upright views, (n, 11); see `fdk_kernels.backproject`."""
+    rows, cols = shape
+    pitch_u = np.linalg.norm(cone_vec.u, axis=1)
+    pitch_v = np.linalg.norm(cone_vec.v, axis=1)
+    u = cone_vec.u[:, :2] / pitch_u[:, None]
+    offset = cone_vec.detector - cone_vec.source
+    normal = np.column_stack([-u[:, 1], u[:, 0]])
+    depth = (offset[:, :2] * normal).sum(axis=1)
+    normal *= np.sign(depth)[:, None]
+    depth = np.abs(depth)
+    foot_c = (cols - 1) / 2 - (offset[:, :2] * u).sum(axis=1) / pitch_u
+    foot_r = (rows - 1) / 2 + offset[:, 2] / pitch_v
+    return np.ascontiguousarray(
+        np.column_stack(
+            [cone_vec.source, normal, u, depth / pitch_u, foot_c, depth / pitch_v, foot_r]
+        )
+    )
