@@ -23,8 +23,9 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Final, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
 
+from flexdt.library.algorithms import PLAIN, WINDOWS
 from flexdt.library.failure import CommandError
 from flexdt.runtime.process_settings import (
     GatewaySettings,
@@ -37,6 +38,11 @@ from flexdt.runtime.process_settings import (
     read,
     words,
 )
+
+if TYPE_CHECKING:
+    Window = str
+else:
+    Window = Literal[tuple(WINDOWS)]
 
 S = TypeVar("S", bound=Settings)
 
@@ -89,7 +95,7 @@ class ReconstructSettings(Settings):
     """
 
     command = "reconstruct"
-    window: Literal["ram-lak", "shepp-logan", "cosine", "hamming", "hann"] = option("ram-lak")
+    window: Window = option(PLAIN)  # noqa: RUF009
 
 
 @dataclass(frozen=True, kw_only=True)

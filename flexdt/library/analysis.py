@@ -11,6 +11,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from flexdt.library.algorithms import DEFAULT, PLAIN
 from flexdt.library.calibration.align_dataset import Aligned
 from flexdt.library.calibration.calibrate import Outcome, calibrate_datasets, calibration_request
 from flexdt.library.data_set import DataSet
@@ -97,7 +98,7 @@ def calibrate(
 @public
 def reconstruct(
     data: Data,
-    algorithm: str = "fdk",
+    algorithm: str = DEFAULT,
     *,
     voxel: float | None = None,
     shape: tuple[int, int, int] | None = None,
@@ -106,7 +107,7 @@ def reconstruct(
     every: int = 1,
     iterations: int | None = None,
     weight: float | None = None,
-    window: str = "ram-lak",
+    window: str = PLAIN,
     material: str | Sequence[str] | None = None,
     scatter_correction: str | Sequence[str] | None = None,
     tube: Tube | None = None,
@@ -136,8 +137,7 @@ def reconstruct(
         parameters: correction; default: the one in force during the scan, if any.
         progress: called with the fraction done.
         errors: of FDK, find what may be off, `volume.bias_bound` and `volume.accuracy`, and warn
-            of it; and find the noise, `volume.sigma` (of a circle on the processor, of five rows or
-            more).
+            of it; and find the noise, `volume.sigma` (of a circle, of five rows or more).
 
     Returns:
         Volume of attenuation [1/mm].

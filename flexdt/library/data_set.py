@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from flexdt.library.algorithms import DEFAULT, PLAIN
 from flexdt.library.datasets.exchange import with_geometry
 from flexdt.library.datasets.image_set import ImageSet
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -96,7 +97,7 @@ class DataSet(ImageSet):
 
     def reconstruct(
         self,
-        algorithm: str = "fdk",
+        algorithm: str = DEFAULT,
         *,
         voxel: float | None = None,
         shape: tuple[int, int, int] | None = None,
@@ -105,7 +106,7 @@ class DataSet(ImageSet):
         every: int = 1,
         iterations: int | None = None,
         weight: float | None = None,
-        window: str = "ram-lak",
+        window: str = PLAIN,
         material: str | Sequence[str] | None = None,
         scatter_correction: str | Sequence[str] | None = None,
         tube: Tube | None = None,

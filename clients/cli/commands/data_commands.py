@@ -18,6 +18,7 @@ from flexdt.clients.cli import options
 from flexdt.clients.cli.console import ProgressBar, duration, note, size, warn
 from flexdt.clients.cli.options import Answer, Twin, argument, option
 from flexdt.clients.cli.settings_file import ReconstructSettings, chosen
+from flexdt.library.algorithms import ALGORITHMS, DEFAULT
 from flexdt.library.failure import CommandError
 
 if TYPE_CHECKING:
@@ -27,7 +28,9 @@ if TYPE_CHECKING:
     from flexdt.library.datasets.exchange import Given
     from flexdt.twin.geometry.offsets import Offsets
 
-Algorithm = Literal["fdk", "sirt", "sart", "cgls", "em", "tv"]
+    Algorithm = str
+else:
+    Algorithm = Literal[tuple(ALGORITHMS)]
 
 
 def reconstruct(
@@ -78,7 +81,7 @@ def reconstruct(
         slurm: Submit workers to SLURM as this file says.
     """
     own = {
-        "algorithm": None if algorithm == "fdk" else algorithm, "voxel": voxel, "shape": shape,
+        "algorithm": None if algorithm == DEFAULT else algorithm, "voxel": voxel, "shape": shape,
         "binning": binning, "every": every, "iterations": iterations, "weight": weight,
         "center": center, "rings": rings or None, "material": material,
         "scatter-correction": scatter_correction, "scheduler": scheduler, "slurm": slurm,
@@ -95,7 +98,7 @@ def reconstruct(
     made_of = None if material is None else options.names(material)
     middle = "X,Y,Z, e.g. 0,0,-5.5"
     request = VolumeRequest(
-        algorithm=algorithm or "fdk", voxel_mm=voxel, shape=voxels, binning=binning or 1,
+        algorithm=algorithm or DEFAULT, voxel_mm=voxel, shape=voxels, binning=binning or 1,
         every=every or 1, iterations=iterations, weight=weight,
         window=chosen(ReconstructSettings).window,
         center_mm=None if center is None else options.triple(center, "center", middle),
@@ -110,7 +113,7 @@ def reconstruct(
     if data.missing:
         note(f"{dataset}: warning: {len(data.missing)} frames are missing and are left out")
     workers = _workers(scheduler, slurm)
-    unit = "slabs" if request.algorithm == "fdk" else "iterations"
+    unit = "slabs" if ALGORITHMS[request.algorithm].direct else "iterations"
     with ProgressBar(f"{request.algorithm} of {dataset.name}", unit) as bar:
         if preview:
             document = quick_look(data, out, parameters=parameters, progress=bar.update)
@@ -134,17 +137,19 @@ def _check_together(given: Mapping[str, object], out: Path, kept_out: Iterable[s
     """Usage errors of options that do not go together; a preview keeps some out."""
     from flexdt.library.reconstruction.volume_files import SUFFIXES, ending
 
-    algorithm = given.get("algorithm", "fdk")
+    algorithm = str(given.get("algorithm", DEFAULT))
+    has = ALGORITHMS[algorithm].options
     corrects = {"material", "scatter-correction"} & given.keys()
     for wrong, name, why in (
         *((True, name, "--preview chooses for itself") for name in kept_out),
         (ending(out) not in SUFFIXES, "out",
          f"{out}: the ending must be one of {', '.join(SUFFIXES)}"),
         ("kv" in given and not corrects, "kv", "it is for --material and --scatter-correction"),
-        ("iterations" in given and algorithm == "fdk", "iterations", "fdk has none"),
-        ("weight" in given and algorithm != "tv", "weight", f"{algorithm} has none"),
+        *((name in given and name not in has, name, f"{algorithm} has none")
+          for name in ("iterations", "weight")),
         ({"scheduler", "slurm"} <= given.keys(), "slurm", "not together with --scheduler"),
-        *((algorithm != "fdk", name, f"{algorithm} is not done by workers; allowed: fdk")
+        *((not ALGORITHMS[algorithm].direct, name,
+           f"{algorithm} is not done by workers; allowed: {DEFAULT}")
           for name in ("scheduler", "slurm") if name in given),
         ({"correction", "geometry"} <= given.keys(), "correction",
          "no correction is added to a geometry from a file"),

@@ -11,7 +11,7 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from flexdt.library.algorithms import ALGORITHMS, DEFAULT, PLAIN, having
 from flexdt.library.datasets.image_doubts import image_doubts
 from flexdt.library.datasets.image_set import ImageSet
 from flexdt.library.extras import extension
@@ -44,19 +45,14 @@ from flexdt.twin.reconstruction import (
     Truncation,
     bias_of,
     bias_warnings,
-    cgls,
     checked_fdk,
-    em,
     fdk_parts,
     field_of_view,
     hardening,
     layer_warnings,
     lost_layers,
     ring_errors,
-    sart,
-    sirt,
     truncation_of,
-    tv,
 )
 from flexdt.twin.reconstruction.scatter_correction import scatterer_of, subtracted
 
@@ -68,14 +64,6 @@ if TYPE_CHECKING:
 Progress = Callable[[float, float], None]
 """Called with the work done and the whole, in the algorithm's own units."""
 
-ITERATIVE: Final[Mapping[str, Callable[..., Volume]]] = {
-    "sirt": sirt,
-    "sart": sart,
-    "cgls": cgls,
-    "em": em,
-    "tv": tv,
-}
-ALGORITHMS: Final = ("fdk", *ITERATIVE)
 SLAB_BYTES: Final = 512 << 20
 PART: Final = 16
 """Frames read at a time."""
@@ -90,7 +78,7 @@ class VolumeRequest:
     """The volume that a user requests.
 
     Attributes:
-        algorithm: one of `ALGORITHMS`.
+        algorithm: one of `flexdt.library.algorithms.ALGORITHMS`.
         voxel_mm: edge of a voxel; None is the pixel's size at the rotation axis.
         shape: (z, y, x) about the rotation axis at the sample's height; None is the field of view.
         binning: pixels a side over which images are averaged first.
@@ -112,13 +100,13 @@ class VolumeRequest:
         tube: of the scan, in place of what the data set says and of `kV`.
     """
 
-    algorithm: str = "fdk"
+    algorithm: str = DEFAULT
     voxel_mm: float | None = None
     shape: tuple[int, int, int] | None = None
     binning: int = 1
     every: int = 1
     iterations: int | None = None
-    window: str = "ram-lak"
+    window: str = PLAIN
     center_mm: tuple[float, float, float] | None = None
     rings: bool = False
     material: str | tuple[str, ...] | None = None
@@ -275,7 +263,7 @@ def reconstruct_dataset(
             by_workers = extension("slabs", "a reconstruction by workers")
             doubts = by_workers(views, grid, wanted, out, pool, tell)
     accuracy = None
-    if wanted.algorithm == "fdk":
+    if ALGORITHMS[wanted.algorithm].direct:
         bias = bias_of(views.view, views.cone_vec, views.shape, views.truncation)
         accuracy = None if bias is None else bias.accuracy(grid)
         doubts = [*bias_warnings(bias, accuracy), *doubts]
@@ -308,7 +296,7 @@ def _here(
 ) -> list[str]:
     """Reconstruct into a file; returns what is doubtful."""
     with volume_writer(out, grid) as write:
-        if request.algorithm != "fdk":
+        if not ALGORITHMS[request.algorithm].direct:
             write(_iterative(views, grid, request, tell).data)
             return []
         slabs, truncation = grid.slabs(SLAB_BYTES), views.truncation
@@ -344,7 +332,7 @@ def reconstruct_volume(
     views = _corrected(views, wanted)
     for doubt in views.doubts:
         warnings.warn(doubt, stacklevel=2)
-    if wanted.algorithm != "fdk":
+    if not ALGORITHMS[wanted.algorithm].direct:
         return _iterative(views, grid, wanted, tell)
     volume, doubts = checked_fdk(
         views.view, views.parts, views.cone_vec, views.shape, grid, wanted.window,
@@ -364,9 +352,10 @@ def _task(
     if name not in ALGORITHMS:
         raise UnknownNameError.among(f"unknown algorithm {name!r}; allowed", name, ALGORITHMS)
     several = _names(wanted.material)
-    if len(several) > 1 and name not in ("sirt", "sart"):
+    if len(several) > 1 and "materials" not in ALGORITHMS[name].options:
         said = f"materials {', '.join(several)} with {name}"
-        allowed = "one, or several with sirt or sart, which follow each through the volume"
+        follow = " or ".join(having("materials"))
+        allowed = f"one, or several with {follow}, which follow each through the volume"
         raise LimitError.instead(said, [name, *several], allowed)
     views = views_of(dataset, parameters, binning=wanted.binning, every=wanted.every)
     views = replace(views, doubts=tuple(image_doubts(dataset, needed=True)))
@@ -508,8 +497,8 @@ def _require(where: str, need: int, free: int, grid: Grid) -> None:
 
 
 def _iterative(views: ScanFrames, grid: Grid, request: VolumeRequest, tell: Progress) -> Volume:
-    # Stacks of images and grids of voxels that the algorithm holds at a time.
-    stacks, grids = (6, 13) if request.algorithm == "tv" else (3, 5)
+    algorithm = ALGORITHMS[request.algorithm]
+    stacks, grids = algorithm.stacks, algorithm.grids
     if views.mixture is not None:
         stacks, grids = stacks + 2 * len(views.mixture.mu), grids + 3
     need = stacks * 4 * len(views.indices) * math.prod(views.shape) + grids * grid.bytes
@@ -517,10 +506,11 @@ def _iterative(views: ScanFrames, grid: Grid, request: VolumeRequest, tell: Prog
     asked = {
         "iterations": request.iterations, "weight": request.weight, "hardening": views.mixture,
     }  # fmt: skip
-    return ITERATIVE[request.algorithm](
+    made: Volume = algorithm.load()(
         np.concatenate(list(views.parts())),
         views.cone_vec,
         grid.blank(),
         watch=lambda step: tell(step.iteration, step.of),
         **{name: value for name, value in asked.items() if value is not None},
     )
+    return made
