@@ -25,6 +25,8 @@ import sys
 import tempfile
 import time
 import timeit
+import tracemalloc
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -79,7 +81,14 @@ from flexdt_extensions.bench.benchmark import (
     untuned_cases,
 )
 from flexdt_extensions.bench.peers import absent
+from flexdt_extensions.bench.scanned_objects import ATTENUATION, KINDS
 
+FIRST = next(iter(KINDS))
+"""The object that is seen whole."""
+MIDDLE_MM = 10.0
+"""Radius about the axis in which a volume's mean is compared with the truth."""
+RTK_PADDING = 0.5
+"""Of rows that RTK is told are cut off, over their length."""
 ADJOINT = (
     "C1", "C1x36", "C1-tilt", "C2", "C3", "C2-tilt", "C3-tilt", "cone-60", "cone-60-tilt",
     "tilt-45", "roll-90", "roll-90-tilt", "near", "flat", "anisotropic", "on-axis", "C1x1000",
@@ -127,40 +136,90 @@ def adjoint(wanted: Callable[[str], bool]) -> list[Entry]:
     return entries
 
 
-def fdk_input() -> tuple[Float32Array, ConeVec, Volume]:
-    """360 views of 478 x 380 pixels of a ball, and a grid of 256^3."""
-    shape = (380, 478)
-    geometry = circle(360, shape, pitch=0.3)
-    scene = Scene((Solid(Sphere((5.0, -3.0, 4.0), 12.0), "abs", 0.02),))
-    return project_scene(scene, geometry, shape), geometry, Volume(np.zeros((256,) * 3), 0.2)
+FDK_SHAPE = (380, 478)
+FDK_WHAT = "360 views of 478 x 380 into 256^3"
 
 
-def fdk_entry(part: frozenset[str]) -> Entry:
-    """FDK of 360 views of 478 x 380 pixels into 256^3, against RTK's."""
+def fdk_scan() -> tuple[ConeVec, Volume]:
+    """360 views of 478 x 380 pixels, and a grid of 256^3."""
+    return circle(360, FDK_SHAPE, pitch=0.3), Volume(np.zeros((256,) * 3), 0.2)
+
+
+def fdk_names() -> list[str]:
+    """Names of what `fdk_entries` measures: `FDK` is of an object that is seen whole."""
+    return ["FDK" if kind == FIRST else f"FDK-{kind}" for kind in KINDS]
+
+
+def fdk_entries(wanted: Callable[[str], bool], part: frozenset[str]) -> list[Entry]:
+    """FDK of four kinds of images, against RTK's, without and with `errors`.
+
+    Processor seconds and the most memory that arrays take beside the images come from calls of
+    their own, and are also told as multiples of those of the object seen whole.
+    """
+    geometry, grid = fdk_scan()
+    entries: list[Entry] = []
+    for name, kind in zip(fdk_names(), KINDS, strict=True):
+        if wanted(name):
+            images = KINDS[kind](geometry, FDK_SHAPE)
+            entries.append(fdk_entry(name, kind, images, geometry, grid, part))
+    first = next((entry for entry in entries if entry["name"] == "FDK"), None)
+    for entry in entries if first is not None else ():
+        entry["times_whole"] = entry["cpu_ms"] / first["cpu_ms"]
+        entry["memory_times_whole"] = entry["peak_MB"] / first["peak_MB"]
+    return entries
+
+
+def fdk_entry(
+    name: str,
+    kind: str,
+    images: Float32Array,
+    geometry: ConeVec,
+    grid: Volume,
+    part: frozenset[str],
+) -> Entry:
+    """FDK of images into a grid, beside RTK's."""
     from flexdt.twin.reconstruction import fdk
 
-    images, geometry, grid = fdk_input()
     made: dict[str, Volume] = {}
 
-    def ours() -> None:
-        made["flexdt"] = fdk(images, geometry, grid, errors=False)
+    def ours(*, errors: bool = False) -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            made["flexdt"] = fdk(images, geometry, grid, errors=errors)
 
     calls: dict[str, Callable[[], object]] = {"flexdt": ours}
     other = None
     if "itk-rtk" in part:
-        other = rtk.Rtk(rtk_fdk, images, geometry.rows, grid.shape, grid.voxel_xyz, grid.center_mm)
+        pad = 0.0 if kind == FIRST else RTK_PADDING
+        place = grid.shape, grid.voxel_xyz, grid.center_mm
+        other = rtk.Rtk(rtk_fdk, images, geometry.rows, *place, pad)
         calls["itk-rtk"] = other.run
     try:
-        what = "360 views of 478 x 380 into 256^3; error: of the ball's mean"
-        entry = timed("FDK", 1, calls, what, frozenset({"itk-rtk"}))
-        entry["mean_error"] = _ball_error(made["flexdt"])
-        if other is not None:
-            theirs = _ball_error(grid.like(other.images()))
-            entry["peers"]["itk-rtk"]["mean_error"] = theirs
+        what = f"{FDK_WHAT}, {kind}; error: of the middle's mean"
+        entry = timed(name, 1, calls, what, frozenset({"itk-rtk"}))
+        if kind != "noise":
+            entry["mean_error"] = _middle_error(made["flexdt"])
+            if other is not None:
+                theirs = _middle_error(grid.like(other.images()))
+                entry["peers"]["itk-rtk"]["mean_error"] = theirs
     finally:
         if other is not None:
             other.close()
+    entry["cpu_ms"] = _spent(ours, time.process_time, rounds=2)[1]
+    entry["errors_times"] = _spent(partial(ours, errors=True), time.process_time, rounds=2)[1]
+    entry["errors_times"] /= entry["cpu_ms"]
+    entry["peak_MB"] = peak_bytes(ours) / 1e6
     return entry
+
+
+def peak_bytes(call: Callable[[], object]) -> int:
+    """Most bytes that NumPy's arrays and Python's objects take at a time in a call."""
+    tracemalloc.start()
+    try:
+        call()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
 
 
 def rtk_fdk(
@@ -169,8 +228,12 @@ def rtk_fdk(
     counts: tuple[int, int, int],
     voxel_mm: tuple[float, float, float],
     center_mm: tuple[float, float, float],
+    padding: float = 0.0,
 ) -> rtk.Work:
-    """RTK's FDK of projections (n, rows, cols) into a grid of counts (nz, ny, nx)."""
+    """RTK's FDK of projections (n, rows, cols) into a grid of counts (nz, ny, nx).
+
+    padding: of rows that are cut off, over their length (its correction of truncation).
+    """
     import itk
     from itk import RTK
 
@@ -184,7 +247,7 @@ def rtk_fdk(
         reconstruct.SetInput(0, grid)
         reconstruct.SetInput(1, stack)
         reconstruct.SetGeometry(geometry)
-        reconstruct.GetRampFilter().SetTruncationCorrection(0.0)
+        reconstruct.GetRampFilter().SetTruncationCorrection(padding)
         reconstruct.GetRampFilter().SetHannCutFrequency(0.0)
         reconstruct.Update()
         # Back from (-y, z, x).
@@ -193,12 +256,11 @@ def rtk_fdk(
     return run, lambda: np.ascontiguousarray(made[0])
 
 
-def _ball_error(volume: Volume) -> float:
-    """How far the mean of the ball of `fdk_entry` is from the truth, as a share of it."""
-    x, y, z = volume.centers()
-    z, y, x = np.meshgrid(z, y, x, indexing="ij", sparse=True)
-    inside = (x - 5) ** 2 + (y + 3) ** 2 + (z - 4) ** 2 < 10.0**2
-    return abs(float(volume.data[inside].mean()) - 0.02) / 0.02
+def _middle_error(volume: Volume) -> float:
+    """How far the mean about the axis is from the truth, as a share of it."""
+    x, y, _ = volume.centers()
+    middle = volume.data[len(volume.data) // 2, np.hypot(x, y[:, None]) < MIDDLE_MM]
+    return abs(float(middle.mean()) / ATTENUATION - 1.0)
 
 
 def cold_start() -> list[Entry]:
@@ -347,29 +409,30 @@ def columns_passed(ray: FloatArray, box: VoxelBox, cols: int) -> int:
 
 def _fdk_bound(rate: float) -> Entry:
     """FDK of `fdk_entry`: images are read once, or by each tile of voxel columns that they meet."""
-    module = importlib.import_module("flexdt.twin.reconstruction.fdk")
+    from flexdt.twin.reconstruction import backprojection, fdk, views
+
     kernels = importlib.import_module("flexdt.twin.reconstruction.fdk_kernels")
-    images, geometry, grid = fdk_input()
-    rows, cols = images.shape[1:]
+    geometry, grid = fdk_scan()
+    images = KINDS[FIRST](geometry, FDK_SHAPE)
+    rows, cols = FDK_SHAPE
     x, y, _ = (np.sort(c)[[0, -1]] for c in grid.centers())
     tile = kernels.TILE
     places = [np.linspace(*ends, n + 1) for ends, n in zip((x, y), grid.shape[:0:-1], strict=True)]
     px, py = np.meshgrid(places[0][::tile], places[1][::tile])
     asked = 0.0
-    for g in module.view_table(geometry, (rows, cols)):
+    for g in views.view_table(geometry, (rows, cols)):
         depth = (px - g[0]) * g[3] + (py - g[1]) * g[4]
         c = g[8] + ((px - g[0]) * g[5] + (py - g[1]) * g[6]) / depth * g[7]
         corners = np.stack([c[:-1, :-1], c[1:, :-1], c[:-1, 1:], c[1:, 1:]])
         high = np.minimum(np.ptp(grid.centers()[2]) * g[9] / depth[:-1, :-1], rows)
         asked += float((4 * (np.ptp(corners, axis=0) + 2) * high).sum())
-    call = partial(module.fdk, images, geometry, grid)
+    call = partial(fdk, images, geometry, grid)
     least = images.nbytes + grid.data.nbytes
-    what = "360 views of 478 x 380 into 256^3"
-    entry = _bound(BOUNDS[-1], what, call, rate, least, asked + grid.data.nbytes, 1)
+    entry = _bound(BOUNDS[-1], FDK_WHAT, call, rate, least, asked + grid.data.nbytes, 1)
     with contextlib.ExitStack() as stack:
         for name in ("weigh", "stand_up", "backproject"):
             stack.enter_context(mock.patch.object(kernels, name))
-        stack.enter_context(mock.patch.object(module, "filtered"))
+        stack.enter_context(mock.patch.object(backprojection, "filtered"))
         entry["serial_ms"] = _spent(call, time.thread_time)[1]
     return entry
 
@@ -386,11 +449,13 @@ def _bound(
 
 
 def _spent(
-    call: Callable[[], object], clock: Callable[[], float] = time.process_time
+    call: Callable[[], object],
+    clock: Callable[[], float] = time.process_time,
+    rounds: int = 5,
 ) -> tuple[float, float]:
-    """Least time [ms] of five calls, after a first one, by the clock on the wall and by another."""
+    """Least time [ms] of some calls, after a first one, by the clock on the wall and by another."""
     found = []
-    for _ in range(6):
+    for _ in range(rounds + 1):
         wall, own = time.perf_counter(), clock()
         call()
         found.append([time.perf_counter() - wall, clock() - own])
@@ -641,7 +706,7 @@ GROUPS: Mapping[tuple[str, ...], Callable[[Wanted, frozenset[str]], list[Entry]]
     ("scene-C1", "scene-C3"): lambda wanted, part: scenes(),
     ("mesh",): lambda wanted, part: meshes(part),
     tuple(adjoint_names()): lambda wanted, part: adjoint(wanted),
-    ("FDK",): lambda wanted, part: [fdk_entry(part)],
+    tuple(fdk_names()): fdk_entries,
     ("cold-cached", "cold-uncached"): lambda wanted, part: cold_start(),
     ("server-C1",): lambda wanted, part: through_server(),
     BOUNDS: lambda wanted, part: bounds(wanted),
@@ -658,7 +723,8 @@ CURVES: Mapping[str, Callable[[], list[Entry]]] = {
 
 FURTHER = (
     "times_forward", "added_ms", "dot_product_error", "cpu_ms", "least_MB", "asked_MB", "bound_ms",
-    "share", "cached_ms", "cached_cpu_ms", "serial_ms",
+    "share", "cached_ms", "cached_cpu_ms", "serial_ms", "times_whole", "errors_times", "peak_MB",
+    "memory_times_whole",
 )  # fmt: skip
 """Figures of an entry that its line ends with."""
 

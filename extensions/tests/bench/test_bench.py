@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import time
 import xml.etree.ElementTree as ET
@@ -301,6 +302,7 @@ real = device_page.on_the_clock
 device_page.on_the_clock = lambda work, rounds=1: real(work, 1)
 device_page.by_events = real  # the simulator has no clock of its own
 device_page.astra_ms = lambda volume, scan, algorithm: 1.0 if algorithm == "FP3D_CUDA" else None
+device_page.KINDS = {kind: device_page.KINDS[kind] for kind in ("whole", "noise")}
 main(["bench", "--device", "--out", sys.argv[1]])
 """
 
@@ -311,7 +313,7 @@ def test_the_page_of_a_device_has_every_target(tmp_path) -> None:
     run_simulated(DEVICE, str(tmp_path))
     document = json.loads((tmp_path / "device.json").read_text("utf-8"))
     lines = {line["target"]: line for line in document["targets"]}
-    assert len(lines) == len(document["targets"]) == 3 * 9 + 4
+    assert len(lines) == len(document["targets"]) == 3 * 9 + 2 + 2 * 4
     for name in ("C1", "512^3", "1024^3"):
         assert lines[f"{name}: worst error"]["met"] == "wanted"
         assert lines[f"{name}: part of the bound, 3 views"]["met"] == "not measured"
@@ -324,9 +326,15 @@ def test_the_page_of_a_device_has_every_target(tmp_path) -> None:
             ratio = lines[f"{name}: back of {count} views / the processor's"]["measured"]
             assert ratio == seen["back_call_ms"] / seen["back_processor_ms"]
     assert lines["FDK: backprojection / ASTRA BP3D"]["measured"] is None
-    assert lines["FDK of 6 views, host to host [s]"]["measured"] > 0
+    for kind in ("whole", "noise"):
+        assert lines[f"FDK of 6 views, {kind}, host to host [s]"]["measured"] > 0
+        assert lines[f"FDK of 6 views, {kind}, with errors / without"]["measured"] > 0
+    assert lines["FDK of 6 views, whole, over an object seen whole"]["measured"] == 1.0
     text = (tmp_path / "device.md").read_text("utf-8")
     assert all(f"| {target} |" in text for target in lines)
+    assert re.search(
+        r"not measured: (astra-toolbox is not installed|the device does not say)", text
+    )
 
 
 def test_a_contestant_may_time_itself() -> None:
