@@ -25,7 +25,6 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
 
-from flexdt.library.algorithms import PLAIN, WINDOWS
 from flexdt.library.failure import CommandError
 from flexdt.runtime.process_settings import (
     GatewaySettings,
@@ -38,6 +37,7 @@ from flexdt.runtime.process_settings import (
     read,
     words,
 )
+from flexdt.twin.algorithms import PLAIN, WINDOWS
 
 if TYPE_CHECKING:
     Window = str

@@ -11,7 +11,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from flexdt.library.algorithms import DEFAULT, PLAIN
 from flexdt.library.calibration.align_dataset import Aligned
 from flexdt.library.calibration.calibrate import Outcome, calibrate_datasets, calibration_request
 from flexdt.library.data_set import DataSet
@@ -19,6 +18,7 @@ from flexdt.library.datasets.exchange import with_geometry
 from flexdt.library.reading.folders import load_dataset, read_tiffs
 from flexdt.library.reading.listed_images import markers_alone
 from flexdt.phantoms import Phantom
+from flexdt.twin.algorithms import DEFAULT, PLAIN
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from flexdt.library.algorithms import DEFAULT, PLAIN
 from flexdt.library.datasets.exchange import with_geometry
 from flexdt.library.datasets.image_set import ImageSet
+from flexdt.twin.algorithms import DEFAULT, PLAIN
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.signatures import File, public

@@ -14,13 +14,13 @@ import pytest
 
 import flexdt as fx
 from flexdt.clients.cli.settings_file import ReconstructSettings
-from flexdt.library.algorithms import ALGORITHMS, WINDOWS, Algorithm
+from flexdt.twin.algorithms import ALGORITHMS, WINDOWS, Algorithm
 
 PAGE = Path(__file__).parents[2] / "docs" / "reconstruction.md"
 ADDED = Algorithm("half", "tests.clients.test_algorithms", "half_everywhere")
 WITH_IT = """
 import os, sys
-from flexdt.library.algorithms import ALGORITHMS
+from flexdt.twin.algorithms import ALGORITHMS
 from tests.clients.test_algorithms import ADDED
 ALGORITHMS[ADDED.name] = ADDED
 from flexdt.clients.cli.command_tree import run

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from flexdt.library.algorithms import PLAIN
+from flexdt.twin.algorithms import PLAIN
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray

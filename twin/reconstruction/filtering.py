@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flexdt.library.algorithms import PLAIN, WINDOWS
+from flexdt.twin.algorithms import PLAIN, WINDOWS
 from flexdt.twin.errors import UnknownNameError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 

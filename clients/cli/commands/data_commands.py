@@ -18,8 +18,8 @@ from flexdt.clients.cli import options
 from flexdt.clients.cli.console import ProgressBar, duration, note, size, warn
 from flexdt.clients.cli.options import Answer, Twin, argument, option
 from flexdt.clients.cli.settings_file import ReconstructSettings, chosen
-from flexdt.library.algorithms import ALGORITHMS, DEFAULT
 from flexdt.library.failure import CommandError
+from flexdt.twin.algorithms import ALGORITHMS, DEFAULT
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor

@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from flexdt.library.algorithms import ALGORITHMS, DEFAULT, PLAIN, having
 from flexdt.library.datasets.image_doubts import image_doubts
 from flexdt.library.datasets.image_set import ImageSet
 from flexdt.library.extras import extension
@@ -33,6 +32,7 @@ from flexdt.library.reconstruction.volume_files import (
 )
 from flexdt.runtime.files.directory import memory_bytes
 from flexdt.runtime.files.whole_files import free_bytes
+from flexdt.twin.algorithms import ALGORITHMS, DEFAULT, PLAIN, having
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import LimitError, TwinError, UnknownNameError, require_within
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -78,7 +78,7 @@ class VolumeRequest:
     """The volume that a user requests.
 
     Attributes:
-        algorithm: one of `flexdt.library.algorithms.ALGORITHMS`.
+        algorithm: one of `flexdt.twin.algorithms.ALGORITHMS`.
         voxel_mm: edge of a voxel; None is the pixel's size at the rotation axis.
         shape: (z, y, x) about the rotation axis at the sample's height; None is the field of view.
         binning: pixels a side over which images are averaged first.

@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from scipy.optimize import curve_fit
 from scipy.special import ndtr
 
-from flexdt.library.algorithms import WINDOWS
+from flexdt.twin.algorithms import WINDOWS
 from flexdt.twin.errors import GeometryError, UnknownNameError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
