@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -95,8 +96,11 @@ def interrupted(words: Sequence[str], moment_s: float, folder: Path) -> End:
 def kind_of(code: int, said: str, *, interrupted: bool) -> str:
     """What an end was."""
     if "Traceback" in said or "KeyboardInterrupt" in said or code < 0:
-        ours = "flexdt" in said.replace("bin/flexdt", "").replace("flexdt: interrupted", "")
-        return "wrong" if ours or code not in (-signal.SIGINT, 1) else "early"
+        files = re.findall(r'File "([^"]+)"', said)
+        ours = any("/flexdt/" in file or "flexdt_command" in file for file in files)
+        early = not ours and "interrupted" not in said and code in (-signal.SIGINT, 1)
+        # A signal that nobody heard, after the command's own words, is not early.
+        return "early" if early and (files or not said.strip()) else "wrong"
     if code == INTERRUPTED:
         return "told" if "interrupted" in said and interrupted else "wrong"
     return "done" if 0 <= code <= 5 else "wrong"
