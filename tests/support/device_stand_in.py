@@ -1,7 +1,6 @@
 """A plugin of pytest: tests run as on a machine with a CUDA device, without one.
 
-    NUMBA_ENABLE_CUDASIM=1 PYTHONPATH=tests/support \\
-      pytest -p device_stand_in -m 'not slow' tests/twin
+    NUMBA_ENABLE_CUDASIM=1 PYTHONPATH=tests/support pytest -p device_stand_in -m 'not slow' tests
 
 Projections, their transpose and FDK are computed where `gpu` would send them to a device, by the
 processor, with the last bits that a device gives: others than the processor's, and those of the

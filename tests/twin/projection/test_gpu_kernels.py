@@ -95,3 +95,31 @@ def test_the_reference_is_that_of_the_other_tests(siddon) -> None:
         back = spread_back(grid, case.values, starts, ends)
         both = np.vdot(back, case.data.astype(float)), np.vdot(found, case.values.ravel())
         assert abs(both[0] - both[1]) < 1e-11 * both[1], kind
+
+
+AS_WITH_A_DEVICE = (
+    "clients/test_reconstruct_materials.py", "face/test_papercuts.py",
+    "server/test_projector_server.py", "twin/projection/test_projection_frameworks.py",
+    "twin/projection/test_projection_hard.py", "twin/projection/test_projection_operator.py",
+    "twin/projection/test_projection_turns.py",
+    "twin/reconstruction/test_reconstruction_iterative.py",
+)  # fmt: skip
+"""Tests that once took a device's sums for the processor's."""
+
+
+@pytest.mark.slow
+@pytest.mark.campaign(2)
+@pytest.mark.parametrize("name", AS_WITH_A_DEVICE)
+def test_tests_pass_on_a_machine_with_a_device(name) -> None:
+    tests = Path(__file__).parents[2]
+    environment = {
+        **os.environ,
+        "NUMBA_ENABLE_CUDASIM": "1",
+        "PYTHONPATH": str(tests / "support"),
+    }
+    options = ["-p", "device_stand_in", "-p", "no:cacheprovider", "-m", "not slow", "-q"]
+    command = [sys.executable, "-m", "pytest", *options, str(tests / name)]
+    done = subprocess.run(
+        command, env=environment, cwd=tests.parent, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout

@@ -201,6 +201,47 @@ def test_what_runs_in_the_simulator_gives_the_processors_numbers(program: str) -
     run_simulated(program)
 
 
+STRICT = """
+import sys
+import numpy as np
+from flexdt.twin.projection import gpu
+from flexdt.twin.projection.kernels import gpu_kernels
+from flexdt.twin.reconstruction import Grid, fdk_parts, tv
+from flexdt.twin.reconstruction.fdk import OnDevice, OnProcessor
+from tests.support.device_simulator import as_on_a_device
+from tests.twin.reconstruction.scans import ball, circle
+
+as_on_a_device()
+rng = np.random.default_rng(int(sys.argv[1]))
+aside, yaw = rng.uniform(-2, 2), rng.uniform(-0.1, 0.1)
+scan = circle(int(rng.integers(4, 8)), pixel=6.0, aside=aside, yaw=yaw)
+shape = tuple(rng.integers(5, 12, 2).tolist())
+images, like = ball(scan, shape), Grid(tuple(rng.integers(1, 6, 3).tolist()), 4.0).blank()
+found, right = (
+    fdk_parts(lambda: [images], scan, shape, like, target=target(like)).data
+    for target in (OnDevice, OnProcessor)
+)
+seen = np.isfinite(right)
+assert (seen == np.isfinite(found)).all() and np.abs(right[seen]).max() > 0
+assert np.abs(found - right)[seen].max() < 1e-6 * np.abs(right[seen]).max()
+
+if sys.argv[2] == "tv":
+    gpu.VIEWS_A_THREAD, gpu.LINEAR, gpu_kernels.FOLDING = 0.0, 32, (1, 32)
+    found = tv(images, scan, like, iterations=1).data
+    assert gpu.availability().present
+    with gpu.switched_off():
+        right = tv(images, scan, like, iterations=1).data
+    assert np.abs(found - right).max() < 1e-5 * np.abs(right).max()
+"""
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.daily(1)
+@pytest.mark.campaign(1)
+def test_kernels_on_blocks_as_on_a_device_touch_nothing_outside(seed: int) -> None:
+    run_simulated(STRICT, str(seed), "tv" if seed else "")
+
+
 def test_a_volume_too_large_for_the_device_goes_to_the_processor(monkeypatch) -> None:
     like = Grid((40, 40, 40), 1.0).blank()
     monkeypatch.setattr(gpu, "availability", lambda: gpu.Availability(True, "pretended"))
