@@ -31,6 +31,7 @@ from flexdt.protocol.field_checks import (
     payload,
     plain_name,
 )
+from flexdt.protocol.image import Dtype
 
 MAX_UNKNOWN = 50
 """An object with this many members more than it has fields is rejected without a closer look."""
@@ -153,7 +154,7 @@ class Nothing(Result):
 class ImageValue(Result):
     """An array: little-endian, C order."""
 
-    dtype: Literal["uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"]
+    dtype: Dtype
     shape: list[int]
     """sizes, slowest first: (rows, columns) for an image"""
     data: Payload

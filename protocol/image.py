@@ -11,15 +11,15 @@ import base64
 import binascii
 import math
 from collections.abc import Mapping, Sequence
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.protocol.rpc_errors import clip, invalid_params
+from flexdt.protocol.rpc_errors import clip, invalid_params, problem
 
-DTYPES: tuple[str, ...] = (
-    "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64",
-)  # fmt: skip
+Dtype = Literal["uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"]
+DTYPES: tuple[str, ...] = get_args(Dtype)
 """Allowed element types; always little-endian on the wire."""
 
 
@@ -66,7 +66,7 @@ def from_bytes(
     if size != expected:
         raise invalid_params(
             f"an image of shape {list(shape)} and dtype {dtype} has {expected} bytes, not {size}",
-            [{"path": "data", "message": "wrong size", "asked": size}],
+            [problem("data", "wrong size", size)],
             {"bytes": expected},
         )
     array = np.frombuffer(data, dtype=kind).reshape(tuple(shape))

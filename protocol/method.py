@@ -13,7 +13,7 @@ from typing import Final, Generic, TypeAlias, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from flexdt.protocol.fields import Params, Result
-from flexdt.protocol.rpc_errors import Code, RpcError, clip, invalid_params
+from flexdt.protocol.rpc_errors import Code, RpcError, clip, invalid_params, problem
 
 PROTOCOL: Final = "1.0"
 """Version of the wire: a server serves every client of the same major number (before the dot)."""
@@ -76,7 +76,7 @@ def require_compatible(protocol: str) -> None:
     if not compatible(protocol):
         raise invalid_params(
             f"protocol {protocol!r} is not spoken here; this server speaks {PROTOCOL}",
-            [{"path": "protocol", "message": "another version", "asked": protocol}],
+            [problem("protocol", "another version", protocol)],
             PROTOCOL,
         )
 

@@ -87,11 +87,16 @@ def method_not_found(asked: str, allowed: Iterable[str]) -> RpcError:
 def invalid_params(
     message: str, problems: Sequence[Mapping[str, object]] = (), allowed: object = None
 ) -> RpcError:
-    """Parameters that do not fit. `problems`: one {path, message, asked} each."""
+    """Make the error for parameters that do not fit; `problems` are those of `problem`."""
     data: dict[str, object] = {"problems": [dict(p) for p in problems]}
     if allowed is not None:
         data["allowed"] = allowed
     return RpcError(Code.INVALID_PARAMS, message, data)
+
+
+def problem(path: str, message: str, asked: object) -> dict[str, object]:
+    """Make one entry of `invalid_params`: the parameter, what is wrong, and what was asked for."""
+    return {"path": path, "message": message, "asked": asked}
 
 
 def internal(trace: str | None = None) -> RpcError:

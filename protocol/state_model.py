@@ -11,7 +11,11 @@ from pydantic import Field
 
 from flexdt.protocol.fields import NonNegative, Pair, Positive, Result, Roi, Shape2, SpeedUp, Triple
 
-JobPhase = Literal["queued", "running", "paused", "done", "failed", "aborted", "incomplete"]
+EndedPhase = Literal["done", "failed", "aborted", "incomplete"]
+JobPhase = Literal["queued", "running", "paused", EndedPhase]
+StopPath = Literal["along", "apart", "coasting"]
+LogLevel = Literal["debug", "info", "warning", "error"]
+ImageEdge = Literal["left", "right", "top", "bottom"]
 
 
 class AxisState(Result):
@@ -181,7 +185,7 @@ class ImageFlags(Result):
     """part of the pixels at full scale"""
     starved: float = Field(ge=0, le=1)
     """part of the pixels with hardly a count above dark"""
-    truncated: list[Literal["left", "right", "top", "bottom"]]
+    truncated: list[ImageEdge]
     """edges of the image at which the sample is cut off"""
     good_counts: Pair | None = None
     """a pixel with fewer counts than the first is starved, from the second on saturated"""
@@ -212,7 +216,7 @@ class State(Result):
 class Stopping(Result):
     """How the motors come to rest after a stop."""
 
-    path: Literal["along", "apart", "coasting"]
+    path: StopPath
     """along the path they were on together; apart, each by itself, on a path that was swept;
     coasting, without power (E-stop of category 0), on a path nothing keeps free"""
     duration_s: NonNegative
@@ -234,7 +238,7 @@ class Stopped(State):
 class LogEntry(Result):
     """Data of a `log` event."""
 
-    level: Literal["debug", "info", "warning", "error"]
+    level: LogLevel
     message: str
     data: dict[str, object] = Field(default_factory=dict)
 

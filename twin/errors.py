@@ -70,6 +70,11 @@ class MachineFileError(TwinError):
 class LimitError(TwinError):
     """A target, speed or setting outside what the machine allows."""
 
+    @classmethod
+    def of_axis(cls, said: str, axis: str, asked: object, allowed: object, unit: str) -> Self:
+        """Make the error whose message is `said`, about what an axis allows."""
+        return cls(said, {"axis": axis, "asked": asked, "allowed": allowed, "unit": unit})
+
 
 def require_within(what: str, value: float, low: float, high: float, unit: str = "") -> None:
     """Check that a number is finite and from `low` to `high`.

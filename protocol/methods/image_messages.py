@@ -15,6 +15,7 @@ from flexdt.protocol.methods.scanner_messages import CameraSet, TubeSet
 from flexdt.protocol.state_model import GeometryResult, ImageFlags
 
 LayerText = Annotated[f.ShortText, MaxLen(100)]
+ScanKind = Literal["fly", "step", "tiled", "helical", "calibration"]
 PREDICTION_LIMITS: Final[Mapping[str, float]] = {"seconds": 60, "memory_bytes": 4 << 30}
 """What a prediction of image quality may cost."""
 
@@ -60,7 +61,7 @@ class ExposurePredict(f.Params):
     roi: f.RoiAsked | None = None
     frames: Frames = 361
     """of the scan, or of each of its turns"""
-    kind: Literal["fly", "step", "tiled", "helical", "calibration"] | None = None
+    kind: ScanKind | None = None
     """of a script, of which time and bytes are then; default: images"""
     sod_mm: f.Distance | None = None
     """default: as it stands"""

@@ -26,7 +26,7 @@ from flexdt.phantoms.materials import stated_keV
 from flexdt.protocol import Codec
 from flexdt.protocol.connection import encoded
 from flexdt.protocol.methods.image_messages import PREDICTION_LIMITS, ExposurePrediction
-from flexdt.protocol.state_model import ImageFlags
+from flexdt.protocol.state_model import ImageEdge, ImageFlags
 from flexdt.runtime.workers import Workers
 from flexdt.server.imaging.projections import Imaging, TrueGeometry
 from flexdt.twin.errors import LimitError
@@ -314,12 +314,17 @@ def flags_of(
     top = radiography.saturating
     # The signal of an open beam, as a logarithm. Two digits: with more, poly would tell distances.
     beam = float(np.median(lines[::EVERY, ::EVERY] + np.log(np.maximum(signal, 1e-30))))
-    edges = {"left": lines[:, 0], "right": lines[:, -1], "top": lines[0], "bottom": lines[-1]}
+    edges: dict[ImageEdge, Float32Array] = {
+        "left": lines[:, 0],
+        "right": lines[:, -1],
+        "top": lines[0],
+        "bottom": lines[-1],
+    }
     return ImageFlags(
         time=time,
         saturated=float(np.mean(signal >= top)),
         starved=float(np.mean(signal < ideal.FEW_COUNTS)),
-        truncated=[name for name, edge in edges.items() if float(edge.max()) > SHADOW],  # type: ignore[misc]
+        truncated=[name for name, edge in edges.items() if float(edge.max()) > SHADOW],
         good_counts=(radiography.offset + ideal.FEW_COUNTS, radiography.full_scale),
         good_lines=(round(beam - math.log(top), 2), round(beam - math.log(ideal.FEW_COUNTS), 2)),
     )

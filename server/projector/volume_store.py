@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexdt.protocol import projector as wire
-from flexdt.protocol.rpc_errors import RpcError, invalid_params, too_large
+from flexdt.protocol.rpc_errors import RpcError, invalid_params, problem, too_large
 from flexdt.twin.projection import Body, TriangleMesh, Volume
 
 LAYOUT_COPIES = 2
@@ -81,7 +81,7 @@ class VolumeStore:
         if name not in self._held:
             raise invalid_params(
                 f"no volume {name!r}; there are: {', '.join(sorted(self._held)) or 'none'}",
-                [{"path": "volume", "message": "unknown volume", "asked": name}],
+                [problem("volume", "unknown volume", name)],
                 sorted(self._held),
             )
         return self._held[name]
@@ -176,7 +176,7 @@ def _needed(what: wire.VoxelGrid | wire.MeshSize) -> int:
 def _bad_chunk(name: str, asked: int, allowed: int) -> RpcError:
     return invalid_params(
         f"volume {name!r}: a chunk at or up to byte {asked} does not fit; expected {allowed}",
-        [{"path": "start", "message": "chunks must come in order", "asked": asked}],
+        [problem("start", "chunks must come in order", asked)],
         allowed,
     )
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import get_args
 
 from flexdt.protocol.rpc_errors import Code
-from flexdt.protocol.state_model import JobPhase
+from flexdt.protocol.state_model import EndedPhase, JobPhase
 from flexdt.runtime.files.dataset_folder import read_document
 from flexdt.runtime.files.directory import Directory
 from flexdt.server.scans.runner import Produce, Progress, ScanRunner
@@ -17,7 +18,7 @@ from flexdt.server.storage.memory import JobMemory
 from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.script import ScanPlan
 
-ENDED: tuple[JobPhase, ...] = ("done", "failed", "aborted", "incomplete")
+ENDED: tuple[JobPhase, ...] = get_args(EndedPhase)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from functools import partial
 
 from flexdt.protocol import Codec
 from flexdt.protocol.messages import Encoded
-from flexdt.protocol.rpc_errors import RpcError, busy, invalid_params
+from flexdt.protocol.rpc_errors import RpcError, busy, invalid_params, problem
 from flexdt.runtime.files.dataset_folder import dated_name, read_document
 from flexdt.runtime.files.directory import Directory, free_bytes
 from flexdt.runtime.files.own_documents import used_bytes
@@ -358,6 +358,6 @@ def name_conflict(name: str, why: str) -> RpcError:
     """The error for a data set's name that cannot be used."""
     return invalid_params(
         f"the data set name {name!r} cannot be used: {why}",
-        [{"path": "name", "message": why, "asked": name}],
+        [problem("name", why, name)],
         "another name, or the same script for an incomplete data set",
     )

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from flexdt.protocol.fields import ShortText
 from flexdt.protocol.methods import document_messages as p
-from flexdt.protocol.rpc_errors import invalid_params
+from flexdt.protocol.rpc_errors import invalid_params, problem
 from flexdt.runtime.files import own_documents as own
 from flexdt.runtime.files.directory import Directory
 from flexdt.server.storage.scene_document import correction_fields, correction_of
@@ -107,7 +107,7 @@ class Corrections:
         if chosen in self._all and self._all[chosen].parameters != parameters:
             raise invalid_params(
                 f"a correction called {chosen!r} exists and corrections are never edited",
-                [{"path": "name", "message": "taken", "asked": chosen}],
+                [problem("name", "taken", chosen)],
                 "another name",
             )
         return self._all.get(chosen) or NamedCorrection(chosen, date, parameters, note)

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from typing import Any
 
 from flexdt.protocol.methods import document_messages as p
-from flexdt.protocol.rpc_errors import invalid_params
+from flexdt.protocol.rpc_errors import invalid_params, problem
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.machine.kinematics import resolve_targets
 from flexdt.twin.scanner.scanner import ScannerTwin
@@ -73,7 +73,7 @@ def require_fit(scene: p.Scene, scanner: ScannerTwin) -> None:
     if scene.machine != scanner.machine.name:
         raise invalid_params(
             f"the scene is of machine {scene.machine!r}, this is {scanner.machine.name!r}",
-            [{"path": "machine", "message": "another machine", "asked": scene.machine}],
+            [problem("machine", "another machine", scene.machine)],
             scanner.machine.name,
         )
     resolve_targets(scanner.machine, scene.positions, scene.positions)

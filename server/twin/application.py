@@ -15,7 +15,7 @@ from typing import get_args
 from prometheus_client import Metric
 
 from flexdt.protocol import AnyMethod
-from flexdt.protocol.fields import Params
+from flexdt.protocol.fields import Params, TopicName
 from flexdt.protocol.state_model import JobPhase
 from flexdt.runtime.files.directory import free_bytes
 from flexdt.runtime.http_pages import Pages, Requests, counter, gauge, watching_pages
@@ -26,7 +26,7 @@ from flexdt.server.network.tcp import TcpServer
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers import HANDLERS
 from flexdt.server.twin.handlers.handler import Client
-from flexdt.server.twin.hub import Topic
+from flexdt.twin.scanner.state import SafetyName
 
 
 class TwinSession:
@@ -98,9 +98,9 @@ def twin_pages(
 def _figures(twin: TwinServer, server: TcpServer, projector: ProjectorPool) -> list[Metric]:
     jobs = Counter(job.phase for job in twin.jobs.all())
     phases: dict[str, float] = {phase: jobs[phase] for phase in get_args(JobPhase)}
-    events: dict[str, float] = {topic: twin.hub.count(topic) for topic in get_args(Topic)}
+    events: dict[str, float] = {topic: twin.hub.count(topic) for topic in get_args(TopicName)}
     in_force = twin.scanner.safety.state
-    safety = {state: float(in_force == state) for state in ("ready", "blocked", "estopped")}
+    safety = {state: float(in_force == state) for state in get_args(SafetyName)}
     factor = twin.clock.real_time_factor
     views, free = projector.views, free_bytes(twin.root)
     room = [] if free is None else [gauge("flexdt_data_free_bytes", "Room on the data disk.", free)]

@@ -17,7 +17,7 @@ from collections.abc import Callable, Collection, Coroutine
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
-from typing import Any, Literal
+from typing import Any
 
 from flexdt.protocol import state_model as w
 from flexdt.protocol.rpc_errors import RpcError, busy
@@ -56,7 +56,6 @@ LOG_KEPT = 50
 FAILURES, FAILURES_S = 5, 60.0
 """A service that has failed so often within so many real seconds cannot be kept going."""
 SERVICE_PAUSE_S = 0.1
-Level = Literal["debug", "info", "warning", "error"]
 
 
 # Who may move: one controller at a time, everyone may watch.
@@ -419,12 +418,12 @@ class TwinServer:
         """A stop from outside also pauses the scan that runs."""
         self.jobs.interrupt(SafetyError(f"{what} was commanded; resume goes on", {"asked": what}))
 
-    def tell(self, level: Level, message: str, **data: object) -> None:
+    def tell(self, level: w.LogLevel, message: str, **data: object) -> None:
         """Say something to whoever listens to the topic `log`, and to the server's log."""
         log(message, LEVELS[level], error=False, **data)
         self._publish_log(level, message, data)
 
-    def _publish_log(self, level: Level, message: str, data: dict[str, object]) -> None:
+    def _publish_log(self, level: w.LogLevel, message: str, data: dict[str, object]) -> None:
         entry = w.LogEntry(level=level, message=message, data=data)
         self.hub.publish("log", entry, slot=None)
 
@@ -433,7 +432,7 @@ class TwinServer:
         self.hub.publish("job", status, slot=job.id)
         if status.state not in ("running", job.logged):
             data: dict[str, object] = {"job": job.id, "error": status.error}
-            level: Level = "error" if status.error else "info"
+            level: w.LogLevel = "error" if status.error else "info"
             self._publish_log(level, f"{job.id} is {status.state}", data)
         job.logged = status.state
         self.changed()

@@ -17,11 +17,9 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from flexdt.protocol import Prepared, event
+from flexdt.protocol.fields import TopicName
 from flexdt.protocol.rpc_errors import busy
 from flexdt.server.network.shell_parts import Peer
-
-Topic = Literal["state", "projection", "job", "log"]
-
 
 A_TURN = 4
 """Events posted in one turn of the loop; requests are read and answered between turns."""
@@ -43,7 +41,7 @@ class _Event:
     """One event, encoded once a view and codec."""
 
     def __init__(
-        self, topic: Topic, seq: int, time: float, data: object | Render, slot: str | None
+        self, topic: TopicName, seq: int, time: float, data: object | Render, slot: str | None
     ) -> None:
         self.topic, self.seq, self.time, self._data = topic, seq, time, data
         self.slot = None if slot is None else f"{topic}:{slot}"
@@ -80,17 +78,17 @@ class Hub:
     def __init__(
         self,
         now: Callable[[], float],
-        kept: Mapping[Topic, int] | None = None,
+        kept: Mapping[TopicName, int] | None = None,
         most: int = 2048,
         most_views: int = 16,
     ) -> None:
         self._now, self._most, self._most_views = now, most, most_views
-        self._kept: dict[Topic, deque[_Event]] = {
+        self._kept: dict[TopicName, deque[_Event]] = {
             topic: deque(maxlen=count) for topic, count in (kept or {}).items()
         }
-        self._told: dict[tuple[Peer, Topic], int] = {}
-        self._seq: dict[Topic, int] = {}
-        self._listeners: dict[Topic, dict[Peer, _Subscription]] = {}
+        self._told: dict[tuple[Peer, TopicName], int] = {}
+        self._seq: dict[TopicName, int] = {}
+        self._listeners: dict[TopicName, dict[Peer, _Subscription]] = {}
         self._due: deque[tuple[Peer, _Subscription, _Event]] = deque()
         self._room = A_TURN
         self._refilling = False
@@ -98,7 +96,7 @@ class Hub:
     def subscribe(
         self,
         listener: Peer,
-        topics: Iterable[Topic],
+        topics: Iterable[TopicName],
         max_rate_hz: float | None = None,
         view: ImageWish | None = None,
     ) -> None:
@@ -121,7 +119,7 @@ class Hub:
                 if earlier.seq > told:
                     self._deliver(listener, subscription, earlier)
 
-    def _require_room(self, listener: Peer, topics: set[Topic], view: ImageWish) -> None:
+    def _require_room(self, listener: Peer, topics: set[TopicName], view: ImageWish) -> None:
         views = [
             s.view
             for topic, listeners in self._listeners.items()
@@ -136,7 +134,7 @@ class Hub:
                 data = {"asked": asked, "allowed": most}
                 raise busy(f"there would be {asked} {what}; this server has {most} at most", data)
 
-    def unsubscribe(self, listener: Peer, topics: Iterable[Topic]) -> None:
+    def unsubscribe(self, listener: Peer, topics: Iterable[TopicName]) -> None:
         """Send them no longer; topics that were not subscribed to are fine."""
         for topic in topics:
             subscription = self._listeners.get(topic, {}).pop(listener, None)
@@ -149,20 +147,24 @@ class Hub:
         for topic in self._kept:
             self._told.pop((listener, topic), None)
 
-    def wanted(self, topic: Topic) -> bool:
+    def wanted(self, topic: TopicName) -> bool:
         """Whether anybody is subscribed, so that nothing is computed in vain."""
         return bool(self._listeners.get(topic))
 
-    def count(self, topic: Topic) -> int:
+    def count(self, topic: TopicName) -> int:
         """How many events of `topic` there have been."""
         return self._seq.get(topic, 0)
 
-    def views(self, topic: Topic) -> set[ImageWish]:
+    def views(self, topic: TopicName) -> set[ImageWish]:
         """Views that subscribers of `topic` want."""
         return {s.view for s in self._listeners.get(topic, {}).values()}
 
     def publish(
-        self, topic: Topic, data: object | Render, slot: str | None = "", time: float | None = None
+        self,
+        topic: TopicName,
+        data: object | Render,
+        slot: str | None = "",
+        time: float | None = None,
     ) -> None:
         """Send an event to all subscribers of `topic`.
 
@@ -185,7 +187,7 @@ class Hub:
             self._offer(listener, subscription, new)
 
     def snapshot(
-        self, listener: Peer, topic: Topic, data: object | Render, slot: str | None = ""
+        self, listener: Peer, topic: TopicName, data: object | Render, slot: str | None = ""
     ) -> None:
         """Tell one subscriber of `topic` how things are: the last event's `seq`, out of turn.
 

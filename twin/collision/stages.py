@@ -24,6 +24,7 @@ import numpy as np
 from flexdt.twin.collision.convex_solids import ConvexSolid, Polytope, UprightCylinder, box, hull
 from flexdt.twin.geometry.conventions import (
     COLUMN_DIRECTION,
+    COORDINATES,
     ROW_DIRECTION,
     FloatArray,
     from_unity,
@@ -39,7 +40,6 @@ DOWN = np.array([0.0, 0.0, -1.0])
 """The stage's axis, so that growing angles turn clockwise seen from above."""
 TINY = 1e-300
 """Keeps a quotient finite."""
-_COORDINATES = ("x", "y", "z")
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +204,7 @@ def _shifts(machine: Machine, profile: Profile, p: Offsets) -> dict[str, FloatAr
     for quantity, value in machine.fixed.items():
         anchor, _, coordinate = quantity.partition("_")
         if anchor in shifts:
-            shifts[anchor][_COORDINATES.index(coordinate)] += value
+            shifts[anchor][COORDINATES.index(coordinate)] += value
     return shifts
 
 
@@ -226,7 +226,7 @@ def _wherever(
         return solid
     carriers = machine.chain(part) if place is None else tuple(machine.axes)
     ends = np.zeros((2, 3))
-    for i, coordinate in enumerate(_COORDINATES[:2]):
+    for i, coordinate in enumerate(COORDINATES[:2]):
         factors = machine.geometry.get(f"mount_{coordinate}", {})
         moved = [motor for motor in factors if motor in carriers]
         if moved or place is not None:
@@ -254,7 +254,7 @@ def _chain(
     columns = {name: i for i, name in enumerate(machine.axes)}
     origin = np.zeros(3)
     slides, turns = np.zeros((len(columns), 3)), np.zeros(len(columns))
-    for i, coordinate in enumerate(_COORDINATES):
+    for i, coordinate in enumerate(COORDINATES):
         factors = machine.geometry.get(f"{part.anchor}_{coordinate}", {})
         for motor in chain:
             slides[columns[motor], i] += factors.get(motor, 0.0)

@@ -307,7 +307,7 @@ class FrameEntry(_Model):
     """One image, taken or still to be taken."""
 
     file: PlainName
-    kind: Literal["dark", "flat", "projection"]
+    kind: FrameKind
     time_s: float
     """Nominal moment on the scan's clock [s]."""
     exposure_ms: float

@@ -35,6 +35,7 @@ from flexdt.twin.errors import GeometryError
 FloatArray = npt.NDArray[np.float64]
 Float32Array = npt.NDArray[np.float32]
 
+COORDINATES = ("x", "y", "z")
 RIGHT = (1.0, 0.0, 0.0)
 """Unit vector of traversal, +x."""
 BEAM = (0.0, 1.0, 0.0)

@@ -12,10 +12,17 @@ import numpy.typing as npt
 
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.geometry.conventions import BEAM, RIGHT, UP, FloatArray, rotation_about
+from flexdt.twin.geometry.conventions import (
+    BEAM,
+    COORDINATES,
+    RIGHT,
+    UP,
+    FloatArray,
+    rotation_about,
+)
 from flexdt.twin.signatures import public
 
-AXES: Final = {"x": RIGHT, "y": BEAM, "z": UP}
+AXES: Final = dict(zip(COORDINATES, (RIGHT, BEAM, UP), strict=True))
 ORTHOGONAL: Final = 1e-9
 """How far a rotation may be from orthogonal."""
 

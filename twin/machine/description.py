@@ -695,10 +695,8 @@ def check_target(machine: Machine, axis: str, value: float) -> float:
     """
     a = machine.axis(axis)
     if not a.lower <= value <= a.upper:
-        raise LimitError(
-            f"{axis} target {value:g} {a.unit} is outside [{a.lower:g}, {a.upper:g}] {a.unit}",
-            {"axis": axis, "asked": value, "allowed": [a.lower, a.upper], "unit": a.unit},
-        )
+        said = f"{axis} target {value:g} {a.unit} is outside [{a.lower:g}, {a.upper:g}] {a.unit}"
+        raise LimitError.of_axis(said, axis, value, [a.lower, a.upper], a.unit)
     return value
 
 

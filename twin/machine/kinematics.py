@@ -20,6 +20,7 @@ import numpy.typing as npt
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import (
     COLUMN_DIRECTION,
+    COORDINATES,
     ROW_DIRECTION,
     FloatArray,
     turn_detector,
@@ -96,8 +97,8 @@ def motor_poses(
 
     def place(anchor: str, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> FloatArray:
         """Where the motors put it, and what is added to that, (n, 3) [mm]."""
-        added = {"x": x, "y": y, "z": z}
-        return np.stack([total(f"{anchor}_{c}") + more for c, more in added.items()], axis=1)
+        added = zip(COORDINATES, (x, y, z), strict=True)
+        return np.stack([total(f"{anchor}_{c}") + more for c, more in added], axis=1)
 
     column_shift, row_shift = camera.roi_shift_mm(machine.detector.pixels)
     pixel, row_pixel = camera.pixels_mm(machine.detector.pixels)
@@ -171,11 +172,11 @@ def resolve_targets(
                 ends.append(sorted(here + way / factor for way in left))
             low, high = max(low for low, _ in ends), min(high for _, high in ends)
             unit = error.data["unit"]
-            raise LimitError(
+            said = (
                 f"{name} target {here + step:g} {unit} is outside [{low:g}, {high:g}] {unit}, "
-                f"which is how far its motors go from here: {error}",
-                {"axis": name, "asked": here + step, "allowed": [low, high], "unit": unit},
-            ) from None
+                f"which is how far its motors go from here: {error}"
+            )
+            raise LimitError.of_axis(said, name, here + step, [low, high], str(unit)) from None
         out.update(shares)
     return out
 

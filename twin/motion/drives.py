@@ -173,10 +173,8 @@ def plan_jog(
     limit, name = min((machine.axes[n].max_speed / abs(f), n) for n, f in moves.items())
     if not abs(velocity) <= limit:
         unit = machine.axes[name].unit
-        raise LimitError(
-            f"jog of {axis} at {velocity:g} {unit}/s: {name} allows {limit:g} {unit}/s",
-            {"axis": axis, "asked": str(velocity), "allowed": limit, "unit": f"{unit}/s"},
-        )
+        said = f"jog of {axis} at {velocity:g} {unit}/s: {name} allows {limit:g} {unit}/s"
+        raise LimitError.of_axis(said, axis, str(velocity), limit, f"{unit}/s")
 
     def run(name: str, lease: float) -> Trajectory:
         """A motor's share: it runs for `lease` [s], or as far as its limit."""

@@ -48,6 +48,8 @@ WORTH_S = 0.02
 """A stop that is quicker by less than this is not looked for [s]."""
 
 Trajectories = Mapping[str, Trajectory]
+StopPath = Literal["along", "apart", "coasting"]
+"""How motors come to rest, see `StopMotion`."""
 MANY_LEGS = 500
 """A programme of more trajectories than these is too long to be swept at a takeover."""
 
@@ -105,7 +107,7 @@ class StopMotion:
     """
 
     trajectories: Trajectories
-    path: Literal["along", "apart", "coasting"]
+    path: StopPath
     duration_s: float
     distances: Mapping[str, float]
     would_hit: Contact | None = None
@@ -114,7 +116,7 @@ class StopMotion:
     def of(
         cls,
         trajectories: Trajectories,
-        path: Literal["along", "apart", "coasting"],
+        path: StopPath,
         now: float,
         would_hit: Contact | None = None,
     ) -> StopMotion:

@@ -14,7 +14,7 @@ from flexdt.protocol.fields import Empty, ImageValue
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import image_messages as p
 from flexdt.protocol.methods.scanner_messages import CameraSet, TubeSet
-from flexdt.protocol.rpc_errors import invalid_params, too_large
+from flexdt.protocol.rpc_errors import invalid_params, problem, too_large
 from flexdt.server.imaging.radiography import marks_of
 from flexdt.server.imaging.radiography import predict as forecast
 from flexdt.server.storage.stored_samples import EMPTY
@@ -44,7 +44,7 @@ async def get_projection(twin: TwinServer, client: Client, params: p.ProjectionG
     if params.binning > min(shot.camera.shape):
         raise invalid_params(
             f"binning {params.binning} leaves nothing of {shot.camera.shape} pixels",
-            [{"path": "binning", "message": "too large", "asked": params.binning}],
+            [problem("binning", "too large", params.binning)],
             min(shot.camera.shape),
         )
     codec = client.peer.codec
