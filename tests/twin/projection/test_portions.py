@@ -78,7 +78,7 @@ import signal, sys, time
 import numpy as np
 import flexdt as fx
 
-N = 320
+N = 128 if sys.argv[1] == "tv" else 320  # whose passes over the volume take longest
 SHAPE = (N, N)
 scan = fx.ConeVec.circular(sod=600, sdd=900, angles=720, shape=SHAPE, pixel=1.0)
 data = np.random.default_rng(1).random((N, N, N), dtype=np.float32)
