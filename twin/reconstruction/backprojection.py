@@ -26,7 +26,7 @@ CHUNK: Final = 32
 """Views worked on at a time, at least."""
 GROUP: Final = 8
 """Views that the processor weighs and filters at a time, at least: they stay in its caches. Fewer
-of those that are widened, which take as much memory."""
+of those that are widened to more than twice their columns, which take more memory."""
 PIXELS: Final = 1 << 18
 """Of a group; a chunk may hold four times as many. Calls of few rows cost more than their work."""
 STACKS: Final = 6
@@ -62,7 +62,8 @@ class OnProcessor:
         if views.sizes != self._sizes:  # new memory costs as much as filtering
             self._sizes, self._columns = views.sizes, fdk_kernels.room(n, cols, rows, views.few)
         views = replace(views, images=np.ascontiguousarray(views.images))
-        group = max(1, GROUP * views.images.shape[2] // wide, PIXELS // (wide * rows))
+        fitting = min(GROUP, 2 * GROUP * views.images.shape[2] // wide)
+        group = max(1, fitting, PIXELS // (wide * rows))
         for first in range(0, n, group):
             some = slice(first, first + group)
             lines = filtered(_weighed(views.of(some)), views.response)
