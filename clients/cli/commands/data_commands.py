@@ -135,15 +135,15 @@ def reconstruct(
 
 def _check_together(given: Mapping[str, object], out: Path, kept_out: Iterable[str]) -> None:
     """Usage errors of options that do not go together; a preview keeps some out."""
-    from flexdt.library.reconstruction.volume_files import SUFFIXES, ending
+    from flexdt.library.reconstruction.volume_files import ending, endings
 
     algorithm = str(given.get("algorithm", DEFAULT))
     has = ALGORITHMS[algorithm].options
     corrects = {"material", "scatter-correction"} & given.keys()
     for wrong, name, why in (
         *((True, name, "--preview chooses for itself") for name in kept_out),
-        (ending(out) not in SUFFIXES, "out",
-         f"{out}: the ending must be one of {', '.join(SUFFIXES)}"),
+        (ending(out) not in endings(), "out",
+         f"{out}: the ending must be one of {', '.join(endings())}"),
         ("kv" in given and not corrects, "kv", "it is for --material and --scatter-correction"),
         *((name in given and name not in has, name, f"{algorithm} has none")
           for name in ("iterations", "weight")),
