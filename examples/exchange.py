@@ -22,8 +22,6 @@ from flexdt.library.datasets.exchange import (
 )
 from flexdt.library.reading.folders import load_dataset
 
-ENDINGS = {"ctsimu": ".json", "rtk": ".xml", "tomosipo": ".npz", "flexdata": ".toml", "csv": ".csv"}
-
 
 def main(argv: list[str]) -> None:
     data = load_dataset(argv[0])
@@ -34,8 +32,10 @@ def main(argv: list[str]) -> None:
     points = np.stack(np.meshgrid(ticks, ticks, ticks), axis=-1).reshape(-1, 3)
     pixels = ours.cone_vec.project_points(points, data.shape)
     print(f"{data.name}: {len(data)} projections of {data.shape[1]} x {data.shape[0]} pixels")
-    for name in FORMATS:
-        for ending in (".npy", ".txt") if name == "astra" else (ENDINGS[name],):
+    for name, format in FORMATS.items():
+        if format.read is None:
+            continue
+        for ending in (".npy", ".txt") if name == "astra" else format.endings[:1]:
             file = folder / f"{data.name}-{name}{ending}"
             try:
                 export_dataset(data, file, name)

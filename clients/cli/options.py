@@ -16,7 +16,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
@@ -36,7 +36,9 @@ Answer = Iterator[object]
 is the document of `--json`."""
 
 
-def option(default: object, *words: str, **details: Any) -> Any:
+def option(
+    default: object, *words: str, among: Callable[[], Iterable[str]] | None = None, **details: Any
+) -> Any:
     """The default of a command's parameter that the command line offers as an option.
 
     Args:
@@ -44,11 +46,15 @@ def option(default: object, *words: str, **details: Any) -> Any:
         words: flags as typed, and one line of help. Flags follow from the parameter's name, but a
             switch that is only ever on has to name its flag, or typer adds one that switches it
             off. The help is that of the command's docstring (`Args:`) if it is not given here.
+        among: gives the words that are allowed. It is called when the command line is built, so
+            that each list has one home, and imports nothing heavy.
         details: of `typer.Option`, such as metavar, min and max.
     """
     flags = [word for word in words if word.startswith("-")]
     help = next((word for word in words if not word.startswith("-")), None)
-    return typer.Option(default, *flags, help=help, **details)
+    made = typer.Option(default, *flags, help=help, **details)
+    made.among = among
+    return made
 
 
 def argument(default: object, metavar: str, help: str = "") -> Any:
@@ -105,9 +111,20 @@ def completed(command: Callable[..., Any]) -> tuple[Callable[..., None], tuple[s
 
     complete.__doc__ = about
     context = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
-    has_parameters(complete, [context, *(p for name, p in own.items() if name not in GIVEN)])
+    offered = (_with_choices(p) for name, p in own.items() if name not in GIVEN)
+    has_parameters(complete, [context, *offered])
     heeds = ("--json",) if yields or "json" in own else ()
     return complete, (*heeds, "--server", "--token-file") if "twin" in own else heeds
+
+
+def _with_choices(parameter: inspect.Parameter) -> inspect.Parameter:
+    """The parameter with the words that its option is among as its type."""
+    among = getattr(parameter.default, "among", None)
+    if among is None:
+        return parameter
+    choices: Any = Literal[tuple(among())]
+    optional = parameter.default.default is None
+    return parameter.replace(annotation=choices | None if optional else choices)
 
 
 def connect(server: str | None = None, token_file: str | None = None) -> TwinClient:

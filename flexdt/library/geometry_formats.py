@@ -6,15 +6,15 @@ The formats are in `flexdt.twin.exchange`, their files in `flexdt.library.datase
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from flexdt.library.datasets.exchange import (
-    ENDINGS,
     FORMATS,
+    Format,
     Given,
     import_geometry,
     load_geometry,
@@ -22,6 +22,7 @@ from flexdt.library.datasets.exchange import (
     text_of,
     write_geometry,
 )
+from flexdt.library.datasets.exchange_formats import OWN_ENDINGS
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.exchange.number_tables import (
@@ -34,9 +35,8 @@ from flexdt.twin.geometry.cone_vec import ConeVec, Shape2, check_spread
 from flexdt.twin.geometry.conventions import FloatArray, as_numbers
 from flexdt.twin.signatures import File
 
-BY_ENDING: Final = {
-    ending: format for format in FORMATS for ending in ENDINGS[format] if ending != ".json"
-}
+OWN: Final = OWN_ENDINGS[0]
+"""Ending of flexdt's own document."""
 
 
 def from_astra(geometry: Any, shape: Shape2 | None) -> ConeVec:
@@ -129,9 +129,10 @@ def load(
     """See `ConeVec.load`."""
     path = Path(file)
     pitch = None if pixel is None else _pair(pixel)
-    if format is None and path.suffix.lower() == ".json":
+    if format is None and path.suffix.lower() == OWN:
         return _value(_json(path, Given(shape, pitch)))
-    return _value(import_geometry(path, format or _format(path), Given(shape, pitch)))
+    chosen = format or _format(path, [form for form in FORMATS.values() if form.read])
+    return _value(import_geometry(path, chosen, Given(shape, pitch)))
 
 
 def _json(path: Path, given: Given) -> ScanGeometry:
@@ -148,16 +149,19 @@ def _json(path: Path, given: Given) -> ScanGeometry:
 def save(cone_vec: ConeVec, file: File, format: str | None) -> None:
     """See `ConeVec.save`."""
     path = Path(file)
-    if format is None and path.suffix.lower() == ".json":
+    if format is None and path.suffix.lower() == OWN:
         save_geometry(_scan(cone_vec), path)
     else:
-        write_geometry(_scan(cone_vec), path, format or _format(path))
+        chosen = format or _format(path, [form for form in FORMATS.values() if form.write])
+        write_geometry(_scan(cone_vec), path, chosen)
 
 
-def _format(path: Path) -> str:
-    found = BY_ENDING.get(path.suffix.lower())
+def _format(path: Path, among: Iterable[Format]) -> str:
+    """The name of the format whose files end so; `OWN` is flexdt's."""
+    by_ending = {ending: form.name for form in among for ending in form.endings if ending != OWN}
+    found = by_ending.get(path.suffix.lower())
     if found is None:
-        endings = [".json", *BY_ENDING]
+        endings = [OWN, *by_ending]
         raise ExchangeError(
             f"{path.name}: the ending of a geometry file is one of {', '.join(endings)}",
             {"asked": path.suffix, "allowed": endings},

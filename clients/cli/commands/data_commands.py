@@ -18,6 +18,7 @@ from flexdt.clients.cli import options
 from flexdt.clients.cli.console import ProgressBar, duration, note, size, warn
 from flexdt.clients.cli.options import Answer, Twin, argument, option
 from flexdt.clients.cli.settings_file import ReconstructSettings, chosen
+from flexdt.library.datasets.exchange_formats import FORMATS, exported, imported
 from flexdt.library.failure import CommandError
 from flexdt.twin.algorithms import ALGORITHMS, DEFAULT
 
@@ -275,14 +276,12 @@ def moved(data: DataSet, report: Report) -> DataSet:
         raise CommandError(f"{path}: {error}") from None
 
 
-Format = Literal["ctsimu", "rtk", "astra", "tomosipo", "flexdata", "csv"]
-Exported = Literal[Format, "nxtomo"]
 Rows = Literal["down", "up"]
 
 
 def export(
     dataset: Path = argument(..., "DATASET"),
-    format: Exported = option(...),
+    format: str = option(..., among=exported),
     out: Path = option(..., metavar="FILE"),
     corrected: bool = option(True, "--corrected/--nominal"),
     correction: Path | None = option(None, metavar="FILE"),
@@ -324,7 +323,7 @@ def export(
     height, width = written.shape or (0, 0)
     yield {
         "format": format, "file": str(out), "views": len(written), "shape": [height, width],
-        "corrected": corrected, "rows": "up" if format == "flexdata" else rows,
+        "corrected": corrected, "rows": FORMATS[format].rows or rows,
     }  # fmt: skip
     what = "corrected" if corrected else "nominal"
     yield f"{out}: {len(written)} views of {width} x {height} pixels, {what}, {format}"
@@ -332,7 +331,7 @@ def export(
 
 def import_(
     file: Path = argument(..., "FILE"),
-    format: Format = option(...),
+    format: str = option(..., among=imported),
     out: Path = option(..., metavar="FILE.{json,npy}"),
     like: Path | None = option(None, metavar="DATASET"),
     shape: str | None = option(None, metavar="ROWS,COLS"),

@@ -1,0 +1,67 @@
+"""Read what a geometry's file contains: its text, its arrays, and what is stated for it."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from flexdt.library.datasets.image_set import ImageSet
+from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
+
+MAX_BYTES: Final = 256 << 20
+"""Of a text; no geometry is longer."""
+
+
+@dataclass(frozen=True)
+class Given:
+    """What a file may not say of itself.
+
+    Attributes:
+        shape: detector (rows, cols).
+        pitch_mm: of a pixel along u and v [mm].
+        views: number of projections.
+    """
+
+    shape: tuple[int, int] | None = None
+    pitch_mm: tuple[float, float] | None = None
+    views: int | None = None
+
+    @classmethod
+    def of(cls, dataset: ImageSet) -> Given:
+        """The values of a data set of the same scan."""
+        pitch = ScanGeometry(dataset.cone_vec).pitch_mm
+        return cls(dataset.shape, pitch, len(dataset))
+
+    def check_pitch(self, geometry: ScanGeometry, path: Path) -> None:
+        """Raise ExchangeError if a file says another pitch."""
+        pitch = geometry.pitch_mm
+        if self.pitch_mm is not None and not np.allclose(pitch, self.pitch_mm, rtol=1e-3):
+            found, asked = (f"{u:g} x {v:g}" for u, v in (pitch, self.pitch_mm))
+            said = f"{path} says pixels of {found} mm, not {asked}"
+            raise ExchangeError(said, {"asked": list(self.pitch_mm), "allowed": list(pitch)})
+
+
+def text_of(path: Path) -> str:
+    """A file's UTF-8 text, or ExchangeError."""
+    if path.stat().st_size > MAX_BYTES:
+        raise ExchangeError(f"{path}: {path.stat().st_size} bytes; allowed: {MAX_BYTES}")
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise ExchangeError(f"{path} is no UTF-8 text", {"path": str(path)}) from None
+
+
+def arrays_of(path: Path) -> dict[str, np.ndarray[Any, np.dtype[Any]]]:
+    """The arrays of an .npz, or the one of an .npy as `array`; ExchangeError if it is neither."""
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        if isinstance(loaded, np.ndarray):
+            return {"array": loaded}
+        with loaded:
+            return {name: loaded[name] for name in loaded.files}
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ExchangeError(f"{path} is no NumPy file: {error}", {"path": str(path)}) from None
