@@ -1,0 +1,158 @@
+"""Read Zeiss's .txrm.
+
+Signs on which CIL's ZEISSDataReader 26.0, dxchange, xrmreader and mbirjax agree: row 0 is the
+lowest, column 0 the left one as seen from the source; the stage turns anticlockwise by `Angles`
+[deg] seen from above; `PixelSize` [um] is that of a pixel at the axis; shifts [pixels] take an
+image to higher columns and rows; counts are not divided by the reference, an image of the open
+beam, and nothing is left to subtract from either.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.library.data_set import DataSet
+from flexdt.library.extras import package
+from flexdt.runtime.files.dataset_folder import opened
+from flexdt.twin.dataset.dataset_errors import DatasetFormatError
+from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray, rotation_z
+
+KINDS: Final = {3: "u1", 5: "<u2", 10: "<f4"}
+"""Xradia's numbers of types of pixels."""
+REFERENCES: Final = ("ReferenceData", "MultiReferenceData")
+"""Storages of images of the open beam, `Image` or `Image1` and so on."""
+NOT_APPLIED: Final = ("ImageInfo/CameraOffset", "ImageInfo/CameraFineRotation")
+GIVE: Final = ", or give it: geometry=ConeVec"
+
+
+def read_zeiss(path: Path, geometry: ConeVec | None) -> DataSet:
+    """Read a scan of Zeiss's into memory.
+
+    Args:
+        path: the .txrm file.
+        geometry: one view for each projection, in place of the file's.
+
+    Raises:
+        DatasetFormatError: it is damaged, or lacks what is needed.
+    """
+    olefile = package("olefile", "Zeiss's .txrm")
+    try:
+        with opened(path) as raw:
+            head, size = raw.read(76), os.fstat(raw.fileno()).st_size
+            if 512 * int.from_bytes(head[44:48], "little") > size:  # of these a list is made
+                raise OSError("its list of sectors is longer than itself")
+            with olefile.OleFileIO(raw, raise_defects=olefile.DEFECT_INCORRECT) as ole:
+                return _read(_Streams(ole, size), geometry, path.stem)
+    except TwinError as error:
+        said = error.message
+    except Exception as error:  # A third party's parser on a damaged file: anything may come.
+        said = f"it is no OLE2 file, or a damaged one ({error})"
+    raise DatasetFormatError(f"{path}: {said}", {"path": str(path)})
+
+
+@dataclass(frozen=True)
+class _Streams:
+    """An open file and its size [bytes], which bounds whatever it claims of itself."""
+
+    ole: Any
+    size: int
+
+    def values(
+        self, name: str, kind: str, count: int = 1, default: float | None = None, hint: str = ""
+    ) -> npt.NDArray[Any]:
+        """The first numbers of a stream; where there is none, the default."""
+        there = self.ole.exists(name)
+        if not there and default is not None:
+            return np.full(count, default)
+        wanted, held = count * np.dtype(kind).itemsize, self.ole.get_size(name) if there else 0
+        if not wanted <= held <= self.size:
+            said = f"has {held} bytes" if there else "is missing"
+            raise DatasetFormatError(f"{name} {said}; allowed: {wanted} to {self.size} bytes{hint}")
+        return np.frombuffer(self.ole.openstream(name).read(wanted), kind)
+
+    def whole(self, name: str, default: float | None = None) -> int:
+        return int(self.values(name, "<u4", default=default)[0])
+
+    def images(self, names: Sequence[str], code: int, shape: tuple[int, int]) -> npt.NDArray[Any]:
+        if code not in KINDS:
+            raise DatasetFormatError(f"DataType is {code}; allowed: {', '.join(map(str, KINDS))}")
+        out = np.empty((len(names), *shape), KINDS[code])
+        for image, name in zip(out, names, strict=True):
+            image[:] = self.values(name, KINDS[code], image.size).reshape(shape)
+        return out
+
+    def lengths(self, name: str, count: int) -> FloatArray:
+        """Of `ImageInfo`, without their signs."""
+        found = abs(self.values(f"ImageInfo/{name}", "<f4", count, hint=GIVE).astype(np.float64))
+        if not np.all((found > 0) & np.isfinite(found)):
+            raise DatasetFormatError(f"{name} is {found.min():g}; allowed: above 0{GIVE}")
+        return found
+
+
+def _read(file: _Streams, geometry: ConeVec | None, name: str) -> DataSet:
+    sizes = "ImageHeight", "ImageWidth", "NoOfImages", "DataType"
+    rows, cols, planned, code = (file.whole(f"ImageInfo/{n}") for n in sizes)
+    taken = min(file.whole("ImageInfo/ImagesTaken", planned), planned)
+    if not 0 < taken * rows * cols <= file.size:
+        said = f"{taken} images of {cols} x {rows} pixels are claimed in {file.size} bytes"
+        raise DatasetFormatError(said)
+    cone, doubts = _geometry(file, taken, rows) if geometry is None else (geometry, [])
+    names = [f"ImageData{k // 100 + 1}/Image{k + 1}" for k in range(taken)]
+    images = file.images(names, code, (rows, cols))
+    flats = _reference(file, code, (rows, cols))
+    if images.dtype.kind == "f":
+        if flats is None:
+            raise DatasetFormatError(f"images of floats; allowed: with {REFERENCES[0]}/Image")
+        with np.errstate(all="ignore"):  # what is not finite is refused by its name
+            images = images / np.maximum(flats.mean(axis=0), 1e-6 * flats.max())
+            images, flats = -np.log(np.maximum(images, np.finfo(np.float32).tiny)), None
+    elif flats is None:
+        doubts.append("no reference: DataSet.from_arrays(data.counts(), data.geometry, flat=FLAT)")
+    dark = np.zeros((rows, cols))
+    data = DataSet.from_arrays(images, cone, dark=dark, flat=flats, name=name, warnings=doubts)
+    reason = f"{taken} of {planned} images were taken" if taken < planned else ""
+    return replace(data, complete=not reason, reason=reason)
+
+
+def _reference(file: _Streams, code: int, shape: tuple[int, int]) -> npt.NDArray[Any] | None:
+    """The images of the open beam, one or several."""
+    for folder in REFERENCES:
+        names = [n for k in range(1000) if file.ole.exists(n := f"{folder}/Image{k or ''}")]
+        if names:
+            images = file.images(names, file.whole(f"{folder}/DataType", code), shape)
+            if not np.isfinite(images).all():
+                raise DatasetFormatError(f"{names[0]} has pixels that are no numbers")
+            return images
+    return None
+
+
+def _geometry(file: _Streams, views: int, rows: int) -> tuple[ConeVec, list[str]]:
+    """The geometry, and what is doubtful about it."""
+    if file.whole("ImageInfo/XrayGeometry", 1) != 1:
+        raise DatasetFormatError("XrayGeometry says a parallel beam; allowed: a cone beam")
+    near, far = file.lengths("StoRADistance", views), file.lengths("DtoRADistance", views)
+    size = file.lengths("PixelSize", 1) / 1000.0
+    rise = np.ptp(file.values("ImageInfo/YPosition", "<f4", views, 0.0)) / 1000.0
+    if rise > 0.25 * rows * size:  # Shifts undo the small steps against rings, and no more.
+        raise DatasetFormatError(f"the stage rises by YPosition; allowed: a circle{GIVE}")
+    pixel = size * (near[:1] + far[:1]) / near[:1]
+    center = file.values("ReconSettings/CenterShift", "<f4", default=0.0)
+    shifts = (file.values(f"Alignment/{axis}-Shifts", "<f4", views, 0.0) for axis in "XY")
+    right, up = (pixel * (shift + more) for shift, more in zip(shifts, (center, 0), strict=True))
+    angles = np.deg2rad(file.values("ImageInfo/Angles", "<f4", views, hint=GIVE), dtype=np.float64)
+    stated = {name: file.values(name, "<f4", default=0.0)[0] for name in NOT_APPLIED}
+    doubts = [f"{name} of {value:g} is not applied" for name, value in stated.items() if value]
+    if center[0]:
+        doubts.append(f"CenterShift of {center[0]:g} pixels is applied")
+    o, p = np.zeros(views), np.full(views, pixel)
+    place = np.stack([o, -near, o, right, far, up, p, o, o, o, o, p], axis=-1).reshape(-1, 4, 3)
+    return ConeVec((place @ rotation_z(angles)).reshape(-1, 12)), doubts
