@@ -12,7 +12,7 @@ import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,7 @@ from flexdt.clients.client.events import Projection
 from flexdt.clients.client.flows import OWN_PATIENCE, Flow, Sleep, Tell, ask, sample_shape
 from flexdt.protocol import image as wire_image
 from flexdt.protocol import state_model as s
+from flexdt.protocol.fields import TopicName
 from flexdt.protocol.methods import calibration_messages as corrections
 from flexdt.protocol.methods import document_messages as documents
 from flexdt.protocol.methods import image_messages as images
@@ -31,20 +32,20 @@ from flexdt.protocol.methods import session_messages as session
 if TYPE_CHECKING:
     from flexdt.phantoms import Phantom
 
-Topic = Literal["state", "projection", "job", "log"]
+Topic = TopicName
 Kind = Literal["line_integral", "counts"]
 SpeedUp = float | Literal["max"]
 Positions = Mapping[str, float]
 
 CHUNK: Final = 4 * 2**20
 """Bytes in one message of an upload: below a frame, also as base64."""
-SCENE_FORMATS: Final = ("toml", "json")
-MESH_FORMATS: Final = ("stl", "obj", "ply", "glb", "off")
-FINAL_STATES: Final = ("done", "failed", "aborted", "incomplete")
+SCENE_FORMATS: Final = get_args(scanner.SceneFormat)
+MESH_FORMATS: Final = get_args(scanner.MeshFormat)
+FINAL_STATES: Final[tuple[s.EndedPhase, ...]] = get_args(s.EndedPhase)
 """States in which a job has ended."""
 
 
-def control(action: Literal["acquire", "release", "force"]) -> Flow[session.ControlResult]:
+def control(action: session.ControlAction) -> Flow[session.ControlResult]:
     """Acquire control, release it, or take it over from its holder.
 
     Example:
@@ -278,7 +279,7 @@ def upload_mesh(
     name: str | None = None,
     *,
     format: str | None = None,
-    unit: Literal["um", "mm", "cm", "m", "inch"] | None = None,
+    unit: scanner.LengthUnit | None = None,
     material: str | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Flow[scanner.UploadResult]:

@@ -23,7 +23,7 @@ from typing import IO, Literal
 
 from flexdt.clients.client.client import TwinClient
 from flexdt.library.failure import CommandError
-from flexdt.runtime.process_settings import words
+from flexdt.runtime.process_settings import Physics, Scatter, words
 from flexdt.twin.signatures import public
 
 STOP_TIMEOUT_S = 30.0
@@ -167,8 +167,8 @@ class LocalTwin:
         sample: str | None = None,
         machine: str | PathLike[str] | None = None,
         profile: str | None = None,
-        physics: Literal["ideal", "mono", "poly"] = "ideal",
-        scatter: Literal["off", "mc"] = "off",
+        physics: Physics = "ideal",
+        scatter: Scatter = "off",
         speed_up: float | Literal["max"] = "max",
         truth: str | PathLike[str] | None = None,
         viewer: bool = False,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -32,6 +33,8 @@ TOLERANCE_PX: Final = 0.5
 """Default of the largest allowed rms residual of the beads after correction."""
 
 
+FIGURES: Final = ("rms_px", "max_px", "image_rms")
+"""Of one correction: rms and largest residual of the beads [px], rms of the difference images."""
 SHOWN: Final = 4
 """Frames of which difference images are made."""
 
@@ -134,11 +137,17 @@ def virtual(
 
 def _figures(residual: FloatArray, images: Float32Array | None) -> dict[str, float | None]:
     length = np.linalg.norm(residual, axis=2)
-    return {
-        "rms_px": _rms(residual),
-        "max_px": float(np.nanmax(length)),
-        "image_rms": None if images is None else float(np.sqrt(np.mean(images.astype("f8") ** 2))),
-    }
+    of_images = None if images is None else float(np.sqrt(np.mean(images.astype("f8") ** 2)))
+    return dict(zip(FIGURES, (_rms(residual), float(np.nanmax(length)), of_images), strict=True))
+
+
+def rows_of(document: Mapping[str, Any]) -> list[tuple[Any, ...]]:
+    """The rows of a comparison's table: correction, rms and largest [px], rms of the images."""
+    return [
+        (name, *(document[name][figure] for figure in FIGURES))
+        for name in ("before", "after", "in_force")
+        if name in document
+    ]
 
 
 def write_comparison(comparison: Comparison, out: Path) -> None:
@@ -151,11 +160,7 @@ def write_comparison(comparison: Comparison, out: Path) -> None:
             tifffile.imwrite(out / f"difference_{frame:06d}_{name}.tif", stack[k])
     document = comparison.document
     (out / "compare.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    rows = [
-        [name, *(document[name][k] for k in ("rms_px", "max_px", "image_rms"))]
-        for name in ("before", "after", "in_force")
-        if name in document
-    ]
+    rows = [[name, *figures] for name, *figures in rows_of(document)]
     before, after = (
         np.sqrt(np.nanmean(residual**2, axis=(1, 2))) for residual in comparison.residuals
     )

@@ -1,4 +1,4 @@
-"""Phantoms from meshes and grids of the user's own: mesh files of five formats, voxel arrays.
+"""Phantoms from meshes and grids of the user's own: mesh files, voxel arrays.
 
 Files come from outside: format, size and content are checked before and after parsing, nothing is
 unpickled, and references to other files are not followed. A mesh must be closed.
@@ -22,14 +22,15 @@ from flexdt.phantoms.materials import material as material_of
 from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.pieces import Surface, Voxels
 from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.length_units import UNITS_MM
 from flexdt.twin.projection.analytic_solids import ConvexPolyhedron, Scene, Solid, Vector
 from flexdt.twin.signatures import public
 
 if TYPE_CHECKING:
     import trimesh
 
-UNITS_MM: Final = {"um": 1e-3, "mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 FORMATS: Final = ("stl", "obj", "ply", "glb", "off")
+"""The wire has the same names (`MeshFormat` of the protocol)."""
 DEFAULT_UNIT: Final[Mapping[str, str]] = {"glb": "m"}
 """Unit of the formats that have one; the others are in mm unless a unit is given."""
 MAX_BYTES: Final = 256 << 20

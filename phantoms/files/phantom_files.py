@@ -24,11 +24,12 @@ import numpy as np
 from flexdt.phantoms import checked_reading as reading
 from flexdt.phantoms.beads import cuboid_with_beads, spiral_positions, worst_overlap
 from flexdt.phantoms.checked_reading import MAX_SOLIDS, PhantomError, shape_from_dict
-from flexdt.phantoms.files.mesh_files import MAX_EXTENT_MM, MAX_FACES, UNITS_MM, mesh_phantom
+from flexdt.phantoms.files.mesh_files import MAX_EXTENT_MM, MAX_FACES, mesh_phantom
 from flexdt.phantoms.materials import material as material_of
 from flexdt.phantoms.phantom import Phantom, assemble
 from flexdt.phantoms.pieces import size_about_origin
 from flexdt.twin.errors import GeometryError, TwinError
+from flexdt.twin.length_units import UNITS_MM
 from flexdt.twin.projection import TriangleMesh
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Vector
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Literal, get_args
 
 from annotated_types import Ge, Gt, Le
 from pydantic import Field, model_validator
@@ -26,6 +27,9 @@ Bytes = Annotated[int, Ge(0), Le(2**53)]
 MESH_CHUNK = 4 << 20
 """Bytes of a mesh in one answer: below a frame, also as base64."""
 LengthUnit = Literal["um", "mm", "cm", "m", "inch"]
+MeshFormat = Literal["stl", "obj", "ply", "glb", "off"]
+VoxelFormat = Literal["raw"]
+SceneFormat = Literal["json", "toml"]
 
 
 class Move(f.Params):
@@ -129,6 +133,14 @@ CAMERA_SET = by_hand("camera.set", CameraSet, CameraState,
                      "set exposure, mode, ROI, averages, frames")  # fmt: skip
 
 
+KINDS: Mapping[str, str] = {
+    **dict.fromkeys(get_args(MeshFormat), "mesh"),
+    **dict.fromkeys(get_args(VoxelFormat), "voxels"),
+    **dict.fromkeys(get_args(SceneFormat), "scene"),
+}
+"""Format of an upload -> its kind."""
+
+
 class SampleSet(f.Params):
     """Which sample stands on the stage: a shipped phantom's name, or an uploaded file's."""
 
@@ -159,7 +171,7 @@ class SampleUpload(f.Params):
 
     name: f.Name
     kind: Literal["mesh", "voxels", "scene"] = "mesh"
-    format: Literal["stl", "obj", "ply", "glb", "off", "raw", "json", "toml"]
+    format: Literal[MeshFormat, VoxelFormat, SceneFormat]
     """raw: float32 little-endian voxels [z, y, x] of attenuation [1/mm]; json, toml: the text of a
     phantom or scene file"""
     total: Annotated[Bytes, Gt(0)]
@@ -179,7 +191,7 @@ class SampleUpload(f.Params):
     def _fits(self) -> SampleUpload:
         if self.start + len(self.data) > self.total:
             raise ValueError(f"chunk ends at {self.start + len(self.data)}, total is {self.total}")
-        own = {"raw": "voxels", "json": "scene", "toml": "scene"}.get(self.format, "mesh")
+        own = KINDS[self.format]
         if self.kind != own:
             raise ValueError(f"format {self.format} is for kind {own}, not {self.kind}")
         if self.kind == "scene" and self.material is not None:

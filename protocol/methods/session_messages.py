@@ -46,10 +46,13 @@ class Hello(Params):
     token: Annotated[str, MaxLen(4096)] | None = None
 
 
+ControlAction = Literal["acquire", "release", "force"]
+
+
 class Control(Params):
     """Take control, give it back, or take it from whoever has it."""
 
-    action: Literal["acquire", "release", "force"]
+    action: ControlAction
 
 
 class Subscribe(Params):

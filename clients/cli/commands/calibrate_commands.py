@@ -258,7 +258,7 @@ def compare(
         tolerance: Exit with 1 where the beads' rms is above this.
         out: Write a report and difference images to this folder.
     """
-    from flexdt.library.comparison import compare_folder, write_comparison
+    from flexdt.library.comparison import compare_folder, rows_of, write_comparison
     from flexdt.library.figures import require_plots
 
     if out is not None:
@@ -268,11 +268,7 @@ def compare(
         write_comparison(found, out)
     document: dict[str, Any] = found.document
     yield document
-    rows = [
-        (name, *(_number(document[name][k], 4) for k in ("rms_px", "max_px", "image_rms")))
-        for name in ("before", "after", "in_force")
-        if name in document
-    ]
+    rows = [(name, *(_number(n, 4) for n in figures)) for name, *figures in rows_of(document)]
     yield table(rows, ("correction", "rms [px]", "worst bead [px]", "difference rms"))
     if not found.within:
         rms = _number(document["after"]["rms_px"], 4)

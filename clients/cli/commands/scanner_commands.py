@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import typer
 
@@ -19,11 +19,13 @@ from flexdt.clients.cli.console import duration, note, table, warn
 from flexdt.clients.cli.options import Answer, Twin, argument, option
 from flexdt.library.failure import CommandError
 from flexdt.runtime import process_settings
+from flexdt.twin.length_units import UNITS_MM
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
     from flexdt.clients.client.client import TwinClient
+    from flexdt.protocol.methods.scanner_messages import LengthUnit
     from flexdt.protocol.state_model import AxisState, ImageFlags, State, Stopped, TubeState
 
 
@@ -274,7 +276,7 @@ def reset(twin: Twin) -> Answer:
 def sample(
     twin: Twin,
     name: str | None = argument(None, "NAME or FILE"),
-    unit: Literal["um", "mm", "cm", "m", "inch"] | None = option(None),
+    unit: str | None = option(None, among=lambda: UNITS_MM),
     material: str | None = option(None),
 ) -> Answer:
     """Put a sample on the stage, or list what there is.
@@ -302,7 +304,8 @@ def sample(
             if kind in SCENE_FORMATS:
                 sent = client.upload_scene(file)
             else:
-                sent = client.upload_mesh(file, unit=unit, material=material)
+                in_unit = cast("LengthUnit | None", unit)
+                sent = client.upload_mesh(file, unit=in_unit, material=material)
             now = client.set_sample(file=sent.name)
         else:
             now = client.set_sample(name)

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -34,11 +34,11 @@ class ScanFormat:
     read: Callable[[Path, ConeVec | None], DataSet]
 
 
-SCAN_FORMATS: Final[Sequence[ScanFormat]] = [
+SCAN_FORMATS: Final = (
     ScanFormat("Nikon", (".xtekct",), read_nikon),
     ScanFormat("Zeiss", (".txrm",), read_zeiss),
     ScanFormat("NXtomo", FORMATS["nxtomo"].endings, read_nxtomo),
-]
+)
 """In the order in which they are listed."""
 
 

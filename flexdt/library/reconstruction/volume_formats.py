@@ -273,12 +273,12 @@ def _read_zarr(path: Path) -> Stored:
     return stored
 
 
-VOLUME_FORMATS: Final[Sequence[VolumeFormat]] = [
+VOLUME_FORMATS: Final = (
     VolumeFormat((".tif", ".tiff"), _renamed(_write_tiff), _read_tiff),
     VolumeFormat((".nrrd",), _headed(_nrrd_header), _read_nrrd),
     VolumeFormat((".mha",), _headed(_mha_header), _read_mha),
     VolumeFormat((".nii.gz",), _headed(_nifti_header, compress=True), _read_nifti, _nibabel),
     VolumeFormat((".h5",), _renamed(_write_hdf5), _read_hdf5, _h5py),
     VolumeFormat((".zarr",), _write_zarr, _read_zarr, _zarr),
-]
+)
 """In the order in which they are listed."""
