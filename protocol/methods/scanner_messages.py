@@ -30,6 +30,12 @@ LengthUnit = Literal["um", "mm", "cm", "m", "inch"]
 MeshFormat = Literal["stl", "obj", "ply", "glb", "off"]
 VoxelFormat = Literal["raw"]
 SceneFormat = Literal["json", "toml"]
+KINDS: Mapping[str, str] = {
+    **dict.fromkeys(get_args(MeshFormat), "mesh"),
+    **dict.fromkeys(get_args(VoxelFormat), "voxels"),
+    **dict.fromkeys(get_args(SceneFormat), "scene"),
+}
+"""Format of an upload -> its kind."""
 
 
 class Move(f.Params):
@@ -131,14 +137,6 @@ CLOCK_SET = command("clock.set", ClockSet, ClockState, "set how fast the twin's 
 TUBE_SET = by_hand("tube.set", TubeSet, TubeState, "set kV, power and X-rays on or off")
 CAMERA_SET = by_hand("camera.set", CameraSet, CameraState,
                      "set exposure, mode, ROI, averages, frames")  # fmt: skip
-
-
-KINDS: Mapping[str, str] = {
-    **dict.fromkeys(get_args(MeshFormat), "mesh"),
-    **dict.fromkeys(get_args(VoxelFormat), "voxels"),
-    **dict.fromkeys(get_args(SceneFormat), "scene"),
-}
-"""Format of an upload -> its kind."""
 
 
 class SampleSet(f.Params):

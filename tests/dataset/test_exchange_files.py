@@ -16,6 +16,7 @@ import pytest
 
 from flexdt.clients.cli.command_tree import run
 from flexdt.library.datasets.exchange import (
+    FORMATS,
     ExchangeError,
     export_dataset,
     geometry_of,
@@ -28,8 +29,8 @@ from flexdt.twin.dataset.flexdt_json import FrameBlock, ScanRecord
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.projection import Volume
 
-ENDINGS = {"ctsimu": "json", "rtk": "xml", "astra": "npy", "tomosipo": "npz", "flexdata": "toml",
-           "csv": "csv"}  # fmt: skip
+THERE_AND_BACK = [form for form in FORMATS.values() if form.read and (form.write or form.export)]
+ENDINGS = {form.name: form.endings[0].strip(".") for form in THERE_AND_BACK}
 TILTED = Offsets.from_edge({"dO_x": 0.4, "det_roll": 1.0, "det_pitch": -2.0, "axis_tilt_x": 0.3,
                                "tau_x": 0.5, "dS_y": -0.2})  # fmt: skip
 

@@ -19,6 +19,8 @@ FOLDERS = (
     "src", "flexdt", "protocol", "twin", "phantoms", "runtime", "server", "clients", "tests",
     "examples", "extensions",
 )  # fmt: skip
+PAGES = ("docs/phantoms.md", "docs/exchange.md", "docs/command-line.md", "docs/reconstruction.md",
+         "docs/data-sets.md", "docs/tutorials/own-sample.md")  # fmt: skip
 ROW = re.compile(r"^\| (?!file \|)(?P<file>[^|]*)\| (?P<change>[^|]*)\| (?P<test>[^|]*)\|$", re.M)
 
 
@@ -44,7 +46,13 @@ def files_to_run(rows: list[dict[str, str]]) -> list[str]:
 
 def test_recipes_are_tables_whose_rows_end_with_a_test() -> None:
     tables = {name: rows for name, rows in recipes().items() if rows}
-    assert {"A wire method", "A machine", "A phantom", "A figure of the detector"} <= set(tables)
+    assert {
+        "A wire method",
+        "A machine",
+        "A phantom",
+        "A figure of the detector",
+        "A format of geometry",
+    } <= set(tables)
     for name, rows in tables.items():
         assert len(rows) >= 3, name
         silent = [row["file"] for row in rows if not row["test"].strip()]
@@ -61,7 +69,7 @@ def copy(tmp_path: Path) -> Path:
     """The files that git knows or would add, links as links."""
     listed = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", "--", *FOLDERS,
-         "pyproject.toml", "docs/phantoms.md"],
+         "pyproject.toml", *PAGES],
         cwd=ROOT, capture_output=True, check=True,
     ).stdout.decode().split("\0")  # fmt: skip
     for name in filter(None, listed):
@@ -149,3 +157,46 @@ def test_a_phantom_is_added_by_its_recipe(copy: Path) -> None:
     listed = run(copy, "-m", "flexdt.clients.cli", "phantom", "list")
     assert "added" in listed.stdout, listed.stderr
     assert passed(copy, files_to_run(rows), "added or every or row") >= 3
+
+
+@pytest.mark.slow
+def test_a_format_of_geometry_is_added_by_its_recipe(copy: Path) -> None:
+    rows = recipes()["A format of geometry"]
+    (copy / "twin" / "exchange" / "added.py").write_text(
+        '"""Rows of cone_vec as JSON."""\n\n'
+        "import json\n\n"
+        "from flexdt.twin.exchange.geometry import ScanGeometry\n"
+        "from flexdt.twin.geometry.cone_vec import ConeVec\n\n\n"
+        "def added_text(geometry):\n"
+        "    return json.dumps(geometry.cone_vec.rows.tolist())\n\n\n"
+        "def read_added(text, shape):\n"
+        "    return ScanGeometry(ConeVec(json.loads(text)), shape)\n"
+    )
+    changes = {
+        "flexdt/library/datasets/exchange_formats.py": (
+            ("FORMATS: Final[", "def _write_added(geometry, out):\n"
+             "    from flexdt.twin.exchange.added import added_text\n\n"
+             "    return added_text(geometry)\n\n\n"
+             "def _read_added(path, given):\n"
+             "    from flexdt.twin.exchange.added import read_added\n\n"
+             "    return read_added(path.read_text(), given.shape)\n\n\n"),
+            ('        Format("csv",',
+             '        Format("added", (".added",), _write_added, read=_read_added),\n'),
+        ),
+        "twin/geometry/cone_vec.py": (
+            ("csv.\n            shape: detector", "added, "),
+            (".csv, .xml (RTK)", ".added, "),
+        ),
+        "docs/exchange.md": (
+            ("csv,nxtomo} --out", "added,"), ("| `csv` |", "| `added` | `.added` | cone_vec | |\n"),
+        ),
+        "docs/command-line.md": (("csv and back, images", "added, "),),
+    }  # fmt: skip
+    for name, insertions in changes.items():
+        for place, text in insertions:
+            whole = (copy / name).read_text()
+            assert whole.count(place) == 1, (name, place)
+            (copy / name).write_text(whole.replace(place, text + place))
+    shown = run(copy, "-m", "flexdt.clients.cli", "export", "--help")
+    assert "|added|" in shown.stdout, shown.stderr
+    assert passed(copy, files_to_run(rows), "added or state") >= 20

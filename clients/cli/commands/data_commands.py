@@ -29,16 +29,12 @@ if TYPE_CHECKING:
     from flexdt.library.datasets.exchange import Given
     from flexdt.twin.geometry.offsets import Offsets
 
-    Algorithm = str
-else:
-    Algorithm = Literal[tuple(ALGORITHMS)]
-
 
 def reconstruct(
     twin: Twin,
     dataset: Path = argument(..., "DATASET"),
     out: Path = option(..., metavar="FILE"),
-    algorithm: Algorithm | None = option(None),
+    algorithm: str | None = option(None, among=lambda: ALGORITHMS),
     voxel: float | None = option(None, metavar="MM"),
     shape: str | None = option(None, metavar="Z,Y,X"),
     binning: int | None = option(None, min=1),
