@@ -6,10 +6,13 @@ its name only when whole. What a file does not state, such as the detector's siz
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 from flexdt.library.datasets.exchange_formats import (
     FORMATS,
@@ -44,6 +47,22 @@ __all__ = [
     "with_geometry",
     "write_geometry",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Return `ENDINGS` or `WRITERS`, which are deprecated, from `FORMATS`."""
+    if name == "ENDINGS":
+        found: dict[str, Any] = {form.name: form.endings for form in FORMATS.values()}
+    elif name == "WRITERS":
+        found = {
+            form.name: partial(form.write, out=Path(form.name + form.endings[0]))
+            for form in FORMATS.values()
+            if form.write
+        }
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    warnings.warn(f"{name}: use FORMATS[name]", DeprecationWarning, stacklevel=2)
+    return found
 
 
 def geometry_of(dataset: ImageSet, parameters: Offsets | None = None) -> ScanGeometry:
