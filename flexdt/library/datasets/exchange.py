@@ -55,7 +55,7 @@ def __getattr__(name: str) -> Any:
         found: dict[str, Any] = {form.name: form.endings for form in FORMATS.values()}
     elif name == "WRITERS":
         found = {
-            form.name: partial(form.write, out=Path(form.name + form.endings[0]))
+            form.name: partial(_content, form=form, out=Path(form.name + form.endings[0]))
             for form in FORMATS.values()
             if form.write
         }
