@@ -16,7 +16,7 @@ from in_process import ROI, Lab, M, PointProjector, run, script
 
 from flexdt.protocol import image as wire_image
 from flexdt.server.imaging.projections import TrueGeometry
-from flexdt.server.twin import live
+from flexdt.server.twin import live, state_views
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.camera import Roi
@@ -223,7 +223,7 @@ def test_a_long_list_of_corrections_lets_others_be_answered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     many, turns, made = 300, [0], list[int]()
-    view = live.correction_view
+    view = state_views.correction_view
 
     def noted(*args: Any) -> Any:
         made.append(turns[0])
@@ -238,7 +238,7 @@ def test_a_long_list_of_corrections_lets_others_be_answered(
         for i in range(many):
             known = lab.twin.corrections.make({"dD_x": 0.01 * i}, f"c{i}", "")
             lab.twin.corrections.know(known, None)
-        monkeypatch.setattr(live, "correction_view", noted)
+        monkeypatch.setattr(state_views, "correction_view", noted)
         counter = asyncio.create_task(count())
         listed = (await lab.client().call("calibration.list"))["corrections"]
         counter.cancel()
