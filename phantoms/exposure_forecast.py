@@ -35,9 +35,9 @@ from flexdt.twin.projection import project_body
 from flexdt.twin.projection.analytic_solids import Vector
 from flexdt.twin.scanner.state import CameraChange, changed_camera
 from flexdt.twin.script.compose import compose_script
-from flexdt.twin.script.plan import ScanPlan
-from flexdt.twin.script.plan_values import StartState
-from flexdt.twin.script.planner import plan_script
+from flexdt.twin.script.planning.plan import ScanPlan
+from flexdt.twin.script.planning.plan_values import StartState
+from flexdt.twin.script.planning.planner import plan_script
 from flexdt.twin.script.problems import ScriptProblem
 from flexdt.twin.script.scan_request import Kind, ScanRequest
 from flexdt.twin.signatures import public

@@ -24,8 +24,8 @@ from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.script import parse_script, plan_script
 from flexdt.twin.script.parse import is_light
-from flexdt.twin.script.plan import ScanPlan
-from flexdt.twin.script.plan_values import StartState
+from flexdt.twin.script.planning.plan import ScanPlan
+from flexdt.twin.script.planning.plan_values import StartState
 
 MAX_STEPS = 4000
 CURVE_POINTS = 400

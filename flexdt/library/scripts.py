@@ -21,7 +21,7 @@ from flexdt.twin.script import (
     plan_script,
 )
 from flexdt.twin.script.dry_run import CollisionCheck, check_plan
-from flexdt.twin.script.plan_values import StartState
+from flexdt.twin.script.planning.plan_values import StartState
 from flexdt.twin.signatures import File, public
 
 machine = public(find_machine)

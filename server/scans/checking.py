@@ -40,7 +40,7 @@ from flexdt.twin.script import (
     plan_poses,
 )
 from flexdt.twin.script.parse import LIGHT_BYTES, is_light
-from flexdt.twin.script.plan_values import SampleSize
+from flexdt.twin.script.planning.plan_values import SampleSize
 
 AT_ONCE: Final = 2
 """Checks in worker processes at a time; others wait."""

@@ -35,7 +35,7 @@ from flexdt.twin.motion import profiles as motion
 from flexdt.twin.scanner.safety import Guard, require_ready
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import Sample, StagePlacement
-from flexdt.twin.script.plan_values import SampleSize
+from flexdt.twin.script.planning.plan_values import SampleSize
 
 KEPT = 8
 MAX_BYTES: Final = 64 << 20

@@ -23,7 +23,7 @@ from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.physics.exposure import ExposureSettings, IdealResponse, expose, frame_rng
 from flexdt.twin.scanner.state import Sample, StagePlacement
 from flexdt.twin.script.parse import parse_script
-from flexdt.twin.script.planner import plan_script
+from flexdt.twin.script.planning.planner import plan_script
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)

@@ -36,8 +36,8 @@ from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.script.dry_run import check_plan, check_script
-from flexdt.twin.script.plan_values import StartState
-from flexdt.twin.script.pose_plan import plan_poses
+from flexdt.twin.script.planning.plan_values import StartState
+from flexdt.twin.script.planning.pose_plan import plan_poses
 
 M = builtin_machine("flexray")
 P = builtin_profile(M.default_profile)

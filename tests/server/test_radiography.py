@@ -62,7 +62,7 @@ from flexdt.twin.projection import TriangleMesh, Volume, forward, project_body, 
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script.parse import parse_script
-from flexdt.twin.script.planner import plan_script
+from flexdt.twin.script.planning.planner import plan_script
 
 FLEXRAY = Path(__file__).parents[2] / "twin" / "data" / "machines" / "flexray.toml"
 M = builtin_machine()

@@ -20,8 +20,8 @@ from flexdt.twin.physics.exposure import ExposureSettings, IdealResponse, expose
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.script import Exposure, ScanPlan
 from flexdt.twin.script.parse import parse_script
-from flexdt.twin.script.planner import plan_script
-from flexdt.twin.script.pose_plan import plan_poses
+from flexdt.twin.script.planning.planner import plan_script
+from flexdt.twin.script.planning.pose_plan import plan_poses
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)

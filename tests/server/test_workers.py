@@ -30,7 +30,7 @@ from flexdt.twin.collision.convex_solids import hull
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.script import ScanPlan, StartState
-from flexdt.twin.script.plan_values import SampleSize
+from flexdt.twin.script.planning.plan_values import SampleSize
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from flexdt.twin.script.planned_images import FULL_TURN, run_up
+from flexdt.twin.script.planning.planned_images import FULL_TURN, run_up
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import parse_script, plan_script
 from flexdt.twin.script.commands import MoveAbsolute
 from flexdt.twin.script.dry_run import check_script
-from flexdt.twin.script.plan_values import SampleSize
+from flexdt.twin.script.planning.plan_values import SampleSize
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)

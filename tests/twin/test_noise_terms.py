@@ -10,9 +10,9 @@ import pytest
 import flexdt as fx
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.camera import CameraSettings, PixelGrid
-from flexdt.twin.physics import Detector, noise
+from flexdt.twin.physics import Detector, panel_noise
 from flexdt.twin.physics.exposure import ExposureSettings
-from flexdt.twin.physics.noise import Exposed, NoiseTerm
+from flexdt.twin.physics.panel_noise import Exposed, NoiseTerm
 from flexdt.twin.physics.readout import Expected, read_out
 
 SIDE = 240
@@ -59,9 +59,9 @@ def test_a_planted_term_is_in_images_as_the_forecast_says(
     mean_e, xrays_e2 = float(rng.uniform(1e5, 3e5)), float(rng.uniform(1e6, 1e7))
     sigma_e = float(rng.uniform(2.0, 4.0)) * math.sqrt(xrays_e2)
     told, seen = [], []
-    for terms in (noise.NOISE, (*noise.NOISE, planted(sigma_e, spreads))):
-        monkeypatch.setattr(noise, "NOISE", terms)
-        told.append(noise.pixel_variance(panel, camera, averages, xrays_e2))
+    for terms in (panel_noise.NOISE, (*panel_noise.NOISE, planted(sigma_e, spreads))):
+        monkeypatch.setattr(panel_noise, "NOISE", terms)
+        told.append(panel_noise.pixel_variance(panel, camera, averages, xrays_e2))
         seen.append(seen_variance(panel, camera, averages, mean_e, xrays_e2, seed))
     assert seen == pytest.approx(told, rel=0.08)
     if not spreads:
@@ -76,5 +76,5 @@ def test_a_planted_term_lowers_the_contrast_that_expose_forecasts(
 ) -> None:
     ball = {"kind": "sphere", "center": [0, 0, 0], "radius": 8, "material": "aluminium"}
     before = fx.expose(ball).asked.cnr
-    monkeypatch.setattr(noise, "NOISE", (*noise.NOISE, planted(20_000.0, False)))
+    monkeypatch.setattr(panel_noise, "NOISE", (*panel_noise.NOISE, planted(20_000.0, False)))
     assert fx.expose(ball).asked.cnr < 0.5 * before

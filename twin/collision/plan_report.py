@@ -20,11 +20,11 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.scanner.safety import Contact
-from flexdt.twin.script.check_findings import Clearance, Collision
 from flexdt.twin.script.commands import MoveAbsolute
 from flexdt.twin.script.dry_run import CollisionCheck
-from flexdt.twin.script.plan import ScanPlan
-from flexdt.twin.script.plan_values import SampleSize
+from flexdt.twin.script.planning.check_findings import Clearance, Collision
+from flexdt.twin.script.planning.plan import ScanPlan
+from flexdt.twin.script.planning.plan_values import SampleSize
 
 MAX_CONTACTS = 20
 """Contacts of one pair that are listed; a scan that hits every turn needs no more to be wrong."""

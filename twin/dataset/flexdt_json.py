@@ -32,7 +32,7 @@ from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.scanner.state import NamedCorrection
 from flexdt.twin.script import SampleSize, ScanPlan
-from flexdt.twin.script.plan import saved_images
+from flexdt.twin.script.planning.plan import saved_images
 from flexdt.twin.values import ArrayValue, message_of
 
 SAME = 1e-4

@@ -25,11 +25,11 @@ from flexdt.twin.script import commands as c
 from flexdt.twin.script.dry_run import CollisionCheck, check_plan
 from flexdt.twin.script.executed_log import MotorReply, log_line, motor_reply, reply_bytes
 from flexdt.twin.script.grammar import FIXED, ArgumentError, describe, find, number
-from flexdt.twin.script.plan_values import PlanStep, SampleSize
-from flexdt.twin.script.planner import plan_script, simulated
+from flexdt.twin.script.planning.plan_values import PlanStep, SampleSize
+from flexdt.twin.script.planning.planner import plan_script, simulated
+from flexdt.twin.script.planning.simulated_script import Simulation
+from flexdt.twin.script.planning.time_ranges import Range, step_range, total_range
 from flexdt.twin.script.problems import Severity
-from flexdt.twin.script.simulated_script import Simulation
-from flexdt.twin.script.time_ranges import Range, step_range, total_range
 
 NEAR_LIMIT: Final = 0.5
 """Distance of a target from a limit that is worth telling [mm or deg]."""

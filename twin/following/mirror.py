@@ -16,7 +16,7 @@ from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.script import commands as c
-from flexdt.twin.script.plan_values import StartState
+from flexdt.twin.script.planning.plan_values import StartState
 from flexdt.twin.script.problems import Severity
 
 KEPT: Final = 100

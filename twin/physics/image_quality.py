@@ -21,7 +21,7 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.physics.chain import Chain, mAs, weights_of
 from flexdt.twin.physics.exposure import ExposureSettings
-from flexdt.twin.physics.noise import pixel_variance
+from flexdt.twin.physics.panel_noise import pixel_variance
 from flexdt.twin.physics.readout import expected_counts
 from flexdt.twin.physics.tube import tube_spectrum
 

@@ -17,7 +17,7 @@ from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.physics.blur import blurred
 from flexdt.twin.physics.detector import Detector, pattern
 from flexdt.twin.physics.exposure import Counts, ExposureSettings
-from flexdt.twin.physics.noise import Exposed, drawn
+from flexdt.twin.physics.panel_noise import Exposed, drawn
 
 Signal = TypeVar("Signal", float, Float32Array)
 

@@ -27,7 +27,7 @@ from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Axis, Machine, Profile, check_target
 from flexdt.twin.scanner.state import CameraChange, TubeSettings, changed_camera, changed_tube
 from flexdt.twin.script.motor_targets import QUANTITIES, MotorTargets, beside_beam
-from flexdt.twin.script.planned_images import MARGIN_IMAGES, run_up
+from flexdt.twin.script.planning.planned_images import MARGIN_IMAGES, run_up
 from flexdt.twin.script.scan_request import ScanPosition, ScanRequest
 
 MAX_FRAMES: Final = 100_000

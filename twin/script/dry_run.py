@@ -14,12 +14,12 @@ import numpy as np
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.script import commands as c
-from flexdt.twin.script.beam_view import View, views
-from flexdt.twin.script.check_findings import Clearance, Dose, Optics
 from flexdt.twin.script.parse import Source, content, read_script
-from flexdt.twin.script.plan import CheckReport, ScanPlan
-from flexdt.twin.script.plan_values import SampleSize, StartState
-from flexdt.twin.script.planner import plan_script
+from flexdt.twin.script.planning.beam_view import View, views
+from flexdt.twin.script.planning.check_findings import Clearance, Dose, Optics
+from flexdt.twin.script.planning.plan import CheckReport, ScanPlan
+from flexdt.twin.script.planning.plan_values import SampleSize, StartState
+from flexdt.twin.script.planning.planner import plan_script
 from flexdt.twin.script.problems import ScriptProblem, in_order
 
 CollisionCheck = Callable[[ScanPlan, Machine, Profile, SampleSize | None], Clearance]

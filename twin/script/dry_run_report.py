@@ -12,11 +12,11 @@ import math
 from collections.abc import Iterable, Sequence
 from itertools import zip_longest
 
-from flexdt.twin.script.check_findings import Optics, Trace
 from flexdt.twin.script.log_fit import LogComparison
-from flexdt.twin.script.plan import HOME_ASSUMED, CheckReport
+from flexdt.twin.script.planning.check_findings import Optics, Trace
+from flexdt.twin.script.planning.plan import HOME_ASSUMED, CheckReport
+from flexdt.twin.script.planning.time_ranges import Range, step_range, total_range
 from flexdt.twin.script.problems import ScriptProblem
-from flexdt.twin.script.time_ranges import Range, step_range, total_range
 
 Facts = Sequence[tuple[str, str]]
 

@@ -33,11 +33,11 @@ from flexdt.twin.machine.description import MAX_TIME_S, Axis, Machine, Spread, T
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.executed_log import Executed, MotorReply
 from flexdt.twin.script.grammar import describe, own_name
-from flexdt.twin.script.plan_values import StartState
-from flexdt.twin.script.planner import simulated
+from flexdt.twin.script.planning.plan_values import StartState
+from flexdt.twin.script.planning.planner import simulated
+from flexdt.twin.script.planning.simulated_script import Simulation
+from flexdt.twin.script.planning.time_ranges import Range, step_range, total_range
 from flexdt.twin.script.problems import ScriptProblem
-from flexdt.twin.script.simulated_script import Simulation
-from flexdt.twin.script.time_ranges import Range, step_range, total_range
 
 BORROWED_TIMES: Final = 4.0
 """How many times of its own the deviations of all kinds count for."""

@@ -161,7 +161,7 @@ def tell(problems: Sequence[ScriptProblem], file: str) -> None:
 def show(report: CheckReport, file: str) -> Answer:
     """The plan and the figures of a check."""
     from flexdt.twin.script.dry_run_report import between, summary
-    from flexdt.twin.script.time_ranges import step_range
+    from flexdt.twin.script.planning.time_ranges import step_range
 
     timing = report.plan.machine.timing
     steps = [

@@ -39,7 +39,7 @@ from flexdt.twin.script.executed_log import (
     read_log,
 )
 from flexdt.twin.script.log_fit import Fit, LogComparison, first_difference, fit_machine
-from flexdt.twin.script.time_ranges import step_range, total_range
+from flexdt.twin.script.planning.time_ranges import step_range, total_range
 
 DATA = Path(__file__).parents[2] / "data" / "logs"
 LOG = DATA / "unitom_xl_201106_001.txt"

@@ -11,7 +11,7 @@ from smooth_rule import smooth_scan
 
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.script import ScanPlan, parse_script, plan_script
-from flexdt.twin.script.planned_images import run_up
+from flexdt.twin.script.planning.planned_images import run_up
 from tests.twin.script.conftest import Planner
 
 LISTING_1 = Path(__file__).parents[3] / "examples/scripts/listing1.txt"

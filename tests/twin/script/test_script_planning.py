@@ -31,7 +31,7 @@ from flexdt.twin.script import (
     plan_poses,
     plan_script,
 )
-from flexdt.twin.script.plan_values import SampleSize
+from flexdt.twin.script.planning.plan_values import SampleSize
 from tests.twin.script.conftest import Planner
 
 # FleX-ray, linear axes: 50 mm/s, 50 mm/s2; so a move of d >= 50 mm takes d / 50 + 1 s, a shorter

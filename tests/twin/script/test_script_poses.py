@@ -23,7 +23,7 @@ from flexdt.twin.machine.description import (
     profile_of,
 )
 from flexdt.twin.script import ScanPlan, StartState, plan_poses, plan_script
-from flexdt.twin.script.plan_values import Exposure, SampleSize
+from flexdt.twin.script.planning.plan_values import Exposure, SampleSize
 
 SEEDS = range(12)
 

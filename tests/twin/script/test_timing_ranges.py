@@ -14,7 +14,7 @@ import timing_ranges
 
 from flexdt.twin.machine.description import Spread, Timing
 from flexdt.twin.script.log_fit import LogRow
-from flexdt.twin.script.time_ranges import total_range
+from flexdt.twin.script.planning.time_ranges import total_range
 
 
 @pytest.mark.slow

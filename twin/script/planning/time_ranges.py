@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from typing import Protocol
 
 from flexdt.twin.machine.description import Timing
-from flexdt.twin.script.plan_values import PlanStep
+from flexdt.twin.script.planning.plan_values import PlanStep
 
 Range = tuple[float, float]
 

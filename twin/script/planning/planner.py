@@ -15,12 +15,12 @@ from flexdt.twin.machine.description import (
     profile_of,
 )
 from flexdt.twin.script import commands as c
-from flexdt.twin.script.beam_view import beam_problems
 from flexdt.twin.script.parse import Source, parse_script
-from flexdt.twin.script.plan import ScanPlan
-from flexdt.twin.script.plan_values import SampleSize, StartState
+from flexdt.twin.script.planning.beam_view import beam_problems
+from flexdt.twin.script.planning.plan import ScanPlan
+from flexdt.twin.script.planning.plan_values import SampleSize, StartState
+from flexdt.twin.script.planning.simulated_script import Simulation
 from flexdt.twin.script.problems import in_order
-from flexdt.twin.script.simulated_script import Simulation
 
 
 def plan_script(

@@ -20,10 +20,10 @@ import numpy as np
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.script import commands as c
-from flexdt.twin.script import planned_scanner as planned
 from flexdt.twin.script.commands import ImageKind
 from flexdt.twin.script.grammar import image_name, kind_of, sequence_names, shorten
-from flexdt.twin.script.plan_values import ExposureGroup
+from flexdt.twin.script.planning import planned_scanner as planned
+from flexdt.twin.script.planning.plan_values import ExposureGroup
 from flexdt.twin.script.problems import Findings
 
 MARGIN_IMAGES: Final = 4.0

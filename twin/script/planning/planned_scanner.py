@@ -15,7 +15,7 @@ from flexdt.twin.machine.description import Machine
 from flexdt.twin.machine.kinematics import virtual_reading
 from flexdt.twin.motion import profiles as motion
 from flexdt.twin.motion.profiles import Trajectory
-from flexdt.twin.script.plan_values import BeamOn, StartState
+from flexdt.twin.script.planning.plan_values import BeamOn, StartState
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,10 @@ from flexdt.twin.machine.description import Machine, unknown_axis
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.scanner.state import CameraChange, TubeSettings, changed_camera, changed_tube
 from flexdt.twin.script import commands as c
-from flexdt.twin.script import planned_scanner as planned
 from flexdt.twin.script.grammar import describe, is_reserved, own_name
-from flexdt.twin.script.plan_values import PlanStep, SampleSize, Settings, StartState
-from flexdt.twin.script.planned_images import ImageCollector
+from flexdt.twin.script.planning import planned_scanner as planned
+from flexdt.twin.script.planning.plan_values import PlanStep, SampleSize, Settings, StartState
+from flexdt.twin.script.planning.planned_images import ImageCollector
 from flexdt.twin.script.problems import Findings
 
 # The binary argument of `scanner set sample info`: the sample's size and names.

@@ -19,7 +19,7 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.script.commands import ImageKind
-from flexdt.twin.script.plan import ScanPlan
+from flexdt.twin.script.planning.plan import ScanPlan
 from flexdt.twin.script.problems import ScriptProblem
 
 BoolArray = npt.NDArray[np.bool_]

@@ -23,8 +23,8 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.motion.profiles import AxisPath, Trajectory
-from flexdt.twin.script.check_findings import Clearance, Dose, Optics
-from flexdt.twin.script.plan_values import (
+from flexdt.twin.script.planning.check_findings import Clearance, Dose, Optics
+from flexdt.twin.script.planning.plan_values import (
     BeamOn,
     Exposure,
     ExposureGroup,
@@ -33,8 +33,8 @@ from flexdt.twin.script.plan_values import (
     Settings,
     StartState,
 )
+from flexdt.twin.script.planning.time_ranges import Range, step_range, total_range
 from flexdt.twin.script.problems import ScriptProblem, WithProblems
-from flexdt.twin.script.time_ranges import Range, step_range, total_range
 from flexdt.twin.values import ArrayValue, JsonValue
 
 _OF_STEP = ("line", "start_s", "duration_s", "holds_s", "assumed_s", "assumed_from", "what")
