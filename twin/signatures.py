@@ -298,6 +298,11 @@ def _is_number(value: Any) -> bool:
     return alone and not isinstance(value, bool) and getattr(value, "dtype", "") != "bool"
 
 
+def _is_truth(value: Any) -> bool:
+    alone = getattr(value, "ndim", 0) == 0
+    return isinstance(value, bool) or (alone and getattr(value, "dtype", "") == "bool")
+
+
 def _is_numbers(value: Any) -> bool:
     """Whether an array can be made of it; what is not looked at, such as memory on a device, is
     for the function to read.
@@ -347,6 +352,6 @@ PLAIN: Final = {
     types.NoneType: Kind(("None",), lambda v: v is None),
     float: Kind(("a number",), _is_number),
     int: Kind(("a whole number",), lambda v: _is_number(v) and hasattr(v, "__index__")),
-    bool: Kind(("True or False",), lambda v: _type(v) is bool or str(_type(v)) == "bool"),
+    bool: Kind(("True or False",), _is_truth),
     str: Kind(("a text",), lambda v: isinstance(v, str)),
 }

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 import flexdt as fx
+from flexdt.twin.signatures import public
 
 SCAN = fx.ConeVec.circular(sod=100, sdd=200, angles=4, shape=(6, 8), pixel=0.5)
 GRID = fx.Grid((4, 4, 4), 0.5)
@@ -232,3 +233,18 @@ def test_mistakes_drawn_over_the_signatures_get_a_sentence(
     print(f"{len(drawn) - len(failed)} of {len(drawn)} mistakes get a sentence\n{listed}")
     assert len(drawn) == IN_ALL
     assert len(failed) <= 0.05 * IN_ALL, listed
+
+
+def test_numpy_s_scalars_are_taken_as_python_s() -> None:
+    def given(yes: bool, whole: int, number: float, none: bool | None = None) -> tuple[Any, ...]:
+        return yes, whole, number, none
+
+    told: Callable[..., tuple[Any, ...]] = public(given)
+    for kind in (np.int8, np.uint16, np.int64):
+        for real in (np.float32, np.float64, kind):
+            for yes in (np.True_, np.array(True), True):
+                assert told(yes, kind(3), real(2), yes) == (True, 3, 2.0, True)
+    for wrong in ((np.array([True]), 1, 1.0), (np.int8(1), 1, 1.0), (True, np.float64(1), 1.0),
+                  (True, np.True_, 1.0), (True, 1, np.True_)):  # fmt: skip
+        with pytest.raises(fx.TwinError, match=r"given: .* is .*; allowed: "):
+            told(*wrong)
