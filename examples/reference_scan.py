@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from flexdt.clients import TwinClient
-from flexdt.clients.cli.commands.scan_commands import follow
+from flexdt.clients.cli.commands.job_commands import follow
 from flexdt.clients.launch.processes import Servers
 from flexdt.library.reading.folders import load_dataset
 from flexdt.library.reconstruction.reconstruct import (

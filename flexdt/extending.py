@@ -11,6 +11,7 @@ A dot in the name stands for a group: `phantom.design` is `flexdt phantom design
 
 from flexdt.clients.cli.commands.process_commands import become
 from flexdt.clients.cli.console import note, size, table, warn
+from flexdt.clients.cli.option_values import assignments, names, numbers, position, triple
 from flexdt.clients.cli.options import (
     Answer,
     Free,
@@ -21,12 +22,7 @@ from flexdt.clients.cli.options import (
     Scheduler,
     Twin,
     argument,
-    assignments,
-    names,
-    numbers,
     option,
-    position,
-    triple,
 )
 from flexdt.library.extras import package
 from flexdt.library.failure import CommandError

@@ -18,45 +18,57 @@ from typer.core import TyperGroup
 from typer.main import get_command
 
 from flexdt.clients.cli.boundary import DONE, INTERRUPTED, USAGE, describe
-from flexdt.clients.cli.commands import analysis_commands as analysis
 from flexdt.clients.cli.commands import calibrate_commands as geometry
+from flexdt.clients.cli.commands import check_command as checking
+from flexdt.clients.cli.commands import commission_command as commissioning
 from flexdt.clients.cli.commands import data_commands as data
+from flexdt.clients.cli.commands import demo_command as demonstration
+from flexdt.clients.cli.commands import doctor_command as installation
+from flexdt.clients.cli.commands import expose_command as exposure
 from flexdt.clients.cli.commands import follow_command as following
+from flexdt.clients.cli.commands import job_commands as jobs
+from flexdt.clients.cli.commands import machine_commands as machines
+from flexdt.clients.cli.commands import phantom_commands as phantoms
 from flexdt.clients.cli.commands import process_commands as processes
-from flexdt.clients.cli.commands import scan_commands as scans
 from flexdt.clients.cli.commands import scanner_commands as scanner
+from flexdt.clients.cli.commands import script_commands as scripts
+from flexdt.clients.cli.completed_commands import completed
 from flexdt.clients.cli.console import hush, note, printable
-from flexdt.clients.cli.options import Json, Server, TokenFile, argument, completed, option
+from flexdt.clients.cli.options import Json, Server, TokenFile, argument, option
 
 COMMANDS: Final[Mapping[str, Callable[..., object]]] = {
     name.strip("_"): getattr(module, name)
     for module, names in (
-        (processes, "demo up twin projector viewer gateway doctor"),
-        (scans, "check run expose"),
+        (demonstration, "demo"),
+        (processes, "up twin projector viewer gateway"),
+        (installation, "doctor"),
+        (checking, "check"),
+        (jobs, "run"),
+        (exposure, "expose"),
         (scanner, "state tube camera clock move jog stop estop reset sample snap"),
         (geometry, "calibrate align compare"),
         (data, "reconstruct export import_"),
         (following, "follow"),
-        (analysis, "commission"),
+        (commissioning, "commission"),
     )
     for name in names.split()
 }
 """Name -> what it runs."""
 GROUPS: Final[Mapping[str, tuple[str, Mapping[str, Callable[..., object]]]]] = {
-    "script": ("Scan scripts.", {"new": scans.new}),
-    "job": ("Jobs: scripts and trajectories being run.", scans.JOB_COMMANDS),
+    "script": ("Scan scripts.", {"new": scripts.new}),
+    "job": ("Jobs: scripts and trajectories being run.", jobs.JOB_COMMANDS),
     "phantom": (
         "Phantoms: objects to scan.",
-        {"list": analysis.list_phantoms, "make": analysis.make},
+        {"list": phantoms.list_phantoms, "make": phantoms.make},
     ),
     "machine": (
         "Machines as data, and from their logs.",
         {
-            "list": analysis.list_machines,
-            "show": analysis.show,
-            "check": analysis.check,
-            "new": analysis.new,
-            "fit": analysis.fit,
+            "list": machines.list_machines,
+            "show": machines.show,
+            "check": machines.check,
+            "new": machines.new,
+            "fit": machines.fit,
         },
     ),
 }

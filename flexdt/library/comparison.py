@@ -17,8 +17,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from flexdt.library.calibration.bead_tracks import coordinate_rms, predictions
 from flexdt.library.calibration.calibrate import Outcome, calibrate_datasets
-from flexdt.library.calibration.calibration_report import _rms, predictions
 from flexdt.library.datasets.image_set import ImageSet
 from flexdt.library.figures import Series, image_under, page, plot, table
 from flexdt.library.reading.folders import load_dataset
@@ -101,7 +101,7 @@ def compare_folder(
     seen = dataset.stack(chosen)
     first = seen - virtual(outcome.phantom, dataset, chosen, NOMINAL)
     second = seen - virtual(outcome.phantom, dataset, chosen, corrected)
-    rms = _rms(after)
+    rms = coordinate_rms(after)
     document: dict[str, Any] = {
         "within": bool(rms <= tolerance_px),
         "tolerance_px": tolerance_px,
@@ -138,7 +138,9 @@ def virtual(
 def _figures(residual: FloatArray, images: Float32Array | None) -> dict[str, float | None]:
     length = np.linalg.norm(residual, axis=2)
     of_images = None if images is None else float(np.sqrt(np.mean(images.astype("f8") ** 2)))
-    return dict(zip(FIGURES, (_rms(residual), float(np.nanmax(length)), of_images), strict=True))
+    return dict(
+        zip(FIGURES, (coordinate_rms(residual), float(np.nanmax(length)), of_images), strict=True)
+    )
 
 
 def rows_of(document: Mapping[str, Any]) -> list[tuple[Any, ...]]:

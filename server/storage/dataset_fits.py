@@ -30,7 +30,7 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
     """
     # Here, as only workers fit: the server's own process loads nothing of it.
     from flexdt.library.analysis import calibrate
-    from flexdt.library.calibration.calibration_report import tracks_document
+    from flexdt.library.calibration.bead_tracks import tracks_document
     from flexdt.twin.calibration.fit.fit import covariance_by_step
     from flexdt.twin.calibration.unknown_markers import UNKNOWN
 

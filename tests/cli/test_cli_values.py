@@ -9,13 +9,13 @@ import typer
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flexdt.clients.cli import console, options
+from flexdt.clients.cli import connection, console, option_values
 from flexdt.clients.cli.console import PLAIN_INTERVAL_S, ProgressBar
 from flexdt.runtime import process_settings
 
 
 def test_assignments_keep_order_and_signs() -> None:
-    assert options.assignments(["tra_obj=-12.5", "rot_obj=+3e1", " ver_tube = 40"]) == {
+    assert option_values.assignments(["tra_obj=-12.5", "rot_obj=+3e1", " ver_tube = 40"]) == {
         "tra_obj": -12.5,
         "rot_obj": 30.0,
         "ver_tube": 40.0,
@@ -24,7 +24,7 @@ def test_assignments_keep_order_and_signs() -> None:
 
 @given(st.floats(allow_nan=False, allow_infinity=False))
 def test_every_finite_number_survives(value: float) -> None:
-    assert options.assignments([f"a={value!r}"]) == {"a": value}
+    assert option_values.assignments([f"a={value!r}"]) == {"a": value}
 
 
 @pytest.mark.parametrize(
@@ -40,7 +40,7 @@ def test_every_finite_number_survives(value: float) -> None:
 )
 def test_bad_assignments(words: list[str], says: str) -> None:
     with pytest.raises(typer.BadParameter, match=says):
-        options.assignments(words)
+        option_values.assignments(words)
 
 
 @pytest.mark.parametrize(
@@ -55,13 +55,13 @@ def test_bad_assignments(words: list[str], says: str) -> None:
     ],
 )
 def test_server_addresses(word: str, expected: tuple[str, int]) -> None:
-    assert options.server_address(word) == expected
+    assert connection.server_address(word) == expected
 
 
 @pytest.mark.parametrize("word", ["host:0", "host:65536", "host:abc", "[::1", "[::1]x", "host:-1"])
 def test_bad_server_addresses(word: str) -> None:
     with pytest.raises(typer.BadParameter):
-        options.server_address(word)
+        connection.server_address(word)
 
 
 def test_speed_up() -> None:

@@ -15,15 +15,13 @@ import tifffile
 from bead_scan import bead_scan
 
 from flexdt.clients.cli.command_tree import run
+from flexdt.library.calibration.bead_tracks import write_tracks
 from flexdt.library.calibration.calibrate import (
     calibrate_datasets,
     find_phantom,
     inside_95,
 )
-from flexdt.library.calibration.calibration_report import (
-    write_report,
-    write_tracks,
-)
+from flexdt.library.calibration.calibration_report import write_report
 from flexdt.library.comparison import compare_folder, write_comparison
 from flexdt.library.reading.folders import load_dataset
 from flexdt.phantoms import load_phantom

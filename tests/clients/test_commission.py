@@ -14,7 +14,7 @@ from bead_scan import bead_scan
 from past_laboratory import Laboratory
 
 from flexdt.clients.cli.command_tree import run
-from flexdt.clients.cli.commands.scan_commands import read_log_file
+from flexdt.clients.cli.commands.script_files import read_log_file
 from flexdt.clients.following.session import Recorded, format_recorded
 from flexdt.library import machines
 from flexdt.library.commission import commission

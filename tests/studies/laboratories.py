@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from past_laboratory import LINEAR, Laboratory
 
-from flexdt.clients.cli.commands.scan_commands import read_log_file
+from flexdt.clients.cli.commands.script_files import read_log_file
 from flexdt.library.commission import Commissioned, commission
 
 

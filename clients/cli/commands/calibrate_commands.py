@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
-from flexdt.clients.cli import options
+from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
 from flexdt.clients.cli.commands.data_commands import said
 from flexdt.clients.cli.console import as_json, note, table, warn
@@ -79,7 +79,7 @@ def calibrate(
         start: Begin at these offsets (mm, deg).
     """
     if report is not None:
-        options.require_ending(report, ".html", ".json")
+        option_values.require_ending(report, ".html", ".json")
     from flexdt.library.calibration.calibrate import calibrate_datasets
     from flexdt.library.calibration.calibration_report import write_report
     from flexdt.library.calibration.markers import Scale
@@ -102,7 +102,7 @@ def calibrate(
     if report is not None:
         write_report(outcome, report)
     if tracks is not None:
-        from flexdt.library.calibration.calibration_report import write_tracks
+        from flexdt.library.calibration.bead_tracks import write_tracks
 
         write_tracks(outcome, tracks)
     yield document
@@ -128,22 +128,22 @@ def _request(
     from flexdt.twin.geometry.offsets import Offsets
 
     usual = ("dO_x",) if phantom == UNKNOWN else SIX
-    asked = usual if free is None else options.names(free)
+    asked = usual if free is None else option_values.names(free)
     return CalibrationRequest(
         free=asked,
-        per_scan=options.names(per_scan),
+        per_scan=option_values.names(per_scan),
         reading={"axis": Reading.AXIS_AT_O_PLUS_TAU, "mount": Reading.MOUNT_SHIFT}[reading],
         bead_tolerance_mm=bead_tolerance,
         priors=exact(asked) if prior == ["none"] else _assigned(prior),
         bound=chosen(CalibrateSettings).bound,
         start=Offsets.from_edge(_assigned(start)),
-        per_frame=options.names(per_frame),
+        per_frame=option_values.names(per_frame),
     )
 
 
 def _assigned(given: list[str] | None) -> dict[str, float]:
     """P=VALUE,... of an option that may be given several times."""
-    return options.assignments(word for one in given or () for word in one.split(","))
+    return option_values.assignments(word for one in given or () for word in one.split(","))
 
 
 def _named(phantom: str | None) -> str:
@@ -214,7 +214,7 @@ def align(
         per_frame: Find shifts of single frames (jitter) too.
     """
     if out is not None:
-        options.require_ending(out, ".json")
+        option_values.require_ending(out, ".json")
     from flexdt.library.calibration.align_dataset import align_dataset
 
     if push:

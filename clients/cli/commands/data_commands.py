@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
-from flexdt.clients.cli import options
+from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.console import ProgressBar, duration, note, size, warn
 from flexdt.clients.cli.options import Answer, Twin, argument, option
 from flexdt.clients.cli.settings_file import ReconstructSettings, chosen
@@ -91,17 +91,17 @@ def reconstruct(
     from flexdt.twin.projection.volume import Accuracy
 
     voxels = None if shape is None else _shape(shape)
-    scattering = None if scatter_correction is None else options.names(scatter_correction)
-    made_of = None if material is None else options.names(material)
+    scattering = None if scatter_correction is None else option_values.names(scatter_correction)
+    made_of = None if material is None else option_values.names(material)
     middle = "X,Y,Z, e.g. 0,0,-5.5"
     request = VolumeRequest(
         algorithm=algorithm or DEFAULT, voxel_mm=voxel, shape=voxels, binning=binning or 1,
         every=every or 1, iterations=iterations, weight=weight,
         window=chosen(ReconstructSettings).window,
-        center_mm=None if center is None else options.triple(center, "center", middle),
+        center_mm=None if center is None else option_values.triple(center, "center", middle),
         rings=rings, material=made_of, kV=kv, scatter_correction=scattering, png=png,
     )  # fmt: skip
-    options.require_folder(out)
+    option_values.require_folder(out)
     parameters, report = _correction(correction, twin)
     # Workers have working directories of their own.
     shared = scheduler is not None or slurm is not None
@@ -206,7 +206,7 @@ def _workers(scheduler: str | None, slurm: Path | None) -> AbstractContextManage
 
 def _shape(text: str) -> tuple[int, int, int]:
     form = "Z,Y,X, e.g. 300,400,400"
-    z, y, x = map(int, options.numbers(text, "shape", form, 3, whole=True))
+    z, y, x = map(int, option_values.numbers(text, "shape", form, 3, whole=True))
     return z, y, x
 
 
@@ -379,9 +379,9 @@ def said(
     size = pitch = None
     if shape is not None:
         form = "ROWS,COLS, e.g. 760,956"
-        size = options.numbers(shape, "shape", form, 2, whole=True)
+        size = option_values.numbers(shape, "shape", form, 2, whole=True)
     if pixel is not None:
-        pitch = options.numbers(pixel, "pixel pitch", "MM or U,V", 1, 2)
+        pitch = option_values.numbers(pixel, "pixel pitch", "MM or U,V", 1, 2)
     if pitch is not None and min(pitch) <= 0.0:
         raise typer.BadParameter(f"pixel pitch {pixel!r} must be above 0")
     from flexdt.library.datasets.exchange import Given

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 import typer
 
-from flexdt.clients.cli import options
+from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.boundary import REFUSED
 from flexdt.clients.cli.console import duration, note, table, warn
 from flexdt.clients.cli.options import Answer, Twin, argument, option
@@ -165,7 +165,7 @@ def move(
         shortest: Turn rot_obj by the shortest way.
         no_wait: Return without waiting for the arrival.
     """
-    wanted = options.assignments(targets)
+    wanted = option_values.assignments(targets)
     with twin() as client:
         try:
             done = client.move(
@@ -194,8 +194,8 @@ def jog(
         velocity: mm/s or deg/s, signed.
         seconds: Stop after so many seconds of the twin's clock.
     """
-    speed = options.number(velocity, "the velocity")
-    lasting = math.inf if seconds is None else options.number(seconds, "--for")
+    speed = option_values.number(velocity, "the velocity")
+    lasting = math.inf if seconds is None else option_values.number(seconds, "--for")
     if lasting <= 0:
         raise typer.BadParameter(f"--for {seconds}: the seconds must be more than 0")
     with twin() as client:
@@ -332,8 +332,8 @@ def snap(
         binning: Average so many pixels a side.
         marks: Colour saturated, starved and cut-off pixels of a PNG.
     """
-    options.require_ending(file, ".tiff", ".tif", ".png")
-    options.require_folder(file)
+    option_values.require_ending(file, ".tiff", ".tif", ".png")
+    option_values.require_folder(file)
     with twin() as client:
         wanted = kind or ("line_integral" if file.suffix.lower() == ".png" else "counts")
         tube = client.state().tube

@@ -1,32 +1,27 @@
-"""`flexdt machine` and `flexdt phantom`: machines and phantoms as data, new ones, fitted machines.
-
-A phantom file is JSON and may be named wherever `--phantom` is. `flexdt commission` makes a machine
-from a laboratory's past scans.
-"""
+"""`flexdt machine`: machines as data, shown, checked, new, and fitted to logs of scripts."""
 
 from __future__ import annotations
 
-import json as json_text
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from flexdt.clients.cli import options
-from flexdt.clients.cli.commands.scan_commands import read_log_file, tell
-from flexdt.clients.cli.console import note, table
+from flexdt.clients.cli import option_values
+from flexdt.clients.cli.commands.script_files import read_log_file, tell
+from flexdt.clients.cli.console import table
 from flexdt.clients.cli.options import Answer, argument, option
-from flexdt.clients.cli.settings_file import MachineNewSettings, PhantomMakeSettings, chosen
+from flexdt.clients.cli.settings_file import MachineNewSettings, chosen
 from flexdt.library import machines
-from flexdt.library.failure import CommandError
 
 if TYPE_CHECKING:
-    from flexdt.phantoms import Phantom
     from flexdt.twin.machine.description import Axis, Machine
 
-T = TypeVar("T")
-_COMMENTS = "as the file's comments say"
+COMMENTS: Final = "as the file's comments say"
+"""Source of a value whose source is no value of the file."""
+USUAL_BASE: Final = "xyzr_cabinet"
+"""Machine that a new one begins with."""
 NameOrFile = Annotated[str, typer.Argument(metavar="NAME or FILE", help="Shipped, or TOML.")]
 
 
@@ -44,7 +39,7 @@ def show(name: NameOrFile) -> Answer:
     found = machines.machine(name)
     yield found.model_dump(mode="json", by_alias=True)
     yield f"{found.name}: {found.description}\n"
-    yield _axes({n: (a, a.source or _COMMENTS) for n, a in found.axes.items()})
+    yield _axes({n: (a, a.source or COMMENTS) for n, a in found.axes.items()})
     yield "\n" + _places(found)
     panel, tube = found.detector, found.tube
     yield (f"\npanel: {panel.model}, {panel.columns} x {panel.rows} of {panel.pitch_mm:g} mm, "
@@ -103,26 +98,22 @@ def new(
     from flexdt.twin.machine.kinematics import place
     from flexdt.twin.machine.new_machine import Answers, new_machine_text
 
-    def asked(question: str, given: str | None, usual: str) -> str | None:
-        if given is not None or not sys.stdin.isatty():
-            return given
-        answer: str = typer.prompt(question, default=usual, err=True)
-        return None if answer == usual else answer
-
-    base = asked(f"Most like which of {', '.join(builtin_machines())}", base, "xyzr_cabinet")
-    base = base or "xyzr_cabinet"
+    base = _asked(f"Most like which of {', '.join(builtin_machines())}", base, USUAL_BASE)
+    base = base or USUAL_BASE
     like = builtin_machine(base)
     panel = like.detector
     usual = [
         ":".join(f"{end:g}" for end in dict.fromkeys((at.least, at.most)))
         for at in (place(like, "object_y"), place(like, "detector_y"))
     ]
-    size = asked("Panel, columns x rows", detector, f"{panel.columns}x{panel.rows}")
-    pitch = asked("Pixel, mm", pitch, f"{panel.pitch_mm:g}")
-    sod = asked("SOD, mm: one if fixed, or least:greatest", sod, usual[0])
-    sdd = asked("SDD, mm: one if fixed, or least:greatest", sdd, usual[1])
-    kv = asked("Tube, kV: at most, or least:most", kv, f"{like.tube.min_kV:g}:{like.tube.max_kV:g}")
-    volts = None if kv is None else options.span(kv, "--kv")
+    size = _asked("Panel, columns x rows", detector, f"{panel.columns}x{panel.rows}")
+    pitch = _asked("Pixel, mm", pitch, f"{panel.pitch_mm:g}")
+    sod = _asked("SOD, mm: one if fixed, or least:greatest", sod, usual[0])
+    sdd = _asked("SDD, mm: one if fixed, or least:greatest", sdd, usual[1])
+    kv = _asked(
+        "Tube, kV: at most, or least:most", kv, f"{like.tube.min_kV:g}:{like.tube.max_kV:g}"
+    )
+    volts = None if kv is None else option_values.span(kv, "--kv")
     pixels = None if size is None else _pair(size, "--detector", whole=True)
     lines = [word.partition("=") for word in limit or []]
     answers = Answers(
@@ -133,12 +124,12 @@ def new(
         rows=None if pixels is None else int(pixels[1]),
         pitch_mm=None if pitch is None else _pair(pitch, "--pitch"),
         bits=bits,
-        sod_mm=None if sod is None else options.span(sod, "--sod"),
-        sdd_mm=None if sdd is None else options.span(sdd, "--sdd"),
+        sod_mm=None if sod is None else option_values.span(sod, "--sod"),
+        sdd_mm=None if sdd is None else option_values.span(sdd, "--sdd"),
         min_kV=volts[0] if volts is not None and ":" in str(kv) else None,
         max_kV=None if volts is None else volts[1],
-        max_W=None if power is None else options.number(f"{power}", "--power"),
-        limits={axis: options.span(ends, f"--limit {axis}") for axis, _, ends in lines},
+        max_W=None if power is None else option_values.number(f"{power}", "--power"),
+        limits={axis: option_values.span(ends, f"--limit {axis}") for axis, _, ends in lines},
         without=tuple(without or ()),
     )
     text = new_machine_text(answers)
@@ -153,9 +144,17 @@ def new(
     )
 
 
+def _asked(question: str, given: str | None, usual: str) -> str | None:
+    """What was given, else what a person at a terminal answers; None for what is usual."""
+    if given is not None or not sys.stdin.isatty():
+        return given
+    answer: str = typer.prompt(question, default=usual, err=True)
+    return None if answer == usual else answer
+
+
 def _pair(word: str, what: str, *, whole: bool = False) -> tuple[float, float]:
     form = "of the form NUMBERxNUMBER"
-    found = options.numbers(word, f"{what}:", form, 1, 2, by="x", whole=whole)
+    found = option_values.numbers(word, f"{what}:", form, 1, 2, by="x", whole=whole)
     return found[0], found[-1]
 
 
@@ -222,7 +221,7 @@ def _bodies(machine: Machine) -> str:
     rows = [
         (c.name, c.role, " + ".join(reversed(machine.chain(c))) or "nothing",
          " x ".join(f"{side:g}" for side in c.size_mm),
-         "; ".join(filter(None, (c.mesh and f"mesh {c.mesh}", c.source))) or _COMMENTS)
+         "; ".join(filter(None, (c.mesh and f"mesh {c.mesh}", c.source))) or COMMENTS)
         for c in machine.components
     ]  # fmt: skip
     return table(rows, ("body", "role", "moved by", "size [mm]", "source"))
@@ -240,106 +239,3 @@ def _times(machine: Machine) -> str:
     if timing.spread:
         rows.append(("all together", "", "", f"+-{100 * timing.drift:.0f} %", "log; for totals"))
     return table(rows, ("time of a", "median [s]", "5 %", "95 %", f"source ({timing.source})"))
-
-
-def list_phantoms() -> Answer:
-    """List the phantoms that ship."""
-    from flexdt.phantoms import load_phantom, phantom_names
-
-    found = {name: load_phantom(name) for name in phantom_names()}
-    yield {"phantoms": [_summary(name, p) for name, p in found.items()]}
-    rows = [
-        (name, " x ".join(f"{s:g}" for s in p.size_mm), len(p.beads), p.description)
-        for name, p in found.items()
-    ]
-    yield table(rows, ("name", "size [mm]", "beads", "what it is"))
-    yield "\nCuboids take a number of beads: normal-7 has seven."
-
-
-def make(
-    file: Path = argument(..., "FILE.json"),
-    like: str | None = option(None, metavar="NAME"),
-    size: str | None = option(None, metavar="W,B,H"),
-    beads: int = option(5, metavar="K"),
-    radius: float = option(2.0, metavar="MM"),
-    body: str = option("abs", metavar="MATERIAL"),
-    mesh: Path | None = option(None, metavar="FILE"),
-    unit: str | None = option(None),
-    stl: Path | None = option(None, metavar="FILE.stl"),
-) -> Answer:
-    """Write a new phantom: a bead cuboid of your own size, or a mesh.
-
-    Args:
-        file: Where to write it.
-        like: Begin with this cuboid of `phantom list`.
-        size: Set width, breadth and height [mm].
-        beads: Put so many beads on a spiral.
-        radius: Set the beads' radius.
-        body: Make the body of this material.
-        mesh: Fill this mesh: STL, OBJ, PLY, GLB or OFF.
-        unit: Read the mesh in this unit; default: mm, for GLB m.
-        stl: Write its surfaces, too, to print it.
-    """
-    if sum(given is not None for given in (like, size, mesh)) != 1:
-        raise typer.BadParameter("give one of --like NAME, --size W,B,H or --mesh FILE")
-    options.require_folder(file, stl)
-    from flexdt.phantoms import bead_phantom, mesh_phantom
-
-    if mesh is not None:
-        made = mesh_phantom(mesh, unit=unit, material=body, name=file.stem)
-    else:
-        made = bead_phantom(
-            like if like is not None else _size(size or ""),
-            beads,
-            bead_radius_mm=radius,
-            body_material=body,
-            bead_material=chosen(PhantomMakeSettings).bead,
-        )
-    file.write_text(json_text.dumps(made.to_dict()), encoding="utf-8")
-    if stl is not None:
-        made.mesh().export(stl, file_type="stl")
-    for line in made.assumed:
-        note(f"assumed: {line}")
-    yield {"file": str(file), "stl": stl, **_summary(made.name, made)}
-    yield f"{file}: {made.description}"
-
-
-def _size(text: str) -> tuple[float, float, float]:
-    return options.triple(text, "size", "W,B,H, e.g. 20,40,60")
-
-
-def _summary(name: str, phantom: Phantom) -> dict[str, object]:
-    return {
-        "name": name,
-        "size_mm": list(phantom.size_mm),
-        "beads": len(phantom.beads),
-        "bead_radius_mm": phantom.bead_radius_mm.tolist(),
-        "description": phantom.description,
-        "assumed": list(phantom.assumed),
-    }
-
-
-def commission(
-    folders: list[Path] = argument(..., "FOLDER..."),
-    traffic: Path | None = option(None, metavar="FILE"),
-    out: Path = option(..., metavar="DIR"),
-) -> Answer:
-    """Fit a machine, its zero offsets and their drift to past scans, and say what disagrees.
-
-    Args:
-        folders: Past scans.
-        traffic: Read this recording of `flexdt follow --record` too.
-        out: Write machine, profile and report to this folder.
-    """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise CommandError(f"{out} is there; allowed: a new or an empty folder")
-    from flexdt.library.commission import commission as commissioned
-    from flexdt.library.commission import write_commission
-    from flexdt.library.figures import cell_text
-
-    found = commissioned(folders, traffic, read_log_file)
-    write_commission(found, out)
-    yield found.document(out)
-    for title, (head, rows) in found.tables(out).items():
-        yield f"{title}\n{table(([cell_text(x) for x in row] for row in rows), head)}\n"
-    yield f"{out}: machine.toml, profile.toml, commission.json and report.html written"

@@ -1,0 +1,115 @@
+"""`flexdt check`: a script parsed, planned and checked without a server, or beside its log."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from flexdt.clients.cli import options
+from flexdt.clients.cli.boundary import INVALID
+from flexdt.clients.cli.commands.script_files import ScriptFile, exit_code, read_log_file, tell
+from flexdt.clients.cli.console import table
+from flexdt.clients.cli.options import Answer, option
+from flexdt.library import machines
+from flexdt.library.failure import CommandError
+
+if TYPE_CHECKING:
+    from flexdt.twin.script import CheckReport
+
+
+def check(
+    script: ScriptFile,
+    machine: options.MachineName = None,
+    profile: options.ProfileName = None,
+    sample: str | None = option(None, metavar="NAME or FILE"),
+    html: Path | None = option(None, metavar="FILE"),
+    against: Path | None = option(None, metavar="LOG"),
+    json: bool = False,
+) -> Answer:
+    """Parse, plan and check a script, without a server.
+
+    Exit code 0 with warnings alone, 1 for an invalid script, 3 for a collision or limit.
+
+    Args:
+        sample: Check truncation, collisions and exposure of this sample.
+        html: Write the report to this file as one page.
+        against: Compare with the log of this script, line by line.
+    """
+    if against is not None:
+        yield from compare(script, against, machine, html)
+        return
+    from flexdt.library.scripts import collisions, size_of
+    from flexdt.phantoms.samples import as_phantom
+    from flexdt.twin.script import check_script, html_report
+    from flexdt.twin.script.problems import in_order
+
+    data = script.read_bytes()
+    scanner = machines.machine(machine)
+    phantom = None if sample is None else as_phantom(sample)
+    report = check_script(
+        data,
+        scanner,
+        machines.profile(profile, scanner, machine),
+        sample=size_of(phantom),
+        collision=collisions(phantom) if scanner.components else None,
+    )
+    if phantom is not None and not report.errors:
+        from flexdt.phantoms.exposure_forecast import exposure_problems
+
+        more = exposure_problems(report.plan, phantom)
+        report = replace(report, problems=in_order((*report.problems, *more)))
+    if html is not None:
+        html.write_text(html_report(report, script.name), encoding="utf-8")
+    yield report.to_dict()
+    if not json:
+        tell(report.problems, str(script))
+    yield from show(report, str(script))
+    raise typer.Exit(exit_code(report))
+
+
+def compare(script: Path, log: Path, machine: str | None, html: Path | None) -> Answer:
+    """Each line of an executed script beside its prediction, the greatest errors first.
+
+    Raises:
+        CommandError: the log is not of this script; the message names the first line that differs.
+    """
+    from flexdt.twin.script import parse_script
+    from flexdt.twin.script.dry_run_report import against_html, against_summary
+    from flexdt.twin.script.log_fit import LogComparison, first_difference
+    from flexdt.twin.script.parse import is_log
+
+    known = machines.machine(machine)
+    lines = read_log_file(log, known)
+    data = script.read_bytes()
+    if not is_log(data):
+        different = first_difference(parse_script(data).commands, lines)
+        if different is not None:
+            raise CommandError(f"{script}: {different}; {log} is not a log of it", INVALID)
+    found = LogComparison.of(lines, known)
+    tell(found.problems, str(log))
+    if html is not None:
+        html.write_text(against_html(found, script.name), encoding="utf-8")
+    yield found.to_dict()
+    yield table(found.table(), found.HEADER) + "\n"
+    yield table([(f"{label}:", value) for label, value in against_summary(found)])
+
+
+def show(report: CheckReport, file: str) -> Answer:
+    """The plan and the figures of a check."""
+    from flexdt.twin.script.dry_run_report import between, summary
+    from flexdt.twin.script.time_ranges import step_range
+
+    timing = report.plan.machine.timing
+    steps = [
+        (s.line, f"{s.start_s:.2f}", f"{s.duration_s:.2f}", between(step_range(s, timing)),
+         f"{s.assumed_s:.2f}" if s.assumed_s else "", s.what)
+        for s in report.plan.steps
+    ]  # fmt: skip
+    if steps:
+        head = ("line", "start [s]", "takes [s]", "90 %", "of it commands", "what")
+        yield table(steps, head) + "\n"
+    yield table([(f"{label}:", value) for label, value in summary(report)])
+    yield f"{file}: {'ok' if report.ok else 'not ok'}"

@@ -1,0 +1,258 @@
+"""`flexdt demo`: the main job from end to end, with servers of its own.
+
+Each stage does its real work through the public client and the files, as a user would, and stops
+the demonstration with a readable error when something is wrong. A stage that did not run is absent
+from the document.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from datetime import datetime
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
+from flexdt.clients.cli.commands.calibrate_commands import (
+    parameter_rows,
+    push_correction,
+    write_json,
+)
+from flexdt.clients.cli.commands.job_commands import follow
+from flexdt.clients.cli.console import duration, note, say, size, table
+from flexdt.clients.cli.options import Answer, option
+from flexdt.clients.launch import random_truth as hidden
+from flexdt.library.failure import CommandError
+from flexdt.twin import long_work
+
+if TYPE_CHECKING:
+    from flexdt.clients.client.client import TwinClient
+    from flexdt.clients.launch.processes import Servers
+    from flexdt.library.calibration.calibrate import Outcome
+    from flexdt.library.data_set import DataSet
+
+SAMPLE: Final = "lego"
+SCRIPT: Final = "lego-fly-360.txt"
+STAY_S: Final = 3600.0
+"""Longest sleep while the lab stays up; Ctrl-C ends it at once."""
+Tell = Callable[[str], None]
+"""Called with each line of what is done."""
+
+
+def demo(
+    out: Path = option(Path("flexdt-demo"), metavar="DIR"),
+    no_viewer: bool = option(False, "--no-viewer"),
+    truth: Path | None = option(None, metavar="FILE"),
+    json: bool = False,
+) -> Answer:
+    """Do the main job: script, scan, data set, calibration.
+
+    Starts the servers on free ports, scans the LEGO bead phantom with the example script,
+    accelerated, calibrates from the data set, and says what was done, where the files are and how
+    the result compares with the hidden truth. With the viewer it stays up until Ctrl-C.
+
+    Args:
+        out: Write everything to this folder.
+        no_viewer: Exit when the work is done, without a viewer.
+        truth: Hide this misalignment, not a random one.
+    """
+
+    def stay(url: str) -> None:
+        note(f"the lab is at {url}; Ctrl-C ends the demonstration")
+        try:
+            while True:
+                time.sleep(STAY_S)
+        except KeyboardInterrupt:
+            note("")
+
+    yield run_demo(out, truth, note if json else say, None if no_viewer else stay)
+
+
+def run_demo(
+    out: Path, truth_file: Path | None, tell: Tell, stay: Callable[[str], None] | None = None
+) -> dict[str, object]:
+    """Run every stage there is.
+
+    Args:
+        out: folder for everything that is written, made if need be.
+        truth_file: hidden misalignment; None draws one.
+        tell: told what is done, line by line.
+        stay: start the viewer too; called with its URL when the work is done, and the servers live
+            until it returns.
+
+    Returns:
+        The document of `demo.json`.
+
+    Raises:
+        CommandError: a stage did not do what it should; the line says which and what.
+    """
+    from flexdt.clients.client.client import TwinClient
+    from flexdt.runtime import compile_ahead
+
+    data = out / "data"
+    data.mkdir(parents=True, exist_ok=True)
+    with contextlib.ExitStack() as running:
+        path = truth_file or running.enter_context(_drawn_truth())
+        truth = hidden.read(path)
+        tell("starting the servers; the very first start compiles the projector's kernels")
+        # What calibration and reconstruction need, beside the servers' start and the scan.
+        compiling = running.enter_context(compile_ahead.start(compile_ahead.ANALYSIS))
+        options = {"data": data.absolute(), "truth": path.absolute(), "speed-up": "max"}
+        servers = running.enter_context(_started(options, out, tell, viewer=stay is not None))
+        with TwinClient(*servers.address) as client:
+            document = _main_job(client, compiling.wait, truth, out, tell)
+        write_json(out / "demo.json", document)
+        tell(f"summary: {out / 'demo.json'}")
+        if stay is not None and servers.viewer_url is not None:
+            stay(servers.viewer_url)
+    return document
+
+
+@contextlib.contextmanager
+def _drawn_truth() -> Iterator[Path]:
+    """The file of a random hidden misalignment, outside the folder of the results."""
+    with tempfile.TemporaryDirectory(prefix="flexdt-truth-") as secret:
+        path = Path(secret) / "truth.toml"
+        hidden.write(hidden.draw(), path)
+        yield path
+
+
+@contextlib.contextmanager
+def _started(
+    options: Mapping[str, object], out: Path, tell: Tell, *, viewer: bool
+) -> Iterator[Servers]:
+    """Servers on free ports, and where they are."""
+    from flexdt.clients.launch.processes import Servers
+
+    log = out / "servers.log"
+    servers = Servers(options, log, viewer=viewer)
+    with contextlib.ExitStack() as running:
+        with long_work.during("starting the servers"):
+            running.enter_context(servers)
+        host, port = servers.address
+        tell(f"twin on {host}:{port}, projector beside it, log in {log}")
+        if servers.viewer_url is not None:
+            tell(f"viewer: {servers.viewer_url}")
+        yield servers
+
+
+def _main_job(
+    client: TwinClient,
+    compiled: Callable[[], object],
+    truth: Mapping[str, float],
+    out: Path,
+    tell: Tell,
+) -> dict[str, object]:
+    """Scan, calibrate, put the correction in force and preview; returns the document.
+
+    Args:
+        client: connected to the twin.
+        compiled: returns once the kernels of calibration and reconstruction are compiled.
+        truth: hidden misalignment, to compare with.
+        out: folder for everything that is written.
+        tell: told what is done, line by line.
+    """
+    dataset, seconds = _scanned(client, out / "data", tell)
+    with long_work.during("compiling the kernels of calibration and reconstruction"):
+        compiled()
+    begun = time.monotonic()
+    outcome = _calibrated(dataset, tell)
+    document = {
+        "dataset": str(dataset.folder),
+        "frames": len(dataset.frames),
+        "scan_s": round(seconds, 3),
+        "calibration_s": round(time.monotonic() - begun, 3),
+        "calibration": outcome.document,
+        "truth": dict(truth),
+    }
+    push_correction(client, outcome.correction, outcome.sources)
+    tell(f"correction in force on the twin: {outcome.correction.name}")
+    document["inside_95"] = _compared(outcome, truth, tell)
+    document["preview"] = _previewed(dataset, outcome, out / "preview.tif", tell)
+    return document
+
+
+def _scanned(client: TwinClient, data: Path, tell: Tell) -> tuple[DataSet, float]:
+    """Run the example script on the twin and read the data set back with the ordinary reader; it
+    must be whole. Returns it and the wall time of the scan [s]."""
+    from flexdt.library.reading.folders import load_dataset
+
+    client.set_sample(SAMPLE)
+    script = (resources.files("flexdt.clients") / "data" / SCRIPT).read_bytes()
+    name = f"{SAMPLE}-{datetime.now():%Y%m%d-%H%M%S}"
+    made = client.submit_script(script, name=name, speed_up="max")
+    tell(f"{made.job}: scanning the {SAMPLE} phantom with {SCRIPT}")
+    for warning in made.warnings:
+        tell(f"  warning: {warning}")
+    begun = time.monotonic()
+    status = follow(client, made.job, own=True)
+    seconds = time.monotonic() - begun
+    if status.state != "done":
+        message = (status.error or {}).get("message", "no reason given")
+        raise CommandError(f"the scan ended as {status.state}: {message}")
+    tell(
+        f"{status.frames_done} frames in {duration(seconds)} "
+        f"({duration(status.elapsed_s)} on the twin's clock)"
+    )
+    folder = data / (status.dataset or name)
+    dataset = load_dataset(folder).require_complete()
+    files = [p for p in folder.iterdir() if p.is_file()]
+    rows, cols = dataset.shape
+    tell(
+        f"data set {folder}: {len(dataset.frames)} projections of {cols} x {rows}, "
+        f"{len(files)} files, {size(sum(p.stat().st_size for p in files))}"
+    )
+    return dataset, seconds
+
+
+def _calibrated(dataset: DataSet, tell: Tell) -> Outcome[DataSet]:
+    """Calibrate from the data set alone."""
+    from flexdt.library.calibration.calibrate import calibrate_datasets
+
+    begun = time.monotonic()
+    outcome = calibrate_datasets([dataset], SAMPLE)
+    document = outcome.document
+    if not document["identifiable"]:
+        problems = [str(f.text) for f in outcome.calibration.findings]
+        raise CommandError(["the calibration is not identifiable", *problems], NOT_IDENTIFIABLE)
+    tell(
+        f"calibrated in {duration(time.monotonic() - begun)}: {document['detections']} beads seen, "
+        f"rms {document['rms_px']:.4f} px"
+    )
+    return outcome
+
+
+def _previewed(
+    dataset: DataSet, outcome: Outcome[DataSet], out: Path, tell: Tell
+) -> dict[str, object]:
+    """A small volume with the calibrated geometry."""
+    from flexdt.library.reconstruction.reconstruct import preview
+
+    fit = outcome.calibration.fit
+    assert fit is not None
+    with long_work.during("making a preview"):
+        document = preview(dataset, out, parameters=fit.parameters)
+    tell(f"preview {out}: {duration(document['seconds'])}")
+    return document
+
+
+def _compared(outcome: Outcome[DataSet], truth: Mapping[str, float], tell: Tell) -> bool:
+    """Set the calibration beside the hidden truth; a miss is called a miss."""
+    from flexdt.library.calibration.calibrate import inside_95
+
+    rows = []
+    for name, value, sigma, _, unit in parameter_rows(outcome.document):
+        true = truth.get(name.strip("()"), 1.0 if name == "angle_scale" else 0.0)
+        rows.append((name, f"{true:.5f}", value, sigma, unit))
+    tell(table(rows, ("parameter", "truth", "calibrated", "sigma", "unit")))
+    inside = inside_95(outcome, truth)
+    tell(
+        "the truth lies inside the joint 95 % ellipsoid"
+        if inside
+        else "a miss: the truth lies outside the joint 95 % ellipsoid"
+    )
+    return inside

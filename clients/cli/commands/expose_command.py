@@ -1,0 +1,107 @@
+"""`flexdt expose`: the exposure of a scan predicted, or measured in a data set."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from flexdt.clients.cli import options
+from flexdt.clients.cli.console import duration, size, table, warn
+from flexdt.clients.cli.options import Answer, argument, option
+from flexdt.library import machines
+
+if TYPE_CHECKING:
+    from flexdt.library.expose import Forecast, Measured, Transmission
+
+BEST: Final = 5
+"""Proposed settings that are shown."""
+
+
+def expose(
+    dataset: Path | None = argument(None, "[DATASET]"),
+    sample: str = option("lego", metavar="NAME or FILE"),
+    material: str | None = option(None, metavar="M"),
+    kV: list[float] | None = option(None, "--kV", "--kv"),
+    power: float | None = option(None, metavar="W"),
+    filter: str = option("", metavar="MATERIAL:MM"),
+    exposure: float | None = option(None, metavar="MS"),
+    averages: int = option(1),
+    mode: str | None = option(None, metavar="NAME"),
+    roi: options.Roi = None,
+    frames: int = option(361),
+    sod: float = option(600.0, metavar="MM"),
+    sdd: float = option(1059.0, metavar="MM"),
+    detail: str = option("void:0.5", metavar="MATERIAL:MM"),
+    machine: options.MachineName = None,
+) -> Answer:
+    """Predict transmission, contrast to noise, dose and the best voltage and filter.
+
+    Args:
+        dataset: Measure a scan's radiographs instead.
+        sample: Predict the scan of this sample.
+        material: Fill a mesh file with this material.
+        kV: Try this voltage; repeat it for more, and the best is chosen.
+        power: Set the tube's power.
+        filter: Put this filter beside the machine's own.
+        exposure: Expose each image so long.
+        averages: Average so many read-outs in an image.
+        mode: Set the camera's mode.
+        frames: Take so many images of the scan.
+        sod: Set the distance from source to axis.
+        sdd: Set the distance from source to panel.
+        detail: See this detail; void:MM for less of the sample.
+    """
+    from flexdt.library import expose as of
+    from flexdt.library.reading.folders import load_dataset
+    from flexdt.twin.machine.camera import Roi
+
+    if dataset is not None:
+        data = load_dataset(dataset)
+        warn(data.warnings, dataset)
+        measured = of.exposure_of(data)
+        yield asdict(measured)
+        yield from _seen(measured)
+        return
+    forecast = of.expose(
+        sample,
+        kV=kV or None,
+        power_W=power,
+        filter=filter,
+        exposure_ms=exposure,
+        averages=averages,
+        mode=mode,
+        roi=None if roi is None else Roi(*roi),
+        images=frames,
+        sod=sod,
+        sdd=sdd,
+        detail=detail,
+        machine=machines.machine(machine),
+        material=material,
+    )
+    warn(forecast.assumed)
+    yield asdict(forecast)
+    yield from _told(forecast)
+
+
+def _seen(found: Forecast | Measured) -> Answer:
+    seen: Transmission = found.transmission
+    yield (f"transmission: least {seen.least:.3g}, 1 % below {seen.p1:.3g}, "
+           f"5 % below {seen.p5:.3g}, half below {seen.median:.3g}")  # fmt: skip
+    full = "unknown" if found.saturated is None else f"{100 * found.saturated:.3g} % of the pixels"
+    yield f"saturated {full}, starved {100 * found.starved:.3g} %"
+
+
+def _told(forecast: Forecast) -> Answer:
+    yield from _seen(forecast)
+    asked = forecast.asked
+    yield f"{forecast.detail} on the darkest ray: contrast {asked.cnr:.3g} times the noise"
+    yield (f"air kerma on the axis {asked.kerma_mGy:.3g} mGy; {forecast.images} images, at least "
+           f"{duration(forecast.seconds)}, {size(forecast.bytes)}")  # fmt: skip
+    rows = [
+        (f"{s.kV:g}", s.filter or "-", f"{s.averages} x {s.exposure_ms:.4g}", f"{s.cnr:.3g}",
+         f"{s.kerma_mGy:.3g}")
+        for s in forecast.best[:BEST]
+    ]  # fmt: skip
+    yield f"best of {len(forecast.best)} settings of the same power and time:"
+    yield table(rows, ("kV", "filter", "ms", "contrast/noise", "mGy"))

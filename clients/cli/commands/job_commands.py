@@ -1,0 +1,174 @@
+"""`flexdt run` and `flexdt job`: scripts run on a twin, and the jobs that they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+
+from flexdt.clients.cli.boundary import (
+    INTERRUPTED,
+    INVALID,
+    WIRE_EXIT_CODES,
+    positions,
+    wire_code,
+)
+from flexdt.clients.cli.commands.scanner_commands import warn_of_exposure
+from flexdt.clients.cli.commands.script_files import ScriptFile
+from flexdt.clients.cli.console import ProgressBar, duration, note, table, warn
+from flexdt.clients.cli.options import Answer, Twin, option
+from flexdt.library.failure import CommandError
+from flexdt.runtime import process_settings
+
+if TYPE_CHECKING:
+    from flexdt.clients.client.client import TwinClient
+    from flexdt.protocol.state_model import JobStatus
+
+Job = Annotated[
+    str | None, typer.Argument(metavar="JOB", help="As in `job list`; the current one if left out.")
+]
+
+
+def run(
+    twin: Twin,
+    script: ScriptFile,
+    out: str | None = option(None, metavar="NAME"),
+    sample: str | None = option(None, metavar="NAME"),
+    speed_up: Any = option(None, metavar="X or max", parser=process_settings.speed_up),
+    detach: bool = option(False, "--detach"),
+) -> Answer:
+    """Run a script on the twin and wait for the data set.
+
+    Ctrl-C leaves the scan running; `flexdt job` steers it.
+
+    Args:
+        out: Give the data set this name.
+        sample: Put this sample on the stage first.
+        speed_up: Let the twin's time run X times as fast as yours.
+        detach: Return once the script is submitted.
+    """
+    from flexdt.protocol.rpc_errors import RpcError
+
+    data = script.read_bytes()
+    with twin() as client:
+        if sample is not None:
+            client.set_sample(sample)
+        began = client.state().time
+        try:
+            made = client.submit_script(data, name=out, speed_up=speed_up)
+        except RpcError as error:
+            places = positions(error.data, str(script))
+            if not places:
+                raise
+            for place in places:
+                note(place)
+            raise CommandError(
+                f"{script} was refused; nothing was started", wire_code(error)
+            ) from None
+        warn(made.warnings, script)
+        if detach:
+            yield made
+            yield f"{made.job} submitted; `flexdt job status {made.job}`"
+            return
+        last = follow(client, made.job)
+        seen = client.state().image
+    if seen is not None and (seen.time or 0.0) >= began:
+        warn_of_exposure(seen)
+    yield last
+    yield describe(last)
+    if last.state != "done":
+        message = (last.error or {}).get("message", "the data set is incomplete")
+        raise CommandError(f"{last.job} {last.state}: {message}", failure_code(last))
+
+
+def failure_code(status: JobStatus) -> int:
+    """Exit code of a job that did not end well."""
+    return WIRE_EXIT_CODES.get((status.error or {}).get("code"), INVALID)
+
+
+def follow(client: TwinClient, job: str, *, own: bool = False) -> JobStatus:
+    """Show a job's progress until it ends; returns its last status.
+
+    Args:
+        client: connected to the twin.
+        job: which one.
+        own: no other client steers the job, so Ctrl-C and a pause because of an error end the wait.
+
+    Raises:
+        CommandError: Ctrl-C; the job goes on, and the message says how to steer it.
+    """
+    shown = ""
+
+    def show(status: JobStatus) -> None:
+        nonlocal shown
+        text = f"{job}: {status.state}" if status.state != "running" else None
+        bar.update(status.frames_done, status.frames_total or None, text)
+        reason = str(status.error.get("message", "")) if status.error else ""
+        if status.state == "paused" and reason and reason != shown:
+            shown = reason
+            if own:
+                raise CommandError(f"{job} is paused: {reason}", failure_code(status))
+            note(f"{job} is paused: {reason}; `flexdt job resume {job}` goes on")
+
+    try:
+        with ProgressBar(f"{job}: scanning") as bar:
+            return client.wait_job(job, show)
+    except KeyboardInterrupt:
+        if own:
+            raise
+        raise CommandError(
+            f"detached; {job} goes on: `flexdt job status {job}`, `flexdt job abort {job}`",
+            INTERRUPTED,
+        ) from None
+
+
+def list_jobs(twin: Twin) -> Answer:
+    """List all jobs, oldest first."""
+    with twin() as client:
+        found = client.jobs()
+    yield found
+    rows = [(j.job, j.state, f"{j.frames_done}/{j.frames_total}", j.dataset or j.name)
+            for j in found.jobs]  # fmt: skip
+    yield table(rows, ("job", "state", "frames", "data set")) if rows else "no jobs yet"
+
+
+def _on_job(does: str, method: str) -> Callable[..., Answer]:
+    """A command that does something with one job and shows how the job is then."""
+
+    def command(twin: Twin, job: Job = None) -> Answer:
+        with twin() as client:
+            status: JobStatus = getattr(client, method)(job)
+        warn(status.warnings)
+        yield status
+        yield describe(status)
+
+    command.__doc__ = does
+    return command
+
+
+def describe(status: JobStatus) -> str:
+    """A job in one line."""
+    text = f"{status.job}: {status.state}, {status.frames_done} of {status.frames_total} frames"
+    if status.line is not None:
+        text += f", line {status.line}"
+    if status.what:
+        text += f" ({status.what})"
+    if status.remaining_s is not None and status.state in ("queued", "running", "paused"):
+        text += f", {duration(status.remaining_s)} left on the twin's clock"
+    if status.error:
+        text += f"; {status.error.get('message', status.error)}"
+    if status.dataset:
+        text += f"; data set {status.dataset}"
+    return text
+
+
+JOB_COMMANDS: Final = {
+    "list": list_jobs,
+    "status": _on_job("Show how far a job is.", "job_status"),
+    "pause": _on_job("Pause a job; a frame under exposure is taken again.", "pause_job"),
+    "resume": _on_job("Return to the pose of the pause and go on.", "resume_job"),
+    "step": _on_job("Run a paused job for one step.", "step_job"),
+    "abort": _on_job("End a job; its data set stays, marked incomplete.", "abort_job"),
+}
+"""Commands of the group by name."""

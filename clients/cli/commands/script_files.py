@@ -1,0 +1,59 @@
+"""Scripts and their logs as arguments of commands: what is read, and what is told of problems."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from flexdt.clients.cli.boundary import INVALID, verdict
+from flexdt.clients.cli.console import note
+from flexdt.library.failure import CommandError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from flexdt.twin.machine.description import Machine
+    from flexdt.twin.script import CheckReport, ScriptProblem
+    from flexdt.twin.script.executed_log import Executed
+
+ScriptFile = Annotated[Path, typer.Argument(metavar="SCRIPT", help="Acquila scan script.")]
+
+
+def read_log_file(log: Path, machine: Machine) -> tuple[Executed, ...]:
+    """The lines of an executed script, or of one in a recording of `flexdt follow`.
+
+    What is worth knowing about them goes to standard error.
+
+    Raises:
+        CommandError: it is no log, or a line of it does not hold.
+    """
+    from flexdt.clients.following.session import STAMP
+    from flexdt.twin.script.executed_log import COLUMNS, read_log
+    from flexdt.twin.script.parse import is_log
+
+    data = log.read_bytes()
+    if STAMP.match(data):
+        from flexdt.clients.following.session import executed_script
+
+        data = executed_script(data, machine)
+    if not is_log(data):
+        raise CommandError(f"{log}: no line of an executed script in it; {COLUMNS}", INVALID)
+    lines, problems = read_log(data)
+    tell(problems, str(log))
+    if any(p.severity == "error" for p in problems):
+        raise CommandError(f"{log}: the log does not hold; nothing was done", INVALID)
+    return lines
+
+
+def tell(problems: Sequence[ScriptProblem], file: str) -> None:
+    """Problems with their places, to standard error."""
+    for p in problems:
+        place = ":".join([file, *(str(n) for n in (p.line, p.column) if p.line)])
+        note(f"{place}: {p.severity}: {p.message} [{p.code}]")
+
+
+def exit_code(report: CheckReport) -> int:
+    """Exit code of a check."""
+    return verdict(p.code for p in report.problems if p.severity == "error")

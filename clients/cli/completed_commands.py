@@ -1,0 +1,67 @@
+"""Commands as typer takes them: with what `flexdt` itself was told, and their answers printed.
+
+`--json`, `--server` and `--token-file` are options of `flexdt` itself, which commands get as
+arguments: what yields answers `--json`, and a parameter `twin: Twin` connects to the server.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from functools import partial, wraps
+from typing import Any, Final, Literal
+
+import typer
+
+from flexdt.clients.cli.connection import connect
+from flexdt.clients.cli.console import emit, say
+from flexdt.runtime.process_settings import described, has_parameters
+
+GIVEN: Final = ("context", "twin", "json")
+"""Parameters of commands that are no options of theirs."""
+
+
+def completed(command: Callable[..., Any]) -> tuple[Callable[..., None], tuple[str, ...]]:
+    """A command as typer takes it, and the options of `flexdt` that it heeds."""
+    own = inspect.signature(command, eval_str=True).parameters
+    yields = inspect.isgeneratorfunction(inspect.unwrap(command))
+    if not yields and "context" in own:  # it passes its words on
+        return command, ()
+
+    about, helps = described(command)
+    for name, parameter in own.items():
+        if getattr(parameter.default, "help", "") is None:
+            parameter.default.help = helps.get(name)
+
+    @wraps(command)
+    def complete(context: typer.Context, **given: Any) -> None:
+        root = context.find_root().params
+        if "context" in own:
+            given["context"] = context
+        if "twin" in own:
+            given["twin"] = partial(connect, root["server"], root["token_file"])
+        if "json" in own:
+            given["json"] = root["json"]
+        answer = command(**given)
+        for part in answer if yields else ():
+            if isinstance(part, str) and not root["json"]:
+                say(part)
+            elif root["json"] and not isinstance(part, str):
+                emit(part)
+
+    complete.__doc__ = about
+    context = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
+    offered = (_with_choices(p) for name, p in own.items() if name not in GIVEN)
+    has_parameters(complete, [context, *offered])
+    heeds = ("--json",) if yields or "json" in own else ()
+    return complete, (*heeds, "--server", "--token-file") if "twin" in own else heeds
+
+
+def _with_choices(parameter: inspect.Parameter) -> inspect.Parameter:
+    """The parameter with the words that its option is among as its type."""
+    among = getattr(parameter.default, "among", None)
+    if among is None:
+        return parameter
+    choices: Any = Literal[tuple(among())]
+    optional = parameter.default.default is None
+    return parameter.replace(annotation=choices | None if optional else choices)

@@ -1,0 +1,60 @@
+"""The twin that the command line, the environment or the settings file names, and its client."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flexdt.clients.cli.settings_file import configuration
+from flexdt.library.failure import CommandError
+from flexdt.runtime.process_settings import LOOPBACK, address
+
+if TYPE_CHECKING:
+    from flexdt.clients.client.client import TwinClient
+
+DEFAULT_SERVER = "127.0.0.1:55000"
+DEFAULT_PORT = 55000
+
+
+def connect(server: str | None = None, token_file: str | None = None) -> TwinClient:
+    """A client for a twin, to be used as a context manager.
+
+    What is None is taken from the user's configuration, see `configuration`.
+
+    Args:
+        server: HOST:PORT, see `server_address`; 127.0.0.1:55000 if nothing says otherwise.
+        token_file: file whose first line is the session's token; shows none by default.
+
+    Raises:
+        typer.BadParameter: the address has another form.
+        CommandError: the token or certificate file cannot be read or holds none, or the
+            configuration is wrong.
+        OSError: nothing answers.
+    """
+    own = configuration()
+    host, port = server_address(server or own.server or DEFAULT_SERVER)
+    shown = token_file or own.token_file
+    from flexdt.clients.client.client import TwinClient
+    from flexdt.runtime.access import AccessError, client_tls, read_token
+
+    try:
+        token = own.token if shown is None else read_token(Path(shown))
+        context = client_tls(None if own.tls_ca is None else Path(own.tls_ca))
+    except AccessError as error:
+        raise CommandError(str(error)) from None
+    return TwinClient(host, port, token=token, name="flexdt", ssl=context)
+
+
+def server_address(word: str) -> tuple[str, int]:
+    """HOST:PORT, HOST, :PORT or [IPV6]:PORT to (host, port); the default port is 55000.
+
+    Raises:
+        typer.BadParameter: no such form, or a port outside 1 to 65535.
+    """
+    text = word.strip()
+    if text.count(":") > 1 and "[" not in text:  # an IPv6 address by itself
+        text = f"[{text}]"
+    if ":" not in text.rpartition("]")[2]:
+        text += f":{DEFAULT_PORT}"
+    found = address(f"{LOOPBACK}{text}" if text.startswith(":") else text)
+    return found.host, found.port

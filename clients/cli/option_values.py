@@ -1,0 +1,128 @@
+"""The words of options and arguments as values.
+
+Words of the command line that do not hold (AXIS=VALUE, lists, file names) become usage errors (exit
+code 2) that quote the word and state what is allowed. The twin, not this module, knows the names of
+the axes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+
+import typer
+
+from flexdt.library.failure import CommandError
+
+
+def number(word: str, what: str) -> float:
+    """A finite number, negative ones and exponents included.
+
+    Raises:
+        typer.BadParameter: not a finite number.
+    """
+    try:
+        value = float(word)
+    except ValueError:
+        raise typer.BadParameter(f"{what}: {word!r} is not a number") from None
+    if not math.isfinite(value):
+        raise typer.BadParameter(f"{what}: {word!r} is not finite")
+    return value
+
+
+def assignments(words: Iterable[str]) -> dict[str, float]:
+    """AXIS=VALUE words to axis -> value, in order.
+
+    Raises:
+        typer.BadParameter: a word of another form, or an axis given twice.
+    """
+    out: dict[str, float] = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        name = name.strip()
+        if not equals or not name or not value.strip():
+            raise typer.BadParameter(f"{word!r} is not of the form AXIS=VALUE, e.g. tra_obj=-12.5")
+        if name in out:
+            raise typer.BadParameter(f"{name} is given twice")
+        out[name] = number(value, f"the value of {name}")
+    return out
+
+
+def span(word: str, what: str) -> tuple[float, float]:
+    """LOWER:UPPER, or one number for both.
+
+    Raises:
+        typer.BadParameter: neither, or the lower is above the upper.
+    """
+    ends = [number(part, what) for part in word.split(":")]
+    if len(ends) > 2 or ends[0] > ends[-1]:
+        raise typer.BadParameter(f"{what}: {word!r} is not of the form VALUE or LOWER:UPPER")
+    return ends[0], ends[-1]
+
+
+def numbers(
+    word: str, what: str, form: str, *counts: int, by: str = ",", whole: bool = False
+) -> list[float]:
+    """A list of finite numbers.
+
+    Args:
+        word: from the command line.
+        what: is listed, for errors.
+        form: of the list with an example, for errors: `X,Y,Z, e.g. 0,0,-5.5`.
+        counts: how many there may be.
+        by: what separates them.
+        whole: they are whole and above 0.
+
+    Raises:
+        typer.BadParameter: another count, or a part that is no such number.
+    """
+    parts = [part.strip() for part in word.lower().split(by)]
+    if len(parts) not in counts or (whole and not all(p.isdecimal() and int(p) for p in parts)):
+        raise typer.BadParameter(f"{what} {word!r} is not {form}")
+    return [number(part, what) for part in parts]
+
+
+def triple(word: str, what: str, form: str) -> tuple[float, float, float]:
+    """Three of `numbers`."""
+    x, y, z = numbers(word, what, form, 3)
+    return x, y, z
+
+
+def position(word: str) -> tuple[float, float]:
+    """SOD[:LATERAL] to (SOD, lateral) [mm]; lateral is 0 if left out.
+
+    Raises:
+        typer.BadParameter: not numbers.
+    """
+    sod, _, lateral = word.partition(":")
+    return (
+        number(sod, "the SOD of --position"),
+        number(lateral, "the lateral of --position") if lateral else 0.0,
+    )
+
+
+def names(word: str) -> tuple[str, ...]:
+    """A comma-separated list of names, blanks dropped."""
+    return tuple(part.strip() for part in word.split(",") if part.strip())
+
+
+def require_ending(file: Path, *allowed: str) -> None:
+    """Check a file's ending.
+
+    Raises:
+        typer.BadParameter: another one.
+    """
+    if file.suffix.lower() not in allowed:
+        raise typer.BadParameter(f"{file.name}: the ending must be {' or '.join(allowed)}")
+
+
+def require_folder(*files: Path | None) -> None:
+    """Check that files can be written where they are to be.
+
+    Raises:
+        CommandError: a folder does not exist.
+    """
+    for file in files:
+        if file is not None and not file.absolute().parent.is_dir():
+            raise CommandError(f"{file}: the folder does not exist")
