@@ -11,6 +11,7 @@ A dot in the name stands for a group: `phantom.design` is `flexdt phantom design
 
 from flexdt.clients.cli.commands.process_commands import become
 from flexdt.clients.cli.console import note, size, table, warn
+from flexdt.clients.cli.one_line import OneLine
 from flexdt.clients.cli.option_values import assignments, names, numbers, position, triple
 from flexdt.clients.cli.options import (
     Answer,
@@ -29,7 +30,6 @@ from flexdt.library.failure import CommandError
 from flexdt.library.reconstruction.volume_files import volume_writer
 from flexdt.runtime.files.dataset_folder import tiff_bytes
 from flexdt.runtime.files.whole_files import free_bytes, write_whole
-from flexdt.runtime.process_settings import OneLine
 from flexdt.twin.values import message_of
 
 __all__ = [

@@ -1,31 +1,30 @@
-"""The options of each server process, declared once.
+"""The settings of each server process, and the values that their words stand for.
 
-Each process has a frozen dataclass of settings. The options of `python -m flexdt....main`, the keys
-of its table in the settings file, and the words that `flexdt up` starts its processes with are all
-derived from it. Command line and servers both import this module, so it stands above their two
-packages.
+Each process has a frozen dataclass of settings; what is derived from it: `flexdt.runtime.settings`.
 """
 
 # ruff: noqa: RUF009  (the calls make fields; they are not values shared by all instances)
 
 from __future__ import annotations
 
-import argparse
-import inspect
 import math
 import re
-import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeVar, get_args, get_type_hints
+from typing import Any, Final, Literal, get_args
 
 import typer
-from typer.main import get_command
 
-LOOPBACK = "127.0.0.1"
-LARGEST_PORT = 65535
-UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
+from flexdt.runtime.settings import Settings, option
+
+LOOPBACK: Final = "127.0.0.1"
+TWIN_PORT: Final = 55000
+PROJECTOR_PORT: Final = 55001
+VIEWER_PORT: Final = 8080
+GATEWAY_PORT: Final = 50000
+LARGEST_PORT: Final = 65535
+UNITS: Final = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
+"""Prefix of a unit -> bytes."""
 LogLevel = Literal["debug", "info", "warning", "error"]
 Physics = Literal["ideal", "mono", "poly"]
 Scatter = Literal["off", "mc"]
@@ -51,7 +50,7 @@ def address(text: str) -> Address:
     host, _, port = text.strip().rpartition(":")
     closed = host.startswith("[") == host.endswith("]")
     if not host or not closed or not (port.isascii() and port.isdigit()):
-        raise typer.BadParameter(f"{text!r} is not HOST:PORT, such as {LOOPBACK}:55000")
+        raise typer.BadParameter(f"{text!r} is not HOST:PORT, such as {LOOPBACK}:{TWIN_PORT}")
     if not 1 <= int(port) <= LARGEST_PORT:
         raise typer.BadParameter(f"{text!r}: the port must be a number from 1 to {LARGEST_PORT}")
     return Address(host.strip("[]"), int(port))
@@ -115,34 +114,11 @@ def scatter_method(text: str) -> str:
     return text
 
 
-def option(default: object, *flags: str, public: bool = True, **details: Any) -> Any:
-    """A field of settings that is an option; its help is what the class's docstring says of it.
-
-    Args:
-        default: where the option is left out.
-        flags: as typed; they follow from the field's name.
-        public: whether `flexdt up` lists it in its help.
-        details: of `typer.Option`, such as metavar, min, max and parser.
-    """
-    return field(default=default, metadata={"public": public, "flags": flags, "details": details})
-
-
 def tcp_port(
     default: int | None, *flags: str, most: int = LARGEST_PORT, public: bool = True
 ) -> Any:
     """A field for a TCP port."""
     return option(default, *flags, public=public, min=0, max=most)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Settings:
-    """A table of the settings file.
-
-    Attributes:
-        command: the `flexdt` command that the table is for.
-    """
-
-    command: ClassVar[str]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,7 +168,7 @@ class ProjectorSettings(ServerSettings):
     """
 
     command = "projector"
-    port: int = tcp_port(55001, "--port", "--projector-port")
+    port: int = tcp_port(PROJECTOR_PORT, "--port", "--projector-port")
     threads: int | None = option(None, min=1)
     memory_limit: int | None = option(None, metavar="SIZE", parser=memory_size)
 
@@ -214,7 +190,7 @@ class ScannerSettings(ServerSettings):
         fresh: Start anew instead of where the last twin left off.
     """
 
-    port: int = tcp_port(55000)
+    port: int = tcp_port(TWIN_PORT)
     data: Path | None = option(None, metavar="DIR")
     machine: str | None = option(None, metavar="FILE or NAME")
     profile: str | None = option(None, metavar="NAME")
@@ -227,7 +203,20 @@ class ScannerSettings(ServerSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TwinSettings(ScannerSettings):
+class FarProjectorSettings(Settings):
+    """What `flexdt twin` and `flexdt up` share of projectors on other machines.
+
+    Attributes:
+        projectors: Deal the views among these projectors, too.
+        projector_token_file: Show this file's token to the projectors.
+    """
+
+    projectors: str | None = option(None, public=False, metavar="HOST:PORT,...", parser=several)
+    projector_token_file: Path | None = option(None, public=False, metavar="FILE")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwinSettings(FarProjectorSettings, ScannerSettings):
     """`flexdt twin`.
 
     Attributes:
@@ -235,8 +224,6 @@ class TwinSettings(ScannerSettings):
         machine: Simulate this machine: a shipped name or a TOML file.
         projector: Connect to the projector that listens there; default: 127.0.0.1:55001.
         projector_port: Connect to the projector on this port of 127.0.0.1 instead.
-        projectors: Deal the views among these projectors, too.
-        projector_token_file: Show this file's token to the projectors.
         projector_tls_ca: Speak TLS with the projectors and trust this certificate.
         no_noise: Make images of expected counts, without noise.
     """
@@ -246,8 +233,6 @@ class TwinSettings(ScannerSettings):
     machine: str = option("flexray", metavar="FILE or NAME")
     projector: Address | None = option(None, metavar="HOST:PORT", parser=address)
     projector_port: int | None = tcp_port(None)
-    projectors: str | None = option(None, public=False, metavar="HOST:PORT,...", parser=several)
-    projector_token_file: Path | None = option(None, metavar="FILE")
     projector_tls_ca: Path | None = option(None, metavar="FILE")
     no_noise: bool = option(False, public=False)
 
@@ -257,7 +242,7 @@ class TwinSettings(ScannerSettings):
         port = None if self.projector_port is None else Address(LOOPBACK, self.projector_port)
         named = [place for place in (self.projector or port,) if place is not None]
         found = tuple(dict.fromkeys((*named, *addresses(self.projectors))))
-        return found or (Address(LOOPBACK, 55001),)
+        return found or (Address(LOOPBACK, PROJECTOR_PORT),)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -290,8 +275,8 @@ class ViewerSettings(TwinClientSettings, ServerSettings):
     """
 
     command = "viewer"
-    port: int = tcp_port(8080, "--port", "--viewer-port")
-    twin: Address = option(Address(LOOPBACK, 55000), metavar="HOST:PORT", parser=address)
+    port: int = tcp_port(VIEWER_PORT, "--port", "--viewer-port")
+    twin: Address = option(Address(LOOPBACK, TWIN_PORT), metavar="HOST:PORT", parser=address)
     token_file: Path | None = option(None, metavar="FILE")
 
 
@@ -309,133 +294,27 @@ class GatewaySettings(TwinClientSettings):
 
     command = "gateway"
     host: str = option(LOOPBACK, "--bind", "--host", metavar="HOST")
-    port: int = tcp_port(50000)
+    port: int = tcp_port(GATEWAY_PORT)
     inbound_port: int | None = tcp_port(None)
-    server: Address = option(Address(LOOPBACK, 55000), metavar="HOST:PORT", parser=address)
+    server: Address = option(Address(LOOPBACK, TWIN_PORT), metavar="HOST:PORT", parser=address)
     data: Path = option(Path("data"), metavar="DIR")
 
 
 @dataclass(frozen=True, kw_only=True)
-class UpSettings(ScannerSettings):
+class UpSettings(FarProjectorSettings, ScannerSettings):
     """`flexdt up`: those of the twin, and what the other processes need.
 
     Attributes:
         projector_port: Give the projector this port; 0 is any free one.
         projector_memory: Let the projector hold volumes of this size, e.g. 4GiB.
-        projectors: Deal the views among these projectors, too.
-        projector_token_file: Show this file's token to the projectors.
         viewer_port: Give the viewer this port; 0 is any free one.
         no_viewer: Start no viewer.
         gateway_port: Serve Acquila's interface on this port and the next (see gateway).
     """
 
     command = "up"
-    projector_port: int = tcp_port(55001)
+    projector_port: int = tcp_port(PROJECTOR_PORT)
     projector_memory: str | None = option(None, public=False, metavar="SIZE")
-    projectors: str | None = option(None, public=False, metavar="HOST:PORT,...", parser=several)
-    projector_token_file: Path | None = option(None, public=False, metavar="FILE")
-    viewer_port: int = tcp_port(8080)
+    viewer_port: int = tcp_port(VIEWER_PORT)
     no_viewer: bool = option(False)
     gateway_port: int | None = tcp_port(None, most=LARGEST_PORT - 1)
-
-
-S = TypeVar("S", bound=Settings)
-
-
-def parameters(settings: type[Settings]) -> dict[str, inspect.Parameter]:
-    """A table's keys as options: parameters of a function that typer reads."""
-    hints, found = get_type_hints(settings), {}
-    helps = {n: h for kind in settings.__mro__[::-1] for n, h in described(kind)[1].items()}
-    for f in fields(settings):
-        flags = f.metadata["flags"] or (f"--{f.name.replace('_', '-')}",)
-        default = str(f.default) if isinstance(f.default, Address) else f.default
-        kind: Any = list[str] if isinstance(default, tuple) else hints[f.name]
-        details = {"help": helps.get(f.name, ""), **f.metadata["details"]}
-        found[f.name] = inspect.Parameter(
-            f.name, inspect.Parameter.KEYWORD_ONLY,
-            default=[*default] if isinstance(default, tuple) else default,
-            annotation=Annotated[kind, typer.Option(*flags, **details)],
-        )  # fmt: skip
-    return found
-
-
-def described(thing: object) -> tuple[str, dict[str, str]]:
-    """A docstring without its list of arguments or attributes, and what the list says of each."""
-    text, *lists = re.split(r"\n\n(?:Args|Attributes):\n", inspect.getdoc(thing) or "")
-    items = re.findall(r"^    (\w+): (.*(?:\n {5,}.*)*)", "\n".join(lists), re.MULTILINE)
-    return text, {name: " ".join(about.split()) for name, about in items}
-
-
-def has_parameters(command: Callable[..., Any], shown: Iterable[inspect.Parameter]) -> None:
-    """Have typer see these parameters as those of a command, by name alone."""
-    named = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in shown]
-    command.__signature__ = inspect.Signature(named)  # type: ignore[attr-defined]
-    command.__annotations__ = {p.name: p.annotation for p in named}
-
-
-def read(settings: type[S], words: Sequence[str] | None = None) -> S | None:
-    """The settings that words say; None where they asked for the help, which is shown.
-
-    Args:
-        settings: class of the process or command.
-        words: of the command line, `sys.argv`'s where left out.
-
-    Raises:
-        Exception: typer's usage errors, of any version; they have a `format_message`.
-    """
-    found: dict[str, Any] = {}
-
-    def take(**given: Any) -> None:
-        found.update({n: tuple(v) if isinstance(v, list) else v for n, v in given.items()})
-
-    has_parameters(take, parameters(settings).values())
-    app = typer.Typer(add_completion=False, rich_markup_mode=None)
-    app.command(context_settings={"help_option_names": ["-h", "--help"]})(take)
-    get_command(app).main(words, f"flexdt {settings.command}", standalone_mode=False)
-    return settings(**found) if found else None
-
-
-def parse(settings: type[S], words: Sequence[str] | None = None) -> S:
-    """As `read`, in a process of its own: exits with code 2 where the words are wrong."""
-    try:
-        found = read(settings, words)
-    except Exception as error:
-        if not hasattr(error, "format_message"):
-            raise
-        print(f"flexdt {settings.command}: {error.format_message()}", file=sys.stderr)
-        sys.exit(2)
-    if found is None:
-        sys.exit(0)
-    return found
-
-
-def words(given: Mapping[str, object]) -> list[str]:
-    """Options as words of a command line.
-
-    Args:
-        given: name -> value; None and False are left out, True is a bare flag, a list or tuple is
-            given once for each item.
-    """
-    out = []
-    for name, value in given.items():
-        flag = f"--{name.replace('_', '-')}"
-        if value is True:
-            out.append(flag)
-        elif value is not None and value is not False:
-            each: Iterable[object] = value if isinstance(value, list | tuple) else [value]
-            out += [word for item in each for word in (flag, str(item))]
-    return out
-
-
-def shared(settings: ProcessSettings, other: type[ProcessSettings]) -> dict[str, object]:
-    """The values of `settings` that a process with settings `other` takes too, by name."""
-    mine = {f.name for f in fields(settings)}
-    return {f.name: getattr(settings, f.name) for f in fields(other) if f.name in mine}
-
-
-class OneLine(argparse.ArgumentParser):
-    """Reports a wrong option in one line, without the page of all options."""
-
-    def error(self, message: str) -> NoReturn:
-        """Exit with code 2."""
-        self.exit(2, f"{self.prog}: {message}\n")

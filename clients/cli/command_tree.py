@@ -28,6 +28,7 @@ from flexdt.clients.cli.commands import expose_command as exposure
 from flexdt.clients.cli.commands import follow_command as following
 from flexdt.clients.cli.commands import job_commands as jobs
 from flexdt.clients.cli.commands import machine_commands as machines
+from flexdt.clients.cli.commands import new_machine_command as new_machine
 from flexdt.clients.cli.commands import phantom_commands as phantoms
 from flexdt.clients.cli.commands import process_commands as processes
 from flexdt.clients.cli.commands import scanner_commands as scanner
@@ -67,7 +68,7 @@ GROUPS: Final[Mapping[str, tuple[str, Mapping[str, Callable[..., object]]]]] = {
             "list": machines.list_machines,
             "show": machines.show,
             "check": machines.check,
-            "new": machines.new,
+            "new": new_machine.new,
             "fit": machines.fit,
         },
     ),

@@ -15,7 +15,7 @@ import typer
 
 from flexdt.clients.cli.connection import connect
 from flexdt.clients.cli.console import emit, say
-from flexdt.runtime.process_settings import described, has_parameters
+from flexdt.runtime.settings import described, has_parameters
 
 GIVEN: Final = ("context", "twin", "json")
 """Parameters of commands that are no options of theirs."""

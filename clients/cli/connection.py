@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from flexdt.clients.cli.settings_file import configuration
 from flexdt.library.failure import CommandError
-from flexdt.runtime.process_settings import LOOPBACK, address
+from flexdt.runtime.process_settings import LOOPBACK, TWIN_PORT, Address, address
 
 if TYPE_CHECKING:
     from flexdt.clients.client.client import TwinClient
 
-DEFAULT_SERVER = "127.0.0.1:55000"
-DEFAULT_PORT = 55000
+DEFAULT_SERVER: Final = str(Address(LOOPBACK, TWIN_PORT))
 
 
 def connect(server: str | None = None, token_file: str | None = None) -> TwinClient:
@@ -55,6 +54,6 @@ def server_address(word: str) -> tuple[str, int]:
     if text.count(":") > 1 and "[" not in text:  # an IPv6 address by itself
         text = f"[{text}]"
     if ":" not in text.rpartition("]")[2]:
-        text += f":{DEFAULT_PORT}"
+        text += f":{TWIN_PORT}"
     found = address(f"{LOOPBACK}{text}" if text.startswith(":") else text)
     return found.host, found.port

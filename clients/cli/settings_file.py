@@ -20,98 +20,37 @@ from __future__ import annotations
 
 import os
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
+from typing import Any, Final, TypeVar
 
+from flexdt.clients.cli.command_settings import (
+    CalibrateSettings,
+    MachineNewSettings,
+    PhantomMakeSettings,
+    ReconstructSettings,
+    ScriptNewSettings,
+)
 from flexdt.library.failure import CommandError
 from flexdt.runtime.process_settings import (
     GatewaySettings,
     ProjectorSettings,
-    Settings,
     TwinSettings,
     UpSettings,
     ViewerSettings,
-    option,
-    read,
-    words,
 )
-from flexdt.twin.algorithms import PLAIN, WINDOWS
-
-if TYPE_CHECKING:
-    Window = str
-else:
-    Window = Literal[tuple(WINDOWS)]
+from flexdt.runtime.settings import Settings, option, read, words
 
 S = TypeVar("S", bound=Settings)
 
 PREFIX: Final = "FLEXDT_"
-PATHS: Final = ("token_file", "tls_ca", "data")
+PATHS: Final = ("FILE", "DIR")
+"""What values are that may begin with ~."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class CalibrateSettings(Settings):
-    """`flexdt calibrate`.
-
-    Attributes:
-        bound: Refuse a sigma above this (mm, deg).
-    """
-
-    command = "calibrate"
-    bound: float = option(5.0)
-
-
-@dataclass(frozen=True, kw_only=True)
-class MachineNewSettings(Settings):
-    """`flexdt machine new`.
-
-    Attributes:
-        scanner: Name the scanner so in data sets.
-    """
-
-    command = "machine new"
-    scanner: str | None = option(None)
-
-
-@dataclass(frozen=True, kw_only=True)
-class PhantomMakeSettings(Settings):
-    """`flexdt phantom make`.
-
-    Attributes:
-        bead: Make the beads of this material.
-    """
-
-    command = "phantom make"
-    bead: str = option("steel")
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReconstructSettings(Settings):
-    """`flexdt reconstruct`.
-
-    Attributes:
-        window: Filter FDK with this window.
-    """
-
-    command = "reconstruct"
-    window: Window = option(PLAIN)  # noqa: RUF009
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScriptNewSettings(Settings):
-    """`flexdt script new`.
-
-    Attributes:
-        height: Set the height of source and detector centre [mm].
-    """
-
-    command = "script new"
-    height: float | None = option(None)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Configuration:
+class Configuration(Settings):
     """Defaults of commands; None where neither file nor environment says anything.
 
     Attributes:
@@ -123,11 +62,11 @@ class Configuration:
         tables: options of processes and commands, by the names of their tables.
     """
 
-    server: str | None = None
-    token: str | None = None
-    token_file: str | None = None
-    tls_ca: str | None = None
-    data: str | None = None
+    server: str | None = option(None, metavar="HOST:PORT")
+    token: str | None = option(None, metavar="TEXT")
+    token_file: str | None = option(None, metavar="FILE")
+    tls_ca: str | None = option(None, metavar="FILE")
+    data: str | None = option(None, metavar="DIR")
     tables: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
 
 
@@ -142,7 +81,10 @@ TABLES: Final[Mapping[str, type[Settings]]] = {
 """Tables of the file, and what their keys are."""
 ELSEWHERE: Final[Mapping[str, str]] = {"doctor": "up"}
 """Commands that read the table of another one."""
-KEYS: Final = tuple(f.name for f in fields(Configuration) if f.name != "tables")
+KEYS: Final = {
+    f.name: f.metadata["details"]["metavar"] for f in fields(Configuration) if f.metadata
+}
+"""Keys of the file that stand in no table -> what they are; `FLEXDT_` and a key is a variable."""
 
 
 def config_file(environ: Mapping[str, str]) -> Path:
@@ -176,10 +118,10 @@ def configuration(environ: Mapping[str, str] | None = None) -> Configuration:
         raise CommandError(f"{where} are both set; allowed: one of them")
     tables = {name: found.pop(name) for name in TABLES if name in found}
     given = {key: value for key, value in found.items() if value}
-    for key in PATHS:
-        if key in given:
-            given[key] = str(Path(given[key]).expanduser())
-    return Configuration(**given, tables=tables)
+    paths = {
+        key: str(Path(value).expanduser()) for key, value in given.items() if KEYS[key] in PATHS
+    }
+    return Configuration(**given | paths, tables=tables)
 
 
 def _of_file(path: Path, *, required: bool) -> dict[str, Any]:
@@ -194,20 +136,26 @@ def _of_file(path: Path, *, required: bool) -> dict[str, Any]:
         raise CommandError(f"{path}: {why}") from None
     except tomllib.TOMLDecodeError as error:
         raise CommandError(f"{path}: not valid TOML: {error}") from None
-    for key, value in document.items():
-        if key in TABLES and isinstance(value, dict):
-            allowed = [f.name for f in fields(TABLES[key])]
-            for name in value:
-                if name not in allowed:
-                    what = f"{path}: [{key}] unknown key {name!r}; allowed"
-                    raise CommandError(f"{what}: {', '.join(allowed)}")
-            continue
-        if key not in KEYS:
-            allowed = [*KEYS, *(f"[{name}]" for name in TABLES)]
-            raise CommandError(f"{path}: unknown key {key!r}; allowed: {', '.join(allowed)}")
+    tables = {key: value for key, value in document.items() if key in TABLES}
+    for key, table in tables.items():
+        if isinstance(table, dict):
+            _require_known(f"{path}: [{key}]", table, [f.name for f in fields(TABLES[key])])
+    plain = {k: v for k, v in document.items() if not isinstance(tables.get(k), dict)}
+    _require_known(f"{path}:", plain, KEYS, [f"[{name}]" for name in TABLES])
+    for key, value in plain.items():
         if not isinstance(value, str) or not value:
             raise CommandError(f"{path}: {key} is {value!r}; allowed: a text that is not empty")
     return dict(document)
+
+
+def _require_known(
+    where: str, given: Iterable[str], known: Collection[str], tables: Sequence[str] = ()
+) -> None:
+    """Check the keys of a table, or those that stand in none, beside which there are tables."""
+    for key in given:
+        if key not in known:
+            allowed = ", ".join((*known, *tables))
+            raise CommandError(f"{where} unknown key {key!r}; allowed: {allowed}")
 
 
 def settings_of(kind: type[S], more: Sequence[str] = ()) -> S | None:
@@ -222,7 +170,11 @@ def settings_of(kind: type[S], more: Sequence[str] = ()) -> S | None:
         Exception: typer's usage errors of `more`.
     """
     own = configuration()
-    data = {"data": own.data or "data"} if issubclass(kind, UpSettings | TwinSettings) else {}
+    data = (
+        {"data": own.data or TwinSettings.data}
+        if issubclass(kind, UpSettings | TwinSettings)
+        else {}
+    )
     name = kind.command.replace(" ", "_")
     given = words({**data, **own.tables.get(name, {})})
     try:

@@ -25,7 +25,8 @@ from flexdt.runtime.process import (
     run_process,
     stop_signal,
 )
-from flexdt.runtime.process_settings import GatewaySettings, parse
+from flexdt.runtime.process_settings import GatewaySettings
+from flexdt.runtime.settings import parse
 from flexdt.twin.machine.description import parse_profile
 
 EVENTS_HZ = 20.0

@@ -23,7 +23,8 @@ from typing import IO, Literal
 
 from flexdt.clients.client.client import TwinClient
 from flexdt.library.failure import CommandError
-from flexdt.runtime.process_settings import Physics, Scatter, words
+from flexdt.runtime.process_settings import Physics, Scatter
+from flexdt.runtime.settings import words
 from flexdt.twin.signatures import public
 
 STOP_TIMEOUT_S = 30.0

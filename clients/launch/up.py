@@ -24,10 +24,8 @@ from flexdt.runtime.process_settings import (
     TwinSettings,
     UpSettings,
     ViewerSettings,
-    parse,
-    shared,
-    words,
 )
+from flexdt.runtime.settings import parse, shared, words
 from flexdt.runtime.supervisor import (
     Addresses,
     Service,

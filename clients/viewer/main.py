@@ -35,7 +35,8 @@ from flexdt.runtime.process import (
     run_process,
     stop_signal,
 )
-from flexdt.runtime.process_settings import Address, ViewerSettings, parse
+from flexdt.runtime.process_settings import Address, ViewerSettings
+from flexdt.runtime.settings import parse
 from flexdt.twin.machine.description import parse_profile
 
 if TYPE_CHECKING:

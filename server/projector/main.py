@@ -13,7 +13,8 @@ from flexdt.runtime.access import ConnectionLimits, read_token, server_tls, with
 from flexdt.runtime.files.directory import memory_bytes
 from flexdt.runtime.log import LEVELS, set_up
 from flexdt.runtime.process import OK, announce, announce_bound, run_process, stop_signal
-from flexdt.runtime.process_settings import ProjectorSettings, parse
+from flexdt.runtime.process_settings import ProjectorSettings
+from flexdt.runtime.settings import parse
 
 
 async def run(options: ProjectorSettings) -> int:

@@ -14,7 +14,8 @@ from flexdt.library import machines
 from flexdt.runtime import access
 from flexdt.runtime.log import LEVELS, set_up
 from flexdt.runtime.process import FAILED, OK, announce, first_of, run_process, stop_signal
-from flexdt.runtime.process_settings import TwinSettings, parse
+from flexdt.runtime.process_settings import TwinSettings
+from flexdt.runtime.settings import parse
 
 DEFAULT_SAMPLE = "lego"
 SWITCH_S = 0.001

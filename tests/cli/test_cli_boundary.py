@@ -14,7 +14,7 @@ from flexdt.clients.cli import boundary, command_tree
 from flexdt.clients.cli.commands import process_commands as processes
 from flexdt.library.failure import CommandError
 from flexdt.protocol.rpc_errors import RpcError
-from flexdt.runtime.process_settings import words
+from flexdt.runtime.settings import words
 from flexdt.twin import errors as twin
 
 HEAVY = ("numpy", "scipy", "numba", "trimesh", "fcl", "cv2", "viser", "pydantic", "tifffile",

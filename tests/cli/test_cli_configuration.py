@@ -209,6 +209,8 @@ def test_a_command_that_does_not_heed_an_option_says_so(
         ("server = ", "not valid TOML"),
         ('sever = "a:1"', "unknown key 'sever'; allowed: server, token"),
         ("server = 55000", "server is 55000; allowed: a text"),
+        ("twin = 5", "unknown key 'twin'; allowed: server, token"),
+        ('"[twin]" = "x"', "unknown key '[twin]'; allowed: server, token"),
         ('data = ""', "data is ''"),
         ('token = "a"\ntoken_file = "b"', "token and token_file"),
     ],

@@ -15,7 +15,7 @@ from typer.main import get_command
 
 from flexdt.clients.cli.command_tree import SECTIONS, build
 from flexdt.clients.cli.settings_file import TABLES
-from flexdt.runtime.process_settings import parameters
+from flexdt.runtime.settings import parameters
 
 MOST_OPTIONS = 216
 THEIRS = ("flexdt study", "flexdt batch", "flexdt bench", "flexdt phantom design")

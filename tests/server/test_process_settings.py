@@ -19,10 +19,8 @@ from flexdt.runtime.process_settings import (
     TwinSettings,
     UpSettings,
     ViewerSettings,
-    parse,
-    shared,
-    words,
 )
+from flexdt.runtime.settings import parse, shared, words
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 
 PROCESSES = (UpSettings, TwinSettings, ProjectorSettings, ViewerSettings, GatewaySettings)

@@ -23,7 +23,8 @@ from flexdt.clients.launch.up import main as up_main
 from flexdt.clients.launch.up import services
 from flexdt.runtime import process as processes
 from flexdt.runtime import supervisor as module
-from flexdt.runtime.process_settings import Address, UpSettings, parse
+from flexdt.runtime.process_settings import Address, UpSettings
+from flexdt.runtime.settings import parse
 from flexdt.runtime.supervisor import Addresses, Service, ServiceError, Supervisor
 
 pytestmark = pytest.mark.slow

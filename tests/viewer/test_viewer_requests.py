@@ -30,7 +30,8 @@ from flexdt.clients.viewer.page import HIDDEN, MAX_NOTES, Page
 from flexdt.clients.viewer.page_methods import METHODS, serve
 from flexdt.protocol import METHODS as WIRE
 from flexdt.protocol import Connection, Notification, Request, Response
-from flexdt.runtime.process_settings import Address, UpSettings, ViewerSettings, parse
+from flexdt.runtime.process_settings import Address, UpSettings, ViewerSettings
+from flexdt.runtime.settings import parse
 
 pytestmark = pytest.mark.slow
 

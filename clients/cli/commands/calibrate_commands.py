@@ -15,10 +15,11 @@ import typer
 
 from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
+from flexdt.clients.cli.command_settings import CalibrateSettings
 from flexdt.clients.cli.commands.data_commands import said
 from flexdt.clients.cli.console import as_json, note, table, warn
 from flexdt.clients.cli.options import Answer, Twin, argument, option
-from flexdt.clients.cli.settings_file import CalibrateSettings, chosen
+from flexdt.clients.cli.settings_file import chosen
 from flexdt.library.failure import CommandError
 from flexdt.runtime.files.whole_files import write_whole
 

@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import typer
 
 from flexdt.clients.cli import option_values, options
+from flexdt.clients.cli.command_settings import ReconstructSettings
 from flexdt.clients.cli.console import ProgressBar, duration, note, size, warn
 from flexdt.clients.cli.options import Answer, Twin, argument, option
-from flexdt.clients.cli.settings_file import ReconstructSettings, chosen
+from flexdt.clients.cli.settings_file import chosen
 from flexdt.library.datasets.exchange_formats import FORMATS, exported, imported
 from flexdt.library.failure import CommandError
 from flexdt.twin.algorithms import ALGORITHMS, DEFAULT

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Final
 
 import typer
 
 from flexdt.clients.cli.options import Answer
 from flexdt.clients.cli.settings_file import chosen
-from flexdt.runtime.process_settings import UpSettings
+from flexdt.runtime.process_settings import TwinSettings, UpSettings
 
 MARKS: Final = {"ok": "ok     ", "warning": "warning", "error": "ERROR  "}
 """Verdict on a finding -> the word before it, padded."""
@@ -26,7 +25,7 @@ def doctor() -> Answer:
     up = chosen(UpSettings)
     ports = (("twin", up.port), ("projector", up.projector_port), ("viewer", up.viewer_port))
     findings = []
-    for finding in examine(up.data or Path("data"), ports):
+    for finding in examine(up.data or TwinSettings.data, ports):
         findings.append(finding)
         advice = f" -> {finding.advice}" if finding.advice else ""
         yield f"{MARKS[finding.verdict]}  {finding.what}: {finding.found}{advice}"

@@ -1,18 +1,15 @@
-"""`flexdt machine`: machines as data, shown, checked, new, and fitted to logs of scripts."""
+"""`flexdt machine`: machines as data, shown, checked, and fitted to logs of scripts."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from flexdt.clients.cli import option_values
 from flexdt.clients.cli.commands.script_files import read_log_file, tell
 from flexdt.clients.cli.console import table
 from flexdt.clients.cli.options import Answer, argument, option
-from flexdt.clients.cli.settings_file import MachineNewSettings, chosen
 from flexdt.library import machines
 
 if TYPE_CHECKING:
@@ -20,8 +17,6 @@ if TYPE_CHECKING:
 
 COMMENTS: Final = "as the file's comments say"
 """Source of a value whose source is no value of the file."""
-USUAL_BASE: Final = "xyzr_cabinet"
-"""Machine that a new one begins with."""
 NameOrFile = Annotated[str, typer.Argument(metavar="NAME or FILE", help="Shipped, or TOML.")]
 
 
@@ -61,101 +56,6 @@ def check(name: NameOrFile) -> Answer:
     yield _places(found)
     if not found.components:
         yield "\nno components: nothing is checked for collisions"
-
-
-def new(
-    name: str = argument(..., "NAME"),
-    out: Path = option(..., metavar="FILE"),
-    base: str | None = option(None, metavar="NAME"),
-    detector: str | None = option(None, metavar="COLUMNSxROWS"),
-    pitch: str | None = option(None, metavar="MM[xMM]"),
-    bits: int | None = option(None),
-    sod: str | None = option(None, metavar="MM or MM:MM"),
-    sdd: str | None = option(None, metavar="MM or MM:MM"),
-    kv: str | None = option(None, metavar="KV or KV:KV"),
-    power: float | None = option(None, metavar="W"),
-    limit: list[str] | None = option(None, metavar="AXIS=LOWER:UPPER"),
-    without: list[str] | None = option(None, metavar="AXIS"),
-) -> Answer:
-    """Write a short file for a machine of your own; asks for what is not said, on a terminal.
-
-    Args:
-        name: One word.
-        out: Write the machine to this file.
-        base: Begin with this machine, the most similar.
-        detector: Set the detector's unbinned columns and rows.
-        pitch: Set the pitch of columns, and of rows.
-        bits: Set the bits of a pixel.
-        sod: Set source to axis, or least:most.
-        sdd: Set source to panel, or least:most.
-        kv: Set the largest voltage, or least:most.
-        power: Set the largest power.
-        limit: Set an axis's travel so.
-        without: Leave out this axis.
-    """
-    from flexdt.twin.collision.home_check import check_home
-    from flexdt.twin.machine.description import builtin_machine, builtin_machines, parse_machine
-    from flexdt.twin.machine.kinematics import place
-    from flexdt.twin.machine.new_machine import Answers, new_machine_text
-
-    base = _asked(f"Most like which of {', '.join(builtin_machines())}", base, USUAL_BASE)
-    base = base or USUAL_BASE
-    like = builtin_machine(base)
-    panel = like.detector
-    usual = [
-        ":".join(f"{end:g}" for end in dict.fromkeys((at.least, at.most)))
-        for at in (place(like, "object_y"), place(like, "detector_y"))
-    ]
-    size = _asked("Panel, columns x rows", detector, f"{panel.columns}x{panel.rows}")
-    pitch = _asked("Pixel, mm", pitch, f"{panel.pitch_mm:g}")
-    sod = _asked("SOD, mm: one if fixed, or least:greatest", sod, usual[0])
-    sdd = _asked("SDD, mm: one if fixed, or least:greatest", sdd, usual[1])
-    kv = _asked(
-        "Tube, kV: at most, or least:most", kv, f"{like.tube.min_kV:g}:{like.tube.max_kV:g}"
-    )
-    volts = None if kv is None else option_values.span(kv, "--kv")
-    pixels = None if size is None else _pair(size, "--detector", whole=True)
-    lines = [word.partition("=") for word in limit or []]
-    answers = Answers(
-        name=name,
-        base=base,
-        scanner=chosen(MachineNewSettings).scanner,
-        columns=None if pixels is None else int(pixels[0]),
-        rows=None if pixels is None else int(pixels[1]),
-        pitch_mm=None if pitch is None else _pair(pitch, "--pitch"),
-        bits=bits,
-        sod_mm=None if sod is None else option_values.span(sod, "--sod"),
-        sdd_mm=None if sdd is None else option_values.span(sdd, "--sdd"),
-        min_kV=volts[0] if volts is not None and ":" in str(kv) else None,
-        max_kV=None if volts is None else volts[1],
-        max_W=None if power is None else option_values.number(f"{power}", "--power"),
-        limits={axis: option_values.span(ends, f"--limit {axis}") for axis, _, ends in lines},
-        without=tuple(without or ()),
-    )
-    text = new_machine_text(answers)
-    made = parse_machine(text, str(out))
-    check_home(made, machines.profile(None, made, str(out)), str(out))
-    out.write_text(text, encoding="utf-8")
-    least = f", the tube's least voltage ({made.tube.min_kV:g} kV) included"
-    yield {"file": str(out), "text": text}
-    yield (
-        f"{out}: {len(text.splitlines())} lines; everything else as in {base}"
-        f"{least if answers.min_kV is None else ''}; see: flexdt machine show {out}"
-    )
-
-
-def _asked(question: str, given: str | None, usual: str) -> str | None:
-    """What was given, else what a person at a terminal answers; None for what is usual."""
-    if given is not None or not sys.stdin.isatty():
-        return given
-    answer: str = typer.prompt(question, default=usual, err=True)
-    return None if answer == usual else answer
-
-
-def _pair(word: str, what: str, *, whole: bool = False) -> tuple[float, float]:
-    form = "of the form NUMBERxNUMBER"
-    found = option_values.numbers(word, f"{what}:", form, 1, 2, by="x", whole=whole)
-    return found[0], found[-1]
 
 
 def fit(

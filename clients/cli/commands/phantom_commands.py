@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 import typer
 
 from flexdt.clients.cli import option_values
+from flexdt.clients.cli.command_settings import PhantomMakeSettings
 from flexdt.clients.cli.console import note, table
 from flexdt.clients.cli.options import Answer, argument, option
-from flexdt.clients.cli.settings_file import PhantomMakeSettings, chosen
+from flexdt.clients.cli.settings_file import chosen
 
 if TYPE_CHECKING:
     from flexdt.phantoms import Phantom

@@ -15,7 +15,8 @@ from typing import Annotated, Any, Final, Literal, NoReturn
 import typer
 
 from flexdt.clients.cli.settings_file import TABLES, settings_of
-from flexdt.runtime.process_settings import UpSettings, has_parameters, parameters, words
+from flexdt.runtime.process_settings import UpSettings
+from flexdt.runtime.settings import has_parameters, parameters, words
 
 MODULES: Final = {
     "up": "flexdt.clients.launch.up",

@@ -9,10 +9,11 @@ from typing import Any, Literal
 import typer
 
 from flexdt.clients.cli import option_values, options
+from flexdt.clients.cli.command_settings import ScriptNewSettings
 from flexdt.clients.cli.commands.script_files import exit_code, tell
 from flexdt.clients.cli.console import duration, size
 from flexdt.clients.cli.options import Answer, option
-from flexdt.clients.cli.settings_file import ScriptNewSettings, chosen
+from flexdt.clients.cli.settings_file import chosen
 from flexdt.library import machines
 from flexdt.library.failure import CommandError
 

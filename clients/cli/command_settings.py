@@ -1,0 +1,74 @@
+"""Rarely changed choices of commands: keys of the settings file, not options."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from flexdt.runtime.settings import Settings, option
+from flexdt.twin.algorithms import PLAIN, WINDOWS
+
+if TYPE_CHECKING:
+    Window = str
+else:
+    Window = Literal[tuple(WINDOWS)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateSettings(Settings):
+    """`flexdt calibrate`.
+
+    Attributes:
+        bound: Refuse a sigma above this (mm, deg).
+    """
+
+    command = "calibrate"
+    bound: float = option(5.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MachineNewSettings(Settings):
+    """`flexdt machine new`.
+
+    Attributes:
+        scanner: Name the scanner so in data sets.
+    """
+
+    command = "machine new"
+    scanner: str | None = option(None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhantomMakeSettings(Settings):
+    """`flexdt phantom make`.
+
+    Attributes:
+        bead: Make the beads of this material.
+    """
+
+    command = "phantom make"
+    bead: str = option("steel")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructSettings(Settings):
+    """`flexdt reconstruct`.
+
+    Attributes:
+        window: Filter FDK with this window.
+    """
+
+    command = "reconstruct"
+    window: Window = option(PLAIN)  # noqa: RUF009
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScriptNewSettings(Settings):
+    """`flexdt script new`.
+
+    Attributes:
+        height: Set the height of source and detector centre [mm].
+    """
+
+    command = "script new"
+    height: float | None = option(None)

@@ -1,0 +1,140 @@
+"""Settings declared once: fields of a frozen dataclass, with their help, bounds and defaults.
+
+The options of `python -m flexdt....main`, the keys of a table of the settings file, and the words
+that a process is started with are all derived from the declaration. Servers and command line both
+import this module, so it stands above their two packages.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import Field, dataclass, field, fields
+from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
+
+import typer
+from typer.main import get_command
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """A table of the settings file.
+
+    Attributes:
+        command: the `flexdt` command that the table is for.
+    """
+
+    command: ClassVar[str]
+
+
+S = TypeVar("S", bound=Settings)
+
+
+def option(default: object, *flags: str, public: bool = True, **details: Any) -> Any:
+    """A field of settings that is an option; its help is what the class's docstring says of it.
+
+    Args:
+        default: where the option is left out.
+        flags: as typed; they follow from the field's name.
+        public: whether `flexdt up` lists it in its help.
+        details: of `typer.Option`, such as metavar, min, max and parser.
+    """
+    return field(default=default, metadata={"public": public, "flags": flags, "details": details})
+
+
+def parameters(settings: type[Settings]) -> dict[str, inspect.Parameter]:
+    """A table's keys as options: parameters of a function that typer reads."""
+    hints, found = get_type_hints(settings), {}
+    helps = {n: h for kind in settings.__mro__[::-1] for n, h in described(kind)[1].items()}
+    for f in fields(settings):
+        flags = f.metadata["flags"] or (f"--{f.name.replace('_', '-')}",)
+        default = str(f.default) if _is_read(f) else f.default
+        kind: Any = list[str] if isinstance(default, tuple) else hints[f.name]
+        details = {"help": helps.get(f.name, ""), **f.metadata["details"]}
+        found[f.name] = inspect.Parameter(
+            f.name, inspect.Parameter.KEYWORD_ONLY,
+            default=[*default] if isinstance(default, tuple) else default,
+            annotation=Annotated[kind, typer.Option(*flags, **details)],
+        )  # fmt: skip
+    return found
+
+
+def _is_read(declared: Field[Any]) -> bool:
+    """Whether a parser reads the default, as it reads words; None is left alone."""
+    return "parser" in declared.metadata["details"] and declared.default is not None
+
+
+def described(thing: object) -> tuple[str, dict[str, str]]:
+    """A docstring without its list of arguments or attributes, and what the list says of each."""
+    text, *lists = re.split(r"\n\n(?:Args|Attributes):\n", inspect.getdoc(thing) or "")
+    items = re.findall(r"^    (\w+): (.*(?:\n {5,}.*)*)", "\n".join(lists), re.MULTILINE)
+    return text, {name: " ".join(about.split()) for name, about in items}
+
+
+def has_parameters(command: Callable[..., Any], shown: Iterable[inspect.Parameter]) -> None:
+    """Have typer see these parameters as those of a command, by name alone."""
+    named = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in shown]
+    command.__signature__ = inspect.Signature(named)  # type: ignore[attr-defined]
+    command.__annotations__ = {p.name: p.annotation for p in named}
+
+
+def read(settings: type[S], words: Sequence[str] | None = None) -> S | None:
+    """The settings that words say; None where they asked for the help, which is shown.
+
+    Args:
+        settings: class of the process or command.
+        words: of the command line, `sys.argv`'s where left out.
+
+    Raises:
+        Exception: typer's usage errors, of any version; they have a `format_message`.
+    """
+    found: dict[str, Any] = {}
+
+    def take(**given: Any) -> None:
+        found.update({n: tuple(v) if isinstance(v, list) else v for n, v in given.items()})
+
+    has_parameters(take, parameters(settings).values())
+    app = typer.Typer(add_completion=False, rich_markup_mode=None)
+    app.command(context_settings={"help_option_names": ["-h", "--help"]})(take)
+    get_command(app).main(words, f"flexdt {settings.command}", standalone_mode=False)
+    return settings(**found) if found else None
+
+
+def parse(settings: type[S], words: Sequence[str] | None = None) -> S:
+    """As `read`, in a process of its own: exits with code 2 where the words are wrong."""
+    try:
+        found = read(settings, words)
+    except Exception as error:
+        if not hasattr(error, "format_message"):
+            raise
+        print(f"flexdt {settings.command}: {error.format_message()}", file=sys.stderr)
+        sys.exit(2)
+    if found is None:
+        sys.exit(0)
+    return found
+
+
+def words(given: Mapping[str, object]) -> list[str]:
+    """Options as words of a command line.
+
+    Args:
+        given: name -> value; None and False are left out, True is a bare flag, a list or tuple is
+            given once for each item.
+    """
+    out = []
+    for name, value in given.items():
+        flag = f"--{name.replace('_', '-')}"
+        if value is True:
+            out.append(flag)
+        elif value is not None and value is not False:
+            each: Iterable[object] = value if isinstance(value, list | tuple) else [value]
+            out += [word for item in each for word in (flag, str(item))]
+    return out
+
+
+def shared(settings: Settings, other: type[Settings]) -> dict[str, object]:
+    """The values of `settings` that a process with settings `other` takes too, by name."""
+    mine = {f.name for f in fields(settings)}
+    return {f.name: getattr(settings, f.name) for f in fields(other) if f.name in mine}
