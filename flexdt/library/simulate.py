@@ -281,7 +281,7 @@ def simulate(
         return made
     rays = 1 if rays is None else rays
     if noise is not None and noise < 0:
-        raise LimitError(f"noise is {noise}; allowed: a seed >= 0, or None", {"asked": noise})
+        raise LimitError.instead(f"noise is {noise}", noise, "a seed >= 0, or None")
     check_rays(rays)
     allowed = (1, *range(3, MOST_POINTS + 1))
     if spot_points not in allowed:
@@ -365,11 +365,9 @@ def _pitch(cone: ConeVec) -> tuple[float, float]:
     u, v = lengths[:, 0].tolist()
     for name, values, first in zip("uv", lengths, (u, v), strict=True):
         if np.abs(values - first).max() > SAME_PITCH * first:
-            raise GeometryError(
-                f"pixels measure {values.min():.6g} to {values.max():.6g} mm along {name}; "
-                "allowed: alike in all views",
-                {"asked": [float(values.min()), float(values.max())]},
-            )
+            least, most = float(values.min()), float(values.max())
+            said = f"pixels measure {least:.6g} to {most:.6g} mm along {name}"
+            raise GeometryError.instead(said, [least, most], "alike in all views")
     return u, u if abs(v - u) <= SAME_PITCH * u else v
 
 

@@ -172,7 +172,8 @@ def calibrate_datasets(
     sought = None
     if radius_px is not None:
         if not low <= radius_px <= high:
-            raise TwinError(f"radius {radius_px:g} px; allowed: {low:g} to {high:g}")
+            allowed = f"{low:g} to {high:g}"
+            raise TwinError.instead(f"radius {radius_px:g} px", float(radius_px), allowed)
         sought = SpotFinder((0.65 * radius_px, 1.5 * radius_px))
     if (unknown or markers is not None) and len(datasets) != 1:
         raise TwinError(

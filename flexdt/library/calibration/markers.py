@@ -49,6 +49,9 @@ FREE_SCALE: Final = 0.05
 """Relative uncertainty of SOD where no distance of two markers is known, assumed."""
 LONGEST_MM: Final = 1e5
 """A known distance is at most so long."""
+SCALE_FORM: Final = (
+    "A-B=MM or A-B=MM+-SIGMA, the distance of markers A and B, such as 0-3=41.5+-0.02"
+)
 NAMES: Final = {
     "frame": ("frame", "view", "image", "projection"),
     "marker": ("marker", "bead", "point", "id"),
@@ -108,10 +111,7 @@ class Scale:
             found = cls(a, b, math.nan)
         sizes = (found.mm, found.sigma_mm)
         if not (dash and found.a and found.b and all(0 < size <= LONGEST_MM for size in sizes)):
-            raise TwinError(
-                f"scale {text!r}; allowed: A-B=MM or A-B=MM+-SIGMA, the distance of markers A and "
-                "B, such as 0-3=41.5+-0.02"
-            )
+            raise TwinError.instead(f"scale {text!r}", text, SCALE_FORM)
         return found
 
 
@@ -128,21 +128,28 @@ def read_markers(source: str | PathLike[str] | Sequence[Mark], views: int) -> Ma
     if not isinstance(source, str | PathLike):
         return _gathered((_mark(f"mark {i}", row) for i, row in enumerate(source)), views)
     path = Path(source)
-    if path.suffix.lower() == ".npy":
-        try:
-            stored = np.load(path, allow_pickle=False)
-            tracks = stored.astype(np.float64, casting="same_kind")
-        except (AttributeError, OSError, TypeError, ValueError) as error:
-            raise TwinError(f"cannot read {path}: {error}") from None
-        if tracks.ndim != 3 or tracks.shape[0] != views or tracks.shape[2] != 2:
-            raise TwinError(
-                f"{path}: array of shape {tracks.shape}; allowed: ({views} frames, markers, 2)"
-            )
-        if (np.abs(tracks) > FAR_PX).any():
-            raise TwinError(f"{path}: pixels up to {np.nanmax(np.abs(tracks)):g}; allowed: "
-                            f"{FAR_PX:g}, nan where unseen")  # fmt: skip
-        names = tuple(str(k) for k in range(tracks.shape[1]))
-        return Markers(names, tracks, np.full(tracks.shape[:2], ASSUMED_PX))
+    return _of_array(path, views) if path.suffix.lower() == ".npy" else _of_table(path, views)
+
+
+def _of_array(path: Path, views: int) -> Markers:
+    """Markers of a NumPy file: an array (views, markers, 2) of pixels, nan where unseen."""
+    try:
+        stored = np.load(path, allow_pickle=False)
+        tracks = stored.astype(np.float64, casting="same_kind")
+    except (AttributeError, OSError, TypeError, ValueError) as error:
+        raise TwinError(f"cannot read {path}: {error}") from None
+    if tracks.ndim != 3 or tracks.shape[0] != views or tracks.shape[2] != 2:
+        raise TwinError.of_shape(f"{path}: array", tracks.shape, (f"{views} frames", "markers", 2))
+    if (np.abs(tracks) > FAR_PX).any():
+        farthest = float(np.nanmax(np.abs(tracks)))
+        allowed = f"{FAR_PX:g}, nan where unseen"
+        raise TwinError.instead(f"{path}: pixels up to {farthest:g}", farthest, allowed)
+    names = tuple(str(k) for k in range(tracks.shape[1]))
+    return Markers(names, tracks, np.full(tracks.shape[:2], ASSUMED_PX))
+
+
+def _of_table(path: Path, views: int) -> Markers:
+    """Markers of a CSV file whose first line names its columns."""
     try:
         rows = list(csv.reader(io.StringIO(read_text(path))))
     except csv.Error as error:
@@ -150,10 +157,8 @@ def read_markers(source: str | PathLike[str] | Sequence[Mark], views: int) -> Ma
     head = [word.strip().lower() for word in rows[0]] if rows else []
     at = {n: next((head.index(w) for w in words if w in head), -1) for n, words in NAMES.items()}
     if -1 in at.values():
-        raise TwinError(
-            f"{path}, line 1: columns {', '.join(head) or 'none'}; allowed: frame, marker, column, "
-            "row and, optionally, sigma"
-        )
+        said = f"{path}, line 1: columns {', '.join(head) or 'none'}"
+        raise TwinError.instead(said, head, "frame, marker, column, row and, optionally, sigma")
     width = head.index("sigma") if "sigma" in head else -1
     marks: list[tuple[str, Mark]] = []
     for line, row in enumerate(rows[1:], start=2):
@@ -176,10 +181,8 @@ def _mark(where: str, row: Mark) -> tuple[str, Mark]:
         stated = None if sigma is None else float(sigma)
         return where, (operator.index(frame), str(name), float(column), float(line), stated)
     except (TypeError, ValueError):
-        raise TwinError(
-            f"{where} is {row!r}; allowed: (frame, marker, column, row, sigma), sigma None where "
-            "it is not known"
-        ) from None
+        allowed = "(frame, marker, column, row, sigma), sigma None where it is not known"
+        raise TwinError.instead(f"{where} is {row!r}", repr(row), allowed) from None
 
 
 def _gathered(marks: Iterable[tuple[str, Mark]], views: int) -> Markers:
@@ -188,12 +191,15 @@ def _gathered(marks: Iterable[tuple[str, Mark]], views: int) -> Markers:
     for where, (frame, name, x, y, stated) in marks:
         sigma = ASSUMED_PX if stated is None else stated
         if not 0 <= frame < views or (frame, name) in seen or not 0 < sigma <= WIDEST_PX:
-            raise TwinError(
-                f"{where}: marker {name!r} in frame {frame}, sigma {sigma:g} px; allowed: frames "
-                f"0 to {views - 1}, each marker once in each, sigma above 0 to {WIDEST_PX:g}"
+            raise TwinError.instead(
+                f"{where}: marker {name!r} in frame {frame}, sigma {sigma:g} px",
+                [frame, name, sigma],
+                f"frames 0 to {views - 1}, each marker once in each, "
+                f"sigma above 0 to {WIDEST_PX:g}",
             )
         if any(abs(v) > FAR_PX for v in (x, y)):
-            raise TwinError(f"{where}: pixel ({x:g}, {y:g}); allowed: up to {FAR_PX:g}")
+            said = f"{where}: pixel ({x:g}, {y:g})"
+            raise TwinError.instead(said, [x, y], f"up to {FAR_PX:g}")
         seen[frame, name] = x, y, sigma
     labels = {name for _, name in seen}
     names = tuple(sorted(labels, key=lambda n: (not n.isdecimal(), n.zfill(9))))
@@ -242,9 +248,10 @@ def calibrate_known(
     numbers = [int(n) for n in markers.names if n not in odd]
     odd += [n for n in markers.names if n not in odd and numbers.count(int(n)) > 1]
     if odd:
-        raise TwinError(
-            f"marker {odd[0]!r} is no bead of {phantom.name!r}; allowed: 0 to {beads - 1}, each "
-            "once, or phantom unknown"
+        raise TwinError.instead(
+            f"marker {odd[0]!r} is no bead of {phantom.name!r}",
+            odd[0],
+            f"0 to {beads - 1}, each once, or phantom unknown",
         )
     looks, index = spots_of(markers, data.shape)
     every = np.full((len(data), beads), -1, dtype=np.int64)
@@ -293,7 +300,7 @@ def calibrate_unknown(
         looks, index = spots_of(markers, data.shape)
         names = markers.names
         if len(names) < 3:
-            raise TwinError(f"{len(names)} markers; allowed: three or more")
+            raise TwinError.instead(f"{len(names)} markers", len(names), "three or more")
         at = centred(markers.tracks, poses, data.shape, request.start)
         places = triangulate(markers.tracks, poses.cone_vec(at), data.shape)
         radii = np.full(len(names), 1e-3)
@@ -318,9 +325,10 @@ def calibrate_unknown(
         return found, {"markers": _described(found, names, index), "scale": told}
     pair = [_numbered(names, n) for n in (scale.a, scale.b)]
     if pair[0] == pair[1] or "dO_z" in request.free:
-        raise TwinError(
-            f"scale {scale.a}-{scale.b} with {', '.join(request.free)} free; allowed: two markers, "
-            "and dO_z not free (the scale says where the axis is)"
+        raise TwinError.instead(
+            f"scale {scale.a}-{scale.b} with {', '.join(request.free)} free",
+            [scale.a, scale.b, *request.free],
+            "two markers, and dO_z not free (the scale says where the axis is)",
         )
     width = sod * scale.sigma_mm / scale.mm
     ratio = scale.mm / float(np.linalg.norm(places[pair[0]] - places[pair[1]]))
@@ -393,7 +401,7 @@ def _calibrated(
 
 def _numbered(names: Sequence[str], name: str) -> int:
     if name not in names:
-        raise TwinError(f"scale: no marker {name!r}; allowed: {', '.join(names)}")
+        raise TwinError.instead(f"scale: no marker {name!r}", name, [*names])
     return names.index(name)
 
 
