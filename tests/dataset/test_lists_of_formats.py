@@ -19,7 +19,7 @@ import pytest
 
 import flexdt as fx
 from flexdt.clients.cli.command_tree import run
-from flexdt.clients.cli.commands import analysis_commands, scan_commands
+from flexdt.clients.cli.commands import phantom_commands, script_commands
 from flexdt.clients.client import events, twin_methods
 from flexdt.clients.launch import random_truth
 from flexdt.library import plots
@@ -139,7 +139,7 @@ def mesh_pages() -> object:
         page("phantoms.md", "\n\nSTL, ", "files become"),
         page("tutorials/own-sample.md", "\nSTL, ", ", closed"),
         argument(fx.phantoms.mesh_phantom, "source").split(" file,")[0],
-        argument(analysis_commands.make, "mesh").rstrip("."),
+        argument(phantom_commands.make, "mesh").rstrip("."),
     )
     named = [set(re.findall(r"\b[A-Z]{3}\b", f"STL, {text}")) for text in texts]
     return [one ^ {form.upper() for form in mesh_files.FORMATS} for one in named
@@ -178,7 +178,7 @@ def test_pages_docstrings_and_wire_state_the_lists(differs: Differs) -> None:
     [
         (get_args(state_model.LogLevel), get_args(process_settings.LogLevel)),
         (get_args(fields.TopicName), events.MODELS),
-        (get_args(scan_commands.Kind), KINDS),
+        (get_args(script_commands.Kind), KINDS),
         (get_args(get_args(image_messages.ExposurePredict.model_fields["kind"].annotation)[0]),
          KINDS),
         (get_args(ImageKind), plots.KINDS),

@@ -100,7 +100,7 @@ def compare(script: Path, log: Path, machine: str | None, html: Path | None) -> 
 def show(report: CheckReport, file: str) -> Answer:
     """The plan and the figures of a check."""
     from flexdt.twin.script.dry_run_report import between, summary
-    from flexdt.twin.script.time_ranges import step_range
+    from flexdt.twin.script.planning.time_ranges import step_range
 
     timing = report.plan.machine.timing
     steps = [
