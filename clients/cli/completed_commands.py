@@ -13,8 +13,8 @@ from typing import Any, Final, Literal
 
 import typer
 
-from flexdt.clients.cli.connection import connect
 from flexdt.clients.cli.console import emit, say
+from flexdt.clients.cli.twin_connection import connect
 from flexdt.runtime.settings import described, has_parameters
 
 GIVEN: Final = ("context", "twin", "json")

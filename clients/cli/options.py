@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexdt.clients.cli.connection import DEFAULT_SERVER
+from flexdt.clients.cli.twin_connection import DEFAULT_SERVER
 
 if TYPE_CHECKING:
     from flexdt.clients.client.client import TwinClient
