@@ -1,187 +1,35 @@
 """A session of `flexdt follow`: messages in; alarms, a record and a mirror in the twin out.
 
 It decides nothing: `flexdt.twin.following` says what a message changes. Time is this machine's
-monotonic clock when a message came, or that of a recording, which takes the same way.
-
-With a folder of frames, the last real one is written beside the twin's radiograph of the mirrored
-machine: its positions and camera when the frame appeared, the profile's offsets and the phantom on
-the stage. Their distance comes from the peak of their cross-correlation, whitened (phase
-correlation; Kuglin and Hines 1975).
-
-Raw messages of a scanner with the times of day at which they came: written and read.
-
-One message after the other, each behind its time: `[hh:mm:ss.ffffff LATE] MESSAGE`, where LATE is
-how many seconds earlier it may have come. Messages are kept byte for byte and may hold line ends;
-that the link came up or was lost is a message that begins with `--`. The form is that of the public
-`monitor_zmq.py`, whose times are whole seconds without LATE: they may be anywhere in their second.
+monotonic clock when a message came, or that of a recording, which takes the same way. With a folder
+of frames, the last real one is written beside the twin's radiograph (`frames_beside`).
 """
 
 from __future__ import annotations
 
 import asyncio
-import json
-import re
 import time
-from collections.abc import Callable, Collection, Iterator
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import BinaryIO, Final
 
-import cv2
-import numpy as np
-
-from flexdt.clients.gateway.vocabulary import Question, Refusal, read_command
-from flexdt.library.datasets.pictures import png
-from flexdt.phantoms import Phantom
-from flexdt.phantoms.channels import line_integrals as projected
-from flexdt.protocol.acquila import AcquilaError, AcquilaEvent, parse_event
-from flexdt.runtime.files.dataset_folder import list_folder, mean_image, read_image
-from flexdt.runtime.files.whole_files import write_whole
-from flexdt.twin.dataset.normalise import LineIntegrals
+from flexdt.clients.following.frames_beside import FramesBeside, newest_frame
+from flexdt.clients.following.hearing import heard
+from flexdt.clients.following.recording import (
+    LINK,
+    UP,
+    Recorded,
+    format_recorded,
+    read_recording,
+    time_of_day,
+)
+from flexdt.protocol.acquila import AcquilaError
 from flexdt.twin.errors import TwinError
 from flexdt.twin.following.follower import Follower
-from flexdt.twin.following.mirror import Alarm, Heard, Mirror, What
-from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.following.mirror import Alarm, Mirror
 from flexdt.twin.machine.description import ZERO, Machine, Profile
-from flexdt.twin.machine.kinematics import motor_poses
-from flexdt.twin.script import commands as c
-from flexdt.twin.script.grammar import own_name
-
-
-def newest_frame(folder: Path) -> tuple[Path, float] | None:
-    """The TIFF that was written last, and when; None if there is none.
-
-    Darks and flats are none.
-    """
-    found = []
-    for path in folder.glob("*.tif*"):
-        with suppress(OSError):  # it has gone meanwhile
-            if not path.name.startswith(("di", "io")):
-                found.append((path.stat().st_mtime, path))
-    written, newest = max(found, default=(0.0, None))
-    return None if newest is None else (newest, written)
-
-
-@dataclass(frozen=True)
-class FramesBeside:
-    """Writes `beside.png` (real, virtual) and `beside.json` into a folder.
-
-    Args:
-        follower: its machine and profile.
-        phantom: what stands on the stage.
-        out: where to.
-    """
-
-    follower: Follower
-    phantom: Phantom
-    out: Path
-
-    def write(self, path: Path, mirror: Mirror, age_s: float) -> dict[str, object]:
-        """One frame beside its radiograph.
-
-        Args:
-            path: of the frame.
-            mirror: the machine when it appeared.
-            age_s: of the frame.
-
-        Raises:
-            TwinError: no readable image, or of another shape than the camera's.
-        """
-        shape = mirror.camera.shape
-        real, white = line_integrals(path, shape)
-        machine, profile = self.follower.machine, self.follower.profile
-        poses = motor_poses(machine, profile, mirror.camera, mirror.positions)
-        virtual = projected(self.phantom, poses.cone_vec(), shape)[0]
-        columns, rows = shift(virtual, real)
-        told = {
-            "file": path.name,
-            "age_s": round(age_s, 3),
-            "positions": mirror.positions,
-            "assumed": list(mirror.assumed),
-            "white": white,
-            "shift_px": {"columns": columns, "rows": rows},
-        }
-        picture = png(np.concatenate([real, virtual], axis=1), dark_is_dense=True)
-        self.out.mkdir(parents=True, exist_ok=True)
-        for name, data in (("png", picture), ("json", json.dumps(told, indent=2).encode())):
-            write_whole(self.out / f"beside.{name}", data)
-        return told
-
-
-def line_integrals(path: Path, shape: tuple[int, int]) -> tuple[Float32Array, str]:
-    """A frame's line integrals (rows, cols), and what they take for white.
-
-    With a dark and a flat beside it these are used; else white is a percentile of the frame.
-
-    Raises:
-        TwinError: no readable image, or of another shape.
-    """
-    counts = read_image(path, shape).astype(np.float32)
-    folder = list_folder(path.parent)
-    dark, white = np.zeros_like(counts), np.full_like(counts, np.percentile(counts, 99.5))
-    what = "99.5 % of the frame"
-    if folder.darks and folder.flats:
-        dark = mean_image(folder.paths(folder.darks), shape)
-        white = mean_image(folder.paths(folder.flats), shape)
-        what = "dark and flat of the folder"
-    return LineIntegrals.of(dark, white)(counts), what
-
-
-def shift(virtual: Float32Array, real: Float32Array) -> tuple[float, float]:
-    """By how much the real image lies aside of the virtual one [px], (columns, rows).
-
-    Example:
-        >>> image = np.zeros((32, 48), np.float32)
-        >>> image[10:20, 15:25] = 1.0
-        >>> columns, rows = shift(image, np.roll(image, (2, -3), axis=(0, 1)))
-        >>> round(columns, 1), round(rows, 1)
-        (-3.0, 2.0)
-    """
-    (columns, rows), _ = cv2.phaseCorrelate(virtual.astype(np.float64), real.astype(np.float64))
-    return float(columns), float(rows)
-
-
-# Bytes of the scanner's interface to what a follower hears: no socket, no clock.
-
-
-def heard(data: bytes, axes: Collection[str], stamp: str, late_s: float = 0.0) -> Heard:
-    """One message.
-
-    Args:
-        data: as it came; UTF-8, or one byte for each character where a cluster makes it none. What
-            stands before the object, such as a topic, is left out.
-        axes: motors and virtual axes of the machine.
-        stamp: time of day, hh:mm:ss.mmm.
-        late_s: by how much earlier it may have come than it was read [s].
-
-    Raises:
-        AcquilaError: the bytes are no event.
-    """
-    data = data[max(0, data.find(b"{")) :]
-    try:
-        event = parse_event(data)
-    except AcquilaError:
-        event = parse_event(data.decode("latin-1"))
-    event = replace(event, component=own_name(event.component, axes))
-    command, asks = _read(event, axes)
-    words = (event.component, event.command, event.arg1, event.arg2)
-    what: What = event.reply_type.value or "SEND"  # type: ignore[assignment]
-    tick, reply = event.tick_count, event.reply
-    return Heard(event.key, what, words, command, reply, asks, stamp, tick, late_s)
-
-
-def _read(event: AcquilaEvent, axes: Collection[str]) -> tuple[c.Command | None, str]:
-    """The typed command, and what a question asks for; neither of what the scripts do not know."""
-    try:
-        command = read_command(event, axes)
-    except Refusal:
-        return None, ""
-    if isinstance(command, Question):
-        return None, command.path[-1]
-    return (command if type(command).__module__ == c.__name__ else None), ""
-
 
 TICK_S: Final = 0.1
 FRAMES_S: Final = 0.5
@@ -280,7 +128,7 @@ class FollowSession:
         """Hear a recording as if it came now; the clock is the recording's.
 
         Args:
-            recording: see `flexdt.clients.following.session`.
+            recording: see `flexdt.clients.following.recording`.
             ahead: whether what is under way, and the rest of the script, are checked as well.
         """
         now = self._midnight = 0.0
@@ -337,61 +185,3 @@ def executed_script(recording: bytes, machine: Machine) -> bytes:
     follower = Follower(machine, Profile(name=ZERO, machine=machine.name, source="no offsets"))
     FollowSession(follower, executed=lines.append).replay(recording, ahead=False)
     return b"".join(lines)
-
-
-STAMP: Final = re.compile(rb"^\[(\d\d):(\d\d):(\d\d(?:\.\d+)?)(?: (\d+\.\d+))?\] ", re.MULTILINE)
-LINK: Final = b"-- "
-UP: Final = b"-- connected"
-DAY_S: Final = 86400.0
-
-
-@dataclass(frozen=True)
-class Recorded:
-    """One message.
-
-    Attributes:
-        at_s: when it was read, since the midnight before the first [s].
-        late_s: by how much earlier it may have come [s].
-        data: as it came.
-    """
-
-    at_s: float
-    late_s: float
-    data: bytes
-
-
-def time_of_day(seconds: float, digits: int = 3) -> str:
-    """hh:mm:ss.mmm of a time since a midnight.
-
-    Example:
-        >>> time_of_day(86400.0 + 3723.5)
-        '01:02:03.500'
-    """
-    unit = 10**digits
-    whole, part = divmod(round(seconds * unit) % round(DAY_S * unit), unit)
-    hour, minute = divmod(whole // 60, 60)
-    return f"{hour:02d}:{minute:02d}:{whole % 60:02d}.{part:0{digits}d}"
-
-
-def format_recorded(message: Recorded) -> bytes:
-    """A message as a recording holds it."""
-    head = f"[{time_of_day(message.at_s, 6)} {message.late_s:.6f}] "
-    return head.encode() + message.data + b"\n"
-
-
-def read_recording(data: bytes) -> Iterator[Recorded]:
-    """The messages of a recording; times go on after midnight.
-
-    Example:
-        >>> recording = b"[23:59:59] {}\\n[00:00:01.5 0.002] {}\\n"
-        >>> [(m.at_s, m.late_s) for m in read_recording(recording)]
-        [(86400.0, 1.0), (86401.5, 0.002)]
-    """
-    stamps, last = list(STAMP.finditer(data)), 0.0
-    for stamp, end in zip(stamps, [*(s.start() for s in stamps[1:]), len(data)], strict=True):
-        hour, minute, second = (float(x) for x in stamp.groups()[:3])
-        late = float(stamp[4] or (0.0 if b"." in stamp[3] else 1.0))
-        at = 3600.0 * hour + 60.0 * minute + second + (0.0 if b"." in stamp[3] else 1.0)
-        at += DAY_S * round((last - at) / DAY_S)
-        last = at
-        yield Recorded(at, late, data[stamp.end() : end].removesuffix(b"\n"))

@@ -22,7 +22,8 @@ import zmq.asyncio
 
 from flexdt.clients.gateway.actions import ACTIONS, AT_ONCE
 from flexdt.clients.gateway.connected_twin import CommandProgress, ConnectedTwin
-from flexdt.clients.gateway.vocabulary import Echoes, Refusal, component_type, read_command
+from flexdt.clients.gateway.echoes import Echoes
+from flexdt.clients.gateway.vocabulary import Refusal, component_type, read_command
 from flexdt.protocol.acquila import (
     FIELDS,
     MAX_BYTES,

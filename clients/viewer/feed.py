@@ -31,7 +31,7 @@ import numpy.typing as npt
 
 from flexdt.clients.client.events import Event, Projection
 from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress
-from flexdt.clients.viewer.page import watched
+from flexdt.clients.viewer.watched_tasks import watched
 from flexdt.runtime.log import log
 from flexdt.runtime.workers import ENVIRONMENT
 from flexdt.twin.dataset.normalise import binned_mean

@@ -32,7 +32,8 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
-from flexdt.clients.viewer.viser_gate import MARK, MessageFilter, parted
+from flexdt.clients.viewer.page_messages import MessageFilter
+from flexdt.clients.viewer.viser_gate import MARK, parted
 from flexdt.runtime.access import check_bind, is_loopback, token_matches
 from flexdt.runtime.log import log
 from flexdt.runtime.process import one_at_a_time

@@ -7,9 +7,6 @@ replace older ones that have not gone out, so a slow browser delays nobody else.
 The page acknowledges states and parts of images, and few of either are on their way: what
 is queued in sockets cannot be replaced by something newer, and on a slow link seconds of it would
 be. Images go in parts, so that a state waits for a part of an image and not for a whole one.
-
-Its background tasks are watched, because asyncio keeps a task's exception until somebody awaits the
-task: a failure is logged, reported to whoever depends on the task, and not followed by a restart.
 """
 
 from __future__ import annotations
@@ -28,34 +25,11 @@ from websockets.exceptions import ConnectionClosed
 
 from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress, Unsendable
 from flexdt.clients.client.transport import ConnectionLost
-from flexdt.clients.viewer.scenes.world import Shown
+from flexdt.clients.viewer.scenes.layers import Shown
+from flexdt.clients.viewer.watched_tasks import watched
 from flexdt.protocol import METHODS, Code, RpcError, parse_params
 from flexdt.protocol.rpc_errors import busy, clip, internal, link_down
 from flexdt.runtime.log import log, traced
-
-
-def watched(
-    work: Coroutine[Any, Any, None], what: str, died: Callable[[], None] = lambda: None
-) -> asyncio.Task[None]:
-    """Run `work` as a task.
-
-    Args:
-        work: the coroutine.
-        what: it does, for the log.
-        died: called when it has failed.
-    """
-
-    async def run() -> None:
-        try:
-            await work
-        except Exception:
-            log(f"{what} failed", logging.ERROR, error=True)
-            died()
-
-    task = asyncio.create_task(run())
-    task.add_done_callback(lambda _: work.close())  # where it was cancelled before it began
-    return task
-
 
 MAX_NOTES: Final = 1000
 MAX_ASKED: Final = 64

@@ -15,8 +15,10 @@ import numpy as np
 import viser
 
 from flexdt.clients.viewer.front import SCENE_PATH
-from flexdt.clients.viewer.scenes.lab_scene import SKY, light_finely
-from flexdt.clients.viewer.scenes.world import MM, Nodes, Standpoint, roomy
+from flexdt.clients.viewer.scenes.lamps import SKY, light_finely
+from flexdt.clients.viewer.scenes.layers import Nodes
+from flexdt.clients.viewer.scenes.views import Standpoint, roomy
+from flexdt.clients.viewer.scenes.world import MM
 from flexdt.clients.viewer.viser_gate import Scenes, set_nodes
 from flexdt.twin.geometry.conventions import FloatArray
 

@@ -34,7 +34,9 @@ from flexdt.clients.viewer.feed import ShownImage, packed, wish
 from flexdt.clients.viewer.front import Download
 from flexdt.clients.viewer.page import Page, without_bytes
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
-from flexdt.clients.viewer.scenes.world import FREE, LAYERS, motors
+from flexdt.clients.viewer.scenes.layers import LAYERS
+from flexdt.clients.viewer.scenes.views import FREE
+from flexdt.clients.viewer.scenes.world import motors
 from flexdt.clients.viewer.viewer import PageMethod, Viewer
 from flexdt.protocol import Code, Method, RpcError, parse_params
 from flexdt.protocol import image as wire_image

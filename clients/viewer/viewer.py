@@ -35,16 +35,17 @@ from flexdt.clients.viewer.feed import (
 )
 from flexdt.clients.viewer.front import Download, Front
 from flexdt.clients.viewer.live_volume import points_of
-from flexdt.clients.viewer.page import TRY_AGAIN, Page, watched, without_bytes
+from flexdt.clients.viewer.page import TRY_AGAIN, Page, without_bytes
 from flexdt.clients.viewer.page_cameras import SceneClients
-from flexdt.clients.viewer.scenes import painted_meshes as shapes
-from flexdt.clients.viewer.scenes import world as views
-from flexdt.clients.viewer.scenes.drawing_aids import NameTags
+from flexdt.clients.viewer.scenes import sample_looks, views
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
-from flexdt.clients.viewer.scenes.painted_meshes import NOTHING, MeshCache, SampleLook
-from flexdt.clients.viewer.scenes.still import Stills
-from flexdt.clients.viewer.scenes.world import Shown, World, beads_on, world_of
+from flexdt.clients.viewer.scenes.layers import Shown
+from flexdt.clients.viewer.scenes.name_tags import NameTags
+from flexdt.clients.viewer.scenes.sample_looks import NOTHING, MeshCache, SampleLook
+from flexdt.clients.viewer.scenes.still_pictures import Stills
+from flexdt.clients.viewer.scenes.world import World, beads_on, world_of
 from flexdt.clients.viewer.viser_gate import Scenes
+from flexdt.clients.viewer.watched_tasks import watched
 from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SafetyState, SampleState, State
 from flexdt.runtime.access import ViewerLimits
@@ -367,7 +368,7 @@ class Viewer:
     async def _fetch(self, lab: LabScene, sample: SampleState) -> None:
         """Fetch the mesh of an upload; a box is drawn until it has arrived."""
         try:
-            stl = await shapes.fetch(self.link.request, sample)
+            stl = await sample_looks.fetch(self.link.request, sample)
             if stl is None:
                 return
             await asyncio.to_thread(self.wardrobe.add, sample, stl)

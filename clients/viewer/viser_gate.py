@@ -1,10 +1,10 @@
-"""A private viser server, and a filter for the messages that pages send to it.
+"""A private viser server.
 
 viser accepts any connection and obeys any message, up to opening a public tunnel. So it listens on
 a Unix socket in a folder that only this user can open, and on no port: every byte has passed the
-front's checks. Of a page's messages only those of a list get through, each validated field by field
-and encoded anew. Everything that relies on viser's private parts is in this module (viser 1.1; the
-version is pinned), and `tests/viewer/test_viewer_gate.py` shows what a new version has changed.
+front's checks, and `page_messages` filters what pages send. Everything that relies on viser's
+private parts is in this module (viser 1.1; the version is pinned), and
+`tests/viewer/test_viewer_gate.py` shows what a new version has changed.
 """
 
 from __future__ import annotations
@@ -12,24 +12,19 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import logging
 import re
 import shutil
 import socket
-import struct
 import tempfile
 import threading
 import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, redirect_stdout
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
-import msgpack
 import viser
 import websockets.asyncio.server as library
-from annotated_types import Ge, Gt, Le, MaxLen
-from pydantic import Field, ValidationError
 from viser._messages import (
     Message,
     SceneNodeUpdateMessage,
@@ -42,21 +37,17 @@ from viser._messages import (
 from websockets.asyncio.client import ClientConnection, unix_connect
 from websockets.typing import Subprotocol
 
-from flexdt.clients.viewer.scenes.world import Nodes, Standpoint
-from flexdt.protocol.fields import Params
-from flexdt.runtime.log import log
+from flexdt.clients.viewer.scenes.layers import Nodes
+from flexdt.clients.viewer.scenes.views import Standpoint
 
 MAX_OF_VISER: Final = 256 << 20
-LARGEST_SIDE: Final = 4096
-"""Of a picture of a view [px]."""
-MAX_SMALL: Final = 4096
-"""Bytes of any message but a picture."""
-SHOWN: Final = 40
 LONGEST_TMP: Final = 70
 """Bytes of the folder for temporary files; a socket's path has at most about a hundred."""
 PREFIX: Final = "flexdt-viser-"
 YOUNG_S: Final = 60.0
 """A younger folder may belong to a viewer that does not listen yet."""
+MARK: Final = b"<!-- program -->"
+_one_at_a_time = threading.Lock()
 
 
 class GateError(RuntimeError):
@@ -167,9 +158,6 @@ def look_from(serializer: Any, camera: Standpoint, nodes: Nodes) -> None:
         serializer._insert_message(message)
 
 
-MARK: Final = b"<!-- program -->"
-
-
 def parted(html: bytes) -> tuple[bytes, bytes]:
     """viser's page with MARK for its program, and the program as a script of its own.
 
@@ -182,9 +170,6 @@ def parted(html: bytes) -> tuple[bytes, bytes]:
     facts = dict(re.findall(r'data-([a-z]+)="([^"]*)"', match[1].decode()))
     script = b"Object.assign(document.currentScript.dataset, %b);" % json.dumps(facts).encode()
     return html[: match.start()] + MARK + html[match.end() :], script + match[2]
-
-
-_one_at_a_time = threading.Lock()
 
 
 @contextlib.contextmanager
@@ -211,132 +196,3 @@ def _listening_at(path: Path) -> Iterator[None]:
     if not used:
         listener.close()
         raise GateError(f"viser {viser.__version__} starts its server in another way")
-
-
-# -- messages that a page may send to viser ----------------------------------------------------
-
-Length = Annotated[float, Ge(-1e6), Le(1e6)]
-Part = Annotated[float, Ge(-2), Le(2)]
-Triple = Annotated[tuple[Length, Length, Length], Field(strict=False)]
-Turn = Annotated[tuple[Part, Part, Part, Part], Field(strict=False)]
-Pixels = Annotated[float, Ge(1), Le(100_000)]
-Name = Annotated[str, MaxLen(200)]
-
-
-class ViewerCameraMessage(Params):
-    """Where a frame looks from [m]."""
-
-    wxyz: Turn
-    position: Triple
-    fov: Annotated[float, Gt(0), Le(3.2)]
-    near: Annotated[float, Gt(0), Le(1e6)]
-    far: Annotated[float, Gt(0), Le(1e9)]
-    image_height: Pixels
-    image_width: Pixels
-    look_at: Triple
-    up_direction: Triple
-
-
-class TransformControlsDragStartMessage(Params):
-    """A drag of a handle begins."""
-
-    name: Name
-    owner: Name = ""
-
-
-class TransformControlsUpdateMessage(TransformControlsDragStartMessage):
-    """A handle is dragged [m]."""
-
-    wxyz: Turn
-    position: Triple
-
-
-class TransformControlsDragEndMessage(TransformControlsDragStartMessage):
-    """A drag of a handle ends."""
-
-
-class GetRenderResponseMessage(Params):
-    """A picture that the viewer has requested."""
-
-    payload: bytes
-    render_uuid: Name
-
-
-ALLOWED: Final[dict[str, type[Params]]] = {
-    model.__name__: model
-    for model in (
-        ViewerCameraMessage,
-        TransformControlsDragStartMessage,
-        TransformControlsUpdateMessage,
-        TransformControlsDragEndMessage,
-        GetRenderResponseMessage,
-    )
-}
-"""What a page's scenes send, by viser's names for it, each checked field by field."""
-
-
-class Unwanted(ValueError):
-    """A message that pages may not send to viser; its text is short, for the log."""
-
-
-def admitted(raw: str | bytes) -> bytes:
-    """A page's message, validated and encoded anew for viser.
-
-    Raises:
-        Unwanted: says what is wrong.
-    """
-    if isinstance(raw, str):
-        raise Unwanted("text")
-    try:
-        fields = msgpack.unpackb(raw)
-        kind = fields.pop("type")
-        model = ALLOWED.get(kind)
-    except (ValueError, msgpack.UnpackException, AttributeError, LookupError, TypeError):
-        raise Unwanted("no message") from None
-    if model is None:
-        raise Unwanted(f"{str(kind)[:SHOWN]!a}")
-    if model is not GetRenderResponseMessage and len(raw) > MAX_SMALL:
-        raise Unwanted(f"a {kind} that is too long")
-    try:
-        read = model.model_validate(fields)
-    except ValidationError as error:
-        where = ".".join(map(str, error.errors()[0]["loc"]))
-        raise Unwanted(f"a {kind} with a wrong {where[:SHOWN]!a}") from None
-    if isinstance(read, GetRenderResponseMessage) and not _small_picture(read.payload):
-        raise Unwanted(f"a {kind} that is no PNG of at most {LARGEST_SIDE} pixels a side")
-    return bytes(msgpack.packb({**read.model_dump(), "type": kind}))
-
-
-def _small_picture(data: bytes) -> bool:
-    """Whether a PNG's header states a small size; empty bytes report a failure and pass."""
-    if not data:
-        return True
-    if len(data) < 24 or not data.startswith(b"\x89PNG\r\n\x1a\n") or data[12:16] != b"IHDR":
-        return False
-    return all(0 < side <= LARGEST_SIDE for side in struct.unpack(">II", data[16:24]))
-
-
-class MessageFilter:
-    """Passes pages' messages on to viser; each reason to drop one is logged once.
-
-    Attributes:
-        dropped: messages so far.
-    """
-
-    MAX_LOGGED: Final = 100
-
-    def __init__(self) -> None:
-        self.dropped = 0
-        self._logged: set[str] = set()
-
-    def admit(self, raw: str | bytes) -> bytes | None:
-        """The message as it goes to viser, or None to drop it."""
-        try:
-            return admitted(raw)
-        except Unwanted as error:
-            self.dropped += 1
-            problem = str(error)
-        if problem not in self._logged and len(self._logged) < self.MAX_LOGGED:
-            self._logged.add(problem)
-            log("a scene's message was dropped", logging.WARNING, message=problem)
-        return None

@@ -15,7 +15,7 @@ from past_laboratory import Laboratory
 
 from flexdt.clients.cli.command_tree import run
 from flexdt.clients.cli.commands.script_files import read_log_file
-from flexdt.clients.following.session import Recorded, format_recorded
+from flexdt.clients.following.recording import Recorded, format_recorded
 from flexdt.library import machines
 from flexdt.library.commission import commission
 from flexdt.twin.machine.description import builtin_machine, builtin_profile

@@ -19,13 +19,10 @@ import zmq
 import zmq.asyncio
 
 from flexdt.clients.cli.command_tree import run
+from flexdt.clients.following.frames_beside import FramesBeside
 from flexdt.clients.following.listening import endpoint
-from flexdt.clients.following.session import (
-    FollowSession,
-    FramesBeside,
-    executed_script,
-    read_recording,
-)
+from flexdt.clients.following.recording import read_recording
+from flexdt.clients.following.session import FollowSession, executed_script
 from flexdt.phantoms import load_phantom
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Alarm

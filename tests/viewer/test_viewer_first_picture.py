@@ -16,18 +16,10 @@ from PIL import Image
 from scipy.spatial import ConvexHull
 
 from flexdt.clients.client.client import TwinClient
-from flexdt.clients.viewer.scenes.painted_meshes import cabinet
+from flexdt.clients.viewer.scenes.cabinet import cabinet
 from flexdt.clients.viewer.scenes.still import Shape, drawn
-from flexdt.clients.viewer.scenes.world import (
-    ROOM,
-    WIDE,
-    Standpoint,
-    World,
-    fitted,
-    placed,
-    presets,
-    roomy,
-)
+from flexdt.clients.viewer.scenes.views import ROOM, WIDE, Standpoint, fitted, presets, roomy
+from flexdt.clients.viewer.scenes.world import World, placed
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import builtin_machine, profile_of
 from tests.viewer.looking import changed, picture, until

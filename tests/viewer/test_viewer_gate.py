@@ -29,9 +29,11 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import InvalidStatus
 from websockets.typing import Origin, Subprotocol
 
+from flexdt.clients.viewer import page_messages
 from flexdt.clients.viewer import viser_gate as gate
 from flexdt.clients.viewer.front import COOKIE, Front
-from flexdt.clients.viewer.viser_gate import ALLOWED, GateError, Scenes, Unwanted, admitted
+from flexdt.clients.viewer.page_messages import ALLOWED, Unwanted, admitted
+from flexdt.clients.viewer.viser_gate import GateError, Scenes
 
 TOKEN = "a-token-of-sixteen-or-more"
 SPOKEN = Subprotocol(f"viser-v{viser.__version__}")
@@ -287,7 +289,7 @@ def test_a_page_opens_no_tunnel(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither through the front, nor to viser itself; each kind is one line of the log."""
     told: list[object] = []
     opened: list[object] = []
-    monkeypatch.setattr(gate, "log", lambda *event, **facts: told.append(facts["message"]))
+    monkeypatch.setattr(page_messages, "log", lambda *event, **facts: told.append(facts["message"]))
     monkeypatch.setattr(viser.ViserServer, "request_share_url", lambda *_: opened.append(1))
     share = msgpack.packb({"type": "ShareUrlRequest"})
 

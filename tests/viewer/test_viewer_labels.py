@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from flexdt.clients.viewer.scenes.drawing_aids import laid_out, leader_end
+from flexdt.clients.viewer.scenes.name_tags import laid_out, leader_end
 
 AREA = (520.0, 700.0)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from flexdt.clients.viewer.page_cameras import SceneClients, Who
-from flexdt.clients.viewer.scenes.world import Nodes
+from flexdt.clients.viewer.scenes.layers import Nodes
 from tests.viewer.looking import Picture, changed, drawn, settled, still
 
 

@@ -17,7 +17,7 @@ import zstandard
 from PIL import Image
 
 from flexdt.clients.client.client import TwinClient
-from flexdt.clients.viewer.scenes.world import FREE
+from flexdt.clients.viewer.scenes.views import FREE
 from flexdt.library.reading.folders import load_dataset
 from tests.viewer.looking import begun, changed, drawn, film, picture, point_at, seen
 

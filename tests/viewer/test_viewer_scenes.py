@@ -16,8 +16,9 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import ConvexHull
 
 from flexdt.clients.client.client import TwinClient
-from flexdt.clients.viewer.scenes.drawing_aids import SIZE_M
-from flexdt.clients.viewer.scenes.world import FIXED, Standpoint, presets, roomy, world_of
+from flexdt.clients.viewer.scenes.drag_handles import SIZE_M
+from flexdt.clients.viewer.scenes.views import FIXED, Standpoint, presets, roomy
+from flexdt.clients.viewer.scenes.world import world_of
 from flexdt.protocol.state_model import State
 from flexdt.twin.machine.description import builtin_machine, profile_of
 from tests.viewer.looking import changed, drawn, frames, picture, seen, settled, still

@@ -21,19 +21,16 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from flexdt.clients.viewer.feed import ShownImage, grey, packed, window_of
-from flexdt.clients.viewer.scenes import painted_meshes as solids
-from flexdt.clients.viewer.scenes.drawing_aids import HULL, MOST, SIDES, Gizmos, fans
+from flexdt.clients.viewer.scenes.beam_planes import HULL, MOST, SIDES, fans
+from flexdt.clients.viewer.scenes.collision_bodies import bare, grown
+from flexdt.clients.viewer.scenes.drag_handles import Gizmos
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
-from flexdt.clients.viewer.scenes.painted_meshes import MeshCache
-from flexdt.clients.viewer.scenes.world import (
-    LAYERS,
-    Shown,
-    World,
-    beads_on,
-    beam_view,
-    placed,
-    quaternion,
-)
+from flexdt.clients.viewer.scenes.layers import LAYERS, Shown
+from flexdt.clients.viewer.scenes.painted_meshes import glb
+from flexdt.clients.viewer.scenes.part_looks import pieces_of
+from flexdt.clients.viewer.scenes.sample_looks import MeshCache, fetch
+from flexdt.clients.viewer.scenes.views import beam_view
+from flexdt.clients.viewer.scenes.world import World, beads_on, placed, quaternion
 from flexdt.clients.viewer.scrubbed_plan import (
     document,
     plan_text,
@@ -153,7 +150,7 @@ def test_far_off_axis_the_beams_eye_says_that_it_is_not_exact() -> None:
 @pytest.mark.daily(1)
 def test_every_component_has_a_look_in_metres(name: str) -> None:
     for part in builtin_machine(name).components:
-        content = solids.glb(solids.pieces_of(part))
+        content = glb(pieces_of(part))
         scene = trimesh.load(trimesh.util.wrap_as_stream(content), file_type="glb")
         extent = np.asarray(scene.extents)
         # A look may add a housing or feet to the body that collides, no more.
@@ -214,15 +211,15 @@ class Twin:
 def test_a_shape_comes_in_parts_or_not_at_all() -> None:
     sample = SampleState(name="ring", revision="1")
     content = bytes(range(256)) * 20
-    assert asyncio.run(solids.fetch(Twin(content).ask, sample)) == content
-    assert asyncio.run(solids.fetch(Twin(content, after=3).ask, sample)) is None
-    assert asyncio.run(solids.fetch(Twin(content, name="other").ask, sample)) is None
-    assert asyncio.run(solids.fetch(Twin(b"").ask, sample)) is None
+    assert asyncio.run(fetch(Twin(content).ask, sample)) == content
+    assert asyncio.run(fetch(Twin(content, after=3).ask, sample)) is None
+    assert asyncio.run(fetch(Twin(content, name="other").ask, sample)) is None
+    assert asyncio.run(fetch(Twin(b"").ask, sample)) is None
 
     async def refuse(method: str, params: Mapping[str, Any]) -> object:
         raise RpcError(-32601, "no such method")
 
-    assert asyncio.run(solids.fetch(refuse, sample)) is None
+    assert asyncio.run(fetch(refuse, sample)) is None
 
 
 def test_packed_pixels_come_out_within_half_a_step() -> None:
@@ -296,13 +293,13 @@ def test_the_margin_is_the_body_and_what_is_within_the_clearance_of_it() -> None
     """Box: faces moved out by the margin, corners round. Cylinder: the same about its axis."""
     low, high = np.array([-5.0, -3.0, 1.0]), np.array([7.0, 4.0, 2.0])
     corners = np.array([[x, y, z] for x in (-5, 7) for y in (-3, 4) for z in (1, 2)], dtype=float)
-    shell = solids.grown(solids.bare(hull(corners)), 2.5)
+    shell = grown(bare(hull(corners)), 2.5)
     np.testing.assert_allclose(shell.bounds, [low - 2.5, high + 2.5], atol=1e-9)
     points = np.asarray(shell.vertices)
     outside = np.linalg.norm(points - np.clip(points, low, high), axis=1)
     np.testing.assert_allclose(outside, 2.5, atol=1e-9)
-    column = solids.bare(UprightCylinder((1.0, 2.0, 3.0), 10.0, 30.0))
-    points = np.asarray(solids.grown(column, 2.0).vertices) - [1.0, 2.0, 3.0]
+    column = bare(UprightCylinder((1.0, 2.0, 3.0), 10.0, 30.0))
+    points = np.asarray(grown(column, 2.0).vertices) - [1.0, 2.0, 3.0]
     radial = np.maximum(np.hypot(points[:, 0], points[:, 1]) - 10.0, 0.0)
     outside = np.hypot(radial, np.maximum(np.abs(points[:, 2]) - 15.0, 0.0))
     assert outside.max() < 2.0 + 1e-9

@@ -16,7 +16,8 @@ from flexdt.library import machines
 from flexdt.library.failure import CommandError
 
 if TYPE_CHECKING:
-    from flexdt.clients.following.session import FollowSession, FramesBeside
+    from flexdt.clients.following.frames_beside import FramesBeside
+    from flexdt.clients.following.session import FollowSession
     from flexdt.twin.following.follower import Follower
     from flexdt.twin.following.mirror import Alarm
 
@@ -51,7 +52,9 @@ def follow(
         out: Write beside.png and beside.json of --frames here.
         seconds: End after this time.
     """
-    from flexdt.clients.following.session import STAMP, FollowSession, FramesBeside
+    from flexdt.clients.following.frames_beside import FramesBeside
+    from flexdt.clients.following.recording import STAMP
+    from flexdt.clients.following.session import FollowSession
 
     if (address is None) == (replay is None):
         raise CommandError("give either ADDRESS or --replay FILE", USAGE)

@@ -1,66 +1,35 @@
 """The scanner in viser: built once, then moved by every state; metres, one frame for each part.
 
 viser sends only what changes. Setters may be called from any one thread at a time.
-
-The lab has plain lamps for every browser, and finer ones where a graphics processor draws. Without
-one, shadows and an environment take ten times as long as all the rest of a picture.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import viser
 
-from flexdt.clients.viewer.scenes import painted_meshes as solids
-from flexdt.clients.viewer.scenes.drawing_aids import (
-    HOME,
-    SCREEN,
-    BeamShade,
-    Drag,
-    Gizmos,
-    Name,
-    PlanDrawing,
-    names_of_image,
-    names_of_parts,
-)
-from flexdt.clients.viewer.scenes.painted_meshes import LAMP, SampleLook, cabinet, ground_of
+from flexdt.clients.viewer.scenes.beam_planes import BeamShade
+from flexdt.clients.viewer.scenes.cabinet import LAMP, cabinet, ground_of
+from flexdt.clients.viewer.scenes.collision_bodies import bare, grown
+from flexdt.clients.viewer.scenes.drag_handles import Drag, Gizmos
+from flexdt.clients.viewer.scenes.lamps import light_plainly
+from flexdt.clients.viewer.scenes.layers import Nodes, Shown
+from flexdt.clients.viewer.scenes.name_tags import Name, names_of_image, names_of_parts
+from flexdt.clients.viewer.scenes.painted_meshes import cylinder, glb, plain
+from flexdt.clients.viewer.scenes.paints import RUBBER
+from flexdt.clients.viewer.scenes.part_looks import pieces_of
+from flexdt.clients.viewer.scenes.plan_drawing import HOME, SCREEN, PlanDrawing
+from flexdt.clients.viewer.scenes.sample_looks import SampleLook
 from flexdt.clients.viewer.scenes.still import Shape, cone, cut, image_on, placed, shape_of
-from flexdt.clients.viewer.scenes.world import MM, Nodes, Shown, World, motors, quaternion
+from flexdt.clients.viewer.scenes.world import MM, World, motors, quaternion
 from flexdt.protocol.state_model import State
 from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine, Profile
-
-SKY: Final = "/lights/sky"
-GROUND: Final = (120, 116, 112)
-SKY_COLOR: Final = (236, 242, 255)
-KEY, KEY_AT = "/lights/key", (1.8, -2.2, 3.2)
-FILL_AT: Final = (-2.6, 1.4, 1.2)
-"""Where light comes from [m]."""
-
-
-def light_plainly(scene: viser.SceneApi) -> None:
-    """Lamps without shadows, for all clients."""
-    scene.configure_environment_map(None)
-    scene.add_light_hemisphere(SKY, sky_color=SKY_COLOR, ground_color=GROUND, intensity=1.35)
-    scene.add_light_directional(KEY, intensity=2.5, position=KEY_AT)
-    scene.add_light_directional("/lights/fill", intensity=0.8, position=FILL_AT)
-
-
-def light_finely(scene: viser.SceneApi) -> None:
-    """A room that shines in metal and lights from all around, and a lamp that casts shadows.
-
-    Args:
-        scene: of one client; its lamps take the place of those that all have.
-    """
-    scene.configure_environment_map("studio", environment_intensity=0.1)
-    scene.add_light_hemisphere(SKY, sky_color=SKY_COLOR, ground_color=GROUND, intensity=1.1)
-    scene.add_light_directional(KEY, intensity=1.9, position=KEY_AT, cast_shadow=True)
-
 
 FLOOR_MM = -405.0
 BEAM_ON = (255, 176, 32)
@@ -152,10 +121,10 @@ class LabScene:
             frame = scene.add_frame(f"/machine/{part.name}", show_axes=False)
             self._frames[part.name] = frame
             own = self._own.get(part.name)
-            pieces = solids.pieces_of(part)
+            pieces = pieces_of(part)
             self._solids[part.name] = cut(pieces)
             self._looks.append(scene.add_glb(
-                f"/machine/{part.name}/look", own or solids.glb(pieces),
+                f"/machine/{part.name}/look", own or glb(pieces),
                 position=tuple(np.array(part.mesh_at_mm if own else (0.0, 0.0, 0.0)) * MM),
                 receive_shadow=part is ground,  # a part's shadow on itself has stripes
             ))  # fmt: skip
@@ -166,7 +135,7 @@ class LabScene:
             "/cabinet/lamp", radius=0.045, color=LAMP[False], position=tuple(lamp * MM), **still
         )
         self._cabinet = [
-            scene.add_glb("/cabinet/walls", solids.glb(pieces), cast_shadow=False),
+            scene.add_glb("/cabinet/walls", glb(pieces), cast_shadow=False),
             self._lamp,
         ]
         self._frames["sample"] = scene.add_frame("/sample", show_axes=False)
@@ -200,10 +169,10 @@ class LabScene:
     def _build_bodies(self) -> None:
         margin = self.machine.safety_margin_mm
         for name, body in self._bodies.items():
-            hull = solids.bare(body.solid)
+            hull = bare(body.solid)
             self._hulls[name] = self._hull(f"/machine/{name}/body", hull, RED, 0.35)
             if margin > 0.0:
-                shell = solids.grown(hull, margin)
+                shell = grown(hull, margin)
                 self._margins[name] = self._hull(f"/machine/{name}/margin", shell, AMBER, 0.25)
 
     def _build_labels(self) -> None:
@@ -229,7 +198,7 @@ class LabScene:
         return out + names_of_parts(self.machine, dict(self._sent))
 
     def _hull(self, node: str, mesh: Any, color: tuple[int, int, int], opacity: float) -> Any:
-        vertices, faces = solids.plain(mesh)
+        vertices, faces = plain(mesh)
         return self._server.scene.add_mesh_simple(
             node, vertices, faces, color=color, opacity=opacity,
             side="double", visible=False, cast_shadow=False, receive_shadow=False,
@@ -356,9 +325,9 @@ class LabScene:
         low = mount.center_mm[2] + mount.size_mm[2] / 2 - self.machine.sample_height_mm
         high = min(float(skin.vertices[:, 2].min()) for skin in look.skins) / MM
         if high > low:
-            rod = solids.cylinder(5.0, high - low, (0.0, 0.0, 0.5 * (low + high)), solids.RUBBER)
+            rod = cylinder(5.0, high - low, (0.0, 0.0, 0.5 * (low + high)), RUBBER)
             self._solids["object"] = cut([rod])
-            self._server.scene.add_glb(name, solids.glb([rod]), receive_shadow=False)
+            self._server.scene.add_glb(name, glb([rod]), receive_shadow=False)
 
     def nodes(self, shown: Shown, near: Collection[str] = ()) -> Nodes:
         """The nodes of all layers, for frames of a page that shows `shown`.

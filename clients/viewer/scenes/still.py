@@ -2,16 +2,12 @@
 
 Triangles are shaded flat and compete for pixels by their depth, in whole arrays: triangles of about
 one size are filled together. The live scene replaces it, so shadows and smooth surfaces can wait.
-
-`Stills` are those of a viewer's pages: computed one at a time, the newest kept.
 """
 
 from __future__ import annotations
 
-import asyncio
 import math
-from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,8 +16,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from flexdt.clients.viewer.scenes.painted_meshes import PaintedMesh, Skin
-from flexdt.clients.viewer.scenes.world import MM, Standpoint, World, roomy
+from flexdt.clients.viewer.scenes.painted_meshes import PaintedMesh
+from flexdt.clients.viewer.scenes.sample_looks import Skin
+from flexdt.clients.viewer.scenes.views import Standpoint
+from flexdt.clients.viewer.scenes.world import MM, World
 from flexdt.twin.geometry.conventions import FloatArray
 
 NEAR_M = 0.02
@@ -36,6 +34,10 @@ SKY, KEY = (0.62, (0.55, -0.6, 0.58))
 """Light from everywhere, and the direction that the rest comes from."""
 GROUND = {False: ((248, 250, 253), (217, 225, 236)), True: ((42, 49, 64), (15, 19, 26))}
 """Dark page or not -> colour of the background above and below, as the scenes have it."""
+Pose = tuple[float, ...]
+"""Quaternion (w, x, y, z) and place [m]."""
+COARSE = (76, 60)
+"""Columns and rows of the image on the panel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +55,6 @@ class Shape:
     color: npt.NDArray[np.generic]
     opacity: float = 1.0
     lit: bool = True
-
-
-Pose = tuple[float, ...]
-"""Quaternion (w, x, y, z) and place [m]."""
-COARSE = (76, 60)
-"""Columns and rows of the image on the panel."""
 
 
 def cut(pieces: Iterable[PaintedMesh]) -> list[Shape]:
@@ -216,49 +212,3 @@ def _filled(
             won = value >= depth[place]
             which[place[won]] = some[index[won]]
     return depth, which
-
-
-LEAST_PX, MOST_PX = 32, 1200
-MOST_BYTES = 60_000
-KEPT = 16
-
-
-class Stills:
-    """Pictures, each until the scene is another one."""
-
-    def __init__(self) -> None:
-        self._turn = asyncio.Lock()
-        self._kept: OrderedDict[object, bytes] = OrderedDict()
-
-    async def picture(
-        self,
-        camera: Standpoint,
-        asked: Mapping[str, str],
-        stamp: tuple[object, ...],
-        shapes: Callable[[], Sequence[Shape]],
-    ) -> bytes:
-        """A JPEG of at most MOST_BYTES.
-
-        Args:
-            camera: from where.
-            asked: `w` and `h` [px], and `dark` where it is "1": the page's query.
-            stamp: says whether the scene is still the same.
-            shapes: makes what is seen, in a thread.
-        """
-        width, height = (_side(asked.get(name, "")) for name in ("w", "h"))
-        dark = asked.get("dark") == "1"
-        key = camera, width, height, dark, *stamp
-        async with self._turn:
-            if key not in self._kept:
-                seen = roomy(camera, width / height)
-                self._kept[key] = await asyncio.to_thread(
-                    lambda: jpeg(drawn(shapes(), seen, (width, height), dark), MOST_BYTES)
-                )
-                while len(self._kept) > KEPT:
-                    self._kept.popitem(last=False)
-            return self._kept[key]
-
-
-def _side(text: str) -> int:
-    """Pixels of a query's words."""
-    return min(MOST_PX, max(LEAST_PX, int(text[:5]) if text.isdecimal() else 0))

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from flexdt.clients.following.session import heard
+from flexdt.clients.following.hearing import heard
 from flexdt.phantoms import load_phantom
 from flexdt.twin.collision.convex_pieces import convex_pieces
 from flexdt.twin.collision.plan_report import collision_check

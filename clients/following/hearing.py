@@ -1,0 +1,49 @@
+"""From the bytes of the scanner's interface to what a follower hears: no socket, no clock."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+
+from flexdt.clients.gateway.vocabulary import Question, Refusal, read_command
+from flexdt.protocol.acquila import AcquilaError, AcquilaEvent, parse_event
+from flexdt.twin.following.mirror import Heard, What
+from flexdt.twin.script import commands as c
+from flexdt.twin.script.grammar import own_name
+
+
+def heard(data: bytes, axes: Collection[str], stamp: str, late_s: float = 0.0) -> Heard:
+    """One message.
+
+    Args:
+        data: as it came; UTF-8, or one byte for each character where a cluster makes it none. What
+            stands before the object, such as a topic, is left out.
+        axes: motors and virtual axes of the machine.
+        stamp: time of day, hh:mm:ss.mmm.
+        late_s: by how much earlier it may have come than it was read [s].
+
+    Raises:
+        AcquilaError: the bytes are no event.
+    """
+    data = data[max(0, data.find(b"{")) :]
+    try:
+        event = parse_event(data)
+    except AcquilaError:
+        event = parse_event(data.decode("latin-1"))
+    event = replace(event, component=own_name(event.component, axes))
+    command, asks = _read(event, axes)
+    words = (event.component, event.command, event.arg1, event.arg2)
+    what: What = event.reply_type.value or "SEND"  # type: ignore[assignment]
+    tick, reply = event.tick_count, event.reply
+    return Heard(event.key, what, words, command, reply, asks, stamp, tick, late_s)
+
+
+def _read(event: AcquilaEvent, axes: Collection[str]) -> tuple[c.Command | None, str]:
+    """The typed command, and what a question asks for; neither of what the scripts do not know."""
+    try:
+        command = read_command(event, axes)
+    except Refusal:
+        return None, ""
+    if isinstance(command, Question):
+        return None, command.path[-1]
+    return (command if type(command).__module__ == c.__name__ else None), ""

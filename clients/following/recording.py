@@ -1,0 +1,71 @@
+"""Raw messages of a scanner with the times of day at which they came: written and read.
+
+One message after the other, each behind its time: `[hh:mm:ss.ffffff LATE] MESSAGE`, where LATE is
+how many seconds earlier it may have come. Messages are kept byte for byte and may hold line ends;
+that the link came up or was lost is a message that begins with `--`. The form is that of the public
+`monitor_zmq.py`, whose times are whole seconds without LATE: they may be anywhere in their second.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+STAMP: Final = re.compile(rb"^\[(\d\d):(\d\d):(\d\d(?:\.\d+)?)(?: (\d+\.\d+))?\] ", re.MULTILINE)
+LINK: Final = b"-- "
+UP: Final = b"-- connected"
+DAY_S: Final = 86400.0
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """One message.
+
+    Attributes:
+        at_s: when it was read, since the midnight before the first [s].
+        late_s: by how much earlier it may have come [s].
+        data: as it came.
+    """
+
+    at_s: float
+    late_s: float
+    data: bytes
+
+
+def time_of_day(seconds: float, digits: int = 3) -> str:
+    """hh:mm:ss.mmm of a time since a midnight.
+
+    Example:
+        >>> time_of_day(86400.0 + 3723.5)
+        '01:02:03.500'
+    """
+    unit = 10**digits
+    whole, part = divmod(round(seconds * unit) % round(DAY_S * unit), unit)
+    hour, minute = divmod(whole // 60, 60)
+    return f"{hour:02d}:{minute:02d}:{whole % 60:02d}.{part:0{digits}d}"
+
+
+def format_recorded(message: Recorded) -> bytes:
+    """A message as a recording holds it."""
+    head = f"[{time_of_day(message.at_s, 6)} {message.late_s:.6f}] "
+    return head.encode() + message.data + b"\n"
+
+
+def read_recording(data: bytes) -> Iterator[Recorded]:
+    """The messages of a recording; times go on after midnight.
+
+    Example:
+        >>> recording = b"[23:59:59] {}\\n[00:00:01.5 0.002] {}\\n"
+        >>> [(m.at_s, m.late_s) for m in read_recording(recording)]
+        [(86400.0, 1.0), (86401.5, 0.002)]
+    """
+    stamps, last = list(STAMP.finditer(data)), 0.0
+    for stamp, end in zip(stamps, [*(s.start() for s in stamps[1:]), len(data)], strict=True):
+        hour, minute, second = (float(x) for x in stamp.groups()[:3])
+        late = float(stamp[4] or (0.0 if b"." in stamp[3] else 1.0))
+        at = 3600.0 * hour + 60.0 * minute + second + (0.0 if b"." in stamp[3] else 1.0)
+        at += DAY_S * round((last - at) / DAY_S)
+        last = at
+        yield Recorded(at, late, data[stamp.end() : end].removesuffix(b"\n"))

@@ -1,0 +1,148 @@
+"""Messages that a page's scenes may send to viser, each validated field by field and encoded anew.
+
+Only the kinds of a list get through (`ALLOWED`), by viser's names for them.
+"""
+
+from __future__ import annotations
+
+import logging
+import struct
+from typing import Annotated, Final
+
+import msgpack
+from annotated_types import Ge, Gt, Le, MaxLen
+from pydantic import Field, ValidationError
+
+from flexdt.protocol.fields import Params
+from flexdt.runtime.log import log
+
+LARGEST_SIDE: Final = 4096
+"""Of a picture of a view [px]."""
+MAX_SMALL: Final = 4096
+"""Bytes of any message but a picture."""
+SHOWN: Final = 40
+Length = Annotated[float, Ge(-1e6), Le(1e6)]
+Part = Annotated[float, Ge(-2), Le(2)]
+Triple = Annotated[tuple[Length, Length, Length], Field(strict=False)]
+Turn = Annotated[tuple[Part, Part, Part, Part], Field(strict=False)]
+Pixels = Annotated[float, Ge(1), Le(100_000)]
+Name = Annotated[str, MaxLen(200)]
+
+
+class ViewerCameraMessage(Params):
+    """Where a frame looks from [m]."""
+
+    wxyz: Turn
+    position: Triple
+    fov: Annotated[float, Gt(0), Le(3.2)]
+    near: Annotated[float, Gt(0), Le(1e6)]
+    far: Annotated[float, Gt(0), Le(1e9)]
+    image_height: Pixels
+    image_width: Pixels
+    look_at: Triple
+    up_direction: Triple
+
+
+class TransformControlsDragStartMessage(Params):
+    """A drag of a handle begins."""
+
+    name: Name
+    owner: Name = ""
+
+
+class TransformControlsUpdateMessage(TransformControlsDragStartMessage):
+    """A handle is dragged [m]."""
+
+    wxyz: Turn
+    position: Triple
+
+
+class TransformControlsDragEndMessage(TransformControlsDragStartMessage):
+    """A drag of a handle ends."""
+
+
+class GetRenderResponseMessage(Params):
+    """A picture that the viewer has requested."""
+
+    payload: bytes
+    render_uuid: Name
+
+
+ALLOWED: Final[dict[str, type[Params]]] = {
+    model.__name__: model
+    for model in (
+        ViewerCameraMessage,
+        TransformControlsDragStartMessage,
+        TransformControlsUpdateMessage,
+        TransformControlsDragEndMessage,
+        GetRenderResponseMessage,
+    )
+}
+"""What a page's scenes send, by viser's names for it, each checked field by field."""
+
+
+class Unwanted(ValueError):
+    """A message that pages may not send to viser; its text is short, for the log."""
+
+
+def admitted(raw: str | bytes) -> bytes:
+    """A page's message, validated and encoded anew for viser.
+
+    Raises:
+        Unwanted: says what is wrong.
+    """
+    if isinstance(raw, str):
+        raise Unwanted("text")
+    try:
+        fields = msgpack.unpackb(raw)
+        kind = fields.pop("type")
+        model = ALLOWED.get(kind)
+    except (ValueError, msgpack.UnpackException, AttributeError, LookupError, TypeError):
+        raise Unwanted("no message") from None
+    if model is None:
+        raise Unwanted(f"{str(kind)[:SHOWN]!a}")
+    if model is not GetRenderResponseMessage and len(raw) > MAX_SMALL:
+        raise Unwanted(f"a {kind} that is too long")
+    try:
+        read = model.model_validate(fields)
+    except ValidationError as error:
+        where = ".".join(map(str, error.errors()[0]["loc"]))
+        raise Unwanted(f"a {kind} with a wrong {where[:SHOWN]!a}") from None
+    if isinstance(read, GetRenderResponseMessage) and not _small_picture(read.payload):
+        raise Unwanted(f"a {kind} that is no PNG of at most {LARGEST_SIDE} pixels a side")
+    return bytes(msgpack.packb({**read.model_dump(), "type": kind}))
+
+
+def _small_picture(data: bytes) -> bool:
+    """Whether a PNG's header states a small size; empty bytes report a failure and pass."""
+    if not data:
+        return True
+    if len(data) < 24 or not data.startswith(b"\x89PNG\r\n\x1a\n") or data[12:16] != b"IHDR":
+        return False
+    return all(0 < side <= LARGEST_SIDE for side in struct.unpack(">II", data[16:24]))
+
+
+class MessageFilter:
+    """Passes pages' messages on to viser; each reason to drop one is logged once.
+
+    Attributes:
+        dropped: messages so far.
+    """
+
+    MAX_LOGGED: Final = 100
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        self._logged: set[str] = set()
+
+    def admit(self, raw: str | bytes) -> bytes | None:
+        """The message as it goes to viser, or None to drop it."""
+        try:
+            return admitted(raw)
+        except Unwanted as error:
+            self.dropped += 1
+            problem = str(error)
+        if problem not in self._logged and len(self._logged) < self.MAX_LOGGED:
+            self._logged.add(problem)
+            log("a scene's message was dropped", logging.WARNING, message=problem)
+        return None

@@ -1,0 +1,140 @@
+"""The beam's light in the air, in two planes through the focal spot and the cone's sides.
+
+It is whole before the sample, and behind it as much as came through. The planes are those of the
+image's middle column and row; the cone's sides are faint. A place behind the sample has the
+transmission of the pixel at which its ray ends, so the shadow stands in the air. A look through all
+of it passes two sides and one sheet of each plane, and keeps half of what lies behind. The ball
+around the sample is left out: where in it light is lost no radiograph says, and a plane through a
+transparent sample would hide half of it. Units: mm, m for viser.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import viser
+
+from flexdt.clients.viewer.scenes.world import MM, World, quaternion
+from flexdt.twin.geometry.conventions import FloatArray
+
+SHAPE: Final = (160, 192)
+"""Rows and columns of each plane's picture."""
+LIGHT: Final = (255, 176, 32)
+MOST: Final = 56
+"""Opacity of the whole beam in a plane, of 255."""
+HULL: Final = 0.08
+"""Opacity of the cone's sides."""
+SIDES: Final = np.array([[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 1, 4]], dtype=np.uint32)
+
+
+@dataclass(frozen=True, eq=False)
+class BeamPlane:
+    """A rectangle with a fan of rays in it.
+
+    Attributes:
+        rgba: (rows, cols, 4); columns go along `axes[:, 0]`, rows along `axes[:, 1]`.
+        size: width and height [mm].
+        center: (3,) [mm].
+        axes: (3, 3) its directions.
+    """
+
+    rgba: npt.NDArray[np.uint8]
+    size: tuple[float, float]
+    center: FloatArray
+    axes: FloatArray
+
+
+def fans(world: World, lines: npt.NDArray[np.generic], radius_mm: float) -> list[BeamPlane]:
+    """Planes of the middle column before and behind the sample, and of the middle row.
+
+    Args:
+        world: of the image's moment.
+        lines: line integrals (rows, cols).
+        radius_mm: of the ball around the sample.
+    """
+    rows, cols = lines.shape
+    through = np.exp(-np.asarray(lines, dtype=np.float64))
+    height, width = world.shape
+    planes = []
+    for across, behind in (
+        (world.v * height, through[:, cols // 2]),
+        (world.u * width, through[rows // 2]),
+    ):
+        for side, light in ((-1.0, np.ones(1)), (1.0, behind)):
+            planes.append(_fan(world, across, light, side, radius_mm))
+    return planes
+
+
+def _fan(
+    world: World, across: FloatArray, through: FloatArray, side: float, radius: float
+) -> BeamPlane:
+    """Rays to a line of pixels through the image's middle, which `across` leads along, before the
+    sample (`side` -1) or behind it (1)."""
+    along = across / np.linalg.norm(across)
+    middle = world.detector - world.source
+    ahead = middle - (middle @ along) * along
+    length = float(np.linalg.norm(ahead))
+    ahead = ahead / length
+    # In the plane: (distance from the focal spot, along the line of pixels).
+    cut = float((world.sample.shift - world.source) @ ahead) + side * radius
+    near, far = (0.0, max(cut, 1.0)) if side < 0.0 else (min(max(cut, 0.0), length - 1.0), length)
+    half = 0.5 * float(np.linalg.norm(across))
+    first, last = middle @ along - half, middle @ along + half
+    low, high = min(first * near, first * far) / length, max(last * near, last * far) / length
+    rows, cols = SHAPE
+    a = near + (np.arange(cols) + 0.5) * (far - near) / cols
+    b = low + (np.arange(rows)[:, None] + 0.5) * (high - low) / rows
+    part = (b * length / a - first) / (last - first)
+    pixel = np.clip(part * len(through), 0, len(through) - 1).astype(int)
+    rgba = np.empty((*SHAPE, 4), dtype=np.uint8)
+    rgba[..., :3] = LIGHT
+    rgba[..., 3] = np.where((part >= 0.0) & (part < 1.0), MOST * through[pixel], 0.0).clip(0, 255)
+    center = world.source + 0.5 * (near + far) * ahead + 0.5 * (low + high) * along
+    axes = np.stack([ahead, along, np.cross(ahead, along)], axis=1)
+    return BeamPlane(rgba, (far - near, float(high - low)), center, axes)
+
+
+class BeamShade:
+    """The planes in a scene."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        plain: Any = {"visible": False, "cast_shadow": False, "receive_shadow": False}
+        self._planes: list[Any] = [
+            scene.add_image(
+                f"/beam/shade{name}", np.zeros((2, 2, 4), dtype=np.uint8), 0.01, 0.01, **plain
+            )
+            for name in range(4)
+        ]
+        self._hull = scene.add_mesh_simple(
+            "/beam/cone", np.zeros((5, 3), np.float32), SIDES, color=LIGHT, opacity=HULL,
+            side="double", **plain,
+        )  # fmt: skip
+        self._newest: tuple[World, npt.NDArray[np.generic], float] | None = None
+        self._lit = False
+
+    def show(self, world: World, lines: npt.NDArray[np.generic], radius_mm: float) -> None:
+        """Take the newest image (see `fans`)."""
+        self._newest = world, lines, max(radius_mm, 1.0)
+        self._draw()
+
+    def light(self, on: bool) -> None:
+        """Show the beam or not."""
+        if on != self._lit:
+            self._lit = on
+            for handle in (*self._planes, self._hull):
+                handle.visible = on
+            self._draw()
+
+    def _draw(self) -> None:
+        if not self._lit or self._newest is None:
+            return
+        world = self._newest[0]
+        self._hull.vertices = (np.vstack([world.source, world.corners]) * MM).astype(np.float32)
+        for handle, plane in zip(self._planes, fans(*self._newest), strict=True):
+            handle.image = plane.rgba
+            handle.render_width, handle.render_height = (side * MM for side in plane.size)
+            handle.position = tuple((plane.center * MM).tolist())
+            handle.wxyz = quaternion(plane.axes)

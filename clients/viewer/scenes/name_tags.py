@@ -1,0 +1,145 @@
+"""Names of what is seen; no name covers another.
+
+Where they stand is a pure function of boxes in pixels. A name's box goes to the free place nearest
+to the point that it names, and a leader joins the two. The names then share these places so that
+their leaders are shortest together: none crosses another. `NameTags` draws them in the views of
+browsers, whose cameras decide where the boxes are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+import viser
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
+
+from flexdt.clients.viewer.scenes.world import MM, World
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.machine.description import Machine
+
+WAYS, RINGS_PX = 24, (26.0, 44.0, 66.0, 92.0, 124.0, 164.0, 220.0, 300.0, 420.0)
+"""Directions and distances in which a place is looked for, the near ones first."""
+GAP_PX = 5.0
+"""Between boxes, and to the picture's edge."""
+LETTER_PX, LINE_PX, PAD_PX = 6.6, 17.0, 10.0
+"""Widest letter, height and margin of viser's labels on a screen."""
+LEAST_PX = 260
+"""A view that is narrower has no names."""
+LEADER: Final = (40, 150, 235)
+Name = tuple[str, FloatArray]
+"""Words, and the point (3,) that they name [m, world]."""
+
+
+def laid_out(anchors: FloatArray, sizes: FloatArray, area: tuple[float, float]) -> FloatArray:
+    """Top left corners (n, 2) of the names' boxes; NaN where a name has no room.
+
+    Args:
+        anchors: (n, 2) what is named [px]; NaN or outside the picture: no name.
+        sizes: (n, 2) widths and heights of the boxes [px].
+        area: width and height of the picture [px].
+    """
+    turns = np.arange(WAYS) * 2.0 * math.pi / WAYS
+    ways = np.stack([np.cos(turns), -np.sin(turns)], axis=1)
+    rings = np.repeat(np.arange(len(RINGS_PX)), WAYS)
+    preference = rings + 0.5 * (1.0 + np.tile(ways[:, 1], len(RINGS_PX)))
+    size = sizes.max(axis=0, initial=0.0)  # of every place, so that any name has room in it
+    places, named = np.zeros((0, 2)), np.zeros(0, dtype=int)
+    for k in np.argsort(anchors[:, 1]):
+        if not ((anchors[k] >= 0.0) & (anchors[k] <= area)).all():
+            continue
+        middles = np.concatenate([anchors[k] + (r + 0.5 * size) * ways for r in RINGS_PX])
+        inside = (np.abs(middles - 0.5 * np.array(area)) <= 0.5 * (area - size) - GAP_PX).all(1)
+        apart = (np.abs(middles[:, None] - places) >= size + GAP_PX).any(axis=2).all(axis=1)
+        covered = (np.abs(middles[:, None] - anchors) < 0.5 * size + GAP_PX).all(axis=2).sum(axis=1)
+        cost = np.where(inside & apart, preference + 4.0 * covered, np.inf)
+        if np.isfinite(cost).any():
+            places, named = np.vstack([places, middles[np.argmin(cost)]]), np.append(named, k)
+    # Where two leaders crossed, their names could change places and both would be shorter.
+    lengths = np.linalg.norm(places[:, None] - anchors[named], axis=2)
+    place, name = linear_sum_assignment(lengths)
+    out = np.full((len(anchors), 2), np.nan)
+    out[named] = places[place[np.argsort(name)]] - 0.5 * sizes[named]
+    return out
+
+
+def leader_end(anchor: FloatArray, corner: FloatArray, size: FloatArray) -> FloatArray:
+    """The point of a box that is nearest to what it names, (2,)."""
+    return np.clip(anchor, corner, corner + size)
+
+
+def names_of_image(world: World) -> list[Name]:
+    """Source, sample and detector."""
+    image = world.detector + world.u * (0.25 * world.shape[1]) - world.normal
+    named = ("X-ray source", world.source), ("sample", world.sample.shift), ("detector", image)
+    return [(words, at * MM) for words, at in named]
+
+
+def names_of_parts(machine: Machine, poses: Mapping[str, tuple[float, ...]]) -> list[Name]:
+    """Parts that move or have a role, at a corner, from their poses (w, x, y, z, place [m])."""
+    out = []
+    for part in machine.components:
+        if (pose := poses.get(part.name)) is not None and (part.axis is not None or part.role):
+            (x, _, z), middle = part.size_mm, np.array(part.center_mm)
+            turn = Rotation.from_quat(pose[:4], scalar_first=True)
+            at = turn.apply((middle + [x / 2, 0.0, z / 2]) * MM) + pose[4:]
+            out.append((part.name.replace("_", " "), np.asarray(at)))
+    return out
+
+
+class NameTags:
+    """Names in the scene of each client, as its own camera sees them."""
+
+    def __init__(self) -> None:
+        self._drawn: dict[int, object] = {}
+
+    def draw(self, client: viser.ClientHandle, names: Sequence[Name]) -> None:
+        """Put the names where they have room now; nothing is sent while nothing has moved."""
+        camera = client.camera
+        area = float(camera.image_width), float(camera.image_height)
+        names = names if area[0] >= LEAST_PX else ()
+        eye, ahead = camera.position, camera.look_at - camera.position
+        ahead = ahead / np.linalg.norm(ahead)
+        right = np.cross(ahead, camera.up_direction)
+        right /= np.linalg.norm(right)
+        axes = np.stack([right, np.cross(ahead, right), ahead])
+        key = [area, camera.fov, eye.round(4), axes.round(4), [(w, p.round(4)) for w, p in names]]
+        if self._drawn.get(client.client_id) == (seen := str(key)):
+            return
+        self._drawn[client.client_id] = seen
+        points = np.array([point for _, point in names]).reshape(-1, 3)
+        x, y, depth = axes @ (points - eye).T
+        depth[depth < 0.02] = np.nan
+        scale = 0.5 * area[1] / math.tan(0.5 * camera.fov)
+        middle = 0.5 * np.array(area)
+        anchors = middle + scale * np.stack([x, y], axis=1) / depth[:, None]
+        sizes = np.array([[PAD_PX + LETTER_PX * len(words), LINE_PX] for words, _ in names])
+        sizes = sizes.reshape(-1, 2)
+        corners = laid_out(anchors, sizes, area)
+        there = np.flatnonzero(~np.isnan(corners[:, 0]))
+
+        def in_space(places: FloatArray, k: int) -> FloatArray:
+            flat = np.append((places - middle) * depth[k] / scale, depth[k])
+            return np.asarray(eye + flat @ axes)
+
+        with client.atomic():
+            for old in range(len(there), 64):
+                handle: Any = client.scene.get_handle_by_name(f"/names/{old}")
+                if handle is None:
+                    break
+                handle.remove()
+            lines = []
+            for n, k in enumerate(there.tolist()):
+                place = in_space(corners[k] + 0.5 * sizes[k], k)
+                end = leader_end(anchors[k], corners[k], sizes[k])
+                lines.append([in_space(end, k), points[k]])
+                client.scene.add_label(
+                    f"/names/{n}", names[k][0], position=place, anchor="center-center"
+                )
+            client.scene.add_line_segments(
+                "/names/leaders", np.array(lines or np.zeros((1, 2, 3)), np.float32), LEADER,
+                thickness=2.0, thickness_units="screen",
+            )  # fmt: skip

@@ -1,0 +1,92 @@
+"""The scanner's components as painted meshes: recognisable machine parts, from the machine file's
+boxes alone (mm).
+
+`data/parts.toml` says of which pieces a look consists. Components of other names and roles become
+bevelled boxes or cylinders, so another machine file still draws; a part with a mesh of its own is
+drawn as that.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import trimesh
+
+from flexdt.clients.viewer.scenes.painted_meshes import (
+    PaintedMesh,
+    bevelled,
+    cylinder,
+    glb,
+    lathe,
+    turn_matrix,
+)
+from flexdt.clients.viewer.scenes.paints import ALUMINIUM, PAINTS
+from flexdt.phantoms.files.mesh_files import read_part
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.machine.description import Component, Machine
+
+MIDDLE: Final = (0.0, 0.0, 0.0)
+_TABLE = resources.files("flexdt.clients.viewer.scenes") / "data" / "parts.toml"
+LOOKS: Final[Mapping[str, Any]] = tomllib.loads(_TABLE.read_text(encoding="utf-8"))
+
+
+def own_looks(machine: Machine, folder: Path) -> dict[str, bytes]:
+    """Part -> its own mesh as a GLB file [m], for those that have one.
+
+    Args:
+        machine: whose parts.
+        folder: of its machine file, in which the meshes lie.
+
+    Raises:
+        PhantomError: a file cannot be read any more.
+    """
+    looks = {}
+    for part in machine.components:
+        if part.mesh:
+            file = folder / part.mesh
+            own = file.suffix.lower() == ".glb"  # with its colours
+            looks[part.name] = (
+                file.read_bytes() if own else glb([PaintedMesh(read_part(file), ALUMINIUM)])
+            )
+    return looks
+
+
+def pieces_of(part: Component) -> list[PaintedMesh]:
+    """The part's painted meshes, in its own frame [mm]."""
+    if part.points_mm:
+        return [PaintedMesh(trimesh.convex.convex_hull(np.array(part.points_mm)), ALUMINIUM)]
+    role = part.role if part.role in LOOKS["looks"] else part.shape
+    look = LOOKS["looks"][LOOKS["components"].get(part.name, role)]
+    pieces = [made for piece in look for made in _pieces(piece, np.array(part.size_mm))]
+    for made in pieces:
+        made.mesh.apply_translation(part.center_mm)
+    return pieces
+
+
+def _pieces(piece: Mapping[str, Any], sides: FloatArray) -> list[PaintedMesh]:
+    """One piece of a look, as often as it is turned; about the middle of a box of these sides."""
+    size, place = (
+        (sides * piece.get(share, MIDDLE) + piece.get(more, MIDDLE)).tolist()
+        for share, more in (("share", "mm"), ("at", "at_mm"))
+    )
+    paint, axis = PAINTS[piece["paint"]], piece.get("axis", "z")
+    made = []
+    for angle in np.radians(piece.get("turned_deg", [0.0])):
+        match piece["solid"]:
+            case "box":
+                one = bevelled(size, place, paint, piece.get("bevel", 2.0))
+            case "cylinder":
+                along = size["xyz".index(axis)]
+                one = cylinder(size[0], along, place, paint, axis, piece.get("sections", 48))
+            case _:
+                wide = max(sides[0], sides[2])
+                profile = [(r * wide + a, h * sides[1] + b) for r, a, h, b in piece["profile"]]
+                one = lathe(profile, place, paint, axis)
+        one.mesh.apply_transform(turn_matrix((0, 0, 1), angle))
+        made.append(one)
+    return made

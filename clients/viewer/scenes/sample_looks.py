@@ -1,0 +1,167 @@
+"""The sample as coloured meshes, one for each material.
+
+Shipped phantoms are made from their names; meshes of uploads come from the twin, by `sample.mesh`,
+for a bounded time and up to a bounded size. Until an upload's mesh has arrived, and where it has
+too many triangles to send, a box of its size stands in.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Awaitable, Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Final, cast
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+
+from flexdt.clients.client.flows import adrive, sample_shape
+from flexdt.clients.viewer.scenes.painted_meshes import SMOOTH_RAD, plain
+from flexdt.clients.viewer.scenes.world import MM
+from flexdt.phantoms import Phantom, load_phantom, mesh_phantom
+from flexdt.protocol import RpcError
+from flexdt.protocol.state_model import SampleState
+from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.conventions import FloatArray
+
+COLORS: Mapping[str, tuple[int, int, int]] = {
+    "steel": (206, 212, 220),
+    "abs": (222, 66, 48),
+    "aluminium": (188, 198, 210),
+    "pmma": (150, 205, 230),
+    "water": (110, 170, 235),
+    "bone": (240, 226, 196),
+}
+"""Material -> colour; others get the last one's."""
+OTHER: Final = (214, 170, 90)
+KEPT: Final = 8
+MAX_FACES: Final = 200_000
+DEFAULT_MATERIAL: Final = "abs"
+Key = tuple[str | None, str | None, str | None]
+Ask = Callable[[str, Mapping[str, Any]], Awaitable[object]]
+
+
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """One mesh of a sample.
+
+    Attributes:
+        name: of the node.
+        vertices: (n, 3) float32 [m], the sample's own frame.
+        faces: (m, 3) uint32.
+        color: (r, g, b).
+        dense: metal beads and the like, drawn opaque inside a translucent body.
+    """
+
+    name: str
+    vertices: npt.NDArray[np.float32]
+    faces: npt.NDArray[np.uint32]
+    color: tuple[int, int, int]
+    dense: bool
+
+
+@dataclass(frozen=True, eq=False)
+class SampleLook:
+    """A sample as the scene needs it.
+
+    Attributes:
+        skins: its meshes.
+        beads: (k, 3) [mm], the sample's own frame.
+        exact: whether this is the sample's shape, or only a box of its size.
+    """
+
+    skins: tuple[Skin, ...]
+    beads: FloatArray
+    exact: bool = True
+
+    @property
+    def radius_mm(self) -> float:
+        """Of the ball about the sample's origin that holds it; of a hand for an empty stage."""
+        far = [float(np.linalg.norm(skin.vertices, axis=1).max()) for skin in self.skins]
+        return max(far) / MM if far else 50.0
+
+
+NOTHING = SampleLook((), np.zeros((0, 3)))
+
+
+def _key(sample: SampleState) -> Key:
+    return sample.name, sample.revision, sample.material
+
+
+class MeshCache:
+    """Looks of samples, made once each."""
+
+    def __init__(self) -> None:
+        self._made: OrderedDict[Key, SampleLook] = OrderedDict()
+
+    def lacks(self, sample: SampleState) -> bool:
+        """Whether the sample is an upload whose mesh has not arrived yet."""
+        return sample.revision is not None and _key(sample) not in self._made
+
+    def add(self, sample: SampleState, stl: bytes) -> None:
+        """The shape of an upload.
+
+        Raises:
+            TwinError: it is no mesh.
+        """
+        material = sample.material or DEFAULT_MATERIAL
+        made = mesh_phantom(stl, material=material, file_type="stl", place="keep")
+        self._keep(sample, made)
+
+    def look(self, sample: SampleState) -> SampleLook:
+        """How `sample` looks, an upload whose mesh is lacking as a box; it may take a second."""
+        if sample.name is None:
+            return NOTHING
+        if sample.revision is None and _key(sample) not in self._made:
+            with suppress(TwinError):
+                self._keep(sample, load_phantom(sample.name))
+        return self._made.get(_key(sample)) or _box(sample)
+
+    def _keep(self, sample: SampleState, phantom: Phantom) -> None:
+        self._made[_key(sample)] = _skins(phantom)
+        while len(self._made) > KEPT:
+            self._made.popitem(last=False)
+
+
+def _skins(phantom: Phantom) -> SampleLook:
+    groups: dict[str, list[trimesh.Trimesh]] = {}
+    for part in phantom.parts():
+        mesh = part.mesh
+        if part.hole:
+            mesh = mesh.copy()
+            mesh.invert()
+        groups.setdefault(part.material, []).append(mesh)
+    skins = []
+    for material, meshes in groups.items():
+        mesh = cast("trimesh.Trimesh", trimesh.util.concatenate(meshes))
+        if len(mesh.faces) <= MAX_FACES:
+            mesh = trimesh.graph.smooth_shade(mesh, angle=SMOOTH_RAD)
+        vertices, faces = plain(mesh)
+        name = "".join(c if c.isalnum() else "_" for c in material)
+        dense = material == "steel" and len(groups) > 1
+        skins.append(Skin(name, vertices, faces, COLORS.get(material, OTHER), dense))
+    return SampleLook(tuple(skins), np.asarray(phantom.beads))
+
+
+def _box(sample: SampleState) -> SampleLook:
+    if sample.size_mm is None:
+        return NOTHING
+    vertices, faces = plain(trimesh.creation.box(extents=sample.size_mm))
+    skin = Skin("size", vertices, faces, OTHER, False)
+    return SampleLook((skin,), np.zeros((0, 3)), exact=False)
+
+
+async def fetch(ask: Ask, sample: SampleState) -> bytes | None:
+    """The STL of the sample on the stage; None if the sample has changed or is too large.
+
+    Raises:
+        ConnectionLost: the twin has gone.
+    """
+    try:
+        told = await adrive(sample_shape(), lambda asked: ask(asked.method, asked.params))
+    except RpcError:  # nothing on the stage any more, too large, or an older twin
+        return None
+    same = (told.name, told.revision) == (sample.name, sample.revision)
+    return told.data or None if same else None

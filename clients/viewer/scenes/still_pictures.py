@@ -1,0 +1,56 @@
+"""Still pictures of a viewer's pages: computed one at a time, the newest kept."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
+
+from flexdt.clients.viewer.scenes.still import Shape, drawn, jpeg
+from flexdt.clients.viewer.scenes.views import Standpoint, roomy
+
+LEAST_PX, MOST_PX = 32, 1200
+MOST_BYTES: Final = 60_000
+KEPT: Final = 16
+
+
+class Stills:
+    """Pictures, each until the scene is another one."""
+
+    def __init__(self) -> None:
+        self._turn = asyncio.Lock()
+        self._kept: OrderedDict[object, bytes] = OrderedDict()
+
+    async def picture(
+        self,
+        camera: Standpoint,
+        asked: Mapping[str, str],
+        stamp: tuple[object, ...],
+        shapes: Callable[[], Sequence[Shape]],
+    ) -> bytes:
+        """A JPEG of at most MOST_BYTES.
+
+        Args:
+            camera: from where.
+            asked: `w` and `h` [px], and `dark` where it is "1": the page's query.
+            stamp: says whether the scene is still the same.
+            shapes: makes what is seen, in a thread.
+        """
+        width, height = (_side(asked.get(name, "")) for name in ("w", "h"))
+        dark = asked.get("dark") == "1"
+        key = camera, width, height, dark, *stamp
+        async with self._turn:
+            if key not in self._kept:
+                seen = roomy(camera, width / height)
+                self._kept[key] = await asyncio.to_thread(
+                    lambda: jpeg(drawn(shapes(), seen, (width, height), dark), MOST_BYTES)
+                )
+                while len(self._kept) > KEPT:
+                    self._kept.popitem(last=False)
+            return self._kept[key]
+
+
+def _side(text: str) -> int:
+    """Pixels of a query's words."""
+    return min(MOST_PX, max(LEAST_PX, int(text[:5]) if text.isdecimal() else 0))

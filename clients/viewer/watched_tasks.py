@@ -1,0 +1,37 @@
+"""Background tasks that are watched.
+
+asyncio keeps a task's exception until somebody awaits the task: a failure of a watched one is
+logged, reported to whoever depends on the task, and not followed by a restart.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+from flexdt.runtime.log import log
+
+
+def watched(
+    work: Coroutine[Any, Any, None], what: str, died: Callable[[], None] = lambda: None
+) -> asyncio.Task[None]:
+    """Run `work` as a task.
+
+    Args:
+        work: the coroutine.
+        what: it does, for the log.
+        died: called when it has failed.
+    """
+
+    async def run() -> None:
+        try:
+            await work
+        except Exception:
+            log(f"{what} failed", logging.ERROR, error=True)
+            died()
+
+    task = asyncio.create_task(run())
+    task.add_done_callback(lambda _: work.close())  # where it was cancelled before it began
+    return task
