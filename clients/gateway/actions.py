@@ -19,8 +19,8 @@ from flexdt.clients.gateway.connected_twin import (
     Armed,
     CommandProgress,
     ConnectedTwin,
-    Image,
 )
+from flexdt.clients.gateway.saved_images import Image
 from flexdt.clients.gateway.vocabulary import (
     AbortScript,
     Question,

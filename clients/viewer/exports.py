@@ -19,13 +19,13 @@ import numpy as np
 import numpy.typing as npt
 import viser
 
-from flexdt.clients.viewer.feed import ShownImage, grey, window_of
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.layers import Nodes
 from flexdt.clients.viewer.scenes.sample_looks import SampleLook
 from flexdt.clients.viewer.scenes.views import FREE, Standpoint
 from flexdt.clients.viewer.scenes.world import world_of
 from flexdt.clients.viewer.scrubbed_plan import Scrubbed, positions_at
+from flexdt.clients.viewer.shown_images import ShownImage, grey, window_of
 from flexdt.clients.viewer.viser_gate import Scenes, look_from
 from flexdt.protocol.state_model import State
 from flexdt.twin.machine.description import Machine, Profile

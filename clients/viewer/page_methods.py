@@ -30,13 +30,14 @@ from flexdt.clients.client.flows import Ask
 from flexdt.clients.viewer import exports
 from flexdt.clients.viewer import scrubbed_plan as plans
 from flexdt.clients.viewer.exports import Form
-from flexdt.clients.viewer.feed import ShownImage, packed, wish
 from flexdt.clients.viewer.front import Download
 from flexdt.clients.viewer.page import Page, without_bytes
+from flexdt.clients.viewer.reconstruction_process import wish
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.layers import LAYERS
 from flexdt.clients.viewer.scenes.views import FREE
 from flexdt.clients.viewer.scenes.world import motors
+from flexdt.clients.viewer.shown_images import ShownImage, packed
 from flexdt.clients.viewer.viewer import PageMethod, Viewer
 from flexdt.protocol import Code, Method, RpcError, parse_params
 from flexdt.protocol import image as wire_image
@@ -71,6 +72,10 @@ from flexdt.twin.script.compose import compose_script
 from flexdt.twin.script.scan_request import Kind as KindOfScan
 from flexdt.twin.script.scan_request import ScanRequest
 
+APART: Final = 0.01
+"""Of two positions that are not the same [mm, deg]."""
+MAX_SHARED: Final = 2
+"""Pictures and exports under way at a time, for all pages: each may take hundreds of megabytes."""
 Kind = Literal["line_integral", "counts"]
 View = Literal["iso", "beam", "side", "free"]
 Grey = Annotated[float, Ge(-1e6), Le(1e6)]
@@ -219,12 +224,6 @@ class Export(Params):
 
     format: Form = "html"
     replay: bool = False
-
-
-APART: Final = 0.01
-"""Of two positions that are not the same [mm, deg]."""
-MAX_SHARED: Final = 2
-"""Pictures and exports under way at a time, for all pages: each may take hundreds of megabytes."""
 
 
 async def layers(viewer: Viewer, page: Page, params: Params) -> object:

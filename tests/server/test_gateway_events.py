@@ -23,8 +23,9 @@ from hypothesis import strategies as st
 
 from flexdt.clients.client.transport import ConnectionLost
 from flexdt.clients.gateway import event_server as shell
-from flexdt.clients.gateway.connected_twin import ConnectedTwin, Image, Recording
+from flexdt.clients.gateway.connected_twin import ConnectedTwin
 from flexdt.clients.gateway.event_server import Gateway
+from flexdt.clients.gateway.saved_images import Image, Recording
 from flexdt.clients.gateway.vocabulary import Refusal
 from flexdt.protocol.acquila import (
     FIELDS,

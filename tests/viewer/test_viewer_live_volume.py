@@ -19,7 +19,6 @@ import pytest
 import tifffile
 
 from flexdt.clients.cli import main
-from flexdt.clients.viewer.feed import LiveReconstruction, wish
 from flexdt.clients.viewer.live_volume import (
     MOST_POINTS,
     TOP,
@@ -32,6 +31,7 @@ from flexdt.clients.viewer.live_volume import (
     reconstruct,
     surface,
 )
+from flexdt.clients.viewer.reconstruction_process import LiveReconstruction, wish
 from flexdt.clients.viewer.volume_truth import figures, main_level, truth_of
 from flexdt.library.reading.folders import load_dataset
 from flexdt.phantoms import load_phantom

@@ -25,9 +25,10 @@ from flexdt.clients.launch import up
 from flexdt.clients.viewer import main as viewer_main
 from flexdt.clients.viewer import page as tasks
 from flexdt.clients.viewer import viewer as app
-from flexdt.clients.viewer.feed import ImageFeed, ShownImage
+from flexdt.clients.viewer.feed import ImageFeed
 from flexdt.clients.viewer.page import HIDDEN, MAX_NOTES, Page
 from flexdt.clients.viewer.page_methods import METHODS, serve
+from flexdt.clients.viewer.shown_images import ShownImage
 from flexdt.protocol import METHODS as WIRE
 from flexdt.protocol import Connection, Notification, Request, Response
 from flexdt.runtime.process_settings import Address, UpSettings, ViewerSettings

@@ -20,7 +20,6 @@ import viser
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from flexdt.clients.viewer.feed import ShownImage, grey, packed, window_of
 from flexdt.clients.viewer.scenes.beam_planes import HULL, MOST, SIDES, fans
 from flexdt.clients.viewer.scenes.collision_bodies import bare, grown
 from flexdt.clients.viewer.scenes.drag_handles import Gizmos
@@ -37,6 +36,7 @@ from flexdt.clients.viewer.scrubbed_plan import (
     projection_positions,
     source_path,
 )
+from flexdt.clients.viewer.shown_images import ShownImage, grey, packed, window_of
 from flexdt.phantoms import load_phantom, phantom_names
 from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SampleState, State

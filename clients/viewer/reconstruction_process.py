@@ -1,0 +1,131 @@
+"""The process of `live_volume`: one at a time, and pages ask it for what they draw."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import sys
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+from flexdt.clients.viewer.watched_tasks import watched
+from flexdt.runtime.workers import ENVIRONMENT
+
+PROGRAM: Final = "flexdt.clients.viewer.live_volume"
+LINE_BYTES: Final = 4 << 20
+SINGLE: Final = {name: ones for name, ones in ENVIRONMENT.items() if not name.startswith("NUMBA")}
+"""The process itself says how many threads its kernels have."""
+Answer = tuple[dict[str, Any], bytes]
+Wish = tuple[str, ...]
+"""What the process reads first."""
+
+
+def wish(folder: Path, side: int, past: bool) -> Wish:
+    """The volume of a data set, with so many voxels a side; the whole one of a past scan."""
+    return str(folder.absolute()), str(side), *(["past"] if past else [])
+
+
+class LiveReconstruction:
+    """The one process of a viewer, for the data set that was asked for last.
+
+    Args:
+        tell: gets its lines.
+    """
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self._tell, self.newest = tell, ""
+        self._asked: Wish = ()
+        self._task: asyncio.Task[None] | None = None
+        self._ending: asyncio.Task[None] | None = None
+        self._spare: asyncio.Task[asyncio.subprocess.Process] | None = None
+        self._writer: asyncio.StreamWriter | None = None
+        self._wanted: deque[asyncio.Future[Answer]] = deque()
+
+    def warm(self) -> None:
+        """Have a process ready that has loaded what it needs: that takes longer than a slice."""
+        if self._spare is None and self._task is None:
+            self._spare = asyncio.create_task(_started())
+
+    def grow(self, folder: Path, side: int, past: bool = False) -> None:
+        """Grow the volume of a data set, unless that is being done; the last line comes again."""
+        asked = wish(folder, side, past)
+        if asked == self._asked:
+            if self.newest:
+                self._tell(self.newest)
+            return
+        self.stop()
+        self._asked = asked
+        self._task = watched(self._follow(*asked), "a live reconstruction")
+
+    def stop(self) -> None:
+        """End what is under way."""
+        if self._task is not None:
+            self._task.cancel()
+            self._ending = self._task
+        self._task, self._asked, self.newest = None, (), ""
+        self._hang_up()
+
+    async def close(self) -> None:
+        """End all there is."""
+        self.stop()
+        if self._ending is not None:
+            await asyncio.wait([self._ending])
+        if self._spare is not None:
+            process = await self._spare
+            process.kill()
+            await process.wait()
+
+    def _hang_up(self) -> None:
+        """Nobody answers any more who has been asked for a slice."""
+        self._writer = None
+        while self._wanted:
+            self._wanted.popleft().cancel()
+
+    async def ask(self, asked: Wish, *words: str) -> Answer | None:
+        """What the process answers, and bytes behind it; None while there is none, or once it
+        has another volume than the one `asked` for."""
+        if self._writer is None or asked != self._asked:
+            return None
+        wanted: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+        self._wanted.append(wanted)
+        self._writer.write("\t".join(words).encode() + b"\n")
+        with suppress(asyncio.CancelledError):  # somebody has asked for another volume
+            return await wanted
+        return None
+
+    async def _follow(self, *asked: str) -> None:
+        spare, self._spare = self._spare, None
+        process = await (spare or _started())
+        assert process.stdout is not None
+        assert process.stdin is not None
+        self._writer = process.stdin
+        self._writer.write("\t".join(asked).encode() + b"\n")
+        try:
+            async for line in process.stdout:
+                kind, _, content = line.decode().partition("\t")
+                if kind == "answer":
+                    size, _, told = content.partition("\t")
+                    answer = json.loads(told), await process.stdout.readexactly(int(size))
+                    if not (wanted := self._wanted.popleft()).done():
+                        wanted.set_result(answer)
+                else:
+                    self.newest = line.decode()
+                    self._tell(self.newest)
+            self._hang_up()
+            await process.wait()  # to kill what has just ended would take its code from the loop
+        finally:
+            if process.returncode is None:
+                process.kill()
+            await process.wait()
+
+
+async def _started() -> asyncio.subprocess.Process:
+    return await asyncio.create_subprocess_exec(
+        sys.executable, "-P", "-m", PROGRAM,
+        stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.DEVNULL, env={**os.environ, **SINGLE}, limit=LINE_BYTES,
+    )  # fmt: skip
