@@ -21,7 +21,6 @@ import ssl as tls
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
-from importlib import resources
 from typing import Any, Final
 from urllib.parse import SplitResult, parse_qs, urlsplit
 
@@ -32,6 +31,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
+from flexdt.clients.viewer.page_html import PAGE, page_file
 from flexdt.clients.viewer.page_messages import MessageFilter
 from flexdt.clients.viewer.viser_gate import MARK, parted
 from flexdt.runtime.access import check_bind, is_loopback, token_matches
@@ -114,7 +114,10 @@ class Front:
         self._guessing, self._closing = asyncio.Lock(), asyncio.Event()
         self.wrong_tokens = 0
         self._downloads, self._token, self._still = downloads, token, still
-        more = b"<style>%s</style><script>%s</script>" % (_data("scene.css"), _data("scene.js"))
+        more = b"<style>%s</style><script>%s</script>" % (
+            page_file("scene.css"),
+            page_file("scene.js"),
+        )
         bare, self._program = parted(scene_html)
         self._program_path = f"/viser-{hashlib.sha256(self._program).hexdigest()[:16]}.js"
         bare = bare.replace(MARK, b'<script src="%b"></script>' % self._program_path.encode(), 1)
@@ -196,11 +199,11 @@ class Front:
             kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
             disposition = f'attachment; filename="{file.name}"'
             return _response(file.content, kind, {"Content-Disposition": disposition})
-        name = "index.html" if url.path == "/" else url.path.removeprefix("/")
+        name = PAGE if url.path == "/" else url.path.removeprefix("/")
         if not re.fullmatch(r"[a-z0-9_-]+\.(html|css|js|svg)", name):
             return _plain(http.HTTPStatus.NOT_FOUND, "no such page")
         try:
-            content = _data(name)
+            content = page_file(name)
         except FileNotFoundError:
             return _plain(http.HTTPStatus.NOT_FOUND, "no such page")
         kind = {"js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}.get(
@@ -362,10 +365,6 @@ def _cookie(request: Request) -> str | None:
             if name == COOKIE:
                 return value
     return None
-
-
-def _data(name: str) -> bytes:
-    return (resources.files("flexdt.clients.viewer") / "data" / name).read_bytes()
 
 
 def _kept(request: Request, body: bytes, kind: str, how_long: str = "no-cache") -> Response:

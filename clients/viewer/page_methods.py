@@ -84,10 +84,11 @@ FileName = Annotated[ShortText, Len(1, 255)]
 Index = Annotated[int, Ge(0), Le(10**6)]
 
 
-_SWITCHES: Any = dict.fromkeys(LAYERS, (bool | None, None))
-_OPACITY: Any = (Annotated[float, Ge(0.05), Le(1)] | None, None)
-Layers: type[Params] = create_model("Layers", __base__=Params, **_SWITCHES, opacity=_OPACITY)
-"""Layers to show or hide on this page; omitted ones stay as they are."""
+def layers_model() -> type[Params]:
+    """Parameters of `viewer.layers`: layers to show or hide on this page; omitted ones stay."""
+    switches: Any = {layer.name: (bool | None, None) for layer in LAYERS}
+    opacity: Any = (Annotated[float, Ge(0.05), Le(1)] | None, None)
+    return create_model("Layers", __base__=Params, **switches, opacity=opacity)
 
 
 class Theme(Params):
@@ -601,7 +602,7 @@ METHODS: Mapping[str, tuple[type[Params], Answer]] = {
     "calibration.apply": (Correct, correct),
     "calibration.fit": (CalibrationFit, estimate),
     "calibration.align": (CalibrationAlign, estimate),
-    "viewer.layers": (Layers, layers),
+    "viewer.layers": (layers_model(), layers),
     "viewer.theme": (Theme, theme),
     "viewer.camera": (Camera, camera),
     "viewer.feed": (Feed, feed),

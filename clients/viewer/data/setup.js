@@ -13,8 +13,8 @@ for (const list of [$select("#mode"), $select("#sample")]) {
     list.addEventListener("keydown", (e) => { if (e.key === "Escape")
         takeBack(list.id); });
 }
-for (const box of $$("#layers input"))
-    box.addEventListener("change", () => void showLayer(box.id.replace("layer-", ""), box.checked));
+for (const box of $$("[data-layer]"))
+    box.addEventListener("change", () => void showLayer(box.dataset.layer ?? "", box.checked));
 const opacity = $input("#opacity");
 opacity.addEventListener("change", () => void reveal({ opacity: Number(opacity.value) }));
 clicks({
@@ -270,7 +270,7 @@ async function showLayer(name, visible) {
 }
 function drawLayers() {
     for (const [name, visible] of Object.entries(store.layers)) {
-        const boxes = $$(name === "gizmos" ? "#layer-gizmos, #handles" : `#layer-${name}`);
+        const boxes = $$(`[data-layer=${name}]`);
         for (const box of boxes)
             if (!choosing.get(name))
                 box.checked = visible;
@@ -278,4 +278,3 @@ function drawLayers() {
     opacity.value = String(store.opacity);
 }
 on("layers", drawLayers);
-$input("#handles").addEventListener("change", () => void showLayer("gizmos", $input("#handles").checked));

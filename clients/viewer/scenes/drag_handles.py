@@ -37,7 +37,7 @@ class _Handle:
 
 
 class Gizmos:
-    """One handle a stage, hidden until wanted.
+    """One handle a stage.
 
     Args:
         server: to draw in.
@@ -50,11 +50,6 @@ class Gizmos:
         self._positions: dict[str, float] = {}
         self._at: dict[str, tuple[float, ...]] = {}
         self._handles = [self._add(server, stage) for stage in STAGES]
-
-    @property
-    def controls(self) -> list[Any]:
-        """Their nodes."""
-        return [handle.control for handle in self._handles]
 
     def update(self, state: State, world: World) -> None:
         """Move the handles with their stages, except the one being dragged."""
@@ -79,7 +74,7 @@ class Gizmos:
         turns = stage == "object" and bool(self._machine.geometry.get("angle"))
         control = server.scene.add_transform_controls(
             f"/gizmos/{stage}", scale=SIZE_M, active_axes=(active[0], active[1], active[2]),
-            disable_sliders=True, disable_rotations=not turns, depth_test=False, visible=False,
+            disable_sliders=True, disable_rotations=not turns, depth_test=False,
             line_width=3.0,
         )  # fmt: skip
         handle = _Handle(stage, control)

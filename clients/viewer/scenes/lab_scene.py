@@ -5,14 +5,14 @@ viser sends only what changes. Setters may be called from any one thread at a ti
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from typing import Any
+from collections.abc import Collection, Mapping
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 import viser
 
-from flexdt.clients.viewer.scenes.beam_planes import BeamShade
+from flexdt.clients.viewer.scenes.beam_planes import LIGHT, BeamShade
 from flexdt.clients.viewer.scenes.cabinet import LAMP, cabinet, ground_of
 from flexdt.clients.viewer.scenes.collision_bodies import bare, grown
 from flexdt.clients.viewer.scenes.drag_handles import Drag, Gizmos
@@ -31,20 +31,21 @@ from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine, Profile
 
-FLOOR_MM = -405.0
-BEAM_ON = (255, 176, 32)
-BEAM_OFF = (120, 140, 165)
-SURFACE = (70, 190, 255)
-FLOOR = (140, 150, 165)
-RANGE = (240, 150, 40)
-RED = (230, 50, 40)
-AMBER = (255, 160, 30)
-STAND = "/object/stand"
-GAP_MM = 0.6
+FLOOR_MM: Final = -405.0
+CONE: Final = 0.2
+"""Opacity of the whole beam in a picture that needs no browser."""
+BEAM_OFF: Final = (120, 140, 165)
+SURFACE: Final = (70, 190, 255)
+FLOOR: Final = (140, 150, 165)
+RANGE: Final = (240, 150, 40)
+RED: Final = (230, 50, 40)
+AMBER: Final = (255, 160, 30)
+STAND: Final = "/object/stand"
+GAP_MM: Final = 0.6
 """Distance of the image from the panel's face, in front of which it floats."""
-HERE = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+HERE: Final = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """The pose of what stands in the world's own frame."""
-AXIS_REACH_MM = 120.0
+AXIS_REACH_MM: Final = 120.0
 SCALE_MM, AXES_MM = 500.0, 150.0
 
 
@@ -71,7 +72,6 @@ class LabScene:
         self._collision = build_scene(machine, profile)
         self._bodies = {b.name: b for b in self._collision.bodies}
         self._frames: dict[str, viser.FrameHandle] = {}
-        self._looks: list[Any] = []
         self._sent: dict[str, tuple[float, ...]] = {}
         self._skins: list[Any] = []
         self._solids: dict[str, list[Shape]] = {}
@@ -86,19 +86,9 @@ class LabScene:
             self._build_bodies()
             self._build_labels()
             self._gizmos = Gizmos(server, machine, drag)
-        self._layers: Mapping[str, Sequence[Any]] = {
-            "beam": [self._beam],
-            "axis": [self._axis, self._cross],
-            "panel": [self._image],
-            "ranges": [self._ranges],
-            "sample": [self._frames["sample"]],
-            "machine": [*self._looks, self._stand_frame],
-            "orbit": [self._paths],
-            "cabinet": self._cabinet,
-            "gizmos": self._gizmos.controls,
-            "labels": self._labels,
-        }
-        """Layer -> nodes to show or hide; those of bodies and margin depend on what is near."""
+            for node, visible in self._visible(Shown()).items():
+                handle: Any = server.scene.get_handle_by_name(node)
+                handle.visible = visible
         self.plain = self.nodes(Shown())
         """How all nodes are built; each frame is told what its page shows otherwise."""
 
@@ -123,26 +113,23 @@ class LabScene:
             own = self._own.get(part.name)
             pieces = pieces_of(part)
             self._solids[part.name] = cut(pieces)
-            self._looks.append(scene.add_glb(
+            scene.add_glb(
                 f"/machine/{part.name}/look", own or glb(pieces),
                 position=tuple(np.array(part.mesh_at_mm if own else (0.0, 0.0, 0.0)) * MM),
                 receive_shadow=part is ground,  # a part's shadow on itself has stripes
-            ))  # fmt: skip
+            )  # fmt: skip
         pieces, lamp = cabinet(self.machine, FLOOR_MM)
         self._solids["cabinet"], self._sent["cabinet"] = cut(pieces), HERE
         still: Any = {"cast_shadow": False, "receive_shadow": False}
         self._lamp = scene.add_icosphere(
             "/cabinet/lamp", radius=0.045, color=LAMP[False], position=tuple(lamp * MM), **still
         )
-        self._cabinet = [
-            scene.add_glb("/cabinet/walls", glb(pieces), cast_shadow=False),
-            self._lamp,
-        ]
+        scene.add_glb("/cabinet/walls", glb(pieces), cast_shadow=False)
         self._frames["sample"] = scene.add_frame("/sample", show_axes=False)
         self._frames["object"] = scene.add_frame("/object", show_axes=False)
-        self._stand_frame = scene.add_frame(STAND, show_axes=False)
-        self._paths = scene.add_frame(HOME, show_axes=False)
-        self._beam = scene.add_frame("/beam", show_axes=False)
+        scene.add_frame(STAND, show_axes=False)
+        scene.add_frame(HOME, show_axes=False)
+        scene.add_frame("/beam", show_axes=False)
         blank = np.zeros((8, 8, 3), dtype=np.uint8)
         self._image = scene.add_image(
             "/panel", blank, 0.1, 0.1, format="jpeg", jpeg_quality=80,
@@ -153,7 +140,7 @@ class LabScene:
             "/beam/edges", np.zeros((8, 2, 3), np.float32), BEAM_OFF, thickness=1.6, **SCREEN
         )
         self._spot = scene.add_icosphere(
-            "/beam/spot", radius=0.004, color=BEAM_ON, cast_shadow=False, receive_shadow=False
+            "/beam/spot", radius=0.004, color=LIGHT, cast_shadow=False, receive_shadow=False
         )
         self._axis = scene.add_line_segments(
             "/axis", _axis_points(), (40, 160, 235), thickness=2.0, **SCREEN
@@ -163,7 +150,7 @@ class LabScene:
         )
         self._ranges = scene.add_line_segments(
             "/ranges", np.zeros((1, 2, 3), dtype=np.float32), RANGE,
-            thickness=2.5, visible=False, **SCREEN,
+            thickness=2.5, **SCREEN,
         )  # fmt: skip
 
     def _build_bodies(self) -> None:
@@ -176,15 +163,14 @@ class LabScene:
                 self._margins[name] = self._hull(f"/machine/{name}/margin", shell, AMBER, 0.25)
 
     def _build_labels(self) -> None:
-        """The world's axes and a scale on the floor; hidden at first."""
+        """The world's axes and a scale on the floor."""
         scene, (x, y, z) = self._server.scene, _scale_mm(self.machine)
         ends = np.array([[[x, y, z], [x, y + SCALE_MM, z]]]) * MM
-        bar = scene.add_line_segments("/scale", ends, RANGE, thickness=5.0, **SCREEN, visible=False)
-        axes = scene.add_frame(
-            "/axes", axes_length=AXES_MM * MM, axes_radius=4 * MM, visible=False,
+        scene.add_line_segments("/scale", ends, RANGE, thickness=5.0, **SCREEN)
+        scene.add_frame(
+            "/axes", axes_length=AXES_MM * MM, axes_radius=4 * MM,
             position=tuple((np.array([x, y - 2 * AXES_MM, z]) * MM).tolist()),
         )  # fmt: skip
-        self._labels = [bar, axes]
 
     def named(self, world: World, shown: Shown) -> list[Name]:
         """What has a name now, and where it is."""
@@ -201,7 +187,7 @@ class LabScene:
         vertices, faces = plain(mesh)
         return self._server.scene.add_mesh_simple(
             node, vertices, faces, color=color, opacity=opacity,
-            side="double", visible=False, cast_shadow=False, receive_shadow=False,
+            side="double", cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
 
     # -- moving ------------------------------------------------------------------------------
@@ -239,7 +225,7 @@ class LabScene:
         a, b, c, d, e = points
         lines = [(a, b), (a, c), (a, d), (a, e), (b, c), (c, d), (d, e), (e, b)]
         self._edges.points = np.array(lines, dtype=np.float32)
-        self._edges.colors = np.full((8, 2, 3), BEAM_ON if on else BEAM_OFF, dtype=np.uint8)
+        self._edges.colors = np.full((8, 2, 3), LIGHT if on else BEAM_OFF, dtype=np.uint8)
         self._spot.position = tuple(points[0])
         self._spot.visible = on
         self._cross.position = tuple((world.foot - GAP_MM * 2 * world.normal) * MM)
@@ -264,8 +250,11 @@ class LabScene:
         out = [shape for n in drawn for shape in placed(self._solids[n], poses[n])]
         skins = () if self._look is None or "sample" not in shown else self._look.skins
         out += placed([shape_of(skin, shown.opacity) for skin in skins], poses["sample"])
-        image = [image_on(np.asarray(self._image.image), world)]
-        return out + image + ([cone(world, BEAM_ON, 0.2)] if self._lit else [])
+        if "panel" in shown:
+            out.append(image_on(np.asarray(self._image.image), world))
+        if self._lit and "beam" in shown:
+            out.append(cone(world, LIGHT, CONE))
+        return out
 
     # -- what is seen ------------------------------------------------------------------------
 
@@ -335,12 +324,16 @@ class LabScene:
         Args:
             near: components near a contact, whose collision bodies and margins are drawn, too.
         """
-        out = {h.name: {"visible": n in shown} for n, hs in self._layers.items() for h in hs}
-        for layer, handles in (("bodies", self._hulls), ("margin", self._margins)):
-            out |= {h.name: {"visible": layer in shown or n in near} for n, h in handles.items()}
+        out = {n: {"visible": visible} for n, visible in self._visible(shown, near).items()}
         skins = () if self._look is None else self._look.skins
         clear = {f"/sample/{skin.name}": _clear(shown.opacity, skin.dense) for skin in skins}
         return {**out, **clear}
+
+    def _visible(self, shown: Shown, near: Collection[str] = ()) -> dict[str, bool]:
+        """Whether each node is visible; margins of 0 have no nodes."""
+        there = self._server.scene.get_handle_by_name
+        wanted = shown.visible(self._bodies, near)
+        return {node: on for node, on in wanted.items() if there(node) is not None}
 
     def draw_ranges(self, state: State) -> None:
         """Draw the remaining travel of each stage as a line through its position."""

@@ -1,27 +1,81 @@
-"""The layers of the scenes; what a page shows of them is each person's own choice (`Shown`)."""
+"""The layers of the scenes; what a page shows of them is each person's own choice (`Shown`).
+
+`LAYERS` is the one list: the page's boxes, the methods' parameters and the nodes that the scenes
+show or hide are made from it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
-
-LAYERS: Final[Mapping[str, bool]] = {
-    "beam": True, "axis": True, "panel": True, "ranges": False, "bodies": False, "margin": False,
-    "sample": True, "machine": True, "orbit": True, "gizmos": False, "labels": False,
-    "names": True, "cabinet": True,
-}  # fmt: skip
-"""Layer -> whether it is shown until somebody chooses."""
 
 Nodes = Mapping[str, Mapping[str, Any]]
 """Name of a node -> its properties; `visible` is one of them."""
 
 
 @dataclass(frozen=True)
+class Layer:
+    """What a page shows or hides as a whole.
+
+    Attributes:
+        name: on the wire.
+        title: of its box on the page.
+        shown: until somebody chooses.
+        nodes: names of its nodes in the scene, where `{part}` stands for each component; none for
+            names, which each view has drawn for itself.
+        near: show the components near a contact, whatever is chosen.
+    """
+
+    name: str
+    title: str
+    shown: bool
+    nodes: tuple[str, ...] = ()
+    near: bool = False
+
+    def nodes_of(self, parts: Collection[str]) -> Iterator[tuple[str, str | None]]:
+        """The names of its nodes, each with the component that it belongs to, if to one.
+
+        >>> list(Layer("margin", "safety margin", False, ("/{part}/margin",)).nodes_of(["tube"]))
+        [('/tube/margin', 'tube')]
+        """
+        for node in self.nodes:
+            if "{part}" in node:
+                yield from ((node.format(part=part), part) for part in parts)
+            else:
+                yield node, None
+
+
+LAYERS: Final[tuple[Layer, ...]] = (
+    Layer("beam", "X-ray cone", True, ("/beam",)),
+    Layer("panel", "image on the panel", True, ("/panel",)),
+    Layer("axis", "axis, piercing point", True, ("/axis", "/piercing")),
+    Layer("ranges", "travel ranges", False, ("/ranges",)),
+    Layer("bodies", "collision bodies", False, ("/machine/{part}/body",), near=True),
+    Layer("margin", "safety margin", False, ("/machine/{part}/margin",), near=True),
+    Layer("sample", "sample", True, ("/sample",)),
+    Layer("machine", "machine", True, ("/machine/{part}/look", "/object/stand")),
+    Layer("cabinet", "cabinet", True, ("/cabinet/walls", "/cabinet/lamp")),
+    Layer("orbit", "planned trajectory", True, ("/object/plan",)),
+    Layer(
+        "gizmos", "handles to drag", False, ("/gizmos/source", "/gizmos/object", "/gizmos/detector")
+    ),
+    Layer("names", "names of source, sample, detector", True),
+    Layer("labels", "all names, axes, scale", False, ("/scale", "/axes")),
+)
+"""All layers, in the page's order."""
+
+
+def first_shown() -> frozenset[str]:
+    """Names of the layers that are shown until somebody chooses."""
+    return frozenset(layer.name for layer in LAYERS if layer.shown)
+
+
+@dataclass(frozen=True)
 class Shown:
     """The layers that are shown, and the opacity of the sample (0, 1]."""
 
-    layers: frozenset[str] = frozenset(name for name, on in LAYERS.items() if on)
+    layers: frozenset[str] = field(default_factory=first_shown)
     opacity: float = 0.5
 
     def __contains__(self, layer: str) -> bool:
@@ -41,4 +95,20 @@ class Shown:
     @property
     def told(self) -> dict[str, object]:
         """For the page."""
-        return {"shown": {name: name in self for name in LAYERS}, "opacity": self.opacity}
+        return {
+            "shown": {layer.name: layer.name in self for layer in LAYERS},
+            "opacity": self.opacity,
+        }
+
+    def visible(self, parts: Collection[str], near: Collection[str] = ()) -> dict[str, bool]:
+        """Whether each node of all layers is visible.
+
+        Args:
+            parts: names of the machine's components.
+            near: those near a contact.
+        """
+        return {
+            node: layer.name in self or (layer.near and part in near)
+            for layer in LAYERS
+            for node, part in layer.nodes_of(parts)
+        }

@@ -14,7 +14,7 @@ for (const list of [$select("#mode"), $select("#sample")]) {
   list.addEventListener("change", () => list.classList.add("typed"));
   list.addEventListener("keydown", (e) => { if (e.key === "Escape") takeBack(list.id); });
 }
-for (const box of $$<HTMLInputElement>("#layers input")) box.addEventListener("change", () => void showLayer(box.id.replace("layer-", ""), box.checked));
+for (const box of $$<HTMLInputElement>("[data-layer]")) box.addEventListener("change", () => void showLayer(box.dataset.layer ?? "", box.checked));
 const opacity = $input("#opacity");
 opacity.addEventListener("change", () => void reveal({ opacity: Number(opacity.value) }));
 clicks({
@@ -210,10 +210,9 @@ async function showLayer(name: string, visible: boolean) {
 }
 function drawLayers() {
   for (const [name, visible] of Object.entries(store.layers)) {
-    const boxes = $$<HTMLInputElement>(name === "gizmos" ? "#layer-gizmos, #handles" : `#layer-${name}`);
+    const boxes = $$<HTMLInputElement>(`[data-layer=${name}]`);
     for (const box of boxes) if (!choosing.get(name)) box.checked = visible;
   }
   opacity.value = String(store.opacity);
 }
 on("layers", drawLayers);
-$input("#handles").addEventListener("change", () => void showLayer("gizmos", $input("#handles").checked));

@@ -116,9 +116,9 @@ export type JobStatus = {
 export type Jog = { axis: string; velocity: number; lease_s?: number };
 export type JsonValue = unknown;
 export type Layers = {
-  beam?: boolean | null; axis?: boolean | null; panel?: boolean | null; margin?: boolean | null;
-  sample?: boolean | null; machine?: boolean | null; gizmos?: boolean | null; labels?: boolean | null;
-  names?: boolean | null; opacity?: number | null
+  beam?: boolean | null; panel?: boolean | null; axis?: boolean | null; margin?: boolean | null;
+  sample?: boolean | null; machine?: boolean | null; names?: boolean | null; labels?: boolean | null;
+  opacity?: number | null
 };
 export type Live = { name?: string | null; side?: 128 | 192 | 256 | 512; past?: boolean };
 export type Mark = {

@@ -1,0 +1,32 @@
+"""The page's HTML: `data/index.html`, and in it a box for each layer of the scenes."""
+
+from __future__ import annotations
+
+import html
+from importlib import resources
+from typing import Final
+
+from flexdt.clients.viewer.scenes.layers import LAYERS, Layer
+
+PAGE: Final = "index.html"
+PLACE: Final = "<!-- a box for each layer -->"
+"""Where the boxes stand."""
+
+
+def page_file(name: str) -> bytes:
+    """A file of the page, as browsers get it.
+
+    Raises:
+        FileNotFoundError: there is none of this name.
+    """
+    content = (resources.files("flexdt.clients.viewer") / "data" / name).read_bytes()
+    return content.replace(PLACE.encode(), boxes(LAYERS).encode(), 1) if name == PAGE else content
+
+
+def boxes(layers: tuple[Layer, ...]) -> str:
+    """A labelled checkbox for each layer, a line each."""
+    return "\n        ".join(
+        f'<div><label><input type="checkbox" id="layer-{layer.name}" data-layer="{layer.name}">'
+        f"{html.escape(layer.title)}</label></div>"
+        for layer in layers
+    )
