@@ -11,6 +11,7 @@ from importlib import import_module
 from typing import Any, Final
 
 BACKENDS: Final = {
+    "dry-run pages": "flexdt.library.dry_run_page",
     "geometry files": "flexdt.library.geometry_formats",
     "plots": "flexdt.library.plots",
     "scripts": "flexdt.library.scripts",

@@ -8,7 +8,6 @@ read is no error: it is named among what could not be judged.
 
 from __future__ import annotations
 
-import html
 import json
 import os
 import shutil
@@ -19,10 +18,11 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from flexdt.library import figures, machines
+from flexdt.library import machines
 from flexdt.library.calibration.align_dataset import align_dataset
 from flexdt.library.failure import CommandError
 from flexdt.library.reading.folders import load_dataset, read_settings
+from flexdt.library.report_page import heading, page, table
 from flexdt.runtime.files.dataset_folder import list_folder, read_image, read_text
 from flexdt.twin import commissioning as tells
 from flexdt.twin.commissioning import PastScan, Question
@@ -264,16 +264,16 @@ def write_commission(found: Commissioned, out: Path) -> None:
     part = out.absolute().with_name(f".{out.absolute().name}.part.{os.getpid()}")
     profile = found.offsets.profile.model_dump(exclude={"priors"})
     lines = [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in profile.items()]
-    body = ["<h1>What past scans tell of the machine</h1>"]
+    body: list[str] = [heading("What past scans tell of the machine")]
     for title, (head, rows) in found.tables(out).items():
-        body += [f"<h2>{html.escape(title)}</h2>", figures.table(head, rows)]
+        body += [heading(title, level=2), table(head, rows)]
     try:
         part.mkdir(parents=True)
         for name, text in (
             ("machine.toml", found.text),
             ("profile.toml", "\n".join(lines) + "\n"),
             ("commission.json", json.dumps(found.document(out), indent=1) + "\n"),
-            ("report.html", figures.page("Commissioning", body)),
+            ("report.html", page("Commissioning", body)),
         ):
             (part / name).write_text(text, encoding="utf-8")
         part.rename(out)

@@ -20,8 +20,9 @@ import numpy as np
 from flexdt.library.calibration.bead_tracks import coordinate_rms, predictions
 from flexdt.library.calibration.calibrate import Outcome, calibrate_datasets
 from flexdt.library.datasets.image_set import ImageSet
-from flexdt.library.figures import Series, image_under, page, plot, table
+from flexdt.library.figures import Series, image_under, plot
 from flexdt.library.reading.folders import load_dataset
+from flexdt.library.report_page import figure, heading, marked, page, paragraph, table
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import line_integrals
 from flexdt.twin.calibration.fit.fit import require_identifiable
@@ -167,11 +168,10 @@ def write_comparison(comparison: Comparison, out: Path) -> None:
         np.sqrt(np.nanmean(residual**2, axis=(1, 2))) for residual in comparison.residuals
     )
     frames = np.arange(len(before))
-    body = [
-        f"<h1>{comparison.outcome.datasets[0].name} beside the twin</h1>",
-        f"<p>Tolerance {document['tolerance_px']} px: "
-        f"<span class='{'good' if comparison.within else 'bad'}'>"
-        f"{'within' if comparison.within else 'exceeded'}</span> after correction.</p>",
+    verdict = marked("within", "good") if comparison.within else marked("exceeded", "bad")
+    body: list[str] = [
+        heading(f"{comparison.outcome.datasets[0].name} beside the twin"),
+        paragraph(f"Tolerance {document['tolerance_px']} px: ", verdict, " after correction."),
         table(["", "rms (px)", "worst bead (px)", "rms of the difference image"], rows),
         plot(
             [Series("before", frames, before), Series("after", frames, after)],
@@ -186,5 +186,5 @@ def write_comparison(comparison: Comparison, out: Path) -> None:
     for k, frame in enumerate(comparison.frames):
         for name, stack in shown.items():
             picture = image_under(stack[k], [], title=f"{name}, frame {frame}", width=300)
-            body.append(f"<figure>{picture}</figure>")
+            body.append(figure(picture))
     (out / "report.html").write_text(page("flexdt compare", body), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Figures as SVG text, drawn with matplotlib, and the HTML pages and tables that hold them.
+"""Figures as SVG text, drawn with matplotlib; pages are of `flexdt.library.report_page`.
 
 matplotlib comes with the extra `plots`; it is imported when the first figure is drawn.
 """
@@ -9,7 +9,7 @@ import html
 import io
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from typing import TYPE_CHECKING
@@ -19,11 +19,17 @@ import numpy.typing as npt
 
 from flexdt.library.extras import package
 
+# Earlier import path of these names.
+from flexdt.library.report_page import cell_text as cell_text
+from flexdt.library.report_page import page as page
+from flexdt.library.report_page import table as table
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 COLOURS = ("#1b6ca8", "#c8553d", "#3a7d44", "#8e5ea2", "#b58900", "#17889b", "#9b2226", "#5f6c7b")
+MARK = "#c62828"
 Floats = npt.NDArray[np.float64]
 DPI = 72.0
 """Sizes below are in pixels, which at 72 dpi are also matplotlib's points."""
@@ -80,8 +86,9 @@ def plot(
     height: int = 260,
     flip_y: bool = False,
     equal: bool = False,
+    marks: Iterable[tuple[float, str]] = (),
 ) -> str:
-    """Lines and dots over two axes, as an SVG element.
+    """Draw lines and dots over two axes, as an SVG element.
 
     Args:
         series: what is drawn; points that are not finite are left out.
@@ -89,19 +96,26 @@ def plot(
         width, height: of the whole figure [px].
         flip_y: y grows downwards, as rows of an image do.
         equal: one unit is as long in x as in y.
+        marks: x and text of vertical lines; browsers show the text under the pointer.
     """
-    figure = blank(width, height)
+    figure, marked = blank(width, height), list(marks)
     axes = axes_of(figure, title, x_label, y_label)
     for s, colour in zip(series, cycle(COLOURS), strict=False):
         style = {"lw": 1.2} if s.line else {"ls": "", "marker": ".", "ms": 3.2}
         x, y = np.asarray(s.x, dtype=np.float64), np.asarray(s.y, dtype=np.float64)
-        axes.plot(x, y, color=colour, label=s.name, **style)
+        axes.plot(x, y, color=colour, label=s.name, gid=_id(title, s.name), **style)
+    for k, (at, _) in enumerate(marked):
+        axes.axvline(at, color=MARK, lw=1.2, gid=_id(title, "mark", k))
     if flip_y:
         axes.invert_yaxis()
     if equal:
         axes.set_aspect("equal", adjustable="datalim")
     _legend(figure, series)
-    return svg(figure)
+    text = svg(figure)
+    for k, (_, words) in enumerate(marked):
+        group = f'<g id="{_id(title, "mark", k)}">'
+        text = text.replace(group, f"{group}<title>{html.escape(words)}</title>", 1)
+    return text
 
 
 def arrows(
@@ -128,7 +142,7 @@ def arrows(
         start, stop = places[keep], places[keep] + factor * vectors[keep]
         # One line for all vectors of a group, interrupted by nan after each.
         ends = np.stack([start, stop, np.full_like(start, np.nan)], axis=1).reshape(-1, 2)
-        gid = re.sub(r"\W+", "-", f"{title} {name}")
+        gid = _id(title, name)
         axes.plot(*ends.T, color=colour, lw=1.0, clip_on=False, gid=gid)
         axes.plot(*start.T, ".", color=colour, ms=2.2, label=name, gid=f"{gid}-places")
     _legend(figure, groups)
@@ -174,51 +188,11 @@ def axes_of(figure: Figure, title: str, x_label: str, y_label: str) -> Axes:
     return axes
 
 
+def _id(*words: object) -> str:
+    """An id of a part of a figure."""
+    return re.sub(r"\W+", "-", " ".join(map(str, words)))
+
+
 def _legend(figure: Figure, series: Sequence[Series | tuple[str, Floats, Floats]]) -> None:
     if any(s.name if isinstance(s, Series) else s[0] for s in series):
         figure.legend(loc="outside right upper", fontsize=8, frameon=False)
-
-
-PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>{title}</title>
-<style>
-body {{ font-family: system-ui, sans-serif; margin: 2rem auto; max-width: 62rem; color: #1f2933; }}
-table {{ border-collapse: collapse; margin: 1rem 0; }}
-td, th {{ border: 1px solid #cbd2d9; padding: .25rem .6rem; text-align: right; font-size: .85rem; }}
-th {{ background: #f0f3f6; }} td:first-child, th:first-child {{ text-align: left; }}
-.bad {{ color: #9b2226; font-weight: 600; }} .good {{ color: #2d6a4f; font-weight: 600; }}
-figure {{ display: inline-block; margin: .5rem 1rem .5rem 0; }}
-svg {{ max-width: 100%; height: auto; }}
-</style></head><body>
-{body}
-</body></html>
-"""
-
-
-def page(title: str, body: Sequence[str]) -> str:
-    """A whole HTML page that needs no other file."""
-    return PAGE.format(title=html.escape(title), body="\n".join(body))
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """An HTML table; cells are escaped."""
-    lines = [
-        "".join(f"<{tag}>{html.escape(cell_text(cell))}</{tag}>" for cell in row)
-        for tag, row in [("th", head), *(("td", row) for row in rows)]
-    ]
-    return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
-
-
-def cell_text(value: object) -> str:
-    """A table cell: numbers short, None as a dash."""
-    match value:
-        case None:
-            return "-"
-        case bool():
-            return "yes" if value else "no"
-        case float() if not math.isfinite(value):
-            return "-"
-        case float():
-            return f"{value:.2g}" if 0 < abs(value) < 0.01 or abs(value) >= 1e4 else f"{value:.4g}"
-        case _:
-            return str(value)

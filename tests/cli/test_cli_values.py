@@ -9,7 +9,7 @@ import typer
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flexdt.clients.cli import connection, console, option_values
+from flexdt.clients.cli import console, option_values
 from flexdt.clients.cli.console import PLAIN_INTERVAL_S, ProgressBar
 from flexdt.runtime import process_settings
 
@@ -55,13 +55,13 @@ def test_bad_assignments(words: list[str], says: str) -> None:
     ],
 )
 def test_server_addresses(word: str, expected: tuple[str, int]) -> None:
-    assert connection.server_address(word) == expected
+    assert twin_connection.server_address(word) == expected
 
 
 @pytest.mark.parametrize("word", ["host:0", "host:65536", "host:abc", "[::1", "[::1]x", "host:-1"])
 def test_bad_server_addresses(word: str) -> None:
     with pytest.raises(typer.BadParameter):
-        connection.server_address(word)
+        twin_connection.server_address(word)
 
 
 def test_speed_up() -> None:

@@ -187,7 +187,7 @@ def test_errors_are_sentences_and_nothing_is_left(
     def full(*_: object) -> str:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("flexdt.library.figures.page", full)
+    monkeypatch.setattr("flexdt.library.commission.page", full)
     assert run(["commission", str(lab[1][0]), "--out", str(out)]) == 1
     assert "No space left" in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["empty", "taken"]

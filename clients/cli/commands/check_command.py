@@ -41,9 +41,10 @@ def check(
     if against is not None:
         yield from compare(script, against, machine, html)
         return
+    from flexdt.library.dry_run_page import html_report
     from flexdt.library.scripts import collisions, size_of
     from flexdt.phantoms.samples import as_phantom
-    from flexdt.twin.script import check_script, html_report
+    from flexdt.twin.script import check_script
     from flexdt.twin.script.problems import in_order
 
     data = script.read_bytes()
@@ -76,8 +77,9 @@ def compare(script: Path, log: Path, machine: str | None, html: Path | None) -> 
     Raises:
         CommandError: the log is not of this script; the message names the first line that differs.
     """
+    from flexdt.library.dry_run_page import against_html
     from flexdt.twin.script import parse_script
-    from flexdt.twin.script.dry_run_report import against_html, against_summary
+    from flexdt.twin.script.dry_run_report import against_summary
     from flexdt.twin.script.log_fit import LogComparison, first_difference
     from flexdt.twin.script.parse import is_log
 

@@ -26,7 +26,7 @@ def commission(
         raise CommandError(f"{out} is there; allowed: a new or an empty folder")
     from flexdt.library.commission import commission as commissioned
     from flexdt.library.commission import write_commission
-    from flexdt.library.figures import cell_text
+    from flexdt.library.report_page import cell_text
 
     found = commissioned(folders, traffic, read_log_file)
     write_commission(found, out)

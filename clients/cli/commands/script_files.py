@@ -29,7 +29,7 @@ def read_log_file(log: Path, machine: Machine) -> tuple[Executed, ...]:
     Raises:
         CommandError: it is no log, or a line of it does not hold.
     """
-    from flexdt.clients.following.session import STAMP
+    from flexdt.clients.following.recording import STAMP
     from flexdt.twin.script.executed_log import COLUMNS, read_log
     from flexdt.twin.script.parse import is_log
 

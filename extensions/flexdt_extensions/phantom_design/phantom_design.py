@@ -9,7 +9,6 @@ height at which a block holds beads.
 
 from __future__ import annotations
 
-import html
 import io
 import json
 import math
@@ -22,7 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.extending import CommandError
-from flexdt.library.figures import COLOURS, DPI, blank, page, require_plots, svg, table
+from flexdt.library.figures import COLOURS, DPI, blank, require_plots, svg
+from flexdt.library.report_page import bullets, heading, page, paragraph, table
 from flexdt.phantoms import Phantom, cuboid_with_beads, spiral_positions
 from flexdt.phantoms.bricks import Brickwork, lego_phantom
 from flexdt.twin.calibration import BeadModel
@@ -235,12 +235,11 @@ def write(
         word, drawings = "level", level_drawings(body.size_mm, phantom.beads, request.radius_mm)
     else:
         word, drawings = "brick", brick_drawings(body.bricks, phantom.beads, request.radius_mm)
-    sections = []
+    sections: list[str] = []
     for k, drawing in enumerate(drawings, 1):
         names.append(f"{word}-{k}.png")
         (out / names[-1]).write_bytes(drawing.png())
-        steps = "".join(f"<li>{html.escape(step)}</li>" for step in drawing.steps)
-        sections.append(f"<h2>{drawing.title}</h2>{drawing.svg()}<ul>{steps}</ul>")
+        sections += [heading(drawing.title, level=2), drawing.svg(), bullets(drawing.steps)]
     (out / "build.html").write_text(_page(phantom, sections, document), encoding="utf-8")
     names.append("design.json")
     (out / "design.json").write_text(
@@ -325,9 +324,9 @@ def _page(phantom: Phantom, sections: Sequence[str], document: dict[str, Any]) -
         f"Chosen by: {document['criterion_text']}",
         f"Assumed: {'; '.join(phantom.assumed)}",
     ]
-    first, last = (["<p>" + html.escape(line) + "</p>" for line in part] for part in (lead, notes))
-    heading = f"<h1>{html.escape(title)}</h1>"
-    return page(title, [heading, *first, table(HEADER, table_rows(document)), *sections, *last])
+    rows = table(HEADER, table_rows(document))
+    body = [*map(paragraph, lead), rows, *sections, *map(paragraph, notes)]
+    return page(title, [heading(title), *body])
 
 
 def _of(measured: dict[str, float] | None, name: str) -> str:

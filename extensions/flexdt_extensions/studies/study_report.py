@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -13,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.extending import write_whole
-from flexdt.library.figures import Series, axes_of, blank, cell_text, page, plot, svg, table
+from flexdt.library.figures import Series, axes_of, blank, plot, svg
+from flexdt.library.report_page import cell_text, figure, heading, page, paragraph, table
 from flexdt.twin.geometry.offsets import UNITS
 from flexdt_extensions.studies.experiment_4 import ENOUGH
 from flexdt_extensions.studies.runs import Run, grid
@@ -78,7 +78,7 @@ def _basin_charts(document: Mapping[str, Any]) -> list[str]:
 
 def _real_charts(document: Mapping[str, Any]) -> list[str]:
     """The logged fits beside their simulation: alpha against N for each scan, tables."""
-    charts = ["".join(f"<p>{html.escape(line)}.</p>" for line in real_lines(document))]
+    charts = ["".join(paragraph(f"{line}.") for line in real_lines(document))]
     for curve in document["curves"]:
         rows = curve["by_projections"]
         x = np.log10([float(n) for n in rows])
@@ -176,13 +176,13 @@ def report(document: Mapping[str, Any], *charts: str) -> str:
     shown = [i for i in range(len(head)) if i < 3 or any(row[i] is not None for row in rows)]
     head, rows = [head[i] for i in shown], [[row[i] for i in shown] for row in rows]
     body = [
-        f"<h1>Study: {document['experiment']}, {document['fidelity']}</h1>",
+        heading(f"Study: {document['experiment']}, {document['fidelity']}"),
         table(head, rows),
-        *(f"<figure>{chart}</figure>" for chart in charts),
+        *map(figure, charts),
+        paragraph(f"{document['thesis_source']}."),
     ]
-    body.append(f"<p>{document['thesis_source']}.</p>")
     assumed = [f"{k}: {v}" for k, v in document["assumed"].items() if v is not None]
-    body.append(f"<p>Assumed: {html.escape('; '.join(assumed))}.</p>")
+    body.append(paragraph(f"Assumed: {'; '.join(assumed)}."))
     return page(f"flexdt study {document['experiment']}", body)
 
 

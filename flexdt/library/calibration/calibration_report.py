@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import html
 import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +14,8 @@ from scipy.special import fdtri
 
 from flexdt.library.calibration.calibrate import Outcome, digits
 from flexdt.library.datasets.image_set import ImageSet
-from flexdt.library.figures import Series, arrows, ellipse_plot, image_under, page, plot, table
+from flexdt.library.figures import Series, arrows, ellipse_plot, image_under, plot
+from flexdt.library.report_page import bullets, code, figure, heading, page, paragraph, table
 from flexdt.runtime.files.whole_files import write_whole
 from flexdt.twin.calibration.fit.certificate import Certificate
 from flexdt.twin.calibration.fit.fit import FitResult
@@ -26,6 +26,8 @@ ELLIPSES = 6
 MAP_FRAMES = 180
 """Largest number of frames whose residuals are drawn over the detector; of more frames, every
 second, third... is drawn."""
+DIGITS: Final = 3
+"""Decimals of a pixel in a track."""
 
 
 def write_report(outcome: Outcome[ImageSet], path: Path) -> None:
@@ -41,22 +43,19 @@ def report(outcome: Outcome[ImageSet]) -> str:
     """The whole page."""
     document: Any = outcome.document
     result, names = outcome.calibration, ", ".join(d.name for d in outcome.datasets)
-    body = [
-        f"<h1>Calibration of {html.escape(names)}</h1>",
-        f"<p>Phantom {html.escape(outcome.phantom.name)}, {document['frames']} frames, "
-        f"{document['detections']} shadows, {document['seconds']} s.</p>",
-        f"<p class='{'good' if result.identifiable else 'bad'}'>"
-        f"{html.escape(document['verdict'])}</p>",
-        *(f"<pre>{html.escape(line)}</pre>" for line in document["next"]),
+    body: list[str] = [
+        heading(f"Calibration of {names}"),
+        paragraph(
+            f"Phantom {outcome.phantom.name}, {document['frames']} frames, "
+            f"{document['detections']} shadows, {document['seconds']} s."
+        ),
+        paragraph(document["verdict"], kind="good" if result.identifiable else "bad"),
+        *map(code, document["next"]),
     ]
     problems: Any = document["problems"]
     if problems:
-        body.append("<h2>Findings</h2><ul>")
-        body += [
-            f"<li class='{'bad' if p['severity'] == 'error' else ''}'>{html.escape(p['text'])}</li>"
-            for p in problems
-        ]
-        body.append("</ul>")
+        kinds = ["bad" if p["severity"] == "error" else "" for p in problems]
+        body += [heading("Findings", level=2), bullets([p["text"] for p in problems], kinds)]
     if result.fit is not None:
         body += _fit_parts(result.fit, document)
         body += _pictures(outcome, result.fit)
@@ -83,17 +82,14 @@ def _fit_parts(fit: FitResult, document: Mapping[str, Any]) -> list[str]:
         for some in document.get("image_space", ())
         for n, q in some.items()
     ]
-    body = [
-        "<h2>Parameters</h2>",
+    body: list[str] = [
+        heading("Parameters", level=2),
         table(HEAD, rows),
-        *(
-            f"<p>{html.escape(n)} {html.escape(t)}.</p>"
-            for n, t in document.get("limited", {}).items()
-        ),
-        "<h3>In the images</h3>" if seen else "",
+        *(paragraph(f"{n} {t}.") for n, t in document.get("limited", {}).items()),
+        heading("In the images", level=3) if seen else "",
         table(["quantity", "value", "sigma", "unit"], seen) if seen else "",
-        f"<p>Reading of eq. 5.4: {fit.reading.value}. Values are true minus nominal.</p>",
-        "<h2>Certificate</h2>",
+        paragraph(f"Reading of eq. 5.4: {fit.reading.value}. Values are true minus nominal."),
+        heading("Certificate", level=2),
         table(
             ["", ""],
             [
@@ -109,14 +105,13 @@ def _fit_parts(fit: FitResult, document: Mapping[str, Any]) -> list[str]:
         ),
     ]
     if c.weak:
-        body.append("<h3>Null and weak directions</h3><ul>")
-        body += [f"<li>{html.escape(text)}</li>" for text in c.weak] + ["</ul>"]
+        body += [heading("Null and weak directions", level=3), bullets(c.weak)]
     for name, why in c.held:
-        body.append(f"<p>{html.escape(name)} is {html.escape(why)}.</p>")
+        body.append(paragraph(f"{name} is {why}."))
     if c.spectrum.full:
         names = list(c.estimates)
         rows = [[n, *map(float, row)] for n, row in zip(names, c.correlation, strict=True)]
-        body += ["<h3>Correlations</h3>", table(["", *names], rows)]
+        body += [heading("Correlations", level=3), table(["", *names], rows)]
     return body
 
 
@@ -125,10 +120,10 @@ def _ellipses(c: Certificate) -> list[str]:
     names = list(c.estimates)
     pairs = [(abs(c.correlation[i, j]), i, j) for i in range(len(names)) for j in range(i)]
     scale = math.sqrt(2.0 * float(fdtri(2, c.dof, 0.95)))
-    out = ["<h2>Joint 95 % ellipses about the estimate</h2>"]
+    out: list[str] = [heading("Joint 95 % ellipses about the estimate", level=2)]
     for _, i, j in sorted(pairs, reverse=True)[:ELLIPSES]:
         part = c.covariance[np.ix_([j, i], [j, i])]
-        out.append(f"<figure>{ellipse_plot(part, (names[j], names[i]), scale)}</figure>")
+        out.append(figure(ellipse_plot(part, (names[j], names[i]), scale)))
     return out
 
 
@@ -137,7 +132,7 @@ def _pictures(outcome: Outcome[ImageSet], fit: FitResult) -> list[str]:
     beads = range(c.used.shape[1])
     frames = np.arange(len(c.used))
     measured = fit.problem.pixels
-    body = ["<h2>Trajectories</h2>"]
+    body: list[str] = [heading("Trajectories", level=2)]
     for dataset, part in outcome.parts:
         tracks = measured[part]
         present = dataset.present
@@ -147,7 +142,7 @@ def _pictures(outcome: Outcome[ImageSet], fit: FitResult) -> list[str]:
         title = f"{dataset.name}: frame {present[0]} and the beads of all frames"
         body.append(image_under(dataset.line_integrals(present[0]), series, title=title))
     r = np.where(c.used[..., None], c.residuals_px, np.nan)
-    body.append("<h2>Residuals (measured minus predicted)</h2>")
+    body.append(heading("Residuals (measured minus predicted)", level=2))
     for axis, name in ((0, "column"), (1, "row")):
         body.append(
             plot(
@@ -185,7 +180,7 @@ def _pictures(outcome: Outcome[ImageSet], fit: FitResult) -> list[str]:
         for k in beads
     ]
     table_of_beads = table(["bead", "frames used", "left out", "rms (px)"], rows)
-    return [*body, "<h3>By bead</h3>", table_of_beads]
+    return [*body, heading("By bead", level=3), table_of_beads]
 
 
 def _maps(

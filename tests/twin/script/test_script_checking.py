@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from html.parser import HTMLParser
 
 import numpy as np
@@ -26,7 +25,7 @@ from flexdt.twin.script import (
     html_report,
     plan_poses,
 )
-from flexdt.twin.script.dry_run_report import clearance_plot, summary
+from flexdt.twin.script.dry_run_report import summary
 from tests.twin.script.conftest import Planner, blob, tabbed
 
 LINES = [
@@ -269,38 +268,6 @@ def test_an_axis_is_in_the_beam_as_far_as_the_edge_of_the_last_pixel(
     made = check_script("\n".join(lines), flexray, profile, start=StartState.of(flexray))
     said = [p.message for p in made.problems if p.code == "sample_out_of_beam"]
     assert len(said) == (beyond > 0)
-
-
-def points(trace: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    [found] = re.findall(r'points="([^"]*)"', clearance_plot(trace, [(2.5, "a<b")]))
-    return [(float(x), float(y)) for x, y in (pair.split(",") for pair in found.split())]
-
-
-def test_a_plot_of_clearance_is_to_scale() -> None:
-    """The frame's corner lies at (60, 206), its ends at (870, 206) and (60, 28)."""
-    trace = [(0.0, 40.0), (2.5, -3.0), (7.5, 10.0), (10.0, 0.0)]
-    assert points(trace) == [(60.0, 28.0), (262.5, 206.0), (667.5, 161.5), (870.0, 206.0)]
-    page = clearance_plot(trace, [(2.5, "a<b")])
-    assert 'd="M60.0,28.0 V206.0 H870.0"' in page
-    marks = re.findall(r'<line x1="([\d.]+)" x2="([\d.]+)" y1="([\d.]+)" y2="([\d.]+)"', page)
-    assert marks == [("262.5", "262.5", "28.0", "206.0")]
-    assert "a&lt;b" in page
-    ticks = re.findall(r'<text x="([\d.]+)" y="([\d.]+)" text-anchor="(\w+)">([\d.]+)<', page)
-    across = [(float(x), float(y), v) for x, y, anchor, v in ticks if anchor == "middle"]
-    up = [(float(x), float(y), v) for x, y, anchor, v in ticks if anchor == "end"]
-    assert across == [(60 + 81 * v, 222.0, f"{v:g}") for v in (0, 2.5, 5, 7.5, 10)]
-    assert up == [(54.0, 206 - 4.45 * v + 4, f"{v:g}") for v in (0, 10, 20, 30, 40)]
-    assert points([(0.0, 0.0)]) == [(60.0, 206.0)]
-
-
-@pytest.mark.parametrize(
-    ("end", "step"),
-    [(1.0, 0.25), (3.0, 1.0), (7.9, 2.0), (41.0, 20.0), (9000.0, 2500.0), (0.3, 0.1)],
-)
-def test_ticks_are_round_numbers(end: float, step: float) -> None:
-    page = clearance_plot([(0.0, 1.0), (end, 1.0)])
-    ticks = re.findall(r'text-anchor="middle">([\d.]+)<', page)
-    assert [float(t) for t in ticks] == pytest.approx(np.arange(0.0, end + 1e-9, step))
 
 
 def test_figures_of_the_report_in_words(flexray: Machine, profile: Profile) -> None:

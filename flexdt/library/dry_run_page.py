@@ -1,0 +1,121 @@
+"""HTML pages of a dry run, and of an executed script beside its prediction.
+
+The page shows the verdict, each problem with its line, the figures, every step with its start,
+duration and effect, and the clearance over time as a plot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from flexdt.library.figures import Series, plot, require_plots
+from flexdt.library.report_page import (
+    facts,
+    figure,
+    folded,
+    heading,
+    marked,
+    page,
+    paragraph,
+    table,
+)
+from flexdt.twin.errors import TwinError
+from flexdt.twin.script.dry_run_report import against_summary, between, summary
+from flexdt.twin.script.log_fit import LogComparison
+from flexdt.twin.script.planning.check_findings import Clearance
+from flexdt.twin.script.planning.plan import CheckReport
+from flexdt.twin.script.planning.time_ranges import step_range
+from flexdt.twin.script.problems import ScriptProblem
+
+
+def html_report(report: CheckReport, name: str = "script") -> str:
+    """Make one self-contained HTML page of a report.
+
+    Args:
+        report: from `check_script`.
+        name: what to call the script.
+    """
+    title = f"Dry run of {name}"
+    verdict = marked("ok", "good") if report.ok else marked("not ok", "bad")
+    body = [
+        heading(title, " ", verdict),
+        facts(summary(report)),
+        *_problems(report.problems),
+        *_clearance(report.clearance),
+        *_steps(report),
+        folded("The script", printable(report.text)) if report.text else "",
+    ]
+    return page(title, body)
+
+
+def against_html(found: LogComparison, name: str = "script") -> str:
+    """Make one self-contained HTML page of predicted beside executed.
+
+    Args:
+        found: the comparison.
+        name: what to call the script.
+    """
+    title = f"{name}: predicted and executed"
+    rows = table(found.HEADER, found.table(), text=("what",))
+    return page(
+        title, [heading(title), facts(against_summary(found)), *_problems(found.problems), rows]
+    )
+
+
+def clearance_plot(found: Clearance) -> str:
+    """Plot the smallest clearance over time, contacts marked, as an SVG element.
+
+    Args:
+        found: with a trace; parts that overlap are 0 mm apart.
+    """
+    times, distances = np.array(found.trace, dtype=np.float64).T
+    return plot(
+        [Series("", times, np.maximum(distances, 0.0))],
+        title="Smallest clearance", x_label="time (s)", y_label="clearance (mm)", width=900,
+        marks=[(c.time_s, f"line {c.line}: {' and '.join(c.pair)}") for c in found.collisions],
+    )  # fmt: skip
+
+
+def printable(text: str) -> str:
+    """Replace what cannot be printed by dots, and the ends of lines by their own."""
+    lines = text.replace("\r\n", "\n")
+    return "".join(c if c.isprintable() or c in "\n\t" else "·" for c in lines)
+
+
+def _problems(problems: Sequence[ScriptProblem]) -> list[str]:
+    if not problems:
+        return []
+    head = ("line", "severity", "code", "what")
+    rows = [(str(p.line), p.severity, p.code, p.message) for p in problems]
+    kinds = [p.severity for p in problems]
+    return [heading("Problems", level=2), table(head, rows, kinds=kinds, text=head[1:])]
+
+
+def _clearance(found: Clearance | None) -> list[str]:
+    if found is None or not found.trace:
+        return []
+    try:
+        require_plots()
+    except TwinError as error:
+        shown = paragraph(f"Not drawn: {error.message}")
+    else:
+        shown = figure(clearance_plot(found))
+    return [heading("Clearance", level=2), shown]
+
+
+def _steps(report: CheckReport) -> list[str]:
+    timing = report.plan.machine.timing
+    rows = [
+        (
+            *(str(s.line), f"{s.start_s:.3f}", f"{s.duration_s:.3f}"),
+            between(step_range(s, timing)),
+            f"{s.assumed_s:.3f} s {s.assumed_from}" if s.assumed_s else "",
+            s.what,
+        )
+        for s in report.plan.steps
+    ]
+    head = ("line", "start [s]", "takes [s]", "90 %", "of it commands", "effect")
+    texts = ("of it commands", "effect")
+    return [heading("Steps", level=2), table(head, rows, text=texts)]
