@@ -339,8 +339,8 @@ def test_the_scene_draws_the_machines_own_margin() -> None:
             assert (there is None) == (points is None)
             if points is not None:
                 np.testing.assert_allclose(there.points, points / 1000.0, atol=1e-5)
-        named, there = Shown().visible(scene._bodies), server.scene.get_handle_by_name
-        absent = {node for node in named if there(node) is None}
+        named = Shown().visible(scene._bodies)
+        absent = {node for node in named if server.scene.get_handle_by_name(node) is None}
         assert absent == {n for n in named if n.endswith("/margin") and not margin}
         for layer in LAYERS:  # each is a choice of nodes of its own, or of names
             other = Shown().changed(**{layer.name: not layer.shown})
