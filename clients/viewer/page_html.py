@@ -14,7 +14,7 @@ PLACE: Final = "<!-- a box for each layer -->"
 
 
 def page_file(name: str) -> bytes:
-    """A file of the page, as browsers get it.
+    """Read a file of the page as browsers get it.
 
     Raises:
         FileNotFoundError: there is none of this name.
@@ -24,7 +24,7 @@ def page_file(name: str) -> bytes:
 
 
 def boxes(layers: tuple[Layer, ...]) -> str:
-    """A labelled checkbox for each layer, a line each."""
+    """Make a labelled checkbox for each layer, a line each."""
     return "\n        ".join(
         f'<div><label><input type="checkbox" id="layer-{layer.name}" data-layer="{layer.name}">'
         f"{html.escape(layer.title)}</label></div>"

@@ -85,7 +85,7 @@ Index = Annotated[int, Ge(0), Le(10**6)]
 
 
 def layers_model() -> type[Params]:
-    """Parameters of `viewer.layers`: layers to show or hide on this page; omitted ones stay."""
+    """Make the parameters of `viewer.layers`: layers to show or hide; omitted ones stay."""
     switches: Any = {layer.name: (bool | None, None) for layer in LAYERS}
     opacity: Any = (Annotated[float, Ge(0.05), Le(1)] | None, None)
     return create_model("Layers", __base__=Params, **switches, opacity=opacity)

@@ -330,7 +330,7 @@ class LabScene:
         return {**out, **clear}
 
     def _visible(self, shown: Shown, near: Collection[str] = ()) -> dict[str, bool]:
-        """Whether each node is visible; margins of 0 have no nodes."""
+        """Say whether each node of the scene is visible; margins of 0 have none."""
         there = self._server.scene.get_handle_by_name
         wanted = shown.visible(self._bodies, near)
         return {node: on for node, on in wanted.items() if there(node) is not None}

@@ -34,7 +34,7 @@ class Layer:
     near: bool = False
 
     def nodes_of(self, parts: Collection[str]) -> Iterator[tuple[str, str | None]]:
-        """The names of its nodes, each with the component that it belongs to, if to one.
+        """Name its nodes, each with its component or None.
 
         >>> list(Layer("margin", "safety margin", False, ("/{part}/margin",)).nodes_of(["tube"]))
         [('/tube/margin', 'tube')]
@@ -67,7 +67,7 @@ LAYERS: Final[tuple[Layer, ...]] = (
 
 
 def first_shown() -> frozenset[str]:
-    """Names of the layers that are shown until somebody chooses."""
+    """Name the layers that are shown until somebody chooses."""
     return frozenset(layer.name for layer in LAYERS if layer.shown)
 
 
@@ -101,7 +101,7 @@ class Shown:
         }
 
     def visible(self, parts: Collection[str], near: Collection[str] = ()) -> dict[str, bool]:
-        """Whether each node of all layers is visible.
+        """Say whether each node of all layers is visible.
 
         Args:
             parts: names of the machine's components.
