@@ -9,7 +9,7 @@ import typer
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flexdt.clients.cli import console, option_values
+from flexdt.clients.cli import console, option_values, twin_connection
 from flexdt.clients.cli.console import PLAIN_INTERVAL_S, ProgressBar
 from flexdt.runtime import process_settings
 
