@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,8 +26,6 @@ ELLIPSES = 6
 MAP_FRAMES = 180
 """Largest number of frames whose residuals are drawn over the detector; of more frames, every
 second, third... is drawn."""
-DIGITS: Final = 3
-"""Decimals of a pixel in a track."""
 
 
 def write_report(outcome: Outcome[ImageSet], path: Path) -> None:
