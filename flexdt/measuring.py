@@ -1,4 +1,7 @@
-"""What a benchmark measures below the public functions: devices, threads, the kernels themselves.
+"""What benchmarks and kernels of other distributions take from below the public functions.
+
+Devices, threads, the kernels themselves; and `parallel`, which compiles a function with `prange`
+as our own: it survives a fork, and its threads sleep while they wait.
 
 Kernels change with every version; a program that imports them is written for one.
 """
@@ -6,6 +9,7 @@ Kernels change with every version; a program that imports them is written for on
 from flexdt.twin.projection import gpu
 from flexdt.twin.projection.cpu import threads
 from flexdt.twin.projection.kernels import siddon_kernels
+from flexdt.twin.projection.kernels.compiling import parallel
 from flexdt.twin.projection.operators import box_of, voxel_rays
 from flexdt.twin.reconstruction import gpu_reconstruction_kernels as gpu_fdk_kernels
 from flexdt.twin.reconstruction.views import view_table
@@ -14,6 +18,7 @@ __all__ = [
     "box_of",
     "gpu",
     "gpu_fdk_kernels",
+    "parallel",
     "siddon_kernels",
     "threads",
     "view_table",

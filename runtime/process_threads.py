@@ -26,6 +26,7 @@ SLEEPING: Final[Mapping[str, str]] = {"OMP_WAIT_POLICY": "passive"}
 CHOSEN_BY: Final = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
 """Variables of the environment by which users choose how OpenMP's threads wait."""
 LAYER: Final = "numba.np.ufunc.parallel"
+DEVICE: Final = "flexdt.twin.projection.gpu"
 
 
 def load_sleeping() -> str:
@@ -54,7 +55,10 @@ def load_sleeping() -> str:
 
 
 def _in_child() -> None:
-    """Compute in one thread, if the parent had kernel threads."""
+    """Compute in one thread if the parent had kernel threads, and without the parent's device."""
+    gpu = sys.modules.get(DEVICE)
+    if gpu is not None:
+        gpu.leave_after_fork()
     layer = sys.modules.get(LAYER)
     if layer is not None and layer._is_initialized:
         kernel_threads.ALONE.value = 1

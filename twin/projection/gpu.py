@@ -102,6 +102,13 @@ def _probed() -> Availability:
     return Availability(True, name.decode() if isinstance(name, bytes) else str(name))
 
 
+def leave_after_fork() -> None:
+    """Leave the device to the parent: a forked child cannot use one that its parent has used."""
+    if _probed.cache_info().currsize and _probed().present:
+        why = "the device belongs to the parent of this forked process; spawn and forkserver work"
+        _failed.insert(0, Availability(False, why))
+
+
 def _project_one_ray() -> None:
     """A ray along x through two voxels of 0.5 mm. One kernel: each takes seconds to compile.
 

@@ -263,8 +263,9 @@ def exact_images(volume: Volume, geometry: ConeVec, shape: tuple[int, int]) -> F
 
     out = np.zeros((len(geometry), *shape), np.float32)
     views = voxel_rays(geometry, volume.layout, shape)
-    every = np.arange(len(geometry))
-    siddon_kernels.project_rays(box_of(volume.layout), views, every, out, 8)
+    every, tile = np.arange(len(geometry)), 8
+    jobs = len(every) * -(-shape[1] // tile)
+    siddon_kernels.project_rays(box_of(volume.layout), views, every, out, tile, 0, jobs)
     return out
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from flexdt.measuring import parallel
 
 # mypy: disable-error-code="no-untyped-def,untyped-decorator"
 
 
-@njit(cache=True, error_model="numpy", parallel=True, nogil=True)
+@parallel
 def solve(
     first, voxel, length, rows, columns, taken, counts, images, volumes, iterations, smallest
 ):

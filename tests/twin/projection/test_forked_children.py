@@ -7,9 +7,12 @@ import importlib.util
 import os
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
+
+from flexdt.twin.projection import gpu
 
 SILENCE_S = 240.0
 ROOT = Path(__file__).parents[3]
@@ -83,10 +86,35 @@ def test_a_forked_child_computes_the_same_bits(way: str, tmp_path: Path) -> None
     script.write_text(WORK + WAYS[way] + "\nprint('same')\n")
     done = subprocess.run(
         [sys.executable, script, str(list(WAYS).index(way))], capture_output=True, text=True,
-        check=False, timeout=SILENCE_S,
+        check=False, timeout=SILENCE_S, env=os.environ | {"NUMBA_DISABLE_CUDA": "1"},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == ["same"]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+@pytest.mark.parametrize("used", [True, False])
+def test_a_forked_child_leaves_its_parents_device_alone(
+    used: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A child of a process that has not met the device yet may use it."""
+    monkeypatch.setattr(gpu, "_failed", [])
+    probed = cache(lambda: gpu.Availability(True, "a device"))
+    monkeypatch.setattr(gpu, "_probed", probed)
+    if used:
+        assert gpu.availability().present
+    reading, writing = os.pipe()
+    if os.fork() == 0:
+        found = gpu.availability()
+        os.write(writing, f"{found.present} {found.reason}".encode())
+        os._exit(0)
+    os.close(writing)
+    with os.fdopen(reading) as answer:
+        told = answer.read()
+    os.wait()
+    assert told.startswith(str(not used))
+    assert ("spawn" in told) == used
 
 
 FOLDERS = ("twin", "phantoms", "runtime", "clients", "server")

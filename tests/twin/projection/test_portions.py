@@ -27,6 +27,7 @@ TURNED = {
 }
 
 
+@pytest.mark.usefixtures("on_processor")
 @pytest.mark.parametrize("name", TURNED)
 def test_results_do_not_depend_on_portions(name, circle, monkeypatch) -> None:
     options = TURNED[name]
