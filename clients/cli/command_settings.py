@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+from flexdt.runtime.process_settings import memory_size
 from flexdt.runtime.settings import Settings, option
 from flexdt.twin.algorithms import PLAIN, WINDOWS
 
@@ -56,10 +57,12 @@ class ReconstructSettings(Settings):
 
     Attributes:
         window: Filter FDK with this window.
+        memory: Let FDK use this much, e.g. 8GiB; default: half of what is free.
     """
 
     command = "reconstruct"
     window: Window = option(PLAIN)  # noqa: RUF009
+    memory: int | None = option(None, metavar="SIZE", parser=memory_size)
 
 
 @dataclass(frozen=True, kw_only=True)

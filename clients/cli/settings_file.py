@@ -14,6 +14,7 @@ set, or the one that FLEXDT_CONFIG names.
 
     [reconstruct]                     # a command's rarely changed choices, see `TABLES`
     window = "hann"
+    memory = "8GiB"
 """
 
 from __future__ import annotations

@@ -33,6 +33,9 @@ LARGEST: Final = 256 << 20
 """Bytes of a file that is read whole, where its size is not known. The record of a scan of 200 000
 poses has about 50 MB; a sparse file may claim any size."""
 CGROUP_LIMIT: Final = Path("/sys/fs/cgroup/memory.max")
+CGROUP_USED: Final = Path("/sys/fs/cgroup/memory.current")
+CGROUP_STATISTICS: Final = Path("/sys/fs/cgroup/memory.stat")
+MEMORY_INFORMATION: Final = Path("/proc/meminfo")
 FALLBACK_MEMORY: Final = 4 << 30
 """Assumed where the system does not say how much memory it has (Windows) [bytes]."""
 
@@ -405,6 +408,27 @@ def memory_bytes() -> int:
     with suppress(OSError, ValueError):  # no container, or none with a limit ("max")
         return min(memory, int(CGROUP_LIMIT.read_text(encoding="ascii")))
     return memory
+
+
+def free_memory_bytes() -> int:
+    """Memory that new work can have: free, or holding files that can be read again [bytes].
+
+    Half of the memory is assumed to be free where the system does not say it (not Linux).
+    """
+    free = memory_bytes() // 2
+    with suppress(OSError, ValueError, KeyError):
+        free = 1024 * _fields(MEMORY_INFORMATION)["MemAvailable:"]
+    with suppress(OSError, ValueError, KeyError):  # no container, or none with a limit ("max")
+        limit = int(CGROUP_LIMIT.read_text(encoding="ascii"))
+        used = int(CGROUP_USED.read_text(encoding="ascii"))
+        free = min(free, limit - used + _fields(CGROUP_STATISTICS)["inactive_file"])
+    return max(free, 0)
+
+
+def _fields(file: Path) -> dict[str, int]:
+    """Numbers by name of a file of lines "name number ..."."""
+    lines = (line.split() for line in file.read_text(encoding="ascii").splitlines())
+    return {words[0]: int(words[1]) for words in lines if len(words) > 1 and words[1].isdigit()}
 
 
 def open_data(root: Path) -> Directory:

@@ -160,6 +160,8 @@ def test_an_option_that_went_to_the_file_names_its_key(
         ),
         ('[reconstruct]\nwindow = "square"', "reconstruct . --out x.tif", 1,
          "[reconstruct] Invalid value for '--window': "),
+        ('[reconstruct]\nmemory = "much"', "reconstruct . --out x.tif", 1,
+         "'much' is not a size such as 512M or 4GiB"),
         ('[phantom_make]\nbead = "cheese"', "phantom make p.json --like normal", 1, "cheese"),
     ],
 )  # fmt: skip

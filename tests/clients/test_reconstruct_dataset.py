@@ -151,8 +151,8 @@ def test_formats_hold_the_same_values(
     )
     data = load_dataset(folders["plain"])
     made = reconstruct_dataset(data, tmp_path / "whole.mha", request)
-    monkeypatch.setattr("flexdt.library.reconstruction.reconstruct.SLAB_BYTES", 7 * 24 * 28 * 4)
-    reconstruct_dataset(data, tmp_path / name, request)
+    monkeypatch.setattr("flexdt.library.reconstruction.memory_plan.WORKING_IMAGES", 0)
+    reconstruct_dataset(data, tmp_path / name, request, memory=7 * 24 * 28 * 4)
     values = read_volume(tmp_path / name).data
     assert values.shape == (20, 24, 28)
     np.testing.assert_allclose(values, read_volume(tmp_path / "whole.mha").data, atol=1e-5)

@@ -111,14 +111,16 @@ def reconstruct(
     if data.missing:
         note(f"{dataset}: warning: {len(data.missing)} frames are missing and are left out")
     workers = _workers(scheduler, slurm)
-    unit = "slabs" if ALGORITHMS[request.algorithm].direct else "iterations"
+    direct = ALGORITHMS[request.algorithm].direct
+    unit = "iterations" if not direct else "images" if workers is None else "slabs"
     with ProgressBar(f"{request.algorithm} of {dataset.name}", unit) as bar:
         if preview:
             document = quick_look(data, out, parameters=parameters, progress=bar.update)
         else:
             document = reconstruct_dataset(
-                data, out, request, parameters=parameters, progress=bar.update, workers=workers
-            )
+                data, out, request, parameters=parameters, progress=bar.update, workers=workers,
+                memory=chosen(ReconstructSettings).memory,
+            )  # fmt: skip
     warn(document["warnings"], dataset)
     yield document
     z, y, x = document["shape"]

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
 
-from flexdt.library.datasets.image_set import ImageSet
+from flexdt.library.datasets.image_set import Counts, ImageSet
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.physics.exposure import FEW_COUNTS, NOTICED
 
@@ -15,12 +16,19 @@ MAX_FROM_DISK: Final = 32
 DARK: Final = "no pixel of the flat images is brighter than the dark ones: was the tube off?"
 
 
-def image_doubts(scan: ImageSet, *, needed: bool = False) -> list[str]:
+def image_doubts(
+    scan: ImageSet, *, needed: bool = False, counts: Callable[[int], Counts] | None = None
+) -> list[str]:
     """Find what in the exposure of a scan's images makes its line integrals doubtful.
 
     Saturated pixels are those with the panel's largest count. Where that is not known, it is the
     largest among the images if it is one at which converters end (2^bits - 1). All radiographs in
     memory are looked at, `MAX_FROM_DISK` of those in files, and the flat image.
+
+    Args:
+        scan: the data set.
+        needed: line integrals are.
+        counts: gives those of a frame in a file by its index; None reads them.
 
     Raises:
         DatasetFormatError: line integrals are `needed`, and the images hold none: no pixel of the
@@ -28,7 +36,9 @@ def image_doubts(scan: ImageSet, *, needed: bool = False) -> list[str]:
     """
     flat, dark = scan.flat, scan.dark
     alive, wanted = flat > dark, scan.present
-    if scan.arrays is None or scan.arrays.counts is None:
+    in_files = scan.arrays is None or scan.arrays.counts is None
+    look = scan.counts if counts is None or not in_files else counts
+    if in_files:
         some = np.linspace(0, len(wanted) - 1, MAX_FROM_DISK).astype(int)
         wanted = tuple(wanted[i] for i in np.unique(some))
     doubts: list[str] = [] if alive.any() else [DARK]
@@ -36,10 +46,10 @@ def image_doubts(scan: ImageSet, *, needed: bool = False) -> list[str]:
     if held:
         top: float | None = scan.full_scale
         if top is None:
-            top = float(max(flat.max(), max(int(scan.counts(i).max()) for i in wanted)))
+            top = float(max(flat.max(), max(int(look(i).max()) for i in wanted)))
             top = top if np.log2(top + 1.0).is_integer() else np.inf
         few = dark[alive] + FEW_COUNTS
-        images = (scan.counts(i)[alive] for i in wanted)
+        images = (look(i)[alive] for i in wanted)
         each = [((seen >= top).mean(), (seen < few).mean()) for seen in images]
         saturated, starved = np.mean(each, axis=0)
         shares = {

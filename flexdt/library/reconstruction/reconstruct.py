@@ -1,8 +1,9 @@
 """`flexdt reconstruct` without its command line: a data set in, a volume file out.
 
-FDK goes slab by slab and reads frames in parts, so memory stays bounded whatever the volume's size;
-the iterative algorithms hold everything and are for small or binned problems. Missing frames are
-left out, and the outcome states how many.
+FDK goes slab by slab and prepares images in parts, so memory stays bounded whatever the volume's
+size, and each image is read once: `memory_plan` decides what is in memory at a time, and images
+that are needed again are in `kept_images`. The iterative algorithms hold everything and are for
+small or binned problems. Missing frames are left out, and the outcome states how many.
 """
 
 from __future__ import annotations
@@ -13,10 +14,11 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
+from tempfile import TemporaryFile, gettempdir
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -24,13 +26,21 @@ import numpy as np
 from flexdt.library.datasets.image_doubts import image_doubts
 from flexdt.library.datasets.image_set import ImageSet
 from flexdt.library.extras import extension
+from flexdt.library.reconstruction.kept_images import (
+    CountsOnce,
+    ImagesInMemory,
+    ImagesOnDisk,
+    KeptImages,
+)
+from flexdt.library.reconstruction.memory_plan import PART, MemoryPlan, plan_memory, plan_whole
+from flexdt.library.reconstruction.slab_fdk import StandingImages, Work, fdk_slabs
 from flexdt.library.reconstruction.volume_files import (
     check_name,
     read_volume,
     volume_writer,
     write_slices,
 )
-from flexdt.runtime.files.directory import memory_bytes
+from flexdt.runtime.files.directory import free_memory_bytes, memory_bytes
 from flexdt.runtime.files.whole_files import free_bytes
 from flexdt.twin.algorithms import ALGORITHMS, DEFAULT, PLAIN, having
 from flexdt.twin.dataset.normalise import binned_mean
@@ -38,14 +48,13 @@ from flexdt.twin.errors import LimitError, TwinError, UnknownNameError, require_
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import Offsets
-from flexdt.twin.projection import Volume
+from flexdt.twin.projection import Volume, gpu
 from flexdt.twin.reconstruction import (
     Grid,
     Polychromatic,
     Truncation,
     bias_of,
     bias_warnings,
-    checked_fdk,
     fdk_parts,
     field_of_view,
     hardening,
@@ -53,20 +62,23 @@ from flexdt.twin.reconstruction import (
     lost_layers,
     ring_errors,
     truncation_of,
+    with_errors,
 )
+from flexdt.twin.reconstruction.coarse_scan import VIEWS as BIAS_VIEWS
 from flexdt.twin.reconstruction.scatter_correction import scatterer_of, subtracted
+from flexdt.twin.reconstruction.trajectory import circle_of, distinct_angles
+from flexdt.twin.reconstruction.truncation import SAMPLES as TRUNCATION_VIEWS
 
 if TYPE_CHECKING:
     from flexdt.twin.physics.scatter import ScanScatter
     from flexdt.twin.physics.tube import Tube, TubeModel
-    from flexdt.twin.reconstruction import Hardening
+    from flexdt.twin.reconstruction import Bias, Hardening
 
 Progress = Callable[[float, float], None]
 """Called with the work done and the whole, in the algorithm's own units."""
 
-SLAB_BYTES: Final = 512 << 20
-PART: Final = 16
-"""Frames read at a time."""
+FREE_SHARE: Final = 0.5
+"""Of the free memory, that FDK uses where nobody says how much it may."""
 PREVIEW_VIEWS: Final = 180
 PREVIEW_VOXELS: Final = 160
 SCATTER_VIEWS, SCATTER_PIXELS = 180, 100
@@ -131,6 +143,7 @@ class ScanFrames:
         mixture: what the spectrum does behind several, for iterations; or None.
         scatter: of each of the m frames, to subtract, or None.
         doubts: what is doubtful about the images, the trajectory and the corrections.
+        kept: where images that are needed again are kept; None reads them again.
     """
 
     dataset: ImageSet
@@ -142,6 +155,7 @@ class ScanFrames:
     mixture: Polychromatic | None = None
     scatter: ScanScatter | None = None
     doubts: tuple[str, ...] = ()
+    kept: KeptImages | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -151,27 +165,37 @@ class ScanFrames:
 
     def parts(self) -> Iterator[Float32Array]:
         """Line integrals of all frames, `PART` at a time, (k, rows, cols)."""
-        for first in range(0, len(self.indices), PART):
-            chosen = self.indices[first : first + PART]
-            yield np.stack([self.image(i) for i in chosen])
+        count = len(self.indices)
+        for first in range(0, count, PART):
+            numbers = range(first, min(first + PART, count))
+            yield np.stack([self.view(number, again=False) for number in numbers])
 
     @cached_property
     def truncation(self) -> Truncation | None:
         """What of the object lies beyond the panel's edges, for FDK."""
         return truncation_of(self.view, self.cone_vec, self.shape)
 
-    def view(self, number: int) -> Float32Array:
-        """As `image`, by the number among those that are reconstructed."""
-        return self.image(self.indices[number])
+    def view(self, number: int, *, again: bool = True) -> Float32Array:
+        """One frame's line integrals, binned and corrected.
 
-    def image(self, index: int) -> Float32Array:
-        """One frame's line integrals, binned and corrected."""
-        image = binned_mean(self.dataset.line_integrals(index), self.binning)
+        Args:
+            number: of the frame among those that are reconstructed.
+            again: keep what was read of it, where images are kept.
+        """
+        if self.kept is None:
+            image = self.measured(self.dataset, number)
+        else:
+            image = self.kept.image(number, again=again)
         if self.scatter is not None:
-            image = subtracted(image, self.scatter.signal(self.indices.index(index)))
+            image = subtracted(image, self.scatter.signal(number))
         if self.rings is not None:
             image = image - self.rings
         return image if self.harden is None else self.harden(image)
+
+    def measured(self, dataset: ImageSet, number: int) -> Float32Array:
+        """One frame's line integrals, binned, read from a data set of the same frames."""
+        image = dataset.line_integrals(self.indices[number])
+        return np.asarray(binned_mean(image, self.binning), np.float32)
 
 
 def views_of(
@@ -211,6 +235,68 @@ def grid_of(views: ScanFrames, request: VolumeRequest) -> Grid:
     return Grid(shape, whole.voxel_mm, chosen)
 
 
+@dataclass(frozen=True, eq=False)
+class ReconstructionTask:
+    """A reconstruction that can be made.
+
+    Attributes:
+        request: the volume.
+        views: its frames, not yet corrected.
+        grid: of the volume.
+        counts: of the data set, as far as they have been looked at.
+    """
+
+    request: VolumeRequest
+    views: ScanFrames
+    grid: Grid
+    counts: CountsOnce
+
+    @property
+    def direct(self) -> bool:
+        """Whether the algorithm goes through the images once, as FDK does."""
+        return ALGORITHMS[self.request.algorithm].direct
+
+    @cached_property
+    def standing(self) -> StandingImages:
+        """The images as upright panels record them, for FDK; what lies beyond is not known yet."""
+        return StandingImages.of(self.views.cone_vec, self.views.shape, None)
+
+    @cached_property
+    def again(self) -> int:
+        """Images that are needed more than once even of a single slab."""
+        count, panel = len(self.views.indices), self.views.dataset.panel
+        if self.request.rings or (panel is not None and panel.lag):
+            return count
+        some = 0 if self.request.scatter_correction is None else SCATTER_VIEWS + 1
+        if self.direct:
+            angles = len(distinct_angles(circle_of(self.views.cone_vec))[0])
+            some += (TRUNCATION_VIEWS + BIAS_VIEWS) * -(-count // angles)
+        return min(some, count)
+
+    def plan(self, memory: int | None, *, slabs: bool = True) -> MemoryPlan:
+        """How memory and disk are used.
+
+        Args:
+            memory: to use; None for half of what is free [bytes].
+            slabs: whether the volume may be made in slabs.
+
+        Raises:
+            LimitError: too little memory.
+        """
+        given = FREE_SHARE * free_memory_bytes() if memory is None else memory
+        images, pixels, again = len(self.views.indices), math.prod(self.views.shape), self.again
+        if not self.direct:
+            return plan_whole(self.grid, again, pixels, int(given))
+        pixels = max(pixels, math.prod(self.standing.shape))
+        if gpu.availability().present:  # which may fail, or lack room, and take images anew
+            again = images
+        if not slabs:
+            plan = plan_whole(self.grid, again, pixels, int(given))
+        else:
+            plan = plan_memory(self.grid, images, again, pixels, int(given), least=memory is None)
+        return replace(plan, prepared=plan.prepared or gpu.availability().present)
+
+
 def reconstruct_dataset(
     dataset: ImageSet,
     out: str | os.PathLike[str],
@@ -219,8 +305,12 @@ def reconstruct_dataset(
     parameters: Offsets | None = None,
     progress: Progress | None = None,
     workers: AbstractContextManager[Executor] | None = None,
+    memory: int | None = None,
 ) -> dict[str, Any]:
     """Reconstruct a data set into a file, which appears under its name only when whole.
+
+    Each image is read once, but by workers. Those that are needed again are kept in memory, or in a
+    file without a name in the folder of `out`.
 
     Args:
         dataset: from `load_dataset`.
@@ -230,6 +320,7 @@ def reconstruct_dataset(
         progress: called with the work done and the whole.
         workers: make the slabs of FDK; they see the data set and `out` under the same paths. An
             interrupted reconstruction is taken up.
+        memory: that FDK may use; None for half of what is free [bytes].
 
     Returns:
         JSON-able: file, slices, algorithm, shape (z, y, x), voxel_mm, center_mm, frames, missing,
@@ -239,8 +330,8 @@ def reconstruct_dataset(
     Raises:
         UnknownNameError: no such algorithm, window or material.
         TwinError: beam hardening cannot be corrected, because the data set has none.
-        LimitError: another ending, one of the data set's own files, or a volume too large for this
-            machine.
+        LimitError: another ending, one of the data set's own files, a volume too large for this
+            machine, or too little memory or room on disk.
         GeometryError: a trajectory that the algorithm cannot use.
         DatasetError: a frame or the flat field cannot be read.
         OSError: the file cannot be written.
@@ -252,37 +343,36 @@ def reconstruct_dataset(
     if out.parent.resolve() == home and out.name in images:
         raise LimitError(f"{out} is an image of the data set itself", {"asked": str(out)})
     begun = time.perf_counter()
-    wanted, views, grid = _task(dataset, request, parameters)
-    _require_room(out, grid)
+    task = _task(dataset, request, parameters)
     tell = progress or _untold
-    with nullcontext() if workers is None else workers as pool:
-        views = _corrected(views, wanted)
-        if pool is None:
-            doubts = _here(views, grid, wanted, out, tell)
-        else:
+    _require_room(out, task.grid)
+    if workers is None:
+        views, bias, doubts = _here(task, task.plan(memory), out, tell)
+    else:
+        with workers as pool:
+            views = _corrected(task.views, task.request)
             by_workers = extension("slabs", "a reconstruction by workers")
-            doubts = by_workers(views, grid, wanted, out, pool, tell)
+            doubts = by_workers(views, task.grid, task.request, out, pool, tell)
+        bias = _bias(views)
     accuracy = None
-    if ALGORITHMS[wanted.algorithm].direct:
-        bias = bias_of(views.view, views.cone_vec, views.shape, views.truncation)
-        accuracy = None if bias is None else bias.accuracy(grid)
+    if task.direct:
+        accuracy = None if bias is None else bias.accuracy(task.grid)
         doubts = [*bias_warnings(bias, accuracy), *doubts]
-    doubts = [*views.doubts, *doubts]
-    slices = write_slices(out, read_volume(out).data) if wanted.png else []
+    slices = write_slices(out, read_volume(out).data) if task.request.png else []
     in_force = dataset.correction
     used = parameters if parameters is not None else in_force.parameters if in_force else None
     return {
         "file": str(out),
         "slices": [str(file) for file in slices],
-        "algorithm": wanted.algorithm,
-        "shape": list(grid.shape),
-        "voxel_mm": grid.voxel_mm,
-        "center_mm": list(grid.center_mm),
+        "algorithm": task.request.algorithm,
+        "shape": list(task.grid.shape),
+        "voxel_mm": task.grid.voxel_mm,
+        "center_mm": list(task.grid.center_mm),
         "frames": len(views.indices),
         "missing": len(dataset.missing),
         "correction": None if used is None else used.to_edge(),
         "accuracy": None if accuracy is None else asdict(accuracy),
-        "warnings": doubts,
+        "warnings": [*views.doubts, *doubts],
         "seconds": round(time.perf_counter() - begun, 3),
     }
 
@@ -291,28 +381,71 @@ def _untold(done: float, total: float) -> None:
     """Progress that is not reported."""
 
 
+def _bias(views: ScanFrames) -> Bias | None:
+    return bias_of(views.view, views.cone_vec, views.shape, views.truncation)
+
+
 def _here(
-    views: ScanFrames, grid: Grid, request: VolumeRequest, out: Path, tell: Progress
-) -> list[str]:
-    """Reconstruct into a file; returns what is doubtful."""
-    with volume_writer(out, grid) as write:
-        if not ALGORITHMS[request.algorithm].direct:
-            write(_iterative(views, grid, request, tell).data)
-            return []
-        slabs, truncation = grid.slabs(SLAB_BYTES), views.truncation
-        lost = 0
-        for k, (first, last) in enumerate(slabs):
-
-            def part(done: float, k: int = k) -> None:
-                tell(k + done, len(slabs))
-
-            like = grid.slab(first, last).blank()
-            slab = fdk_parts(
-                views.parts, views.cone_vec, views.shape, like, request.window, part, truncation
-            )
+    task: ReconstructionTask, plan: MemoryPlan, out: Path, tell: Progress
+) -> tuple[ScanFrames, Bias | None, list[str]]:
+    """Reconstruct into a file; returns the views, the bias of FDK and what is doubtful."""
+    folder, grid = out.absolute().parent, task.grid
+    _require_room_for_images(folder, plan, grid.bytes)
+    with _reading_once(task, plan, folder, tell) as (kept, work), volume_writer(out, grid) as write:
+        views = _corrected(replace(task.views, kept=kept), task.request)
+        if not task.direct:
+            write(_iterative(views, grid, task.request, tell).data)
+            return views, None, []
+        # Before images are prepared: this looks at images as they were recorded.
+        bias, lost = _bias(views), 0
+        for slab in _fdk_slabs(task, views, kept, plan, work):
             write(slab.data)
             lost += lost_layers(slab.data)
-    return layer_warnings(lost, grid.shape[0])
+    return views, bias, layer_warnings(lost, grid.shape[0])
+
+
+def _fdk_slabs(
+    task: ReconstructionTask,
+    views: ScanFrames,
+    kept: KeptImages,
+    plan: MemoryPlan,
+    work: Work,
+    *,
+    errors: bool = False,
+) -> Iterator[Volume]:
+    """The volume by FDK, slab after slab; images of a single one go into it as they are read."""
+    window = task.request.window
+    if plan.prepared:
+        images = replace(task.standing, truncation=views.truncation)
+        view = partial(views.view, again=False)
+        return fdk_slabs(
+            view, kept, images, task.grid, plan.slabs, window, work.slab, errors=errors
+        )
+    whole = fdk_parts(
+        views.parts, views.cone_vec, views.shape, task.grid, window, partial(work.slab, 0),
+        views.truncation, errors=errors,
+    )  # fmt: skip
+    return iter([whole])
+
+
+@contextmanager
+def _reading_once(
+    task: ReconstructionTask, plan: MemoryPlan, folder: Path, tell: Progress
+) -> Iterator[tuple[KeptImages, Work]]:
+    """Read each image once from here on, and tell of the work that is done.
+
+    Args:
+        task: the reconstruction.
+        plan: what is in memory, and what in a file.
+        folder: of that file.
+        tell: called with what is done and the whole, in images; by FDK alone.
+    """
+    views, fdk = task.views, task.direct
+    dataset = task.counts.read_by(views.dataset)
+    work = Work.of(task.standing, task.grid, plan.slabs, tell) if fdk else Work(1, 1.0, (), _untold)
+    store = ImagesOnDisk(folder, plan.most_pixels) if plan.on_disk else ImagesInMemory()
+    with KeptImages(partial(views.measured, dataset), store, work.read) as kept:
+        yield kept, work
 
 
 def reconstruct_volume(
@@ -325,27 +458,53 @@ def reconstruct_volume(
 ) -> Volume:
     """Reconstruct a data set in memory; arguments and errors as for `reconstruct_dataset`, and
     `errors` as for `fdk`.
+
+    A volume by FDK that is too large for the memory lies in a file without a name in the folder for
+    temporary files (TMPDIR); it has no `sigma`.
     """
-    tell = progress or _untold
-    wanted, views, grid = _task(dataset, request, parameters)
-    _require("of memory", 3 * grid.bytes, memory_bytes(), grid)
-    views = _corrected(views, wanted)
-    for doubt in views.doubts:
-        warnings.warn(doubt, stacklevel=2)
-    if not ALGORITHMS[wanted.algorithm].direct:
-        return _iterative(views, grid, wanted, tell)
-    volume, doubts = checked_fdk(
-        views.view, views.parts, views.cone_vec, views.shape, grid, wanted.window,
-        lambda done: tell(done, 1.0), errors=errors,
-    )  # fmt: skip
+    tell, folder = progress or _untold, Path(gettempdir())
+    task = _task(dataset, request, parameters)
+    grid, fdk = task.grid, task.direct
+    in_memory = not fdk or 3 * grid.bytes <= memory_bytes()
+    if in_memory:
+        _require("of memory", 3 * grid.bytes, memory_bytes(), grid)
+    else:
+        _require(f"free in {folder}", grid.bytes, free_bytes(folder), grid)
+        _require_layer(grid)
+    plan = task.plan(None, slabs=not in_memory)
+    _require_room_for_images(folder, plan, 0 if in_memory else grid.bytes)
+    with _reading_once(task, plan, folder, tell) as (kept, work):
+        views = _corrected(replace(task.views, kept=kept), task.request)
+        for doubt in views.doubts:
+            warnings.warn(doubt, stacklevel=2)
+        if not fdk:
+            return _iterative(views, grid, task.request, tell)
+        bias = _bias(views) if errors else None
+        slabs = _fdk_slabs(task, views, kept, plan, work, errors=errors and in_memory)
+        volume = next(slabs) if in_memory else _in_a_file(slabs, grid, folder)
+    doubts = layer_warnings(lost_layers(volume.data), grid.shape[0])
+    if errors:
+        volume = with_errors(volume, bias=bias)
+        doubts = [*bias_warnings(bias, volume.accuracy), *doubts]
     for doubt in doubts:
         warnings.warn(doubt, stacklevel=2)
     return volume
 
 
+def _in_a_file(slabs: Iterator[Volume], grid: Grid, folder: Path) -> Volume:
+    """A volume whose values lie in a file without a name, which goes with them."""
+    with TemporaryFile(dir=folder) as file:
+        data = np.memmap(file, np.float32, "w+", shape=grid.shape)
+    done = 0
+    for slab in slabs:
+        data[done : done + len(slab.data)] = slab.data
+        done += len(slab.data)
+    return replace(grid.blank(), data=data)
+
+
 def _task(
     dataset: ImageSet, request: VolumeRequest | None, parameters: Offsets | None
-) -> tuple[VolumeRequest, ScanFrames, Grid]:
+) -> ReconstructionTask:
     """A request that can be met, its views, not yet corrected, and its grid."""
     wanted = VolumeRequest() if request is None else request
     name = wanted.algorithm
@@ -358,8 +517,10 @@ def _task(
         allowed = f"one, or several with {follow}, which follow each through the volume"
         raise LimitError.instead(said, [name, *several], allowed)
     views = views_of(dataset, parameters, binning=wanted.binning, every=wanted.every)
-    views = replace(views, doubts=tuple(image_doubts(dataset, needed=True)))
-    return wanted, views, grid_of(views, wanted)
+    counts = CountsOnce(dataset.counts)
+    doubts = image_doubts(dataset, needed=True, counts=counts.looked_at)
+    views = replace(views, doubts=tuple(doubts))
+    return ReconstructionTask(wanted, views, grid_of(views, wanted), counts)
 
 
 def preview(
@@ -387,10 +548,15 @@ def preview(
 
 def _corrected(views: ScanFrames, request: VolumeRequest) -> ScanFrames:
     """The views with the requested corrections."""
+    panel = views.dataset.panel
+    if views.kept is not None and panel is not None and panel.lag:
+        # Each image takes the one before, too: read in order, all are read once.
+        for number in range(len(views.indices)):
+            views.view(number)
     if request.scatter_correction is not None:
         views = _without_scatter(views, request.scatter_correction, request)
     if request.rings:
-        views = replace(views, rings=ring_errors(views.image(i) for i in views.indices))
+        views = replace(views, rings=ring_errors(map(views.view, range(len(views.indices)))))
     if request.material is not None:
         from flexdt.phantoms.materials import material, stated_keV
 
@@ -435,8 +601,8 @@ def _without_scatter(
     factor = max(1, min(max(views.shape) // SCATTER_PIXELS, min(views.shape) // 2))
     each = max(1, len(views.indices) // SCATTER_VIEWS)
     geometry = views.cone_vec[::each].binned(factor, views.shape)
-    coarse = ScanFrames(views.dataset, views.indices[::each], geometry, views.binning * factor)
-    stack = np.concatenate(list(coarse.parts()))
+    chosen = range(0, len(views.indices), each)
+    stack = np.stack([binned_mean(views.view(number), factor) for number in chosen])
     found = scatterer_of(stack, geometry, chain, kV)
     beam = Beam.of(chain, kV)
     scatter = scan_scatter(found.thing, views.cone_vec.rows, views.shape, beam)
@@ -481,8 +647,28 @@ def _require_room(out: Path, grid: Grid) -> None:
     """
     folder = out.absolute().parent
     _require(f"free in {folder}", grid.bytes, free_bytes(folder), grid)
+    _require_layer(grid)
+
+
+def _require_layer(grid: Grid) -> None:
     layer = 3 * grid.bytes // grid.shape[0]
     _require("of memory for a layer and its filling", layer, memory_bytes(), grid)
+
+
+def _require_room_for_images(folder: Path, plan: MemoryPlan, volume_bytes: int) -> None:
+    """Check, before any work, that the images which are kept fit the disk beside the volume.
+
+    Raises:
+        LimitError: says what is needed and what there is.
+    """
+    need, free = plan.disk_bytes + volume_bytes, free_bytes(folder)
+    if plan.on_disk and need > free:
+        raise LimitError(
+            f"{plan.kept} images that are needed again take {plan.disk_bytes / 2**30:.3g} GiB "
+            f"beside the volume's {volume_bytes / 2**30:.3g} GiB; there are {free / 2**30:.3g} GiB "
+            f"free in {folder}: choose another folder, binning, fewer frames, or more memory",
+            {"asked": need, "allowed": free},
+        )
 
 
 def _require(where: str, need: int, free: int, grid: Grid) -> None:
@@ -507,10 +693,18 @@ def _iterative(views: ScanFrames, grid: Grid, request: VolumeRequest, tell: Prog
         "iterations": request.iterations, "weight": request.weight, "hardening": views.mixture,
     }  # fmt: skip
     made: Volume = algorithm.load()(
-        np.concatenate(list(views.parts())),
+        _stacked(views),
         views.cone_vec,
         grid.blank(),
         watch=lambda step: tell(step.iteration, step.of),
         **{name: value for name, value in asked.items() if value is not None},
     )
     return made
+
+
+def _stacked(views: ScanFrames) -> Float32Array:
+    """Line integrals of all frames, (n, rows, cols)."""
+    stack = np.empty((len(views.indices), *views.shape), np.float32)
+    for number, image in enumerate(stack):
+        image[:] = views.view(number, again=False)
+    return stack

@@ -10,6 +10,7 @@ import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final
 
@@ -26,6 +27,8 @@ HEADER_BYTES: Final = 4096
 """In which the header of a file that has one must end."""
 NIFTI_DATA_BYTE: Final = 352
 """Where the values of a NIfTI-1 file begin."""
+BLOCK_BYTES: Final = 64 << 20
+"""Of a volume, that are put in a file's order at a time."""
 BIG_TIFF_BYTES: Final = 3 << 30
 """A volume above it is a BigTIFF."""
 
@@ -79,9 +82,17 @@ def _headed(
 
 def _raw(file: IO[bytes] | gzip.GzipFile) -> Sink:
     def write(slab: Float32Array) -> None:
-        file.write(np.ascontiguousarray(slab, dtype="<f4").tobytes())
+        for block in _blocks(slab):
+            file.write(block.data)
 
     return write
+
+
+def _blocks(slab: Float32Array) -> Iterator[Float32Array]:
+    """Layers of a slab in the order of a file, some at a time: FDK's lie across it."""
+    layers = max(1, BLOCK_BYTES // max(slab[:1].nbytes, 1))
+    for first in range(0, len(slab), layers):
+        yield np.ascontiguousarray(slab[first : first + layers], dtype="<f4")
 
 
 def _write_tiff(part: Path, grid: Grid) -> Iterator[Sink]:
@@ -99,9 +110,9 @@ def _write_tiff(part: Path, grid: Grid) -> Iterator[Sink]:
 
         def write(slab: Float32Array) -> None:
             nonlocal first
-            for layer in slab:
+            for layer in chain.from_iterable(_blocks(slab)):
                 tiff.write(
-                    np.ascontiguousarray(layer, dtype=np.float32),
+                    layer,
                     contiguous=True,
                     photometric="minisblack",
                     resolution=(per_cm, per_cm),
@@ -193,8 +204,9 @@ def _write_hdf5(part: Path, grid: Grid) -> Iterator[Sink]:
 
         def write(slab: Float32Array) -> None:
             nonlocal done
-            values[done : done + len(slab)] = slab
-            done += len(slab)
+            for block in _blocks(slab):
+                values[done : done + len(block)] = block
+                done += len(block)
 
         yield write
 

@@ -1,0 +1,205 @@
+"""Images that are read once: what a reconstruction needs again is kept, in memory or on disk.
+
+The file has no name from its first byte on (Windows deletes it when it is closed), so no end of the
+process leaves it behind, not even a kill.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import IO, Any, Final, cast
+
+import numpy as np
+
+from flexdt.library.datasets.image_set import Arrays, Counts, CountsReader, ImageSet
+from flexdt.twin.geometry.conventions import Float32Array
+
+ALL: Final = slice(None)
+
+
+class ImagesInMemory:
+    """Images by number, in memory."""
+
+    def __init__(self) -> None:
+        self._images: dict[int, Float32Array] = {}
+
+    def put(self, number: int, image: Float32Array) -> None:
+        """Keep an image (rows, cols), in place of the one that has this number."""
+        self._images[number] = image
+
+    def get(self, number: int, rows: slice = ALL) -> Float32Array:
+        """Rows of an image that is kept."""
+        return self._images[number][rows]
+
+    def close(self) -> None:
+        """Keep none of them any longer."""
+        self._images.clear()
+
+
+class ImagesOnDisk:
+    """Images by number, in a file without a name.
+
+    Args:
+        folder: in which its bytes lie.
+        most_pixels: of an image.
+
+    Raises:
+        OSError: the file cannot be made.
+    """
+
+    def __init__(self, folder: Path, most_pixels: int) -> None:
+        self._folder, self._most_bytes = folder, 4 * most_pixels
+        self._shapes: dict[int, tuple[int, int]] = {}
+        # Without a buffer: images are larger than one.
+        self._file: IO[bytes] = TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115 (see close)
+
+    def put(self, number: int, image: Float32Array) -> None:
+        """As `ImagesInMemory.put`.
+
+        Raises:
+            OSError: it cannot be written; names the folder.
+        """
+        left = np.ascontiguousarray(image, np.float32).reshape(-1).view(np.uint8).data
+        try:
+            self._file.seek(number * self._most_bytes)
+            while left:
+                left = left[self._file.write(left) :]
+        except OSError as error:
+            raise self._placed(error) from None
+        self._shapes[number] = image.shape[0], image.shape[1]
+
+    def get(self, number: int, rows: slice = ALL) -> Float32Array:
+        """As `ImagesInMemory.get`.
+
+        Raises:
+            OSError: it cannot be read; names the folder.
+        """
+        height, width = self._shapes[number]
+        first, last, _ = rows.indices(height)
+        out = np.empty((last - first, width), np.float32)
+        left = out.reshape(-1).view(np.uint8).data
+        try:
+            self._file.seek(number * self._most_bytes + 4 * first * width)
+            while left:
+                count = self._read_into(left)
+                left = left[count:]
+        except OSError as error:
+            raise self._placed(error) from None
+        return out
+
+    def close(self) -> None:
+        """Give the room on disk back."""
+        self._file.close()
+
+    def _read_into(self, buffer: memoryview) -> int:
+        count: int = self._file.readinto(buffer)  # type: ignore[attr-defined]
+        if not count:
+            raise OSError(5, "the file of kept images ends too early")
+        return count
+
+    def _placed(self, error: OSError) -> OSError:
+        return type(error)(error.errno, error.strerror, f"{self._folder} (images kept for a while)")
+
+
+class CountsOnce:
+    """Counts of a data set's frames, each read once from its file.
+
+    Args:
+        read: gives the counts of a frame by its index.
+    """
+
+    def __init__(self, read: Callable[[int], Counts]) -> None:
+        self._read = read
+        self._looked_at: dict[int, Counts] = {}
+        self._latest: dict[int, Counts] = {}
+
+    def looked_at(self, index: int) -> Counts:
+        """Counts that are held until they are read by index."""
+        if index not in self._looked_at:
+            self._looked_at[index] = self._read(index)
+        return self._looked_at[index]
+
+    def __getitem__(self, index: int) -> Counts:
+        """Counts that are held until two others have been read: a lag takes the frame before."""
+        if index not in self._latest:
+            counts = self._looked_at.pop(index, None)
+            newest = list(self._latest.items())[-1:]
+            self._latest = {**dict(newest), index: self._read(index) if counts is None else counts}
+        return self._latest[index]
+
+    def read_by(self, dataset: ImageSet) -> ImageSet:
+        """The same data set, whose counts come from here."""
+        held = dataset.arrays or Arrays(None)
+        if held.counts is not None:  # in memory already
+            self._looked_at.clear()
+            return dataset
+        return replace(dataset, arrays=replace(held, counts=cast(CountsReader, self)))
+
+
+class KeptImages:
+    """The images of a scan, each read once; a context manager.
+
+    An image is kept as it was read until `prepared` replaces it.
+
+    Args:
+        read: gives an image (rows, cols) by its number.
+        store: where they are kept.
+        told: called after each image that is read.
+    """
+
+    def __init__(
+        self,
+        read: Callable[[int], Float32Array],
+        store: ImagesInMemory | ImagesOnDisk,
+        told: Callable[[], None],
+    ) -> None:
+        self._read, self._store, self._told = read, store, told
+        self._as_read: set[int] = set()
+        self._prepared: set[int] = set()
+
+    def image(self, number: int, *, again: bool) -> Float32Array:
+        """An image as it was read.
+
+        Args:
+            number: of the image.
+            again: keep it.
+
+        Raises:
+            ValueError: another one has taken its place.
+        """
+        if number in self._prepared:
+            raise ValueError(f"image {number} is kept as prepared, no longer as it was read")
+        if number in self._as_read:
+            return self._store.get(number)
+        image = self._read(number)
+        self._told()
+        if again:
+            self._store.put(number, image)
+            self._as_read.add(number)
+        return image
+
+    def prepared(
+        self, number: int, prepare: Callable[[int], Float32Array], rows: slice = ALL
+    ) -> Float32Array:
+        """Rows of a prepared image.
+
+        Args:
+            number: of the image.
+            prepare: gives the prepared image by its number, the first time.
+            rows: of it.
+        """
+        if number in self._prepared:
+            return self._store.get(number, rows)
+        image = prepare(number)
+        self._store.put(number, image)
+        self._prepared.add(number)
+        return image[rows]
+
+    def __enter__(self) -> KeptImages:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self._store.close()

@@ -1,0 +1,86 @@
+"""How much of a reconstruction is in memory at a time, and what lies on disk meanwhile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from flexdt.twin.errors import LimitError
+from flexdt.twin.projection import Grid
+
+PART: Final = 16
+"""Images that are worked on at a time."""
+WORKING_IMAGES: Final = 100
+"""Images of four bytes a pixel that FDK takes beside a slab, at most
+(`tests/studies/full_size.py` measures it)."""
+KEPT_SHARE: Final = 0.25
+"""Of the memory, at most, for images that are needed again; more of them lie on disk."""
+
+
+@dataclass(frozen=True)
+class MemoryPlan:
+    """How FDK divides its work.
+
+    Attributes:
+        slabs: layers (first, last) of each.
+        kept: images that are needed more than once.
+        most_pixels: of an image that is kept.
+        on_disk: whether they lie in a file.
+        prepared: whether images are prepared once, and kept for more passes than one.
+    """
+
+    slabs: tuple[tuple[int, int], ...]
+    kept: int
+    most_pixels: int
+    on_disk: bool
+    prepared: bool
+
+    @property
+    def disk_bytes(self) -> int:
+        """Room on disk for the images."""
+        return 4 * self.kept * self.most_pixels if self.on_disk else 0
+
+
+def plan_memory(
+    grid: Grid, images: int, again: int, most_pixels: int, memory: int, *, least: bool = False
+) -> MemoryPlan:
+    """Divide a volume into as few slabs as fit into the memory.
+
+    Args:
+        grid: of the volume.
+        images: of the scan.
+        again: images that are needed more than once even of a single slab.
+        most_pixels: of an image that is kept.
+        memory: to use [bytes].
+        least: take no more slabs than layers where there is too little memory, instead of an error.
+
+    Raises:
+        LimitError: a layer, and the images that are worked on, need more memory.
+    """
+    work = 4 * most_pixels * min(WORKING_IMAGES, 6 * images)
+    layer = grid.bytes // grid.shape[0]
+    if memory < work + layer and not least:
+        raise LimitError(
+            f"memory of {memory / 2**20:.0f} MiB; FDK of a layer of {grid.shape[1]} x "
+            f"{grid.shape[2]} voxels from images of {most_pixels} pixels takes "
+            f"{(work + layer) / 2**20:.0f} MiB or more",
+            {"asked": memory, "allowed": work + layer},
+        )
+    left = max(memory - work, layer)
+    whole = _plan(grid, again, most_pixels, left)
+    return whole if not whole.prepared else _plan(grid, images, most_pixels, left)
+
+
+def plan_whole(grid: Grid, again: int, most_pixels: int, memory: int) -> MemoryPlan:
+    """Keep a volume in one piece, whatever the memory; arguments as for `plan_memory`."""
+    on_disk = 4 * again * most_pixels > KEPT_SHARE * memory
+    return MemoryPlan(((0, grid.shape[0]),), again, most_pixels, on_disk, prepared=False)
+
+
+def _plan(grid: Grid, kept: int, most_pixels: int, memory: int) -> MemoryPlan:
+    need = 4 * kept * most_pixels
+    # Fewer slabs are better than images in memory: the file's parts are there as long as nobody
+    # else needs the memory.
+    on_disk = need > KEPT_SHARE * memory or memory - need < grid.bytes <= memory
+    slabs = grid.slabs(memory if on_disk else memory - need)
+    return MemoryPlan(tuple(slabs), kept, most_pixels, on_disk, prepared=len(slabs) > 1)

@@ -1,0 +1,220 @@
+"""FDK slab by slab from images that are prepared once: a slab takes the rows in its shadow.
+
+Prepared images are those of upright panels, so that a slab's shadow is some rows of them, one piece
+of a file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from flexdt.library.reconstruction.kept_images import KeptImages
+from flexdt.library.reconstruction.memory_plan import PART
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.projection import Grid, Volume
+from flexdt.twin.reconstruction import Truncation, fdk_parts
+from flexdt.twin.reconstruction.rectify import (
+    FINER,
+    is_upright,
+    leans,
+    on_its_side,
+    rectified,
+    rows_needed,
+    swapped,
+    upright,
+    window,
+)
+from flexdt.twin.reconstruction.trajectory import circle_of, narrow_overlap
+
+MARGIN: Final = 6
+"""Rows beside the shadow that a slab takes, too, so that a panel of many rows never seems to have
+few (`fdk.FEW_ROWS`)."""
+VOXEL, FILTERED_PIXEL, READ_PIXEL = 1.0, 20.0, 30.0
+"""Work of FDK a voxel and view, a pixel that is filtered and one that is read and prepared, in
+units of the first (`tests/studies/full_size.py --costs`)."""
+
+
+@dataclass(frozen=True, eq=False)
+class StandingImages:
+    """The images of a scan on upright panels.
+
+    Attributes:
+        recorded: geometry of the images as recorded, rows along the panel's rows.
+        turned: whether rows and columns of the images as recorded change places.
+        cone_vec: of the standing images.
+        shape: of these, (rows, cols).
+        rises: whether the scan is a helix, whose views take whole images.
+        truncation: what lies beyond the panel's edges.
+    """
+
+    recorded: ConeVec
+    turned: bool
+    cone_vec: ConeVec
+    shape: tuple[int, int]
+    rises: bool
+    truncation: Truncation | None
+
+    @classmethod
+    def of(
+        cls, cone_vec: ConeVec, shape: tuple[int, int], truncation: Truncation | None
+    ) -> StandingImages:
+        """Of a scan.
+
+        Args:
+            cone_vec: of all views.
+            shape: of the images as recorded, (rows, cols).
+            truncation: what lies beyond the panel's edges.
+
+        Raises:
+            GeometryError: neither a circle nor a helix, or a panel that lies flat.
+        """
+        circle = circle_of(cone_vec)
+        turned = on_its_side(cone_vec)
+        if turned:
+            cone_vec, shape = swapped(cone_vec), (shape[1], shape[0])
+        rises, rows, cols = bool(circle.rise), *shape
+        wide = round(FINER * cols) if leans(cone_vec) else cols
+        level = cone_vec if is_upright(cone_vec) else upright(cone_vec, wide / cols)
+        if wide != cols and narrow_overlap(circle, level, wide):
+            # FDK moves the axis between columns as it stands these up: resampled once, not twice.
+            return cls(cone_vec, turned, cone_vec, shape, rises, truncation)
+        return cls(cone_vec, turned, level, (rows, wide), rises, truncation)
+
+    def stood(self, image: Float32Array, number: int) -> Float32Array:
+        """The image of a view as an upright panel would have recorded it."""
+        if self.turned:
+            image = image.T
+        if self.cone_vec is self.recorded:
+            return image
+        view = slice(number, number + 1)
+        panels = self.recorded[view], self.cone_vec[view]
+        stood: Float32Array = rectified(image[None], *panels, self.shape[1])[0]
+        return stood
+
+    def rows(self, like: Volume) -> slice:
+        """Rows in which a slab's shadow lies in some view."""
+        if self.rises or not is_upright(self.cone_vec):
+            return slice(0, self.shape[0])
+        first, last = rows_needed(self.cone_vec, self.shape, like)
+        return slice(max(first - MARGIN, 0), min(last + MARGIN, self.shape[0]))
+
+    def part(self, rows: slice) -> tuple[ConeVec, tuple[int, int], Truncation | None]:
+        """Geometry, shape and truncation of some rows."""
+        shape = rows.stop - rows.start, self.shape[1]
+        if shape == self.shape:
+            return self.cone_vec, self.shape, self.truncation
+        cone_vec = window(self.cone_vec, self.shape, (rows.start, rows.stop), (0, shape[1]))
+        truncation = self.truncation
+        if truncation is not None:
+            truncation = replace(truncation, rows=truncation.rows - rows.start)
+        return cone_vec, shape, truncation
+
+
+def fdk_slabs(
+    view: Callable[[int], Float32Array],
+    kept: KeptImages,
+    images: StandingImages,
+    grid: Grid,
+    slabs: Sequence[tuple[int, int]],
+    filter_window: str,
+    tell: Callable[[int, float], None],
+    *,
+    errors: bool = False,
+) -> Iterator[Volume]:
+    """Reconstruct slab after slab.
+
+    Args:
+        view: gives the corrected image of a view as recorded.
+        kept: where prepared images are kept.
+        images: how they stand.
+        grid: of the whole volume.
+        slabs: layers (first, last) of each.
+        filter_window: of the ramp filter.
+        tell: called with the slab's number and the part of it that is done.
+        errors: give each its `sigma` (circles).
+    """
+
+    def prepare(number: int) -> Float32Array:
+        return images.stood(view(number), number)
+
+    for k, (first, last) in enumerate(slabs):
+        like = grid.slab(first, last).blank()
+        rows = images.rows(like)
+        cone_vec, shape, truncation = images.part(rows)
+
+        def parts(rows: slice = rows) -> Iterator[Float32Array]:
+            for some in _parts(len(images.cone_vec)):
+                yield np.stack([kept.prepared(number, prepare, rows) for number in some])
+
+        def told(part: float, k: int = k) -> None:
+            tell(k, part)
+
+        yield fdk_parts(
+            parts, cone_vec, shape, like, filter_window, told, truncation, errors=errors
+        )
+
+
+def _parts(count: int) -> list[range]:
+    limits = [*range(0, count, PART), count]
+    return [range(first, last) for first, last in pairwise(limits)]
+
+
+class Work:
+    """The work of a reconstruction that is done, in images: a whole one is in every slab.
+
+    Args:
+        images: of the scan.
+        reading: work of reading and preparing them all.
+        slabs: work of each slab.
+        tell: called with what is done and the whole, in images.
+    """
+
+    def __init__(
+        self,
+        images: int,
+        reading: float,
+        slabs: Sequence[float],
+        tell: Callable[[float, float], None],
+    ) -> None:
+        self._images, self._reading, self._slabs, self._tell = images, reading, slabs, tell
+        self._read, self._done = 0, [0.0] * len(slabs)
+
+    @classmethod
+    def of(
+        cls,
+        images: StandingImages,
+        grid: Grid,
+        slabs: Sequence[tuple[int, int]],
+        tell: Callable[[float, float], None],
+    ) -> Work:
+        """Of slabs of a grid."""
+        count, (rows, cols) = len(images.cone_vec), images.shape
+        work = []
+        for first, last in slabs:
+            slab = grid.slab(first, last)
+            seen = images.rows(slab.blank())
+            pixels = (seen.stop - seen.start) * cols
+            work.append(count * (VOXEL * slab.bytes / 4 + FILTERED_PIXEL * pixels))
+        return cls(count, READ_PIXEL * count * rows * cols, work, tell)
+
+    def read(self) -> None:
+        """One image more has been read."""
+        self._read += 1
+        self._say()
+
+    def slab(self, number: int, part: float) -> None:
+        """A part of a slab, from 0 to 1, is done."""
+        self._done[number] = part
+        self._say()
+
+    def _say(self) -> None:
+        done = self._reading * (self._read / self._images)
+        done += sum(work * part for work, part in zip(self._slabs, self._done, strict=True))
+        whole = self._reading + sum(self._slabs)
+        self._tell(self._images * (done / whole), self._images)
