@@ -10,9 +10,9 @@ from flexdt.twin.projection import Grid
 
 PART: Final = 16
 """Images that are worked on at a time."""
-WORKING_IMAGES: Final = 100
+WORKING_IMAGES: Final = 180
 """Images of four bytes a pixel that FDK takes beside a slab, at most
-(`tests/studies/full_size.py` measures it)."""
+(`tests/studies/full_size.py --costs`: of an object that is cut off)."""
 KEPT_SHARE: Final = 0.25
 """Of the memory, at most, for images that are needed again; more of them lie on disk."""
 
@@ -57,7 +57,7 @@ def plan_memory(
     Raises:
         LimitError: a layer, and the images that are worked on, need more memory.
     """
-    work = 4 * most_pixels * min(WORKING_IMAGES, 6 * images)
+    work = 4 * most_pixels * min(WORKING_IMAGES, 12 * images)
     layer = grid.bytes // grid.shape[0]
     if memory < work + layer and not least:
         raise LimitError(
