@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import warnings
+import weakref
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 
 import flexdt as fx
-from flexdt.library.reconstruction import kept_images, memory_plan, reconstruct
+from flexdt.library.reconstruction import kept_images, memory_plan, reconstruct, slab_fdk
 from flexdt.library.reconstruction.memory_plan import plan_memory
 from flexdt.library.reconstruction.reconstruct import (
     VolumeRequest,
@@ -205,6 +206,33 @@ def test_a_volume_larger_than_the_memory_lies_in_a_file_without_a_name(
         reconstruct_volume(data, VolumeRequest(shape=GRID.shape, voxel_mm=GRID.voxel_mm))
 
 
+@pytest.mark.parametrize("in_memory", [False, True])
+def test_one_slab_is_held_at_a_time(
+    in_memory: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = fx.open(written(tmp_path / "scan"))
+    request = VolumeRequest(shape=GRID.shape, voxel_mm=GRID.voxel_mm)
+    earlier: list[weakref.ref[np.ndarray]] = []
+    alive: list[int] = []
+    make = slab_fdk.fdk_parts
+
+    def watched(*args: Any, **more: Any) -> Any:
+        alive.append(sum(one() is not None for one in earlier))
+        made = make(*args, **more)
+        earlier.append(weakref.ref(made.data))
+        return made
+
+    monkeypatch.setattr(slab_fdk, "fdk_parts", watched)
+    if in_memory:
+        monkeypatch.setattr(reconstruct, "memory_bytes", lambda: 2 * GRID.bytes)
+        monkeypatch.setattr(reconstruct, "free_memory_bytes", lambda: GRID.bytes // 2)
+        reconstruct_volume(data, request)
+    else:
+        reconstruct_dataset(data, tmp_path / "v.tif", request, memory=memory_for(7))
+    assert len(alive) > 3
+    assert set(alive) == {0}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("slabs", [1, 3])
 def test_scatter_correction_reads_each_image_once(
@@ -294,7 +322,7 @@ def test_no_file_stays_behind_whatever_fails_and_when(
 KILLED = """
 import os, signal, sys
 import flexdt as fx
-from flexdt.library.reconstruction import kept_images, memory_plan, reconstruct
+from flexdt.library.reconstruction import kept_images, memory_plan, reconstruct, slab_fdk
 memory_plan.WORKING_IMAGES = 0
 put, left = kept_images.ImagesOnDisk.put, [int(sys.argv[3])]
 def dying(self, number, image):

@@ -401,6 +401,7 @@ def _here(
         for slab in _fdk_slabs(task, views, kept, plan, work):
             write(slab.data)
             lost += lost_layers(slab.data)
+            del slab  # before there is another
     return views, bias, layer_warnings(lost, grid.shape[0])
 
 
@@ -499,6 +500,7 @@ def _in_a_file(slabs: Iterator[Volume], grid: Grid, folder: Path) -> Volume:
     for slab in slabs:
         data[done : done + len(slab.data)] = slab.data
         done += len(slab.data)
+        del slab  # before there is another
     return replace(grid.blank(), data=data)
 
 
