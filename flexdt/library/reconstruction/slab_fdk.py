@@ -34,7 +34,7 @@ from flexdt.twin.reconstruction.trajectory import circle_of, narrow_overlap
 
 MARGIN: Final = 6
 """Rows beside the shadow that a slab takes, too, so that a panel of many rows never seems to have
-few (`fdk.FEW_ROWS`)."""
+few (`fdk_plan.FEW_ROWS`)."""
 VOXEL, FILTERED_PIXEL, READ_PIXEL = 1.0, 25.0, 12.0
 """Work of FDK a voxel and view, a pixel that is filtered and one that is read and prepared, in
 units of the first (`tests/studies/full_size.py --costs`)."""
