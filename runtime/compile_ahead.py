@@ -52,7 +52,8 @@ def _fit() -> None:
 
 
 def _reconstruction() -> None:
-    from flexdt.twin.reconstruction import fdk, fdk_kernels, truncation_kernels
+    from flexdt.twin.reconstruction import fdk
+    from flexdt.twin.reconstruction.kernels import fdk_kernels, truncation_kernels
 
     scan = ConeVec.circular(sod=10, sdd=20, angles=8, shape=(4, 6), pixel=1.0)
     images = np.ones((8, 4, 6), np.float32)
@@ -68,7 +69,7 @@ GROUPS: Final[dict[str, tuple[Callable[[], None], str]]] = {
     "projection": (warm_up_forward, "projection.kernels.fan_kernels:project_fans"),
     "calibration": (_fit, "calibration.fit.fit_kernels:evaluate"),
     "bead detection": (_detection, "calibration.detect.spot_kernels:fit_ball"),
-    "FDK": (_reconstruction, "reconstruction.fdk_kernels:warp"),
+    "FDK": (_reconstruction, "reconstruction.kernels.fdk_kernels:warp"),
 }
 """What compiles it, and the entry point that it compiles last; those that take longest first."""
 ANALYSIS: Final = ("calibration", "bead detection", "FDK")

@@ -49,9 +49,9 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.projection import Volume, as_volume
-from flexdt.twin.reconstruction.backprojection import OnProcessor
-from flexdt.twin.reconstruction.fdk import fdk_parts
-from flexdt.twin.reconstruction.rectify import field_of_view
+from flexdt.twin.reconstruction.acquisition.rectify import field_of_view
+from flexdt.twin.reconstruction.feldkamp.backprojection import OnProcessor
+from flexdt.twin.reconstruction.feldkamp.fdk import fdk_parts
 from flexdt.twin.scanner.state import NamedCorrection
 
 MOST_VOXELS: Final = 14 << 20

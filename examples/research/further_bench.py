@@ -409,9 +409,10 @@ def columns_passed(ray: FloatArray, box: VoxelBox, cols: int) -> int:
 
 def _fdk_bound(rate: float) -> Entry:
     """FDK of `fdk_entry`: images are read once, or by each tile of voxel columns that they meet."""
-    from flexdt.twin.reconstruction import backprojection, fdk, views
+    from flexdt.twin.reconstruction import fdk
+    from flexdt.twin.reconstruction.feldkamp import backprojection, fdk_views
 
-    kernels = importlib.import_module("flexdt.twin.reconstruction.fdk_kernels")
+    kernels = importlib.import_module("flexdt.twin.reconstruction.kernels.fdk_kernels")
     geometry, grid = fdk_scan()
     images = KINDS[FIRST](geometry, FDK_SHAPE)
     rows, cols = FDK_SHAPE
@@ -420,7 +421,7 @@ def _fdk_bound(rate: float) -> Entry:
     places = [np.linspace(*ends, n + 1) for ends, n in zip((x, y), grid.shape[:0:-1], strict=True)]
     px, py = np.meshgrid(places[0][::tile], places[1][::tile])
     asked = 0.0
-    for g in views.view_table(geometry, (rows, cols)):
+    for g in fdk_views.view_table(geometry, (rows, cols)):
         depth = (px - g[0]) * g[3] + (py - g[1]) * g[4]
         c = g[8] + ((px - g[0]) * g[5] + (py - g[1]) * g[6]) / depth * g[7]
         corners = np.stack([c[:-1, :-1], c[1:, :-1], c[:-1, 1:], c[1:, 1:]])

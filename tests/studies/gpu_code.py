@@ -116,7 +116,7 @@ def all_kernels() -> dict[str, tuple[Any, tuple[Any, ...]]]:
     from numba import boolean, float32, float64, int64, types
 
     project = load_kernels("projection/kernels/gpu_kernels.py")
-    fdk = load_kernels("reconstruction/gpu_reconstruction_kernels.py")
+    fdk = load_kernels("reconstruction/kernels/gpu_reconstruction_kernels.py")
     table, images, flat2 = float64[:, ::1], float32[:, :, ::1], float32[:, ::1]
     flat, counts, edges = float32[::1], types.UniTuple(int64, 3), types.UniTuple(float32, 3)
 

@@ -25,7 +25,7 @@ from lab import machine
 
 import flexdt as fx
 from flexdt.twin.reconstruction import fdk
-from flexdt.twin.reconstruction.filtering import filtered, ramp
+from flexdt.twin.reconstruction.feldkamp.filtering import filtered, ramp
 from flexdt_extensions.fdk_on_workers import create, put_whole, slabs
 
 

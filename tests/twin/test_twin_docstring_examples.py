@@ -15,7 +15,7 @@ MODULES = (
     "flexdt.twin.projection.volume",
     "flexdt.twin.reconstruction.checked_fdk",
     "flexdt.twin.reconstruction.iterative",
-    "flexdt.twin.reconstruction.rectify",
+    "flexdt.twin.reconstruction.acquisition.rectify",
 )
 
 

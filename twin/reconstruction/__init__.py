@@ -1,13 +1,14 @@
 """Volumes back from projections."""
 
 from flexdt.twin.projection.volume import Accuracy, Grid
+from flexdt.twin.reconstruction.acquisition.coverage import layer_warnings, lost_layers
+from flexdt.twin.reconstruction.acquisition.rectify import field_of_view
+from flexdt.twin.reconstruction.acquisition.truncation import Truncation, truncation_of
 from flexdt.twin.reconstruction.bias import Bias, bias_of
 from flexdt.twin.reconstruction.checked_fdk import bias_warnings, checked_fdk, fdk
-from flexdt.twin.reconstruction.coverage import layer_warnings, lost_layers
-from flexdt.twin.reconstruction.fdk import fdk_parts
+from flexdt.twin.reconstruction.feldkamp.fdk import fdk_parts
 from flexdt.twin.reconstruction.iterative import cgls, em, sart, sirt
 from flexdt.twin.reconstruction.linear_system import Step
-from flexdt.twin.reconstruction.rectify import field_of_view
 from flexdt.twin.reconstruction.scatter_correction import (
     Hardening,
     Polychromatic,
@@ -15,7 +16,6 @@ from flexdt.twin.reconstruction.scatter_correction import (
     ring_errors,
     without_scatter,
 )
-from flexdt.twin.reconstruction.truncation import Truncation, truncation_of
 from flexdt.twin.reconstruction.tv import Minimised, minimise_tv, tv
 from flexdt.twin.reconstruction.volume_errors import with_errors
 

@@ -19,11 +19,11 @@ from flexdt.twin.projection.operators import (
     require_line_integrals,
 )
 from flexdt.twin.projection.volume import Accuracy
-from flexdt.twin.reconstruction.backprojection import CHUNK, PIXELS
+from flexdt.twin.reconstruction.acquisition.coverage import layer_warnings, lost_layers
+from flexdt.twin.reconstruction.acquisition.truncation import truncation_of
 from flexdt.twin.reconstruction.bias import Bias, bias_of
-from flexdt.twin.reconstruction.coverage import layer_warnings, lost_layers
-from flexdt.twin.reconstruction.fdk import Progress, fdk_parts
-from flexdt.twin.reconstruction.truncation import truncation_of
+from flexdt.twin.reconstruction.feldkamp.backprojection import CHUNK, PIXELS
+from flexdt.twin.reconstruction.feldkamp.fdk import Progress, fdk_parts
 from flexdt.twin.reconstruction.volume_errors import with_errors
 from flexdt.twin.signatures import public
 

@@ -14,10 +14,14 @@ from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume, forward
-from flexdt.twin.reconstruction.backprojection import OnProcessor
-from flexdt.twin.reconstruction.fdk import fdk_parts
-from flexdt.twin.reconstruction.rectify import field_of_view, on_its_side, swapped, upright, window
-from flexdt.twin.reconstruction.trajectory import (
+from flexdt.twin.reconstruction.acquisition.rectify import (
+    field_of_view,
+    on_its_side,
+    swapped,
+    upright,
+    window,
+)
+from flexdt.twin.reconstruction.acquisition.trajectory import (
     Circle,
     circle_of,
     distinct_angles,
@@ -25,7 +29,9 @@ from flexdt.twin.reconstruction.trajectory import (
     mean_image,
     reach,
 )
-from flexdt.twin.reconstruction.truncation import ACCURACY, Truncation
+from flexdt.twin.reconstruction.acquisition.truncation import ACCURACY, Truncation
+from flexdt.twin.reconstruction.feldkamp.backprojection import OnProcessor
+from flexdt.twin.reconstruction.feldkamp.fdk import fdk_parts
 
 NODES: Final = 40
 """Columns, rows and voxels along the longest side, at most: what is off changes smoothly."""

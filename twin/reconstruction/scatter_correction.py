@@ -33,9 +33,9 @@ from flexdt.twin.physics.scatter import Beam, Object, ScatterSettings, scan_scat
 from flexdt.twin.physics.tube import TubeModel
 from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.projection.operators import as_cone_vec, check_projections, require_finite
-from flexdt.twin.reconstruction.fdk import fdk_parts
-from flexdt.twin.reconstruction.rectify import field_of_view
-from flexdt.twin.reconstruction.truncation import truncation_of
+from flexdt.twin.reconstruction.acquisition.rectify import field_of_view
+from flexdt.twin.reconstruction.acquisition.truncation import truncation_of
+from flexdt.twin.reconstruction.feldkamp.fdk import fdk_parts
 from flexdt.twin.signatures import public
 
 RING_WIDTH = 9

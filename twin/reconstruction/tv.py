@@ -299,7 +299,7 @@ class Regular:
 
     def variation(self, x: Any) -> float:
         """The total variation of x."""
-        from flexdt.twin.reconstruction import tv_kernels
+        from flexdt.twin.reconstruction.kernels import tv_kernels
 
         layers = np.empty(len(x))
         for first, last in layer_portions(x):
@@ -325,7 +325,7 @@ class Regular:
 
     def primal_step(self, z: Any, dual: Any, theta: np.float32, x: Any) -> None:
         """See `tv_kernels`; into x."""
-        from flexdt.twin.reconstruction import tv_kernels
+        from flexdt.twin.reconstruction.kernels import tv_kernels
 
         for first, last in layer_portions(x):
             tv_kernels.primal_step(
@@ -334,7 +334,7 @@ class Regular:
 
     def dual_step(self, x: Any, ahead: Any, rate: np.float32, further: np.float32) -> None:
         """See `tv_kernels`; changes `dual` and `ahead`."""
-        from flexdt.twin.reconstruction import tv_kernels
+        from flexdt.twin.reconstruction.kernels import tv_kernels
 
         for first, last in layer_portions(x):
             tv_kernels.dual_step(x, ahead, self.dual, rate, further, self.scale, first, last)
@@ -378,7 +378,7 @@ class DeviceRegular(Regular):
 
     def _run(self, name: str, *arguments: Any) -> None:
         def launch() -> None:
-            from flexdt.twin.reconstruction import gpu_reconstruction_kernels as kernels
+            from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels as kernels
 
             blocks = -(-self.allowed.flat.size // gpu.LINEAR)
             getattr(kernels, name)[blocks, gpu.LINEAR](*arguments)

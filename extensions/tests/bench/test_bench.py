@@ -287,7 +287,7 @@ from flexdt.clients.cli import main
 from flexdt_extensions.bench import device_page
 from flexdt.twin.projection import gpu
 from flexdt.twin.projection.kernels import gpu_kernels
-from flexdt.twin.reconstruction import gpu_reconstruction_kernels as gpu_fdk_kernels
+from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels as gpu_fdk_kernels
 
 gpu_kernels.BLOCK = gpu_fdk_kernels.BLOCK = gpu_fdk_kernels.PLANE = (4, 2)
 gpu_kernels.FOLDING = (1, 4)

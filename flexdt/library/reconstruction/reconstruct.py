@@ -64,10 +64,10 @@ from flexdt.twin.reconstruction import (
     truncation_of,
     with_errors,
 )
+from flexdt.twin.reconstruction.acquisition.trajectory import circle_of, distinct_angles
+from flexdt.twin.reconstruction.acquisition.truncation import SAMPLES as TRUNCATION_VIEWS
 from flexdt.twin.reconstruction.coarse_scan import VIEWS as BIAS_VIEWS
 from flexdt.twin.reconstruction.scatter_correction import scatterer_of, subtracted
-from flexdt.twin.reconstruction.trajectory import circle_of, distinct_angles
-from flexdt.twin.reconstruction.truncation import SAMPLES as TRUNCATION_VIEWS
 
 if TYPE_CHECKING:
     from flexdt.twin.physics.scatter import ScanScatter

@@ -19,7 +19,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.reconstruction import Truncation, fdk_parts
-from flexdt.twin.reconstruction.rectify import (
+from flexdt.twin.reconstruction.acquisition.rectify import (
     FINER,
     is_upright,
     leans,
@@ -30,7 +30,7 @@ from flexdt.twin.reconstruction.rectify import (
     upright,
     window,
 )
-from flexdt.twin.reconstruction.trajectory import circle_of, narrow_overlap
+from flexdt.twin.reconstruction.acquisition.trajectory import circle_of, narrow_overlap
 
 MARGIN: Final = 6
 """Rows beside the shadow that a slab takes, too, so that a panel of many rows never seems to have

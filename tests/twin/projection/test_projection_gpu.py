@@ -346,7 +346,8 @@ from numba import cuda
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Volume, back, forward, gpu, room_like
 from flexdt.twin.projection.kernels import gpu_kernels
-from flexdt.twin.reconstruction import Grid, fdk, gpu_reconstruction_kernels
+from flexdt.twin.reconstruction import Grid, fdk
+from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels
 from tests.twin.reconstruction.scans import ball, circle
 
 said = []
@@ -459,7 +460,8 @@ from numba.cuda.simulator.kernel import FakeCUDAKernel
 from flexdt.twin.errors import TwinError
 from flexdt.twin.projection import Volume, back, forward, gpu
 from flexdt.twin.projection.kernels import gpu_kernels
-from flexdt.twin.reconstruction import Grid, cgls, fdk, gpu_reconstruction_kernels
+from flexdt.twin.reconstruction import Grid, cgls, fdk
+from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels
 from tests.twin.projection.conftest import _circle
 
 said = []

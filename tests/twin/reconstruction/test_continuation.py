@@ -11,11 +11,11 @@ from scipy.optimize import least_squares
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.reconstruction import Truncation
-from flexdt.twin.reconstruction.fdk_plan import weighing
-from flexdt.twin.reconstruction.trajectory import circle_of
-from flexdt.twin.reconstruction.truncation import Prism
-from flexdt.twin.reconstruction.truncation_kernels import fit_prism
-from flexdt.twin.reconstruction.views import Views
+from flexdt.twin.reconstruction.acquisition.trajectory import circle_of
+from flexdt.twin.reconstruction.acquisition.truncation import Prism
+from flexdt.twin.reconstruction.feldkamp.fdk_plan import weighing
+from flexdt.twin.reconstruction.feldkamp.fdk_views import Views
+from flexdt.twin.reconstruction.kernels.truncation_kernels import fit_prism
 
 ROUNDING = 4 * float(np.finfo(np.float32).eps)
 """Of the largest value: a pixel is rounded once, and the panel's means are of float32 images."""

@@ -14,8 +14,8 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Grid, project_scene
 from flexdt.twin.projection.analytic_solids import Ellipsoid, Scene, Solid
 from flexdt.twin.reconstruction import fdk, fdk_parts, field_of_view
-from flexdt.twin.reconstruction.coverage import Sharing
-from flexdt.twin.reconstruction.trajectory import circle_of
+from flexdt.twin.reconstruction.acquisition.coverage import Sharing
+from flexdt.twin.reconstruction.acquisition.trajectory import circle_of
 
 SOD, SDD, PITCH, SHAPE, MU = 300.0, 600.0, 2.0, (40, 64), 0.02
 FIELD = SOD * np.sin(np.arctan2((SHAPE[1] - 1) * PITCH / 2, SDD))

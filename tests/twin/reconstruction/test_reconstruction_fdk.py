@@ -39,20 +39,20 @@ from flexdt.twin.reconstruction import (
     field_of_view,
     truncation_of,
 )
-from flexdt.twin.reconstruction.filtering import filtered, ramp
-from flexdt.twin.reconstruction.rectify import (
+from flexdt.twin.reconstruction.acquisition.rectify import (
     homography,
     is_upright,
     rectified,
     rows_needed,
     upright,
 )
-from flexdt.twin.reconstruction.trajectory import (
+from flexdt.twin.reconstruction.acquisition.trajectory import (
     circle_of,
     fan_angles,
     reach,
     redundancy,
 )
+from flexdt.twin.reconstruction.feldkamp.filtering import filtered, ramp
 from tests.twin.reconstruction.scans import CENTRE, MU, RADIUS, ball, circle, measure
 
 plain_fdk = partial(fdk, errors=False)

@@ -7,7 +7,7 @@ import pytest
 
 from flexdt.twin.projection import gpu
 from flexdt.twin.reconstruction import Grid, fdk
-from flexdt.twin.reconstruction.backprojection import device_takes
+from flexdt.twin.reconstruction.feldkamp.backprojection import device_takes
 from tests.support.device_simulator import run_simulated
 from tests.twin.reconstruction.scans import ball, circle, measure
 
@@ -17,9 +17,9 @@ SIMULATED = """
 import numpy as np
 from flexdt.twin.projection import gpu
 from flexdt.twin.reconstruction import Grid, fdk
-from flexdt.twin.reconstruction.backprojection import device_takes
-from flexdt.twin.reconstruction.fdk import fdk_parts
-from flexdt.twin.reconstruction.truncation import Prism, Truncation
+from flexdt.twin.reconstruction.feldkamp.backprojection import device_takes
+from flexdt.twin.reconstruction.feldkamp.fdk import fdk_parts
+from flexdt.twin.reconstruction.acquisition.truncation import Prism, Truncation
 from tests.twin.reconstruction.scans import ball, circle
 
 assert gpu.availability().present
@@ -84,8 +84,9 @@ for case in range(4):
 BY_SLABS = """
 import numpy as np
 from flexdt.twin.projection import gpu
-from flexdt.twin.reconstruction import Grid, fdk, gpu_reconstruction_kernels
-from flexdt.twin.reconstruction.backprojection import OnDevice
+from flexdt.twin.reconstruction import Grid, fdk
+from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels
+from flexdt.twin.reconstruction.feldkamp.backprojection import OnDevice
 from tests.twin.reconstruction.scans import ball, circle
 
 gpu_reconstruction_kernels.BLOCK = gpu_reconstruction_kernels.PLANE = (4, 2)
@@ -207,7 +208,7 @@ import numpy as np
 from flexdt.twin.projection import gpu
 from flexdt.twin.projection.kernels import gpu_kernels
 from flexdt.twin.reconstruction import Grid, fdk_parts, tv
-from flexdt.twin.reconstruction.fdk import OnDevice, OnProcessor
+from flexdt.twin.reconstruction.feldkamp.fdk import OnDevice, OnProcessor
 from tests.support.device_simulator import as_on_a_device
 from tests.twin.reconstruction.scans import ball, circle
 

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from llvmlite import binding
 
-from flexdt.twin.reconstruction.fdk_kernels import MARGIN, STEEPEST, lanes
+from flexdt.twin.reconstruction.kernels.fdk_kernels import MARGIN, STEEPEST, lanes
 
 WAYS = {16: "+avx2,+fma,+avx512f", 8: "+avx2,+fma", 1: ""}
 PROGRAM = """
 import sys
 import numpy as np
 from numba import njit
-from flexdt.twin.reconstruction.fdk_kernels import LANES, add_column, mix_columns
+from flexdt.twin.reconstruction.kernels.fdk_kernels import LANES, add_column, mix_columns
 
 @njit
 def work(acc, left, right, shares, cases):

@@ -23,17 +23,17 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import Grid, Volume, as_volume, gpu
 from flexdt.twin.projection.volume import cut
-from flexdt.twin.reconstruction.backprojection import (
+from flexdt.twin.reconstruction.acquisition.trajectory import circle_of
+from flexdt.twin.reconstruction.acquisition.truncation import Truncation
+from flexdt.twin.reconstruction.feldkamp.backprojection import (
     Backprojector,
     OnDevice,
     OnProcessor,
     device_takes,
 )
-from flexdt.twin.reconstruction.fdk_plan import FdkPlan, plan_fdk
-from flexdt.twin.reconstruction.noise import Noise, NoiseMeter, NoiseOfSlabs
-from flexdt.twin.reconstruction.slabs import layers
-from flexdt.twin.reconstruction.trajectory import circle_of
-from flexdt.twin.reconstruction.truncation import Truncation
+from flexdt.twin.reconstruction.feldkamp.fdk_plan import FdkPlan, plan_fdk
+from flexdt.twin.reconstruction.feldkamp.noise import Noise, NoiseMeter, NoiseOfSlabs
+from flexdt.twin.reconstruction.feldkamp.slabs import layers
 from flexdt.twin.reconstruction.volume_errors import with_errors
 
 Progress = Callable[[float], None]

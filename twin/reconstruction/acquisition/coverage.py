@@ -21,7 +21,7 @@ import numpy as np
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume
-from flexdt.twin.reconstruction.trajectory import Circle, fan_angles, no_fdk, reach
+from flexdt.twin.reconstruction.acquisition.trajectory import Circle, fan_angles, no_fdk, reach
 
 LEAST_SEEN: Final = 0.4
 """Part of the weight of all views that must see a voxel. At the panel's upper and lower edge it is
@@ -59,7 +59,7 @@ def normalise_coverage(
         cut_off: whether the panel cuts the object off, so that voxels which are not seen in lines
             of all directions become NaN.
     """
-    from flexdt.twin.reconstruction import fdk_kernels
+    from flexdt.twin.reconstruction.kernels import fdk_kernels
 
     first, size = first_and_steps(like)
     x, y, z = (np.array([places[0], places[-1]]) for places in like.centers())

@@ -19,8 +19,14 @@ import numpy.typing as npt
 
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
-from flexdt.twin.reconstruction.rectify import is_upright, on_its_side, rectified, swapped, upright
-from flexdt.twin.reconstruction.trajectory import (
+from flexdt.twin.reconstruction.acquisition.rectify import (
+    is_upright,
+    on_its_side,
+    rectified,
+    swapped,
+    upright,
+)
+from flexdt.twin.reconstruction.acquisition.trajectory import (
     circle_of,
     columns_beyond,
     distinct_angles,
@@ -360,7 +366,7 @@ def _fit(
         usual: a usual one of the object.
         near: of a neighbouring band.
     """
-    from flexdt.twin.reconstruction.truncation_kernels import fit_prism
+    from flexdt.twin.reconstruction.kernels.truncation_kernels import fit_prism
 
     hit = seen > 0.1 * ACCURACY * usual  # of dead columns a prism elsewhere is right
     if not hit.any():

@@ -15,10 +15,10 @@ import numpy as np
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume, gpu
 from flexdt.twin.projection.cpu import threads
-from flexdt.twin.reconstruction.coverage import first_and_steps
-from flexdt.twin.reconstruction.filtering import filtered, taps
-from flexdt.twin.reconstruction.noise import NoiseMeter
-from flexdt.twin.reconstruction.views import Views
+from flexdt.twin.reconstruction.acquisition.coverage import first_and_steps
+from flexdt.twin.reconstruction.feldkamp.fdk_views import Views
+from flexdt.twin.reconstruction.feldkamp.filtering import filtered, taps
+from flexdt.twin.reconstruction.feldkamp.noise import NoiseMeter
 
 MOST_COLUMNS: Final = 65_535
 """Voxel columns along y that a device's grid can hold."""
@@ -56,7 +56,7 @@ class OnProcessor:
 
     def add(self, views: Views) -> None:
         """Weigh and filter views, and add them to the volume."""
-        from flexdt.twin.reconstruction import fdk_kernels
+        from flexdt.twin.reconstruction.kernels import fdk_kernels
 
         n, wide, cols, rows = views.sizes
         if views.sizes != self._sizes:  # new memory costs as much as filtering
@@ -82,7 +82,7 @@ class OnProcessor:
 
 def _weighed(views: Views) -> Float32Array:
     """Rows that go into the filter, with their weights, (n, rows, cols)."""
-    from flexdt.twin.reconstruction import fdk_kernels
+    from flexdt.twin.reconstruction.kernels import fdk_kernels
 
     n, wide, _, rows = views.sizes
     ready = np.empty((n, rows, wide), np.float32)
@@ -152,7 +152,7 @@ class OnDevice:
         """Columns of the images on the device, weighed and filtered, (n, cols, rows)."""
         from numba import cuda
 
-        from flexdt.twin.reconstruction import gpu_reconstruction_kernels as kernels
+        from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels as kernels
 
         there, top = self._moved(views), 0 if views.wider else views.top
         n, wide, cols, rows = views.sizes
@@ -186,7 +186,7 @@ class OnDevice:
         """Add filtered columns of images of `size` (cols, rows) to a volume (ny, nx, nz)."""
         from numba import cuda
 
-        from flexdt.twin.reconstruction import gpu_reconstruction_kernels as kernels
+        from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels as kernels
 
         ny, nx, nz = shape
         blocks = (-(-nz // (kernels.BLOCK[0] * kernels.RUN)), -(-nx // kernels.BLOCK[1]), ny)

@@ -18,7 +18,7 @@ from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Grid, Volume
-from flexdt.twin.reconstruction.trajectory import no_fdk
+from flexdt.twin.reconstruction.acquisition.trajectory import no_fdk
 
 UPRIGHT = 1e-7
 """Largest slope of rows and columns of a panel that counts as upright."""
@@ -89,7 +89,7 @@ def rectified(
         cone_vec, target: n rows each.
         cols: of the target's panels; default: as many as there are.
     """
-    from flexdt.twin.reconstruction import fdk_kernels
+    from flexdt.twin.reconstruction.kernels import fdk_kernels
 
     shape = (images.shape[1], images.shape[2])
     new_shape = (shape[0], shape[1] if cols is None else cols)

@@ -59,7 +59,7 @@ def filtered(rows: Float32Array, response: Float32Array) -> Float32Array:
     """
     from scipy import fft
 
-    from flexdt.twin.reconstruction import fdk_kernels
+    from flexdt.twin.reconstruction.kernels import fdk_kernels
 
     cols, length = rows.shape[-1], padded_length(response)
     spectrum = fft.rfft(rows, length, axis=-1, workers=-1)

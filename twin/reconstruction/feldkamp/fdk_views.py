@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
-from flexdt.twin.reconstruction.truncation import Continuation
+from flexdt.twin.reconstruction.acquisition.truncation import Continuation
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class Views:
 
     def widen(self, out: Float32Array) -> None:
         """Write the rows that are needed, continued beyond the panel's edges, (n, rows, cols)."""
-        from flexdt.twin.reconstruction import truncation_kernels
+        from flexdt.twin.reconstruction.kernels import truncation_kernels
 
         on = self.beyond
         truncation_kernels.continue_rows(

@@ -18,10 +18,10 @@ import numpy as np
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.cpu import threads
 from flexdt.twin.projection.volume import Volume
-from flexdt.twin.reconstruction.coverage import first_and_steps
-from flexdt.twin.reconstruction.slabs import layers
-from flexdt.twin.reconstruction.trajectory import Circle
-from flexdt.twin.reconstruction.views import Views
+from flexdt.twin.reconstruction.acquisition.coverage import first_and_steps
+from flexdt.twin.reconstruction.acquisition.trajectory import Circle
+from flexdt.twin.reconstruction.feldkamp.fdk_views import Views
+from flexdt.twin.reconstruction.feldkamp.slabs import layers
 from flexdt.twin.reconstruction.volume_errors import interpolated
 
 NODES: Final = 32
@@ -130,7 +130,7 @@ class NoiseMeter:
 
     def add(self, views: Views, columns: Float32Array) -> None:
         """Add views whose filtered columns are at hand, (n, cols, rows); the columns are lost."""
-        from flexdt.twin.reconstruction import fdk_kernels
+        from flexdt.twin.reconstruction.kernels import fdk_kernels
 
         signs, rows = self.note(views), views.sizes[3]
         columns[: len(signs)] *= signs[:, None, None]

@@ -16,9 +16,8 @@ from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume
-from flexdt.twin.reconstruction.coverage import Sharing, normalise_coverage
-from flexdt.twin.reconstruction.filtering import ramp
-from flexdt.twin.reconstruction.rectify import (
+from flexdt.twin.reconstruction.acquisition.coverage import Sharing, normalise_coverage
+from flexdt.twin.reconstruction.acquisition.rectify import (
     FINER,
     is_upright,
     leans,
@@ -28,8 +27,8 @@ from flexdt.twin.reconstruction.rectify import (
     swapped,
     upright,
 )
-from flexdt.twin.reconstruction.rectify import window as window_of
-from flexdt.twin.reconstruction.trajectory import (
+from flexdt.twin.reconstruction.acquisition.rectify import window as window_of
+from flexdt.twin.reconstruction.acquisition.trajectory import (
     Circle,
     axis_between,
     circle_of,
@@ -38,8 +37,9 @@ from flexdt.twin.reconstruction.trajectory import (
     no_fdk,
     redundancy,
 )
-from flexdt.twin.reconstruction.truncation import Continuation, Truncation
-from flexdt.twin.reconstruction.views import Views, view_table
+from flexdt.twin.reconstruction.acquisition.truncation import Continuation, Truncation
+from flexdt.twin.reconstruction.feldkamp.fdk_views import Views, view_table
+from flexdt.twin.reconstruction.feldkamp.filtering import ramp
 
 FEW_ROWS: Final = 5
 """Of a panel that is done voxels beside one another at a time. The panel decides, not the rows that

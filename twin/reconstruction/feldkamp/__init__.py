@@ -1,0 +1,1 @@
+"""Filtered backprojection of Feldkamp, Davis and Kress, step by step."""

@@ -1,0 +1,1 @@
+"""Compiled loops of the reconstructions, for the processor and for CUDA devices."""
