@@ -49,7 +49,7 @@ async def run(options: ViewerSettings, out: TextIO) -> int:
     The ready line goes to `out`; returns the exit code.
     """
     from flexdt.clients.viewer.page_methods import ANSWERS
-    from flexdt.clients.viewer.scenes.part_looks import own_looks
+    from flexdt.clients.viewer.scenes.meshes.part_looks import own_looks
     from flexdt.clients.viewer.viewer import Viewer
 
     token = read_token(options.token_file)

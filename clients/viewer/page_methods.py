@@ -32,13 +32,13 @@ from flexdt.clients.viewer import scrubbed_plan as plans
 from flexdt.clients.viewer.exports import Form
 from flexdt.clients.viewer.front import Download
 from flexdt.clients.viewer.page import Page, without_bytes
-from flexdt.clients.viewer.reconstruction_process import wish
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.layers import LAYERS
 from flexdt.clients.viewer.scenes.views import FREE
 from flexdt.clients.viewer.scenes.world import motors
 from flexdt.clients.viewer.shown_images import ShownImage, packed
 from flexdt.clients.viewer.viewer import PageMethod, Viewer
+from flexdt.clients.viewer.volumes.reconstruction_process import wish
 from flexdt.protocol import Code, Method, RpcError, parse_params
 from flexdt.protocol import image as wire_image
 from flexdt.protocol.field_checks import few

@@ -27,10 +27,8 @@ from flexdt.clients.client.transport import ConnectionLost
 from flexdt.clients.viewer import scrubbed_plan as plans
 from flexdt.clients.viewer.feed import ImageFeed
 from flexdt.clients.viewer.front import Download, Front
-from flexdt.clients.viewer.live_volume import points_of
 from flexdt.clients.viewer.page import TRY_AGAIN, Page, without_bytes
 from flexdt.clients.viewer.page_cameras import SceneClients
-from flexdt.clients.viewer.reconstruction_process import LiveReconstruction
 from flexdt.clients.viewer.scenes import sample_looks, views
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.layers import Shown
@@ -40,6 +38,8 @@ from flexdt.clients.viewer.scenes.still_pictures import Stills
 from flexdt.clients.viewer.scenes.world import World, beads_on, world_of
 from flexdt.clients.viewer.shown_images import ShownImage, grey, packed, window_of
 from flexdt.clients.viewer.viser_gate import Scenes
+from flexdt.clients.viewer.volumes.live_volume import points_of
+from flexdt.clients.viewer.volumes.reconstruction_process import LiveReconstruction
 from flexdt.clients.viewer.watched_tasks import watched
 from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SafetyState, SampleState, State

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from flexdt.clients.cli.command_tree import run
-from flexdt.clients.viewer.scenes.part_looks import own_looks, pieces_of
+from flexdt.clients.viewer.scenes.meshes.part_looks import own_looks, pieces_of
 from flexdt.library import machines
 from flexdt.phantoms.files import mesh_files
 from flexdt.twin.errors import MachineFileError

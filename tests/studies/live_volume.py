@@ -32,7 +32,7 @@ def measured(twin: fx.TwinClient, data: Path, side: int, frames: int) -> str:
     name = f"slices-{side}"
     job = twin.submit_script(script, name, 1.0).job
     grower = subprocess.Popen(
-        [sys.executable, "-m", "flexdt.clients.viewer.live_volume"],
+        [sys.executable, "-m", "flexdt.clients.viewer.volumes.live_volume"],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**os.environ, **ENVIRONMENT},
     )  # fmt: skip
     assert grower.stdin is not None

@@ -16,7 +16,7 @@ from PIL import Image
 from scipy.spatial import ConvexHull
 
 from flexdt.clients.client.client import TwinClient
-from flexdt.clients.viewer.scenes.cabinet import cabinet
+from flexdt.clients.viewer.scenes.meshes.cabinet import cabinet
 from flexdt.clients.viewer.scenes.still import Shape, drawn
 from flexdt.clients.viewer.scenes.views import ROOM, WIDE, Standpoint, fitted, presets, roomy
 from flexdt.clients.viewer.scenes.world import World, placed

@@ -19,7 +19,7 @@ import pytest
 import tifffile
 
 from flexdt.clients.cli import main
-from flexdt.clients.viewer.live_volume import (
+from flexdt.clients.viewer.volumes.live_volume import (
     MOST_POINTS,
     TOP,
     Held,
@@ -31,8 +31,8 @@ from flexdt.clients.viewer.live_volume import (
     reconstruct,
     surface,
 )
-from flexdt.clients.viewer.reconstruction_process import LiveReconstruction, wish
-from flexdt.clients.viewer.volume_truth import figures, main_level, truth_of
+from flexdt.clients.viewer.volumes.reconstruction_process import LiveReconstruction, wish
+from flexdt.clients.viewer.volumes.volume_truth import figures, main_level, truth_of
 from flexdt.library.reading.folders import load_dataset
 from flexdt.phantoms import load_phantom
 from flexdt.runtime.files.directory import open_data
@@ -124,7 +124,7 @@ def test_it_grows_with_every_image_to_the_true_values(
     scan: tuple[Path, list[Path]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     home, waiting = scan
-    monkeypatch.setattr("flexdt.clients.viewer.live_volume.TELL_S", 0.0)
+    monkeypatch.setattr("flexdt.clients.viewer.volumes.live_volume.TELL_S", 0.0)
     told: list[tuple[int, float]] = []
     grown = held(lambda m: told.append((m["views"], middle(grown.volumes["volume"]))))
     work = threading.Thread(target=grow, args=(grown, home, SIDE))

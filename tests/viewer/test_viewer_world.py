@@ -21,12 +21,12 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from flexdt.clients.viewer.scenes.beam_planes import HULL, MOST, SIDES, fans
-from flexdt.clients.viewer.scenes.collision_bodies import bare, grown
 from flexdt.clients.viewer.scenes.drag_handles import Gizmos
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.layers import LAYERS, Shown
-from flexdt.clients.viewer.scenes.painted_meshes import glb
-from flexdt.clients.viewer.scenes.part_looks import pieces_of
+from flexdt.clients.viewer.scenes.meshes.collision_bodies import bare, grown
+from flexdt.clients.viewer.scenes.meshes.painted_meshes import glb
+from flexdt.clients.viewer.scenes.meshes.part_looks import pieces_of
 from flexdt.clients.viewer.scenes.sample_looks import MeshCache, fetch
 from flexdt.clients.viewer.scenes.views import beam_view
 from flexdt.clients.viewer.scenes.world import World, beads_on, placed, quaternion

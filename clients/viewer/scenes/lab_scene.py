@@ -13,15 +13,15 @@ import numpy.typing as npt
 import viser
 
 from flexdt.clients.viewer.scenes.beam_planes import LIGHT, BeamShade
-from flexdt.clients.viewer.scenes.cabinet import LAMP, cabinet, ground_of
-from flexdt.clients.viewer.scenes.collision_bodies import bare, grown
 from flexdt.clients.viewer.scenes.drag_handles import Drag, Gizmos
 from flexdt.clients.viewer.scenes.lamps import light_plainly
 from flexdt.clients.viewer.scenes.layers import Nodes, Shown
+from flexdt.clients.viewer.scenes.meshes.cabinet import LAMP, cabinet, ground_of
+from flexdt.clients.viewer.scenes.meshes.collision_bodies import bare, grown
+from flexdt.clients.viewer.scenes.meshes.painted_meshes import cylinder, glb, plain
+from flexdt.clients.viewer.scenes.meshes.paints import RUBBER
+from flexdt.clients.viewer.scenes.meshes.part_looks import pieces_of
 from flexdt.clients.viewer.scenes.name_tags import Name, names_of_image, names_of_parts
-from flexdt.clients.viewer.scenes.painted_meshes import cylinder, glb, plain
-from flexdt.clients.viewer.scenes.paints import RUBBER
-from flexdt.clients.viewer.scenes.part_looks import pieces_of
 from flexdt.clients.viewer.scenes.plan_drawing import HOME, SCREEN, PlanDrawing
 from flexdt.clients.viewer.scenes.sample_looks import SampleLook
 from flexdt.clients.viewer.scenes.still import Shape, cone, cut, image_on, placed, shape_of

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import viser
 
-from flexdt.clients.viewer.scenes.collision_bodies import bare
-from flexdt.clients.viewer.scenes.painted_meshes import plain
+from flexdt.clients.viewer.scenes.meshes.collision_bodies import bare
+from flexdt.clients.viewer.scenes.meshes.painted_meshes import plain
 from flexdt.clients.viewer.scenes.world import MM, quaternion
 from flexdt.twin.collision.collision_scene import CollisionScene
 from flexdt.twin.geometry.conventions import FloatArray

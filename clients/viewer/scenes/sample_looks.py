@@ -18,7 +18,7 @@ import numpy.typing as npt
 import trimesh
 
 from flexdt.clients.client.flows import adrive, sample_shape
-from flexdt.clients.viewer.scenes.painted_meshes import SMOOTH_RAD, plain
+from flexdt.clients.viewer.scenes.meshes.painted_meshes import SMOOTH_RAD, plain
 from flexdt.clients.viewer.scenes.world import MM
 from flexdt.phantoms import Phantom, load_phantom, mesh_phantom
 from flexdt.protocol import RpcError

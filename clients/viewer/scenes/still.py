@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from flexdt.clients.viewer.scenes.painted_meshes import PaintedMesh
+from flexdt.clients.viewer.scenes.meshes.painted_meshes import PaintedMesh
 from flexdt.clients.viewer.scenes.sample_looks import Skin
 from flexdt.clients.viewer.scenes.views import Standpoint
 from flexdt.clients.viewer.scenes.world import MM, World

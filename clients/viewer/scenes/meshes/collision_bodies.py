@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from flexdt.clients.viewer.scenes.painted_meshes import cylinder
-from flexdt.clients.viewer.scenes.paints import STEEL
+from flexdt.clients.viewer.scenes.meshes.painted_meshes import cylinder
+from flexdt.clients.viewer.scenes.meshes.paints import STEEL
 from flexdt.twin.collision.convex_solids import ConvexSolid, Polytope, UprightCylinder
 from flexdt.twin.geometry.conventions import FloatArray
 

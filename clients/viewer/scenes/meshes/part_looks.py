@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 import trimesh
 
-from flexdt.clients.viewer.scenes.painted_meshes import (
+from flexdt.clients.viewer.scenes.meshes.painted_meshes import (
     PaintedMesh,
     bevelled,
     cylinder,
@@ -25,7 +25,7 @@ from flexdt.clients.viewer.scenes.painted_meshes import (
     lathe,
     turn_matrix,
 )
-from flexdt.clients.viewer.scenes.paints import ALUMINIUM, PAINTS
+from flexdt.clients.viewer.scenes.meshes.paints import ALUMINIUM, PAINTS
 from flexdt.phantoms.files.mesh_files import read_part
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Component, Machine

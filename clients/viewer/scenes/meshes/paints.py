@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from flexdt.clients.viewer.scenes.painted_meshes import Paint
+from flexdt.clients.viewer.scenes.meshes.painted_meshes import Paint
 
 STEEL = Paint((186, 192, 200), 0.25, 0.35)
 ALUMINIUM = Paint((205, 210, 217), 0.15, 0.45)

@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 import trimesh
 
-from flexdt.clients.viewer.scenes.painted_meshes import Paint, PaintedMesh, bevelled
-from flexdt.clients.viewer.scenes.paints import ANODISED, SIGNAL, STEEL
+from flexdt.clients.viewer.scenes.meshes.painted_meshes import Paint, PaintedMesh, bevelled
+from flexdt.clients.viewer.scenes.meshes.paints import ANODISED, SIGNAL, STEEL
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Component, Machine
 

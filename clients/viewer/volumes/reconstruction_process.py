@@ -15,7 +15,7 @@ from typing import Any, Final
 from flexdt.clients.viewer.watched_tasks import watched
 from flexdt.runtime.workers import ENVIRONMENT
 
-PROGRAM: Final = "flexdt.clients.viewer.live_volume"
+PROGRAM: Final = "flexdt.clients.viewer.volumes.live_volume"
 LINE_BYTES: Final = 4 << 20
 SINGLE: Final = {name: ones for name, ones in ENVIRONMENT.items() if not name.startswith("NUMBA")}
 """The process itself says how many threads its kernels have."""

@@ -1,10 +1,10 @@
 """A volume that grows while its scan runs, and those of past scans: FDK in a process of its own.
 
-`python -m flexdt.clients.viewer.live_volume` loads what it needs and reads a line, FOLDER, SIDE and
-perhaps `past`, tabs between them. It follows that data set then and prints a line of JSON whenever
-its volume has changed: views so far and of how many, its size, and points on the surface of what is
-dense, for the scenes. The geometry of all images is written when a scan begins, so each view has
-its final weight at once, and the values of a grown volume are those of the finished one.
+`python -m flexdt.clients.viewer.volumes.live_volume` loads what it needs and reads a line, FOLDER,
+SIDE and perhaps `past`, tabs between them. It follows that data set then and prints a line of JSON
+whenever its volume has changed: views so far and of how many, its size, and points on the surface
+of what is dense, for the scenes. The geometry of all images is written when a scan begins, so each
+view has its final weight at once, and the values of a grown volume are those of the finished one.
 
 With `past` it is the volume of `flexdt reconstruct` from the images that are there.
 
@@ -38,7 +38,7 @@ from typing import Any, Final
 import numba
 import numpy as np
 
-from flexdt.clients.viewer.volume_truth import figures, truth_of
+from flexdt.clients.viewer.volumes.volume_truth import figures, truth_of
 from flexdt.library.data_set import DataSet
 from flexdt.library.reading.folders import load_dataset
 from flexdt.library.reconstruction.reconstruct import VolumeRequest, reconstruct_volume

@@ -1,0 +1,1 @@
+"""Volumes in the page: one that grows with its scan, and those of past scans."""
