@@ -63,6 +63,8 @@ BODY = (3.0, -2.0, 30.0, 0.02)
 PINS = ((12.0, 5.0, 1.5, 0.08), (-9.0, 14.0, 0.8, 0.1), (0.0, -20.0, 2.0, 0.05),
         (-18.0, -6.0, 0.5, 0.2), (6.0, 18.0, 1.0, 0.1))  # fmt: skip
 """The same of what is added in pins; the last ends in the plane of the source."""
+TOLD = 0.05
+"""Part of the work after which figures are told."""
 RTK_PART = 16
 """Of the layers, one part is made beside itk-rtk."""
 
@@ -130,7 +132,7 @@ def write(folder: Path, fraction: float) -> None:
           f"{time.process_time() - begun:.0f} CPU s", flush=True)  # fmt: skip
 
 
-def reconstruct(folder: Path, out: Path, memory: int | None) -> dict[str, Any]:
+def reconstruct(folder: Path, out: Path, memory: int | None, voxel: float | None) -> dict[str, Any]:
     """Reconstruct in this process, and say what it took."""
     reads, read = [0], image_set.read_image
 
@@ -141,9 +143,25 @@ def reconstruct(folder: Path, out: Path, memory: int | None) -> dict[str, Any]:
     image_set.read_image = counted  # type: ignore[assignment]
     data = load_dataset(folder)
     before, begun = counters(), time.perf_counter()
+    spoken = 0.0
+
+    def told(done: float, whole: float) -> None:
+        nonlocal spoken
+        if done - spoken >= TOLD * whole:
+            spoken = done
+            print(
+                f"{100 * done / whole:.0f} %: {time.process_time():.0f} CPU s, peak "
+                f"{size(1024 * status('VmHWM:'))}, read "
+                f"{size(counters()['rchar'] - before['rchar'])}, {reads[0]} images",
+                file=sys.stderr,
+                flush=True,
+            )
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        made = reconstruct_dataset(data, out, VolumeRequest(), memory=memory)
+        made = reconstruct_dataset(
+            data, out, VolumeRequest(voxel_mm=voxel), memory=memory, progress=told
+        )
     used, after = resource.getrusage(resource.RUSAGE_SELF), counters()
     images = 2 * len(data) * math.prod(data.shape)
     return {
@@ -325,6 +343,7 @@ def main() -> None:
     parser.add_argument("--write", type=Path, metavar="FOLDER")
     parser.add_argument("--reconstruct", type=Path, metavar="FOLDER", nargs="?", const=Path())
     parser.add_argument("--memory", type=memory_size, metavar="SIZE")
+    parser.add_argument("--voxel", type=float, metavar="MM", help="default: a pixel's at the axis")
     parser.add_argument("--fraction", type=float, default=1.0)
     parser.add_argument("--out", type=Path, help="of the volume; default: beside FOLDER, removed")
     parser.add_argument("--costs", action="store_true")
@@ -341,11 +360,12 @@ def main() -> None:
     if given.reconstruct is not None:
         folder = given.write if given.reconstruct == Path() else given.reconstruct
         if given.write is not None:  # so that making the images is not in the figures
-            memory = [] if given.memory is None else ["--memory", str(given.memory)]
-            again("--reconstruct", str(folder), *memory)
+            words = {"--memory": given.memory, "--voxel": given.voxel}
+            more = [str(w) for pair in words.items() if pair[1] is not None for w in pair]
+            again("--reconstruct", str(folder), *more)
             return
         out = given.out or folder.with_name(f"{folder.name}.mha")
-        print(json.dumps(reconstruct(folder, out, given.memory), indent=1), flush=True)
+        print(json.dumps(reconstruct(folder, out, given.memory, given.voxel), indent=1), flush=True)
         if given.out is None:
             os.remove(out)
     if given.costs:

@@ -10,7 +10,7 @@ from flexdt.twin.projection import Grid
 
 PART: Final = 16
 """Images that are worked on at a time."""
-WORKING_IMAGES: Final = 180
+WORKING_IMAGES: Final = 100
 """Images of four bytes a pixel that FDK takes beside a slab, at most
 (`tests/studies/full_size.py --costs`: of an object that is cut off)."""
 KEPT_SHARE: Final = 0.25
