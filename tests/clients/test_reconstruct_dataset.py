@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import itertools
 import json
 import math
 import re
@@ -21,7 +22,7 @@ from flexdt.library.reconstruction.reconstruct import (
     preview,
     reconstruct_dataset,
 )
-from flexdt.library.reconstruction.volume_files import middle_slices, read_volume
+from flexdt.library.reconstruction.volume_files import MiddleSlices, read_volume
 from flexdt.phantoms import lego_phantom
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.imaging.projections import Imaging, TrueGeometry
@@ -293,10 +294,26 @@ def _ints(value: object) -> list[int]:
 def test_slices_have_up_at_the_top() -> None:
     volume = np.zeros((3, 5, 7), np.float32)
     volume[2, 2, 3] = 1.0
-    slices = middle_slices(volume)
+    taken = MiddleSlices(volume.shape)
+    taken.take(volume)
+    slices = taken.images
     assert slices["xz"][0, 3] == 1.0
     assert slices["yz"][0, 2] == 1.0
     assert slices["xy"].shape == (5, 7)
+
+
+def test_slices_of_slabs_are_those_of_the_volume() -> None:
+    rng = np.random.default_rng(31)
+    for _ in range(40):
+        nz, ny, nx = (int(n) for n in rng.integers(1, 12, 3))
+        volume = rng.normal(size=(nz, ny, nx)).astype(np.float32)
+        taken = MiddleSlices(volume.shape)
+        limits = sorted({0, nz, *rng.integers(0, nz + 1, 3).tolist()})
+        for first, last in itertools.pairwise(limits):
+            taken.take(volume[first:last])
+        np.testing.assert_array_equal(taken.images["xy"], np.flip(volume[nz // 2], 0))
+        np.testing.assert_array_equal(taken.images["xz"], np.flip(volume[:, ny // 2], 0))
+        np.testing.assert_array_equal(taken.images["yz"], np.flip(volume[:, :, nx // 2], 0))
 
 
 def run(words: list[str]) -> int:

@@ -35,10 +35,10 @@ from flexdt.library.reconstruction.kept_images import (
 from flexdt.library.reconstruction.memory_plan import PART, MemoryPlan, plan_memory, plan_whole
 from flexdt.library.reconstruction.slab_fdk import StandingImages, Work, fdk_slabs
 from flexdt.library.reconstruction.volume_files import (
+    MiddleSlices,
     check_name,
     read_volume,
     volume_writer,
-    write_slices,
 )
 from flexdt.runtime.files.directory import free_memory_bytes, memory_bytes
 from flexdt.runtime.files.whole_files import free_bytes
@@ -346,24 +346,27 @@ def reconstruct_dataset(
     task = _task(dataset, request, parameters)
     tell = progress or _untold
     _require_room(out, task.grid)
+    slices = MiddleSlices(task.grid.shape)
     if workers is None:
-        views, bias, doubts = _here(task, task.plan(memory), out, tell)
+        views, bias, doubts = _here(task, task.plan(memory), out, slices, tell)
     else:
         with workers as pool:
             views = _corrected(task.views, task.request)
             by_workers = extension("slabs", "a reconstruction by workers")
             doubts = by_workers(views, task.grid, task.request, out, pool, tell)
         bias = _bias(views)
+        if task.request.png:
+            slices.take(read_volume(out).data)
     accuracy = None
     if task.direct:
         accuracy = None if bias is None else bias.accuracy(task.grid)
         doubts = [*bias_warnings(bias, accuracy), *doubts]
-    slices = write_slices(out, read_volume(out).data) if task.request.png else []
+    pictures = slices.write(out) if task.request.png else []
     in_force = dataset.correction
     used = parameters if parameters is not None else in_force.parameters if in_force else None
     return {
         "file": str(out),
-        "slices": [str(file) for file in slices],
+        "slices": [str(file) for file in pictures],
         "algorithm": task.request.algorithm,
         "shape": list(task.grid.shape),
         "voxel_mm": task.grid.voxel_mm,
@@ -386,7 +389,7 @@ def _bias(views: ScanFrames) -> Bias | None:
 
 
 def _here(
-    task: ReconstructionTask, plan: MemoryPlan, out: Path, tell: Progress
+    task: ReconstructionTask, plan: MemoryPlan, out: Path, slices: MiddleSlices, tell: Progress
 ) -> tuple[ScanFrames, Bias | None, list[str]]:
     """Reconstruct into a file; returns the views, the bias of FDK and what is doubtful."""
     folder, grid = out.absolute().parent, task.grid
@@ -394,12 +397,15 @@ def _here(
     with _reading_once(task, plan, folder, tell) as (kept, work), volume_writer(out, grid) as write:
         views = _corrected(replace(task.views, kept=kept), task.request)
         if not task.direct:
-            write(_iterative(views, grid, task.request, tell).data)
+            volume = _iterative(views, grid, task.request, tell)
+            write(volume.data)
+            slices.take(volume.data)
             return views, None, []
         # Before images are prepared: this looks at images as they were recorded.
         bias, lost = _bias(views), 0
         for slab in _fdk_slabs(task, views, kept, plan, work):
             write(slab.data)
+            slices.take(slab.data)
             lost += lost_layers(slab.data)
             del slab  # before there is another
     return views, bias, layer_warnings(lost, grid.shape[0])

@@ -111,26 +111,48 @@ def read_volume(file: File) -> Volume:
         ) from None
 
 
-def write_slices(path: Path, volume: npt.NDArray[np.float32]) -> list[Path]:
-    """Middle slices across z, y and x as PNG files beside `path`, named after all of its name (so
-    those of `v.tif` and `v.nrrd` keep apart); returns their paths.
+class MiddleSlices:
+    """The middle slices of a volume that comes in slabs.
 
-    All three share one grey scale: the 0.5th and 99.5th percentile of their values.
+    Args:
+        shape: of the volume, (z, y, x).
     """
-    slices = middle_slices(volume)
-    every = np.concatenate([s.ravel() for s in slices.values()])
-    written = []
-    for name, image in slices.items():
-        written.append(path.with_name(f"{path.name}_{name}.png"))
-        written[-1].write_bytes(png(image, like=every))
-    return written
 
+    def __init__(self, shape: tuple[int, int, int]) -> None:
+        nz, ny, nx = self._shape = shape
+        self._across_z = np.zeros((ny, nx), np.float32)
+        self._across_y = np.zeros((nz, nx), np.float32)
+        self._across_x = np.zeros((nz, ny), np.float32)
+        self._done = 0
 
-def middle_slices(volume: npt.NDArray[np.float32]) -> dict[str, npt.NDArray[np.float32]]:
-    """Middle slices by name: xy (seen from above, +y up), xz and yz (+z up)."""
-    nz, ny, nx = volume.shape
-    return {
-        "xy": volume[nz // 2, ::-1],
-        "xz": volume[::-1, ny // 2],
-        "yz": volume[::-1, :, nx // 2],
-    }
+    def take(self, slab: npt.NDArray[np.float32]) -> None:
+        """Take the next layers (k, ny, nx), from the lowest up."""
+        nz, ny, nx = self._shape
+        layers = slice(self._done, self._done + len(slab))
+        self._across_y[layers] = slab[:, ny // 2]
+        self._across_x[layers] = slab[:, :, nx // 2]
+        if layers.start <= nz // 2 < layers.stop:
+            self._across_z[:] = slab[nz // 2 - layers.start]
+        self._done = layers.stop
+
+    @property
+    def images(self) -> dict[str, npt.NDArray[np.float32]]:
+        """By name: xy (seen from above, +y up), xz and yz (+z up)."""
+        return {
+            "xy": self._across_z[::-1],
+            "xz": self._across_y[::-1],
+            "yz": self._across_x[::-1],
+        }
+
+    def write(self, path: Path) -> list[Path]:
+        """Write PNG files beside `path`, named after all of its name (so those of `v.tif` and
+        `v.nrrd` keep apart); returns their paths.
+
+        All three share one grey scale: the 0.5th and 99.5th percentile of their values.
+        """
+        every = np.concatenate([image.ravel() for image in self.images.values()])
+        written = []
+        for name, image in self.images.items():
+            written.append(path.with_name(f"{path.name}_{name}.png"))
+            written[-1].write_bytes(png(image, like=every))
+        return written
