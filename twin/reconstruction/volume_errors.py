@@ -8,12 +8,17 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import replace
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 
-from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.volume import Accuracy, Volume
+
+Neighbours = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Float32Array]
+"""Of each place on an axis: its lower and its upper node, and the weight of the upper one."""
 
 
 class SigmaOf(Protocol):
@@ -50,15 +55,38 @@ def with_errors(
 
 
 def interpolated(nodes: Volume, grid: Volume) -> Float32Array:
-    """Interpolate values on a coarse grid, linearly, at the voxels of another, (nz, ny, nx)."""
-    from scipy.ndimage import map_coordinates
+    """Interpolate values on a coarse grid, linearly, at the voxels of another, (nz, ny, nx).
 
-    at = [
-        np.interp(places, known, np.arange(len(known)))
+    Voxels beyond the outermost nodes have the value of the nearest. Axes are interpolated one after
+    the other, so that a voxel costs two multiplications.
+    """
+    z, y, x = (
+        _neighbours(places, known)
         for places, known in zip(grid.centers()[::-1], nodes.centers()[::-1], strict=True)
-    ]
+    )
+
+    @lru_cache(2)  # a layer lies between two planes of nodes
+    def plane(k: int) -> Float32Array:
+        across = _between(nodes.data[k].T, x).T
+        return _between(across, y)
+
     out = np.empty(grid.shape, np.float32)
-    across = np.meshgrid(at[1], at[2], indexing="ij")
-    for layer, k in enumerate(at[0]):
-        map_coordinates(nodes.data, [np.full_like(across[0], k), *across], out[layer], order=1)
+    for layer, lower, upper, weight in zip(out, *z, strict=True):
+        np.multiply(plane(lower), 1.0 - weight, out=layer)
+        layer += weight * plane(upper)
     return out
+
+
+def _neighbours(places: FloatArray, known: FloatArray) -> Neighbours:
+    at = np.interp(places, known, np.arange(len(known)))
+    lower = np.minimum(at.astype(np.int64), max(len(known) - 2, 0))
+    upper = np.minimum(lower + 1, len(known) - 1)
+    return lower, upper, (at - lower).astype(np.float32)
+
+
+def _between(values: Float32Array, along: Neighbours) -> Float32Array:
+    """Interpolate along the first axis of two."""
+    lower, upper, weight = along
+    found: Float32Array = values[lower] * (1.0 - weight)[:, None]
+    found += values[upper] * weight[:, None]
+    return found
