@@ -31,6 +31,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.geometry.panel import Panel
 from flexdt.twin.projection import Grid
+from flexdt.twin.reconstruction import coarse_scan
 from flexdt.twin.scanner.state import NamedCorrection
 
 VIEWS, ROWS, COLS, PIXEL = 66, 30, 36, 1.2
@@ -164,6 +165,28 @@ def test_each_image_is_read_once_whatever_the_slabs(
     for volume in volumes[1:]:
         np.testing.assert_allclose(volume, volumes[0], atol=3e-6 * np.nanmax(volumes[0]), rtol=0.0)
     assert np.nanmax(volumes[0]) > 0.015
+
+
+def test_images_that_only_slabs_need_are_read_once(
+    tmp_path: Path, reads: Counter[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As most of a scan of many views are: truncation and bias take some of them."""
+    monkeypatch.setattr(coarse_scan, "VIEWS", 11)
+    data = fx.open(written(tmp_path / "scan"))
+    before: list[int] = []
+    make = slab_fdk.fdk_parts
+
+    def counting(*args: Any, **more: Any) -> Any:
+        before.append(len(reads))
+        return make(*args, **more)
+
+    monkeypatch.setattr(slab_fdk, "fdk_parts", counting)
+    request = VolumeRequest(shape=GRID.shape, voxel_mm=GRID.voxel_mm)
+    reads.clear()
+    reconstruct_dataset(data, tmp_path / "v.mha", request, memory=memory_for(3))
+    assert before[0] < VIEWS
+    assert before[1:] == [VIEWS, VIEWS]
+    assert dict(reads) == {frame.file: 1 for frame in data.frames}
 
 
 @pytest.mark.parametrize("errors", [False, True])

@@ -17,6 +17,7 @@ import pytest
 from flexdt.clients.cli import main
 from flexdt.library.data_set import DataSet
 from flexdt.library.reading.folders import load_dataset
+from flexdt.library.reconstruction import volume_formats
 from flexdt.library.reconstruction.reconstruct import VolumeRequest as Request
 from flexdt.library.reconstruction.reconstruct import (
     preview,
@@ -153,6 +154,8 @@ def test_formats_hold_the_same_values(
     data = load_dataset(folders["plain"])
     made = reconstruct_dataset(data, tmp_path / "whole.mha", request)
     monkeypatch.setattr("flexdt.library.reconstruction.memory_plan.WORKING_IMAGES", 0)
+    # Slabs of 7 layers, in blocks of 3.
+    monkeypatch.setattr(volume_formats, "BLOCK_BYTES", 3 * 24 * 28 * 4)
     reconstruct_dataset(data, tmp_path / name, request, memory=7 * 24 * 28 * 4)
     values = read_volume(tmp_path / name).data
     assert values.shape == (20, 24, 28)

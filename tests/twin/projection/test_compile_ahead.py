@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
@@ -53,6 +54,13 @@ def test_nothing_compiles_after_it_was_compiled_ahead(tmp_path: Path) -> None:
     done = subprocess.run(users, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "compiling" not in done.stderr
+
+
+@pytest.mark.parametrize("group", compile_ahead.GROUPS)
+def test_a_group_names_a_kernel(group: str) -> None:
+    module, _, name = compile_ahead.GROUPS[group][1].partition(":")
+    kernel = getattr(importlib.import_module(f"flexdt.twin.{module}"), name, None)
+    assert callable(getattr(kernel, "py_func", None))
 
 
 def test_what_is_missing_is_named_and_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
