@@ -17,7 +17,6 @@ import pytest
 from flexdt.clients.cli.command_tree import run
 from flexdt.library.datasets import exchange
 from flexdt.library.datasets.exchange import (
-    FORMATS,
     ExchangeError,
     export_dataset,
     geometry_of,
