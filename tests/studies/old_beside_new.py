@@ -46,12 +46,17 @@ class Code:
             ["git", "archive", commit], cwd=ROOT, check=True, capture_output=True
         ).stdout
         subprocess.run(["tar", "--extract", f"--directory={source}"], input=archive, check=True)
+        if (source / "src").exists():  # newer states hold these links themselves
+            package = source / "src" / "flexdt"
+            paths = f"{package.parent}{os.pathsep}{source / 'extensions'}"
+            return cls(source, {**SAFE, "PYTHONPATH": paths})
         for name in FOLDERS:
             (package / name).symlink_to(source / name)
         for file in (source / "flexdt").glob("*"):  # the public face, which older states have not
             (package / file.name).symlink_to(file)
         (package / "__init__.py").touch()
-        return cls(source, {**SAFE, "PYTHONPATH": str(package.parent)})
+        paths = f"{package.parent}{os.pathsep}{source / 'extensions'}"
+        return cls(source, {**SAFE, "PYTHONPATH": paths})
 
     def run(self, *words: str | Path) -> str:
         """What Python prints."""
