@@ -76,7 +76,7 @@ def interrupted(words: Sequence[str], moment_s: float, folder: Path) -> End:
     try:
         process.wait(moment_s)
     except subprocess.TimeoutExpired:
-        used = session_seconds(process.pid)
+        used = tree_seconds(process.pid)
         process.send_signal(signal.SIGINT)
     sent = time.monotonic()
     try:
@@ -106,17 +106,21 @@ def kind_of(code: int, said: str, *, interrupted: bool) -> str:
     return "done" if 0 <= code <= 5 else "wrong"
 
 
-def session_seconds(session: int) -> float:
-    """Processor time so far of the processes of a session [s]."""
-    total = 0
+def tree_seconds(root: int) -> float:
+    """Processor time so far of a process and of what it started, in whatever session [s]."""
+    parents, ticks = {}, {}
     for name in filter(str.isdigit, os.listdir("/proc")):
         try:
             words = Path("/proc", name, "stat").read_text().rpartition(")")[2].split()
         except OSError:
             continue
-        if int(words[3]) == session:
-            total += sum(int(word) for word in words[11:15])
-    return max(total, 1) / os.sysconf("SC_CLK_TCK")
+        parents[int(name)] = int(words[1])
+        ticks[int(name)] = sum(int(word) for word in words[11:15])
+    found, new = set(), {root}
+    while new:
+        found |= new
+        new = {pid for pid, parent in parents.items() if parent in new}
+    return max(sum(ticks.get(pid, 0) for pid in found), 1) / os.sysconf("SC_CLK_TCK")
 
 
 @contextmanager

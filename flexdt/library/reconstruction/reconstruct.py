@@ -669,8 +669,10 @@ def _require_room_for_images(folder: Path, plan: MemoryPlan, volume_bytes: int) 
     Raises:
         LimitError: says what is needed and what there is.
     """
+    if not plan.on_disk:
+        return
     need, free = plan.disk_bytes + volume_bytes, free_bytes(folder)
-    if plan.on_disk and need > free:
+    if need > free:
         raise LimitError(
             f"{plan.kept} images that are needed again take {plan.disk_bytes / 2**30:.3g} GiB "
             f"beside the volume's {volume_bytes / 2**30:.3g} GiB; there are {free / 2**30:.3g} GiB "
