@@ -424,11 +424,6 @@ def _edge(cols: int) -> int:
     return max(1, cols // SAMPLES)
 
 
-def _centred(count: int) -> FloatArray:
-    """Numbers of pixels, counted from the middle of a panel."""
-    return np.arange(count, dtype=np.float64) - (count - 1) / 2.0
-
-
 def _rays(
     cone_vec: ConeVec, rows: FloatArray, columns: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
