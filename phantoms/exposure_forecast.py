@@ -29,12 +29,15 @@ from flexdt.twin.physics.chain import Chain, flux_of, radiographs
 from flexdt.twin.physics.detector import detector_of
 from flexdt.twin.physics.exposure import FEW_COUNTS, NOTICED, ExposureSettings
 from flexdt.twin.physics.image_quality import air_kerma_mGy, contrast_to_noise, pixel_reading
+from flexdt.twin.physics.predicted_beam import BRIGHTEST_FILL
 from flexdt.twin.physics.readout import expected_counts, saturating_counts
 from flexdt.twin.physics.tube import Filter, tube_of, voltages
 from flexdt.twin.projection import project_body
 from flexdt.twin.projection.analytic_solids import Vector
 from flexdt.twin.scanner.state import CameraChange, changed_camera
 from flexdt.twin.script.compose import compose_script
+from flexdt.twin.script.planning.beam_view import views
+from flexdt.twin.script.planning.open_beam_findings import lit_settings, open_beam_problems
 from flexdt.twin.script.planning.plan import ScanPlan
 from flexdt.twin.script.planning.plan_values import StartState
 from flexdt.twin.script.planning.planner import plan_script
@@ -46,8 +49,6 @@ VIEWS: Final = 8
 """Views of a turn that are looked at."""
 EDGES: Final = np.concatenate([[0.0], np.logspace(-3.95, 0.05, 41), [np.inf]])
 """Bins of transmission: ten a decade, the open beam amid the last, and what lies outside."""
-BRIGHTEST: Final = 0.9
-"""Part of the panel's range that the open beam may fill in a proposed setting."""
 FILTERS: Final = (
     "", "aluminium:0.5", "aluminium:1", "aluminium:2", "copper:0.1", "copper:0.25", "copper:0.5",
     "copper:1",
@@ -93,7 +94,8 @@ class Setting:
     Attributes:
         kV, filter: voltage, and the filter beside the tube's own ("" for none).
         exposure_ms, averages: of one image; their product is the time asked for.
-        cnr: contrast of the detail to the noise, of one pixel of one image.
+        cnr: contrast of the detail to the noise, of one pixel of one image; None where that pixel
+            is saturated.
         kerma_mGy: air kerma of the whole scan on the axis, without a sample.
     """
 
@@ -101,7 +103,7 @@ class Setting:
     filter: str
     exposure_ms: float
     averages: int
-    cnr: float
+    cnr: float | None
     kerma_mGy: float
 
 
@@ -154,8 +156,8 @@ def expose(
     roi: Roi | None = None,
     images: int = 361,
     kind: Kind | None = None,
-    sod: float = 600.0,
-    sdd: float = 1059.0,
+    sod: float | None = None,
+    sdd: float | None = None,
     detail: str = f"{VOID}:0.5",
     machine: Machine | str = "flexray",
     material: str | None = None,
@@ -177,7 +179,8 @@ def expose(
         images: of the scan.
         kind: of a scan to compose for the machine, whose time, bytes and dose are then the whole
             script's, as `flexdt.check` has them; None counts `images` exposures and nothing else.
-        sod, sdd: distances [mm].
+        sod, sdd: distances [mm]; default: those of the script that flexdt composes for the machine
+            (600 and 1059 on the FleX-ray).
         detail: MATERIAL:MM, a detail of so much of that material on the darkest ray, or void:MM,
             so much less of what this ray meets most of.
         machine: a machine (see `flexdt.machine`) or the name of one that ships.
@@ -201,31 +204,10 @@ def expose(
     """
     scanner = machine if isinstance(machine, Machine) else builtin_machine(machine)
     spec = scanner.detector
-    low, high = max(scanner.tube.min_kV, voltages()[0]), min(scanner.tube.max_kV, voltages()[1])
     tried = np.atleast_1d(scanner.tube.kV if kV is None else kV).astype(float).tolist()
-    if not tried:
-        raise LimitError(
-            f"kV is {kV}, no voltage; allowed with {scanner.name}: one or more of {low:g} to "
-            f"{high:g}, or None",
-            {"asked": [], "allowed": [low, high]},
-        )
     power = scanner.tube.power_W if power_W is None else power_W
     time_ms = spec.exposure_ms if exposure_ms is None else exposure_ms
-    for what, values, least, most in (
-        ("kV", tried, low, high),
-        ("power_W", [power], 1e-9, scanner.tube.max_W),
-        ("exposure_ms", [time_ms], spec.min_exposure_ms, spec.max_exposure_ms),
-        ("averages", [averages], 1, 10**6), ("images", [images], 1, 10**7),
-    ):  # fmt: skip
-        for value in values:
-            counted = what in ("averages", "images")
-            if not least <= value <= most or (counted and value != int(value)):
-                whole = "whole numbers from " if counted else ""
-                raise LimitError(
-                    f"{what} is {value:g}; allowed with {scanner.name}: {whole}{least:g} to "
-                    f"{most:g}",
-                    {"asked": value, "allowed": [least, most]},
-                )
+    _check_settings(scanner, tried, power, time_ms, averages, images)
     missing, size = _layer("detail", detail)
     wanted = (None if missing == VOID else material_of(missing).substance, size)
     phantom = as_phantom(sample, material=material, voxel_mm=voxel_mm)
@@ -234,68 +216,190 @@ def expose(
         "exposure_ms": time_ms, "averages": averages, "mode": mode, "roi": roi,
     }  # fmt: skip
     camera = changed_camera(spec, spec.camera, change)
+    lit = ExposureSettings(tried[0], power, camera.exposure_ms, averages)
+    wish = ScanRequest(
+        kind or "step", sod, sdd, images, camera.exposure_ms, averages, mode=camera.mode,
+        roi=camera.roi, kV=lit.kV, power_W=power,
+    )  # fmt: skip
+    plan: ScanPlan | None = None
+    seconds, total = images * averages * camera.exposure_ms / 1e3, images * 2 * _pixels(camera)
+    if kind is not None:
+        plan = _plan_of(wish, scanner, profile, start)
+        images, seconds, total = plan.frames, plan.duration_s, plan.bytes
+    elif start is None:  # else the distances of a scanner as it stands
+        distances = ScanRequest("step", sod, sdd, frames=2, exposure_ms=camera.exposure_ms)
+        plan = _plan_of(distances, scanner, profile, start)
+    if plan is not None:
+        source_mm, panel_mm = _distances(plan)
+        sod, sdd = sod or source_mm, sdd or panel_mm
+    assert sod is not None
+    assert sdd is not None
     cone = ConeVec.circular(
         sod=sod, sdd=sdd, angles=VIEWS, shape=camera.shape, pixel=camera.pixel_mm(spec.pixels)
     )
-    lit = ExposureSettings(tried[0], power, camera.exposure_ms, averages)
-    rows, cols = camera.shape
-    total, seconds = images * 2 * rows * cols, images * averages * camera.exposure_ms / 1e3
-    if kind is not None:
-        request = ScanRequest(
-            kind, sod, sdd, images, camera.exposure_ms, averages, mode=camera.mode, roi=camera.roi,
-            kV=lit.kV, power_W=power,
-        )  # fmt: skip
-        offsets = profile or profile_of(scanner)
-        text = compose_script(request, scanner, offsets)
-        plan = plan_script(text, scanner, offsets, start=start)
-        images, seconds, total = plan.frames, plan.duration_s, plan.bytes
-    panel, tube = detector_of(spec), tube_of(scanner.tube)
-
-    def chain(layer: str) -> Chain:
-        name, thickness = _layer("filter", layer) if layer else ("", 0.0)
-        more = (Filter(material_of(name).substance, thickness),) if layer else ()
-        return chain_through(parts, panel, replace(tube, filters=(*tube.filters, *more)))
-
-    layers = {layer: chain(layer) for layer in (filter, *FILTERS)}
-    paths, through, saturated, starved = _views(parts, layers[filter], camera, cone, lit)
+    layers = _Layers(parts, scanner, filter)
+    paths, through, saturated, starved = _views(parts, layers.chains[filter], camera, cone, lit)
     view, row, col = np.unravel_index(int(through.argmin()), through.shape)
     flux = flux_of(cone.rows[0], camera.shape)
     ray = _Ray(tuple(paths[:, view, row, col].tolist()), float(flux[row, col]), float(flux.max()))
     other = ray.with_detail(wanted, [part.material.substance for part in parts])
-
-    def setting(layer: str, at: ExposureSettings) -> Setting:
-        plain, changed = (
-            pixel_reading(layers[layer], camera, at, one.flux, one.paths_mm, one.added)
-            for one in (ray, other)
-        )
-        return Setting(
-            at.kV, layer, at.exposure_ms, at.averages,
-            contrast_to_noise(plain, changed), air_kerma_mGy(layers[layer], at, sod) * images,
-        )  # fmt: skip
-
-    def split(layer: str, voltage: float) -> ExposureSettings:
-        """The same time in so many read-outs that the open beam does not saturate."""
-        time = lit.exposure_ms * averages
-        whole = replace(lit, kV=voltage, exposure_ms=time, averages=1)
-        bright = pixel_reading(layers[layer], camera, whole, ray.brightest).signal
-        reads = max(1, math.ceil(bright / (BRIGHTEST * saturating_counts(panel))))
-        return replace(whole, exposure_ms=time / reads, averages=reads)
-
+    seen = _SeenDetail(layers, camera, ray, other, sod, images)
+    low, high = _voltages(scanner)
     kVs = tried if len(tried) > 1 else np.arange(10.0 * math.ceil(low / 10), high + 1, 10.0)
-    found = [setting(layer, split(layer, float(one))) for layer in FILTERS for one in kVs]
+    found = [
+        seen.setting(layer, seen.unsaturated(layer, replace(lit, kV=float(one))))
+        for layer in FILTERS
+        for one in kVs
+    ]
     best = [s for s in found if spec.min_exposure_ms <= s.exposure_ms <= spec.max_exposure_ms]
     return Forecast(
         Transmission.of(through),
         saturated,
         starved,
         detail,
-        setting(filter, lit),
-        tuple(sorted(best, key=lambda one: -one.cnr)),
+        seen.setting(filter, lit),
+        tuple(sorted(best, key=lambda one: -(one.cnr or 0.0))),
         images,
         seconds,
         total,
         tuple(dict.fromkeys(part.assumed for part in parts if part.assumed)),
     )
+
+
+def _voltages(machine: Machine) -> tuple[float, float]:
+    """Give the least and the greatest voltage [kV] of the tube that has a spectrum."""
+    low, high = voltages()
+    return max(machine.tube.min_kV, low), min(machine.tube.max_kV, high)
+
+
+def _check_settings(
+    machine: Machine,
+    kVs: Sequence[float],
+    power_W: float,
+    exposure_ms: float,
+    averages: float,
+    images: float,
+) -> None:
+    """Refuse settings that the machine does not have.
+
+    Raises:
+        LimitError: names the setting, what was asked and what is allowed.
+    """
+    low, high = _voltages(machine)
+    spec = machine.detector
+    if not kVs:
+        raise LimitError(
+            f"kV is [], no voltage; allowed with {machine.name}: one or more of {low:g} to "
+            f"{high:g}, or None",
+            {"asked": [], "allowed": [low, high]},
+        )
+    for what, values, least, most in (
+        ("kV", kVs, low, high),
+        ("power_W", [power_W], 1e-9, machine.tube.max_W),
+        ("exposure_ms", [exposure_ms], spec.min_exposure_ms, spec.max_exposure_ms),
+        ("averages", [averages], 1, 10**6), ("images", [images], 1, 10**7),
+    ):  # fmt: skip
+        for value in values:
+            counted = what in ("averages", "images")
+            if not least <= value <= most or (counted and value != int(value)):
+                whole = "whole numbers from " if counted else ""
+                raise LimitError(
+                    f"{what} is {value:g}; allowed with {machine.name}: {whole}{least:g} to "
+                    f"{most:g}",
+                    {"asked": value, "allowed": [least, most]},
+                )
+
+
+def _plan_of(
+    request: ScanRequest, machine: Machine, profile: Profile | None, start: StartState | None
+) -> ScanPlan:
+    """Plan the script that is composed for a request.
+
+    Raises:
+        LimitError: distances or speeds that the machine does not have.
+    """
+    offsets = profile or profile_of(machine)
+    text = compose_script(request, machine, offsets)
+    return plan_script(text, machine, offsets, start=start)
+
+
+def _distances(plan: ScanPlan) -> tuple[float, float]:
+    """Give SOD and SDD [mm] of a plan's first projections."""
+    first = next(view for view in views(plan) if view.kind == "projection")
+    return float(first.poses.sod[0]), float(first.poses.sdd[0])
+
+
+def _pixels(camera: CameraSettings) -> int:
+    """Count the pixels of an image."""
+    rows, cols = camera.shape
+    return rows * cols
+
+
+class _Layers:
+    """The chains from tube to counts behind each proposed filter.
+
+    Args:
+        parts: materials of the sample.
+        machine: its tube and panel.
+        asked: the filter asked for, MATERIAL:MM or "".
+    """
+
+    def __init__(self, parts: Sequence[Channel], machine: Machine, asked: str) -> None:
+        panel, tube = detector_of(machine.detector), tube_of(machine.tube)
+        self.panel = panel
+        self.chains: dict[str, Chain] = {}
+        for layer in (asked, *FILTERS):
+            more: tuple[Filter, ...] = ()
+            if layer:
+                name, thickness_mm = _layer("filter", layer)
+                more = (Filter(material_of(name).substance, thickness_mm),)
+            filtered = replace(tube, filters=(*tube.filters, *more))
+            self.chains[layer] = chain_through(parts, panel, filtered)
+
+
+@dataclass(frozen=True)
+class _SeenDetail:
+    """How well a detail on the darkest ray is seen.
+
+    Attributes:
+        layers: the filters.
+        camera: its mode decides electrons in a count.
+        plain, changed: the ray without and with the detail.
+        sod_mm: source to axis, where the dose is.
+        images: of the scan.
+    """
+
+    layers: _Layers
+    camera: CameraSettings
+    plain: _Ray
+    changed: _Ray
+    sod_mm: float
+    images: int
+
+    def setting(self, layer: str, at: ExposureSettings) -> Setting:
+        """Rate a setting; without contrast where a pixel that it rests on is saturated."""
+        chain = self.layers.chains[layer]
+        plain, changed = (
+            pixel_reading(chain, self.camera, at, one.flux, one.paths_mm, one.added)
+            for one in (self.plain, self.changed)
+        )
+        full = saturating_counts(self.layers.panel)
+        seen = max(plain.signal, changed.signal) < full
+        return Setting(
+            at.kV, layer, at.exposure_ms, at.averages,
+            contrast_to_noise(plain, changed) if seen else None,
+            air_kerma_mGy(chain, at, self.sod_mm) * self.images,
+        )  # fmt: skip
+
+    def unsaturated(self, layer: str, asked: ExposureSettings) -> ExposureSettings:
+        """Split the time into so many read-outs that the open beam does not saturate."""
+        time_ms = asked.exposure_ms * asked.averages
+        whole = replace(asked, exposure_ms=time_ms, averages=1)
+        chain = self.layers.chains[layer]
+        bright = pixel_reading(chain, self.camera, whole, self.plain.brightest).signal
+        full = saturating_counts(self.layers.panel)
+        reads = max(1, math.ceil(bright / (BRIGHTEST_FILL * full)))
+        return replace(whole, exposure_ms=time_ms / reads, averages=reads)
 
 
 def exposure_problems(plan: ScanPlan, phantom: Phantom) -> tuple[ScriptProblem, ...]:
@@ -305,24 +409,17 @@ def exposure_problems(plan: ScanPlan, phantom: Phantom) -> tuple[ScriptProblem, 
     """
     parts, scanner = channels(phantom), plan.machine
     chain = chain_through(parts, detector_of(scanner.detector), tube_of(scanner.tube))
-    found: dict[tuple[ExposureSettings, CameraSettings], tuple[int, list[int]]] = {}
-    first = 0
-    for group in plan.groups:
-        if group.kind == "projection" and group.xrays_on and group.files:
-            camera = group.camera
-            lit = ExposureSettings(group.kV, group.power_W, camera.exposure_ms, camera.averages)
-            _, known = found.setdefault((lit, replace(camera, frames=1)), (group.line, []))
-            known.extend(range(first, first + len(group)))
-        first += len(group)
+    known = {(p.code, p.line) for p in open_beam_problems(plan)}
     problems: list[ScriptProblem] = []
-    for (lit, camera), (line, numbers) in list(found.items())[:SETTINGS]:
+    settings = lit_settings(plan, kinds=("projection",))
+    for (lit, camera), (line, numbers) in list(settings.items())[:SETTINGS]:
         some = np.unique(np.linspace(0, len(numbers) - 1, FEW_VIEWS).astype(int))
         index = [numbers[i] for i in some]
         positions = {name: x[index] for name, x in plan.image_positions.items()}
         cone = motor_poses(scanner, plan.profile, camera, positions).cone_vec()
         _, _, *shares = _views(parts, chain, camera, cone, lit)
         for name, share in zip(("saturated", "starved"), shares, strict=True):
-            if share >= NOTICED:
+            if share >= NOTICED and (f"{name}_open_beam", line) not in known:
                 text = f"about {100 * share:.3g} % of the projections' pixels will be {name}"
                 problems.append(ScriptProblem("warning", f"{name}_pixels", line, 1, text))
     return tuple(problems)

@@ -3,6 +3,7 @@ what plans do beyond the core."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from flexdt.twin.script import (
 )
 from flexdt.twin.script.dry_run import CollisionCheck, check_plan
 from flexdt.twin.script.planning.plan_values import StartState
+from flexdt.twin.script.problems import in_order
 from flexdt.twin.signatures import File, public
 
 machine = public(find_machine)
@@ -68,7 +70,23 @@ def check(plan: ScanPlan, sample: object = None) -> CheckReport:
     """See `ScanPlan.check`."""
     phantom = None if sample is None else as_phantom(sample)
     collision = collisions(phantom) if plan.machine.components else None
-    return check_plan(plan, (), collision, "", plan.start != StartState.of(plan.machine))
+    known = plan.start != StartState.of(plan.machine)
+    return with_exposures(check_plan(plan, (), collision, "", known), phantom)
+
+
+def with_exposures(report: CheckReport, phantom: Phantom | None) -> CheckReport:
+    """Add warnings of projections in which the sample's pixels will be saturated or starved.
+
+    Args:
+        report: of a dry run; one with errors is returned as it is.
+        phantom: on the stage; None adds nothing.
+    """
+    if phantom is None or report.errors:
+        return report
+    from flexdt.phantoms.exposure_forecast import exposure_problems
+
+    more = exposure_problems(report.plan, phantom)
+    return replace(report, problems=in_order((*report.problems, *more)))
 
 
 def size_of(phantom: Phantom | None) -> SampleSize | None:

@@ -112,8 +112,8 @@ class PredictedSetting(f.Result):
     filter: str
     exposure_ms: float
     averages: int
-    cnr: float
-    """contrast of the detail to the noise of a pixel of one image"""
+    cnr: float | None
+    """contrast of the detail to the noise of a pixel of one image; null where it is saturated"""
     kerma_mGy: float
     """air kerma of the scan on the axis, without a sample"""
 

@@ -15,7 +15,7 @@ import asyncio
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -39,11 +39,11 @@ from flexdt.twin.physics import scatter as mc
 from flexdt.twin.physics.chain import Chain, Radiograph, Scattered, radiographs, without_spot
 from flexdt.twin.physics.detector import Detector, detector_of
 from flexdt.twin.physics.exposure import ExposureSettings
+from flexdt.twin.physics.predicted_beam import Physics
 from flexdt.twin.physics.readout import Expected, expected_counts, read_out
 from flexdt.twin.physics.tube import TubeModel, tube_of, voltages
 from flexdt.twin.scanner.state import Sample
 
-Physics = Literal["ideal", "mono", "poly"]
 SCATTER: Final = mc.ScatterSettings()
 FORGOTTEN_S: Final = 10.0
 """Time after which an earlier frame has left nothing on the panel."""

@@ -30,6 +30,7 @@ from flexdt.twin.collision.obstacle_path import free_moves
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.physics.predicted_beam import Physics
 from flexdt.twin.script import (
     CheckReport,
     Clearance,
@@ -66,6 +67,7 @@ class CheckInput:
         machine, profile, start: the scanner before.
         size: of the sample the beam sees.
         pieces, parameters: what may collide, and the correction in force.
+        physics: how images are made, for what the open beam will count.
     """
 
     wish: ScanSource
@@ -75,6 +77,7 @@ class CheckInput:
     size: SampleSize | None
     pieces: Sequence[Polytope]
     parameters: Offsets
+    physics: Physics = "ideal"
 
     @property
     def light(self) -> bool:
@@ -98,12 +101,13 @@ class CheckInput:
             return dry_run.check_script(
                 wish.script, machine, self.profile,
                 start=self.start, sample=self.size, collision=sweep,
+                physics=self.physics,
             )  # fmt: skip
         plan = plan_poses(
             wish.poses.decoded(), machine, self.profile, wish.exposure_ms, start=self.start,
             sample=self.size, flat=wish.flat, route=self.free_moves if sweep else None,
         )  # fmt: skip
-        return dry_run.check_plan(plan, (), sweep)
+        return dry_run.check_plan(plan, (), sweep, physics=self.physics)
 
     def free_moves(
         self, start: Mapping[str, float], goal: Mapping[str, float]

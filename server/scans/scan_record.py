@@ -18,8 +18,8 @@ from pydantic import Field, TypeAdapter
 
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.own_documents import Changes, file_stem, read_json, read_or_set_aside
-from flexdt.server.imaging.radiography import Physics
 from flexdt.server.scans.twin_clock import SpeedUp, check_speed_up
+from flexdt.twin.physics.predicted_beam import Physics
 from flexdt.twin.physics.scatter import Scatter
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import StartState

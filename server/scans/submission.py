@@ -224,7 +224,9 @@ class Submissions:
             pieces = stage.pieces(stands) if scanner.machine.components else ()
             size = stage.size(shown)
             machine, profile = scanner.machine, scanner.profile
-            return CheckInput(wish, machine, profile, start, size, pieces, parameters)
+            return CheckInput(
+                wish, machine, profile, start, size, pieces, parameters, self.radiography.physics
+            )
 
         return await asyncio.to_thread(work)
 

@@ -26,7 +26,7 @@ from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.own_documents import settle
 from flexdt.runtime.log import LEVELS, log
 from flexdt.server.imaging.projections import Imaging, Projector, TrueGeometry
-from flexdt.server.imaging.radiography import Physics, Radiography, predictors, with_spectra
+from flexdt.server.imaging.radiography import Radiography, predictors, with_spectra
 from flexdt.server.scans.jobs import Jobs, fresh_seed
 from flexdt.server.scans.scan_job import Job
 from flexdt.server.scans.stage import ObstacleMoves, Shapes, Stage
@@ -45,6 +45,7 @@ from flexdt.twin.errors import GeometryError, SafetyError
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.physics.chain import Radiograph
+from flexdt.twin.physics.predicted_beam import Physics
 from flexdt.twin.physics.scatter import Scatter
 from flexdt.twin.scanner.safety import Guard
 from flexdt.twin.scanner.scanner import ScannerTwin

@@ -197,7 +197,7 @@ def test_script_new_writes_what_check_accepts(
     kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / f"{kind}.txt"
-    words = ["--frames", "41", "--exposure", "500", "--out", str(path), "--json"]
+    words = ["--frames", "41", "--averages", "5", "--out", str(path), "--json"]
     assert run(["script", "new", "--kind", kind, *words]) == 0
     made = json.loads(capsys.readouterr().out)
     assert made["text"].encode() == path.read_bytes()

@@ -175,6 +175,11 @@ def test_both_clients_do_every_method_of_the_wire(shell: Shell, tmp_path: Path) 
 
     bad = twin.check_script("tube\tset kV\tmany\t\tACK\t\t\r\n")
     assert not bad.ok
+    bright = (
+        "camera\tset exposure\t60000\t\tACK\t\t\r\ntube\txrayon\t\t\tACK\t\t\r\n"
+        "camera\ttake image\t\t\tACK\t\t\r\ncamera\tsave image\tscan_0.tif\t\tACK\t\t\r\n"
+    )
+    assert "saturated_open_beam" in {p.code for p in twin.check_script(bright).problems}
     with pytest.raises(RpcError) as caught:
         twin.submit_script(b"warp drive\r\n")
     assert caught.value.code == -32005

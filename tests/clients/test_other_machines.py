@@ -122,7 +122,7 @@ REQUESTS = {
     "xyzr_cabinet": ScanRequest(
         sod_mm=300.0, frames=25, averages=4, mode="4x4", roi=Roi(600, 400, 1399, 1599)
     ),
-    "micro_ct": ScanRequest(frames=25, averages=4, exposure_ms=500.0, mode="preview"),
+    "micro_ct": ScanRequest(frames=25, averages=28, mode="preview"),
 }
 
 

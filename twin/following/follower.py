@@ -25,6 +25,7 @@ from flexdt.twin.script import commands as c
 from flexdt.twin.script.dry_run import CollisionCheck, check_plan
 from flexdt.twin.script.executed_log import MotorReply, log_line, motor_reply, reply_bytes
 from flexdt.twin.script.grammar import FIXED, ArgumentError, describe, find, number
+from flexdt.twin.script.planning.open_beam_findings import OPEN_BEAM_CODES
 from flexdt.twin.script.planning.plan_values import PlanStep, SampleSize
 from flexdt.twin.script.planning.planner import plan_script, simulated
 from flexdt.twin.script.planning.simulated_script import Simulation
@@ -174,10 +175,11 @@ class Follower:
         report = check_plan(plan, (), collision)
         assumed = f" ({', '.join(mirror.assumed)} assumed at home)" if mirror.assumed else ""
         found: dict[tuple[str, int], Alarm] = {}
-        for p in report.errors:  # of the contacts of one line, the first
+        exposures = [p for p in report.warnings if p.code in OPEN_BEAM_CODES]
+        for p in (*report.errors, *exposures):  # of the contacts of one line, the first
             where = f"line {p.line}" if p.line else "the move under way"
             what = f"{where}: {p.message}{assumed}"
-            alarm = Alarm(now, "error", p.code, f"ahead, {where}", what)
+            alarm = Alarm(now, p.severity, p.code, f"ahead, {where}", what)
             found.setdefault((p.code, p.line), alarm)
         near = report.clearance
         bound = self.machine.safety_margin_mm + NEAR_PART_MM

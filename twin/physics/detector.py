@@ -231,8 +231,10 @@ class Detector:
         return sigma / across, sigma / up
 
     def gain(self, camera: CameraSettings) -> float:
-        """Electrons in each count: by default the unbinned pixel's full well fills the converter's
-        depth.
+        """Give the electrons in each count.
+
+        By default the unbinned pixel's full well fills the converter's depth, and a full well is
+        in proportion to the pixel's area: larger pixels hold more charge.
 
         Example:
             >>> panel = Detector(electrons_per_count=20)
@@ -241,7 +243,9 @@ class Detector:
         """
         if self.electrons_per_count is not None:
             return self.electrons_per_count
-        return FULL_WELL_E[_is_low(camera)] / 2.0**self.bits
+        across, up = self.pixels.edges_mm
+        area = across * up / PixelGrid.pitch_mm**2
+        return FULL_WELL_E[_is_low(camera)] * area / 2.0**self.bits
 
     def read_noise(self, camera: CameraSettings) -> float:
         """Standard deviation of one read-out of an image pixel [electrons].

@@ -37,7 +37,7 @@ class IdealResponse:
         bits: depth; counts are clipped to [0, 2^bits - 1].
         i0_counts: open-beam signal above dark at the reference settings. It scales with
             kV * power_W * exposure_ms, and knows no distance law.
-        reference: (kV, W, ms) of `i0_counts`: the thesis's Listing 1.
+        reference: (kV, W, ms) of `i0_counts`; default: the thesis's Listing 1.
         dark_counts: level without X-rays.
         photons_per_count: detected photons one count stands for (sets the Poisson noise).
         read_noise_counts: standard deviation of one read-out.
@@ -73,12 +73,13 @@ class ExposureSettings:
 
 
 def ideal_response(machine: Machine) -> IdealResponse:
-    """That of `machine`; an open beam fills about 3/4 of its depth."""
-    model = IdealResponse()
+    """Give the response of `machine`: at its own settings an open beam fills 3/4 of its depth."""
+    model, tube = IdealResponse(), machine.tube
     scale = 2.0 ** (machine.detector.bits - model.bits)
     return IdealResponse(
         bits=machine.detector.bits,
         i0_counts=model.i0_counts * scale,
+        reference=(tube.kV, tube.power_W, machine.detector.exposure_ms),
         dark_counts=model.dark_counts * scale,
         read_noise_counts=model.read_noise_counts * scale,
         photons_per_count=model.photons_per_count / scale,

@@ -51,9 +51,7 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
             which it has no motor; says which.
     """
     panel, tube = machine.detector, machine.tube
-    exposure = min(max(100.0, panel.min_exposure_ms), panel.max_exposure_ms)
-    if request.exposure_ms is not None:
-        exposure = request.exposure_ms
+    exposure = panel.exposure_ms if request.exposure_ms is None else request.exposure_ms
     change: CameraChange = {"mode": request.mode, "roi": request.roi, "exposure_ms": exposure}
     changed_camera(panel, panel.camera, change)
     changed_tube(tube, TubeSettings(tube.kV, tube.power_W), request.kV, request.power_W)

@@ -13,10 +13,12 @@ import numpy as np
 
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.physics.predicted_beam import Physics
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.parse import Source, content, read_script
 from flexdt.twin.script.planning.beam_view import View, views
 from flexdt.twin.script.planning.check_findings import Clearance, Dose, Optics
+from flexdt.twin.script.planning.open_beam_findings import open_beam_problems
 from flexdt.twin.script.planning.plan import CheckReport, ScanPlan
 from flexdt.twin.script.planning.plan_values import SampleSize, StartState
 from flexdt.twin.script.planning.planner import plan_script
@@ -34,6 +36,7 @@ def check_script(
     start: StartState | None = None,
     sample: SampleSize | None = None,
     collision: CollisionCheck | None = None,
+    physics: Physics = "poly",
 ) -> CheckReport:
     """Parse, plan and check a script; what cannot be read is reported and the rest is planned.
 
@@ -44,6 +47,7 @@ def check_script(
         start: the scanner before it; None assumes the machine's homes, and the report says so.
         sample: its size, for truncation; None takes what the script says, if anything.
         collision: finds collisions and clearances over a plan; None leaves them unchecked.
+        physics: predicts whether the open beam saturates the panel.
 
     Example:
         >>> script = "camera\\tset exposure\\t100\\t\\tACK\\t\\t\\r\\n"
@@ -59,7 +63,7 @@ def check_script(
         shown = text if isinstance(text, str) else text.decode("utf-8", "replace")
     bare = c.Script(script.commands, (), script.lines)
     plan = plan_script(bare, machine, profile, start=start, sample=sample)
-    return check_plan(plan, problems, collision, shown, start is not None)
+    return check_plan(plan, problems, collision, shown, start is not None, physics)
 
 
 def check_plan(
@@ -68,6 +72,7 @@ def check_plan(
     collision: CollisionCheck | None = None,
     text: str = "",
     start_known: bool = True,
+    physics: Physics = "poly",
 ) -> CheckReport:
     """The report about a plan.
 
@@ -77,6 +82,7 @@ def check_plan(
         collision: see `check_script`.
         text: that it was made from, for the page.
         start_known: whether the start was given.
+        physics: see `check_script`.
     """
     seen = [v for v in views(plan) if v.kind == "projection"]
     optics = tuple(_optics(v) for v in seen)
@@ -84,6 +90,7 @@ def check_plan(
         None if collision is None else collision(plan, plan.machine, plan.profile, plan.sample)
     )
     found = [*problems, *plan.problems, *_truncation_problems(seen)]
+    found += open_beam_problems(plan, physics)
     if not start_known:
         found += _start_problems(plan)
     if clearance is not None:

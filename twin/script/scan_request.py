@@ -34,7 +34,7 @@ class ScanRequest:
         sod_mm, sdd_mm: source-object and source-detector distance; None is 600 and 1059 where the
             machine gets there, else its home, or its only one.
         frames: images of one fly scan, of the whole for step and helical.
-        exposure_ms, averages: of one image; None is 100 ms, or as near as the camera gets.
+        exposure_ms, averages: of one image; None is the machine's exposure.
         height_mm: of source and detector centre above the origin; None is the sample's, or as for
             sod_mm.
         turns, rise_mm: of a helical scan, in total.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,10 +41,9 @@ def check(
         yield from compare(script, against, machine, html)
         return
     from flexdt.library.dry_run_page import html_report
-    from flexdt.library.scripts import collisions, size_of
+    from flexdt.library.scripts import collisions, size_of, with_exposures
     from flexdt.phantoms.samples import as_phantom
     from flexdt.twin.script import check_script
-    from flexdt.twin.script.problems import in_order
 
     data = script.read_bytes()
     scanner = machines.machine(machine)
@@ -57,11 +55,7 @@ def check(
         sample=size_of(phantom),
         collision=collisions(phantom) if scanner.components else None,
     )
-    if phantom is not None and not report.errors:
-        from flexdt.phantoms.exposure_forecast import exposure_problems
-
-        more = exposure_problems(report.plan, phantom)
-        report = replace(report, problems=in_order((*report.problems, *more)))
+    report = with_exposures(report, phantom)
     if html is not None:
         html.write_text(html_report(report, script.name), encoding="utf-8")
     yield report.to_dict()

@@ -30,8 +30,8 @@ def expose(
     mode: str | None = option(None, metavar="NAME"),
     roi: options.Roi = None,
     frames: int = option(361),
-    sod: float = option(600.0, metavar="MM"),
-    sdd: float = option(1059.0, metavar="MM"),
+    sod: float | None = option(None, metavar="MM"),
+    sdd: float | None = option(None, metavar="MM"),
     detail: str = option("void:0.5", metavar="MATERIAL:MM"),
     machine: options.MachineName = None,
 ) -> Answer:
@@ -48,8 +48,8 @@ def expose(
         averages: Average so many read-outs in an image.
         mode: Set the camera's mode.
         frames: Take so many images of the scan.
-        sod: Set the distance from source to axis.
-        sdd: Set the distance from source to panel.
+        sod: Set the distance from source to axis; default: as `flexdt script new` sets it.
+        sdd: Set the distance from source to panel; default: likewise.
         detail: See this detail; void:MM for less of the sample.
     """
     from flexdt.library import expose as of
@@ -95,12 +95,15 @@ def _seen(found: Forecast | Measured) -> Answer:
 def _told(forecast: Forecast) -> Answer:
     yield from _seen(forecast)
     asked = forecast.asked
-    yield f"{forecast.detail} on the darkest ray: contrast {asked.cnr:.3g} times the noise"
+    seen = "not seen: these pixels are saturated"
+    if asked.cnr is not None:
+        seen = f"contrast {asked.cnr:.3g} times the noise"
+    yield f"{forecast.detail} on the darkest ray: {seen}"
     yield (f"air kerma on the axis {asked.kerma_mGy:.3g} mGy; {forecast.images} images, at least "
            f"{duration(forecast.seconds)}, {size(forecast.bytes)}")  # fmt: skip
     rows = [
-        (f"{s.kV:g}", s.filter or "-", f"{s.averages} x {s.exposure_ms:.4g}", f"{s.cnr:.3g}",
-         f"{s.kerma_mGy:.3g}")
+        (f"{s.kV:g}", s.filter or "-", f"{s.averages} x {s.exposure_ms:.4g}",
+         "-" if s.cnr is None else f"{s.cnr:.3g}", f"{s.kerma_mGy:.3g}")
         for s in forecast.best[:BEST]
     ]  # fmt: skip
     yield f"best of {len(forecast.best)} settings of the same power and time:"

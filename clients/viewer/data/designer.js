@@ -81,12 +81,12 @@ async function predict() {
     }
     if (mine !== number)
         return;
-    const { cnr } = p.asked, goal = Number($input("#design-cnr").value), ms = w.exposure_ms * (goal / cnr) ** 2, best = p.best.at(0), enough = cnr * LATEST >= goal;
+    const cnr = p.asked.cnr ?? 0, goal = Number($input("#design-cnr").value), ms = w.exposure_ms * (goal / cnr) ** 2, best = p.best.at(0), enough = cnr * LATEST >= goal;
     const part = (v) => `${fixed(100 * v, v && v < 0.1 ? 1 : 0)} %`, line = (id, ...nodes) => el("div", { id: `design-${id}` }, ...nodes);
     // Noise of photons goes with the root of the time, what the panel adds falls faster.
     const other = best && (best.kV !== w.kV || best.filter !== p.asked.filter);
     const reach = { class: "small", id: "design-reach", onclick: () => { put("exposure_ms", ms); changed(); } };
-    facts.replaceChildren(line("time", `${seconds(p.seconds)} · ${bytes(p.bytes)} · ${fixed(p.asked.kerma_mGy, 2)} mGy on the axis`), line("least", `least transmission ${part(p.transmission.least)} · saturated ${part(p.saturated)} · starved ${part(p.starved)}`), line("quality", `contrast to noise of ${p.detail}: `, el("b", { class: `verdict ${enough ? "ok" : "bad"}` }, fixed(cnr, 2)), " ", enough || !(goal > 0) ? null : ms <= (scales.exposure_ms?.[1] ?? 0) ? el("button", reach, `${fixed(goal, 1)} takes ${fixed(Math.ceil(ms), 0)} ms at most`) : `no exposure reaches ${fixed(goal, 1)}`), line("best", other ? `best at ${fixed(best.kV, 0)} kV${best.filter ? `, ${best.filter}` : ""}: ${fixed(best.cnr, 2)}` : "", ...p.assumed.map((a) => ` · ${a}`)));
+    facts.replaceChildren(line("time", `${seconds(p.seconds)} · ${bytes(p.bytes)} · ${fixed(p.asked.kerma_mGy, 2)} mGy on the axis`), line("least", `least transmission ${part(p.transmission.least)} · saturated ${part(p.saturated)} · starved ${part(p.starved)}`), line("quality", `contrast to noise of ${p.detail}: `, el("b", { class: `verdict ${enough ? "ok" : "bad"}` }, p.asked.cnr === null ? "saturated" : fixed(cnr, 2)), " ", enough || !(goal > 0) || p.asked.cnr === null ? null : ms <= (scales.exposure_ms?.[1] ?? 0) ? el("button", reach, `${fixed(goal, 1)} takes ${fixed(Math.ceil(ms), 0)} ms at most`) : `no exposure reaches ${fixed(goal, 1)}`), line("best", other ? `best at ${fixed(best.kV, 0)} kV${best.filter ? `, ${best.filter}` : ""}: ${fixed(best.cnr ?? 0, 2)}` : "", ...p.assumed.map((a) => ` · ${a}`)));
     draw(p.transmission);
 }
 function draw({ edges, shares }) {

@@ -143,7 +143,7 @@ async function predict() {
   $button("#predict").disabled = true; $("#predicted").textContent = "a few seconds …";
   const p = await command("exposure.predict", {}, "No prediction");
   $button("#predict").disabled = false;
-  const setting = (s: PredictedSetting) => `${fixed(s.kV, 0)} kV${s.filter ? ` ${s.filter}` : ""}: ${fixed(s.cnr, 1)}`;
+  const setting = (s: PredictedSetting) => `${fixed(s.kV, 0)} kV${s.filter ? ` ${s.filter}` : ""}: ${s.cnr === null ? "saturated" : fixed(s.cnr, 1)}`;
   const told = (p: ExposurePrediction) => [`contrast to noise of ${p.detail}: ${setting(p.asked)}`, ...p.best.slice(0, 1).map((s) => `best ${setting(s)}`),
     `1 % of the pixels see ${fixed(100 * p.transmission.p1, 1)} % or less`];
   $("#predicted").textContent = p ? told(p).join(" · ") : "";

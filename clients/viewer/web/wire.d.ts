@@ -133,7 +133,7 @@ export type MoveResult = {
 export type Placement = { x?: number; y?: number; z?: number; rx?: number; ry?: number; rz?: number };
 export type Plan = { text?: string | null };
 export type PredictedSetting = {
-  kV: number; filter: string; exposure_ms: number; averages: number; cnr: number; kerma_mGy: number
+  kV: number; filter: string; exposure_ms: number; averages: number; cnr: number | null; kerma_mGy: number
 };
 export type Problem = {
   severity: "error" | "warning"; code: string; line: number | null; column: number | null; message: string

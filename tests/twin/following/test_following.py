@@ -308,6 +308,18 @@ def test_the_rest_of_the_script_is_checked_from_where_the_machine_really_is() ->
     assert twice.raised == 1
 
 
+def test_an_exposure_ahead_that_saturates_the_panel_is_a_warning() -> None:
+    rows = [
+        ("tube", "set kV", "90"), ("tube", "set power", "60"), ("camera", "set exposure", "5000"),
+        ("tube", "xrayon", ""), ("camera", "take image", ""), ("camera", "save image", "a.tif"),
+    ]  # fmt: skip
+    text = "".join(f"{part}\t{what}\t{value}\t\tACK\t\t\n" for part, what, value in rows)
+    follow = follower(script=parse_script(text))
+    found = follow.ahead(Mirror.of(FLEXRAY), 0.0)
+    assert [(a.severity, a.kind) for a in found] == [("warning", "saturated_open_beam")]
+    assert "would fill 90 %" in found[0].message
+
+
 # -- a day -----------------------------------------------------------------------------------
 
 

@@ -1,0 +1,108 @@
+"""Predict the counts of the open beam before an image is exposed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy.typing as npt
+
+from flexdt.twin.errors import LimitError
+from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.machine.description import Machine
+from flexdt.twin.physics import exposure as ideal
+from flexdt.twin.physics.chain import Chain, flux_of
+from flexdt.twin.physics.detector import detector_of
+from flexdt.twin.physics.exposure import ExposureSettings
+from flexdt.twin.physics.image_quality import pixel_reading
+from flexdt.twin.physics.readout import saturating_counts
+from flexdt.twin.physics.tube import tube_of
+
+Physics = Literal["ideal", "mono", "poly"]
+
+BRIGHTEST_FILL: Final = 0.9
+"""Part of the panel's range that the open beam may fill in a proposed setting."""
+LEAST_COUNTS: Final = 20.0 * ideal.FEW_COUNTS
+"""Open beam [counts above dark] below which a sample that lets 1/20 through is starved."""
+
+
+@dataclass(frozen=True)
+class OpenBeam:
+    """Counts of the open beam's brightest pixel in one read-out.
+
+    Attributes:
+        counts: expected, above the dark level, not clipped.
+        full_counts: counts above the dark level from which a pixel is saturated.
+    """
+
+    counts: float
+    full_counts: float
+
+    @property
+    def fill(self) -> float:
+        """Part of the panel's range; saturated from 1."""
+        return self.counts / self.full_counts
+
+    @property
+    def saturated(self) -> bool:
+        """Whether the brightest pixel reads the largest count."""
+        return self.fill >= 1.0
+
+    @property
+    def starved(self) -> bool:
+        """Whether there is too little light to see through a sample."""
+        return self.counts < LEAST_COUNTS
+
+
+def open_beam_of(
+    machine: Machine,
+    camera: CameraSettings,
+    exposure: ExposureSettings,
+    view: npt.ArrayLike,
+    physics: Physics = "poly",
+) -> OpenBeam | None:
+    """Predict the open beam of one image.
+
+    Args:
+        machine: its tube and detector.
+        camera: mode and region of interest.
+        exposure: tube and time; taken as if X-rays were on.
+        view: cone_vec row (12,): distances and pixel size.
+        physics: how the counts are made; mono has the counts of poly.
+
+    Returns:
+        None where `physics` has no spectrum for the voltage.
+    """
+    if physics == "ideal":
+        model = ideal.ideal_response(machine)
+        counts = ideal.open_beam(model, exposure)
+        return OpenBeam(counts, model.full_scale - model.dark_counts)
+    panel = detector_of(machine.detector)
+    brightest = float(flux_of(view, camera.shape).max())
+    try:
+        reading = pixel_reading(Chain(panel, tube_of(machine.tube)), camera, exposure, brightest)
+    except LimitError:
+        return None
+    return OpenBeam(reading.signal, saturating_counts(panel))
+
+
+def proposed_setting(machine: Machine, exposure: ExposureSettings, beam: OpenBeam) -> str:
+    """Name an exposure that fills the panel, or a power where no exposure does.
+
+    Args:
+        machine: whose limits hold.
+        exposure: the setting that `beam` was predicted for.
+        beam: its open beam.
+    """
+    spec, tube = machine.detector, machine.tube
+    factor = BRIGHTEST_FILL / beam.fill
+    power_W = exposure.power_W
+    if factor > 1.0:  # more power costs no time
+        power_W = min(power_W * factor, max(tube.max_W, power_W))
+    time_ms = exposure.exposure_ms * factor * exposure.power_W / power_W
+    nearest_ms = min(max(time_ms, spec.min_exposure_ms), spec.max_exposure_ms)
+    power_W *= min(time_ms / nearest_ms, 1.0)
+    words = f"{nearest_ms:.3g} ms at {power_W:.3g} W"
+    if time_ms > spec.max_exposure_ms:
+        return f"not even {words}"
+    return words if power_W != exposure.power_W else f"{nearest_ms:.3g} ms"

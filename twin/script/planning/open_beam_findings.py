@@ -1,0 +1,107 @@
+"""Warn of images of a plan whose open beam saturates or starves the panel."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Final, get_args
+
+import numpy as np
+
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.machine.camera import CameraSettings
+from flexdt.twin.machine.kinematics import motor_poses
+from flexdt.twin.physics.exposure import ExposureSettings
+from flexdt.twin.physics.predicted_beam import (
+    BRIGHTEST_FILL,
+    OpenBeam,
+    Physics,
+    open_beam_of,
+    proposed_setting,
+)
+from flexdt.twin.script.commands import ImageKind
+from flexdt.twin.script.planning.plan import ScanPlan
+from flexdt.twin.script.problems import ScriptProblem
+
+PROBES = 5
+"""Images of one setting whose distances are looked at."""
+OPEN_BEAM_CODES: Final = ("saturated_open_beam", "starved_open_beam")
+"""Codes of the warnings of `open_beam_problems`."""
+Setting = tuple[ExposureSettings, CameraSettings]
+
+
+def open_beam_problems(plan: ScanPlan, physics: Physics = "poly") -> tuple[ScriptProblem, ...]:
+    """Warn once for each setting of tube and camera whose open beam is saturated or starved.
+
+    Args:
+        plan: with the saved images, their settings and positions.
+        physics: how counts are predicted.
+
+    Returns:
+        Warnings `saturated_open_beam` and `starved_open_beam`, each with an exposure that would do.
+    """
+    problems: list[ScriptProblem] = []
+    for (exposure, camera), (line, indices) in lit_settings(plan).items():
+        beam = _brightest(plan, exposure, camera, indices, physics)
+        if beam is None or not (beam.saturated or beam.starved):
+            continue
+        proposal = proposed_setting(plan.machine, exposure, beam)
+        remedy = f"{proposal} would fill {100 * BRIGHTEST_FILL:.0f} %"
+        if beam.saturated:
+            code = OPEN_BEAM_CODES[0]
+            fill = f"{beam.fill:.3g} times the largest count"
+            text = f"the open beam saturates the panel: {fill}; {remedy}"
+        else:
+            code = OPEN_BEAM_CODES[1]
+            text = f"the open beam has {beam.counts:.3g} counts above dark; {remedy}"
+        problems.append(ScriptProblem("warning", code, line, 1, text))
+    return tuple(problems)
+
+
+def lit_settings(
+    plan: ScanPlan, kinds: Sequence[ImageKind] = get_args(ImageKind)
+) -> dict[Setting, tuple[int, list[int]]]:
+    """List the settings of tube and camera of a plan's saved images with X-rays on.
+
+    Args:
+        plan: with its groups of images.
+        kinds: of the images that are listed; default: all.
+
+    Returns:
+        For each setting the line that first uses it, and the indices of its images.
+    """
+    found: dict[Setting, tuple[int, list[int]]] = {}
+    first = 0
+    for group in plan.groups:
+        saved = group.kind in kinds and group.files
+        if saved and group.xrays_on and min(group.camera.shape) > 0:
+            camera = replace(group.camera, frames=1, averages=1)
+            exposure = ExposureSettings(group.kV, group.power_W, camera.exposure_ms)
+            _, indices = found.setdefault((exposure, camera), (group.line, []))
+            indices.extend(range(first, first + len(group)))
+        first += len(group)
+    return found
+
+
+def _brightest(
+    plan: ScanPlan,
+    exposure: ExposureSettings,
+    camera: CameraSettings,
+    indices: list[int],
+    physics: Physics,
+) -> OpenBeam | None:
+    """Predict the brightest open beam of some images of a setting."""
+    beams = [
+        beam
+        for view in _views(plan, camera, indices)
+        if (beam := open_beam_of(plan.machine, camera, exposure, view, physics)) is not None
+    ]
+    return max(beams, key=lambda beam: beam.counts, default=None)
+
+
+def _views(plan: ScanPlan, camera: CameraSettings, indices: list[int]) -> Iterator[FloatArray]:
+    """Give cone_vec rows (12,) of some images."""
+    chosen = np.unique(np.linspace(0, len(indices) - 1, PROBES).astype(int))
+    index = [indices[i] for i in chosen]
+    positions = {name: x[index] for name, x in plan.image_positions.items()}
+    yield from motor_poses(plan.machine, plan.profile, camera, positions).cone_vec().rows
